@@ -85,7 +85,7 @@ compile: install ## compile the kernels, and the callbacks of bodies, mechanisms
 	from twoloop.kernels.evaluation import static_inner; from twoloop.bodies import spatial_callbacks, spatial_programs; \
 	from studies.bench import sharp_callbacks" & \
 	$(RUN) -c "from twoloop.kernels import advance, agreement, interpolation, short_loops; \
-	from twoloop.kernels.algebra import independent, pivots, scaling; from twoloop.kernels.control import switching; \
+	from twoloop.kernels.algebra import dependents, independent, pivots, scaling; from twoloop.kernels.control import switching; \
 	from twoloop.kernels.evaluation import first_look, traced; \
 	from twoloop.kernels.lanes import lane_dop853, lane_runs, lane_starts, lane_taylor; \
 	from twoloop.kernels.steps import adams_step, asking_step, bdf_step, bridge, explicit_step, \

@@ -22,6 +22,7 @@ from twoloop.checks.arguments import (
     check_times,
     check_tolerance,
     check_vector,
+    is_vector,
     shown,
 )
 from twoloop.checks.consistency import ConstraintWarning
@@ -32,13 +33,14 @@ from twoloop.methods.presets import PRESETS, is_preset
 from twoloop.problem.events import check_events
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.folder import begin_folder, check_folder, end_folder
-from twoloop.result.result import Result, result_of
-from twoloop.run.again import LONGEST, Output
+from twoloop.result.result import Result
+from twoloop.run.again import LONGEST, STEPS, Output
 from twoloop.run.asked import Asked
 from twoloop.run.course import Course
 from twoloop.run.interrupts import Interrupts, not_begun
 from twoloop.run.kept import InMemory, OnDisk
 from twoloop.run.launch import record_again, run_from
+from twoloop.run.record import record_of
 from twoloop.run.recorder import Wanted
 from twoloop.run.short_changes import MOST, closer, may_be_missed
 
@@ -196,23 +198,26 @@ def solve_dae(
     asked: Asked = known[1]
     event_functions = None if events is None else check_events(events)
     t0, t1 = check_span(t_span)
-    q0 = check_vector("q0", q0, system.n_q)
-    v0 = check_vector("v0", v0, system.n_q)
+    if not (is_vector(q0, system.n_q) and is_vector(v0, system.n_q)):
+        q0, v0 = check_vector("q0", q0, system.n_q), check_vector("v0", v0, system.n_q)
     if step_size is not None and step_size > (t1 - t0) * (1.0 + SAME):
         raise ValueError(f"step_size must not exceed the length of t_span, {t1 - t0:g}; given {step_size!r}")
     times = None if t_eval is None else check_times(t_eval, t0, t1, step_size)
     folder = None if store is None else check_folder(store)
     with Interrupts() as interrupts:
-        own, told = asked.own_tolerance, asked.told | {"system": system, "atol": asked.atol.copy()}
+        own = asked.own_tolerance
         at_ends = times is not None and times.size <= 2 and set(times.tolist()) <= {t0, t1}
         in_time = time_limit is None or time_limit >= LONGEST
         if folder is event_functions is own is None and in_time and not progress:
-            made = record_again(system, t0, t1, q0, v0, asked, Output(times, at_ends, bool(dense_output)))
+            output = STEPS if times is None and not dense_output else Output(times, at_ends, bool(dense_output))
+            made = record_again(system, t0, t1, q0, v0, asked, output, interrupts)
             if made is not None and not interrupts.asked:
                 fields, said_of_rows = made
                 if said_of_rows:
                     warnings.warn(said_of_rows, ConstraintWarning, stacklevel=2)
-                return result_of(fields | told)
+                return record_of(Result, fields)
+        interrupts.listen()
+        q0, v0 = check_vector("q0", q0, system.n_q), check_vector("v0", v0, system.n_q)
         run = run_from(system, t0, t1, q0, v0, asked)
         if run.said_of_rows:
             warnings.warn(run.said_of_rows, ConstraintWarning, stacklevel=2)
@@ -231,17 +236,18 @@ def solve_dae(
             spent += record.stats.cpu_time
             give_back(run.work)
             every, run = closer(run), run_from(system, t0, t1, q0, v0, asked)
-            run.look_every(every)
+            run.control[run.a.APART] = every
         if spent > 0.0:
             record = replace(record, stats=replace(record.stats, cpu_time=spent + record.stats.cpu_time))
         give_back(run.work)
+        told = asked.told | {"system": system, "atol": asked.atol.copy()}
         if own is not None:  # Newmark's own test, of positions, has its place
             told |= {"rtol": own, "atol": np.full(system.n_q, own), "untested": np.ones(len(record.h), dtype=bool)}
-        result = result_of(vars(record) | told | {"compiled": with_code})
+        result = record_of(Result, vars(record) | told | {"compiled": with_code})
         if isinstance(kept, OnDisk):
             end_folder(kept, result)
         return result
-    return result_of(vars(not_begun(system, t0, event_functions, asked.method.name)))
+    return record_of(Result, vars(not_begun(system, t0, event_functions, asked.method.name)))
 
 
 def check_options(

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import FunctionType
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -105,7 +105,7 @@ def check_choice(name: str, value: Any, choices: Sequence[str]) -> str:
 def check_real(name: str, value: ArrayLike) -> Array:
     """Return `value` as a new float array, or say that it is not one."""
     if type(value) is np.ndarray and value.dtype == np.float64:
-        return value.astype(np.float64)
+        return value.copy()
     if type(value) is list and all(type(each) is float for each in value):
         return np.array(value, dtype=np.float64)
     expected = f"{name} must be an array of real numbers"
@@ -151,6 +151,11 @@ def check_vector(name: str, value: ArrayLike, n: int) -> Array:
     if not math.isfinite(sum(array.tolist())) and not np.isfinite(array).all():  # sums may be too large
         raise wrong_entries(name, "finite", array, ~np.isfinite(array))
     return array
+
+
+def is_vector(value: Any, n: int) -> TypeGuard[Array]:
+    """Whether a value is a float vector of length n, as it is; its numbers may not be finite."""
+    return type(value) is np.ndarray and value.dtype == np.float64 and value.shape == (n,)
 
 
 def check_columns(name: str, value: Array, n: int) -> None:

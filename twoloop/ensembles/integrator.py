@@ -17,7 +17,8 @@ from twoloop.checks.consistency import ConstraintWarning
 from twoloop.methods.plan import Method
 from twoloop.problem.events import check_events
 from twoloop.problem.system import ConstrainedSystem, check_system
-from twoloop.result.result import Result, result_of
+from twoloop.result.result import Result
+from twoloop.run.record import record_of
 from twoloop.run.sampled import SampledRun, SampledState
 from twoloop.solve import check_method, check_options, solve_dae
 
@@ -216,7 +217,7 @@ class Integrator:
             raise ValueError("result has the samples since a start: call integrator.start(t0, q0, v0) first")
         record = replace(self._sampled.record(), system=self._started, method=self._options["method"].name)
         atol = check_tolerance("atol", self._options["atol"], self.system.n_q)
-        return result_of(vars(record) | {"compiled": False, "rtol": float(self._options["rtol"]), "atol": atol})
+        return record_of(Result, vars(record) | {"compiled": False, "rtol": float(self._options["rtol"]), "atol": atol})
 
     def _system_of(self, parameters: ArrayLike) -> ConstrainedSystem:
         made = self.system.with_parameters(parameters)

@@ -10,6 +10,7 @@ from twoloop.checks.arguments import Array
 from twoloop.generate.series import series_for
 from twoloop.generate.time_dependence import may_be_narrow
 from twoloop.generate.tracing import Untraceable
+from twoloop.kernels.layout import short_loops
 from twoloop.methods import dop853_tableau as tableau
 from twoloop.methods.auto import TIGHTEST
 from twoloop.methods.dop853 import COARSE_SHARE, UNSEEN
@@ -19,7 +20,6 @@ from twoloop.methods.runge_kutta import RungeKutta
 from twoloop.methods.tableaux import radau_iia
 from twoloop.methods.taylor import order_in_lanes
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.run import FIRST_STEP
 
 if TYPE_CHECKING:  # it loads kernels
     from twoloop.generate.lane_code import LaneCode
@@ -144,4 +144,6 @@ def _newton(name: str, tested: Literal["all", "positions"], n: int, rtol: float,
 def _options(method: Method, n: int, rtol: float, atol: float) -> Array:
     """What a step reads, behind what lane_control.py reads."""
     plan = method.plan(n, rtol, atol, False)
-    return np.concatenate([plan.rule, [plan.rough, FIRST_STEP, least_tolerance(rtol, atol)], plan.options])
+    return np.concatenate(
+        [plan.rule, [plan.rough, short_loops().FIRST_STEP, least_tolerance(rtol, atol)], plan.options]
+    )

@@ -1,14 +1,21 @@
-"""What numbers decide at a position before equations are written down: which rows of C_q and A count, and how M helps.
+"""What numbers decide at a position before equations are written down.
+
+Which rows of C_q and A count, how M helps, and which coordinates these rows give from the others.
 
 The choice depends on the position alone, so that the same call gets the same code whatever ran before it.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.at_position import mass_and_rows
+from twoloop.generate.families import Family, family_of
+from twoloop.generate.traced_equations import Equations
 from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.compile.linking import direct
 from twoloop.problem.system import ConstrainedSystem
@@ -20,6 +27,11 @@ RANK = 1e-9  # of a row of G, of which no more is left without its part in the r
 NEAR = 0.01  # of the smallest pivot that a row of G may have at the start: where the constraints are near losing rank
 LEAST = 10.0 ** np.arange(-2, -9, -1)  # from what pivots may be at most down to what is not nearly lost to rounding
 BOUNDS = LEAST[:-1] / NEAR
+# of the rows of G over the coordinates, from which on it pays to express some coordinates by the others: below, the
+# system of the rows is the smaller one
+MOSTLY_ROWS = 2.0 / 3.0
+
+Blocks = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
 
 
 @dataclass(frozen=True)
@@ -34,12 +46,16 @@ class Choice:
         Rows of G that make M definite when added, and by what factor: a power of two that brings them to its size.
     least : float
         What the pivot of a row must be, of what it is without the others, a power of ten.
+    blocks : tuple of (rows, columns)
+        One or two of `rows`, by their places in it, and as many coordinates that these give: all of them, in the order
+        in which they are eliminated; empty where it does not pay, or no coordinates will do.
     """
 
     rows: tuple[int, ...]
     added: tuple[int, ...]
     scale: float
     least: float
+    blocks: Blocks = ()
 
     @classmethod
     def at(cls, system: ConstrainedSystem, t: float, q: Array) -> "Choice":
@@ -50,7 +66,64 @@ class Choice:
         Untraceable
             If M is singular on velocities that the constraints allow.
         """
-        return Chooser(system).choice(*mass_and_rows(system, t, q))
+        mass, G = mass_and_rows(system, t, q)
+        choice = Chooser(system).choice(mass, G)
+        return replace(choice, blocks=Dependents(system, choice.rows).blocks(G))
+
+
+class Dependents:
+    """Finds the coordinates that rows of G give, at one position after another.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+    rows : tuple of int
+
+    Attributes
+    ----------
+    find : callable or None
+        Of G and `arguments`: how many blocks there are, of which it puts four numbers each into `found`. None: there
+        are none at any position.
+    """
+
+    find: Any = None
+
+    def __init__(self, system: ConstrainedSystem, rows: tuple[int, ...]):
+        kinds = _kinds(system) if len(rows) >= MOSTLY_ROWS * system.n_q > 0 else None
+        if kinds is not None:
+            from twoloop.kernels.algebra.dependents import dependents, room_size
+
+            numbers, integers = room_size(len(rows), system.n_q)
+            blocks, room, work = np.zeros(4 * len(rows), np.int64), np.zeros(numbers), np.zeros(integers, np.int64)
+            self.find, self.found = direct(dependents), blocks.data
+            self.arguments = kinds, np.array(rows, np.int64), len(rows), room, work, blocks
+
+    def blocks(self, G: Array) -> Blocks:
+        """Those of a choice."""
+        if self.find is None:
+            return ()
+        n = self.find(G, *self.arguments)
+        each = (self.found[4 * k : 4 * k + 4].tolist() for k in range(n))
+        return tuple(((i,), (j,)) if i == k else ((i, k), (j, l)) for i, k, j, l in each)
+
+
+def _kinds(system: ConstrainedSystem) -> Any:
+    """Which entries of G are zero, 0, or a number, 1, or vary, 2; None: that is known only when code is made."""
+    if system.called_in_python:  # may keep what it gets, and so is traced no earlier than it must be
+        return None
+
+    def make(equations: Callable[[], Equations]) -> Any:
+        try:
+            rows = [*equations().of("jacobian").flat, *equations().of("nonholonomic").flat]
+        except (Untraceable, ArithmeticError, RecursionError):
+            return None
+        return np.array([2 if form.terms else int(form.constant != 0.0) for form in rows], dtype=np.int64)
+
+    family: Family = system.remembered(("family", family_of), partial(family_of, system))
+    kinds = family.remembered("kinds of entries", partial(make, partial(family.equations, system)))
+    if kinds is None:  # it may be traced with numbers
+        kinds = system.remembered("kinds of entries", partial(make, partial(Equations, system)))
+    return kinds
 
 
 class Chooser:

@@ -72,7 +72,7 @@ class CollocationCode:
             self.n, len(self.iterated), self.n_rows
         )
 
-        outputs = [self.equations.there]
+        outputs = list(self.equations.accelerations)
         if own.projects:
             outputs += [self.equations.closer, self.equations.nearer]
         graph, numbers = self.equations.graph, self.numbers
@@ -80,9 +80,10 @@ class CollocationCode:
         self.structure = hashlib.sha256(repr([own.digest, told]).encode()).hexdigest()
 
     def _iterated(self) -> list[int]:
-        graph, outputs = self.equations.graph, self.equations.there
-        quantities = outputs.quantities(graph)
-        forms = outputs.forms + [form for i in quantities for form in graph.arguments(i)]
+        graph, forms = self.equations.graph, []
+        for outputs in self.equations.accelerations:
+            forms += outputs.forms
+            forms += [form for i in outputs.quantities(graph) for form in graph.arguments(i)]
         found = {i for form in forms for i in form.terms if graph.operations[i] is None}
         return sorted({(i - 1) % self.n for i in found if i > 0})
 
@@ -133,7 +134,7 @@ class CollocationCode:
     def sweep(self, emit: LaneEmitter, room: Value, state: Value, numbers: Value) -> Value:
         """Accelerations at the nodes anew; the largest change of what follows from them, or FAILED."""
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
-        emit.constants = numbers
+        emit.numbers = emit.constants = numbers
         t, h = emit.splat(one.load(room, at.T)), emit.splat(one.load(room, at.H))
         t = emit.fused(constants(tables().nodes), h, t)
         zero = emit.constant(0.0)
@@ -177,7 +178,7 @@ class CollocationCode:
     def audit(self, emit: LaneEmitter, room: Value, state: Value, numbers: Value) -> Value:
         """The largest defect between nodes: what a step as long as this one would make of it, over the tolerances."""
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
-        emit.constants = numbers
+        emit.numbers = emit.constants = numbers
         t, h = emit.splat(one.load(room, at.T)), emit.splat(one.load(room, at.H))
         length = emit.multiply(h, constants(tables().between))
         zero = emit.constant(0.0)
@@ -263,7 +264,7 @@ class CollocationCode:
 
     def _project(self, emit: LaneEmitter, room: Value, numbers: Value, outputs: Outputs) -> None:
         builder, n = emit.builder, self.n
-        emit.constants = numbers
+        emit.numbers = emit.constants = numbers
         inputs = [_get(emit, room, self.ends + LANES * k) for k in range(1 + 2 * n)]
         written, arrays = results_of(emit, self.equations.graph, outputs, inputs, self.numbers)
         values = dict(zip(outputs.arrays, arrays, strict=True))

@@ -8,6 +8,7 @@ import hashlib
 import math
 from typing import Any
 
+from twoloop.generate.accelerations import write_accelerations
 from twoloop.generate.choices import Choice
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.lane_emitter import LaneEmitter
@@ -70,7 +71,7 @@ class LaneCode(LaneSteps):
         self._rows_at = Outputs({"G": [rows[k, j] for k, j in self._entries]}, [])
         self.structure = self._structure()
         self.n_numbers = self.numbers.n_varying
-        parts = [equations.there, equations.closer, equations.nearest, equations.redundant]
+        parts = [*equations.accelerations, equations.closer, equations.nearest, equations.redundant]
         parts += [self.solution.kept] if series else []
         counts = [len(each.quantities(equations.graph)) for each in parts]
         counts += [len(self.solution.solved.quantities(self.solution.graph))] if series else []
@@ -92,7 +93,7 @@ class LaneCode(LaneSteps):
     def _structure(self) -> str:
         equations, numbers = self.equations, self.numbers
         told: list[Any] = [] if self.explicit is None else [*self.explicit.structure]
-        parts = [equations.there, equations.closer, equations.nearest, equations.redundant]
+        parts = [*equations.accelerations, equations.closer, equations.nearest, equations.redundant]
         if self.recurrences is not None:
             told += list(self.recurrences.structure)
             parts.append(self.solution.kept)
@@ -212,9 +213,8 @@ class LaneCode(LaneSteps):
         keep_fine(emit, room, holds)
 
     def _there(self, emit: LaneEmitter, room: Value, at: Places) -> tuple[Value, list[Value]]:
-        outputs = self.equations.there
-        written, (a,) = results_of(emit, self.equations.graph, outputs, self._new(emit, room, at), self.numbers)
-        return conditions_hold(emit, written, outputs, a), a
+        a, holds = write_accelerations(emit, self.equations, self._new(emit, room, at), self.numbers)
+        return holds, a
 
     def turned(self, emit: LaneEmitter, at: Places) -> Value | None:
         """Where det G1 G0^T is not positive, see lane_turns.py; series have their defects for that."""

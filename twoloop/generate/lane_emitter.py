@@ -24,6 +24,10 @@ class LaneEmitter(Emitter):
         self.lanes, self.suffix = lanes, f"v{lanes}f64"
         self.double, self.whole_number, self.bit = (vector_of(kind, lanes) for kind in (DOUBLE, INTEGER, BIT))
 
+    def like(self, builder: Builder) -> "LaneEmitter":
+        """One of as many lanes, for another function."""
+        return LaneEmitter(builder, self.lanes)
+
     def splat(self, value: Value) -> Value:
         """A number of all lanes."""
         vector = self.builder.insert(undefined(vector_of(value.type, self.lanes)), value, 0)

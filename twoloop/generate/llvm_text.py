@@ -116,6 +116,10 @@ class Module:
         self._functions.append(made)
         return made
 
+    def defines(self, name: str) -> bool:
+        """Whether there is a function of a name."""
+        return any(function.name == name for function in self._functions)
+
     def table(self, places: Sequence[int]) -> Value:
         """A pointer to integers that never change."""
         kind, name = f"[{len(places)} x {WORD}]", f"@table{len(self._tables)}"
@@ -143,7 +147,7 @@ class Builder:
     def __init__(self, module: Module, name: str, result: str, arguments: Sequence[str], internal: bool = False):
         self.module, self.name, self.result, self.internal = module, name, result, internal
         self.arguments = [Value(kind, f"%a{k}") for k, kind in enumerate(arguments)]
-        self._n = 0
+        self._n = self._n_rooms = 0
         self.part = 0  # of a divided function, in which operations are put now
         self._blocks: list[Block] = []
         self._n_blocks = 0
@@ -232,8 +236,11 @@ class Builder:
         self._line(f"call {NOTHING} @{name}({', '.join(map(str, arguments))})")
 
     def room(self, kind: str, size: int) -> Value:
-        """Memory for some values, until the function ends."""
-        return self._value(f"{kind}*", f"alloca {kind}, {integer(max(size, 1))}, align 64")
+        """Memory for some values, until the function ends: where it begins, as within a loop it would grow."""
+        made = Value(f"{kind}*", f"%room{self._n_rooms}")
+        self._blocks[0].lines.insert(self._n_rooms, f"{made.text} = alloca {kind}, {integer(max(size, 1))}, align 64")
+        self._n_rooms += 1
+        return made
 
     def leave_unless(self, condition: Value) -> None:
         """End the function where a condition does not hold, which is its result."""

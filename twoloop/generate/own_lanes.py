@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.generate import (
+    accelerations,
     coefficients,
     lane_code,
     lane_constraints,
@@ -18,8 +19,10 @@ from twoloop.generate import (
     llvm_code,
     llvm_text,
     llvm_trigonometry,
+    null_space,
     series,
     straight_line,
+    symbolic_factors,
     written,
 )
 from twoloop.generate.known_numbers import Record
@@ -35,7 +38,8 @@ Array = NDArray[np.float64]
 
 BUILD_SECONDS = 3e-4  # for a quantity, about
 LANE_WRITERS = (lane_code, lane_constraints, lane_steps, lane_series, lane_stages, lane_turns, lane_emitter)
-WRITERS = (series, straight_line, written, coefficients, *LANE_WRITERS, llvm_code, llvm_text, llvm_trigonometry)
+ELIMINATION = (straight_line, symbolic_factors, null_space, accelerations)
+WRITERS = (series, *ELIMINATION, written, coefficients, *LANE_WRITERS, llvm_code, llvm_text, llvm_trigonometry)
 
 Code = TypeVar("Code", LaneCode, LaneConstraints)
 KIND = "lanes"  # of files on the disk

@@ -10,13 +10,13 @@ constraints, and every order of a series, right-hand sides, and, with redundant 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from twoloop.generate.accelerations import MASS_FIRST
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.llvm_code import ZERO, Emitter
 from twoloop.generate.llvm_text import BIT, DOUBLE, Builder, Module, Value, integer
 from twoloop.generate.straight_line import Outputs, Solution, StraightLine
-from twoloop.generate.written import NOWHERE, Place, Written, conditions_hold
+from twoloop.generate.written import NOWHERE, TRUE, Place, Written, conditions_hold
 
-TRUE = Value(BIT, "true")
 ARRAY = f"{DOUBLE}*"
 POSITION = [DOUBLE, ARRAY, ARRAY, ARRAY, ARRAY]  # t, q, v, numbers, kept
 LONG = 500  # operations from which on equations are written in parts
@@ -57,7 +57,11 @@ class PartsCode:
 
     def write(self, module: Module, kinds: Callable[[str], tuple[str, list[str]]]) -> list[str]:
         """Put all of them into a module; the names of those that kernels know, whose types `kinds` has."""
-        known: dict[str, Callable[..., Any]] = {"own_factors": self._factors, "own_there": self._there}
+        known: dict[str, Callable[..., Any]] = {"own_factors": self._factors}
+        if self.equations.quick is None:
+            known["own_there"] = self._there
+        else:  # which calls this one where it does not serve
+            _write(module.function(MASS_FIRST, *kinds("own_there"), internal=True), self._there)
         if self.equations.projects:
             known |= {"own_closer": self._closer, "own_nearer": self._nearer}
         for name, outputs in self.at_position.items():

@@ -3,8 +3,8 @@
 A step by the general code stores each stage, reads it back to find accelerations, stores these and reads them back for
 the next sum. What a processor has stored number by number it cannot read as a vector at once, so that this takes about
 as long as the accelerations of a small mechanism. Here what a sum gives stays in registers. Long equations have more
-numbers than there are registers: their code is called, not written and compiled again. Where the code does not serve,
-the general inner loop finds the accelerations of a stage.
+numbers than there are registers: their code is called, not written and compiled again. So it is where few operations do
+not serve. Where no code does, the general inner loop finds the accelerations of a stage.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from twoloop.generate.llvm_code import SLACK, Emitter
 from twoloop.generate.llvm_text import BIT, Module, Value, integer
 from twoloop.generate.series_groups import WIDTH
 from twoloop.generate.straight_code import OwnCode, SharedCode
-from twoloop.generate.written import conditions_hold, results_of
+from twoloop.generate.written import TRUE, conditions_hold, results_of
 from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.own_functions import CALLED, LaterFunctions, own_functions
 
@@ -87,16 +87,18 @@ class StageCode:
         stage = self._sum(emit, base, h, weights, which)
         if self.calls:
             return self._stage_by_call(emit, scratch, which, stage, t, place)
-        outputs = self.equations.there
+        outputs = self.equations.accelerations[0]
         written, (a,) = results_of(emit, self.equations.graph, outputs, [t, *stage[: 2 * n]], self.numbers)
-        holds = conditions_hold(emit, written, outputs, a)
-        with builder.if_else(holds) as (then, otherwise):
+        with builder.if_else(conditions_hold(emit, written, outputs, a)) as (then, otherwise):
             with then:
                 row = emit.pointer(base, self.slopes, builder.mul(which, integer(self.slopes)))
                 self._store(emit, [*stage[n : 2 * n], *a], row, 0)
+                found = TRUE, builder.block
             with otherwise:
-                for i in range(2 * n):
-                    emit.store(stage[i], place, i)
+                elsewhere = self._stage_by_call(emit, scratch, which, stage, t, place), builder.block
+        holds = builder.phi(BIT)
+        for value, block in (found, elsewhere):
+            holds.add_incoming(value, block)
         return holds
 
     def _stage_by_call(
@@ -174,8 +176,7 @@ def _compiled(own: SharedCode, n_stages: int) -> CompiledStages:
             llvm_code.write(module, name, KIT.own_type(name), emit)
         return list(parts), str(module)
 
-    called = own.functions if code.calls else None
-    return CompiledStages(LaterFunctions(lambda: own_functions("stages", _stamp(), key, write, called)), code)
+    return CompiledStages(LaterFunctions(lambda: own_functions("stages", _stamp(), key, write, own.functions)), code)
 
 
 @cache

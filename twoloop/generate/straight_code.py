@@ -12,7 +12,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.generate import coefficients, llvm_code, llvm_text, llvm_trigonometry, parts_code, straight_line, written
+from twoloop.generate import (
+    accelerations,
+    coefficients,
+    llvm_code,
+    llvm_text,
+    llvm_trigonometry,
+    null_space,
+    parts_code,
+    straight_line,
+    symbolic_factors,
+    written,
+)
+from twoloop.generate.accelerations import write_own_accelerations
 from twoloop.generate.choices import Choice
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.families import Evaluator, Family, of_family
@@ -108,16 +120,21 @@ class SharedCode:
         """What functions compute that are no parts of others."""
         equations = self.equations
         outputs = {"own_redundant": equations.redundant} if self.projects else {}
-        if self.parts is None:
-            outputs["own_there"] = equations.there
-            if self.projects:
-                outputs |= {"own_closer": equations.closer, "own_nearer": equations.nearer}
+        if self.parts is None and self.projects:
+            outputs |= {"own_closer": equations.closer, "own_nearer": equations.nearer}
         return outputs
+
+    @property
+    def _accelerations(self) -> list[Outputs]:
+        """What `own_there` computes."""
+        if self.parts is None:
+            return self.equations.accelerations
+        return [] if self.equations.quick is None else [self.equations.quick]
 
     def _described(self) -> Iterable[Any]:
         equations, solution, numbers = self.equations, self.solution, self.numbers
         yield equations.system.n_q, equations.choice.rows, equations.choice.added
-        for outputs in (*self.outputs.values(), solution.kept):
+        for outputs in (*self.outputs.values(), solution.kept, *self._accelerations):
             yield outputs.sizes, list(numbers.structure(equations.graph, outputs.forms))
         if self.parts is not None:
             for outputs in self.parts.at_position.values():
@@ -133,6 +150,9 @@ class SharedCode:
         for name, outputs in self.outputs.items():
             write_own(module, name, equations.graph, outputs, self.numbers)
         parts = [] if self.parts is None else self.parts.write(module, KIT.own_type)
+        if "own_there" not in parts:
+            write_own_accelerations(module, "own_there", KIT.own_type("own_there"), equations, self.numbers)
+            parts.append("own_there")
         return [*self.outputs, *parts], str(module)
 
 
@@ -189,5 +209,6 @@ def _stamp() -> str:
     """A digest of what writes the functions, and of what they are called as."""
     from twoloop.kernels.data.common import KIT
 
-    writers = (straight_line, coefficients, llvm_code, llvm_text, llvm_trigonometry, parts_code, written)
+    elimination = (straight_line, symbolic_factors, null_space, accelerations, parts_code)
+    writers = (*elimination, coefficients, llvm_code, llvm_text, llvm_trigonometry, written)
     return digest_of(repr(KIT), __file__, *writers)

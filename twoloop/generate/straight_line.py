@@ -21,14 +21,20 @@ import numpy as np
 
 from twoloop.generate.choices import Choice
 from twoloop.generate.known_numbers import elementwise
+from twoloop.generate.null_space import DependentCoordinates, NotReduced, reduced_accelerations
 from twoloop.generate.symbolic_factors import Block, Factors, solve
 from twoloop.generate.traced_equations import Equations, only
 from twoloop.generate.traced_values import Traced
 from twoloop.generate.tracing import Form, Graph, Untraceable
 from twoloop.kernels.evaluation.inner import CONTRADICTS
+from twoloop.kernels.evaluation.operations import PRODUCT, RECIPROCAL, SUM
 from twoloop.problem.system import ConstrainedSystem
 
 MOST_ELIMINATED = 60_000  # operations with their elimination: those of more than 40 bodies on hinges in space
+# operations of `quick` over those of `there`, from which on it does not pay: now and then both are needed
+WORTH = 0.9
+# of operations, in multiplications: those of division and functions where their results are not waited for
+COSTS, FUNCTION = {PRODUCT: 1, SUM: 0, RECIPROCAL: 4}, 20
 
 
 @dataclass(frozen=True)
@@ -49,6 +55,15 @@ class Outputs:
     def quantities(self, graph: Graph, known: Container[int] = ()) -> list[int]:
         """What all of this is made of, inputs and what is known apart, in an order in which it can be computed."""
         return graph.needed_by(self.forms, known)
+
+    def cost(self, graph: Graph) -> int:
+        """About how long all of this takes to compute, in multiplications and additions."""
+        forms, total = self.forms, 0
+        for i in self.quantities(graph):
+            kind, *arguments = graph.operations[i]  # type: ignore[misc]
+            total += COSTS.get(kind, FUNCTION)
+            forms += [form for form in arguments if isinstance(form, Form)]
+        return total + sum(max(len(form.terms) - 1, 0) for form in forms)
 
     @property
     def sizes(self) -> tuple[dict[str, int], int]:
@@ -79,6 +94,8 @@ class StraightLine:
         Its first quantities are t, q and v.
     there : Outputs
         "a" (n_q,), the accelerations at (q, v) as they stand.
+    quick : Outputs or None
+        The same by dependent coordinates, where that takes fewer operations. `there` holds in more positions.
     right : Outputs
         "r" (n_q,) and "c" (n_c + n_a,), Q and the right-hand sides of the rows of G that are used; without conditions.
     projects : bool
@@ -105,7 +122,7 @@ class StraightLine:
     def __init__(self, system: ConstrainedSystem, choice: Choice, equations: Equations | None = None):
         self.equations = Equations(system) if equations is None else equations
         self.system, self.choice, self.graph = system, choice, self.equations.graph
-        self.nothing = Form(self.graph, 0.0, {})
+        self.nothing, self._beside = Form(self.graph, 0.0, {}), 0  # operations of `quick`
         n, (self.q, self.v) = system.n_q, (self.equations.q, self.equations.v)
         self.projects = system.n_a == 0
         self.mass = self._made("mass")
@@ -124,7 +141,7 @@ class StraightLine:
         self.traced = Traced(system, self.graph)
 
     def _bound(self) -> None:
-        if len(self.graph.operations) > MOST_ELIMINATED:
+        if len(self.graph.operations) - self._beside > MOST_ELIMINATED:
             raise Untraceable(f"its equations are more than {MOST_ELIMINATED} operations")
 
     def _made(self, kind: str, v: Sequence[Form] | None = None) -> Any:
@@ -174,6 +191,27 @@ class StraightLine:
         solution = self._accelerations(self.v)
         self._bound()
         return Outputs({"a": solution[: self.system.n_q]}, self.conditions)
+
+    @cached_property
+    def quick(self) -> Outputs | None:
+        """See the class."""
+        blocks, before, there = self.choice.blocks, len(self.graph.operations), self.there.cost(self.graph)
+        if not blocks:
+            return None
+        force, gamma = self._given(self.v)
+        try:
+            of = DependentCoordinates(self.rows.tolist(), [gamma[k] for k in self.choice.rows], blocks, there)
+            a, conditions = reduced_accelerations(self.mass, force, of)
+            quick = Outputs({"a": a}, [*of.conditions, *conditions])
+        except NotReduced:
+            quick = None
+        self._beside += len(self.graph.operations) - before
+        return quick if quick is not None and quick.cost(self.graph) < WORTH * there else None
+
+    @property
+    def accelerations(self) -> list[Outputs]:
+        """What code for accelerations is made of, see `accelerations.write_accelerations`."""
+        return [self.there] if self.quick is None else [self.quick, self.there]
 
     @cached_property
     def right(self) -> Outputs:

@@ -5,7 +5,7 @@ from typing import Any
 
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.llvm_code import Emitter, Quantities
-from twoloop.generate.llvm_text import DOUBLE, Value
+from twoloop.generate.llvm_text import BIT, DOUBLE, Value
 from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE, sine_and_cosine
 from twoloop.generate.straight_line import Outputs
 from twoloop.generate.tracing import Form, Graph
@@ -23,6 +23,7 @@ from twoloop.kernels.evaluation.operations import (
 
 FUNCTIONS = {SQUARE_ROOT: "sqrt", EXPONENTIAL: "exp", LOGARITHM: "log", ARCTANGENT: "atan"}
 
+TRUE = Value(BIT, "true")
 Place = tuple[Value, int]
 NOWHERE: Mapping[int, Place] = {}
 

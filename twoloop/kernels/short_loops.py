@@ -2,13 +2,18 @@
 
 import math
 
+import numpy as np
 from numba import types
 
 from twoloop.kernels.compile.reference import Reference
 from twoloop.kernels.control import clock as at
+from twoloop.kernels.control.sudden import PLACES
 from twoloop.kernels.data import codes, noted
-from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, WORK, f8, i8, kernel, merged
+from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, WORK, exact, f8, i8, kernel, merged
 from twoloop.kernels.data.counters import N_ACCEPTED
+from twoloop.kernels.data.finite import finite_vector
+from twoloop.kernels.data.flags import FORM
+from twoloop.kernels.data.tolerances import GAP, LONGEST_UNSEEN, LOOK
 from twoloop.kernels.evaluation.first_look import CONSISTENT, DEFINITE, IN_ORDER, INDEFINITE
 
 ROUNDING = 1e-15  # of the largest coordinate: corrections of this size are rounding
@@ -41,11 +46,18 @@ def make_ready(w, numbers, integers, pattern, q, accuracy, reuse):
     put_ready(w, numbers, integers, pattern, q, accuracy, reuse)
 
 
-@kernel(f8(VECTOR, i8, f8, f8, f8))
-def first_step(state, n, least, span, share):
+FIRST_STEP = 0.01  # of the shortest time scale that a state shows: the first step ...
+RESOLVED = 1e4  # ... but no fewer spacings of floating-point numbers at the start
+SHORTEST_STEP = 1e-16  # of the first step
+SHARPER = 10  # times as often steps that look within look at the equations, of what may be sharp in q or v
+
+
+@exact
+def _first_step(state, n, t, span, least):
     """A share of the time in which velocities and accelerations change the coordinates as a whole, s.
 
-    `least` is what counts as the size of coordinates that are zero, of which there is no other length.
+    `least` is what counts as the size of coordinates that are zero, of which there is no other length. Of those next to
+    zero that time may be less than numbers near t can tell apart.
     """
     far, fast, sharp = least, 0.0, 0.0
     for j in range(n):
@@ -56,9 +68,27 @@ def first_step(state, n, least, span, share):
         scale = min(scale, far / fast)
     if sharp > 0.0:
         scale = min(scale, math.sqrt(far / sharp))
-    if fast > 0.0 and sharp > 0.0 and fast / sharp > share * scale:  # not at what is next to rest
+    if fast > 0.0 and sharp > 0.0 and fast / sharp > FIRST_STEP * scale:  # not at what is next to rest
         scale = min(scale, fast / sharp)
-    return share * scale
+    return max(FIRST_STEP * scale, RESOLVED * np.spacing(abs(t)))
+
+
+@exact
+def _limit_steps(control, tolerances, span, longest, within):
+    """Let no hundredth of a run pass unseen. `within`: its steps look within, and may be as long as that is."""
+    gap = LONGEST_UNSEEN * span
+    tolerances[GAP], tolerances[LOOK] = gap, gap / (SHARPER if control[at.BY_STATE] > 0.0 else 1.0)
+    control[at.MAX_STEP] = longest if within else min(longest, gap / control[at.UNSEEN])
+    control[at.APART] = gap / PLACES
+    control[at.SPACING] = control[at.APART] if control[at.BY_TIME] + control[at.BY_STATE] > 0.0 else 0.0
+
+
+@kernel(f8(VECTOR, VECTOR, VECTOR, i8, f8, f8, f8, f8, types.boolean))
+def set_sizes(control, tolerances, state, n, t, t1, least, longest, within):
+    """The first step from a state, s; and if a longest one is given, no hundredth of the run is to pass unseen."""
+    if longest > 0.0:
+        _limit_steps(control, tolerances, t1 - t, longest, within)
+    return _first_step(state, n, t, t1 - t, least)
 
 
 @merged
@@ -88,21 +118,30 @@ def tell_steps(steps, counts, h, changes, untested):
 
 REFUSED, IN_DOUBT, READY = range(3)  # another way has to be gone; a closer look has to be taken; at the start
 
-# arrays of looks at starts, of choices and of a run; `begin_numbers` is what `numbers` is full of at a start, and
-# `begin_memory` what stands in `memory` at `places`: of the rest, nearly all, to clear it takes less than to copy it
-BEGINNING = Reference(
-    "Beginning",
+# Arrays of a run that starts again and again, of looks at its starts and of choices; and room for its states and steps.
+# `begin_numbers` is what `numbers` is full of before a start, `begin_memory` what stands in `memory` at `places`: of
+# the rest, nearly all, to clear it takes less than to copy it. `saved` and `saved_integers`: all that counts at a start
+AGAIN = Reference(
+    "Again",
     {
-        **dict.fromkeys(("looked", "lam", "room", "least", "bounds", "scratch", "constants"), VECTOR),
-        **dict.fromkeys(("begin_numbers", "numbers", "begin_memory", "memory", "clock", "state", "lasting"), VECTOR),
-        **dict.fromkeys(("mass", "rows", "ways", "pattern"), MATRIX),
-        **dict.fromkeys(("chosen", "expected", "lapack", "lasting_integers", "places"), INTEGERS),
+        **dict.fromkeys(("looked", "lam", "room", "least", "bounds", "scratch", "constants", "saved"), VECTOR),
+        **dict.fromkeys(("begin_numbers", "numbers", "begin_memory", "memory", "lasting", "options"), VECTOR),
+        **dict.fromkeys(("tolerances", "control", "clock", "state", "new_state", "end", "out_t", "told"), VECTOR),
+        **dict.fromkeys(("mass", "rows", "ways", "pattern", "out_rows", "out_steps"), MATRIX),
+        **dict.fromkeys(("chosen", "expected", "lapack", "lasting_integers", "saved_integers"), INTEGERS),
+        **dict.fromkeys(("places", "filled"), INTEGERS),
     },
 )
-BEGINNING.add_function("look", i8(KIT, f8, *(VECTOR,) * 5, *(MATRIX,) * 4, VECTOR))
-BEGINNING.add_function("choose", i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS))
-BEGINNING.add_function("start", i8(KIT, WORK, f8, VECTOR))
-ACCURACY, REUSE, NEARLY_SINGULAR, RANK, SCALE, CONTRADICTS = range(6)  # in `constants`
+AGAIN.add_function("look", i8(KIT, f8, *(VECTOR,) * 5, *(MATRIX,) * 4, VECTOR))
+AGAIN.add_function("choose", i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS))
+AGAIN.add_function("start", i8(KIT, WORK, f8, VECTOR))
+AGAIN.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS))
+# in `constants`: of starts, the flag of an M that varies, else 0, the smallest pivot with which one is taken and the
+# form of the equations; of steps, a first one, or 0, and what set_sizes takes; of ends, the pivot below which speeds
+# are looked at, how many times what accelerations give these may change by, and how many looks at sudden changes two
+# of these must be apart
+ACCURACY, REUSE, NEARLY_SINGULAR, RANK, SCALE, CONTRADICTS, OF_MASS, LEAST_PIVOT, IN_FORM = range(9)
+FIRST, LEAST, LONGEST, LOOKS_WITHIN, NEAR, MOST_TURNED, LOOKS = range(9, 16)
 PLACE, N_KEPT, N_ADDED, KEPT = range(4)  # in `expected`, which is empty without code; those that help follow those kept
 
 
@@ -147,89 +186,107 @@ def _agree(w, b, n):
     return True
 
 
-@kernel(i8(KIT, KIT, WORK, BEGINNING, f8, VECTOR, VECTOR, VECTOR, f8, i8, types.boolean))
-def begin(f, given, w, b, t, q, v, sizes, weak, definite, sure):
-    """Whether a run begins at a state, with the same choices as the run before it; then it is at its start there.
+@merged
+def _put_form(f, b):
+    if f.flags[FORM] != int(b.constants[IN_FORM]):  # which a run may change
+        f.flags[FORM] = int(b.constants[IN_FORM])
 
-    `given`: the system that is looked at, with `sizes` as of `look`; `weak` as of `choose`. `definite` is the flag of
-    an M that varies, else 0. `sure`: the state is known to be consistent.
+
+@kernel(i8(KIT, KIT, WORK, AGAIN, f8, f8, VECTOR, VECTOR, VECTOR, f8, types.boolean), vectorized=True)
+def begin(f, given, w, b, t, t1, q, v, sizes, weak, sure):
+    """Whether a run to t1 begins at a state, with the same choices as the run before it; its start is then saved.
+
+    `given`: the system that is looked at, with `sizes` as of `look`; `weak` as of `choose`. `sure`: the state is known
+    to be consistent.
     """
     n = q.size
+    if not (finite_vector(q) and finite_vector(v)):
+        return REFUSED
+    _put_form(f, b)
     for k in range(b.looked.size):
         b.looked[k] = 0.0
     found = b.look(given, t, q, v, sizes, b.lam, b.room, b.mass, b.rows, b.ways, b.pattern, b.least)
-    if found & IN_ORDER == 0 or found & (DEFINITE | INDEFINITE) != definite:
+    if found & IN_ORDER == 0 or found & (DEFINITE | INDEFINITE) != int(b.constants[OF_MASS]):
         return REFUSED
     if found & CONSISTENT == 0 and not sure:
         return IN_DOUBT
     if b.expected.size > 0 and not _is_expected(b, weak):
         return REFUSED
     _copy(b.begin_numbers, b.numbers)
-    for k in range(b.memory.size):
-        b.memory[k] = 0.0
-    for k in range(b.places.size):
-        b.memory[b.places[k]] = b.begin_memory[k]
     for j in range(b.state.size):
         b.state[j] = q[j] if j < n else v[j - n] if j < 2 * n else 0.0
     b.clock[at.T] = b.clock[at.T_START] = t
     put_ready(w, b.lasting, b.lasting_integers, b.pattern, q, b.constants[ACCURACY], b.constants[REUSE])
     _copy(b.lapack, w.lapack[: b.lapack.size])
     w.notes[noted.NEARLY_SINGULAR] = b.constants[NEARLY_SINGULAR]
-    return READY if b.start(f, w, t, b.state) == codes.DONE and _agree(w, b, n) else REFUSED
-
-
-# of a run that is made again and again: what `advance` takes, room for its states and steps, and what is told of it
-GOING = Reference(
-    "Going",
-    {
-        **dict.fromkeys(("options", "memory", "tolerances", "control", "clock", "state", "new_state"), VECTOR),
-        **dict.fromkeys(("end", "t", "told"), VECTOR),
-        **dict.fromkeys(("rows", "steps"), MATRIX),
-        "filled": INTEGERS,
-    },
-)
-GOING.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS))
-# in `told`: numbers of states, the first included, and of steps; as numbers, whether velocities turned in the last step
-# and all states lie in a box; and what stands in the workspace and the clock
-N_STATES, N_STEPS, TURNED, WITHIN, NEARLY, PIVOT, CHECKED, DEFECT, GAP, N_TOLD = range(10)
+    if b.start(f, w, t, b.state) != codes.DONE or not _agree(w, b, n):
+        return REFUSED
+    if w.notes[noted.PIVOT] < b.constants[LEAST_PIVOT]:
+        return REFUSED
+    w.notes[noted.KINK_AFTER] = t1
+    if b.control[at.FIXED_STEP] == 0.0:
+        span, first, within = t1 - t, b.constants[FIRST], b.constants[LOOKS_WITHIN] > 0.0
+        _limit_steps(b.control, b.tolerances, span, b.constants[LONGEST], within)
+        b.clock[at.H_NEXT] = min(first if first > 0.0 else _first_step(b.state, n, t, span, b.constants[LEAST]), span)
+        b.control[at.SHORTEST] = SHORTEST_STEP * b.clock[at.H_NEXT]
+    i, j = b.numbers.size, b.numbers.size + b.lasting.size
+    _copy(b.numbers, b.saved[:i])
+    _copy(b.lasting, b.saved[i:j])
+    _copy(b.state, b.saved[j:])
+    _copy(b.lasting_integers, b.saved_integers)
+    return READY
 
 
 @merged
-def _turned(b, k, n, turned):
+def _begin_again(f, b):
+    """Put all that counts back to where the last start left it."""
+    _put_form(f, b)
+    i, j = b.numbers.size, b.numbers.size + b.lasting.size
+    _copy(b.saved[:i], b.numbers)
+    _copy(b.saved[i:j], b.lasting)
+    _copy(b.saved[j:], b.state)
+    _copy(b.saved_integers, b.lasting_integers)
+    for k in range(b.memory.size):
+        b.memory[k] = 0.0
+    for k in range(b.places.size):
+        b.memory[b.places[k]] = b.begin_memory[k]
+
+
+# in `told`: numbers of states, the first included, and of steps; as numbers, whether nothing has to be looked at,
+# velocities turned in the last step, and all states lie in a box; and what stands in the workspace
+N_STATES, N_STEPS, PLAIN, TURNED, INSIDE, CHECKED, DEFECT, WIDEST, N_TOLD = range(9)
+
+
+@merged
+def _turned(b, k, n):
     """Whether the velocities of the last two states differ by more than one of their accelerations gives."""
     change, first, last = 0.0, 0.0, 0.0
     for j in range(n):
-        change = max(change, abs(b.rows[k, n + j] - b.rows[k - 1, n + j]))
-        first, last = max(first, abs(b.rows[k - 1, 2 * n + j])), max(last, abs(b.rows[k, 2 * n + j]))
-    return change > turned * (b.t[k] - b.t[k - 1]) * min(first, last)
+        change = max(change, abs(b.out_rows[k, n + j] - b.out_rows[k - 1, n + j]))
+        first, last = max(first, abs(b.out_rows[k - 1, 2 * n + j])), max(last, abs(b.out_rows[k, 2 * n + j]))
+    return change > b.constants[MOST_TURNED] * (b.out_t[k] - b.out_t[k - 1]) * min(first, last)
 
 
-@merged
-def _tell(w, b, n_rows, n_steps, turned, box):
-    """Put down what `told` has, after so many rows behind the first, and steps."""
-    b.told[N_STATES], b.told[N_STEPS] = 1 + n_rows, n_steps
-    b.told[TURNED] = n_rows > 0 and _turned(b, n_rows, w.Q.size, turned)
-    b.told[WITHIN] = box.shape[1] > 0 and _lie_within(b.t[: 1 + n_rows], b.rows, box)
-    b.told[NEARLY], b.told[PIVOT] = w.notes[noted.NEARLY_SINGULAR], b.clock[at.PIVOT_AT_OUTPUT]
-    b.told[CHECKED] = w.counters[N_ACCEPTED] > 0 and w.notes[noted.UNCHECKED] == 0.0
-    b.told[DEFECT], b.told[GAP] = w.notes[noted.LARGEST_DEFECT], w.notes[noted.WIDEST_GAP]
+@kernel(i8(KIT, WORK, AGAIN, f8, MATRIX, i8, i8), vectorized=True)
+def go(f, w, b, t1, box, n_rows, n_steps):
+    """The first chunk of the steps of a run to t1 from its saved start: how `advance` ended, and `told`.
 
-
-@kernel(types.void(WORK, GOING, i8, i8, f8, MATRIX))
-def tell(w, b, n_rows, n_steps, turned, box):
-    """The same, for Python."""
-    _tell(w, b, n_rows, n_steps, turned, box)
-
-
-@kernel(i8(KIT, WORK, GOING, f8, f8, MATRIX))
-def go(f, w, b, t1, turned, box):
-    """The first chunk of the steps of a run from its start to t1; how `advance` ended, and `told`.
-
-    `turned` is how many times what accelerations give is too much; `box` has rows [t, q, v], or nothing.
+    Or what is told, where so many rows, behind the first, and steps were made. `box` has rows [t, q, v], or nothing.
     """
-    b.end[0], b.t[0] = t1, b.clock[at.T]
-    _copy(b.state, b.rows[0])
-    arrays = b.tolerances, b.control, b.clock, b.state, b.new_state
-    code = b.advance(f, w, b.options, b.memory, *arrays, b.end, b.t[1:], b.rows[1:], b.steps, b.filled)
-    _tell(w, b, b.filled[0], b.filled[1], turned, box)
+    code = at.GO_ON
+    if n_steps < 0:
+        _begin_again(f, b)
+        b.end[0], b.out_t[0] = t1, b.clock[at.T]
+        _copy(b.state, b.out_rows[0])
+        arrays = b.tolerances, b.control, b.clock, b.state, b.new_state
+        code = b.advance(f, w, b.options, b.memory, *arrays, b.end, b.out_t[1:], b.out_rows[1:], b.out_steps, b.filled)
+        n_rows, n_steps = b.filled[0], b.filled[1]
+    turned = n_rows > 0 and _turned(b, n_rows, w.Q.size)
+    inside = box.shape[1] > 0 and _lie_within(b.out_t[: 1 + n_rows], b.out_rows, box)
+    near = b.clock[at.PIVOT_AT_OUTPUT] < b.constants[NEAR]
+    missed = b.clock[at.BRIEFEST] < b.constants[LOOKS] * b.clock[at.WIDEST_LOOK]
+    b.told[N_STATES], b.told[N_STEPS], b.told[PLAIN] = 1 + n_rows, n_steps, not (turned or near or missed)
+    b.told[TURNED], b.told[INSIDE] = turned, inside
+    b.told[CHECKED] = w.counters[N_ACCEPTED] > 0 and w.notes[noted.UNCHECKED] == 0.0
+    b.told[DEFECT], b.told[WIDEST] = w.notes[noted.LARGEST_DEFECT], w.notes[noted.WIDEST_GAP]
     return code

@@ -122,14 +122,3 @@ def sundials_slider_crank() -> Problem:
         conserved=False,
         coordinates=("crank angle (rad)", "slider position (m)", "rod angle (rad)"),
     )
-
-
-# as printed beside the end: t, crank angle, slider position, rod angle
-PRINTED = (
-    (1.0, 1.3154, 1.0015, -0.50497),
-    (2.0, 0.57904, 1.3803, -0.27715),
-    (4.0, -1.2064, 1.0623, 0.48609),
-    (6.0, -1.108, 1.1176, 0.46386),
-    (7.25, -0.070713, 1.4981, 0.035334),
-    (8.0, 0.64422, 1.3536, -0.305),
-)

@@ -250,10 +250,3 @@ class Result(Record):
             File to write; an existing file is replaced.
         """
         save(self, path)
-
-
-def result_of(fields: dict[str, Any]) -> Result:
-    """Return a result with these fields, which it takes over."""
-    made = object.__new__(Result)  # avoids the slow constructor of a frozen dataclass with thirty fields
-    object.__setattr__(made, "__dict__", fields)
-    return made

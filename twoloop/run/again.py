@@ -5,7 +5,7 @@ does, or a start is not beyond doubt, nothing comes of it, and the call goes the
 """
 
 import time
-from types import SimpleNamespace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,17 +16,18 @@ from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Sample
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import flags, intervals, noted
-from twoloop.kernels.layout import short_loops
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.asked import Asked
 from twoloop.run.beginning import Beginning
 from twoloop.run.between import Between, interpolator_of
 from twoloop.run.comparison import compared_at, territory_of
 from twoloop.run.course import BUFFER_STEPS
-from twoloop.run.crossings import TURNED, Place
+from twoloop.run.crossings import Place
 from twoloop.run.dense import Table
 from twoloop.run.dense_solution import DenseSolution
-from twoloop.run.fields import kinds_of, of_states, told_later
+from twoloop.run.fields import BEFORE, kinds_of, of_states, of_steps, statistics
+from twoloop.run.interrupts import Interrupts
+from twoloop.run.kept import OF_STEPS
 from twoloop.run.messages import message_of, outcome, said_of_reached, unless_turned
 from twoloop.run.movable import Kin, Movable
 from twoloop.run.pace import INTERRUPTED, STAGNATED, Pace
@@ -41,8 +42,10 @@ Array = NDArray[np.float64]
 MOST_WAITING, LARGEST = 4, 500_000  # those of a kind that wait for a call, one a thread; numbers of the states of each
 IN_VAIN = 16  # runs that are not tried after one that did not come to its end ...
 TOO_LONG = 1024  # ... and after one for which there was no room, or which took longer than that:
-LONGEST = 0.1  # s of CPU time, in which Ctrl-C is not heard, nor is the time looked at
-NEARER = 0.1  # of the smallest pivot at the start of the first run: below it, a start is looked at anew
+LONGEST = 0.1  # s of CPU time, in which Ctrl-C is not answered, nor is the time looked at
+LATER = (*OF_STEPS, "stats")  # fields that are put together apart from the others
+OTHERS = {name: value for name, value in DEFAULTS.items() if name not in LATER}
+SHORT = 1e-3  # s of CPU time of the last run: then it is the time that elapses, which takes less to look at
 NO_PACE = Pace(0.0)  # of a run that came to its end at once
 
 
@@ -59,6 +62,9 @@ class Output(NamedTuple):
         return None if self.at_ends else self.times
 
 
+STEPS = Output(None, False, False)
+
+
 class Again:
     """The arrays of a run that starts again and again.
 
@@ -72,8 +78,8 @@ class Again:
         The machine code that its plan calls.
     definite : bool
         Whether M has an inverse at its start.
-    check_derivatives : bool
-        As it was asked for.
+    asked : Asked
+        The options of the call.
     kin : Kin or None
         What it shares with runs of systems of other parameters, which it may then be made for.
     """
@@ -84,42 +90,22 @@ class Again:
         system: ConstrainedSystem,
         code: OwnCode | None,
         definite: bool,
-        check_derivatives: bool,
+        asked: Asked,
         kin: Kin | None,
     ):
         self.movable = None if kin is None else Movable(kin, run)
-        self.run, self.check_derivatives = run, check_derivatives
-        self.least_pivot = NEARER * run.work.notes[noted.PIVOT]
-        self.territory = territory_of(run, check_derivatives) if kin is None else kin.territory(check_derivatives)
+        self.run, self.check_derivatives = run, (checks := asked.check_derivatives)
+        self.territory = territory_of(run, checks) if kin is None else kin.territory(checks)
         run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, run.chunk
-        self.beginning = Beginning(run, system if self.movable is None else self.movable.system, code, definite)
+        looked, room = system if self.movable is None else self.movable.system, LARGEST // len(run.state)
+        self.beginning = Beginning(run, looked, code, definite, asked, room)
         self.look, self.rest, self._advance = self.beginning.look, 0, direct(run.kernels.advance)
-        self.plan, self.kit, self.flags, self.memory = run.plan, run.kit, run.kit.flags.copy(), run.memory
-        room = LARGEST // len(run.state)
-        self.t, self.rows = np.empty(room + 1), np.empty((room + 1, len(run.state)))
-        self.steps = np.empty((room, run.a.N_STEP_COLUMNS))
+        self.plan, self.kit, self.form, self.memory = run.plan, run.kit, run.kit.flags[flags.FORM], run.memory
         self.looks: Looks | None = None  # of a run of several chunks
-        self.loading = 0.0  # CPU time of a step that a run came to, s
+        self.loading, self.spent = 0.0, np.inf  # CPU time of a step that a run came to, and of the last run, s
         self.kinds, self.between = np.empty(room, dtype=np.int64), Between(run)
-        loops = short_loops()
-        self._go, self._tell, self.going = direct(loops.go), direct(loops.tell), self._going(loops)
         self.dependent: dict[bytes, tuple[NDArray[np.int64], str]] = {}  # by the rows that count
-        self.call: tuple[int, float, float, bytes, bytes] | None = None  # the last one
-        # arrays with copies made at its start, where the one before was equal
-        self.saved: list[tuple[NDArray[Any], NDArray[Any]]] = []
-
-    def _going(self, loops: Any) -> SimpleNamespace:
-        """The arrays that `go` of kernels/short_loops.py reads and writes."""
-        run = self.run
-        going = SimpleNamespace(
-            **{"options": run.plan.options, "memory": run.plan.memory, "tolerances": run.tolerances},
-            **{"control": run.control, "clock": run.clock, "state": run.state, "new_state": run.new_state},
-            **{"end": np.zeros(1), "t": self.t, "told": np.zeros(loops.N_TOLD), "rows": self.rows, "steps": self.steps},
-            **{"filled": np.zeros(2, dtype=np.int64), "advance": run.kernels.advance},
-        )
-        going.table = loops.GOING.table(going)
-        going.address = going.table.ctypes.data
-        return going
+        self.call: tuple[int, float, float, bytes, bytes] | None = None  # the last one, whose start is saved
 
     @staticmethod
     def suits(run: Run) -> bool:
@@ -133,7 +119,7 @@ class Again:
         lands = run.plan.lands or run.control[run.a.FIXED_STEP] > 0.0
         return not lands and run.kit.flags[flags.FORM] != flags.AUGMENTED
 
-    def record(
+    def fields(
         self,
         system: ConstrainedSystem,
         t0: float,
@@ -142,10 +128,14 @@ class Again:
         v0: Array,
         asked: Asked,
         output: Output,
+        interrupts: Interrupts,
     ) -> dict[str, Any] | None:
-        """The fields of the record of a run of a system; None: make it the long way."""
-        between = output.between
-        run, movable, a, territory = self.run, self.movable, self.run.a, self.territory
+        """The fields of the result of a run of a system; None: make it the long way.
+
+        But for the status they are put together when they are asked for, from copies of the arrays.
+        """
+        run, movable, territory, beginning = self.run, self.movable, self.territory, self.beginning
+        done = run.a.ALL_OUTPUT_DONE
         if self.rest > 0:
             self.rest -= 1
             return None
@@ -155,87 +145,87 @@ class Again:
         else:
             movable.take(system)
             self.look.system = movable.system
-        if not self._is_ready(system, t0, t1, q0, v0, asked):
-            return None
-        began = time.process_time()
-        code = self._steps_to(t1, between is not None or output.dense, began + LONGEST)
-        n_states, n_steps, turned, within, nearly, pivot, checked, defect, gap = self.going.told.tolist()
-        n_states, n_steps = int(n_states), int(n_steps)
-        if between is not None and code == a.ALL_OUTPUT_DONE:
-            parts = self.t[:n_states], self.rows[:n_states], self.kinds[:n_steps]
-            self.between.find(between, *parts, self.look.pattern)
-        spent = time.process_time() - began - self.loading
-        t, rows = self.t[:n_states], self.rows[:n_states]
-        turns = turned and output.times is None and (nearly == 1.0 or not run.plan.watchful)
-        special = turns or run.crossings or pivot < run.near
-        missed = may_be_missed(run)
-        if code != a.ALL_OUTPUT_DONE or missed or (special and not self._is_to_be_trusted(t, rows, t1, output, turns)):
+        if self.looks is not None:
+            self._forget_chunks()
+        call = id(system), t0, t1, q0.tobytes(), v0.tobytes()  # of the last call the system is kept
+        if call != self.call:  # one that begins as the last needs no second look
+            self.call = None
+            if not self._begins(t0, t1, q0, v0, interrupts):
+                return None
+            self.call = call
+        clock = time.perf_counter if self.spent < SHORT else time.process_time
+        began = clock()
+        try:
+            code = beginning.go(t1, territory.known)
+            if code != done or output is not STEPS:
+                code = self._steps_on(code, t1, interrupts)
+        except Exception:  # of a callback; the long way knows what to do
+            code = INTERRUPTED
+        states, taken, plain, turned, inside, checked, defect, gap = beginning.told.tolist()
+        n_states, n_steps, plain = int(states), int(taken), plain and self.looks is None
+        t, rows, steps = beginning.t[:n_states], beginning.rows[:n_states], beginning.steps[:n_steps]
+        if output is not STEPS and output.between is not None and code == done:
+            self.between.find(output.between, t, rows, self.kinds[:n_steps], self.look.pattern)
+        self.spent = spent = clock() - began - self.loading
+        if code != done or not (plain or self._is_to_be_trusted(t, rows, t1, output, turned)):
             self.rest = max(self.rest, IN_VAIN)
             return None
-        if run.compared_to[0] < t1 or territory.is_due():
-            if not (within and movable is None) and not self._compared(t, rows, bool(within)):
+        if not inside or movable is not None:
+            interrupts.listen()
+            if (run.compared_to[0] < t1 or territory.is_due()) and not self._compared(t, rows, bool(inside)):
                 return None
             run.compared_to[0] = t1
-        told = told_later(self.steps[:n_steps], run.work.counters, spent)
-        sol = None
+        fields: dict[str, Any] = {"status": Status.REACHED_END}
         if output.dense:
             table = Table(t.copy(), rows[:, : 3 * system.n_q].copy(), self.kinds[:n_steps].copy())
-            sol = DenseSolution(interpolator_of(run, table.states[0]), table, t1)
-        if output.times is not None:
-            if between is None:
-                at_times: Array | None = rows[[0 if time == t0 else -1 for time in output.times.tolist()]]
-            else:
-                at_times = self.between.completed(between)
+            fields["sol"] = DenseSolution(interpolator_of(run, table.states[0]), table, t1)
+        if output.times is None:
+            t, rows = t.copy(), rows.copy()
+        else:
+            ends = [0 if time == t0 else -1 for time in output.times.tolist()]
+            at_times = rows[ends] if output.at_ends else self.between.completed(output.times)
             if at_times is None:
                 return None
             t, rows = output.times.copy(), at_times
-        else:
-            t, rows = t.copy(), rows.copy()
-        # after all that may send it the long way: it may warn, and takes the workspace
-        words = outcome(run, code, t1, NO_PACE)[1] if special else said_of_reached(run)
-        if self.looks is not None:
-            words += said_of_stiffness(self.looks, run.kit, run.work)
-        message = message_of(run, words, run.system if movable is None else system)
+        of_run = run.rank, run.redundant, defect if checked else None, gap, self.plan.own
+        arrays = t, rows, steps.copy(), run.work.counters.copy()
+        fields["later"] = later = partial(_told, arrays, spent, of_run, system, t1, asked)
+        if not plain:  # after all that may send it the long way: it may warn, and takes the workspace
+            words = outcome(run, code, t1, NO_PACE)[1]
+            if self.looks is not None:
+                words += said_of_stiffness(self.looks, run.kit, run.work)
+            fields |= message_of(run, words, run.system if movable is None else system, later)
         territory.count()  # a run that goes the long way is counted there
-        return {
-            **DEFAULTS,
-            **of_states(system.n_q, t, rows),
-            **told,
-            "rank": run.rank,
-            "redundant": run.redundant.copy(),
-            "defect": defect if checked else None,
-            "widest_gap": gap,
-            "status": Status.REACHED_END,
-            "message": message,
-            "compiled": bool(self.plan.own),
-            "sol": sol,
-        }
+        return fields
 
-    def _steps_to(self, t1: float, with_kinds: bool, until: float) -> int:
-        """How the steps end; what is told of them stands in `going`."""
-        run, going, a = self.run, self.going, self.run.a
-        self.looks, self.loading = None, 0.0
-        try:
-            code: int = self._go(run.kit, run.work, going, t1, TURNED, self.territory.known)
-            n_rows, n_steps = going.filled.tolist()
-            if with_kinds:
-                self.kinds[:n_steps] = kinds_of(run, self.steps[:n_steps])
-            if code in (a.HAS_TO_GIVE_WAY, a.HAS_TO_LOAD, a.NEAR_SINGULAR, a.PAUSED):
-                code, n_rows, n_steps = self._steps_beyond(code, n_rows, n_steps, t1, until)
-                self._tell(run.work, going, n_rows, n_steps, TURNED, self.territory.known)
-        except Exception:  # of a callback; the long way knows what to do
-            return INTERRUPTED
+    def _forget_chunks(self) -> None:
+        """Put back what a run of several chunks may have changed, beside arrays."""
+        run, self.looks, self.loading = self.run, None, 0.0
+        run.crossings = []
+        if run.substituted:
+            run.plan, run.kit, run.functions, run.substituted = self.plan, self.kit, self.kit.functions, False
+            run.memory = self.memory
+
+    def _steps_on(self, code: int, t1: float, interrupts: Interrupts) -> int:
+        """How the steps end after the first chunk, with their kinds; what is told of them stands in `beginning`."""
+        run, beginning, a = self.run, self.beginning, self.run.a
+        n_rows, n_steps = beginning.filled.tolist()
+        self.kinds[:n_steps] = kinds_of(run, beginning.steps[:n_steps])
+        if code in (a.HAS_TO_GIVE_WAY, a.HAS_TO_LOAD, a.NEAR_SINGULAR, a.PAUSED):
+            interrupts.listen()
+            code, n_rows, n_steps = self._steps_beyond(code, n_rows, n_steps, t1)
+            beginning.tell(t1, self.territory.known, n_rows, n_steps)
         return code
 
-    def _steps_beyond(self, code: int, n_rows: int, n_steps: int, t1: float, until: float) -> tuple[int, int, int]:
+    def _steps_beyond(self, code: int, n_rows: int, n_steps: int, t1: float) -> tuple[int, int, int]:
         """How they end, with how many states, beside the first, and steps, where the first chunk did not reach it."""
-        run, going, a = self.run, self.going, self.run.a
+        run, beginning, a = self.run, self.beginning, self.run.a
         self.looks = looks = Looks(run.plan)
         plan, control, kit = run.plan, run.control, run.kit  # at the moment: not always the run's own
-        pace, taken, across = Pace(run.t0), n_steps, False
+        pace, taken, across, until = Pace(run.t0), n_steps, False, time.process_time() + LONGEST
         between_looks = next_look = run.chunk  # the states that are looked at are those of `Course`
         while True:
-            h = self.steps[n_steps - taken : n_steps, a.H]
+            h = beginning.steps[n_steps - taken : n_steps, a.H]
             looks.pass_by(h)
             pace.pass_by(h)
             if code == a.ALL_OUTPUT_DONE:
@@ -259,7 +249,7 @@ class Again:
                 self.loading = time.process_time() - began
                 until += self.loading
                 kit = run.kit
-                if run.substituted or kit.flags[flags.FORM] != self.flags[flags.FORM]:
+                if run.substituted or kit.flags[flags.FORM] != self.form:
                     run.substituted = True  # this kit is not for a start
                 else:
                     self.kit = kit
@@ -273,55 +263,41 @@ class Again:
                     return code, n_rows, n_steps
             elif code != a.PAUSED:
                 return code, n_rows, n_steps
-            if n_steps == len(self.steps):
+            if n_steps == len(beginning.steps):
                 self.rest = TOO_LONG
                 return a.PAUSED, n_rows, n_steps
             run.control[a.MAX_ATTEMPTS] = max(0, next_look - run.attempts())
             arrays = plan.options, plan.memory, run.tolerances, control, run.clock, run.state, run.new_state
-            room = self.t[n_rows + 1 :], self.rows[n_rows + 1 :], self.steps[n_steps:]
-            code = self._advance(kit, run.work, *arrays, going.end, *room, going.filled)
-            more, taken = going.filled.tolist()
+            room = beginning.t[n_rows + 1 :], beginning.rows[n_rows + 1 :], beginning.steps[n_steps:]
+            code = self._advance(kit, run.work, *arrays, beginning.end, *room, beginning.filled)
+            more, taken = beginning.filled.tolist()
             n_rows, n_steps, across = n_rows + more, n_steps + taken, plan is not run.plan
             made = slice(n_steps - taken, n_steps)
-            self.kinds[made] = intervals.ACROSS if across else kinds_of(run, self.steps[made])
+            self.kinds[made] = intervals.ACROSS if across else kinds_of(run, beginning.steps[made])
 
-    def _is_ready(self, system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, asked: Asked) -> bool:
-        """Whether the run is at its start: one that is asked for again needs no second look."""
-        run, call = self.run, (id(system), t0, t1, q0.tobytes(), v0.tobytes())  # of the last call the system is kept
-        if run.substituted:
-            run.plan, run.kit, run.functions, run.substituted = self.plan, self.kit, self.kit.functions, False
-            run.memory = self.memory
-        run.crossings = []
-        if run.kit.flags[flags.FORM] != self.flags[flags.FORM]:
-            run.kit.flags[:] = self.flags
-        equal = call == self.call
-        if equal and self.saved:
-            for array, copy in self.saved:
-                array[:] = copy
-            return True
-        self.call, self.saved = None, []
-        if not self.beginning.at(t0, q0, v0) or run.work.notes[noted.PIVOT] < self.least_pivot:
+    def _begins(self, t0: float, t1: float, q0: Array, v0: Array, interrupts: Interrupts) -> bool:
+        """Whether the run begins at another start, which is then saved."""
+        run = self.run
+        if not self.beginning.at(t0, t1, np.ascontiguousarray(q0), np.ascontiguousarray(v0), interrupts):
             return False
         run.t0, run.compared_to[0] = t0, -np.inf
         if run.said_of_rows:  # rounding may decide which row is left out
+            interrupts.listen()
             counted = run.work.rows_v.tobytes()
             if counted not in self.dependent:
                 self.dependent[counted] = run.redundant_rows(self.look.rows)
             run.redundant, run.said_of_rows = self.dependent[counted]
-        if self.movable is not None and not self.movable.agrees(t1, self.look.mass, self.check_derivatives):
-            return False
-        asked.set_sizes(run, t1)
-        self.call = call
-        if equal:
-            self.saved = [(each, each.copy()) for each in (*self.beginning.lasting, run.state)]
-        return True
+        return self.movable is None or self.movable.agrees(t1, self.look.mass, self.check_derivatives)
 
-    def _is_to_be_trusted(self, t: Array, rows: Array, t1: float, output: Output, turns: bool) -> bool:
+    def _is_to_be_trusted(self, t: Array, rows: Array, t1: float, output: Output, turned: float) -> bool:
         """Whether nothing speaks against a run that ended near singular positions or crossed some, as in `Course`."""
         run, landed = self.run, list[Place]()
+        if may_be_missed(run):
+            return False
+        near = run.work.notes[noted.NEARLY_SINGULAR] == 1.0 or not run.plan.watchful
+        last = [(float(t[-2]), rows[-2])] if turned and near and output.times is None else []
         if (output.at_ends or run.control[run.a.FIXED_STEP] > 0.0) and run.came_near():
             landed = list(zip(t.tolist(), rows, strict=True))
-        last = [(float(t[-2]), rows[-2])] if turns else []
         return unless_turned(run, last, landed, t1, Status.REACHED_END, "")[0] == Status.REACHED_END
 
     def _compared(self, t: Array, rows: Array, within: bool) -> bool:
@@ -341,3 +317,24 @@ class Again:
         if right and self.movable is not None:
             territory.add_parameters(self.movable.parameters)
         return right
+
+
+def _told(
+    arrays: tuple[Any, ...],
+    spent: float,
+    of_run: tuple[Any, ...],
+    system: ConstrainedSystem,
+    t1: float,
+    asked: Asked,
+    name: str,
+) -> dict[str, Any]:
+    """A field of a result, with those that are put together with it."""
+    t, rows, steps, counted = arrays
+    if name == "message":
+        return {name: said_of_reached(t1, asked.step_size is not None)}
+    if name in LATER:
+        return of_steps(steps, BEFORE.copy()) | {"stats": statistics(counted, spent)} | asked.told
+    rank, redundant, defect, gap, own = of_run
+    told = {"rank": rank, "redundant": redundant.copy(), "defect": defect, "widest_gap": gap, "compiled": bool(own)}
+    told |= {"system": system, "atol": asked.atol.copy()}
+    return OTHERS | of_states(system.n_q, t, rows) | told | asked.told

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from twoloop.generate.traced_values import Sample
 from twoloop.kernels.compile.linking import direct
-from twoloop.kernels.data import intervals, noted
+from twoloop.kernels.data import intervals, noted, tolerances
 from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.tolerances import LONGEST_UNSEEN
 from twoloop.problem.events import SAMPLES
@@ -22,9 +22,9 @@ from twoloop.run.kept import OF_STEPS
 from twoloop.run.messages import message_of, outcome, unless_turned, warned
 from twoloop.run.pace import INTERRUPTED, OUT_OF_REACH, OUT_OF_TIME, STAGNATED, Pace
 from twoloop.run.passage import beyond, bridge, bridging_kit, give_way, leap, load
-from twoloop.run.record import Record, Status, explained
+from twoloop.run.record import DEFAULTS, Record, Status, explained, record_of
 from twoloop.run.recorder import Recorder, Wanted
-from twoloop.run.run import SHARPER, Run
+from twoloop.run.run import Run
 from twoloop.run.short_changes import said_of_missed
 from twoloop.run.stability import Looks, said_of_stiffness
 
@@ -272,17 +272,10 @@ class Course:
             status, message = Status.INTERRUPTED, said_of_interrupt(reached, table)
         t_events, q_events, v_events = recorder.events()
         fields = of_run(run, t, table) | {name: kept.array(name) for name in OF_STEPS}
-        return Record(
-            **fields,
-            status=status,
-            message=message_of(run, message + explained(status), run.system),
-            stats=stats,
-            sol=recorder.solution(),
-            t_events=t_events,
-            q_events=q_events,
-            v_events=v_events,
-            system=run.system,
-        )
+        fields |= message_of(run, message + explained(status), run.system)
+        fields |= {"status": status, "stats": stats, "sol": recorder.solution(), "system": run.system}
+        fields |= {"t_events": t_events, "q_events": q_events, "v_events": v_events}
+        return record_of(Record, DEFAULTS | fields)
 
     def _last_step(self, t: Array, table: Array) -> list[Place]:
         """The beginning of the last step where velocities turned in it, as near a singular position: else nothing."""
@@ -314,7 +307,8 @@ class Course:
         """What takes the states; where some are to lie between steps, with what finds them."""
         run, n = self.run, self.run.system.n_q
         interpolator = interpolator_of(run, run.state[: 3 * n]) if self.wanted.between_steps else None
-        every = LONGEST_UNSEEN * (self.t1 - run.t0) / (SHARPER if run.sudden.by_state else SAMPLES)
+        apart = LONGEST_UNSEEN * (self.t1 - run.t0) / SAMPLES
+        every = float(run.tolerances[tolerances.LOOK]) if run.sudden.by_state else apart
         return Recorder(self.wanted, interpolator, n, run.t0, run.state, every)
 
     def _kinds(self, steps: Array, across: bool, leaps: bool) -> NDArray[np.int64]:

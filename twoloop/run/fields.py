@@ -11,7 +11,7 @@ from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import counters, intervals, noted
 from twoloop.kernels.layout import short_loops
 from twoloop.run.kept import OF_STEPS
-from twoloop.run.record import Later, Statistics
+from twoloop.run.record import Statistics
 from twoloop.run.run import Run
 
 Array = NDArray[np.float64]
@@ -19,7 +19,6 @@ Integers = NDArray[np.int64]
 
 COUNTED = [each.name for each in fields(Statistics) if each.name != "cpu_time"]
 COUNTERS = itemgetter(*(getattr(counters, name.upper()) for name in COUNTED))
-LATER = (*OF_STEPS, "stats")  # fields that are put together when they are asked for
 BEFORE = np.array([0, 0, 1])  # rejections and partitions before all steps: the first partition is not a renewal
 
 
@@ -29,13 +28,6 @@ def of_steps(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
     h, changes, untested = np.empty(n), np.empty((3, n), dtype=np.int64), np.empty(n, dtype=np.bool_)
     direct(short_loops().tell_steps)(steps, counts, h, changes, untested)
     return dict(zip(OF_STEPS, (h, *changes, untested), strict=True))
-
-
-def told_later(steps: Array, counted: Integers, cpu: float) -> dict[str, Later]:
-    """The same of all steps of a run, and its statistics, once one of them is asked for; from copies of arrays."""
-    steps, counted = steps.copy(), counted.copy()
-    later = Later(lambda: of_steps(steps, BEFORE.copy()) | {"stats": statistics(counted, cpu)})
-    return dict.fromkeys(LATER, later)
 
 
 def statistics(counted: Integers, cpu: float) -> Statistics:

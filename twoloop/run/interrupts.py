@@ -7,6 +7,7 @@ which may take long and from which every caller expects exceptions; elsewhere it
 
 import _signal  # type: ignore[import-not-found]  # `signal` makes enumerations of handlers, which takes 8 microseconds
 import signal
+from contextlib import suppress
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -25,7 +26,9 @@ IMPATIENCE = 3  # signals after which the next one raises at once, whatever is l
 
 
 class Interrupts:
-    """Stands in for Python's own handler of Ctrl-C as long as it is entered; a handler of the user's stays.
+    """Stands in for Python's own handler of Ctrl-C, from when it listens until it is left; a user's handler stays.
+
+    Before, Ctrl-C raises, as ever: that takes less, where all that is half written then is thrown away.
 
     Attributes
     ----------
@@ -38,16 +41,20 @@ class Interrupts:
         self._stands_in = False
 
     def __enter__(self) -> "Interrupts":
-        self._stands_in = _signal.getsignal(signal.SIGINT) is signal.default_int_handler
-        if self._stands_in:
-            try:
+        return self
+
+    def listen(self) -> "Interrupts":
+        """Keep signals from here on, but for those within the functions of a user."""
+        if _signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            with suppress(ValueError):  # in threads other than the main one, which get no signals
                 _signal.signal(signal.SIGINT, self._heard)
-            except ValueError:  # in threads other than the main one, which get no signals
-                self._stands_in = False
+                self._stands_in = True
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: Any, trace: TracebackType | None) -> bool:
         """Whether what was raised is Ctrl-C to be answered by a result: not the fourth, nor a user's handler's."""
+        if kind is KeyboardInterrupt:
+            self.listen()  # where the handler is Python's own
         if self._stands_in:
             _signal.signal(signal.SIGINT, signal.default_int_handler)
         return kind is KeyboardInterrupt and self._stands_in and self.asked <= IMPATIENCE

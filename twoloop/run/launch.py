@@ -17,9 +17,10 @@ from twoloop.methods.code_for import code_for, may_have_code
 from twoloop.methods.plans_for import plans_for
 from twoloop.methods.presets import identity
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.again import MOST_WAITING, Again, Output
+from twoloop.run.again import MOST_WAITING, STEPS, Again, Output
 from twoloop.run.asked import Asked
 from twoloop.run.comparison import unlike_before
+from twoloop.run.interrupts import Interrupts
 from twoloop.run.movable import Kin
 from twoloop.run.run import Run
 from twoloop.run.workspace import sparse_factors_pay
@@ -51,8 +52,9 @@ def record_again(
     v0: Array,
     asked: Asked,
     output: Output,
+    interrupts: Interrupts,
 ) -> tuple[dict[str, Any], str] | None:
-    """The record of a run by the arrays of one before it, and what is said of its rows.
+    """The fields of the result of a run by the arrays of one before it, and what is said of its rows.
 
     None where there are none, or where something has to be looked at: then `run_from` begins it.
     """
@@ -61,30 +63,28 @@ def record_again(
         known = others.get((asked.key, _family_of(system)))
         alike = (known,) if isinstance(known, Kept) else ()
     for kept in alike:
-        made = _by_arrays_of(kept, system, t0, t1, q0, v0, asked, output)
-        if made is not None:
-            return made
+        if kept.waiting is None or not (output is STEPS or _suits(kept, output)):
+            continue
+        if kept.kin is not None or output is not STEPS or not kept.waiting:
+            interrupts.listen()
+        try:
+            again = kept.waiting.pop()
+        except IndexError:
+            again = Again(kept.run.again(), system, kept.code, kept.definite, asked, kept.kin)
+        fields = again.fields(system, t0, t1, q0, v0, asked, output, interrupts)
+        said_of_rows = again.run.said_of_rows
+        if len(kept.waiting) < MOST_WAITING:
+            kept.waiting.append(again)
+        if fields is not None:
+            return fields, said_of_rows
     return None
 
 
-def _by_arrays_of(
-    kept: Kept, system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, asked: Asked, output: Output
-) -> tuple[dict[str, Any], str] | None:
-    """The same by the arrays of one of those that are kept."""
-    if kept.waiting is None:
-        return None
+def _suits(kept: Kept, output: Output) -> bool:
+    """Whether what is wanted of a run may be had by the arrays of one that is kept."""
     if output.dense and (output.between is not None or kept.kin is not None):
-        return None  # both have the same states within steps; what belongs to kin takes other parameters
-    if output.between is not None and not Again.interpolates(kept.run):
-        return None
-    try:
-        again = kept.waiting.pop()
-    except IndexError:
-        again = Again(kept.run.again(), system, kept.code, kept.definite, asked.check_derivatives, kept.kin)
-    record = again.record(system, t0, t1, q0, v0, asked, output)
-    if len(kept.waiting) < MOST_WAITING:
-        kept.waiting.append(again)
-    return None if record is None else (record, again.run.said_of_rows)
+        return False  # both have the same states within steps; what belongs to kin takes other parameters
+    return output.between is None or Again.interpolates(kept.run)
 
 
 def run_from(system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, asked: Asked) -> Run:

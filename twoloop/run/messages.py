@@ -54,21 +54,22 @@ def _said_of_passages(run: "Run") -> str:
     return said + (CROSSINGS if run.crossings else "")
 
 
-def message_of(run: "Run", words: str, system: "ConstrainedSystem") -> Any:
-    """The message of these words, or what makes it: to measure what was crossed takes longer than many a run.
+def message_of(run: "Run", words: str, system: "ConstrainedSystem", later: Later | None = None) -> dict[str, Any]:
+    """The message of these words, or a `later` that makes it: to measure what was crossed takes longer than many a run.
 
-    `system`: one that stays what it is, as the arrays of the run may not.
+    `system`: one that stays what it is, as the arrays of the run may not; `later`: of other fields.
     """
     if CROSSINGS not in words:
-        return words
+        return {"message": words}
     crossings, now, rank = run.crossings, (float(run.clock[run.a.T]), run.state.copy()), run.rank
 
-    def made() -> dict[str, str]:
+    def made(name: str) -> dict[str, Any]:
+        if name != "message" and later is not None:
+            return later(name)
         return {"message": words.replace(CROSSINGS, said_of_crossings(system, crossings, now, rank))}
 
-    if system.called_in_python:  # what such functions find in their surroundings may change
-        return made()["message"]
-    return Later(made)
+    # what functions in Python find in their surroundings may change
+    return made("message") if system.called_in_python else {"later": made}
 
 
 def unless_turned(
@@ -105,17 +106,17 @@ def said_of_rounding(run: "Run", places: list[Place], end: float) -> str:
     return ""
 
 
-def said_of_reached(run: "Run") -> str:
+def said_of_reached(t: float, fixed: bool) -> str:
     """The first sentence of a run that came to its end."""
-    fixed = ", with a constant step: no error was estimated" if run.control[run.a.FIXED_STEP] > 0.0 else ""
-    return f"Reached the end, t = {run.clock[run.a.T]:g}{fixed}."
+    return f"Reached the end, t = {t:g}{', with a constant step: no error was estimated' if fixed else ''}."
 
 
 def outcome(run: "Run", code: int, t1: float, pace: Pace) -> tuple[Status, str]:
     """Status and message for how the run ended."""
     a, t = run.a, float(run.clock[run.a.T])
     if code == a.ALL_OUTPUT_DONE:
-        return Status.REACHED_END, said_of_reached(run) + _said_of_passages(run) + said_of_end(run)
+        reached = said_of_reached(t, run.control[a.FIXED_STEP] > 0.0)
+        return Status.REACHED_END, reached + _said_of_passages(run) + said_of_end(run)
     stopped = f"Stopped at t = {t:.10g}"
     failure = int(run.clock[a.FAILURE_CODE])
     if code == INTERRUPTED:

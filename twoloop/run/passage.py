@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.kernels.compile.linking import direct
-from twoloop.kernels.data import codes, noted
+from twoloop.kernels.data import codes, noted, tolerances
 from twoloop.kernels.data.kit import Kit
 from twoloop.kernels.steps.named_step import loaded
 from twoloop.methods.plan import Plan, kept_plan
@@ -61,7 +61,7 @@ def bridge(run: Run) -> tuple[Plan, Array]:
     control[a.SYMMETRIC], control[a.BRIDGE], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
     control[a.GIVES_WAY] = control[a.IN_A_ROW] = 0.0
     if control[a.FIXED_STEP] == 0.0:
-        control[a.MAX_STEP] = min(run.max_step, run.gap)
+        control[a.MAX_STEP] = min(run.max_step, run.tolerances[tolerances.GAP])
     clock[a.H_LIMIT], clock[a.LIMIT_AGE] = np.inf, 0.0
     run.lengths = [float(clock[a.H_LONG]) * part for part in BRIDGES]
     clock[a.H_NEXT] = run.lengths.pop(0)
@@ -113,5 +113,5 @@ def leap(run: Run, t1: float) -> bool:
     clock[a.LEAPS] = 1.0
     clock[a.H_LIMIT], clock[a.LIMIT_AGE] = run.plan.limit_start, 0.0
     if end < t1:
-        clock[a.H_NEXT] = min(clock[a.H_NEXT], run.first_step(end, t1 - end, run.new_state))
+        clock[a.H_NEXT] = min(clock[a.H_NEXT], run.first_step(end, t1, run.new_state))
     return True

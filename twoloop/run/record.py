@@ -4,7 +4,7 @@ import pickle
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, fields
 from enum import IntEnum
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,8 @@ from twoloop.run.dense_solution import DenseSolution
 from twoloop.run.kept import OF_STEPS
 
 Array = NDArray[np.float64]
+AnyRecord = TypeVar("AnyRecord", bound="Record")
+Later = Callable[[str], dict[str, Any]]  # takes the name of a field, and returns it with others by their names
 
 
 class Status(IntEnum):
@@ -211,40 +213,32 @@ class Record:
         return f"Result({self.status.name}: {self.message} n_t={self.t.size}, {end}; {counts})"
 
 
-class Later:
-    """Stands in the place of fields that are put together when one of them is first asked for.
+def record_of(kind: type[AnyRecord], fields: dict[str, Any]) -> AnyRecord:
+    """A record with these fields, which it takes over: the constructor of a frozen dataclass with thirty is slow."""
+    made = object.__new__(kind)
+    object.__setattr__(made, "__dict__", fields)
+    return made
 
-    Parameters
-    ----------
-    make : callable
-        Returns these fields by name.
+
+class _Deferred:
+    """A field that is put together when it is first asked for: where a record lacks it, its `later` makes it.
+
+    It stands beside the fields in `vars(record)`.
     """
-
-    def __init__(self, make: Callable[[], dict[str, Any]]):
-        self.make = make
-
-
-class _MayComeLater:
-    """A field in whose place there may be `Later`."""
 
     def __init__(self, name: str):
         self.name = name
 
     def __get__(self, record: Any, owner: Any = None) -> Any:
-        if record is None:
-            raise AttributeError(self.name)  # its default stands with the fields of the class
-        known = vars(record)
-        later = known[self.name]
-        if type(later) is Later:
-            known.update({name: made for name, made in later.make().items() if known[name] is later})
+        known = {} if record is None else vars(record)
+        if "later" not in known:
+            raise AttributeError(self.name)  # of a class: its default stands with the fields
+        known.update(known["later"](self.name) | known)
         return known[self.name]
-
-    def __set__(self, record: Any, value: Any) -> None:
-        vars(record)[self.name] = value
 
 
 DEFAULTS = {each.name: each.default for each in fields(Record) if each.default is not MISSING}
 
 NOT_OF_STATES = ("stats", *OF_STEPS, "rank", "redundant", "defect", "widest_gap", "compiled")  # but of the run
-for _name in ("a", "lam", "message", *NOT_OF_STATES):  # behind the decorator, which would take it for a default
-    setattr(Record, _name, _MayComeLater(_name))
+for _field in fields(Record):  # behind the decorator, which would take it for a default
+    setattr(Record, _field.name, _Deferred(_field.name))

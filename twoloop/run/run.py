@@ -1,6 +1,5 @@
 """One run: its arrays, at its start, with what the kernels keep in them."""
 
-import math
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
@@ -13,7 +12,6 @@ from twoloop.checks.rank import SHOWN, equations_in_words, in_words
 from twoloop.checks.sparse_rows import Rows, SparseRows, norms
 from twoloop.generate.time_dependence import Sudden, may_be_narrow, may_be_sudden
 from twoloop.kernels.compile.linking import direct
-from twoloop.kernels.control.sudden import PLACES
 from twoloop.kernels.data import codes, counters, flags, noted, tolerances
 from twoloop.kernels.evaluation.tasks import SOLVE
 from twoloop.kernels.layout import copy_of, empty, short_loops
@@ -30,11 +28,7 @@ Array = NDArray[np.float64]
 FIRST_CHUNK = 1024  # attempts of a small compiled system before Python looks at the run: a look costs 0.2 ms
 FIRST_CHUNK_IN_PYTHON = 64  # ... of one whose callbacks are plain Python functions, which may be slow
 SMALL = 32  # coordinates; chunks of larger systems are shorter in proportion
-SHARPER = 10  # times as often steps that look within look at the equations, of what may be sharp in q or v
 PROVISIONAL = 10  # steps within which a method that pays for long steps only gives way if they are short
-FIRST_STEP = 0.01  # of the shortest time scale that the initial state shows
-RESOLVED = 1e4  # spacings of floating-point numbers at the start: the first step is no shorter
-SHORTEST_STEP = 1e-16  # of the first step
 NONE = np.zeros((0, 0))
 CONTRADICTS = 1e-6  # relative: what the accelerations of redundant rows may differ by
 
@@ -329,25 +323,12 @@ class Run:
 
     def set_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
         """Set the first and the largest step, s."""
-        span = t1 - self.t0
-        first = min(self.first_step(self.t0, span, self.state) if first_step is None else first_step, span)
-        self.clock[self.a.H_NEXT], self.control[self.a.FIRST_GIVEN] = first, float(first_step is not None)
-        self.control[self.a.SHORTEST] = SHORTEST_STEP * first
         self.max_step = max_step
-        self.look_within(span)
-
-    def look_within(self, span: float) -> None:
-        """Set how long a run is of which no hundredth is to pass unseen, s."""
-        self.gap = tolerances.LONGEST_UNSEEN * span
-        self.apart = self.gap / PLACES
-        self.tolerances[tolerances.GAP] = self.gap
-        self.tolerances[tolerances.LOOK] = self.gap / (SHARPER if self.sudden.by_state else 1)
         self.limit_steps()
-
-    def look_every(self, apart: float) -> None:
-        """Look for sudden changes with time at least so often, s."""
-        self.apart = apart
-        self.limit_steps()
+        found = self.first_step(self.t0, t1, self.state, max_step)
+        first = min(first_step or found, t1 - self.t0)
+        self.clock[self.a.H_NEXT], self.control[self.a.FIRST_GIVEN] = first, float(first_step is not None)
+        self.control[self.a.SHORTEST] = short_loops().SHORTEST_STEP * first
 
     def limit_steps(self) -> None:
         """Let no step pass over a hundredth of the run without an evaluation.
@@ -355,18 +336,14 @@ class Run:
         Where something may be narrow, one stage that meets it may say too little: no step is longer then.
         """
         unseen = 1.0 if self.narrow else self.plan.unseen
-        longest = np.inf if self.plan.looks_within else self.gap / unseen
+        longest = np.inf if self.plan.looks_within else self.tolerances[tolerances.GAP] / unseen
         self.control[self.a.MAX_STEP], self.control[self.a.UNSEEN] = min(self.max_step, longest), unseen
-        self.control[self.a.SPACING] = self.gap / PLACES if any(self.sudden) else 0.0
-        self.control[self.a.APART] = self.apart
 
-    def first_step(self, t: float, span: float, state: Array) -> float:
-        """A share of the time in which velocities and accelerations of a state change the coordinates as a whole.
-
-        Of coordinates next to zero that may be less than numbers near t can tell apart.
-        """
-        share: float = direct(short_loops().first_step)(state, self.system.n_q, self.least_atol, span, FIRST_STEP)
-        return max(share, RESOLVED * math.ulp(t))
+    def first_step(self, t: float, t1: float, state: Array, longest: float = 0.0) -> float:
+        """The first step from a state, s. With a longest one, no hundredth of the run to t1 is to pass unseen."""
+        numbers = self.system.n_q, t, t1, self.least_atol, longest, self.plan.looks_within
+        first: float = direct(short_loops().set_sizes)(self.control, self.tolerances, state, *numbers)
+        return first
 
     def defect(self) -> float | None:
         """The largest defect of the steps, if all looked for it."""

@@ -186,9 +186,8 @@ class SampledRun:
         t, code = self.times[-1], self.run.a.PAUSED
         if self._changed or self.system.called_in_python:  # what such functions find in their surroundings may change
             code = self._begin_anew(t)
-        run.look_within(end - self.t0)
-        if self._every < run.apart:
-            run.look_every(self._every)
+        run.first_step(self.t0, end, run.state, run.max_step)
+        run.control[a.APART] = min(self._every, run.control[a.APART])
         self._outputs[0], clock[a.NEXT_OUTPUT], clock[a.T_START], clock[a.N_FIXED] = end, 0.0, t, 0.0
         run.control[run.a.MAX_ATTEMPTS], clock[a.PIVOT_AT_OUTPUT] = STEPS, np.inf
         steps = self._buffers[2]
@@ -273,7 +272,7 @@ class SampledRun:
         run = self.run
         run.t0, run.said_of_start = float(run.clock[run.a.T]), ""
         wanted = Wanted(np.array([end]), True, False, None, InMemory())
-        with Interrupts() as interrupts:
+        with Interrupts().listen() as interrupts:
             course = Course(run, end, wanted, lambda t: None, None, interrupts)
             record = course.to_end(False)
         run.control[run.a.STORE_ALL], run.work.notes[noted.KINK_AFTER] = 0.0, np.inf

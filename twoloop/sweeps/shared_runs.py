@@ -14,10 +14,10 @@ from twoloop.ensembles.starts import Starts, far_off, kit_to_write
 from twoloop.kernels.data.common import PROGRAMS
 from twoloop.kernels.layout import give_back
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.result.result import Result, result_of
+from twoloop.result.result import Result
 from twoloop.run.between import interpolator_of
 from twoloop.run.launch import run_from
-from twoloop.run.record import DEFAULTS, NOT_OF_STATES, Later, Statistics, Status
+from twoloop.run.record import DEFAULTS, NOT_OF_STATES, Statistics, Status, record_of
 from twoloop.solve import check_method, check_options
 from twoloop.sweeps.cells import Row
 from twoloop.sweeps.digests import digest_of
@@ -210,17 +210,19 @@ class _Runs:
     def result(self, number: int, problem: Problem) -> Result:
         """What lanes left of a run; for what they do not know it is made singly, when that is asked for."""
         work, runs, place, system = self.work, self.runs, self.places[number], problem.system
-        of_steps: Any = Later(lambda: _not_of_states(work, problem))
-        of_states: Any = Later(lambda: _accelerations(system, runs, place))
         counts = int(runs.n_steps[place]), int(runs.n_evaluations[place])
         stats = Statistics(n_accepted=counts[0], n_evaluations=counts[1], cpu_time=self.seconds)
         message = f"Reached the end, t = {runs.t1:g}, in lanes by {runs.methods[runs.turn[place]]}."
-        told = dict.fromkeys(NOT_OF_STATES, of_steps) | {
+
+        def later(name: str) -> dict[str, Any]:
+            return _accelerations(system, runs, place) if name in ("a", "lam") else _not_of_states(work, problem)
+
+        told = {name: value for name, value in DEFAULTS.items() if name not in NOT_OF_STATES} | {
             **{"t": runs.times.copy(), "q": runs.q[place].copy(), "v": runs.v[place].copy()},
-            **{"a": of_states, "lam": of_states, "status": Status.REACHED_END, "message": message, "system": system},
+            **{"status": Status.REACHED_END, "message": message, "system": system, "later": later},
             **{"method": check_method(work[2].get("method", "auto")).name, "rtol": runs.rtol, "atol": runs.atol.copy()},
         }
-        return result_of(DEFAULTS | told | ({"stats": stats} if work[1] is ends else {}))
+        return record_of(Result, told | ({"stats": stats} if work[1] is ends else {}))
 
 
 def _not_of_states(work: Work, problem: Problem) -> dict[str, Any]:

@@ -7,16 +7,50 @@
 import numpy as np
 
 from twoloop.kernels.algebra.linalg import copy
-from twoloop.kernels.control.compensated_sums import compensated, forget
-from twoloop.kernels.control.convergence import CONVERGED, MAX_ITERATIONS, UNDECIDED, judged
 from twoloop.kernels.control.predictor import restore_predicted
 from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED
-from twoloop.kernels.data.common import compiled, merged
+from twoloop.kernels.data.common import compiled, exact, merged
 from twoloop.kernels.data.counters import N_OUTER
-from twoloop.kernels.evaluation.calls import evaluate, restore
+from twoloop.kernels.evaluation.calls import evaluate, restore, rounding_floor
+from twoloop.kernels.steps.fixed_point_memory import N_RESTS
 from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TEST, OUTER_TOL, tableau_of
 
+MAX_ITERATIONS = 60
 MAX_ITERATIONS_PAPER = 200  # the paper names no limit; (33) ends a divergent loop long before
+GROWTH = 1e3  # the differences may first grow (the iteration is not normal), but not by more than this
+PATIENCE = 8  # iterations after which a difference that grows again means divergence
+UNDECIDED, CONVERGED, DIVERGED = range(3)
+
+
+@merged
+def _judge(change, before, first, iteration, tolerance, q):
+    """Judge an iteration by its largest change, those of the last and the first one, and the rounding of q."""
+    if change <= tolerance:
+        return CONVERGED
+    if not change <= GROWTH * first:
+        return DIVERGED
+    if change >= before:
+        if change <= rounding_floor(q):
+            return CONVERGED
+        if iteration >= PATIENCE:
+            return DIVERGED
+    return UNDECIDED
+
+
+@exact
+def _compensated(x, rest, increment):
+    """The sum of the three, and what rounding takes from it (W. Kahan, Commun. ACM 8 (1965), 40)."""
+    increment += rest
+    total = x + increment
+    return total, increment - (total - x)
+
+
+@merged
+def _forget(coordinates, rest):
+    """Clear the rests of coordinates that the constraints give."""
+    for i in range(N_RESTS // 2, rest.shape[0]):
+        for m in coordinates:
+            rest[i, m] = 0.0
 
 
 @compiled
@@ -65,7 +99,7 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
             copy(q1, A_stage[j])
         if iteration == 0:
             first = change
-        verdict = judged(change, before, first, iteration, options[OUTER_TOL], q)
+        verdict = _judge(change, before, first, iteration, options[OUTER_TOL], q)
         if verdict != UNDECIDED:
             break
         before = change
@@ -81,9 +115,9 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
             q1[m] = q[m] + h * v[m] + h * h * in_q
             v1[m] = v[m] + h * in_v
         else:
-            q1[m], rest[2, m] = compensated(q[m], rest[0, m], h * v[m] + h * h * in_q)
-            v1[m], rest[3, m] = compensated(v[m], rest[1, m], h * in_v)
-    forget(w.dependent, rest)
+            q1[m], rest[2, m] = _compensated(q[m], rest[0, m], h * v[m] + h * h * in_q)
+            v1[m], rest[3, m] = _compensated(v[m], rest[1, m], h * in_v)
+    _forget(w.dependent, rest)
     return restore_predicted(f, w, tolerances, t + h, h, q, v, q1, v1, tolerance)
 
 

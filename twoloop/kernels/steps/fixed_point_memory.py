@@ -1,7 +1,12 @@
 """Where the parts of the `memory` of fixed_point_step.py and paper_step.py are."""
 
-from twoloop.kernels.control.compensated_sums import N_RESTS, rests
-from twoloop.kernels.data.common import inlined
+from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.data.common import inlined, merged
+from twoloop.kernels.data.tolerances import ESTIMATE
+
+# rows of REST, for the compensated sums of fixed steps: what rounding took from q and from v, at the last accepted step
+# and in this attempt. Without them the energy of a symmetric method wanders with the number of steps
+N_RESTS = 4
 
 # scalars, then stage blocks (s, n_q) and vectors (n_q)
 HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(5)
@@ -30,5 +35,13 @@ def vector(memory, s, n, which):
 
 @inlined
 def rests_of(memory, s, n, tolerances):
-    """What rounding took from the sums."""
-    return rests(memory[N_MEMORY_SCALARS + (N_BLOCKS * s + REST) * n :], n, tolerances)
+    """The rows of REST; none with step-size control, whose errors exceed rounding."""
+    start, count = N_MEMORY_SCALARS + (N_BLOCKS * s + REST) * n, N_RESTS if tolerances[ESTIMATE] == 0.0 else 0
+    return memory[start : start + count * n].reshape((count, n))
+
+
+@merged
+def keep_rest(rest):
+    """Make the rests of an accepted attempt those that the next step begins with."""
+    for i in range(rest.shape[0] // 2):
+        copy(rest[rest.shape[0] // 2 + i], rest[i])

@@ -3,7 +3,6 @@
 import numpy as np
 
 from twoloop.kernels.algebra.linalg import copy
-from twoloop.kernels.control.compensated_sums import keep_rest
 from twoloop.kernels.control.richardson import conclude
 from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, kernel
@@ -11,7 +10,7 @@ from twoloop.kernels.data.tolerances import ESTIMATE
 from twoloop.kernels.evaluation.calls import accelerations
 from twoloop.kernels.steps import fixed_point_memory as at
 from twoloop.kernels.steps.fixed_point_loops import iterate_accelerations
-from twoloop.kernels.steps.fixed_point_memory import block, rests_of, vector
+from twoloop.kernels.steps.fixed_point_memory import block, keep_rest, rests_of, vector
 from twoloop.kernels.steps.stages import (
     EXTRAPOLATION,
     FARTHEST,

@@ -1,0 +1,239 @@
+"""Accelerations by dependent coordinates: those of the callbacks, in fewer operations, also where a pivot vanishes."""
+
+import ctypes
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.linalg import null_space
+
+from tests.bodies.random_models import Both
+from tests.problems import assert_same, quick, worst
+from twoloop import mechanisms, solve_dae
+from twoloop.generate.accelerations import write_accelerations
+from twoloop.generate.choices import Choice
+from twoloop.generate.coefficients import Coefficients
+from twoloop.generate.lane_emitter import LaneEmitter
+from twoloop.generate.llvm_text import BIT, Module
+from twoloop.generate.null_space import LEAST
+from twoloop.generate.straight_code import own_code, write_function
+from twoloop.generate.straight_line import StraightLine
+from twoloop.kernels.compile.own_functions import OwnFunctions, object_code
+from twoloop.kernels.lanes.lane_room import LANES
+
+pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
+
+READY = ["four_bar", "andrews", "spatial_slider_crank", "redundant_slider_crank", "sundials_slider_crank"]
+READY += ["driven_slider_crank", "driven_crank", "n_four_bar", "spatial_four_bar", "bricard", "governor", "heavy_top"]
+READY += ["closed_chain", "double_pendulum", "pendulum", "knife_edge", "rolling_disc"]
+KIND = BIT, ["double", *["double*"] * 4]
+
+
+def function_of(module, name, *kinds):
+    """A function of a module, on numbers and arrays."""
+    made = OwnFunctions([name], object_code(str(module)))
+    function = ctypes.CFUNCTYPE(ctypes.c_bool, *kinds)(made.addresses[name])
+    return lambda *given, made=made: function(*(x if isinstance(x, float) else x.ctypes.data for x in given))
+
+
+def on_arrays(address):
+    return ctypes.CFUNCTYPE(ctypes.c_bool, ctypes.c_double, *[ctypes.c_void_p] * 4)(address)
+
+
+class Code:
+    """`own_there` of a system, and a function of the few operations alone."""
+
+    def __init__(self, system, q0):
+        self.code, self.n = own_code(system, 0.0, q0), system.n_q
+        self.equations = self.code.shared.equations
+        self.there = on_arrays(self.code.shared.functions.addresses["own_there"])
+        self.quick = None
+        if self.equations.quick is not None:
+            module, numbers = Module(), self.code.shared.numbers
+            kind = BIT, ["double*"] * 5
+            write_function(module, "quick", kind, self.equations.graph, self.equations.quick, numbers)
+            self.quick = function_of(module, "quick", *[ctypes.c_void_p] * 5)
+
+    def at(self, t, q, v):
+        """Whether all code holds, and a; whether the few operations hold."""
+        a, b = np.full((2, self.n), np.nan)
+        arrays = np.ascontiguousarray(q), np.ascontiguousarray(v), self.code.numbers
+        holds = self.there(t, *(x.ctypes.data for x in (*arrays, a)))
+        fast = self.quick is not None and self.quick(np.array([t]), *arrays, b)
+        if fast:
+            assert worst(a, b) <= 1e-9 * np.abs(a).max()
+        return holds, a, fast
+
+
+def by_callbacks(system, rows, t, q, v):
+    """a by dense linear algebra, for the rows that count."""
+    n, m = system.n_q, len(rows)
+    matrix = np.zeros((n + m, n + m))
+    G = system.rows(t, q)[rows]
+    kinds = [kind for kind, size in (("gamma", system.n_c), ("nonholonomic_gamma", system.n_a)) if size]
+    gamma = np.concatenate([system.evaluate(kind, t, q, v) for kind in kinds])
+    matrix[:n, :n], matrix[n:, :n], matrix[:n, n:] = system.mass(t, q), G, G.T
+    return np.linalg.solve(matrix, [*system.force(t, q, v), *gamma[rows]])[:n]
+
+
+def agrees(code, system, t, q, v, accuracy=1e-9):
+    """Whether the few operations serve there; with or without them a is that of the callbacks."""
+    expected = by_callbacks(system, list(code.equations.choice.rows), t, q, v)
+    holds, a, fast = code.at(t, q, v)
+    assert holds and np.abs(a - expected).max() < accuracy * max(1.0, np.abs(expected).max())
+    return fast
+
+
+@pytest.mark.parametrize("name", quick(READY, 4))
+def test_accelerations_are_those_of_the_callbacks(name):
+    """At a start and about it, with any velocities."""
+    problem, rng = getattr(mechanisms, name)(), np.random.default_rng(1)
+    system, code = problem.system, Code(problem.system, problem.q0)
+    fast = []
+    for _ in range(10):
+        q = problem.q0 + 1e-2 * rng.standard_normal(system.n_q) * np.abs(problem.q0)
+        v = problem.v0 + rng.standard_normal(system.n_q) * max(1e-3, np.abs(problem.v0).max())
+        fast.append(agrees(code, system, 0.1, q, v))
+    assert all(fast) == (code.quick is not None) == any(fast)
+
+
+@pytest.mark.parametrize(
+    ("planar", "kinds"),
+    [
+        (True, ["revolute"] * 4),
+        (True, ["revolute"] * 3 + ["prismatic"]),
+        (False, ["revolute", "spherical", "universal", "revolute"]),
+        (False, ["revolute", "cylindrical", "spherical", "prismatic"]),
+    ],
+)
+def test_so_are_those_of_random_loops_of_bodies(planar, kinds):
+    """The code for all of them is made for one start."""
+    for seed in range(3):
+        both, n = Both(seed, planar, len(kinds) - 1), len(kinds) - 1
+        for k, kind in enumerate(kinds):
+            getattr(both, kind)(None if k == 0 else k - 1, None if k == n else k)
+        problem = both.model.problem((0.0, 1.0))
+        system, rng = problem.system, np.random.default_rng(seed)
+        code, free = Code(system, problem.q0), null_space(system.jacobian(0.0, problem.q0))
+        assert code.quick is not None
+        for _ in range(3):
+            assert agrees(code, system, 0.0, problem.q0, free @ rng.standard_normal(free.shape[1]))
+
+
+@pytest.mark.parametrize(
+    ("name", "span"), quick([("spatial_four_bar", 2.0), ("four_bar", 5.0), ("spatial_slider_crank", 2.0)], 2)
+)
+def test_where_a_pivot_vanishes_on_the_way_the_same_accelerations_are_found(name, span):
+    """And on both sides of it by few operations, whatever the sign of the pivot is."""
+    problem = getattr(mechanisms, name)()
+    system, code = problem.system, Code(problem.system, problem.q0)
+    known = solve_dae(system, (0.0, span), problem.q0, problem.v0, t_eval=np.linspace(0.0, span, 801))
+    fast = [agrees(code, system, t, q, v, 1e-8) for t, q, v in zip(known.t, known.q.T, known.v.T, strict=True)]
+    assert fast[0] and 0.85 < np.mean(fast) < 1.0
+    assert True in fast[fast.index(False) :]
+
+
+def test_a_run_goes_on_where_a_pivot_vanishes():
+    """Two bars that depend on the third lie in one line on the way."""
+    problem = mechanisms.four_bar()
+    with_code, without = (
+        solve_dae(problem.system, (0.0, 10.0), problem.q0, problem.v0, "DOP853", 1e-9, 1e-9, compiled=compiled)
+        for compiled in (True, False)
+    )
+    error = np.abs(without.q[:, -1] - problem.reference.q).max()
+    assert np.abs(with_code.q[:, -1] - problem.reference.q).max() < max(1e-8, 3.0 * error)
+    assert abs(with_code.stats.n_evaluations - without.stats.n_evaluations) < 0.02 * without.stats.n_evaluations
+
+
+COUNTS = {"four_bar": (90, 152), "andrews": (220, 318), "redundant_slider_crank": (55, 120)}
+COUNTS |= {"spatial_slider_crank": (715, 1705), "spatial_four_bar": (850, 1622)}
+
+
+@pytest.mark.parametrize(("name", "most", "mass_first"), [(name, *counts) for name, counts in COUNTS.items()])
+def test_they_take_fewer_operations(name, most, mass_first):
+    problem = getattr(mechanisms, name)()
+    equations = own_code(problem.system, 0.0, problem.q0).shared.equations
+    quick_ones, all_of_them = (
+        len(equations.graph.needed_by(outputs.arrays["a"])) for outputs in (equations.quick, equations.there)
+    )
+    assert quick_ones <= most < all_of_them <= mass_first
+    assert len(equations.quick.quantities(equations.graph)) < 0.8 * len(equations.there.quantities(equations.graph))
+
+
+@pytest.mark.parametrize("name", ["pendulum", "double_pendulum", "heavy_top", "closed_chain", "rolling_disc"])
+def test_where_few_coordinates_depend_mass_first_stays(name):
+    problem = getattr(mechanisms, name)()
+    assert own_code(problem.system, 0.0, problem.q0).shared.equations.quick is None
+
+
+def blocks_along(system, known):
+    return [Choice.at(system, t, q).blocks for t, q in zip(known.t, known.q.T, strict=True)]
+
+
+def test_neighbouring_starts_have_the_same_code_and_any_start_its_own():
+    """A call gets the code of its start, whatever ran before it."""
+    problem = mechanisms.four_bar()
+    known = solve_dae(problem.system, (0.0, 5.0), problem.q0, problem.v0, t_eval=np.linspace(0.0, 5.0, 201))
+    blocks = blocks_along(problem.system, known)
+    assert 1 < len(set(blocks)) <= 3  # pairs of three bars
+    assert sum(one != other for one, other in pairwise(blocks)) < 20
+    first = next(k for k, each in enumerate(blocks) if each != blocks[0])
+    starts = [0, 1, 0, first, first, 0, first, first + 1, 2]
+
+    def runs(systems):
+        return [
+            solve_dae(system, (0.0, 0.2), known.q[:, k], known.v[:, k], "DOP853", compiled=True)
+            for system, k in zip(systems, starts, strict=True)
+        ]
+
+    repeated = runs([problem.system] * len(starts))
+    for one, other in zip(repeated, runs([mechanisms.four_bar().system for _ in starts]), strict=True):
+        assert_same(one, other)
+
+
+def test_in_lanes_no_run_depends_on_those_beside_it():
+    """One lane has a pivot that vanishes, one has no values."""
+    problem = mechanisms.four_bar()
+    system, n = problem.system, problem.system.n_q
+    known = solve_dae(system, (0.0, 5.0), problem.q0, problem.v0, t_eval=np.linspace(0.0, 5.0, 801))
+    equations = StraightLine(system, Choice.at(system, 0.0, problem.q0))
+    module, numbers = Module(), Coefficients()
+    for outputs in equations.accelerations:
+        list(numbers.structure(equations.graph, outputs.forms))
+    builder = module.function("in_lanes", "void", ["double*"] * 3)
+    emit = LaneEmitter(builder)
+    states, emit.constants, out = builder.arguments
+    emit.numbers = emit.constants
+    for _ in range(2):  # the second goes on where the first ends
+        inputs = [emit.load(states, i) for i in range(1 + 2 * n)]
+        a, holds = write_accelerations(emit, equations, inputs, numbers)
+        for i, value in enumerate([*a, builder.select(holds, emit.constant(1.0), emit.constant(0.0))]):
+            emit.store(value, out, i)
+    builder.ret(None)
+    assert str(module).count("define internal") == 1
+    in_lanes = function_of(module, "in_lanes", *[ctypes.c_void_p] * 3)
+
+    def values(which):
+        given = np.vstack([known.t[which], known.q[:, which], known.v[:, which]])
+        filled = np.zeros((n + 1, LANES))
+        given[:, np.array(which) < 0] = np.nan
+        in_lanes(np.ascontiguousarray(given), numbers.values, filled)
+        return filled
+
+    code = Code(system, problem.q0)
+    fast = [code.at(t, q, v)[2] for t, q, v in zip(known.t, known.q.T, known.v.T, strict=True)]
+    fails = fast.index(False)
+    among = [0, 10, fails, -1, 20, 30, 40, 50]
+    alone, together = values([0, 10, 10, 10, 20, 30, 40, 50]), values(among)
+    easy = [k for k in range(LANES) if k not in (2, 3)]
+    np.testing.assert_array_equal(alone[:, easy], together[:, easy])
+    assert together[-1].tolist() == [1.0, 1.0, 1.0, 0.0, *[1.0] * (LANES - 4)]
+    rows = list(equations.choice.rows)
+    for k, place in enumerate(among):
+        if place >= 0:
+            expected = by_callbacks(system, rows, known.t[place], known.q[:, place], known.v[:, place])
+            assert np.abs(together[:n, k] - expected).max() < 1e-9 * np.abs(expected).max()
+
+
+def test_the_limit_of_pivots_leaves_nine_digits():
+    assert LEAST**-1.5 * 2.0**-52 < 1e-9

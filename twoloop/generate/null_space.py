@@ -1,0 +1,192 @@
+"""Accelerations by dependent coordinates: rows G a = gamma give those of some coordinates from those of the others.
+
+With G = [G_d G_i], a_d = g + B a_i for B = -G_d^-1 G_i and g = G_d^-1 gamma. What is left is the small system
+(T^T M T) a_i = T^T (Q - M g) with T = [B; 1]. It takes about half the operations of an elimination that begins with M,
+and M may be singular where the constraints do not let it be felt.
+
+Pivots are fixed. Where one becomes small on the way, the conditions do not hold, and other code has to find a.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from twoloop.generate.symbolic_factors import Factors
+from twoloop.generate.tracing import Form
+
+Blocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # rows and columns of pivots, one or two each
+Terms = dict[int, Form]  # entries of a row that are not zero, by their columns
+
+# The square of what a pivot must be at least, of what it is divided into, or of the sine between two columns. The
+# accelerations lose up to three times as many digits. Blocks are chosen by limits 7 and 2 times as strict.
+LEAST = 0.03**2
+
+
+class NotReduced(Exception):
+    """Raised where a pivot is zero by its structure, or it takes too many operations."""
+
+
+class DependentCoordinates:
+    """a_d = g + B a_i from G a = gamma.
+
+    Parameters
+    ----------
+    rows : sequence of sequence of Form
+        G, of full rank.
+    gamma : sequence of Form
+    blocks : sequence of (rows, columns)
+        Of pivots, in their order.
+    most : int
+        Operations, of which it is not to take more.
+
+    Attributes
+    ----------
+    independent : list of int
+        The coordinates that stay.
+    T : list of dict
+        The entries of T in each row, by the coordinate that they multiply.
+    g : list of Form
+        0 for the coordinates that stay.
+    conditions : list of (Form, Form)
+        The first is larger than the second where pivots are not too small.
+
+    Raises
+    ------
+    NotReduced
+        If a pivot is zero by its structure, or it takes more operations.
+    """
+
+    def __init__(self, rows: Sequence[Sequence[Form]], gamma: Sequence[Form], blocks: Blocks, most: int):
+        self._n, graph = len(rows[0]), rows[0][0].graph
+        self._graph, self._most = graph, len(graph.operations) + most
+        self._zero, self._one = Form(graph, 0.0, {}), Form(graph, 1.0, {})
+        self._rows: list[Terms] = [
+            {j: entry for j, entry in enumerate([*row, right]) if not _is_zero(entry)}
+            for row, right in zip(rows, gamma, strict=True)
+        ]
+        self._left, self._free = set(range(len(rows))), set(range(self._n))
+        self.conditions: list[tuple[Form, Form]] = []
+        for block in blocks:
+            self._eliminate(*block)
+        self.independent = sorted(self._free)
+        self.T: list[Terms] = [{j: self._one} if j in self._free else {} for j in range(self._n)]
+        self.g = [self._zero] * self._n
+        for places, columns in reversed(blocks):
+            for i, j in zip(places, columns, strict=True):
+                self._substitute(j, self._rows[i])
+
+    def _eliminate(self, places: tuple[int, ...], columns: tuple[int, ...]) -> None:
+        """Solve rows for columns, and take these out of the other rows that are left."""
+        self._bound()
+        block = [[self._rows[i].get(j, self._zero) for j in columns] for i in places]
+        pivot, inverse = self._inverse(block)
+        around = sorted({j for i in places for j in self._rows[i]} - set(columns))
+        entries = {j: [self._rows[i].get(j, self._zero) for i in places] for j in around}
+        solved = [
+            _not_zero({j: _dot(self._zero, zip(row, known, strict=True)) for j, known in entries.items()})
+            for row in inverse
+        ]
+        self._left -= set(places)
+        self._free -= set(columns)
+        for k in sorted(self._left):
+            row = self._rows[k]
+            factors = [row.pop(j, None) for j in columns]
+            for factor, others in zip(factors, solved, strict=True):
+                for j, entry in {} if factor is None else others.items():
+                    row[j] = row.get(j, self._zero) - factor * entry
+            self._rows[k] = _not_zero(row)
+        for i, row in zip(places, solved, strict=True):
+            self._rows[i] = row
+        if pivot.terms:
+            self._add_conditions(block, pivot, solved)
+
+    def _bound(self) -> None:
+        if len(self._graph.operations) > self._most:
+            raise NotReduced
+
+    def _inverse(self, block: list[list[Form]]) -> tuple[Form, list[list[Form]]]:
+        """The determinant of a block, and its inverse."""
+        if len(block) == 1:
+            ((determinant,),) = block
+        else:
+            (a, b), (c, d) = block
+            determinant = (a * d - b * c).value()
+        if _is_zero(determinant):
+            raise NotReduced
+        share = determinant.reciprocal()
+        if len(block) == 1:
+            return determinant, [[share]]
+        return determinant, [
+            [(d * share).value(), (-(b * share)).value()],
+            [(-(c * share)).value(), (a * share).value()],
+        ]
+
+    def _add_conditions(self, block: list[list[Form]], pivot: Form, solved: list[Terms]) -> None:
+        """What is solved is not divided by too small a pivot, and columns of a block are not nearly parallel."""
+        entries = [entry for row in solved for j, entry in row.items() if j < self._n]
+        total = _dot(self._zero, [(entry, entry) for entry in entries])
+        if total.terms:
+            self.conditions.append((Form(total.graph, 1.0 / LEAST, {}), total))
+        if len(block) == 2:
+            a, b = (_dot(self._zero, [(x, x) for x in column]).value() for column in zip(*block, strict=True))
+            self.conditions.append((pivot * pivot, (a * b).times(LEAST)))
+
+    def _substitute(self, j: int, row: Terms) -> None:
+        """Express a dependent coordinate by independent ones, and by later ones, which are expressed already."""
+        self._bound()
+        right, entries = row.get(self._n, self._zero), dict[int, Form]()
+        for k, entry in row.items():
+            if k < self._n:
+                right = right - entry * self.g[k]
+                for independent, factor in self.T[k].items():
+                    entries[independent] = entries.get(independent, self._zero) - entry * factor
+        self.T[j], self.g[j] = _not_zero(entries), right.value()
+
+
+def reduced_accelerations(
+    mass: Any, force: Sequence[Form], coordinates: DependentCoordinates
+) -> tuple[list[Form], list[tuple[Form, Form]]]:
+    """Accelerations by those of the coordinates that stay, and conditions that these have inertia, as of the class."""
+    n, T, g, independent = len(mass), coordinates.T, coordinates.g, coordinates.independent
+    zero = Form(mass[0, 0].graph, 0.0, {})
+    rows = [[(mass[i, j], j) for j in range(n) if not _is_zero(mass[i, j])] for i in range(n)]
+    forces = [(force[i] - _dot(zero, ((x, g[j]) for x, j in rows[i]))).value() for i in range(n)]
+    matrix: dict[tuple[int, int], Form] = {}
+    for a, x in enumerate(independent):
+        moved = [_dot(zero, ((entry, T[j][x]) for entry, j in row if x in T[j])).value() for row in rows]  # M T
+        for b, y in enumerate(independent[: a + 1]):
+            inertia = _dot(zero, ((T[i][y], moved[i]) for i in range(n) if y in T[i])).value()
+            if a == b or not _is_zero(inertia):
+                matrix[a, b] = matrix[b, a] = inertia
+    right = [_dot(zero, ((T[i][x], forces[i]) for i in range(n) if x in T[i])).value() for x in independent]
+    factors = Factors(matrix, len(independent), len(independent))
+    solution = dict(zip(independent, factors.solve(right), strict=True))
+    found = [g[i] + _dot(zero, ((entry, solution[x]) for x, entry in T[i].items())) for i in range(n)]
+    return found, list(_definite(matrix, factors))
+
+
+def _definite(matrix: dict[tuple[int, int], Form], factors: Factors) -> Iterator[tuple[Form, Form]]:
+    """What pivots of the small mass matrix are larger than: a share of what they are without those before."""
+    pivots = iter(factors.positive)
+    for places, _, _ in factors.blocks:
+        alone: Form | None = None
+        for place in places:
+            pivot = next(pivots)
+            scale = matrix[place, place] if alone is None else alone * matrix[place, place]
+            alone = pivot
+            if pivot.terms:
+                yield pivot, scale.times(0.0 if pivot.key == scale.key else LEAST)
+
+
+def _dot(total: Form, pairs: Any) -> Form:
+    for x, y in pairs:
+        if not _is_zero(x) and not _is_zero(y):
+            total = total + x * y
+    return total
+
+
+def _not_zero(entries: Terms) -> Terms:
+    return {j: entry.value() for j, entry in entries.items() if not _is_zero(entry)}
+
+
+def _is_zero(form: Form) -> bool:
+    return not form.terms and form.constant == 0.0

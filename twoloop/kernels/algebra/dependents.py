@@ -1,0 +1,202 @@
+"""Which coordinates follow from others by rows of G, block by block of one or two, for code that is made for these.
+
+Entries that are numbers come first, as they need no division and stay what they are. Of others the first ones in order
+of fill that are large enough count, not the largest: neighbouring positions then have mostly the same ones.
+"""
+
+from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, i8, kernel
+
+NONE, NUMBER, VARIES = 0, 1, 2  # kinds of entries
+SHORTEST = 4  # rows, of which two are searched for a block: with all of them it takes milliseconds for 60 rows
+# the sum of squares of what one unit of each other coordinate does to those of a block, and the square of the sine
+# between the columns of a block: first what is good, then what will do
+LARGEST, PARALLEL = (4.0, 20.0, 200.0), (0.2**2, 0.1**2, 0.04**2)
+SMALL = 1e-3  # of the largest entry of its row: a number that is not divided by
+ROUNDING = 1e-12  # what is left of numbers that cancel
+
+
+def room_size(n_rows: int, n: int) -> tuple[int, int]:
+    """How many numbers, and integers, `dependents` takes for scratch."""
+    return n_rows * n, n_rows * n + 3 * n_rows + 2 * n
+
+
+@compiled
+def _constant(R, K, row_left, column_left, row_sizes, column_sizes):
+    """Row n + column of the number with the least fill, -1: none."""
+    best, best_fill, best_size, (m, n) = -1, 0, 0, R.shape
+    row_sizes[:] = 0
+    column_sizes[:] = 0
+    for i in range(m):
+        for j in range(n):
+            if row_left[i] and column_left[j] and K[i, j] != NONE:
+                row_sizes[i] += 1
+                column_sizes[j] += 1
+    for i in range(m):
+        if row_left[i]:
+            largest = 0.0
+            for j in range(n):
+                if column_left[j]:
+                    largest = max(largest, abs(R[i, j]))
+            for j in range(n):
+                if column_left[j] and K[i, j] == NUMBER and abs(R[i, j]) > SMALL * largest:
+                    fill = (row_sizes[i] - 1) * (column_sizes[j] - 1)
+                    if best < 0 or fill < best_fill or (fill == best_fill and row_sizes[i] < best_size):
+                        best, best_fill, best_size = i * n + j, fill, row_sizes[i]
+    return best
+
+
+@compiled
+def _suits(R, column_left, i, k, j, l, largest, parallel):
+    """Whether the entries of rows i and k, or of row i alone, in columns j and l, may be pivots."""
+    n, total = R.shape[1], 0.0
+    if i == k:
+        size = abs(R[i, j])
+        for c in range(n):
+            if column_left[c] and c != j:
+                total += R[i, c] * R[i, c]
+        return size > 0.0 and total < largest * size * size
+    a, b, c, d = R[i, j], R[i, l], R[k, j], R[k, l]
+    determinant = a * d - b * c
+    if not determinant * determinant > parallel * (a * a + c * c) * (b * b + d * d):
+        return False
+    for column in range(n):
+        if column_left[column] and column != j and column != l:
+            x, y = R[i, column], R[k, column]
+            first, second = d * x - b * y, a * y - c * x
+            total += first * first + second * second
+    return total < largest * determinant * determinant
+
+
+@compiled
+def _varying(R, K, row_left, column_left, rows, column_sizes, found):
+    """Whether there are pivots among entries that vary; `found` gets two rows and two columns, or one of each twice."""
+    m, n = R.shape
+    n_rows = 0
+    column_sizes[:] = 0
+    for i in range(m):  # the shortest ones, sorted
+        if row_left[i]:
+            size = 0
+            for j in range(n):
+                if column_left[j] and K[i, j] != NONE:
+                    size += 1
+                    column_sizes[j] += 1
+            place = n_rows
+            while place > 0 and rows[m + place - 1] > size:
+                rows[place], rows[m + place] = rows[place - 1], rows[m + place - 1]
+                place -= 1
+            rows[place], rows[m + place] = i, size
+            n_rows += 1
+    n_searched = min(n_rows, SHORTEST)
+    for tier in range(len(LARGEST)):
+        for size in (2, 1):
+            best = -1
+            for x in range(n_searched):
+                for y in range(x + 1 if size == 2 else x, n_searched if size == 2 else x + 1):
+                    i, k = rows[x], rows[y]
+                    n_columns = 0
+                    for j in range(n):
+                        if column_left[j] and (K[i, j] != NONE or K[k, j] != NONE):
+                            n_columns += 1
+                    for j in range(n):
+                        if not column_left[j] or (K[i, j] == NONE and K[k, j] == NONE):
+                            continue
+                        for l in range(j + 1 if size == 2 else j, n if size == 2 else j + 1):
+                            if not column_left[l] or (K[i, l] == NONE and K[k, l] == NONE):
+                                continue
+                            fill = column_sizes[j] - (K[i, j] != NONE)
+                            if size == 2:
+                                fill += column_sizes[l] - (K[i, l] != NONE) - (K[k, j] != NONE) - (K[k, l] != NONE)
+                            fill *= n_columns - size
+                            if best >= 0 and fill >= best:
+                                continue
+                            if _suits(R, column_left, i, k, j, l, LARGEST[tier], PARALLEL[tier]):
+                                best = fill
+                                found[0], found[1], found[2], found[3] = i, k, j, l
+            if best >= 0:
+                return True
+    return False
+
+
+@compiled
+def _subtract(R, K, column_left, r, j, i):
+    """Take row i, solved for column j, times its entry there from row r."""
+    factor, kind = R[r, j], K[r, j]
+    if kind == NONE:
+        return
+    R[r, j], K[r, j] = 0.0, NONE
+    for c in range(R.shape[1]):
+        if column_left[c] and K[i, c] != NONE:
+            change = factor * R[i, c]
+            left = R[r, c] - change
+            K[r, c] = max(K[r, c], kind, K[i, c])
+            if K[r, c] == NUMBER and abs(left) <= ROUNDING * abs(change):
+                left, K[r, c] = 0.0, NONE
+            R[r, c] = left
+
+
+@compiled
+def _eliminate(R, K, row_left, column_left, i, k, j, l):
+    """Solve rows i and k for columns j and l, or one for one, and take these out of the other rows."""
+    m, n = R.shape
+    row_left[i] = row_left[k] = column_left[j] = column_left[l] = 0
+    if i == k:
+        pivot, kind = R[i, j], K[i, j]
+        for c in range(n):
+            if column_left[c] and K[i, c] != NONE:
+                R[i, c] /= pivot
+                K[i, c] = max(kind, K[i, c])
+    else:
+        a, b, c, d = R[i, j], R[i, l], R[k, j], R[k, l]
+        has_a, has_b, has_c, has_d = K[i, j] != NONE, K[i, l] != NONE, K[k, j] != NONE, K[k, l] != NONE
+        determinant = a * d - b * c
+        for column in range(n):
+            if column_left[column]:
+                x, y = R[i, column], R[k, column]
+                has_x, has_y = K[i, column] != NONE, K[k, column] != NONE
+                R[i, column], R[k, column] = (d * x - b * y) / determinant, (a * y - c * x) / determinant
+                K[i, column] = VARIES if (has_d and has_x) or (has_b and has_y) else NONE
+                K[k, column] = VARIES if (has_a and has_y) or (has_c and has_x) else NONE
+    for r in range(m):
+        if row_left[r]:
+            _subtract(R, K, column_left, r, j, i)
+            if i != k:
+                _subtract(R, K, column_left, r, l, k)
+
+
+@kernel(i8(MATRIX, INTEGERS, INTEGERS, i8, VECTOR, INTEGERS, INTEGERS))
+def dependents(G, kinds, rows, n_kept, room, work, out):
+    """How many blocks there are, 0 where no coordinates will do: of the rows `rows` of G, the first `n_kept` of them.
+
+    kinds : of the entries of G, row by row. out : of each block two rows, as places in `rows`, and two columns, or one
+    of each twice.
+    """
+    n = G.shape[1]
+    if n_kept > n:
+        return 0
+    R, K = room[: n_kept * n].reshape((n_kept, n)), work[: n_kept * n].reshape((n_kept, n))
+    end = n_kept * n
+    row_left, both = work[end : end + n_kept], work[end + n_kept : end + 3 * n_kept]
+    row_sizes, end = both[:n_kept], end + 3 * n_kept
+    column_left, column_sizes = work[end : end + n], work[end + n : end + 2 * n]
+    for i in range(n_kept):
+        row_left[i] = 1
+        for j in range(n):
+            R[i, j], K[i, j] = G[rows[i], j], kinds[rows[i] * n + j]
+    column_left[:] = 1
+    n_left, n_blocks = n_kept, 0
+    while n_left > 0:
+        found = out[4 * n_blocks : 4 * n_blocks + 4]
+        place = _constant(R, K, row_left, column_left, row_sizes, column_sizes)
+        if place < 0:
+            break
+        found[0] = found[1] = place // n
+        found[2] = found[3] = place % n
+        _eliminate(R, K, row_left, column_left, found[0], found[1], found[2], found[3])
+        n_left, n_blocks = n_left - 1, n_blocks + 1
+    while n_left > 0:
+        found = out[4 * n_blocks : 4 * n_blocks + 4]
+        if not _varying(R, K, row_left, column_left, both, column_sizes, found):
+            return 0
+        _eliminate(R, K, row_left, column_left, found[0], found[1], found[2], found[3])
+        n_left, n_blocks = n_left - (1 if found[0] == found[1] else 2), n_blocks + 1
+    return n_blocks
