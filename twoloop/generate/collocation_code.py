@@ -149,7 +149,7 @@ class CollocationCode:
         return builder.select(all_hold, change, constant(DOUBLE, FAILED))
 
     def judge(self, emit: LaneEmitter, room: Value, state: Value) -> None:
-        """ERROR and LARGEST, over the tolerances.
+        """ERROR, CURVED and LARGEST, over the tolerances.
 
         The coefficients c_k of a in Legendre polynomials tell how fast they fall at last: t (t / s)^2 with t and s the
         larger ones of c_7, c_8 and of c_5, c_6. Those of smooth motion fall at one rate, and its error, which is of
@@ -160,19 +160,20 @@ class CollocationCode:
         def larger(a: Value, b: Value) -> Value:
             return builder.select(builder.compare("fcmp ogt", a, b), a, b)
 
-        with one.loop(integer(0), integer(n), [llvm_code.ZERO] * 2) as (i, (error, largest), new):
+        with one.loop(integer(0), integer(n), [llvm_code.ZERO] * 3) as (i, (error, curved, largest), new):
             a0 = one.load(one.pointer(state, i), 2 * n)
             values = emit.function("fabs", self._combined(emit, tables().spectrum, a0, room, i))
             before, top = (larger(*(builder.extract(values, k + m) for m in range(2))) for k in (4, 6))
             falls = one.divide(top, larger(larger(before, top), constant(DOUBLE, SMALLEST)))
             weight = one.load(one.pointer(room, i), at.WEIGHTS)
             new.append(larger(one.multiply(one.multiply(top, weight), one.multiply(falls, falls)), error))
+            new.append(larger(one.multiply(before, weight), curved))
             middle = one.load(one.pointer(room, _lanes(emit, i)), self.a + LANES // 2 - 1)
             for each in (a0, middle):
                 largest = larger(one.multiply(one.function("fabs", each), weight), largest)
             new.append(largest)
         h = one.load(room, at.H)
-        for value, place in zip(new, (at.ERROR, at.LARGEST), strict=True):
+        for value, place in zip(new, (at.ERROR, at.CURVED, at.LARGEST), strict=True):
             one.store(one.multiply(value, h), room, place)
 
     def audit(self, emit: LaneEmitter, room: Value, state: Value, numbers: Value) -> Value:

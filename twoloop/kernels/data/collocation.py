@@ -18,14 +18,15 @@ LANES = 8
     RHO,  # contraction of a sweep
     STARTS,  # guesses for the first step so far
     N_STEPS,  # since the beginning
-    LIMITED,  # steps in a row, and refusals in a row, which convergence kept much shorter than accuracy needs
+    LIMITED,  # steps that convergence, not accuracy, kept short, less the others; and refusals in a row
     REFUSED,
     LARGEST,  # acceleration at the beginning, over the tolerances
     DEFECT,  # between nodes, over what is allowed; -1: it was not looked for
     PARTS,  # of a divided step that have been asked for
     ERROR,  # of the step, over the tolerances
+    CURVED,  # the coefficients of degree 5 and 6 of its accelerations, over the tolerances
     STRICTER,  # how many times less of the coordinates that are iterated the tolerances of others allow
-) = range(18)
+) = range(19)
 POWERS = 24  # lanes: of the length of the step over that before
 WORST = 32  # lanes: the error of predictions of degree 1 to 8 at the end of the step
 MOVED = 40  # lanes: how far positions were moved last, the largest coordinate

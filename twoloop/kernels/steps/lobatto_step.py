@@ -42,7 +42,7 @@ ROUNDING_OF_FIXED, NOISE_OF_FIXED, MOST_OF_FIXED = 1e-16, 1e-9, 60.0  # of steps
 ORDER, SHARE = 12.0, 0.1  # of the estimate of the error: it is mostly ten times smaller
 SHORTER, SAFETY = 0.6, 0.65
 UNFORESEEN = 10.0  # an error that is so large is looked at elsewhere
-LIMITED, LIMITED_ERROR = 24, 1e-11  # steps that accuracy would let be five times as long: stiffness limits them
+LIMITED, STRAIGHT = 24.0, 0.05  # such steps, after which another method goes on; what the iteration leaves of CURVED
 REFUSALS = 6
 BETWEEN = 0.0908  # of a step, the longest part that an audit leaves unseen: half that between two nodes
 ALLOWED = 16.0  # the defect between nodes, over the tolerances: most of it does not last to the end
@@ -137,8 +137,9 @@ def _collocate(f, w, options, room, tolerances, t, h, state):
     most = min(most, longest / h)
     left = math.log2(rho * change / options[KAPPA] + 1e-30) + (target - m) * math.log2(rho)
     factor = 2.0 ** (-(left + 1.0) / (target + 2.0))
-    stiff = error < LIMITED_ERROR and factor < 1.2 and room[room_at.N_STEPS] >= EARLY
-    room[room_at.LIMITED] = room[room_at.LIMITED] + 1.0 if stiff else 0.0
+    # the motion hardly bends within the step, which nonetheless takes all its sweeps
+    limited = room[room_at.CURVED] < STRAIGHT and m >= target
+    room[room_at.LIMITED] = max(0.0, room[room_at.LIMITED] + (1.0 if limited else -1.0))
     if error > 1e-6:
         factor = min(factor, SAFETY * error ** (-1.0 / ORDER))
     if m > target + 1.0:
