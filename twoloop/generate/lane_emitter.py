@@ -47,7 +47,9 @@ class LaneEmitter(Emitter):
     def pointer(self, base: Value, *places: Value | int) -> Value:
         """A pointer some vectors further on."""
         for place in places:
-            scaled = integer(place * self.lanes) if isinstance(place, int) else self.builder.mul(place, integer(self.lanes))
+            scaled = (
+                integer(place * self.lanes) if isinstance(place, int) else self.builder.mul(place, integer(self.lanes))
+            )
             base = self.builder.gep(base, scaled)
         return base
 
@@ -89,7 +91,8 @@ class LaneEmitter(Emitter):
         exponent = builder.sub(builder.operation("lshr", bits, self.whole(52)), self.whole(1023))
         rest = builder.operation("or", builder.both(bits, self.whole((1 << 52) - 1)), self.whole(1023 << 52))
         return self.add(
-            builder.convert("sitofp", exponent, self.double), self._polynomial(LOG2, builder.convert("bitcast", rest, self.double))
+            builder.convert("sitofp", exponent, self.double),
+            self._polynomial(LOG2, builder.convert("bitcast", rest, self.double)),
         )
 
     def exponential(self, x: Value) -> Value:
@@ -100,7 +103,9 @@ class LaneEmitter(Emitter):
         bits = builder.operation(
             "shl", builder.add(builder.convert("fptosi", whole, self.whole_number), self.whole(1023)), self.whole(52)
         )
-        return self.multiply(builder.convert("bitcast", bits, self.double), self._polynomial(EXP2, self.subtract(x, whole)))
+        return self.multiply(
+            builder.convert("bitcast", bits, self.double), self._polynomial(EXP2, self.subtract(x, whole))
+        )
 
     def _polynomial(self, coefficients: Sequence[float], x: Value) -> Value:
         total = self.constant(coefficients[0])

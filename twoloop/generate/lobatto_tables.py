@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Extended = NDArray[np.longdouble]
 N = 9
+QUARTERS: Extended = np.array([-0.5, 0.0, 0.5, 1.0, 1.0, 1.0, 1.0, 1.0], dtype=np.longdouble)
 
 
 class Tables(NamedTuple):
@@ -64,7 +65,7 @@ def tables() -> Tables:
         *((each + 1) / 2 for each in (x[1:], between)),
         *_integrals(coefficients, x[1:])[1:],
         *_integrals(coefficients, between),
-        *_integrals(coefficients, np.minimum(np.arange(-1, 7) / np.longdouble(2), 1))[1:],
+        *_integrals(coefficients, QUARTERS)[1:],
         coefficients[1:].T,
         coefficients.T @ np.array(powers, dtype=np.longdouble).T,
     )

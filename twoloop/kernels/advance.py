@@ -24,26 +24,20 @@ from twoloop.kernels.data.codes import DONE, INNER_DIVERGED, NEEDS_DENSE, NOT_FI
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, WORK, f8, i8, kernel, merged
 from twoloop.kernels.data.counters import (
     N_ACCEPTED,
-    N_JACOBIANS,
-    N_PARTITIONS,
     N_REJECTED_CONVERGENCE,
     N_REJECTED_ERROR,
 )
 from twoloop.kernels.data.flags import FORM, GAMMA_GIVEN, STATIC
 from twoloop.kernels.data.noted import (
     DEFECT,
-    EXPLICIT_STEP,
     FAULT_KIND,
     KINK_AFTER,
     KINK_BEFORE,
-    LARGEST_DEFECT,
     ORIENTATION,
     ORIENTATION_NEW,
     PIVOT,
-    UNCHECKED,
-    WIDEST_GAP,
 )
-from twoloop.kernels.data.tolerances import GAP, LOOK, is_beyond_gap
+from twoloop.kernels.data.tolerances import GAP
 from twoloop.kernels.evaluation.calls import (
     accelerations,
     check_redundant,

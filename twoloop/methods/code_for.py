@@ -80,7 +80,8 @@ def _refuse(method: Method, fixed: bool) -> None:
     if not takes_code(method, fixed):
         implicit = " with step_size, by which it is implicit" if takes_code(method, False) else ""
         raise ValueError(
-            f"compiled=True goes with 'auto', 'Lobatto16', 'Taylor', 'DOP853', 'Adams'; given method {method.name}{implicit}"
+            "compiled=True goes with 'auto', 'Lobatto16', 'Taylor', 'DOP853', 'Adams'; "
+            f"given method {method.name}{implicit}"
         )
 
 

@@ -41,7 +41,7 @@ class Lobatto16:
     -----
     Nodes: Lobatto IIIA (Hairer and Wanner, Solving ODEs II (1996), IV.5). The method is symmetric. Fixed-point
     iteration with all stages in the lanes of a vector, for ordinary differential equations at high precision: M.
-    Antonana, E. Alberdi, J. Makazaga and A. Murua, arXiv 2511.03655.
+    Antonana, J. Makazaga and A. Murua, arXiv 2511.03655.
 
     Examples
     --------
@@ -58,7 +58,9 @@ class Lobatto16:
     code: OwnCode | None = None  # made for one system; solve_dae puts it in
     narrow: bool = True  # whether forces may change much over a short way
 
-    def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked) -> "Lobatto16":
+    def for_system(
+        self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked
+    ) -> "Lobatto16":
         """The method with what is compiled for this system.
 
         Raises
@@ -68,7 +70,8 @@ class Lobatto16:
         """
         if code is None or not suits(code.shared):
             raise ValueError(
-                f"method='Lobatto16' needs code made for {system.name!r}, whose equations are too long. Take method='auto'"
+                f"method='Lobatto16' needs code made for {system.name!r}, whose equations are too long. "
+                "Take method='auto'"
             )
         return replace(self, code=code, narrow=may_be_narrow(system, ran_on_symbols=True))
 

@@ -132,7 +132,16 @@ PRESETS: dict[str, Method] = {
 }
 
 
-OWN = (Adams, BDF, DOP853, ESDIRK, Lobatto16, Newmark, RungeKutta, Taylor)  # whose objects are the values of their options
+OWN = (
+    Adams,
+    BDF,
+    DOP853,
+    ESDIRK,
+    Lobatto16,
+    Newmark,
+    RungeKutta,
+    Taylor,
+)  # whose objects are the values of their options
 PLAIN = (str, int, float, np.generic, type(None))  # such values, beside tableaux
 _OF_PRESETS = frozenset(map(id, PRESETS.values()))
 

@@ -1,17 +1,15 @@
-"""Steps by collocation at nine Lobatto nodes, of order 16: the outer loop of the paper's procedure in the lanes of vectors.
+"""Steps by collocation at nine Lobatto nodes, of order 16: the outer loop of the paper's procedure, in lanes.
 
-The stages of an implicit Runge-Kutta step are iterated without any Jacobian, as the paper does, all of them at once: see
-generate/collocation_code.py, whose functions do the arithmetic. (For ordinary differential equations at high precision:
-M. Antonana, E. Alberdi, J. Makazaga, A. Murua, arXiv 2511.03655.) What is chosen here is the length of a step. A sweep
-over the stages shrinks their error by rho, which grows with the step and with the derivatives of the accelerations; the
+The stages of an implicit Runge-Kutta step are iterated without any Jacobian, as the paper does, all of them at once:
+see generate/collocation_code.py, whose functions do the arithmetic. (M. Antonana, J. Makazaga and A. Murua do so for
+ordinary differential equations at high precision, arXiv 2511.03655.) Here the length of a step is chosen. A sweep over
+the stages shrinks their error by rho, which grows with the step and with the derivatives of the accelerations; the
 length is such that a given number of sweeps suffices, or such that the top coefficients of the accelerations in
-Legendre polynomials are as small as the tolerance asks for. Steps are counted as the integrator does, one at a time; or
-many are made in a row while nothing else has to be looked at, and eight of them are put on the constraints side by side.
+Legendre polynomials are as small as the tolerance asks for. The integrator asks for one step after another; or several
+are made in a row, while nothing else has to be looked at, and put on the constraints side by side.
 """
 
 import math
-
-import numpy as np
 
 from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control import clock as at
@@ -21,7 +19,14 @@ from twoloop.kernels.data import collocation as room_at
 from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED, UNSUITED
 from twoloop.kernels.data.collocation import LANES, places
 from twoloop.kernels.data.common import ATTEMPT, MANY, SETTLE, Attempt, Step, compiled, inlined, kernel, merged
-from twoloop.kernels.data.counters import N_ACCEPTED, N_EVALUATIONS, N_FACTORIZATIONS, N_INNER, N_OUTER, N_REJECTED_ERROR
+from twoloop.kernels.data.counters import (
+    N_ACCEPTED,
+    N_EVALUATIONS,
+    N_FACTORIZATIONS,
+    N_INNER,
+    N_OUTER,
+    N_REJECTED_ERROR,
+)
 from twoloop.kernels.data.noted import BY_GENERAL, DEFECT, NEARLY_SINGULAR, ORIENTATION_NEW, ROUNDED
 from twoloop.kernels.data.tolerances import ESTIMATE, LEAST, LOOK, ROUNDING, allowed
 from twoloop.kernels.evaluation.calls import check_redundant, project
@@ -39,7 +44,7 @@ SLOW_START, FAST_START, WANTED_START = 0.3, 0.04, 0.12  # contraction of the fir
 MOST_STARTS = 4
 STAGNANT, NOISE = 0.5, 1e-13  # changes that fall no further, and are this small relative to the values, are rounding
 ROUNDING_OF_FIXED, NOISE_OF_FIXED, MOST_OF_FIXED = 1e-16, 1e-9, 60.0  # of steps without an estimate of their error
-ORDER, SHARE = 12.0, 0.1  # of the estimate of the error: it is mostly ten times smaller
+ORDER, SHARE = 12.0, 0.5  # of the estimate of the error; and what it counts
 SHORTER, SAFETY = 0.6, 0.65
 UNFORESEEN = 10.0  # an error that is so large is looked at elsewhere
 LIMITED, STRAIGHT = 24.0, 0.05  # such steps, after which another method goes on; what the iteration leaves of CURVED
@@ -85,9 +90,9 @@ def _sweeps(f, w, options, room, tolerances, state, first):
         if m > 1.0:
             rho = min(max(change / before, LEAST_RHO), MOST_RHO) if before > 0.0 else LEAST_RHO
             room[room_at.RHO] = rho
-        if first and m == 2.0 and estimated and room[room_at.STARTS] < MOST_STARTS and change > 0.0:
-            if rho < FAST_START or rho > SLOW_START:
-                return GUESSED, m, change, target
+        begins = first and estimated and m == 2.0 and room[room_at.STARTS] < MOST_STARTS and change > 0.0
+        if begins and not FAST_START <= rho <= SLOW_START:
+            return GUESSED, m, change, target
         if rho * change <= kappa or (m > 2.0 and change >= STAGNANT * before and change <= noise):
             return MADE, m, change, target
         if not change < math.inf or (m > 3.0 and rho >= SLOW and estimated) or m >= most:
@@ -235,7 +240,7 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
 
 @merged
 def _project_all(f, w, options, room, n, n_ends, out_t, out_state):
-    """Put the states of so many rows on the constraints, with accelerations and multipliers, into the lanes of `room`."""
+    """Put the states of so many rows on the constraints, in the lanes of `room`, with accelerations and multipliers."""
     ends = _places(n, int(options[N_ITERATED]), int(options[N_ROWS]))[4]
     for k in range(LANES):
         row = min(k, n_ends - 1)
