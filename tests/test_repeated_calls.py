@@ -4,7 +4,8 @@ import copy
 import cProfile
 import pickle
 import pstats
-from dataclasses import replace
+import signal
+from dataclasses import fields, replace
 from functools import cache
 from itertools import chain
 
@@ -190,18 +191,18 @@ def test_a_result_has_the_system_of_the_call(taken):
 
 # --- a repeated call costs little beside its steps: calls of functions are counted
 # calls of functions in a second run, which compares callbacks again at four states and makes arrays for the next, in a
-# third, which may compare callbacks at turning points, in a fifth, which uses these arrays, and in a sixth
-MANY, THIRD, FEWER, FEWEST = 780, 690, 115, 77
+# third, which may compare callbacks at turning points, and in a fifth and sixth, which use these arrays
+MANY, THIRD, FEWEST = 820, 480, 46
 # in a run from another start, and in one with other parameters; a twentieth more with the oldest versions
-ANOTHER = {"four_bar": (90, 1000), "redundant_slider_crank": (92, 1430), "heavy_top": (108, 770)}
-ANOTHER |= {"spatial_four_bar": (106, 1450), "bricard": (92, 640)}
+ANOTHER = {"four_bar": (55, 920), "redundant_slider_crank": (63, 1360), "heavy_top": (67, 740)}
+ANOTHER |= {"spatial_four_bar": (67, 1450), "bricard": (63, 550)}
 
 
 def run(problem, rtol=1e-6, **options):
     return solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, rtol=rtol, atol=rtol, **options)
 
 
-OF_OBJECTS = 110  # calls more where the method is an object, which is compared with those before by its options
+OF_OBJECTS = 70  # calls more where the method is an object, which is compared with those before by its options
 WAYS = {
     "name": (lambda problem: run(problem, method="RadauIIA5"), 0),
     "default": (run, 0),
@@ -224,7 +225,7 @@ def test_a_repeated_call_takes_few_calls_of_functions(way):
     calls = [calls_of(lambda: call(problem)) for _ in range(6)]
     if not more:
         assert calls[1] < MANY and calls[2] < THIRD, calls  # the first compiles, or checks derivatives
-    assert calls[4] < FEWER + more and calls[5] < FEWEST + more, calls
+    assert max(calls[4:]) < FEWEST + more, calls
 
 
 def test_a_method_of_other_options_makes_a_run_of_its_own():
@@ -384,6 +385,53 @@ def test_a_call_that_crosses_singular_positions_is_that_of_a_new_system(given, o
     last = call(problem.system, states[-1])  # its message is made when it is first read
     copies = copy.deepcopy(last), pickle.loads(pickle.dumps(last)), replace(last, changes="some")
     assert {each.message for each in copies} == {results[-1].message}
+
+
+def test_fields_are_put_together_when_they_are_asked_for():
+    problem = mechanisms.four_bar()
+    *_, result = [run(problem) for _ in range(9)]
+    assert vars(result).keys() == {"status", "later"}
+    assert {each.name for each in fields(result)} <= set(dir(result)) and not hasattr(result, "nothing")
+    assert result.q.shape == (9, result.t.size) and "h" not in vars(result)
+    assert result.q is result.q and result.h is result.h
+    others = pickle.loads(pickle.dumps(run(problem))), copy.copy(run(problem)), replace(run(problem), changes="some")
+    assert all((each.a == result.a).all() and each.stats.n_inner == result.stats.n_inner for each in others)
+    assert others[-1].changes == "some" and "later" not in vars(others[0])
+
+
+def test_starts_are_taken_as_they_are_given(taken):
+    """As columns of a table, as lists, and with numbers that are not finite, which compiled code refuses."""
+    problem = mechanisms.four_bar()
+    expected = [run(problem) for _ in range(8)][-1].q
+    table = np.array([problem.q0, problem.v0]).T
+    for q0, v0 in (table.T, (problem.q0.tolist(), problem.v0.tolist()), (problem.q0[::-1].copy()[::-1], problem.v0)):
+        assert (solve_dae(problem.system, (0.0, 1.0), q0, v0, rtol=1e-6, atol=1e-6).q == expected).all() and taken[-1]
+    for name, values in (("q0", (np.full(9, np.inf), problem.v0)), ("v0", (problem.q0, np.full(9, np.nan)))):
+        with pytest.raises(ValueError, match=f"{name} must be finite"):
+            solve_dae(problem.system, (0.0, 1.0), *values, rtol=1e-6, atol=1e-6)
+    assert (run(problem).q == expected).all() and taken[-1]
+
+
+def test_ctrl_c_in_a_repeated_call_returns_a_result(interruptible, monkeypatch):
+    """Also where no handler of ours stands in for Python's; one of the user's stays."""
+    problem = mechanisms.four_bar()
+    for _ in range(8):
+        full = run(problem)
+    made, heard = again.partial, []
+
+    def pressed(*given):
+        signal.raise_signal(signal.SIGINT)
+        return made(*given)
+
+    with monkeypatch.context() as changed:
+        changed.setattr(again, "partial", pressed)
+        assert run(problem).status.name == "INTERRUPTED"
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        for _ in range(3):
+            run(problem)
+        signal.signal(signal.SIGINT, lambda number, frame: heard.append(number))
+        assert run(problem).success and heard == [signal.SIGINT]
+    assert (run(problem).q == full.q).all()
 
 
 STATE = (0.3, np.array([0.6, -0.8]), np.array([0.8, 0.6]))

@@ -205,7 +205,7 @@ def solve_dae(
     times = None if t_eval is None else check_times(t_eval, t0, t1, step_size)
     folder = None if store is None else check_folder(store)
     with Interrupts() as interrupts:
-        own = asked.own_tolerance
+        own = getattr(asked.method, "error_tol", None)  # of positions, which a method tests by itself
         at_ends = times is not None and times.size <= 2 and set(times.tolist()) <= {t0, t1}
         in_time = time_limit is None or time_limit >= LONGEST
         if folder is event_functions is own is None and in_time and not progress:

@@ -1,6 +1,7 @@
 """Verdicts follow from rows: they turn when the rows do, and a missing row is "not run"."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -17,7 +18,7 @@ from studies.claims.verdicts import Claim, Judgement, Verdict, load
 from studies.reproduction import beam
 from studies.table3.cells import PAPER_IRK, PAPER_NEWMARK, TOLERANCES
 from tests.studies.claim_rows import EXPERIMENTS, MADE
-from twoloop import Result, paper_irk, solve_dae
+from twoloop import paper_irk, solve_dae
 from twoloop.mechanisms import four_bar
 
 CLAIMS = {claim.key: claim for claim in load()}
@@ -259,7 +260,7 @@ def test_choices_repeat_where_nothing_moves_and_change_with_the_motion():
     problem = four_bar()
     run = solve_dae(problem.system, (0.0, 3.0), problem.q0, problem.v0, method=paper_irk(), rtol=1e-5, atol=1e-5)
     assert 0.5 < experiments.repeated_choices(problem, run) < 1.0
-    still = Result(**{**vars(run), "q": np.repeat(run.q[:, :1], run.t.size, axis=1)})
+    still = replace(run, q=np.repeat(run.q[:, :1], run.t.size, axis=1))
     assert experiments.repeated_choices(problem, still) == 1.0
 
 

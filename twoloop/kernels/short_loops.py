@@ -124,16 +124,19 @@ REFUSED, IN_DOUBT, READY = range(3)  # another way has to be gone; a closer look
 AGAIN = Reference(
     "Again",
     {
-        **dict.fromkeys(("looked", "lam", "room", "least", "bounds", "scratch", "constants", "saved"), VECTOR),
+        **dict.fromkeys(
+            ("looked", "lam", "room", "least", "bounds", "scratch", "constants", "saved", "search"), VECTOR
+        ),
         **dict.fromkeys(("begin_numbers", "numbers", "begin_memory", "memory", "lasting", "options"), VECTOR),
-        **dict.fromkeys(("tolerances", "control", "clock", "state", "new_state", "end", "out_t", "told"), VECTOR),
-        **dict.fromkeys(("mass", "rows", "ways", "pattern", "out_rows", "out_steps"), MATRIX),
+        **dict.fromkeys(("tolerances", "control", "clock", "state", "new_state", "end", "t", "told"), VECTOR),
+        **dict.fromkeys(("mass", "rows", "ways", "pattern", "states", "steps"), MATRIX),
         **dict.fromkeys(("chosen", "expected", "lapack", "lasting_integers", "saved_integers"), INTEGERS),
-        **dict.fromkeys(("places", "filled"), INTEGERS),
+        **dict.fromkeys(("places", "filled", "kinds", "counted", "search_places", "blocks", "found"), INTEGERS),
     },
 )
 AGAIN.add_function("look", i8(KIT, f8, *(VECTOR,) * 5, *(MATRIX,) * 4, VECTOR))
 AGAIN.add_function("choose", i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS))
+AGAIN.add_function("dependents", i8(MATRIX, INTEGERS, INTEGERS, i8, VECTOR, INTEGERS, INTEGERS))
 AGAIN.add_function("start", i8(KIT, WORK, f8, VECTOR))
 AGAIN.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS))
 # in `constants`: of starts, the flag of an M that varies, else 0, the smallest pivot with which one is taken and the
@@ -147,7 +150,7 @@ PLACE, N_KEPT, N_ADDED, KEPT = range(4)  # in `expected`, which is empty without
 
 @merged
 def _is_expected(b, weak):
-    """Whether the rows that count, and those that help M, are those of the code."""
+    """Whether the rows that count, those that help M, and the coordinates that follow are those of the code."""
     b.scratch[0] = 0.0
     place = b.choose(b.mass, b.rows, b.constants[RANK], weak, b.bounds, b.scratch, b.chosen)
     n_kept, n_added = b.expected[N_KEPT], b.expected[N_ADDED]
@@ -162,6 +165,11 @@ def _is_expected(b, weak):
         same = same and b.chosen[2 + k] == b.expected[KEPT + k]
     for k in range(n_added):
         same = same and b.chosen[2 + len(b.rows) + k] == b.expected[KEPT + n_kept + k]
+    if same and b.kinds.size > 0:
+        n = 4 * b.dependents(b.rows, b.kinds, b.counted, b.counted.size, b.search, b.search_places, b.found)
+        same = n == b.blocks.size
+        for k in range(b.blocks.size):
+            same = same and b.found[k] == b.blocks[k]
     return same
 
 
@@ -186,12 +194,6 @@ def _agree(w, b, n):
     return True
 
 
-@merged
-def _put_form(f, b):
-    if f.flags[FORM] != int(b.constants[IN_FORM]):  # which a run may change
-        f.flags[FORM] = int(b.constants[IN_FORM])
-
-
 @kernel(i8(KIT, KIT, WORK, AGAIN, f8, f8, VECTOR, VECTOR, VECTOR, f8, types.boolean), vectorized=True)
 def begin(f, given, w, b, t, t1, q, v, sizes, weak, sure):
     """Whether a run to t1 begins at a state, with the same choices as the run before it; its start is then saved.
@@ -202,7 +204,7 @@ def begin(f, given, w, b, t, t1, q, v, sizes, weak, sure):
     n = q.size
     if not (finite_vector(q) and finite_vector(v)):
         return REFUSED
-    _put_form(f, b)
+    f.flags[FORM] = int(b.constants[IN_FORM])  # which a run may have changed
     for k in range(b.looked.size):
         b.looked[k] = 0.0
     found = b.look(given, t, q, v, sizes, b.lam, b.room, b.mass, b.rows, b.ways, b.pattern, b.least)
@@ -240,7 +242,7 @@ def begin(f, given, w, b, t, t1, q, v, sizes, weak, sure):
 @merged
 def _begin_again(f, b):
     """Put all that counts back to where the last start left it."""
-    _put_form(f, b)
+    f.flags[FORM] = int(b.constants[IN_FORM])  # which a run may have changed
     i, j = b.numbers.size, b.numbers.size + b.lasting.size
     _copy(b.saved[:i], b.numbers)
     _copy(b.saved[i:j], b.lasting)
@@ -262,9 +264,9 @@ def _turned(b, k, n):
     """Whether the velocities of the last two states differ by more than one of their accelerations gives."""
     change, first, last = 0.0, 0.0, 0.0
     for j in range(n):
-        change = max(change, abs(b.out_rows[k, n + j] - b.out_rows[k - 1, n + j]))
-        first, last = max(first, abs(b.out_rows[k - 1, 2 * n + j])), max(last, abs(b.out_rows[k, 2 * n + j]))
-    return change > b.constants[MOST_TURNED] * (b.out_t[k] - b.out_t[k - 1]) * min(first, last)
+        change = max(change, abs(b.states[k, n + j] - b.states[k - 1, n + j]))
+        first, last = max(first, abs(b.states[k - 1, 2 * n + j])), max(last, abs(b.states[k, 2 * n + j]))
+    return change > b.constants[MOST_TURNED] * (b.t[k] - b.t[k - 1]) * min(first, last)
 
 
 @kernel(i8(KIT, WORK, AGAIN, f8, MATRIX, i8, i8), vectorized=True)
@@ -276,13 +278,13 @@ def go(f, w, b, t1, box, n_rows, n_steps):
     code = at.GO_ON
     if n_steps < 0:
         _begin_again(f, b)
-        b.end[0], b.out_t[0] = t1, b.clock[at.T]
-        _copy(b.state, b.out_rows[0])
+        b.end[0], b.t[0] = t1, b.clock[at.T]
+        _copy(b.state, b.states[0])
         arrays = b.tolerances, b.control, b.clock, b.state, b.new_state
-        code = b.advance(f, w, b.options, b.memory, *arrays, b.end, b.out_t[1:], b.out_rows[1:], b.out_steps, b.filled)
+        code = b.advance(f, w, b.options, b.memory, *arrays, b.end, b.t[1:], b.states[1:], b.steps, b.filled)
         n_rows, n_steps = b.filled[0], b.filled[1]
     turned = n_rows > 0 and _turned(b, n_rows, w.Q.size)
-    inside = box.shape[1] > 0 and _lie_within(b.out_t[: 1 + n_rows], b.out_rows, box)
+    inside = box.shape[1] > 0 and _lie_within(b.t[: 1 + n_rows], b.states, box)
     near = b.clock[at.PIVOT_AT_OUTPUT] < b.constants[NEAR]
     missed = b.clock[at.BRIEFEST] < b.constants[LOOKS] * b.clock[at.WIDEST_LOOK]
     b.told[N_STATES], b.told[N_STEPS], b.told[PLAIN] = 1 + n_rows, n_steps, not (turned or near or missed)

@@ -11,14 +11,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.checks.consistency import Look
+from twoloop.generate.choices import SINGULAR_MASS
 from twoloop.generate.exact_derivatives import farthest
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Sample
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import flags, intervals, noted
+from twoloop.kernels.layout import short_loops
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.asked import Asked
-from twoloop.run.beginning import Beginning
+from twoloop.run.beginning import arrays_of
 from twoloop.run.between import Between, interpolator_of
 from twoloop.run.comparison import compared_at, territory_of
 from twoloop.run.course import BUFFER_STEPS
@@ -98,8 +101,9 @@ class Again:
         self.territory = territory_of(run, checks) if kin is None else kin.territory(checks)
         run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, run.chunk
         looked, room = system if self.movable is None else self.movable.system, LARGEST // len(run.state)
-        self.beginning = Beginning(run, looked, code, definite, asked, room)
-        self.look, self.rest, self._advance = self.beginning.look, 0, direct(run.kernels.advance)
+        self.look, self.loops, self.rest = Look(looked), short_loops(), 0
+        self.known, self.given = arrays_of(run, self.look, code, definite, asked, room), looked.kit
+        self._begin, self._go, self._advance = map(direct, (self.loops.begin, self.loops.go, run.kernels.advance))
         self.plan, self.kit, self.form, self.memory = run.plan, run.kit, run.kit.flags[flags.FORM], run.memory
         self.looks: Looks | None = None  # of a run of several chunks
         self.loading, self.spent = 0.0, np.inf  # CPU time of a step that a run came to, and of the last run, s
@@ -114,10 +118,12 @@ class Again:
         return run.static is None and fits and not run.said_of_start and not run.system.called_in_python
 
     @staticmethod
-    def interpolates(run: Run) -> bool:
-        """Whether states between its steps may be had in this way: with arrays that serve from start to start."""
+    def gives(run: Run, output: Output, kin: Kin | None) -> bool:
+        """Whether what is wanted may be had in this way: between steps, with arrays that serve from start to start."""
+        if output.dense and (output.between is not None or kin is not None):
+            return False  # both have the same states within steps; what belongs to kin takes other parameters
         lands = run.plan.lands or run.control[run.a.FIXED_STEP] > 0.0
-        return not lands and run.kit.flags[flags.FORM] != flags.AUGMENTED
+        return output.between is None or not (lands or run.kit.flags[flags.FORM] == flags.AUGMENTED)
 
     def fields(
         self,
@@ -134,7 +140,7 @@ class Again:
 
         But for the status they are put together when they are asked for, from copies of the arrays.
         """
-        run, movable, territory, beginning = self.run, self.movable, self.territory, self.beginning
+        run, movable, territory, known = self.run, self.movable, self.territory, self.known
         done = run.a.ALL_OUTPUT_DONE
         if self.rest > 0:
             self.rest -= 1
@@ -156,14 +162,16 @@ class Again:
         clock = time.perf_counter if self.spent < SHORT else time.process_time
         began = clock()
         try:
-            code = beginning.go(t1, territory.known)
-            if code != done or output is not STEPS:
-                code = self._steps_on(code, t1, interrupts)
+            code = self._go(run.kit, run.work, known, t1, territory.known, -1, -1)
+            if code != done:
+                code = self._steps_beyond(code, t1, interrupts)
+            elif output is not STEPS:
+                self.kinds[: known.filled[1]] = kinds_of(run, known.steps[: known.filled[1]])
         except Exception:  # of a callback; the long way knows what to do
             code = INTERRUPTED
-        states, taken, plain, turned, inside, checked, defect, gap = beginning.told.tolist()
+        states, taken, plain, turned, inside, checked, defect, gap = known.told.tolist()
         n_states, n_steps, plain = int(states), int(taken), plain and self.looks is None
-        t, rows, steps = beginning.t[:n_states], beginning.rows[:n_states], beginning.steps[:n_steps]
+        t, rows, steps = known.t[:n_states], known.states[:n_states], known.steps[:n_steps]
         if output is not STEPS and output.between is not None and code == done:
             self.between.find(output.between, t, rows, self.kinds[:n_steps], self.look.pattern)
         self.spent = spent = clock() - began - self.loading
@@ -206,30 +214,22 @@ class Again:
             run.plan, run.kit, run.functions, run.substituted = self.plan, self.kit, self.kit.functions, False
             run.memory = self.memory
 
-    def _steps_on(self, code: int, t1: float, interrupts: Interrupts) -> int:
-        """How the steps end after the first chunk, with their kinds; what is told of them stands in `beginning`."""
-        run, beginning, a = self.run, self.beginning, self.run.a
-        n_rows, n_steps = beginning.filled.tolist()
-        self.kinds[:n_steps] = kinds_of(run, beginning.steps[:n_steps])
-        if code in (a.HAS_TO_GIVE_WAY, a.HAS_TO_LOAD, a.NEAR_SINGULAR, a.PAUSED):
-            interrupts.listen()
-            code, n_rows, n_steps = self._steps_beyond(code, n_rows, n_steps, t1)
-            beginning.tell(t1, self.territory.known, n_rows, n_steps)
-        return code
-
-    def _steps_beyond(self, code: int, n_rows: int, n_steps: int, t1: float) -> tuple[int, int, int]:
-        """How they end, with how many states, beside the first, and steps, where the first chunk did not reach it."""
-        run, beginning, a = self.run, self.beginning, self.run.a
+    def _steps_beyond(self, code: int, t1: float, interrupts: Interrupts) -> int:
+        """How the steps end that go on after the first chunk, which ended so; `told` is of all."""
+        interrupts.listen()
+        run, known, a = self.run, self.known, self.run.a
         self.looks = looks = Looks(run.plan)
         plan, control, kit = run.plan, run.control, run.kit  # at the moment: not always the run's own
+        n_rows, n_steps = known.filled.tolist()
         pace, taken, across, until = Pace(run.t0), n_steps, False, time.process_time() + LONGEST
         between_looks = next_look = run.chunk  # the states that are looked at are those of `Course`
         while True:
-            h = beginning.steps[n_steps - taken : n_steps, a.H]
-            looks.pass_by(h)
-            pace.pass_by(h)
+            made = slice(n_steps - taken, n_steps)
+            self.kinds[made] = intervals.ACROSS if across else kinds_of(run, known.steps[made])
+            looks.pass_by(known.steps[made, a.H])
+            pace.pass_by(known.steps[made, a.H])
             if code == a.ALL_OUTPUT_DONE:
-                return code, n_rows, n_steps
+                break
             if code == a.PAUSED and run.attempts() >= next_look:
                 between_looks = min(2 * between_looks, BUFFER_STEPS)
                 next_look = run.attempts() + between_looks
@@ -237,9 +237,10 @@ class Again:
                     looks.take(float(run.clock[a.T]), run.state, run.system.n_q)
                 if time.process_time() > until:
                     self.rest = TOO_LONG
-                    return code, n_rows, n_steps
+                    break
                 if pace.stagnates(run.clock[a.T], t1):
-                    return STAGNATED, n_rows, n_steps
+                    code = STAGNATED
+                    break
             if code == a.HAS_TO_GIVE_WAY:
                 give_way(run)
                 plan, control, kit = run.plan, run.control, run.kit
@@ -259,26 +260,37 @@ class Again:
             elif across:
                 plan, control, code = beyond(run, plan, control, code, taken)
                 kit = kit if plan is not run.plan else run.kit
-                if code != a.PAUSED:
-                    return code, n_rows, n_steps
-            elif code != a.PAUSED:
-                return code, n_rows, n_steps
-            if n_steps == len(beginning.steps):
-                self.rest = TOO_LONG
-                return a.PAUSED, n_rows, n_steps
+            if code not in (a.HAS_TO_GIVE_WAY, a.HAS_TO_LOAD, a.NEAR_SINGULAR, a.PAUSED):
+                break
+            if n_steps == len(known.steps):
+                self.rest, code = TOO_LONG, a.PAUSED
+                break
             run.control[a.MAX_ATTEMPTS] = max(0, next_look - run.attempts())
             arrays = plan.options, plan.memory, run.tolerances, control, run.clock, run.state, run.new_state
-            room = beginning.t[n_rows + 1 :], beginning.rows[n_rows + 1 :], beginning.steps[n_steps:]
-            code = self._advance(kit, run.work, *arrays, beginning.end, *room, beginning.filled)
-            more, taken = beginning.filled.tolist()
+            room = known.t[n_rows + 1 :], known.states[n_rows + 1 :], known.steps[n_steps:]
+            code = self._advance(kit, run.work, *arrays, known.end, *room, known.filled)
+            more, taken = known.filled.tolist()
             n_rows, n_steps, across = n_rows + more, n_steps + taken, plan is not run.plan
-            made = slice(n_steps - taken, n_steps)
-            self.kinds[made] = intervals.ACROSS if across else kinds_of(run, beginning.steps[made])
+        self._go(kit, run.work, known, t1, self.territory.known, n_rows, n_steps)  # which only tells
+        return code
 
     def _begins(self, t0: float, t1: float, q0: Array, v0: Array, interrupts: Interrupts) -> bool:
         """Whether the run begins at another start, which is then saved."""
-        run = self.run
-        if not self.beginning.at(t0, t1, np.ascontiguousarray(q0), np.ascontiguousarray(v0), interrupts):
+        run, look, system, code = self.run, self.look, self.look.system, 0
+        weak = 0.0 if system.constant_mass and system.made.get("no weak mass", False) else SINGULAR_MASS
+        state = np.ascontiguousarray(q0), np.ascontiguousarray(v0)
+        for sure in (False, True):
+            try:
+                numbers = t0, t1, *state, look.sizes(), weak, sure
+                code = self._begin(run.kit, self.given, run.work, self.known, *numbers)
+            except Exception:  # of a callback, which is called by itself then
+                return False
+            if code != self.loops.IN_DOUBT:
+                break
+            interrupts.listen()
+            if not look.is_surely(0, t0, *state):
+                return False
+        if code != self.loops.READY:
             return False
         run.t0, run.compared_to[0] = t0, -np.inf
         if run.said_of_rows:  # rounding may decide which row is left out

@@ -35,12 +35,6 @@ class Asked:
         return identity(self.method), self.rtol, self.atol.tobytes(), *sizes, self.compiled, self.check_derivatives
 
     @cached_property
-    def own_tolerance(self) -> float | None:
-        """That of a test of positions which a method has for itself."""
-        own: float | None = getattr(self.method, "error_tol", None)
-        return own
-
-    @cached_property
     def told(self) -> dict[str, Any]:
         """What a result says of these; `untested` is None where all steps are tested, else of the run."""
         tested = getattr(self.method, "tested", "all")

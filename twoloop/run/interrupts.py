@@ -36,9 +36,7 @@ class Interrupts:
         How many signals came.
     """
 
-    def __init__(self) -> None:
-        self.asked = 0
-        self._stands_in = False
+    asked, _stands_in = 0, False
 
     def __enter__(self) -> "Interrupts":
         return self

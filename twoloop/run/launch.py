@@ -44,6 +44,10 @@ class Kept(NamedTuple):
     kin: Kin | None = None  # what it shares with systems of other parameters
 
 
+# where the last run began, what is kept of runs, and the code of the last one, if it was not one of these
+NO_RUNS: tuple[Any, dict[Any, tuple[Kept, ...]], int | None] = (None, {}, None)
+
+
 def record_again(
     system: ConstrainedSystem,
     t0: float,
@@ -58,18 +62,19 @@ def record_again(
 
     None where there are none, or where something has to be looked at: then `run_from` begins it.
     """
-    alike = _runs_of(system)[1].get(asked.key, ())
+    alike = system.made.get("runs", NO_RUNS)[1].get(asked.key, ())
     if not alike and (others := system.shared.get("runs")):
         known = others.get((asked.key, _family_of(system)))
         alike = (known,) if isinstance(known, Kept) else ()
     for kept in alike:
-        if kept.waiting is None or not (output is STEPS or _suits(kept, output)):
+        if kept.waiting is None or not (output is STEPS or Again.gives(kept.run, output, kept.kin)):
             continue
-        if kept.kin is not None or output is not STEPS or not kept.waiting:
+        if kept.kin is not None or output is not STEPS:
             interrupts.listen()
         try:
             again = kept.waiting.pop()
         except IndexError:
+            interrupts.listen()
             again = Again(kept.run.again(), system, kept.code, kept.definite, asked, kept.kin)
         fields = again.fields(system, t0, t1, q0, v0, asked, output, interrupts)
         said_of_rows = again.run.said_of_rows
@@ -78,13 +83,6 @@ def record_again(
         if fields is not None:
             return fields, said_of_rows
     return None
-
-
-def _suits(kept: Kept, output: Output) -> bool:
-    """Whether what is wanted of a run may be had by the arrays of one that is kept."""
-    if output.dense and (output.between is not None or kept.kin is not None):
-        return False  # both have the same states within steps; what belongs to kin takes other parameters
-    return output.between is None or Again.interpolates(kept.run)
 
 
 def run_from(system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, asked: Asked) -> Run:
@@ -100,7 +98,7 @@ def run_from(system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Arr
     if system.called_in_python:  # what such functions find in their surroundings may change
         return _made(system, t0, t1, q0, v0, asked)[0]
     start, call = (t0, q0.tobytes(), v0.tobytes()), asked.key
-    came_from, runs, before = _runs_of(system)
+    came_from, runs, before = system.made.get("runs", NO_RUNS)
     alike = runs.get(call, ())
     run, kept = None, next((each for each in alike if each.start == start), None)
     if kept is not None:
@@ -122,13 +120,6 @@ def run_from(system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Arr
             runs[call] = made, *[each for each in alike if each is not kept][: MOST_ALIKE - 1]
     system.made["runs"] = start, runs, id(code) if kept is None else None
     return run
-
-
-def _runs_of(system: ConstrainedSystem) -> tuple[Any, dict[Any, tuple[Kept, ...]], int | None]:
-    """Where the last run began, what is kept of runs, and the code of the last one, if it was not one of these."""
-    nothing: dict[Any, tuple[Kept, ...]] = {}
-    known: tuple[Any, dict[Any, tuple[Kept, ...]], int | None] = system.made.get("runs", (None, nothing, None))
-    return known
 
 
 def _kept_of(run: Run, code: OwnCode | None, t1: float, asked: Asked) -> Kept | None:

@@ -100,7 +100,7 @@ class Statistics:
         Process time of the integration, s: of the steps, of storing what they give, of events, and of q and v at output
         times between them. Compilation, checks of the input, the workspace, the first accelerations, and a and lam at
         output times between steps are not included. A run that was made again counts as a whole; counts are those of
-        the last time.
+        the last time. Of repeated runs that take less than a millisecond it is the time that elapses.
 
     Examples
     --------
