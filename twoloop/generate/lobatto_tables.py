@@ -54,7 +54,7 @@ class Tables(NamedTuple):
 def tables() -> Tables:
     """The coefficients, right to rounding."""
     x = _nodes()
-    between = (x[1:] + x[:-1]) / 2
+    between: Extended = (x[1:] + x[:-1]) / np.longdouble(2)
     values = _legendre(x)
     weights = 2 / (N * (N - 1) * values[N - 1] ** 2)
     norms = np.array([np.longdouble(2) / (2 * k + 1) for k in range(N)])

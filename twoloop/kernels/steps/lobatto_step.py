@@ -48,7 +48,7 @@ ORDER, SHARE = 12.0, 0.5  # of the estimate of the error; and what it counts
 SHORTER, SAFETY = 0.6, 0.65
 UNFORESEEN = 10.0  # an error that is so large is looked at elsewhere
 LIMITED, STRAIGHT = 24.0, 0.05  # such steps, after which another method goes on; what the iteration leaves of CURVED
-REFUSALS = 6
+REFUSALS = 12.0  # of REFUSED, which each accepted step lessens by 1 and each other one raises by 2
 BETWEEN = 0.0908  # of a step, the longest part that an audit leaves unseen: half that between two nodes
 ALLOWED = 16.0  # the defect between nodes, over the tolerances: most of it does not last to the end
 HALF = 4  # parts of half a step
@@ -120,7 +120,7 @@ def _collocate(f, w, options, room, tolerances, t, h, state):
         room[room_at.STARTS] += 1.0
         return ended, 2.0, min(max(WANTED_START / rho, 0.05), 30.0)
     if ended != MADE:
-        room[room_at.REFUSED] += 1.0
+        room[room_at.REFUSED] += 2.0
         return ended, 2.0, SHORTER
     if not estimated:
         return MADE, 0.0, 1.0
@@ -173,7 +173,7 @@ def _accept(room):
     """The polynomial of this step predicts the next."""
     room[room_at.WHICH] = 1.0 - room[room_at.WHICH]
     room[room_at.DEGREE], room[room_at.H_BEFORE] = room[room_at.NEXT_DEGREE], room[room_at.H]
-    room[room_at.PREDICTS], room[room_at.REFUSED] = 1.0, 0.0
+    room[room_at.PREDICTS], room[room_at.REFUSED] = 1.0, max(0.0, room[room_at.REFUSED] - 1.0)
     room[room_at.N_STEPS] += 1.0
 
 
