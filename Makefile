@@ -66,7 +66,7 @@ engines: .venv/engines ## the physics engines of the study engines, where they a
 
 table3: install ## the paper's Table 3 into reports/, about three minutes; ARGS=--full takes twenty
 	@echo "[3/3] Compiling the paper's steps and those of the default (once), then 32 cells, IDA and Exudyn"
-	@$(RUN) -c "from twoloop.kernels.steps import explicit_step, taylor_step; from twoloop.kernels.control import switching" & \
+	@$(RUN) -c "from twoloop.kernels.steps import explicit_step, lobatto_step; from twoloop.kernels.control import switching" & \
 	$(RUN) -c "from twoloop.kernels.steps import newmark_step, paper_step; from twoloop.kernels import interpolation" && wait $$!
 	$(RUN) -m studies.table3 $(ARGS)
 
@@ -88,7 +88,7 @@ compile: install ## compile the kernels, and the callbacks of bodies, mechanisms
 	from twoloop.kernels.algebra import dependents, independent, pivots, scaling; from twoloop.kernels.control import switching; \
 	from twoloop.kernels.evaluation import first_look, traced; \
 	from twoloop.kernels.lanes import lane_dop853, lane_runs, lane_starts, lane_taylor; \
-	from twoloop.kernels.steps import adams_step, asking_step, bdf_step, bridge, explicit_step, \
+	from twoloop.kernels.steps import adams_step, asking_step, bdf_step, bridge, explicit_step, lobatto_step, \
 	fixed_point_step, newmark_step, paper_step, taylor_step; from twoloop.bodies import planar_callbacks, planar_programs" && wait $$!
 	@echo "Compiling the callbacks of the ready mechanisms and of studies"
 	@$(RUN) -c "from twoloop.mechanisms import *" & $(RUN) -c "from studies.honesty import traps" && wait $$!

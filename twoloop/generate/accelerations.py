@@ -100,7 +100,7 @@ def _function(emit: Emitter, equations: StraightLine, outputs: Outputs, numbers:
         n, given = equations.system.n_q, _numbers(emit)
         kinds = [emit.double, ARRAY, ARRAY, *[ARRAY] * len(given), ARRAY]
         builder = module.function(name, emit.bit, kinds, internal=True)
-        inner = type(emit)(builder)
+        inner = emit.like(builder)
         t, q, v, *places, filled = builder.arguments
         for attribute, place in zip(("numbers", "constants"), places, strict=False):
             setattr(inner, attribute, place)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from twoloop.generate.coefficients import Coefficient
 from twoloop.generate.llvm_code import INTRINSICS, Emitter
-from twoloop.generate.llvm_text import BIT, DOUBLE, INTEGER, Value, integer, undefined, vector_of
+from twoloop.generate.llvm_text import BIT, DOUBLE, INTEGER, Builder, Value, integer, undefined, vector_of
 from twoloop.kernels.lanes.lane_room import LANES
 
 # log2 on [1, 2] and 2^x on [-1/2, 1/2], fitted by least squares at Chebyshev points, highest power first: good to 2e-06
@@ -13,19 +13,24 @@ LOG2 = (-0.02512320329, 0.2700374574, -1.247962495, 3.249466561, -5.301709109, 6
 EXP2 = (0.001340043216, 0.009676037098, 0.05550327214, 0.2402210736, 0.6931472067, 1.000000075)
 LARGEST_POWER, SMALLEST = 1000.0, 1e-300
 
-LANE, MASK, WHOLE = (vector_of(kind, LANES) for kind in (DOUBLE, BIT, INTEGER))
-
 
 class LaneEmitter(Emitter):
     """Appends operations on vectors of one number for each lane; places in memory are counted in such vectors."""
 
-    double, whole_number, bit = LANE, WHOLE, MASK
-    suffix = f"v{LANES}f64"
     constants: Value  # where numbers stand that all lanes have in common
+
+    def __init__(self, builder: Builder, lanes: int = LANES):
+        super().__init__(builder)
+        self.lanes, self.suffix = lanes, f"v{lanes}f64"
+        self.double, self.whole_number, self.bit = (vector_of(kind, lanes) for kind in (DOUBLE, INTEGER, BIT))
+
+    def like(self, builder: Builder) -> "LaneEmitter":
+        """One of as many lanes, for another function."""
+        return LaneEmitter(builder, self.lanes)
 
     def splat(self, value: Value) -> Value:
         """A number of all lanes."""
-        vector = self.builder.insert(undefined(vector_of(value.type, LANES)), value, 0)
+        vector = self.builder.insert(undefined(vector_of(value.type, self.lanes)), value, 0)
         return self.builder.first_everywhere(vector)
 
     def known(self, number: float) -> Value:
@@ -42,25 +47,27 @@ class LaneEmitter(Emitter):
     def pointer(self, base: Value, *places: Value | int) -> Value:
         """A pointer some vectors further on."""
         for place in places:
-            scaled = integer(place * LANES) if isinstance(place, int) else self.builder.mul(place, integer(LANES))
+            scaled = (
+                integer(place * self.lanes) if isinstance(place, int) else self.builder.mul(place, integer(self.lanes))
+            )
             base = self.builder.gep(base, scaled)
         return base
 
     def load(self, base: Value, place: int = 0, constant: bool = False) -> Value:
         """The vector at a place."""
-        pointer = self.builder.convert("bitcast", self.pointer(base, place), f"{LANE}*")
+        pointer = self.builder.convert("bitcast", self.pointer(base, place), f"{self.double}*")
         return self.builder.load(pointer, constant=constant)
 
     def store(self, value: Value, base: Value, place: int = 0) -> None:
         """Put a vector at a place."""
-        self.builder.store(value, self.builder.convert("bitcast", self.pointer(base, place), f"{LANE}*"))
+        self.builder.store(value, self.builder.convert("bitcast", self.pointer(base, place), f"{self.double}*"))
 
     def function(self, name: str, x: Value) -> Value:
         """A function of LLVM, of all lanes, or of libm, lane by lane."""
         if name in INTRINSICS:
             return super().function(name, x)
-        made, one = undefined(LANE), Emitter(self.builder)
-        for lane in range(LANES):
+        made, one = undefined(self.double), Emitter(self.builder)
+        for lane in range(self.lanes):
             made = self.builder.insert(made, one.function(name, self.builder.extract(x, lane)), lane)
         return made
 
@@ -80,11 +87,12 @@ class LaneEmitter(Emitter):
     def logarithm(self, x: Value) -> Value:
         """log2 x to a hundredth of a per cent of 1, of what is not negative, as if none were below SMALLEST."""
         builder = self.builder
-        bits = builder.convert("bitcast", self.larger(x, self.constant(SMALLEST)), WHOLE)
+        bits = builder.convert("bitcast", self.larger(x, self.constant(SMALLEST)), self.whole_number)
         exponent = builder.sub(builder.operation("lshr", bits, self.whole(52)), self.whole(1023))
         rest = builder.operation("or", builder.both(bits, self.whole((1 << 52) - 1)), self.whole(1023 << 52))
         return self.add(
-            builder.convert("sitofp", exponent, LANE), self._polynomial(LOG2, builder.convert("bitcast", rest, LANE))
+            builder.convert("sitofp", exponent, self.double),
+            self._polynomial(LOG2, builder.convert("bitcast", rest, self.double)),
         )
 
     def exponential(self, x: Value) -> Value:
@@ -93,9 +101,11 @@ class LaneEmitter(Emitter):
         x = self.larger(self.smaller(x, self.constant(LARGEST_POWER)), self.constant(-LARGEST_POWER))
         whole = self.function("rint", x)
         bits = builder.operation(
-            "shl", builder.add(builder.convert("fptosi", whole, WHOLE), self.whole(1023)), self.whole(52)
+            "shl", builder.add(builder.convert("fptosi", whole, self.whole_number), self.whole(1023)), self.whole(52)
         )
-        return self.multiply(builder.convert("bitcast", bits, LANE), self._polynomial(EXP2, self.subtract(x, whole)))
+        return self.multiply(
+            builder.convert("bitcast", bits, self.double), self._polynomial(EXP2, self.subtract(x, whole))
+        )
 
     def _polynomial(self, coefficients: Sequence[float], x: Value) -> Value:
         total = self.constant(coefficients[0])

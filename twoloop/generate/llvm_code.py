@@ -46,6 +46,10 @@ class Emitter:
         self.builder = builder
         self.numbers: Any = None
 
+    def like(self, builder: Builder) -> "Emitter":
+        """One of the same kind, for another function."""
+        return type(self)(builder)
+
     def constant(self, value: float) -> Value:
         """A number that stands in the code."""
         return constant(self.double, value)

@@ -81,6 +81,12 @@ def constant(kind: str, number: float) -> Value:
     return Value(kind, text if width == 1 else f"<{', '.join([f'{element} {text}'] * width)}>")
 
 
+def constants(numbers: Iterable[float]) -> Value:
+    """A vector of numbers."""
+    each = [str(constant(DOUBLE, float(number))) for number in numbers]
+    return Value(vector_of(DOUBLE, len(each)), f"<{', '.join(each)}>")
+
+
 def integer(number: int) -> Value:
     """An integer."""
     return Value(INTEGER, str(number))
@@ -220,10 +226,10 @@ class Builder:
         """The first of two values where the condition holds."""
         return self._value(a.type, f"select {condition}, {a}, {b}")
 
-    def call(self, name: str, kind: str, arguments: Sequence[Value]) -> Value:
-        """The value of a function of the module, or of one that is declared by this."""
+    def call(self, name: str, kind: str, arguments: Sequence[Value], flags: str = "") -> Value:
+        """The value of a function of the module, or of one that is declared by this; `flags` as of operations."""
         self.module.declare(name, kind, [value.type for value in arguments])
-        return self._value(kind, f"call {kind} @{name}({', '.join(map(str, arguments))})")
+        return self._value(kind, f"call {flags} {kind} @{name}({', '.join(map(str, arguments))})")
 
     def run(self, name: str, arguments: Sequence[Value]) -> None:
         """Call a function of the module that has no result."""

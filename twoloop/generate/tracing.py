@@ -115,6 +115,10 @@ class Graph(Symbolic):
                 ahead += [j for form in operation[1:] if isinstance(form, Form) for j in form.terms]
         return sorted(found)
 
+    def arguments(self, i: int) -> list["Form"]:
+        """What a quantity is computed from; nothing of an input."""
+        return [form for form in (self.operations[i] or ())[1:] if isinstance(form, Form)]
+
     def in_order_of_use(self, forms: Iterable["Form"], known: Container[int] = ()) -> list[int]:
         """The same, each as late as it can be: just before what is made of it first."""
         order: list[int] = []

@@ -9,6 +9,7 @@ from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control import clock as at
 from twoloop.kernels.control.controller import EXPONENT, FACTOR_MIN, SAFETY, factor_of, remember
 from twoloop.kernels.control.landing import NEAR, off_grid, on_grid
+from twoloop.kernels.control.progress import count_step
 from twoloop.kernels.control.singular import (
     SHORT,
     ends_at_singular,
@@ -19,30 +20,24 @@ from twoloop.kernels.control.singular import (
     with_care,
 )
 from twoloop.kernels.control.sudden import up_to_sudden
-from twoloop.kernels.data.codes import DONE, INNER_DIVERGED, NEEDS_DENSE, NOT_FINITE, NOT_LOADED, SINGULAR
+from twoloop.kernels.data.codes import DONE, INNER_DIVERGED, NEEDS_DENSE, NOT_FINITE, NOT_LOADED, SINGULAR, UNSUITED
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, WORK, f8, i8, kernel, merged
 from twoloop.kernels.data.counters import (
     N_ACCEPTED,
-    N_JACOBIANS,
-    N_PARTITIONS,
     N_REJECTED_CONVERGENCE,
     N_REJECTED_ERROR,
 )
 from twoloop.kernels.data.flags import FORM, GAMMA_GIVEN, STATIC
 from twoloop.kernels.data.noted import (
     DEFECT,
-    EXPLICIT_STEP,
     FAULT_KIND,
     KINK_AFTER,
     KINK_BEFORE,
-    LARGEST_DEFECT,
     ORIENTATION,
     ORIENTATION_NEW,
     PIVOT,
-    UNCHECKED,
-    WIDEST_GAP,
 )
-from twoloop.kernels.data.tolerances import GAP, LOOK, is_beyond_gap
+from twoloop.kernels.data.tolerances import GAP
 from twoloop.kernels.evaluation.calls import (
     accelerations,
     check_redundant,
@@ -54,9 +49,9 @@ from twoloop.kernels.evaluation.calls import (
 from twoloop.kernels.evaluation.kinks import JUMP, RAMP, SMOOTH, find_kink, unexplained
 from twoloop.kernels.evaluation.partition import CHANGED
 
-FADING = 0.98  # of the longest step, with each accepted one
 UNFORESEEN = 10.0  # an error that is so large was not foreseen: the force jumps, or bends, within the step
 REFUSED = 0.95  # of a refused step is what the next one is at most
+IN_A_ROW = 8  # steps at most: there has to be room for them
 FIRST_JUDGED = 2  # accepted step after which a provisional method may give way: the first one may be a guess
 
 
@@ -145,7 +140,7 @@ def _failed(f, w, control, clock, t, size, code, retried, state):
         return at.GO_ON
     clock[at.FAILURE_CODE] = code
     clock[at.H_FAILED] = size
-    if code == NOT_FINITE and control[at.GIVES_WAY] == 1.0:
+    if code in (NOT_FINITE, UNSUITED) and control[at.GIVES_WAY] == 1.0:
         return at.HAS_TO_GIVE_WAY
     if control[at.FIXED_STEP] > 0.0:
         if not poor or t == retried:
@@ -177,25 +172,13 @@ def _refused(f, w, control, clock, t, size, proposal):
 
 
 @merged
-def _count(w, tolerances, control, size, out_step):
-    """Count an accepted step, and what it saw of the equations."""
-    w.counters[N_ACCEPTED] += 1
-    if w.notes[DEFECT] >= 0.0:
-        w.notes[LARGEST_DEFECT] = max(w.notes[LARGEST_DEFECT], w.notes[DEFECT])
-    else:
-        w.notes[UNCHECKED] += 1.0
-    gap = size
-    if w.notes[DEFECT] >= 0.0:
-        gap = min(size, tolerances[LOOK])
-    elif is_beyond_gap(tolerances, size):  # as only steps may be whose stages are nearer to one another
-        gap = control[at.UNSEEN] * size
-    w.notes[WIDEST_GAP] = max(w.notes[WIDEST_GAP], gap)
-    w.notes[ORIENTATION] = w.notes[ORIENTATION_NEW]
-    out_step[at.H] = size
-    out_step[at.ERRORS] = w.counters[N_REJECTED_ERROR]
-    out_step[at.FAILURES] = w.counters[N_REJECTED_CONVERGENCE]
-    out_step[at.PARTITIONS] = w.counters[N_PARTITIONS]
-    out_step[at.JACOBIANS] = 0.0 if w.notes[EXPLICIT_STEP] == 1.0 else w.counters[N_JACOBIANS]
+def _may_go_on(control, clock):
+    """Whether the method makes steps in a row, and nothing else has to be looked at before each of them."""
+    if control[at.IN_A_ROW] == 0.0 or control[at.FIXED_STEP] > 0.0 or clock[at.LEAPS] == 1.0:
+        return False
+    if control[at.SPACING] > 0.0 or control[at.DRIVEN] == 1.0:
+        return False
+    return clock[at.FAILURE_CODE] == DONE and clock[at.T] >= clock[at.ROUGH_TO]
 
 
 _ADVANCE = i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS)
@@ -219,11 +202,26 @@ def advance(
     filled[1] = 0
     attempts = 0.0
     while True:
-        if filled[0] == out_t.size or filled[1] == out_steps.shape[0] or attempts == control[at.MAX_ATTEMPTS]:
+        if filled[0] == out_t.size or filled[1] == out_steps.shape[0] or attempts >= control[at.MAX_ATTEMPTS]:
             return at.PAUSED
-        attempts += 1.0
         if w.counters[N_ACCEPTED] >= control[at.MAX_STEPS]:
             return at.MAX_STEPS_REACHED
+        if _may_go_on(control, clock):
+            first, goal = filled[0], outputs[int(clock[at.NEXT_OUTPUT])]
+            if min(out_t.size - first, out_steps.shape[0] - filled[1]) < IN_A_ROW and first + filled[1] > 0:
+                return at.PAUSED
+            rows = out_t[first:], out_state[first:], out_steps[filled[1] :]
+            made = f.attempt_many(f, w, options, memory, tolerances, control, clock, goal, state, new_state, *rows)
+            if made > 0:
+                if control[at.STORE_ALL] == 1.0:
+                    filled[0] += made
+                filled[1] += made
+                attempts += made
+                end = look_at_partition(f, w, control, clock, out_steps[filled[1] - 1, at.H], False, state)
+                if end != at.GO_ON:
+                    return end
+                continue
+        attempts += 1.0
         t = clock[at.T]
         leaps = clock[at.LEAPS] == 1.0
         if t == clock[at.JUMP_FROM] and not leaps:
@@ -296,9 +294,8 @@ def advance(
         if w.rows_v.size < w.Rate.size and check_redundant(f, w, t + size, new_state[:n], new_state[n : 2 * n]) != DONE:
             clock[at.H_FAILED] = size
             return at.ROWS_VIOLATED
-        _count(w, tolerances, control, size, out_steps[filled[1]])
+        count_step(w, tolerances, control, clock, size, out_steps[filled[1]])
         filled[1] += 1
-        clock[at.H_LONG] = max(size, FADING * clock[at.H_LONG])
         remember(control, clock, size, error)
         clock[at.N_FIXED] += in_grid
         if reaches:

@@ -2,11 +2,13 @@
 
 from dataclasses import dataclass, replace
 
+from twoloop.generate.collocation_code import suits
 from twoloop.generate.series import is_quick
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.time_dependence import may_be_narrow
 from twoloop.generate.traced_values import Check, unchecked
 from twoloop.methods.dop853 import DOP853
+from twoloop.methods.lobatto import Lobatto16
 from twoloop.methods.plan import Method, Plan, kept_plan, least_tolerance
 from twoloop.methods.taylor import Taylor
 from twoloop.problem.system import ConstrainedSystem
@@ -135,6 +137,7 @@ class Auto:
     tight: Method
     tightest: Method
     fixed: Method
+    lanes: Lobatto16 | None = None
     n_rows: int = 0  # constraints of the system, and whether there is code made for it; solve_dae says so
     compiled: bool = False
     sparse: bool = False  # whether it gives the values of entries: an evaluation then costs no more than a projection
@@ -154,6 +157,10 @@ class Auto:
         """The same for the operations of a system, without `series` where they cannot be seen, or not be relied on."""
         sparse = len(system.entries) == 2 and system.n_a == 0
         chosen = replace(self, n_rows=system.n_c + system.n_a, compiled=code is not None, sparse=sparse)
+        if code is None or not suits(code.shared):
+            chosen = replace(chosen, lanes=None)
+        elif self.lanes is not None:
+            chosen = replace(chosen, lanes=self.lanes.for_system(system, code))
         if code is not None and isinstance(self.few, DOP853):
             chosen = replace(chosen, few=self.few.for_system(system, code))
         plain = code is None and (system.called_in_python or not is_quick(system))
@@ -189,6 +196,15 @@ class Auto:
         """Make the method ready for a run of n_q coordinates."""
         if fixed:
             return self.fixed.plan(n_q, rtol, atol, True)
+        others = self._others(n_q, rtol, atol)
+        if self.lanes is None or self.lanes.code is None:
+            return others
+        plan = self.lanes.plan(n_q, rtol, atol, False)
+        traced = (*plan.traced, *others.traced)
+        return plan.changed(substitute=others, traced=traced, within_newton=others.within_newton)
+
+    def _others(self, n_q: int, rtol: float, atol: float) -> Plan:
+        """The plan of steps one at a time."""
         tolerance = least_tolerance(rtol, atol)
         implicit = self.loose if tolerance >= LOOSE else self.tight if tolerance >= TIGHTEST else self.tightest
         second = kept_plan(implicit, n_q, rtol, atol)

@@ -10,7 +10,7 @@ from twoloop.generate.series import is_quick, series_for
 from twoloop.generate.straight_code import OwnCode, own_code
 from twoloop.generate.traced_values import Check
 from twoloop.generate.tracing import Untraceable
-from twoloop.methods.plan import Method, takes_code
+from twoloop.methods.plan import Method, needs_code, takes_code
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -43,6 +43,8 @@ def code_for(
     if compiled is True:
         _refuse(method, fixed)
         return own_code(system, t0, q0, check)
+    if needs_code(method):
+        return _needed(system, method, compiled, t0, q0, check)
     if not may_have_code(system, method, fixed, compiled):
         return None
     try:
@@ -53,9 +55,24 @@ def code_for(
 
 def may_have_code(system: ConstrainedSystem, method: Method, fixed: bool, compiled: Compiled) -> bool:
     """Whether a run gets code where it can be had."""
+    if needs_code(method):
+        return True
     if compiled == "auto":
         return not fixed and takes_code(method, False) and is_small(system)
     return compiled
+
+
+def _needed(
+    system: ConstrainedSystem, method: Method, compiled: Compiled, t0: float, q0: Array, check: Check
+) -> OwnCode:
+    """The code for a method that cannot do without."""
+    what = f"method={method.name!r} needs code made for {system.name!r}"
+    if not compiled:
+        raise ValueError(f"{what}; given compiled=False. Leave it out, or take method='auto'")
+    try:
+        return own_code(system, t0, q0, check)
+    except ValueError as error:
+        raise ValueError(f"{what}, which cannot be had; {error.__cause__}. Take method='auto'") from error
 
 
 def _refuse(method: Method, fixed: bool) -> None:
@@ -63,7 +80,8 @@ def _refuse(method: Method, fixed: bool) -> None:
     if not takes_code(method, fixed):
         implicit = " with step_size, by which it is implicit" if takes_code(method, False) else ""
         raise ValueError(
-            f"compiled=True goes with 'auto', 'Taylor', 'DOP853', 'Adams'; given method {method.name}{implicit}"
+            "compiled=True goes with 'auto', 'Lobatto16', 'Taylor', 'DOP853', 'Adams'; "
+            f"given method {method.name}{implicit}"
         )
 
 

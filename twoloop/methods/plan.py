@@ -66,6 +66,11 @@ class Plan:
         """Of step-size control, see kernels/control/controller.py."""
         return [self.safety, self.exponent, self.factor_min, self.factor_max, self.least_error]
 
+    @property
+    def substitutes(self) -> list["Plan"]:
+        """What takes over, and what from that."""
+        return [] if self.substitute is None else [self.substitute, *self.substitute.substitutes]
+
     def fresh(self) -> "Plan":
         """The same for another run, with memory of its own; not so the plans that it holds."""
         return self.changed(memory=self.memory.copy())
@@ -81,6 +86,11 @@ def takes_code(method: Any, fixed: bool) -> bool:
     """Whether steps of a method, of one size or not, ask the inner loop only for what can be code for the mechanism."""
     said = getattr(method, "takes_code", None)
     return said is not None and bool(said(fixed))
+
+
+def needs_code(method: Any) -> bool:
+    """Whether steps of a method cannot do without code for the mechanism."""
+    return bool(getattr(method, "needs_code", False))
 
 
 def least_tolerance(rtol: float, atol: float) -> float:

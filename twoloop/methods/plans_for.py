@@ -49,11 +49,10 @@ def _made(
         interiors[ACCELERATIONS] = method.plan(system.n_q, rtol, atol, True) if plan.interior is None else plan.interior
     if code is None:
         return plan, interiors
-    plan = _with_code(plan, code).changed(traced=(*plan.traced, code.traced))
-    if plan.substitute is not None:
-        plan = plan.changed(substitute=_with_code(plan.substitute, code))
-    return plan, interiors
+    return _with_code(plan, code).changed(traced=(*plan.traced, code.traced)), interiors
 
 
 def _with_code(plan: Plan, code: OwnCode) -> Plan:
-    return plan.changed(inner=code.shared.inner, own=(code.shared.functions, *plan.own), numbers=code.numbers)
+    substitute = None if plan.substitute is None else _with_code(plan.substitute, code)
+    own = code.shared.functions, *plan.own
+    return plan.changed(inner=code.shared.inner, own=own, numbers=code.numbers, substitute=substitute)

@@ -10,6 +10,7 @@ from twoloop.methods.auto import Auto
 from twoloop.methods.bdf import BDF
 from twoloop.methods.dop853 import DOP853
 from twoloop.methods.esdirk import ESDIRK
+from twoloop.methods.lobatto import Lobatto16
 from twoloop.methods.newmark import Newmark
 from twoloop.methods.plan import Method
 from twoloop.methods.runge_kutta import RungeKutta
@@ -113,6 +114,7 @@ PRESETS: dict[str, Method] = {
         tight=RungeKutta(radau_iia(3), outer="newton", tested="positions"),
         tightest=RungeKutta(radau_iia(5), outer="newton", tested="positions"),
         fixed=RungeKutta(sun_radau_iib(3), outer="auto"),
+        lanes=Lobatto16(),
     ),
     "SunRadau5": RungeKutta(sun_radau_iib(3), outer="auto"),
     **{f"Gauss{2 * s}": RungeKutta(gauss(s)) for s in range(2, 9)},
@@ -121,6 +123,7 @@ PRESETS: dict[str, Method] = {
     "ESDIRK4": ESDIRK("ESDIRK4"),
     "Newmark": Newmark(),
     "BDF": BDF(),
+    "Lobatto16": Lobatto16(),
     "DOP853": DOP853(),
     "Adams": Adams(),
     "Taylor": Taylor(),
@@ -129,7 +132,16 @@ PRESETS: dict[str, Method] = {
 }
 
 
-OWN = (Adams, BDF, DOP853, ESDIRK, Newmark, RungeKutta, Taylor)  # whose objects are the values of their options
+OWN = (
+    Adams,
+    BDF,
+    DOP853,
+    ESDIRK,
+    Lobatto16,
+    Newmark,
+    RungeKutta,
+    Taylor,
+)  # whose objects are the values of their options
 PLAIN = (str, int, float, np.generic, type(None))  # such values, beside tableaux
 _OF_PRESETS = frozenset(map(id, PRESETS.values()))
 

@@ -28,7 +28,8 @@ METHODS = {
     "TRBDF2": ("hosea",),
     "ESDIRK4": ("kennedy",),
     "DOP853": ("explicit",),
-    "auto": ("explicit", "krogh", "shampine", "pryce", "jorba", "hosea", "stiff"),
+    "Lobatto16": ("stiff", "lanes"),
+    "auto": ("lanes", "explicit", "krogh", "shampine", "pryce", "jorba", "hosea", "stiff"),
     "Adams": ("krogh", "shampine"),
     "Taylor": ("pryce", "jorba"),
 }

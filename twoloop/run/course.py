@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from twoloop.generate.traced_values import Sample
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import intervals, noted, tolerances
+from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.tolerances import LONGEST_UNSEEN
 from twoloop.problem.events import SAMPLES
 from twoloop.run.between import interpolator_of
@@ -296,7 +297,7 @@ class Course:
     def _buffers(self) -> Buffers:
         """Room for the states and steps of a chunk, each attempt of which fills one row at most."""
         chunk, width = self.run.chunk, len(self.run.state)
-        n_rows, n_steps = min(chunk, BUFFER_ROWS), min(chunk, BUFFER_STEPS)
+        n_rows, n_steps = max(min(chunk, BUFFER_ROWS), LANES), max(min(chunk, BUFFER_STEPS), LANES)
         spare = _spare.pop((n_rows, n_rows * width, n_steps), None)
         if spare is not None:
             return spare

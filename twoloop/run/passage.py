@@ -59,7 +59,7 @@ def bridge(run: Run) -> tuple[Plan, Array]:
     control = run.control.copy()
     control[: a.N_RULE] = plan.changed(least_error=0.0).rule
     control[a.SYMMETRIC], control[a.BRIDGE], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
-    control[a.GIVES_WAY] = 0.0
+    control[a.GIVES_WAY] = control[a.IN_A_ROW] = 0.0
     if control[a.FIXED_STEP] == 0.0:
         control[a.MAX_STEP] = min(run.max_step, run.tolerances[tolerances.GAP])
     clock[a.H_LIMIT], clock[a.LIMIT_AGE] = np.inf, 0.0

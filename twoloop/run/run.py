@@ -62,9 +62,9 @@ class Run:
         self.memory = plan.memory.copy()
         self.rtol, self.reuse, self.interiors, self.traced = rtol, plan.reuse, interiors, plan.traced
         self.least_atol = float(atol.min())
-        others = () if plan.substitute is None else (plan.substitute,)
-        self.static = static_form(system, t0, q0, plan, *others)
-        self.matrices = max(each.matrices for each in (plan, *others))
+        plans = plan, *plan.substitutes
+        self.static = static_form(system, t0, q0, *plans)
+        self.matrices = max(each.matrices for each in plans)
         self.kit = kit_of(system, t0, q0, plan, self.static)
         self.functions = self.kit.functions
         n_rows = system.n_c + system.n_a
@@ -160,6 +160,7 @@ class Run:
         control[a.LIMIT_MEMORY], control[a.SYMMETRIC] = plan.limit_memory, plan.symmetric
         control[a.ROUGH] = plan.rough
         control[a.GIVES_WAY] = plan.substitute is not None
+        control[a.IN_A_ROW] = getattr(plan.step, "many", None) is not None
         control[a.PROVISIONAL] = PROVISIONAL if plan.provisional else -1.0
         self.clock[a.H_LIMIT] = plan.limit_start
 

@@ -43,8 +43,9 @@ GO_ON = -1  # nothing of these yet
     BY_STATE,  # 1: they go along the way of short steps, too, for what may be sharp by place or speed
     FIRST_GIVEN,  # 1: the first step is the user's, and not a guess that may become longer
     UNSEEN,  # of a step, the longest part within which nothing is evaluated
+    IN_A_ROW,  # 1: the method makes many steps in a row, and nothing has to be looked at before each of them
     N_CONTROL,
-) = range(N_RULE, N_RULE + 23)
+) = range(N_RULE, N_RULE + 24)
 
 # places in a row of `out_steps`: the size of an accepted step, and the counters so far; JACOBIANS is 0 after an
 # explicit step of a method that switches

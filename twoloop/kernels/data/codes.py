@@ -12,4 +12,5 @@
     ROWS_CONTRADICT,
     NEEDS_DENSE,  # the static form cannot decide it
     NOT_LOADED,  # the machine code of the step: the caller is to load it
-) = range(11)
+    UNSUITED,  # the method does not suit the motion here: another one is to go on
+) = range(12)

@@ -146,10 +146,14 @@ class Attempt(NamedTuple):
 
 
 class Step(NamedTuple):
-    """A step, and what is to become of what it kept in its memory, once it is known whether it was accepted."""
+    """A step, and what is to become of what it kept in its memory, once it is known whether it was accepted.
+
+    `many` makes steps in a row, where a method has it.
+    """
 
     attempt: Any = None
     settle: Any = None
+    many: Any = None
 
 
 KIT = Reference(
@@ -173,6 +177,9 @@ for _name in ("attempt", "attempt_first", "attempt_second", "instead"):
 SETTLE = types.void(KIT, WORK, VECTOR, VECTOR, VECTOR, types.boolean)
 for _name in ("settle", "settle_first", "settle_second"):
     KIT.add_function(_name, SETTLE)
+# (kit, work, options, memory, tolerances, control, clock, goal, state, new_state, times, states, steps) -> how many
+MANY = i8(KIT, WORK, *[VECTOR] * 5, f8, *[VECTOR] * 3, MATRIX, MATRIX)
+KIT.add_function("attempt_many", MANY)
 
 # functions made for a mechanism, see generate/straight_code.py, series_code.py and stage_code.py; those that return a
 # flag say whether their conditions hold, and fill what they are given only then
@@ -195,6 +202,17 @@ OWN_FUNCTIONS = {
     "begin_stages": types.none(VECTOR, VECTOR),
     "find_stage": types.boolean(VECTOR, i8, VECTOR, f8, f8, VECTOR, VECTOR),
     "put_stage": types.none(VECTOR, i8, VECTOR),
+    # of collocation, on a memory that data/collocation.py describes: (room, state, tolerances), (room, state, numbers),
+    # with the change of velocities, and the defect between nodes, as their results, (room, state), (room, state,
+    # new_state); (room, numbers)
+    "begin_nodes": types.none(*[VECTOR] * 3),
+    "sweep_nodes": f8(*[VECTOR] * 3),
+    "audit_nodes": f8(*[VECTOR] * 3),
+    "judge_nodes": types.none(*[VECTOR] * 2),
+    "divide_nodes": types.none(*[VECTOR] * 2),
+    "end_nodes": types.none(*[VECTOR] * 3),
+    "closer_ends": types.none(*[VECTOR] * 2),
+    "nearer_ends": types.none(*[VECTOR] * 2),
     # (scratch, b, fine, coarse, h, end, estimates)
     "sum_stages": types.none(*[VECTOR] * 4, f8, VECTOR, VECTOR),
 }

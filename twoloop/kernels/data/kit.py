@@ -38,9 +38,9 @@ class Kit:
         self.functions, self.inner, self.general, self.instead, self.own = functions, inner, general, instead, own
         self.numbers = NONE if numbers is None else numbers
         self.own_numbers = NONE if own_numbers is None else own_numbers
-        self.attempt, self.settle = step or Step()
-        self.attempt_first, self.settle_first = first or Step()
-        self.attempt_second, self.settle_second = second or Step()
+        self.attempt, self.settle, self.attempt_many = step or Step()
+        self.attempt_first, self.settle_first, _ = first or Step()
+        self.attempt_second, self.settle_second, _ = second or Step()
         self.__dict__.update(dict.fromkeys(OWN_FUNCTIONS, 0))
         for each in own:
             self.__dict__.update(each.addresses)

@@ -1,0 +1,95 @@
+"""Collocation at nine Lobatto nodes, the first of which is the end of the step before: its coefficients, order 16.
+
+Polynomials of degree 8 through values at the nodes are written in Legendre's, whose coefficients, integrals and
+derivatives at the end are known (Hairer & Wanner, Solving ODEs II, IV.5, on Lobatto IIIA).
+"""
+
+from functools import cache
+from math import comb
+from typing import NamedTuple
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Extended = NDArray[np.longdouble]
+N = 9
+QUARTERS: Extended = np.array([-0.5, 0.0, 0.5, 1.0, 1.0, 1.0, 1.0, 1.0], dtype=np.longdouble)
+
+
+class Tables(NamedTuple):
+    """For nodes c_0 = 0 < ... < c_8 = 1; rows belong to values at the nodes, the first to that at the beginning.
+
+    Attributes
+    ----------
+    nodes, between : (8,)
+        Nodes that are not known, and places half-way from one node to the next.
+    velocities, positions : (9, 8)
+        Single and double integrals from 0 to each node.
+    values_between, velocities_between, positions_between : (9, 8)
+        The polynomial and these integrals at the places between nodes.
+    velocities_parts, positions_parts : (9, 8)
+        Integrals to the ends of four equal parts, and to the end.
+    spectrum : (9, 8)
+        Coefficients of the Legendre polynomials 1 to 8 on [0, 1], which are 1 at its end.
+    end : (9, 8)
+        Coefficients of the powers 1 to 8 of the time from the end.
+    """
+
+    nodes: Array
+    between: Array
+    velocities: Array
+    positions: Array
+    values_between: Array
+    velocities_between: Array
+    positions_between: Array
+    velocities_parts: Array
+    positions_parts: Array
+    spectrum: Array
+    end: Array
+
+
+@cache
+def tables() -> Tables:
+    """The coefficients, right to rounding."""
+    x = _nodes()
+    between: Extended = (x[1:] + x[:-1]) / np.longdouble(2)
+    values = _legendre(x)
+    weights = 2 / (N * (N - 1) * values[N - 1] ** 2)
+    norms = np.array([np.longdouble(2) / (2 * k + 1) for k in range(N)])
+    norms[N - 1] = np.longdouble(2) / (N - 1)  # what the quadrature gives of the square of the last one
+    coefficients = values[:N] * weights / norms[:, None]  # (k, node): Legendre coefficients of the Lagrange polynomials
+    powers = [[comb(n, k) * comb(n + k, k) for n in range(N)] for k in range(1, N)]
+    made = (
+        *((each + 1) / 2 for each in (x[1:], between)),
+        *_integrals(coefficients, x[1:])[1:],
+        *_integrals(coefficients, between),
+        *_integrals(coefficients, QUARTERS)[1:],
+        coefficients[1:].T,
+        coefficients.T @ np.array(powers, dtype=np.longdouble).T,
+    )
+    return Tables(*(each.astype(np.float64) for each in made))
+
+
+def _nodes() -> Extended:
+    """-1, the zeros of P_8', 1."""
+    inner = legendre.legroots(legendre.legder([0] * (N - 1) + [1])).astype(np.longdouble)
+    derivative = legendre.legder(np.array([0] * (N - 1) + [1], dtype=np.longdouble))
+    for _ in range(3):
+        inner = inner - legendre.legval(inner, derivative) / legendre.legval(inner, legendre.legder(derivative))
+    return np.concatenate([[np.longdouble(-1)], np.sort(inner), [np.longdouble(1)]])
+
+
+def _legendre(z: Extended) -> Extended:
+    """P_0 to P_10, a row each."""
+    return np.array([legendre.legval(z, np.array([0] * k + [1], dtype=np.longdouble)) for k in range(N + 2)])
+
+
+def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended, Extended]:
+    """Lagrange polynomials on [0, 1], and their single and double integrals from its beginning, a row a node."""
+    values = _legendre(z)
+    # the integral of P_k from -1 is (P_k+1 - P_k-1) / (2 k + 1)
+    once = np.array([values[1] + 1, *((values[k + 1] - values[k - 1]) / (2 * k + 1) for k in range(1, N + 1))])
+    twice = np.array([once[1] + once[0], *((once[k + 1] - once[k - 1]) / (2 * k + 1) for k in range(1, N))])
+    return coefficients.T @ values[:N], coefficients.T @ once[:N] / 2, coefficients.T @ twice / 4

@@ -1,0 +1,113 @@
+"""Lobatto16(): implicit Runge-Kutta steps by fixed-point iteration, all stages at once."""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from twoloop.generate.collocation_code import compiled_collocation, suits
+from twoloop.generate.lobatto_tables import tables
+from twoloop.generate.straight_code import OwnCode
+from twoloop.generate.time_dependence import may_be_narrow
+from twoloop.generate.traced_values import Check, unchecked
+from twoloop.kernels.data.collocation import LANES
+from twoloop.methods.dop853 import DOP853
+from twoloop.methods.plan import LARGEST_MOVE, Plan
+from twoloop.problem.system import ConstrainedSystem
+
+KAPPA = 0.02  # of the tolerance: what the iteration may leave; errors are then at most those of other methods of ours
+FEW, MOST, LOOSE = 4.0, 5.0, 3e-4  # sweeps that a step is to take, at tolerances from LOOSE on and below
+UNSEEN = float(np.diff([0.0, *tables().nodes]).max())  # of a step, between two nodes
+
+
+@dataclass(frozen=True)
+class Lobatto16:
+    """Collocation at nine Lobatto nodes, of order 16, whose stages are found by fixed-point iteration.
+
+    It is the outer loop of the paper's procedure with another tableau, and for all coordinates: no Jacobian, and a
+    prediction by the polynomial of the step before. The eight unknown stages are evaluated at once, one in each lane of
+    a vector, by code made for the mechanism; a step takes four to seven such sweeps. It is for smooth motion that is
+    not stiff. Accepted states are on the constraints.
+
+    Where the iteration converges too slowly for the accuracy asked for, as in stiff motion, and near singular
+    positions, "DOP853" goes on.
+
+    Raises
+    ------
+    ValueError
+        From `solve_dae`, if there can be no code for the system: its callbacks branch on t, q or v, or are too long.
+
+    Notes
+    -----
+    Nodes: Lobatto IIIA (Hairer and Wanner, Solving ODEs II (1996), IV.5). The method is symmetric. Fixed-point
+    iteration with all stages in the lanes of a vector, for ordinary differential equations at high precision: M.
+    Antonana, J. Makazaga and A. Murua, arXiv 2511.03655.
+
+    Examples
+    --------
+    >>> from twoloop import solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, method="Lobatto16")
+    >>> result.success
+    True
+    """
+
+    needs_code: ClassVar[bool] = True
+    name: ClassVar[str] = "Lobatto16"
+    code: OwnCode | None = None  # made for one system; solve_dae puts it in
+    narrow: bool = True  # whether forces may change much over a short way
+
+    def for_system(
+        self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked
+    ) -> "Lobatto16":
+        """The method with what is compiled for this system.
+
+        Raises
+        ------
+        ValueError
+            If there is no code for it.
+        """
+        if code is None or not suits(code.shared):
+            raise ValueError(
+                f"method='Lobatto16' needs code made for {system.name!r}, whose equations are too long. "
+                "Take method='auto'"
+            )
+        return replace(self, code=code, narrow=may_be_narrow(system, ran_on_symbols=True))
+
+    def takes_code(self, fixed: bool) -> bool:
+        """Whether its steps may be run with code made for the mechanism."""
+        return True
+
+    def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
+        """Make the method ready for a run of n_q coordinates."""
+        from twoloop.kernels.steps import lobatto_step as kernels
+
+        if self.code is None:
+            raise ValueError("Lobatto16() knows no system yet: take for_system(system, code), as solve_dae does")
+        made = compiled_collocation(self.code)
+        options = np.zeros(kernels.N_OPTIONS)
+        options[kernels.KAPPA], options[kernels.THETA] = KAPPA, LARGEST_MOVE
+        options[kernels.TARGET] = FEW if min(rtol, atol) >= LOOSE else MOST
+        options[kernels.N_ITERATED], options[kernels.N_ROWS] = len(made.code.iterated), made.code.n_rows
+        options[kernels.FREE] = 1.0 if self.narrow else 1.0 / UNSEEN
+        sizes = n_q, len(made.code.iterated), made.code.n_rows
+        plan = Plan(
+            kernels.LOBATTO if self.code.shared.projects else kernels.LOBATTO_SINGLY,
+            options,
+            np.zeros(kernels.memory_size(*sizes)),
+            exponent=1.0 / kernels.ORDER,
+            watchful=True,
+            projects=True,
+            looks_within=True,
+            unseen=UNSEEN,
+            parts=LANES,
+            own=(made.functions,),
+            own_numbers=made.numbers,
+        )
+        divided = options.copy()
+        divided[kernels.DIVIDED] = 1.0
+        plan = plan.changed(interior=plan.changed(options=divided, memory=plan.memory.copy()))
+        if fixed:
+            return plan
+        return plan.changed(substitute=DOP853().plan(n_q, rtol, atol, False))
