@@ -142,8 +142,8 @@ def _collocate(f, w, options, room, tolerances, t, h, state):
     most = min(most, longest / h)
     left = math.log2(rho * change / options[KAPPA] + 1e-30) + (target - m) * math.log2(rho)
     factor = 2.0 ** (-(left + 1.0) / (target + 2.0))
-    # the motion hardly bends within the step, which nonetheless takes all its sweeps
-    limited = room[room_at.CURVED] < STRAIGHT and m >= target
+    # the motion hardly bends within the step, which nonetheless takes about all its sweeps
+    limited = room[room_at.CURVED] < STRAIGHT and m >= target - 1.0
     room[room_at.LIMITED] = max(0.0, room[room_at.LIMITED] + (1.0 if limited else -1.0))
     if error > 1e-6:
         factor = min(factor, SAFETY * error ** (-1.0 / ORDER))
