@@ -92,20 +92,23 @@ class CollocationCode:
     def begin(self, emit: LaneEmitter, room: Value, state: Value, tolerances: Value) -> None:
         """Weights of errors, accelerations as predicted, positions and velocities at the nodes by these.
 
-        Where no error is estimated, errors are relative, of values below 1 absolute.
+        Errors are relative to what positions and velocities are at the beginning, or what half a step adds if that is
+        more. Where no error is estimated, they are relative, of values below 1 absolute.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
         fixed = builder.compare("fcmp oeq", one.load(tolerances, ESTIMATE), llvm_code.ZERO)
         h, rtol = one.load(room, at.H), builder.select(fixed, llvm_code.ONE, one.load(tolerances, RTOL))
+        half = one.multiply(h, constant(DOUBLE, 0.5))
         with one.loop(integer(0), integer(n), [llvm_code.ZERO]) as (i, (most,), new):
-            q, v = (one.function("fabs", one.load(one.pointer(state, i), place)) for place in (0, n))
+            q, v, a = (one.function("fabs", one.load(one.pointer(state, i), m * n)) for m in range(3))
+            q, v = (_larger(one, each, one.multiply(half, slope)) for each, slope in ((q, v), (v, a)))
             atol = builder.select(fixed, llvm_code.ONE, one.load(one.pointer(tolerances, i), ATOL))
             of_v, of_q = (one.add(atol, one.multiply(rtol, each)) for each in (v, q))
             of_q = one.divide(of_q, h)
             least = builder.select(builder.compare("fcmp olt", of_v, of_q), of_v, of_q)
-            weight = one.divide(llvm_code.ONE, least)
+            weight = one.divide(llvm_code.ONE, _larger(one, least, constant(DOUBLE, SMALLEST)))
             one.store(weight, one.pointer(room, i), at.WEIGHTS)
-            new.append(builder.select(builder.compare("fcmp ogt", weight, most), weight, most))
+            new.append(_larger(one, weight, most))
         (of_all,) = new
         x = one.divide(h, one.load(room, at.H_BEFORE))
         powers = [x]
@@ -118,10 +121,12 @@ class CollocationCode:
         kept = builder.select(builder.compare("fcmp olt", known, degree), powers_vector, emit.constant(0.0))
         old = self._polynomial(emit, room, other=False)
         nodes = np.array(tables().nodes)
-        with _over(emit, self.iterated, [llvm_code.ZERO]) as (k, i, (most,), new):
+        with _over(emit, self.iterated, [llvm_code.ZERO] * 2) as (k, i, (most, largest), new):
             weight = one.load(one.pointer(room, i), at.WEIGHTS)
-            new.append(builder.select(builder.compare("fcmp ogt", weight, most), weight, most))
-            a0 = emit.splat(one.load(one.pointer(state, i), 2 * n))
+            v, a = (one.load(one.pointer(state, i), m * n) for m in (1, 2))
+            size = one.add(one.function("fabs", v), one.multiply(h, one.function("fabs", a)))
+            new += [_larger(one, weight, most), _larger(one, one.multiply(weight, size), largest)]
+            a0 = emit.splat(a)
             scaled = emit.multiply(_get(emit, one.pointer(old, _lanes(emit, k))), kept)
             total = a0
             for degree_, each in enumerate(_splats(emit, scaled)):
@@ -129,6 +134,7 @@ class CollocationCode:
             _put(emit, total, one.pointer(room, _lanes(emit, i)), self.a)
         if self.iterated:
             one.store(one.divide(of_all, new[0]), room, at.STRICTER)
+            one.store(new[1], room, at.SIZE)
         self._integrate(emit, room, state)
 
     def sweep(self, emit: LaneEmitter, room: Value, state: Value, numbers: Value) -> Value:
@@ -157,24 +163,22 @@ class CollocationCode:
         are smaller by decades, which costs few steps, as the estimate is of order 12.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
-
-        def larger(a: Value, b: Value) -> Value:
-            return builder.select(builder.compare("fcmp ogt", a, b), a, b)
-
         with one.loop(integer(0), integer(n), [llvm_code.ZERO] * 3) as (i, (error, curved, largest), new):
             a0 = one.load(one.pointer(state, i), 2 * n)
             values = emit.function("fabs", self._combined(emit, tables().spectrum, a0, room, i))
-            before, top = (larger(*(builder.extract(values, k + m) for m in range(2))) for k in (4, 6))
-            first = larger(*(builder.extract(values, k) for k in (2, 3)))
-            falls = one.divide(top, larger(larger(before, top), constant(DOUBLE, SMALLEST)))
-            far = one.divide(top, larger(larger(first, larger(before, top)), constant(DOUBLE, SMALLEST)))
-            falls = larger(one.multiply(falls, one.function("sqrt", falls)), far)
+            before, top = (_larger(one, *(builder.extract(values, k + m) for m in range(2))) for k in (4, 6))
+            first = _larger(one, *(builder.extract(values, k) for k in (2, 3)))
+            falls = one.divide(top, _larger(one, _larger(one, before, top), constant(DOUBLE, SMALLEST)))
+            far = one.divide(
+                top, _larger(one, _larger(one, first, _larger(one, before, top)), constant(DOUBLE, SMALLEST))
+            )
+            falls = _larger(one, one.multiply(falls, one.function("sqrt", falls)), far)
             weight = one.load(one.pointer(room, i), at.WEIGHTS)
-            new.append(larger(one.multiply(one.multiply(top, weight), falls), error))
-            new.append(larger(one.multiply(before, weight), curved))
+            new.append(_larger(one, one.multiply(one.multiply(top, weight), falls), error))
+            new.append(_larger(one, one.multiply(before, weight), curved))
             middle = one.load(one.pointer(room, _lanes(emit, i)), self.a + LANES // 2 - 1)
             for each in (a0, middle):
-                largest = larger(one.multiply(one.function("fabs", each), weight), largest)
+                largest = _larger(one, one.multiply(one.function("fabs", each), weight), largest)
             new.append(largest)
         h = one.load(room, at.H)
         for value, place in zip(new, (at.ERROR, at.CURVED, at.LARGEST), strict=True):
@@ -243,10 +247,10 @@ class CollocationCode:
                 one.store(builder.extract(a, last), here, 2 * n)
 
     def divide(self, emit: LaneEmitter, room: Value, state: Value) -> None:
-        """Positions and velocities at the ends of four equal parts of the step, where those of steps are else."""
+        """Positions and velocities half-way and at the end of the step, where those of steps are else."""
         one, n = Emitter(emit.builder), self.n
         h = emit.splat(one.load(room, at.H))
-        length = emit.multiply(h, constants(np.minimum(np.arange(1, LANES + 1) / 4.0, 1.0)))
+        length = emit.multiply(h, constants([0.5] + [1.0] * (LANES - 1)))
         with _over(emit, range(n)) as (_, i, _, _):
             begin, place = one.pointer(state, i), one.pointer(room, _lanes(emit, i))
             q0, v0, a0 = (one.load(begin, m * n) for m in range(3))
@@ -324,6 +328,11 @@ class CollocationCode:
         size = LANES * len(self.iterated)
         place = builder.select(second, integer(self.polynomials + size), integer(self.polynomials))
         return one.pointer(room, place)
+
+
+def _larger(one: Emitter, a: Value, b: Value) -> Value:
+    """The larger of two numbers."""
+    return one.builder.select(one.builder.compare("fcmp ogt", a, b), a, b)
 
 
 def _lanes(emit: LaneEmitter, k: Value) -> Value:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Extended = NDArray[np.longdouble]
 N = 9
-QUARTERS: Extended = np.array([-0.5, 0.0, 0.5, 1.0, 1.0, 1.0, 1.0, 1.0], dtype=np.longdouble)
+HALVES: Extended = np.array([0.0] + [1.0] * 7, dtype=np.longdouble)
 
 
 class Tables(NamedTuple):
@@ -30,7 +30,7 @@ class Tables(NamedTuple):
     values_between, velocities_between, positions_between : (9, 8)
         The polynomial and these integrals at the places between nodes.
     velocities_parts, positions_parts : (9, 8)
-        Integrals to the ends of four equal parts, and to the end.
+        Integrals to the middle, and to the end.
     spectrum : (9, 8)
         Coefficients of the Legendre polynomials 1 to 8 on [0, 1], which are 1 at its end.
     end : (9, 8)
@@ -65,7 +65,7 @@ def tables() -> Tables:
         *((each + 1) / 2 for each in (x[1:], between)),
         *_integrals(coefficients, x[1:])[1:],
         *_integrals(coefficients, between),
-        *_integrals(coefficients, QUARTERS)[1:],
+        *_integrals(coefficients, HALVES)[1:],
         coefficients[1:].T,
         coefficients.T @ np.array(powers, dtype=np.longdouble).T,
     )

@@ -28,7 +28,7 @@ from twoloop.kernels.data.counters import (
     N_REJECTED_ERROR,
 )
 from twoloop.kernels.data.noted import BY_GENERAL, DEFECT, NEARLY_SINGULAR, ORIENTATION_NEW, ROUNDED
-from twoloop.kernels.data.tolerances import ESTIMATE, LEAST, LOOK, ROUNDING, allowed
+from twoloop.kernels.data.tolerances import ESTIMATE, LOOK, ROUNDING, allowed
 from twoloop.kernels.evaluation.calls import check_redundant, project
 from twoloop.kernels.evaluation.gamma import representable
 from twoloop.kernels.evaluation.onto_constraints import ABOVE_ROUNDING
@@ -43,7 +43,7 @@ LEAST_RHO, MOST_RHO = 1e-3, 0.9
 SLOW_START, FAST_START, WANTED_START = 0.3, 0.04, 0.12  # contraction of the first step: between the first two is well
 MOST_STARTS = 4
 STAGNANT, NOISE = 0.5, 1e-13  # changes that fall no further, and are this small relative to the values, are rounding
-ROUNDING_OF_FIXED, NOISE_OF_FIXED, MOST_OF_FIXED = 1e-16, 1e-9, 60.0  # of steps without an estimate of their error
+ROUNDING_OF_FIXED, MOST_OF_FIXED = 1e-16, 60.0  # of steps without an estimate of their error
 ORDER, SHARE = 12.0, 0.5  # of the estimate of the error; and what it counts
 SHORTER, SAFETY = 0.6, 0.65
 UNFORESEEN = 10.0  # an error that is so large is looked at elsewhere
@@ -51,7 +51,7 @@ LIMITED, STRAIGHT = 24.0, 0.05  # such steps, after which another method goes on
 REFUSALS = 12.0  # of REFUSED, which each accepted step lessens by 1 and each other one raises by 2
 BETWEEN = 0.0908  # of a step, the longest part that an audit leaves unseen: half that between two nodes
 ALLOWED = 16.0  # the defect between nodes, over the tolerances: most of it does not last to the end
-HALF = 4  # parts of half a step
+PARTS = 2  # of a quarter of a step
 EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
 MADE, REFUSED, GUESSED, LEFT = range(4)
 _places = merged(places)
@@ -72,15 +72,16 @@ def _room(memory):
 def _sweeps(f, w, options, room, tolerances, state, first):
     """Iterate the stages: how that ended, after how many sweeps, the last change, and how many there should be."""
     estimated = tolerances[ESTIMATE] == 1.0
-    target, kappa, noise, most = options[TARGET], options[KAPPA], NOISE_OF_FIXED, MOST_OF_FIXED
+    target, kappa, most = options[TARGET], options[KAPPA], MOST_OF_FIXED
     if room[room_at.DEGREE] >= 7.0:
         target += 2.0
     elif room[room_at.DEGREE] >= 6.0:
         target += 1.0
     if estimated:
-        noise, most = min(kappa, NOISE / tolerances[LEAST]), target + MORE
+        most = target + MORE
     else:
         kappa = ROUNDING_OF_FIXED
+    noise = NOISE * room[room_at.SIZE] * room[room_at.STRICTER]
     rho, before, m = room[room_at.RHO], math.inf, 0.0
     while True:
         change = room[room_at.STRICTER] * f.sweep_nodes(room, state, f.own_numbers)
@@ -195,17 +196,17 @@ def settle_lobatto(f, w, options, memory, tolerances, accepted):
 
 @merged
 def _next_part(f, w, options, room, tolerances, t, h, state, new_state):
-    """The end of the next of eight equal parts of a step, which is made again in halves.
+    """The end of the next of eight equal parts of a step, which is made again in quarters.
 
     Between its ends the polynomial of a step is less accurate than there.
     """
     n, k = w.Q.size, int(room[room_at.PARTS])
     if k == 0:
-        ended, _, _ = _collocate(f, w, options, room, tolerances, t, HALF * h, state)
+        ended, _, _ = _collocate(f, w, options, room, tolerances, t, PARTS * h, state)
         if ended != MADE:
             return Attempt(OUTER_DIVERGED, math.inf, 0.0)
         f.divide_nodes(room, state)
-    room[room_at.PARTS] = (k + 1.0) % HALF
+    room[room_at.PARTS] = (k + 1.0) % PARTS
     ends = _places(n, int(options[N_ITERATED]), int(options[N_ROWS]))[4] + LANES + k
     for i in range(2 * n):
         new_state[i] = room[ends + LANES * i]
