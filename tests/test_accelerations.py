@@ -26,8 +26,17 @@ from twoloop.kernels.lanes.lane_room import LANES
 
 pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 
-READY = ["four_bar", "andrews", "spatial_slider_crank", "redundant_slider_crank", "sundials_slider_crank"]
-READY += ["driven_slider_crank", "driven_crank", "n_four_bar", "spatial_four_bar", "bricard", "governor", "heavy_top"]
+READY = ["four_bar", "andrews", "spatial_slider_crank", "redundant_slider_crank"]
+READY += [
+    "sundials_slider_crank",
+    "driven_slider_crank",
+    "driven_crank",
+    "n_four_bar",
+    "spatial_four_bar",
+    "bricard",
+    "governor",
+    "heavy_top",
+]
 READY += ["closed_chain", "double_pendulum", "pendulum", "knife_edge", "rolling_disc"]
 KIND = BIT, ["double", *["double*"] * 4]
 

@@ -77,7 +77,7 @@ class DependentCoordinates:
 
     def _eliminate(self, places: tuple[int, ...], columns: tuple[int, ...]) -> None:
         """Solve rows for columns, and take these out of the other rows that are left."""
-        self._bound()
+        self.check()
         block = [[self._rows[i].get(j, self._zero) for j in columns] for i in places]
         pivot, inverse = self._inverse(block)
         around = sorted({j for i in places for j in self._rows[i]} - set(columns))
@@ -100,8 +100,9 @@ class DependentCoordinates:
         if pivot.terms:
             self._add_conditions(block, columns, pivot, solved)
 
-    def _bound(self) -> None:
-        if len(self._graph.operations) > self._most:
+    def check(self, more: int = 0) -> None:
+        """Raise `NotReduced` where it has become too long, or would with more operations."""
+        if len(self._graph.operations) + more > self._most:
             raise NotReduced
 
     def _inverse(self, block: list[list[Form]]) -> tuple[Form, list[list[Form]]]:
@@ -144,7 +145,7 @@ class DependentCoordinates:
 
     def _substitute(self, j: int, row: Terms) -> None:
         """Express a dependent coordinate by independent ones, and by later ones, which are expressed already."""
-        self._bound()
+        self.check()
         right, entries = row.get(self._n, self._zero), dict[int, Form]()
         for k, entry in row.items():
             if k < self._n:
@@ -163,6 +164,7 @@ def reduced_accelerations(
     rows = [[(mass[i, j], j) for j in range(n) if not _is_zero(mass[i, j])] for i in range(n)]
     forces = [(force[i] - _dot(zero, ((x, g[j]) for x, j in rows[i]))).value() for i in range(n)]
     matrix: dict[tuple[int, int], Form] = {}
+    coordinates.check(sum(len(row) ** 2 // 2 for row in T))  # of T^T M T, if M is diagonal
     for a, x in enumerate(independent):
         moved = [_dot(zero, ((entry, T[j][x]) for entry, j in row if x in T[j])).value() for row in rows]  # M T
         for b, y in enumerate(independent[: a + 1]):

@@ -31,8 +31,9 @@ from twoloop.kernels.evaluation.operations import PRODUCT, RECIPROCAL
 from twoloop.problem.system import ConstrainedSystem
 
 MOST_ELIMINATED = 60_000  # operations with their elimination: those of more than 40 bodies on hinges in space
-# operations of `quick` over those of `there`, from which on it does not pay: now and then both are needed
-WORTH = 0.9
+# cost of `quick` over that of `there`, from which on it does not pay: where pivots are small both are needed, code of
+# both takes longer to build, and with 0.68 (four-bar) a run gains 5 %
+WORTH = 0.75
 COSTS = {PRODUCT: 1, RECIPROCAL: 4}  # in multiplications; sums are counted by their terms, and functions are the same
 
 
@@ -194,18 +195,19 @@ class StraightLine:
     @cached_property
     def quick(self) -> Outputs | None:
         """See the class."""
-        blocks, before, there = self.choice.blocks, len(self.graph.operations), self.there.cost(self.graph)
+        blocks = self.choice.blocks
         if not blocks:
             return None
+        most, before = int(WORTH * self.there.cost(self.graph)), len(self.graph.operations)
         force, gamma = self._given(self.v)
         try:
-            of = DependentCoordinates(self.rows.tolist(), [gamma[k] for k in self.choice.rows], blocks, there)
+            of = DependentCoordinates(self.rows.tolist(), [gamma[k] for k in self.choice.rows], blocks, most)
             a, conditions = reduced_accelerations(self.mass, force, of)
             quick = Outputs({"a": a}, [*of.conditions, *conditions])
         except NotReduced:
             quick = None
         self._beside += len(self.graph.operations) - before
-        return quick if quick is not None and quick.cost(self.graph) < WORTH * there else None
+        return quick if quick is not None and quick.cost(self.graph) < most else None
 
     @property
     def accelerations(self) -> list[Outputs]:
