@@ -31,7 +31,7 @@ def test_the_coefficients_are_exact_for_polynomials(degree):
     nodes = np.concatenate([[0.0], TABLES.nodes])
     values = nodes**degree
     once, twice = degree + 1, (degree + 1) * (degree + 2)
-    places = {"": TABLES.nodes, "_between": TABLES.between, "_parts": np.array([0.5] + [1.0] * 7)}
+    places = {"": TABLES.nodes, "_between": TABLES.between}
     for name, x in places.items():
         np.testing.assert_allclose(
             values @ getattr(TABLES, f"velocities{name}"), x ** (degree + 1) / once, rtol=0, atol=1e-14

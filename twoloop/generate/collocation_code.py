@@ -246,21 +246,6 @@ class CollocationCode:
                 one.store(one.add(v, one.multiply(h, sums[0])), here, n)
                 one.store(builder.extract(a, last), here, 2 * n)
 
-    def divide(self, emit: LaneEmitter, room: Value, state: Value) -> None:
-        """Positions and velocities half-way and at the end of the step, where those of steps are else."""
-        one, n = Emitter(emit.builder), self.n
-        h = emit.splat(one.load(room, at.H))
-        length = emit.multiply(h, constants([0.5] + [1.0] * (LANES - 1)))
-        with _over(emit, range(n)) as (_, i, _, _):
-            begin, place = one.pointer(state, i), one.pointer(room, _lanes(emit, i))
-            q0, v0, a0 = (one.load(begin, m * n) for m in range(3))
-            of_v = self._combined(emit, tables().velocities_parts, a0, room, i)
-            of_q = self._combined(emit, tables().positions_parts, a0, room, i)
-            v = emit.fused(h, of_v, emit.splat(v0))
-            q = emit.fused(emit.multiply(h, h), of_q, emit.fused(length, emit.splat(v0), emit.splat(q0)))
-            _put(emit, q, place, self.ends + LANES)
-            _put(emit, v, place, self.ends + LANES * (1 + n))
-
     def closer(self, emit: LaneEmitter, room: Value, numbers: Value) -> None:
         """Positions at the ends of eight steps, moved towards the constraints; FINE and MOVED."""
         self._project(emit, room, numbers, self.equations.closer)
@@ -391,7 +376,7 @@ def _compiled(own: SharedCode) -> Collocation:
         "judge_nodes": code.judge,
         "end_nodes": code.end,
     }
-    parts |= {"audit_nodes": code.audit, "divide_nodes": code.divide}
+    parts["audit_nodes"] = code.audit
     if own.projects:
         parts |= {"closer_ends": code.closer, "nearer_ends": code.nearer}
     long = own.parts is not None

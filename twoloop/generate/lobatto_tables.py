@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Extended = NDArray[np.longdouble]
 N = 9
-HALVES: Extended = np.array([0.0] + [1.0] * 7, dtype=np.longdouble)
 
 
 class Tables(NamedTuple):
@@ -29,8 +28,6 @@ class Tables(NamedTuple):
         Single and double integrals from 0 to each node.
     values_between, velocities_between, positions_between : (9, 8)
         The polynomial and these integrals at the places between nodes.
-    velocities_parts, positions_parts : (9, 8)
-        Integrals to the middle, and to the end.
     spectrum : (9, 8)
         Coefficients of the Legendre polynomials 1 to 8 on [0, 1], which are 1 at its end.
     end : (9, 8)
@@ -44,8 +41,6 @@ class Tables(NamedTuple):
     values_between: Array
     velocities_between: Array
     positions_between: Array
-    velocities_parts: Array
-    positions_parts: Array
     spectrum: Array
     end: Array
 
@@ -65,7 +60,6 @@ def tables() -> Tables:
         *((each + 1) / 2 for each in (x[1:], between)),
         *_integrals(coefficients, x[1:])[1:],
         *_integrals(coefficients, between),
-        *_integrals(coefficients, HALVES)[1:],
         coefficients[1:].T,
         coefficients.T @ np.array(powers, dtype=np.longdouble).T,
     )

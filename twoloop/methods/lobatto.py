@@ -10,13 +10,13 @@ from twoloop.generate.lobatto_tables import tables
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.time_dependence import may_be_narrow
 from twoloop.generate.traced_values import Check, unchecked
-from twoloop.kernels.data.collocation import LANES
 from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import LARGEST_MOVE, Plan
 from twoloop.problem.system import ConstrainedSystem
 
 KAPPA = 0.02  # of the tolerance: what the iteration may leave; errors are then at most those of other methods of ours
 FEW, MOST, LOOSE = 4.0, 5.0, 3e-4  # sweeps that a step is to take, at tolerances from LOOSE on and below
+PARTS = 4  # of a step, made again for the solution between its ends
 UNSEEN = float(np.diff([0.0, *tables().nodes]).max())  # of a step, between two nodes
 
 
@@ -101,13 +101,11 @@ class Lobatto16:
             projects=True,
             looks_within=True,
             unseen=UNSEEN,
-            parts=LANES,
+            parts=PARTS,
             own=(made.functions,),
             own_numbers=made.numbers,
         )
-        divided = options.copy()
-        divided[kernels.DIVIDED] = 1.0
-        plan = plan.changed(interior=plan.changed(options=divided, memory=plan.memory.copy()))
+        plan = plan.changed(interior=plan.changed(memory=plan.memory.copy()))
         if fixed:
             return plan
         return plan.changed(substitute=DOP853().plan(n_q, rtol, atol, False))

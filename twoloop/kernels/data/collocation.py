@@ -22,12 +22,11 @@ LANES = 8
     REFUSED,
     LARGEST,  # acceleration at the beginning, over the tolerances
     DEFECT,  # between nodes, over what is allowed; -1: it was not looked for
-    PARTS,  # of a divided step that have been asked for
     ERROR,  # of the step, over the tolerances
     CURVED,  # the coefficients of degree 5 and 6 of its accelerations, over the tolerances
     SIZE,  # of velocities and their changes, over the tolerances
     STRICTER,  # how many times less of the coordinates that are iterated the tolerances of others allow
-) = range(20)
+) = range(19)
 POWERS = 24  # lanes: of the length of the step over that before
 WORST = 32  # lanes: the error of predictions of degree 1 to 8 at the end of the step
 MOVED = 40  # lanes: how far positions were moved last, the largest coordinate

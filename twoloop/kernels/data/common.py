@@ -209,7 +209,6 @@ OWN_FUNCTIONS = {
     "sweep_nodes": f8(*[VECTOR] * 3),
     "audit_nodes": f8(*[VECTOR] * 3),
     "judge_nodes": types.none(*[VECTOR] * 2),
-    "divide_nodes": types.none(*[VECTOR] * 2),
     "end_nodes": types.none(*[VECTOR] * 3),
     "closer_ends": types.none(*[VECTOR] * 2),
     "nearer_ends": types.none(*[VECTOR] * 2),

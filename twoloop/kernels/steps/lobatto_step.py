@@ -33,9 +33,8 @@ from twoloop.kernels.evaluation.calls import check_redundant, project
 from twoloop.kernels.evaluation.gamma import representable
 from twoloop.kernels.evaluation.onto_constraints import ABOVE_ROUNDING
 
-# DIVIDED: 1 where attempts are the parts of one step, for the solution between its ends;
 # FREE: how many times LOOK a step may be long that nothing is looked at within, beside the nodes
-KAPPA, TARGET, THETA, N_ITERATED, N_ROWS, FREE, DIVIDED, N_OPTIONS = range(8)
+KAPPA, TARGET, THETA, N_ITERATED, N_ROWS, FREE, N_OPTIONS = range(7)
 
 MORE = 7  # sweeps beyond the target, after which a step is refused
 SLOW = 0.8  # contraction that is too slow
@@ -51,7 +50,6 @@ LIMITED, STRAIGHT = 24.0, 0.05  # such steps, after which another method goes on
 REFUSALS = 12.0  # of REFUSED, which each accepted step lessens by 1 and each other one raises by 2
 BETWEEN = 0.0908  # of a step, the longest part that an audit leaves unseen: half that between two nodes
 ALLOWED = 16.0  # the defect between nodes, over the tolerances: most of it does not last to the end
-PARTS = 2  # of a quarter of a step
 EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
 MADE, REFUSED, GUESSED, LEFT = range(4)
 _places = merged(places)
@@ -146,7 +144,7 @@ def _collocate(f, w, options, room, tolerances, t, h, state):
     # the motion hardly bends within the step, which nonetheless takes about all its sweeps
     limited = room[room_at.CURVED] < STRAIGHT and m >= target - 1.0
     room[room_at.LIMITED] = max(0.0, room[room_at.LIMITED] + (1.0 if limited else -1.0))
-    if error > 1e-6:
+    if error > 1e-6 and room[room_at.CURVED] >= STRAIGHT:
         factor = min(factor, SAFETY * error ** (-1.0 / ORDER))
     if m > target + 1.0:
         most = min(most, 0.9)
@@ -194,33 +192,11 @@ def settle_lobatto(f, w, options, memory, tolerances, accepted):
     room[room_at.TRIED] = 0.0
 
 
-@merged
-def _next_part(f, w, options, room, tolerances, t, h, state, new_state):
-    """The end of the next of eight equal parts of a step, which is made again in quarters.
-
-    Between its ends the polynomial of a step is less accurate than there.
-    """
-    n, k = w.Q.size, int(room[room_at.PARTS])
-    if k == 0:
-        ended, _, _ = _collocate(f, w, options, room, tolerances, t, PARTS * h, state)
-        if ended != MADE:
-            return Attempt(OUTER_DIVERGED, math.inf, 0.0)
-        f.divide_nodes(room, state)
-    room[room_at.PARTS] = (k + 1.0) % PARTS
-    ends = _places(n, int(options[N_ITERATED]), int(options[N_ROWS]))[4] + LANES + k
-    for i in range(2 * n):
-        new_state[i] = room[ends + LANES * i]
-    q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    return Attempt(project(f, w, t + h, q1, v1, options[THETA], a1, lam1), 0.0, 0.0)
-
-
 @kernel(ATTEMPT)
 def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt."""
     room, n = _room(memory), w.Q.size
     room[room_at.TRIED] = 0.0
-    if options[DIVIDED] == 1.0:
-        return _next_part(f, w, options, room, tolerances, t, h, state, new_state)
     if tolerances[ESTIMATE] == 1.0 and _is_unsuited(w, room):
         return Attempt(UNSUITED, math.inf, 0.0)
     ended, error, factor = _collocate(f, w, options, room, tolerances, t, h, state)
