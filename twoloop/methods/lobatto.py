@@ -14,8 +14,8 @@ from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import LARGEST_MOVE, Plan
 from twoloop.problem.system import ConstrainedSystem
 
-KAPPA = 0.02  # of the tolerance: what the iteration may leave; errors are then at most those of other methods of ours
-FEW, MOST, LOOSE = 4.0, 5.0, 3e-4  # sweeps that a step is to take, at tolerances from LOOSE on and below
+KAPPA = 0.05  # of the tolerance: what the iteration may leave; errors are then at most those of other methods of ours
+TARGET = 6.0  # sweeps that a step is to take
 PARTS = 4  # of a step, made again for the solution between its ends
 UNSEEN = float(np.diff([0.0, *tables().nodes]).max())  # of a step, between two nodes
 
@@ -26,7 +26,7 @@ class Lobatto16:
 
     It is the outer loop of the paper's procedure with another tableau, and for all coordinates: no Jacobian, and a
     prediction by the polynomial of the step before. The eight unknown stages are evaluated at once, one in each lane of
-    a vector, by code made for the mechanism; a step takes four to seven such sweeps. It is for smooth motion that is
+    a vector, by code made for the mechanism; a step takes four to eight such sweeps. It is for smooth motion that is
     not stiff. Accepted states are on the constraints.
 
     Where the iteration converges too slowly for the accuracy asked for, as in stiff motion, and near singular
@@ -87,8 +87,7 @@ class Lobatto16:
             raise ValueError("Lobatto16() knows no system yet: take for_system(system, code), as solve_dae does")
         made = compiled_collocation(self.code)
         options = np.zeros(kernels.N_OPTIONS)
-        options[kernels.KAPPA], options[kernels.THETA] = KAPPA, LARGEST_MOVE
-        options[kernels.TARGET] = FEW if min(rtol, atol) >= LOOSE else MOST
+        options[kernels.KAPPA], options[kernels.TARGET], options[kernels.THETA] = KAPPA, TARGET, LARGEST_MOVE
         options[kernels.N_ITERATED], options[kernels.N_ROWS] = len(made.code.iterated), made.code.n_rows
         options[kernels.FREE] = 1.0 if self.narrow else 1.0 / UNSEEN
         sizes = n_q, len(made.code.iterated), made.code.n_rows
