@@ -16,7 +16,7 @@ from twoloop.problem.system import ConstrainedSystem
 
 KAPPA = 0.05  # of the tolerance: what the iteration may leave; errors are then at most those of other methods of ours
 TARGET = 6.0  # sweeps that a step is to take
-PARTS = 4  # of a step, made again for the solution between its ends
+PARTS = 6  # of a step, made again for the solution between its ends
 UNSEEN = float(np.diff([0.0, *tables().nodes]).max())  # of a step, between two nodes
 
 
@@ -101,6 +101,7 @@ class Lobatto16:
             looks_within=True,
             unseen=UNSEEN,
             parts=PARTS,
+            apart=True,
             own=(made.functions,),
             own_numbers=made.numbers,
         )

@@ -2,7 +2,7 @@
 
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Check
-from twoloop.kernels.data.intervals import ACCELERATIONS, VELOCITIES
+from twoloop.kernels.data.intervals import ACCELERATIONS, APART, VELOCITIES
 from twoloop.methods.plan import Method, Plan
 from twoloop.methods.presets import identity
 from twoloop.problem.system import ConstrainedSystem
@@ -46,7 +46,9 @@ def _made(
     plan = method.plan(system.n_q, rtol, atol, fixed)
     interiors = {} if plan.within_newton is None else {VELOCITIES: plan.within_newton}
     if plan.parts > 1:
-        interiors[ACCELERATIONS] = method.plan(system.n_q, rtol, atol, True) if plan.interior is None else plan.interior
+        interiors[APART if plan.apart else ACCELERATIONS] = (
+            method.plan(system.n_q, rtol, atol, True) if plan.interior is None else plan.interior
+        )
     if code is None:
         return plan, interiors
     return _with_code(plan, code).changed(traced=(*plan.traced, code.traced)), interiors
