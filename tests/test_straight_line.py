@@ -1,7 +1,6 @@
 """Code made for the equations of one mechanism: against the general inner loop, dense linear algebra and references."""
 
 import ctypes
-import gc
 import math
 from dataclasses import replace
 
@@ -20,7 +19,7 @@ from twoloop.generate.straight_code import own_code, write_function
 from twoloop.generate.straight_line import Outputs
 from twoloop.generate.symbolic_factors import Factors
 from twoloop.generate.tracing import Graph
-from twoloop.kernels.compile.own_functions import CALLED, OwnFunctions, object_code
+from twoloop.kernels.compile.own_functions import OwnFunctions, object_code
 from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.noted import BY_GENERAL
 from twoloop.kernels.evaluation import tasks
@@ -258,22 +257,3 @@ def test_beyond_the_angles_that_it_takes_and_where_nothing_is_finite_it_says_so(
         holds, (filled,) = compute(graph, outputs, (np.array(each),))
         assert not holds
         assert np.isnan(filled).all()  # nothing was written
-
-
-@pytest.mark.usefixtures("collected_alone")
-def test_functions_that_others_call_are_those_they_were_linked_with_and_stay_in_memory():
-    def constant(value):
-        return OwnFunctions(["number"], object_code(f"define i64 @number() {{ ret i64 {value} }}"))
-
-    text = f"""
-        declare i64 @{CALLED}number()
-        define i64 @twice() {{
-            %x = call i64 @{CALLED}number()
-            %y = add i64 %x, %x
-            ret i64 %y
-        }}
-    """
-    made = [OwnFunctions(["twice"], object_code(text), constant(value)) for value in (3, 4)]
-    gc.collect()
-    twice = [ctypes.CFUNCTYPE(ctypes.c_int64)(each.addresses["twice"]) for each in made]
-    assert [each() for each in twice] == [6, 8]

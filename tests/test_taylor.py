@@ -1,17 +1,14 @@
 """The Taylor series of the motion: every operation that it knows, every kind of mechanism, and what it refuses."""
 
 import math
-from collections import defaultdict
 
 import numpy as np
 import pytest
 
 from tests.large_systems import spatial_chain
-from tests.problems import quick, unconstrained, worst
+from tests.problems import quick, unconstrained
 from twoloop import Taylor, mechanisms, solve_dae
 from twoloop.bodies import PlanarModel
-from twoloop.generate import compiled_series, families
-from twoloop.generate.straight_code import own_code
 
 FORCES = {
     "sine and cosine": lambda t, q, v: math.sin(q) * math.cos(2.0 * q),
@@ -81,31 +78,13 @@ def test_a_sum_of_parameters_that_is_zero_in_one_system_alone_is_divided_by_in_n
     assert all(run.success for run in runs) and np.abs(runs[0].q[:, -1] - runs[1].q[:, -1]).max() < 1e-7
 
 
-def test_compiled_operations_give_the_same_run():
-    laws = tuple(FORCES.values())
-    system = one_coordinate(lambda t, q, v: sum(law(t, q, v) for law in laws) / 6.0)
-    start = (system, (0.0, 2.0), [0.4], [0.7])
-    runs = [solve_dae(*start, Taylor(17), 1e-10, 1e-10, compiled=compiled) for compiled in (False, True)]
-    assert abs(runs[1].q[0, -1] - runs[0].q[0, -1]) < 1e-12
-
-
-def test_compiled_code_is_read_from_the_disk(monkeypatch):
-    problem = mechanisms.four_bar()
-    code = own_code(problem.system, 0.0, problem.q0)
-    compiled_series.compiled_series(code)  # now it is there
-    monkeypatch.setattr("twoloop.kernels.compile.own_functions._MADE", defaultdict(dict))
-    code.shared.family._made.clear()
-    monkeypatch.setattr("twoloop.kernels.compile.own_functions.object_code", None)
-    assert "find_order" in compiled_series.compiled_series(code).functions.addresses
-
-
-@pytest.mark.parametrize(("compiled", "tolerances"), [(False, 5.0), (True, 50.0)])
-def test_the_error_follows_the_tolerance(compiled, tolerances):
+@pytest.mark.parametrize("compiled", [False, True])
+def test_the_error_follows_the_tolerance(compiled):
     problem = mechanisms.four_bar()
     start = problem.system, (0.0, 10.0), problem.q0, problem.v0, "Taylor"
     for tolerance in (1e-4, 1e-6, 1e-8, 1e-10, 1e-12):
         result = solve_dae(*start, tolerance, tolerance, compiled=compiled)
-        assert np.abs(result.q[:, -1] - problem.reference.q).max() < tolerances * tolerance
+        assert np.abs(result.q[:, -1] - problem.reference.q).max() < 5.0 * tolerance
 
 
 def test_a_callback_that_branches_is_refused_by_name_and_auto_goes_on_without():
@@ -147,57 +126,3 @@ def test_a_kink_is_seen_after_the_run_came_near_a_singular_position(compiled):
     result = solve_dae(*start, method="Taylor", rtol=1e-10, atol=1e-10, compiled=compiled)
     assert known.success and result.success
     assert np.abs(result.q[:, -1] - known.q[:, -1]).max() < 1e-8  # 1e-5 where steps after it were not checked
-
-
-# --- series as loops over tables: the same numbers as by straight code, and code that does not grow with a mechanism
-FUNCTIONS = {
-    "square root": lambda t, q, v: -np.sqrt(2.0 + q * q),
-    "reciprocal": lambda t, q, v: -1.0 / (2.0 + q) - 0.3 * v,
-    "exponential": lambda t, q, v: -np.exp(0.5 * q),
-    "logarithm": lambda t, q, v: -np.log(3.0 + q),
-    "arctangent": lambda t, q, v: -np.arctan(2.0 * q + 0.1 * v),
-    "sines of some angles": lambda t, q, v: -np.sin(q) + 0.1 * np.cos(3.0 * t),
-}
-KINDS_OF_MECHANISM = [mechanisms.four_bar, mechanisms.driven_slider_crank, mechanisms.andrews, mechanisms.heavy_top]
-KINDS_OF_MECHANISM += [mechanisms.spatial_slider_crank, mechanisms.rolling_disc, mechanisms.moderately_stiff_beam]
-
-
-def both(monkeypatch, make, t_end):
-    """Runs by loops and by straight code; `make` gives a system and its start."""
-    made = []
-    for long in (0, 10**9):
-        monkeypatch.setattr(compiled_series, "LONG", long)
-        monkeypatch.setattr(families, "_FAMILIES", {})
-        system, q0, v0 = make()
-        result = solve_dae(system, (0.0, t_end), q0, v0, "Taylor", 1e-10, 1e-10, compiled=True)
-        assert result.success, result.message
-        made.append(result)
-    return made
-
-
-@pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
-@pytest.mark.parametrize("make", quick(KINDS_OF_MECHANISM, 3))
-def test_mechanisms_move_as_by_straight_code(make, monkeypatch):
-    def start():
-        problem = make()
-        return problem.system, problem.q0, problem.v0
-
-    t_end = 0.002 * make().t_span[1]
-    loops, straight = both(monkeypatch, start, t_end)
-    assert abs(loops.stats.n_accepted - straight.stats.n_accepted) <= 1 + 0.05 * straight.stats.n_accepted
-    assert worst(loops.q[:, -1], straight.q[:, -1]) < 1e-9 * max(1.0, np.abs(straight.q).max())
-    assert worst(loops.lam[:, -1], straight.lam[:, -1]) < 1e-6 * max(1.0, np.abs(straight.lam).max())
-
-
-@pytest.mark.parametrize("n", quick([9, 1, 3]))
-@pytest.mark.parametrize("name", quick(FUNCTIONS, 3))
-def test_functions_of_any_number_of_quantities(name, n, monkeypatch):
-    """One group, groups of which the last is not full, and more than one turn of a loop."""
-
-    def start():
-        return unconstrained(FUNCTIONS[name], n), np.linspace(0.1, 0.9, n), np.linspace(-0.5, 0.4, n)
-
-    loops, straight = both(monkeypatch, start, 1.0)
-    assert worst(loops.q[:, -1], straight.q[:, -1]) < 1e-12
-    q, v = loops.q[:, 0], loops.v[:, 0]
-    assert np.allclose(loops.a[:, 0], FUNCTIONS[name](0.0, q, v), rtol=1e-14, atol=0.0)

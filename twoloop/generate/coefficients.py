@@ -77,12 +77,6 @@ class Coefficients:
             known = self._known[key] = tuple((i, self._number(c)) for i, c in terms), self._number(constant)
         return known
 
-    def in_memory(self, values: Iterable[float]) -> int:
-        """Put numbers side by side, also those that may stand in the code; the place of the first."""
-        first = len(self._values)
-        self._values += values
-        return first
-
     def of_form(self, form: Form) -> tuple[Terms, float]:
         """The same of a form."""
         known = self._of_forms.get(form.key)

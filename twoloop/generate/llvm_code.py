@@ -26,8 +26,6 @@ from twoloop.kernels.data.common import OPTIONS
 
 FLAGS = " ".join(sorted(OPTIONS["fastmath"]))
 ZERO, ONE = constant(DOUBLE, 0.0), constant(DOUBLE, 1.0)
-ALIGNMENT = 64  # bytes, of a line of the cache, in two of which no vector lies
-SLACK = ALIGNMENT // 8  # doubles that are lost where vectors begin at the next such place
 # functions of LLVM; others are those of libm
 INTRINSICS = {name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqrt", "rint", "ceil", "fabs")}
 
@@ -109,11 +107,6 @@ class Emitter:
             base = self.builder.gep(base, integer(place) if isinstance(place, int) else place)
         return base
 
-    def aligned(self, pointer: Value) -> Value:
-        """The next pointer at which vectors may begin."""
-        address = self.builder.add(self.builder.convert("ptrtoint", pointer, INTEGER), integer(ALIGNMENT - 1))
-        return self.builder.convert("inttoptr", self.builder.both(address, integer(-ALIGNMENT)), pointer.type)
-
     def load(self, base: Value, place: int = 0, constant: bool = False) -> Value:
         """The number at a place; `constant`: it never changes."""
         return self.builder.load(self.pointer(base, place), constant=constant)
@@ -136,19 +129,11 @@ class Emitter:
         self.builder.store(value, pointer, 8 * width_of(value.type))
 
     def vector(self, values: Sequence[Value]) -> Value:
-        """Coefficients side by side; one number as it is."""
-        if len(values) == 1:
-            return values[0]
+        """Numbers side by side."""
         vector = undefined(vector_of(DOUBLE, len(values)))
         for place, value in enumerate(values):
             vector = self.builder.insert(vector, value, place)
         return vector
-
-    def elements(self, vector: Value) -> list[Value]:
-        """The numbers of a vector."""
-        if vector.type == DOUBLE:
-            return [vector]
-        return [self.builder.extract(vector, place) for place in range(width_of(vector.type))]
 
     @contextmanager
     def loop(self, first: Value, end: Value, initial: Sequence[Value]) -> Iterator[tuple[Value, list[Any], list[Any]]]:

@@ -7,7 +7,6 @@ are their text. Pointers are written with what they point to, which all versions
 import struct
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
 
 DOUBLE, INTEGER, WORD, BIT, NOTHING = "double", "i64", "i32", "i1", "void"
 LONGEST = 400  # lines of a block of a divided function; longer ones take more than twice as long to compile
@@ -299,21 +298,6 @@ class Builder:
         self.position_at_end(then)
         yield
         self.go_to(after)
-        self.position_at_end(after)
-
-    @contextmanager
-    def if_else(self, condition: Value) -> Iterator[tuple[Any, Any]]:
-        """What is done where a condition holds, and where it does not: two contexts."""
-        then, otherwise, after = (self.append_block() for _ in range(3))
-        self.branch(condition, then, otherwise)
-
-        @contextmanager
-        def within(block: Block) -> Iterator[None]:
-            self.position_at_end(block)
-            yield
-            self.go_to(after)
-
-        yield within(then), within(otherwise)
         self.position_at_end(after)
 
     def ret(self, value: Value | None) -> None:

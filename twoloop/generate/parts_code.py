@@ -3,8 +3,8 @@
 Accelerations and both projections take the same factors and solve with them. What LLVM takes for machine code grows
 faster than the length of a block, and the values of long equations pass through memory in any case, as there are more
 of them than registers. So each part is a function of its own, and the functions that kernels know call them: the
-factors of a position, the solution with them, which gives accelerations, the corrections that move q and v onto the
-constraints, and every order of a series, right-hand sides, and, with redundant rows, multipliers of least norm.
+factors of a position, the solution with them, which gives accelerations and the corrections that move q and v onto the
+constraints, right-hand sides, and, with redundant rows, multipliers of least norm.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -51,26 +51,26 @@ class PartsCode:
         if equations.projects:
             self.at_position |= {"off": equations.off, "faster": equations.faster}
         self.solution = Solution(equations, list(self.at_position.values()))
-        self.with_factors = {"own_solution": self.solution.solved}
+        self.with_factors = {"solution": self.solution.solved}
         if equations.projects and self.redundant:
             self.with_factors["least"] = self.solution.least
 
     def write(self, module: Module, kinds: Callable[[str], tuple[str, list[str]]]) -> list[str]:
         """Put all of them into a module; the names of those that kernels know, whose types `kinds` has."""
-        known: dict[str, Callable[..., Any]] = {"own_factors": self._factors}
+        known: dict[str, Callable[..., Any]] = {}
         if self.equations.quick is None:
             known["own_there"] = self._there
         else:  # which calls this one where it does not serve
             _write(module.function(MASS_FIRST, *kinds("own_there"), internal=True), self._there)
         if self.equations.projects:
             known |= {"own_closer": self._closer, "own_nearer": self._nearer}
+        _write(module.function("factors", BIT, POSITION, internal=True), self._factors)
         for name, outputs in self.at_position.items():
             kind = [*POSITION, *[ARRAY] * len(outputs.arrays)]
             _write(module.function(name, BIT, kind, internal=True), self._at_position(outputs))
-        known["own_solution"] = self._with_factors(self.with_factors["own_solution"])
-        if "least" in self.with_factors:
-            kind = [ARRAY] * 5
-            _write(module.function("least", BIT, kind, internal=True), self._with_factors(self.with_factors["least"]))
+        for name, outputs in self.with_factors.items():
+            kind = [ARRAY] * (4 + len(outputs.arrays))
+            _write(module.function(name, BIT, kind, internal=True), self._with_factors(outputs))
         for name, emit in known.items():
             _write(module.function(name, *kinds(name)), emit)
         return list(known)
@@ -120,13 +120,13 @@ class PartsCode:
     def _there(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, a: Value) -> Value:
         kept, r, c, lam = _rooms(emit, self.solution.n_kept, self.n, self.n_rows, self.n_rows)
         at = [t, q, v, numbers, kept]
-        _leave_unless(emit, "own_factors", at)
+        _leave_unless(emit, "factors", at)
         _leave_unless(emit, "right", [*at, r, c])
-        return emit.builder.call("own_solution", BIT, [r, c, kept, numbers, a, lam])
+        return emit.builder.call("solution", BIT, [r, c, kept, numbers, a, lam])
 
     def _closer(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, moved: Value, out: Value) -> Value:
         kept, r, c, lam = _rooms(emit, self.solution.n_kept, self.n, self.n_rows, self.n_rows)
-        _leave_unless(emit, "own_factors", [t, q, v, numbers, kept])
+        _leave_unless(emit, "factors", [t, q, v, numbers, kept])
         _clear(emit, self.n, r)
         self._correct(emit, "off", [t, q, v, numbers, kept], r, c, moved, lam)
         _sum(emit, self.n, q, moved, out)
@@ -148,13 +148,13 @@ class PartsCode:
         n, n_rows = self.n, self.n_rows
         kept, r, c, change, u = _rooms(emit, self.solution.n_kept, n, n_rows, n, n)
         at = [t, q, v, numbers, kept]
-        _leave_unless(emit, "own_factors", at)
+        _leave_unless(emit, "factors", at)
         _clear(emit, n, r)
         self._correct(emit, "off", at, r, c, moved, lam)
         self._correct(emit, "faster", at, r, c, change, lam)
         _sum(emit, n, v, change, u)
         _leave_unless(emit, "right", [t, q, u, numbers, kept, r, c])
-        _leave_unless(emit, "own_solution", [r, c, kept, numbers, a, c if self.redundant else lam])
+        _leave_unless(emit, "solution", [r, c, kept, numbers, a, c if self.redundant else lam])
         if self.redundant:
             _leave_unless(emit, "least", [c, c, kept, numbers, lam])
         _sum(emit, n, q, moved, new_q)
@@ -164,7 +164,7 @@ class PartsCode:
     def _correct(self, emit: Emitter, what: str, at: list[Value], r: Value, c: Value, out: Value, lam: Value) -> None:
         """The solution where r is zero, in the metric of M; the multipliers do not matter."""
         _leave_unless(emit, what, [*at, c])
-        _leave_unless(emit, "own_solution", [r, c, at[-1], at[-2], out, lam])
+        _leave_unless(emit, "solution", [r, c, at[-1], at[-2], out, lam])
 
 
 def _rooms(emit: Emitter, *sizes: int) -> list[Value]:

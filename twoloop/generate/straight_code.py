@@ -31,7 +31,7 @@ from twoloop.generate.families import Evaluator, Family, of_family
 from twoloop.generate.llvm_code import Emitter
 from twoloop.generate.llvm_text import Module, Value
 from twoloop.generate.parts_code import PartsCode
-from twoloop.generate.straight_line import Outputs, Solution, StraightLine
+from twoloop.generate.straight_line import Outputs, StraightLine
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.generate.tracing import Graph, Untraceable
 from twoloop.generate.written import Written, conditions_hold
@@ -98,7 +98,6 @@ class SharedCode:
         self.projects, self.parts = equations.projects, None
         if parts_code.is_long(equations):
             self.parts = PartsCode(equations, self.numbers)
-        self.solution = Solution(equations) if self.parts is None else self.parts.solution
         self.outputs = self._outputs()
         structure = repr(list(self._described()))
         self.digest = hashlib.sha256((structure + _stamp()).encode()).hexdigest()
@@ -132,15 +131,16 @@ class SharedCode:
         return [] if self.equations.quick is None else [self.equations.quick]
 
     def _described(self) -> Iterable[Any]:
-        equations, solution, numbers = self.equations, self.solution, self.numbers
+        equations, parts, numbers = self.equations, self.parts, self.numbers
         yield equations.system.n_q, equations.choice.rows, equations.choice.added
-        for outputs in (*self.outputs.values(), solution.kept, *self._accelerations):
+        kept = [] if parts is None else [parts.solution.kept]
+        for outputs in (*self.outputs.values(), *kept, *self._accelerations):
             yield outputs.sizes, list(numbers.structure(equations.graph, outputs.forms))
-        if self.parts is not None:
-            for outputs in self.parts.at_position.values():
-                yield outputs.sizes, list(numbers.structure(equations.graph, outputs.forms, solution.known))
-        for outputs in [solution.solved] if self.parts is None else self.parts.with_factors.values():
-            yield outputs.sizes, list(numbers.structure(solution.graph, outputs.forms))
+        if parts is not None:
+            for outputs in parts.at_position.values():
+                yield outputs.sizes, list(numbers.structure(equations.graph, outputs.forms, parts.solution.known))
+            for outputs in parts.with_factors.values():
+                yield outputs.sizes, list(numbers.structure(parts.solution.graph, outputs.forms))
 
     def _write(self) -> tuple[list[str], str]:
         from twoloop.kernels.data.common import KIT
@@ -148,7 +148,7 @@ class SharedCode:
         equations = self.equations
         module = Module(divided=True)
         for name, outputs in self.outputs.items():
-            write_own(module, name, equations.graph, outputs, self.numbers)
+            write_function(module, name, KIT.own_type(name), equations.graph, outputs, self.numbers)
         parts = [] if self.parts is None else self.parts.write(module, KIT.own_type)
         if "own_there" not in parts:
             write_own_accelerations(module, "own_there", KIT.own_type("own_there"), equations, self.numbers)
@@ -175,13 +175,6 @@ class OwnCode(NamedTuple):
             return Choice.at(system, t0, q0) == self.shared.equations.choice
         except Untraceable:
             return False
-
-
-def write_own(module: Module, name: str, graph: Graph, outputs: Outputs, numbers: Coefficients) -> None:
-    """The same of one that kernels know by its name."""
-    from twoloop.kernels.data.common import KIT
-
-    write_function(module, name, KIT.own_type(name), graph, outputs, numbers)
 
 
 def own_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = unchecked) -> OwnCode:

@@ -3,11 +3,11 @@
 from dataclasses import dataclass, replace
 
 from twoloop.generate.collocation_code import suits
-from twoloop.generate.series import is_quick
+from twoloop.generate.series import is_quick, series_for
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.time_dependence import may_be_narrow
 from twoloop.generate.traced_values import Check, unchecked
-from twoloop.methods.dop853 import DOP853
+from twoloop.generate.tracing import Untraceable
 from twoloop.methods.lobatto import Lobatto16
 from twoloop.methods.plan import Method, Plan, kept_plan, least_tolerance
 from twoloop.methods.taylor import Taylor
@@ -23,10 +23,6 @@ SERIES = 1e-6  # tolerance from which down a Taylor series costs less than DOP85
 INVOLVED = 12  # ... up to so many operations a coordinate ...
 SIMPLE = 8  # ... or so many with fewer than FEW coordinates; with MANY at any tolerance up to so many
 FEW = 5
-# the same of code made for the mechanism, where loops over coordinates and operations cost little:
-SHORT = 8  # operations up to which a series costs less than DOP853 at any tolerance below SHORT_FROM
-SHORT_FROM = 1e-3
-SERIES_COMPILED, SERIES_COMPILED_MANY = 1e-6, 1e-8  # tolerance, for fewer than MANY coordinates and for others
 LOOSE = 3e-5  # tolerance from which on stiff motion is integrated to few digits ...
 TIGHTEST = 9e-7  # ... and from which down to many
 LIMIT_FEW, LIMIT_MANY = 4.0, 0.25  # h rho from which on stiffness may limit DOP853 (stable to 5.9) and Adams
@@ -79,8 +75,8 @@ class Auto:
     coordinate (8 of fewer than five coordinates) at tolerances below 1e-6, at most 8 at others if there are 16
     coordinates or more. Else with `few`; with `many` from 64 coordinates on, or from 16 on with at most a quarter as
     many constraints or tolerances below 1e-10. With code made for the mechanism (by `compiled=True` of `solve_dae`, or
-    its default for small ones) a series pays below 1e-6, for 16 coordinates or more below 1e-8, with at most 8
-    operations in all below 1e-3, and `many` from 64 coordinates on.
+    its default for small ones) it begins with `lanes`. Where this cannot go on, or equations are too long for it, it
+    goes on with `few`, or with `many` from 64 coordinates on.
 
     Systems that give the values of entries have `few` from 64 coordinates on, too, unless tolerances are below 1e-10 or
     there are at most a quarter as many constraints: their projections, one a step, cost as much as evaluations.
@@ -114,7 +110,8 @@ class Auto:
     few, many : method object
         Explicit methods, for few and for many coordinates.
     series : Taylor or None
-        None: `few` and `many` alone; so `for_system` has it where callbacks are not made of operations that it knows.
+        None: `few` and `many` alone; so `for_system` has it where callbacks are not made of operations that it knows,
+        and where there is code.
     loose, tight, tightest : method object
         Implicit methods, for loose, tight and the tightest tolerances.
     fixed : method object
@@ -138,8 +135,8 @@ class Auto:
     tightest: Method
     fixed: Method
     lanes: Lobatto16 | None = None
-    n_rows: int = 0  # constraints of the system, and whether there is code made for it; solve_dae says so
-    compiled: bool = False
+    n_rows: int = 0  # constraints of the system; solve_dae says so
+    dearer: float | None = None  # what an evaluation without code costs, in those by code; None: there is no code
     sparse: bool = False  # whether it gives the values of entries: an evaluation then costs no more than a projection
     narrow: bool = True  # whether forces may change much over a short way, so that no method may take longer steps
 
@@ -156,37 +153,26 @@ class Auto:
     def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked) -> "Auto":
         """The same for the operations of a system, without `series` where they cannot be seen, or not be relied on."""
         sparse = len(system.entries) == 2 and system.n_a == 0
-        chosen = replace(self, n_rows=system.n_c + system.n_a, compiled=code is not None, sparse=sparse)
-        if code is None or not suits(code.shared):
-            chosen = replace(chosen, lanes=None)
-        elif self.lanes is not None:
-            chosen = replace(chosen, lanes=self.lanes.for_system(system, code))
-        if code is not None and isinstance(self.few, DOP853):
-            chosen = replace(chosen, few=self.few.for_system(system, code))
-        plain = code is None and (system.called_in_python or not is_quick(system))
-        if self.series is None or plain:
-            return replace(chosen, series=None)
+        chosen = replace(self, n_rows=system.n_c + system.n_a, series=None, lanes=None, sparse=sparse)
+        if code is not None:
+            lanes = self.lanes if suits(code.shared) else None
+            lanes = None if lanes is None else lanes.for_system(system, code)
+            return replace(chosen, lanes=lanes, dearer=_dearer(system))
+        if self.series is None or system.called_in_python or not is_quick(system):
+            return chosen
         try:
-            series = self.series.for_system(system, code, check)
+            series = self.series.for_system(system, None, check)
         except ValueError:
-            return replace(chosen, series=None)
+            return chosen
         return replace(chosen, series=series, narrow=may_be_narrow(system, ran_on_symbols=True))
 
     def _series_pays(self, n_q: int, tolerance: float) -> bool:
         """Whether a step of the series costs less than the steps of the others that it replaces."""
         assert self.series is not None and self.series.program is not None
         operations = self.series.program.n_operations / n_q
-        if self.compiled:
-            short = self.series.program.n_operations <= SHORT and tolerance < SHORT_FROM
-            return short or tolerance < (SERIES_COMPILED if n_q < MANY else SERIES_COMPILED_MANY)
         if tolerance < SERIES:
             return operations <= (INVOLVED if n_q >= FEW else SIMPLE)
         return operations <= SIMPLE and n_q >= MANY
-
-    def _dearer(self, n_q: int) -> float:
-        """What an implicit method's evaluation costs, in evaluations by code made for the mechanism."""
-        program = None if self.series is None else self.series.program
-        return DEARER_HEAVY if program is not None and program.n_operations >= HEAVY * n_q else DEARER
 
     def takes_code(self, fixed: bool) -> bool:
         """Whether its steps may be run with code made for the mechanism."""
@@ -208,13 +194,11 @@ class Auto:
         tolerance = least_tolerance(rtol, atol)
         implicit = self.loose if tolerance >= LOOSE else self.tight if tolerance >= TIGHTEST else self.tightest
         second = kept_plan(implicit, n_q, rtol, atol)
-        dearer = self._dearer(n_q) if self.compiled else 1.0
+        dearer = 1.0 if self.dearer is None else self.dearer
         if self.series is None or self.series.program is None:
-            return self._explicit(self.few, n_q, rtol, atol, second, dearer)
+            return self._explicit(n_q, rtol, atol, second, dearer)
         pays = self._series_pays(n_q, tolerance)
-        # where the series lasts, what takes over if its values are not finite is not worth a compilation
-        few = replace(self.few, code=None) if pays and isinstance(self.few, DOP853) else self.few
-        explicit = self._explicit(few, n_q, rtol, atol, second, dearer)
+        explicit = self._explicit(n_q, rtol, atol, second, dearer)
         # at looser tolerances as well where steps are long: most others may not be longer than a hundredth of the run
         stages_suffice = explicit.unseen < 1.0 and not self.narrow
         if not pays and (stages_suffice or not self._series_pays(n_q, LONG_STEPS)):
@@ -223,14 +207,22 @@ class Auto:
         chosen = switching(series, second, LIMIT_SERIES / series.exponent, n_q, LOOKS_FEW, dearer)
         return chosen.changed(substitute=explicit, provisional=not pays)
 
-    def _explicit(self, few: Method, n_q: int, rtol: float, atol: float, second: Plan, dearer: float) -> Plan:
+    def _explicit(self, n_q: int, rtol: float, atol: float, second: Plan, dearer: float) -> Plan:
         """The plan without a series."""
         many = n_q >= VERY_MANY and not self.sparse
-        if n_q >= MANY and not self.compiled:
+        if n_q >= MANY and self.dearer is None:
             many = many or self.n_rows <= CONSTRAINED * n_q or least_tolerance(rtol, atol) < TIGHT_MANY
-        explicit, limit, looks = (self.many, LIMIT_MANY, 1) if many else (few, LIMIT_FEW, LOOKS_FEW)
-        if explicit is few and n_q >= MANY:  # whose evaluations cost more than a trial
+        explicit, limit, looks = (self.many, LIMIT_MANY, 1) if many else (self.few, LIMIT_FEW, LOOKS_FEW)
+        if explicit is self.few and n_q >= MANY:  # whose evaluations cost more than a trial
             limit, looks = LIMIT_FEW_OF_MANY, 1
         if n_q > HUGE:
             return explicit.plan(n_q, rtol, atol, False)
         return switching(explicit.plan(n_q, rtol, atol, False), second, limit, n_q, looks, dearer)
+
+
+def _dearer(system: ConstrainedSystem) -> float:
+    """What an implicit method's evaluation costs, in evaluations by code made for the mechanism."""
+    try:
+        return DEARER_HEAVY if series_for(system).n_operations >= HEAVY * system.n_q else DEARER
+    except Untraceable:
+        return DEARER

@@ -1,16 +1,12 @@
 """DOP853(...): an explicit method in the two-loop procedure."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from twoloop.generate.stage_code import compiled_stages
-from twoloop.generate.straight_code import OwnCode
-from twoloop.generate.traced_values import Check, unchecked
 from twoloop.methods import dop853_tableau as tableau
 from twoloop.methods.plan import INNER_TOL, LARGEST_MOVE, ROUGH, Plan, check_choices, check_tolerances, least_tolerance
-from twoloop.problem.system import ConstrainedSystem
 
 COARSE_SHARE = 0.1  # of the estimate of order 3 beside that of order 5
 REUSE = 1e-4  # of the tolerance: how far off a stage may be from the position of the Jacobian that its velocities use
@@ -74,7 +70,6 @@ class DOP853:
 
     stages: Literal["free", "restored"] = "free"
     inner_tol: float | None = None
-    code: OwnCode | None = None  # made for one system; solve_dae puts it in
 
     def __post_init__(self) -> None:
         check_choices(self)
@@ -85,10 +80,6 @@ class DOP853:
         """Shown in messages and tables."""
         return "DOP853" if self.stages == "free" else "DOP853(stages='restored')"
 
-    def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked) -> "DOP853":
-        """The method with what is compiled for this system."""
-        return replace(self, code=code)
-
     def takes_code(self, fixed: bool) -> bool:
         """Whether its steps may be run with code made for the mechanism."""
         return self.stages == "free"
@@ -98,7 +89,7 @@ class DOP853:
         from twoloop.kernels.steps import explicit_step as kernels
 
         s, free = len(tableau.B), self.stages == "free"
-        plan = Plan(
+        return Plan(
             kernels.EXPLICIT,
             kernels.options_array(
                 tableau.A,
@@ -120,13 +111,4 @@ class DOP853:
             stable_to=lambda memory: STABLE_TO,
             reuse=0.0 if fixed else REUSE * least_tolerance(rtol, atol),
             unseen=UNSEEN if free else 1.0,
-        )
-        if self.code is None or not free:
-            return plan
-        made = compiled_stages(self.code, s)
-        return plan.changed(
-            step=kernels.COMPILED_EXPLICIT,
-            memory=np.zeros(max(plan.memory.size, made.memory_size)),
-            own=(made.functions,),
-            instead=kernels.explicit_step,
         )

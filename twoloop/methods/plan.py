@@ -48,9 +48,8 @@ class Plan:
     stable_to: Any = None  # memory -> h rho up to which vibration and decay are stable, for Looks of stability.py
     inner: Any = None  # the inner loop that calls code made for the mechanism; None: the general one
     own: tuple[Any, ...] = ()  # functions made for the mechanism, see kernels/data/common.py
-    numbers: Any = None  # what those of the inner loop and of stages read ...
-    own_numbers: Any = None  # ... and those of series
-    instead: Any = None  # what is called where those of the step cannot serve
+    numbers: Any = None  # what those of the inner loop read ...
+    own_numbers: Any = None  # ... and those of collocation
     matrices: int = 0  # of Newton's method: how many of (n_q, n_q) the workspace is to have room for
     parts: int = 1  # equal steps that a step is divided into for the solution between its ends ...
     interior: "Plan | None" = None  # ... and how they are made; None: by the method itself

@@ -27,7 +27,8 @@ def plans_for(
     if made is None:
         ready = method.for_system(system, code, check) if hasattr(method, "for_system") else method
         made = _made(system, ready, rtol, atol, fixed, code)
-        if known is not None and _series(ready) == _series(method) and all(each.trusted for each in made[0].traced):
+        settled = code is not None or _series(ready) == _series(method)
+        if known is not None and settled and all(each.trusted for each in made[0].traced):
             while len(kept) >= MOST:  # other threads may add to them
                 kept.pop(next(iter(kept.copy())), None)
             kept[key] = made

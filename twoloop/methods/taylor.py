@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import check_size
-from twoloop.generate.compiled_series import compiled_series
 from twoloop.generate.series import SeriesProgram, series_for
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Check, unchecked
@@ -20,21 +19,15 @@ Array = NDArray[np.float64]
 
 LOWEST, HIGHEST = 4, 40  # orders that may be asked for
 PER_DIGIT, LEAST = 1.15, 5.0  # order = LEAST + PER_DIGIT digits: about the cheapest on the mechanisms of the bench
-PER_DIGIT_COMPILED, LEAST_COMPILED = 1.25, 5.5  # the same of code made for the mechanism
-LEAST_IN_LANES = 3.5
+PER_DIGIT_IN_LANES, LEAST_IN_LANES = 1.25, 3.5  # the same of code for lanes
 FIXED = 19  # order of constant steps
 FEWEST, MOST = 3, 6  # parts of a step for the solution between its ends: states of its own series, on the constraints
 PADDED = 8  # operations of a table are a multiple of this
 
 
-def compiled_order(rtol: float, atol: float) -> int:
-    """The order that tolerances ask for of code made for a mechanism."""
-    return _order(rtol, atol, LEAST_COMPILED, PER_DIGIT_COMPILED)
-
-
 def order_in_lanes(rtol: float, atol: float) -> int:
-    """The same of code for lanes."""
-    return _order(rtol, atol, LEAST_IN_LANES, PER_DIGIT_COMPILED)
+    """The order that tolerances ask for of code for lanes."""
+    return _order(rtol, atol, LEAST_IN_LANES, PER_DIGIT_IN_LANES)
 
 
 def _order(rtol: float, atol: float, least: float, per_digit: float) -> int:
@@ -60,7 +53,7 @@ class Taylor:
     ----------
     order : int, optional
         Of the method, 4 to 40: velocities are a series of this order, positions of one more. None: 5 and 1.15 for each
-        digit of the smaller tolerance (with `compiled=True` of solve_dae 5.5 and 1.25), or 19 with constant steps.
+        digit of the smaller tolerance, or 19 with constant steps.
 
     Raises
     ------
@@ -85,8 +78,7 @@ class Taylor:
     """
 
     order: int | None = None
-    program: SeriesProgram | None = None  # of one system; solve_dae puts it in ...
-    code: OwnCode | None = None  # ... and what is compiled for it
+    program: SeriesProgram | None = None  # of one system; solve_dae puts it in
 
     def __post_init__(self) -> None:
         if self.order is not None and not LOWEST <= check_size("order", self.order, 1) <= HIGHEST:
@@ -98,7 +90,7 @@ class Taylor:
         return "Taylor" if self.order is None else f"Taylor(order={self.order})"
 
     def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked) -> "Taylor":
-        """The method with the operations of this system, and with what is compiled for it.
+        """The method with the operations of this system, of which what is compiled for it makes no use.
 
         Raises
         ------
@@ -111,7 +103,7 @@ class Taylor:
             raise ValueError(
                 f"method='Taylor' needs callbacks whose operations it can see; {error}. Take 'Adams' or 'DOP853'"
             ) from error
-        return replace(self, program=program, code=code)
+        return replace(self, program=program)
 
     def takes_code(self, fixed: bool) -> bool:
         """Whether its steps may be run with code made for the mechanism."""
@@ -129,7 +121,7 @@ class Taylor:
         if order is None and fixed:
             order = FIXED
         elif order is None:
-            order = compiled_order(rtol, atol) if self.code is not None else _order(rtol, atol, LEAST, PER_DIGIT)
+            order = _order(rtol, atol, LEAST, PER_DIGIT)
         highest = order + 1
         widths = [-(-len(table.first.column) // PADDED) * PADDED for table in (program.early, program.late)]
         plan = Plan(
@@ -147,21 +139,7 @@ class Taylor:
         )
         kept = plan.options.copy()
         kept[series.KEEP] = 1.0
-        interior = plan.changed(options=kept, memory=plan.memory.copy())
-        if self.code is None:
-            return plan.changed(interior=interior)
-        code = compiled_series(self.code)
-        options = plan.options.copy()
-        options[series.N_FACTORS] = code.n_factors
-        return plan.changed(
-            step=taylor.COMPILED_TAYLOR,
-            options=options,
-            memory=np.zeros(code.memory_size(highest)),
-            own=(code.functions,),
-            own_numbers=code.numbers,
-            instead=taylor.solve_order,
-            interior=interior,
-        )
+        return plan.changed(interior=plan.changed(options=kept, memory=plan.memory.copy()))
 
 
 def _options(program: SeriesProgram, highest: int, widths: list[int]) -> Array:

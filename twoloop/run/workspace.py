@@ -69,7 +69,7 @@ def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) 
         functions = functions._replace(newton_program=form.newton)
     if plan is None:
         return Kit(functions, static_inner_loop)
-    return Kit(functions, static_inner_loop, *_steps_of(plan), static_inner_loop, plan.instead)
+    return Kit(functions, static_inner_loop, *_steps_of(plan), static_inner_loop)
 
 
 def _flags_at(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
@@ -117,7 +117,7 @@ def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
     read = (plan.numbers, plan.own_numbers)
     kept: dict[Any, tuple[Kit, Any]] = system.remembered("kits", dict)
     # what it names by numbers is held by what is kept
-    called = (plan.inner, plan.step, plan.first, plan.second, plan.instead)
+    called = (plan.inner, plan.step, plan.first, plan.second)
     key = (id(system.functions), flags.tobytes(), *called, len(LOADED), *map(id, (*plan.own, *read)))
     changes = flags[FORM] == AUGMENTED  # which a run may
     if key in kept:
@@ -125,7 +125,7 @@ def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
     flags = flags.copy()
     flags[STRAIGHT] = plan.inner is not None
     functions = system.functions._replace(flags=flags)
-    made = Kit(functions, plan.inner or inner_loop, *_steps_of(plan), inner_loop, plan.instead, plan.own, *read)
+    made = Kit(functions, plan.inner or inner_loop, *_steps_of(plan), inner_loop, plan.own, *read)
     if len(kept) == MOST_KITS:
         del kept[next(iter(kept))]
     kept[key] = made, system.functions

@@ -8,7 +8,6 @@ done, so that LLVM has little to do before it makes machine code of it.
 from collections import defaultdict
 from collections.abc import Callable
 from functools import cache, cached_property
-from threading import Lock
 from typing import Any
 
 from llvmlite import binding
@@ -17,8 +16,6 @@ from numba.core.registry import cpu_target
 from twoloop.kernels.compile.caches import UNWRITABLE, Newest, say_once, sources_folder
 from twoloop.kernels.compile.kept_files import Files
 
-CALLED = "called_"
-_LINKING = Lock()  # names of what is called are those of the process, and other code of the same names may be linked
 SINGLE_PASSES = hasattr(binding.ModulePassManager, "add_reassociate_pass")
 
 
@@ -30,8 +27,6 @@ class OwnFunctions:
     names : list of str
     content : bytes
         Of `object_code`.
-    called : OwnFunctions or None
-        Others, which these call by their names after CALLED; they stay in memory with these.
 
     Attributes
     ----------
@@ -39,15 +34,11 @@ class OwnFunctions:
         By their names.
     """
 
-    def __init__(self, names: list[str], content: bytes, called: "OwnFunctions | None" = None):
+    def __init__(self, names: list[str], content: bytes):
         self._engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _machine())
-        self._called = called
         object_file = binding.ObjectFileRef.from_data(content)
         self._engine.add_object_file(object_file)
-        with _LINKING:
-            for name, address in ({} if called is None else called.addresses).items():
-                binding.add_symbol(CALLED + name, address)
-            self._engine.finalize_object()
+        self._engine.finalize_object()
         self.addresses: dict[str, int] = {name: int(self._engine.get_function_address(name)) for name in names}
 
 
@@ -76,7 +67,6 @@ def own_functions(
     stamp: str,
     key: str,
     write: Callable[[], tuple[list[str], str]],
-    called: OwnFunctions | None = None,
     passes: bool = True,
 ) -> OwnFunctions:
     """Functions that `write` writes: their names, and the text of a module; from memory or the disk where kept.
@@ -88,8 +78,6 @@ def own_functions(
     stamp, key : str
         What the functions depend on: a digest of what writes them, and of their own content.
     write : callable
-    called : OwnFunctions or None
-        See `OwnFunctions`.
     passes : bool
         See `object_code`.
     """
@@ -108,7 +96,7 @@ def own_functions(
         except OSError:
             say_once(UNWRITABLE)
     names, content = kept
-    _MADE[kind][key] = made = OwnFunctions(names, content, called)
+    _MADE[kind][key] = made = OwnFunctions(names, content)
     return made
 
 

@@ -171,7 +171,7 @@ for _name in ("inner", "general"):
     KIT.add_function(_name, INNER)
 # (kit, work, options, memory, t, h, tolerances, state, new_state) -> Attempt
 ATTEMPT = types.NamedTuple((i8, f8, f8), Attempt)(KIT, WORK, VECTOR, VECTOR, f8, f8, VECTOR, VECTOR, VECTOR)
-for _name in ("attempt", "attempt_first", "attempt_second", "instead"):
+for _name in ("attempt", "attempt_first", "attempt_second"):
     KIT.add_function(_name, ATTEMPT)
 # (kit, work, options, memory, tolerances, accepted)
 SETTLE = types.void(KIT, WORK, VECTOR, VECTOR, VECTOR, types.boolean)
@@ -181,7 +181,7 @@ for _name in ("settle", "settle_first", "settle_second"):
 MANY = i8(KIT, WORK, *[VECTOR] * 5, f8, *[VECTOR] * 3, MATRIX, MATRIX)
 KIT.add_function("attempt_many", MANY)
 
-# functions made for a mechanism, see generate/straight_code.py, series_code.py and stage_code.py; those that return a
+# functions made for a mechanism, see generate/straight_code.py and collocation_code.py; those that return a
 # flag say whether their conditions hold, and fill what they are given only then
 OWN_FUNCTIONS = {
     # (t, q, v, numbers, ...): accelerations; positions moved towards the constraints, by x; the same and velocities,
@@ -190,18 +190,6 @@ OWN_FUNCTIONS = {
     "own_closer": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR),
     "own_nearer": types.boolean(f8, *[VECTOR] * 8),
     "own_redundant": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
-    # of series: factors (t, q, v, numbers, factors), and the solution with them (r, c, factors, numbers, a, lam)
-    "own_factors": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
-    "own_solution": types.boolean(*[VECTOR] * 6),
-    # (scratch, series, r, c, lam, t, unit, state, own_numbers)
-    "begin_series": types.none(*[VECTOR] * 5, f8, f8, VECTOR, VECTOR),
-    # (scratch, series, r, c, t, unit, order, own_numbers), (scratch, series, a, lam, unit, order, own_numbers)
-    "find_order": types.none(*[VECTOR] * 4, f8, f8, i8, VECTOR),
-    "take_order": types.none(*[VECTOR] * 4, f8, i8, VECTOR),
-    # of stages: (scratch, state); (scratch, which, weights, t, h, place, numbers); (scratch, which, place)
-    "begin_stages": types.none(VECTOR, VECTOR),
-    "find_stage": types.boolean(VECTOR, i8, VECTOR, f8, f8, VECTOR, VECTOR),
-    "put_stage": types.none(VECTOR, i8, VECTOR),
     # of collocation, on a memory that data/collocation.py describes: (room, state, tolerances), (room, state, numbers),
     # with the change of velocities, and the defect between nodes, as their results, (room, state), (room, state,
     # new_state); (room, numbers)
@@ -212,8 +200,6 @@ OWN_FUNCTIONS = {
     "end_nodes": types.none(*[VECTOR] * 3),
     "closer_ends": types.none(*[VECTOR] * 2),
     "nearer_ends": types.none(*[VECTOR] * 2),
-    # (scratch, b, fine, coarse, h, end, estimates)
-    "sum_stages": types.none(*[VECTOR] * 4, f8, VECTOR, VECTOR),
 }
 KIT.add_own_functions(OWN_FUNCTIONS)
 

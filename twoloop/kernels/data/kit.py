@@ -16,9 +16,8 @@ class Kit:
 
     The latter two are compiled once, and not again in what calls them; None where they are not called. A step that
     chooses between two others has these as `first` and `second`. An inner loop that calls functions made for the
-    mechanism leaves to `general` what these do not do; `instead` is what is called where those of a step do not serve.
-    `own` are sets of such functions; `numbers` is what those of the inner loop and of stages read, `own_numbers` what
-    those of series read.
+    mechanism leaves to `general` what these do not do. `own` are sets of such functions; `numbers` is what those of the
+    inner loop read, `own_numbers` what those of collocation read.
     """
 
     def __init__(
@@ -29,13 +28,12 @@ class Kit:
         first: Step | None = None,
         second: Step | None = None,
         general: Any = None,
-        instead: Any = None,
         own: tuple[OwnFunctions | LaterFunctions, ...] = (),
         numbers: Any = None,
         own_numbers: Any = None,
     ):
         self.__dict__.update(functions._asdict())
-        self.functions, self.inner, self.general, self.instead, self.own = functions, inner, general, instead, own
+        self.functions, self.inner, self.general, self.own = functions, inner, general, own
         self.numbers = NONE if numbers is None else numbers
         self.own_numbers = NONE if own_numbers is None else own_numbers
         self.attempt, self.settle, self.attempt_many = step or Step()

@@ -13,12 +13,11 @@ from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.controller import nothing_to_settle
 from twoloop.kernels.control.predictor import departure, keep_predicted
 from twoloop.kernels.data.codes import DONE
-from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, inlined, kernel, merged
-from twoloop.kernels.data.counters import N_EVALUATIONS, N_FACTORIZATIONS, N_OUTER
+from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, inlined, kernel
+from twoloop.kernels.data.counters import N_OUTER
 from twoloop.kernels.data.noted import NEARLY_SINGULAR
 from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL, times_gap
 from twoloop.kernels.evaluation.calls import evaluate, evaluate_state, evaluate_there, project
-from twoloop.kernels.evaluation.tasks import EVALUATE_THERE
 
 # places in `options`: scalars, then A (s, s), b (s), c (s) and the weights of the two estimates (s each)
 STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)  # FREE: stages are left where they are
@@ -191,46 +190,4 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     return Attempt(code, error, 0.0)
 
 
-@merged
-def _stages_by_code(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Stages and their sum; a stage that the functions made for the mechanism cannot find is left to the inner loop."""
-    n = w.Q.size
-    estimates, scratch = memory[: 4 * n], memory[4 * n :]
-    q, v, a = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
-    s, A, b, c, fine, coarse = tableau_of(options)
-    f.begin_stages(scratch, state)
-    for j in range(1, s):
-        if f.find_stage(scratch, j, A[j], t + c[j] * h, h, new_state, f.numbers):
-            w.counters[N_EVALUATIONS] += 1
-            w.counters[N_FACTORIZATIONS] += 1
-        else:
-            code = f.general(f, w, EVALUATE_THERE, t + c[j] * h, q, v, 0.0, a, w.lam)
-            if code != DONE:
-                return code, np.inf
-            f.put_stage(scratch, j, new_state)
-    f.sum_stages(scratch, b, fine, coarse, h, new_state, estimates)
-    if tolerances[ESTIMATE] == 0.0:
-        return DONE, 0.0
-    return DONE, largest_error(tolerances, state, new_state, estimates[: 2 * n], estimates[2 * n :], False)
-
-
-@kernel(ATTEMPT)
-def compiled_explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """The same with functions made for the mechanism, whose stages are free; f.instead is explicit_step."""
-    if w.notes[NEARLY_SINGULAR] != 0.0:
-        return f.instead(f, w, options, memory, t, h, tolerances, state, new_state)
-    n = w.Q.size
-    w.counters[N_OUTER] += 1
-    code, error = _stages_by_code(f, w, options, memory, t, h, tolerances, state, new_state)
-    if code != DONE or not error <= 1.0:
-        return Attempt(code, error, 0.0)
-    q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    keep_predicted(w, q1)
-    code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
-    if code == DONE:
-        error = max(error, departure(w, tolerances, h, state[:n], state[n : 2 * n], q1))
-    return Attempt(code, error, 0.0)
-
-
 EXPLICIT = Step(explicit_step, nothing_to_settle)
-COMPILED_EXPLICIT = Step(compiled_explicit_step, nothing_to_settle)

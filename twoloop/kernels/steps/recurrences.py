@@ -15,9 +15,8 @@ from twoloop.kernels.evaluation.tasks import SOLVE
 
 # places in `options`: scalars, ORDER being that of the series of q; where each array of the program begins, and where
 # the last ends; then the arrays, integers by their bits
-# KEEP: steps follow one another by the same series, about the first state, as between the ends of a step; N_FACTORS:
-# numbers that functions made for the mechanism keep of its factors
-ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, N_FACTORS, N_SCALARS = range(8)
+# KEEP: steps follow one another by the same series, about the first state, as between the ends of a step
+ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, N_SCALARS = range(7)
 # arrays of a table; arrays of sums as twoloop.generate.series.Sums has them
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)

@@ -18,18 +18,18 @@ before, so that no power of a short time underflows. The end of the step is move
 import numpy as np
 
 from twoloop.kernels.algebra.linalg import copy
-from twoloop.kernels.algebra.saddle_point import solve_both
 from twoloop.kernels.control.defect import excess
 from twoloop.kernels.control.predictor import departure, keep_predicted
 from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, kernel, merged
 from twoloop.kernels.data.counters import N_OUTER
-from twoloop.kernels.data.noted import DEFECT, NEAR_NOW, NEARLY_SINGULAR
+from twoloop.kernels.data.flags import STRAIGHT
+from twoloop.kernels.data.noted import BY_GENERAL, DEFECT, NEAR_NOW, NEARLY_SINGULAR
 from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, LOOK, ROUNDING, RTOL, times_gap
 from twoloop.kernels.evaluation.calls import evaluate_there, project
 from twoloop.kernels.evaluation.tasks import EVALUATE_THERE
 from twoloop.kernels.steps import recurrences as at
-from twoloop.kernels.steps.recurrences import accelerations_found, end_series, expand, series_of
+from twoloop.kernels.steps.recurrences import accelerations_found, expand, series_of
 
 ALLOWED = 0.3  # of the tolerances: how far from the constraints the end of a step is to be before it is moved there
 LOUDEST, LOUDER = 1e4, 10.0  # a defect up to LOUDEST is rounding, where one near the beginning is a LOUDER-th of it
@@ -42,46 +42,16 @@ FARTHEST = 1e6  # of the guess for the first step: no power of it overflows
 TOO_SHORT = 2.0  # the error of a first step that is not made, as the series allows a longer one
 
 
-@kernel(ATTEMPT)
-def solve_order(f, w, r, c, _t, _unit, _tolerances, a, lam):
-    """The linear solution of one order, for code made for a mechanism where its own factors do not serve."""
-    solve_both(f, w, r, c, a, lam)
-    return Attempt(DONE, 0.0, 0.0)
-
-
 @merged
-def _expand_by_code(f, w, options, memory, t, state, unit):
-    """The series by functions made for the mechanism; f.instead solves where their factors cannot."""
-    order, n, n_rows = int(options[at.ORDER]), w.Q.size, w.Rate.size
-    series = series_of(memory, order, n, memory[at.TARGET])
-    place = at.N_MEMORY_SCALARS + 2 * (order + 1) * n
-    r, a = memory[place : place + n], memory[place + n : place + 2 * n]
-    place += 2 * n
-    c, lam = memory[place : place + n_rows], memory[place + n_rows : place + 2 * n_rows]
-    place += 2 * n_rows
-    n_factors = int(options[at.N_FACTORS])
-    factors, scratch = memory[place : place + n_factors], memory[place + n_factors :]
-    q, v = state[:n], state[n : 2 * n]
-    have_factors = f.own_factors(t, q, v, f.numbers, factors)
-    if not have_factors:
+def _find_series(f, w, options, memory, t, state, unit, which):
+    """The series about a state that was projected just before, into one of the two places."""
+    n = w.Q.size
+    memory[at.TARGET] = which
+    if f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0:  # code made for the mechanism leaves no factors in w
+        q, v, a = state[:n], state[n : 2 * n], accelerations_found(memory, n)
         code = f.general(f, w, EVALUATE_THERE, t, q, v, 0.0, a, w.lam)
         if code != DONE:
             return code
-    f.begin_series(scratch, series, r, c, lam, t, unit, state, f.own_numbers)
-    for k in range(1, order):
-        f.find_order(scratch, series, r, c, t, unit, k, f.own_numbers)
-        if not have_factors or not f.own_solution(r, c, factors, f.numbers, a, lam):  # M a + G^T lam = r, G a = c
-            f.instead(f, w, r, c, t, unit, r, a, lam)
-        f.take_order(scratch, series, a, lam, unit, k, f.own_numbers)
-    return end_series(w, order, series)
-
-
-@merged
-def _find_series(f, w, options, memory, t, state, unit, which, by_code):
-    """The series about a state, into one of the two places; by functions made for the mechanism, if there are."""
-    memory[at.TARGET] = which
-    if by_code:
-        return _expand_by_code(f, w, options, memory, t, state, unit)
     return expand(f, w, options, memory, t, state, unit)
 
 
@@ -199,8 +169,8 @@ def settle_taylor(f, w, options, memory, tolerances, accepted):
     memory[at.TRIED] = 0.0
 
 
-@merged
-def _step(f, w, options, memory, t, h, tolerances, state, new_state, by_code):
+@kernel(ATTEMPT)
+def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt, by the series about its beginning; then the series about its end, which sets the next step."""
     n, order, estimated = w.Q.size, int(options[at.ORDER]), tolerances[ESTIMATE] == 1.0
     q, v = state[:n], state[n : 2 * n]
@@ -210,7 +180,7 @@ def _step(f, w, options, memory, t, h, tolerances, state, new_state, by_code):
         copy(state, new_state)
         code = project(f, w, t, q1, v1, options[at.THETA], a1, lam1)
         if code == DONE:
-            code = _find_series(f, w, options, memory, t, new_state, h, memory[at.WHICH], by_code)
+            code = _find_series(f, w, options, memory, t, new_state, h, memory[at.WHICH])
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
         memory[at.KNOWN], memory[at.UNIT] = 1.0, h
@@ -268,7 +238,7 @@ def _step(f, w, options, memory, t, h, tolerances, state, new_state, by_code):
         w.notes[DEFECT] = max(w.notes[DEFECT], defect)
     series = series_of(memory, order, n, 1.0 - memory[at.WHICH])
     unit = min(memory[at.LENGTH] * unit, GROWTH * h) if estimated else h
-    code = _find_series(f, w, options, memory, t + h, new_state, unit, 1.0 - memory[at.WHICH], by_code)
+    code = _find_series(f, w, options, memory, t + h, new_state, unit, 1.0 - memory[at.WHICH])
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
     memory[at.TRIED], memory[at.NEXT_UNIT] = 1.0, unit
@@ -280,17 +250,4 @@ def _step(f, w, options, memory, t, h, tolerances, state, new_state, by_code):
     return Attempt(DONE, max(error, off), factor)
 
 
-@kernel(ATTEMPT)
-def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """The step with series found by their program."""
-    return _step(f, w, options, memory, t, h, tolerances, state, new_state, False)
-
-
-@kernel(ATTEMPT, vectorized=True)
-def compiled_taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """The step with series found by functions made for the mechanism."""
-    return _step(f, w, options, memory, t, h, tolerances, state, new_state, True)
-
-
 TAYLOR = Step(taylor_step, settle_taylor)
-COMPILED_TAYLOR = Step(compiled_taylor_step, settle_taylor)
