@@ -174,4 +174,4 @@ def test_compiled_events():
         return q[0]
 
     result = swing(2.0, events=lowest)
-    assert result.t_events[0].size > 0 and worst(result.q_events[0][:, 0], 0.0) < 1e-15
+    assert result.t_events[0].size > 0 and worst(result.q_events[0][:, 0], 0.0) < 1e-14
