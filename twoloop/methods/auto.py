@@ -23,6 +23,7 @@ SERIES = 1e-6  # tolerance from which down a Taylor series costs less than DOP85
 INVOLVED = 12  # ... up to so many operations a coordinate ...
 SIMPLE = 8  # ... or so many with fewer than FEW coordinates; with MANY at any tolerance up to so many
 FEW = 5
+SERIES_OF_MANY = 1e-8  # the same of MANY coordinates with code made for the mechanism
 LOOSE = 3e-5  # tolerance from which on stiff motion is integrated to few digits ...
 TIGHTEST = 9e-7  # ... and from which down to many
 LIMIT_FEW, LIMIT_MANY = 4.0, 0.25  # h rho from which on stiffness may limit DOP853 (stable to 5.9) and Adams
@@ -76,7 +77,8 @@ class Auto:
     coordinates or more. Else with `few`; with `many` from 64 coordinates on, or from 16 on with at most a quarter as
     many constraints or tolerances below 1e-10. With code made for the mechanism (by `compiled=True` of `solve_dae`, or
     its default for small ones) it begins with `lanes`. Where this cannot go on, or equations are too long for it, it
-    goes on with `few`, or with `many` from 64 coordinates on.
+    goes on with a series at tolerances below 1e-6, of 16 coordinates or more below 1e-8, else with `few`, or with
+    `many` from 64 coordinates on.
 
     Systems that give the values of entries have `few` from 64 coordinates on, too, unless tolerances are below 1e-10 or
     there are at most a quarter as many constraints: their projections, one a step, cost as much as evaluations.
@@ -110,8 +112,7 @@ class Auto:
     few, many : method object
         Explicit methods, for few and for many coordinates.
     series : Taylor or None
-        None: `few` and `many` alone; so `for_system` has it where callbacks are not made of operations that it knows,
-        and where there is code.
+        None: `few` and `many` alone; so `for_system` has it where callbacks are not made of operations that it knows.
     loose, tight, tightest : method object
         Implicit methods, for loose, tight and the tightest tolerances.
     fixed : method object
@@ -157,11 +158,12 @@ class Auto:
         if code is not None:
             lanes = self.lanes if suits(code.shared) else None
             lanes = None if lanes is None else lanes.for_system(system, code)
-            return replace(chosen, lanes=lanes, dearer=_dearer(system))
-        if self.series is None or system.called_in_python or not is_quick(system):
+            chosen = replace(chosen, lanes=lanes, dearer=_dearer(system))
+        plain = code is None and (system.called_in_python or not is_quick(system))
+        if self.series is None or plain:
             return chosen
         try:
-            series = self.series.for_system(system, None, check)
+            series = self.series.for_system(system, code, check)
         except ValueError:
             return chosen
         return replace(chosen, series=series, narrow=may_be_narrow(system, ran_on_symbols=True))
@@ -170,6 +172,8 @@ class Auto:
         """Whether a step of the series costs less than the steps of the others that it replaces."""
         assert self.series is not None and self.series.program is not None
         operations = self.series.program.n_operations / n_q
+        if self.dearer is not None:  # near singular positions, to which it comes then, a series is more exact
+            return tolerance < (SERIES if n_q < MANY else SERIES_OF_MANY)
         if tolerance < SERIES:
             return operations <= (INVOLVED if n_q >= FEW else SIMPLE)
         return operations <= SIMPLE and n_q >= MANY
