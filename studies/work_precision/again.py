@@ -1,8 +1,9 @@
 """Measure single mechanisms, or other parts, again: `python -m studies.work_precision.again NAME ...`.
 
-The whole study takes hours. A part is a mechanism, or another project's solvers on all mechanisms. Its rows take the
-place of those in work_precision.csv at once, with the commit and the processor that they were made on;
-`python -m studies.work_precision --redraw` then writes the report anew. Without names: what there is.
+The whole study takes hours. A part is a mechanism, or some solvers on all mechanisms: those of another project, or the
+default beside CyRK, mostly the fastest of the others. Its rows take the place of those in work_precision.csv at once,
+with the commit and the processor that they were made on; `python -m studies.work_precision --redraw` then writes the
+report anew. Without names: what there is.
 """
 
 import sys
@@ -14,23 +15,26 @@ import pandas as pd
 
 from studies.bench import cli
 from studies.bench.cli import StudyError
+from studies.bench.headline import OWN_CODE
 from studies.bench.row_files import versions
 from studies.bench.store import KeptRows, Output
 from studies.compare import GROUP as LENGTH
 from studies.work_precision import first_calls, mechanisms, minimal, study
 
+DEFAULT_BESIDE, BESIDE = "the default and CyRK", (OWN_CODE, "CyRK, DOP853", "CyRK, Vern8")
 AT_LENGTH = ", at length"  # after the name of a case: the runs over its whole motion
 IN_ANGLES = ", in angles"  # after that of a mechanism: the runs of its equations in minimal coordinates
 
 
 @dataclass(frozen=True)
 class Part:
-    """Rows that are measured together: all of a group, or those of one case or of one project."""
+    """Rows that are measured together: all of a group, or those of one case, of one project or of some solvers."""
 
     group: str
     case: str | None
     make: Callable[[KeptRows], pd.DataFrame]
     family: str | None = None
+    solvers: Sequence[str] = ()
 
 
 def parts() -> dict[str, Part]:
@@ -43,6 +47,8 @@ def parts() -> dict[str, Part]:
     for family in dict.fromkeys(run.solver.family for run in runs if run.solver.family != "two-loop"):
         own = [run for run in runs if run.solver.family == family]
         found[family] = Part(mechanisms.GROUP, None, partial(mechanisms.collect, own), family)
+    beside = [run for run in runs if run.solver.name in BESIDE]
+    found[DEFAULT_BESIDE] = Part(mechanisms.GROUP, None, partial(mechanisms.collect, beside), solvers=BESIDE)
     for case in study.known_cases(False):
         found[case.name + AT_LENGTH] = Part(LENGTH, case.name, partial(study.at_length, [case], False))
     found["first calls"] = Part(first_calls.GROUP, None, partial(first_calls.collect, quick=False))
@@ -68,6 +74,8 @@ def replaced(rows: pd.DataFrame, part: Part, new: pd.DataFrame) -> pd.DataFrame:
         old &= rows["case"] == part.case
     if part.family is not None:
         old &= rows["family"] == part.family
+    if part.solvers:
+        old &= rows["solver"].isin(part.solvers) & rows["case"].isin(new["case"])
     columns = list(dict.fromkeys([*rows.columns, *new.columns]))
     return pd.concat([rows[~old], new], ignore_index=True).reindex(columns=columns)
 
