@@ -42,12 +42,13 @@ LEAST_RHO, MOST_RHO = 1e-3, 0.9
 SLOW_START, FAST_START, WANTED_START = 0.3, 0.04, 0.12  # contraction of the first step: between the first two is well
 MOST_STARTS = 4
 STAGNANT, NOISE = 0.5, 1e-13  # changes that fall no further, and are this small relative to the values, are rounding
-ROUNDING_OF_FIXED, MOST_OF_FIXED = 1e-16, 60.0  # of steps without an estimate of their error
+# of steps without an estimate of their error; forces may have rounding errors of their own
+ROUNDING_OF_FIXED, NOISE_OF_FIXED, MOST_OF_FIXED = 1e-16, 1e-9, 60.0
 ORDER, SHARE = 12.0, 0.5  # of the estimate of the error; and what it counts
 SHORTER, SAFETY = 0.6, 0.65
 UNFORESEEN = 10.0  # an error that is so large is looked at elsewhere
 LIMITED, STRAIGHT = 24.0, 0.1  # such steps, after which another method goes on; what the iteration leaves of CURVED
-REFUSALS = 12.0  # of REFUSED, which each accepted step lessens by 1 and each other one raises by 2
+REFUSALS = 12.0  # of REFUSED, which each accepted step lessens by 1 and each that did not converge raises by 2
 BETWEEN = 0.0908  # of a step, the longest part that an audit leaves unseen: half that between two nodes
 ALLOWED = 16.0  # the defect between nodes, over the tolerances: most of it does not last to the end
 EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
@@ -70,7 +71,7 @@ def _room(memory):
 def _sweeps(f, w, options, room, tolerances, state, first):
     """Iterate the stages: how that ended, after how many sweeps, the last change, and how many there should be."""
     estimated = tolerances[ESTIMATE] == 1.0
-    target, kappa, most = options[TARGET], options[KAPPA], MOST_OF_FIXED
+    target, kappa, noise, most = options[TARGET], options[KAPPA], NOISE, MOST_OF_FIXED
     if room[room_at.DEGREE] >= 7.0:
         target += 2.0
     elif room[room_at.DEGREE] >= 6.0:
@@ -78,8 +79,8 @@ def _sweeps(f, w, options, room, tolerances, state, first):
     if estimated:
         most = target + MORE
     else:
-        kappa = ROUNDING_OF_FIXED
-    noise = NOISE * room[room_at.SIZE] * room[room_at.STRICTER]
+        kappa, noise = ROUNDING_OF_FIXED, NOISE_OF_FIXED
+    noise *= room[room_at.SIZE] * room[room_at.STRICTER]
     rho, before, m = room[room_at.RHO], math.inf, 0.0
     while True:
         change = room[room_at.STRICTER] * f.sweep_nodes(room, state, f.own_numbers)
