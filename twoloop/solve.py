@@ -150,9 +150,10 @@ def solve_dae(
     *Output times.* The solution is interpolated between the steps as by `sol`, and the steps do not change. With
     `step_size`, and with the two methods of the paper, steps are shortened to end at the times of `t_eval`.
 
-    *Short forces.* "Taylor" evaluates the equations within its steps. Other methods evaluate them at the ends and
-    stages of steps, and take no step longer than a hundredth of the run ("DOP853": 3.75 hundredths where no callback
-    has quotients, roots or fast vibrations and no position was nearly singular). Forces and drives that may change
+    *Short forces.* "Taylor" evaluates the equations within its steps, and "Lobatto16" in those longer than 5.5
+    hundredths of the run, or than one where callbacks have quotients, roots or fast vibrations. Other methods evaluate
+    them at the ends and stages of steps, and take no step longer than a hundredth of the run ("DOP853": 3.75
+    hundredths where there are no such callbacks and no position was nearly singular). Forces and drives that may change
     suddenly with time are also evaluated every two-thousandth of the run, and at least eight times per step; steps end
     where they change. A run that meets a change too short for this is repeated, up to twice, with more evaluations.
     If these are too few, a `ConstraintWarning` says how long the change lasts.
