@@ -14,8 +14,6 @@ from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import LARGEST_MOVE, Plan
 from twoloop.problem.system import ConstrainedSystem
 
-KAPPA = 0.05  # of the tolerance: what the iteration may leave; errors are then at most those of other methods of ours
-TARGET = 6.0  # sweeps that a step is to take
 PARTS = 6  # of a step, made again for the solution between its ends
 UNSEEN = float(np.diff([0.0, *tables().nodes]).max())  # of a step, between two nodes
 
@@ -87,7 +85,7 @@ class Lobatto16:
             raise ValueError("Lobatto16() knows no system yet: take for_system(system, code), as solve_dae does")
         made = compiled_collocation(self.code)
         options = np.zeros(kernels.N_OPTIONS)
-        options[kernels.KAPPA], options[kernels.TARGET], options[kernels.THETA] = KAPPA, TARGET, LARGEST_MOVE
+        options[kernels.THETA] = LARGEST_MOVE
         options[kernels.N_ITERATED], options[kernels.N_ROWS] = len(made.code.iterated), made.code.n_rows
         options[kernels.FREE] = 1.0 if self.narrow else 1.0 / UNSEEN
         sizes = n_q, len(made.code.iterated), made.code.n_rows

@@ -18,8 +18,8 @@ LANES = 8
     RHO,  # contraction of a sweep
     STARTS,  # guesses for the first step so far
     N_STEPS,  # since the beginning
-    LIMITED,  # steps that convergence, not accuracy, kept short, less the others; and those that did not converge
-    REFUSED,
+    LIMITED,  # steps that convergence, not accuracy, kept short, less the others
+    REFUSED,  # twice the steps that did not converge, less those accepted
     LARGEST,  # acceleration at the beginning, over the tolerances
     DEFECT,  # between nodes, over what is allowed; -1: it was not looked for
     ERROR,  # of the step, over the tolerances

@@ -34,8 +34,10 @@ from twoloop.kernels.evaluation.gamma import representable
 from twoloop.kernels.evaluation.onto_constraints import ABOVE_ROUNDING
 
 # FREE: how many times LOOK a step may be long that nothing is looked at within, beside the nodes
-KAPPA, TARGET, THETA, N_ITERATED, N_ROWS, FREE, N_OPTIONS = range(7)
+THETA, N_ITERATED, N_ROWS, FREE, N_OPTIONS = range(5)
 
+KAPPA = 0.05  # of the tolerance: what the iteration may leave; errors are then at most those of other methods of ours
+TARGET = 6.0  # sweeps that a step is to take
 MORE = 7  # sweeps beyond the target, after which a step is refused
 SLOW = 0.8  # contraction that is too slow
 LEAST_RHO, MOST_RHO = 1e-3, 0.9
@@ -68,10 +70,10 @@ def _room(memory):
 
 
 @merged
-def _sweeps(f, w, options, room, tolerances, state, first):
+def _sweeps(f, room, tolerances, state, first):
     """Iterate the stages: how that ended, after how many sweeps, the last change, and how many there should be."""
     estimated = tolerances[ESTIMATE] == 1.0
-    target, kappa, noise, most = options[TARGET], options[KAPPA], NOISE, MOST_OF_FIXED
+    target, kappa, noise, most = TARGET, KAPPA, NOISE, MOST_OF_FIXED
     if room[room_at.DEGREE] >= 7.0:
         target += 2.0
     elif room[room_at.DEGREE] >= 6.0:
@@ -111,7 +113,7 @@ def _collocate(f, w, options, room, tolerances, t, h, state):
     if first:
         room[room_at.H_BEFORE], room[room_at.DEGREE], room[room_at.RHO] = h, 0.0, WANTED_START
     f.begin_nodes(room, state, tolerances)
-    ended, m, change, target = _sweeps(f, w, options, room, tolerances, state, first)
+    ended, m, change, target = _sweeps(f, room, tolerances, state, first)
     rho = room[room_at.RHO]
     w.counters[N_OUTER] += int(m)
     w.counters[N_EVALUATIONS] += LANES * int(m)
@@ -140,7 +142,7 @@ def _collocate(f, w, options, room, tolerances, t, h, state):
         room[room_at.DEFECT] = defect
         most = min(most, 0.9 * max(defect, 1e-9) ** (-1.0 / 9.0))
     most = min(most, longest / h)
-    left = math.log2(rho * change / options[KAPPA] + 1e-30) + (target - m) * math.log2(rho)
+    left = math.log2(rho * change / KAPPA + 1e-30) + (target - m) * math.log2(rho)
     factor = 2.0 ** (-(left + 1.0) / (target + 2.0))
     # the motion hardly bends within the step, which nonetheless takes about all its sweeps
     limited = room[room_at.CURVED] < STRAIGHT and m >= target - 1.0
@@ -271,7 +273,8 @@ def _make(f, w, options, room, tolerances, control, clock, goal, state, n_most, 
     n, t, n_ends = w.Q.size, clock[at.T], 0
     while n_ends < n_most:
         h = min(clock[at.H_NEXT], control[at.MAX_STEP])
-        if h > 0.5 * (goal - t) or h < 0.5 * clock[at.H_LONG]:
+        short = h < 0.5 * clock[at.H_LONG] or h <= control[at.SHORTEST]
+        if short or h > 0.5 * (goal - t) or _is_unsuited(w, room):
             return n_ends
         h = representable(t, h)
         ended, error, factor = _collocate(f, w, options, room, tolerances, t, h, state)
@@ -279,7 +282,7 @@ def _make(f, w, options, room, tolerances, control, clock, goal, state, n_most, 
             clock[at.H_NEXT] = h * factor
             w.counters[N_REJECTED_ERROR] += 1 if ended == REFUSED else 0
             continue
-        if ended != MADE or _is_unsuited(w, room):
+        if ended != MADE:
             return n_ends
         f.end_nodes(room, state, state)
         room[room_at.NEXT_DEGREE] = _next_degree(room)
@@ -303,7 +306,7 @@ def lobatto_steps(
     put on the constraints together depends on nothing but the run.
     """
     room, n = _room(memory), w.Q.size
-    if _is_unsuited(w, room) or out_t.size < LANES:
+    if out_t.size < LANES:
         return 0
     if control[at.FIRST_GIVEN] == 1.0:
         room[room_at.STARTS] = MOST_STARTS
