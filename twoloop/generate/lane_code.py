@@ -18,9 +18,9 @@ from twoloop.generate.lane_steps import LaneSteps, Places, common, is_set, keep_
 from twoloop.generate.lane_turns import turned
 from twoloop.generate.llvm_text import Value, integer
 from twoloop.generate.series import series_program
-from twoloop.generate.straight_line import Outputs, Solution, StraightLine, is_zero
+from twoloop.generate.straight_line import Outputs, Solution, StraightLine
 from twoloop.generate.traced_equations import Equations
-from twoloop.generate.tracing import Untraceable
+from twoloop.generate.tracing import Untraceable, is_zero
 from twoloop.generate.written import conditions_hold, results_of
 from twoloop.kernels.lanes import lane_projection
 from twoloop.kernels.lanes import lane_room as lanes

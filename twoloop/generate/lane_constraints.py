@@ -10,8 +10,9 @@ from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.lane_steps import LaneSteps, keep_fine
 from twoloop.generate.llvm_text import Value
-from twoloop.generate.straight_line import Outputs, is_zero
+from twoloop.generate.straight_line import Outputs
 from twoloop.generate.traced_equations import Equations
+from twoloop.generate.tracing import is_zero
 from twoloop.generate.written import conditions_hold, results_of
 from twoloop.kernels.lanes import lane_room as lanes
 from twoloop.problem.system import ConstrainedSystem

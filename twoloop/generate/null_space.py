@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from twoloop.generate.symbolic_factors import Factors
-from twoloop.generate.tracing import Form
+from twoloop.generate.tracing import Form, is_zero
 
 Blocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # rows and columns of pivots, one or two each
 Terms = dict[int, Form]  # entries of a row that are not zero, by their columns
@@ -60,7 +60,7 @@ class DependentCoordinates:
         self._graph, self._most = graph, len(graph.operations) + most
         self._zero, self._one = Form(graph, 0.0, {}), Form(graph, 1.0, {})
         self._rows: list[Terms] = [
-            {j: entry for j, entry in enumerate([*row, right]) if not _is_zero(entry)}
+            {j: entry for j, entry in enumerate([*row, right]) if not is_zero(entry)}
             for row, right in zip(rows, gamma, strict=True)
         ]
         self._columns = list(zip(*rows, strict=True))
@@ -112,7 +112,7 @@ class DependentCoordinates:
         else:
             (a, b), (c, d) = block
             determinant = (a * d - b * c).value()
-        if _is_zero(determinant):
+        if is_zero(determinant):
             raise NotReduced
         share = determinant.reciprocal()
         if len(block) == 1:
@@ -161,7 +161,7 @@ def reduced_accelerations(
     """Accelerations by those of the coordinates that stay, and conditions that these have inertia, as of the class."""
     n, T, g, independent = len(mass), coordinates.T, coordinates.g, coordinates.independent
     zero = Form(mass[0, 0].graph, 0.0, {})
-    rows = [[(mass[i, j], j) for j in range(n) if not _is_zero(mass[i, j])] for i in range(n)]
+    rows = [[(mass[i, j], j) for j in range(n) if not is_zero(mass[i, j])] for i in range(n)]
     forces = [(force[i] - _dot(zero, ((x, g[j]) for x, j in rows[i]))).value() for i in range(n)]
     matrix: dict[tuple[int, int], Form] = {}
     coordinates.check(sum(len(row) ** 2 // 2 for row in T))  # of T^T M T, if M is diagonal
@@ -169,7 +169,7 @@ def reduced_accelerations(
         moved = [_dot(zero, ((entry, T[j][x]) for entry, j in row if x in T[j])).value() for row in rows]  # M T
         for b, y in enumerate(independent[: a + 1]):
             inertia = _dot(zero, ((T[i][y], moved[i]) for i in range(n) if y in T[i])).value()
-            if a == b or not _is_zero(inertia):
+            if a == b or not is_zero(inertia):
                 matrix[a, b] = matrix[b, a] = inertia
     right = [_dot(zero, ((T[i][x], forces[i]) for i in range(n) if x in T[i])).value() for x in independent]
     factors = Factors(matrix, len(independent), len(independent))
@@ -193,14 +193,10 @@ def _definite(matrix: dict[tuple[int, int], Form], factors: Factors) -> Iterator
 
 def _dot(total: Form, pairs: Any) -> Form:
     for x, y in pairs:
-        if not _is_zero(x) and not _is_zero(y):
+        if not is_zero(x) and not is_zero(y):
             total = total + x * y
     return total
 
 
 def _not_zero(entries: Terms) -> Terms:
-    return {j: entry.value() for j, entry in entries.items() if not _is_zero(entry)}
-
-
-def _is_zero(form: Form) -> bool:
-    return not form.terms and form.constant == 0.0
+    return {j: entry.value() for j, entry in entries.items() if not is_zero(entry)}

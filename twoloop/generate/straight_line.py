@@ -25,7 +25,7 @@ from twoloop.generate.null_space import DependentCoordinates, NotReduced, reduce
 from twoloop.generate.symbolic_factors import Block, Factors, solve
 from twoloop.generate.traced_equations import Equations, only
 from twoloop.generate.traced_values import Traced
-from twoloop.generate.tracing import Form, Graph, Untraceable
+from twoloop.generate.tracing import Form, Graph, Untraceable, is_zero
 from twoloop.kernels.evaluation.inner import CONTRADICTS
 from twoloop.kernels.evaluation.operations import PRODUCT, RECIPROCAL
 from twoloop.problem.system import ConstrainedSystem
@@ -404,8 +404,3 @@ def _shared(graph: Graph, kept: Sequence[int], more: Sequence[Outputs]) -> list[
             assert operation is not None
             found |= {i for form in operation[1:] if isinstance(form, Form) for i in form.terms}
     return sorted(found & made - set(kept))
-
-
-def is_zero(form: Form) -> bool:
-    """Whether a form is zero by its structure."""
-    return not form.terms and form.constant == 0.0

@@ -422,3 +422,8 @@ def symbols(forms: Iterable[Form]) -> Any:
     made = np.empty(len(forms), dtype=object)
     made[:] = forms
     return made
+
+
+def is_zero(form: Form) -> bool:
+    """Whether a form is zero by its structure."""
+    return not form.terms and form.constant == 0.0

@@ -21,6 +21,7 @@ from twoloop.kernels.control.singular import (
 )
 from twoloop.kernels.control.sudden import up_to_sudden
 from twoloop.kernels.data.codes import DONE, INNER_DIVERGED, NEEDS_DENSE, NOT_FINITE, NOT_LOADED, SINGULAR, UNSUITED
+from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, WORK, f8, i8, kernel, merged
 from twoloop.kernels.data.counters import (
     N_ACCEPTED,
@@ -51,7 +52,6 @@ from twoloop.kernels.evaluation.partition import CHANGED
 
 UNFORESEEN = 10.0  # an error that is so large was not foreseen: the force jumps, or bends, within the step
 REFUSED = 0.95  # of a refused step is what the next one is at most
-IN_A_ROW = 8  # steps at most: there has to be room for them
 FIRST_JUDGED = 2  # accepted step after which a provisional method may give way: the first one may be a guess
 
 
@@ -208,7 +208,7 @@ def advance(
             return at.MAX_STEPS_REACHED
         if _may_go_on(control, clock):
             first, goal = filled[0], outputs[int(clock[at.NEXT_OUTPUT])]
-            if min(out_t.size - first, out_steps.shape[0] - filled[1]) < IN_A_ROW and first + filled[1] > 0:
+            if min(out_t.size - first, out_steps.shape[0] - filled[1]) < LANES and first + filled[1] > 0:
                 return at.PAUSED
             rows = out_t[first:], out_state[first:], out_steps[filled[1] :]
             made = f.attempt_many(f, w, options, memory, tolerances, control, clock, goal, state, new_state, *rows)
