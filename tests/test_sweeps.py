@@ -10,7 +10,7 @@ import pytest
 from tests.problems import pendulum as bare_pendulum
 from twoloop import solve_dae, sweep
 from twoloop.mechanisms import Problem, four_bar
-from twoloop.sweeps import saved_sweep, workers
+from twoloop.sweeps import executors, saved_rows
 
 pd = pytest.importorskip("pandas")  # not among the oldest versions
 THREADS = {"parallel": "threads"}
@@ -93,7 +93,7 @@ def test_a_dask_cluster_gives_the_same_numbers(rows):
 def test_an_interrupted_sweep_goes_on(tmp_path, monkeypatch):
     out = tmp_path / "rows.parquet"
     options = {"parallel": "threads", "workers": 1, "t_span": (0.0, 0.1), "out": out}
-    monkeypatch.setattr(saved_sweep, "settings", lambda work: saved_sweep.Settings("the same", {}))  # of both functions
+    monkeypatch.setattr(saved_rows, "settings", lambda work: saved_rows.Settings("the same", {}))  # of both functions
     with pytest.raises(KeyboardInterrupt):
         sweep(interrupted, ANGLES, **options)
     kept = pd.read_parquet(out)
@@ -232,7 +232,7 @@ PAIRS = {
 @pytest.mark.parametrize("name", PAIRS)
 def test_rows_of_another_function_of_the_same_name_are_refused(name, resumes, monkeypatch):
     first, second = PAIRS[name]
-    monkeypatch.setattr("twoloop.sweeps.saved_sweep.described", lambda value: "the same words")
+    monkeypatch.setattr("twoloop.sweeps.saved_rows._in_words", lambda value: "the same words")
     assert resumes(first, first) and not resumes(first, second)
 
 
@@ -248,7 +248,7 @@ def test_a_global_that_is_reached_counts_and_others_do_not(tmp_path, monkeypatch
 
 @pytest.mark.slow
 def test_a_worker_that_dies_costs_its_own_run_alone(tmp_path, monkeypatch):
-    monkeypatch.setattr(workers, "RENEWED_AFTER", 0)  # processes grow with what they compile: each ends after a run
+    monkeypatch.setattr(executors, "RENEWED_AFTER", 0)  # processes grow with what they compile: each ends after a run
     out = tmp_path / "rows.parquet"
     rows = sweep(dying, RUNS[:4], measure=plain, workers=2, out=out, **QUICK)
     assert rows["status"].tolist() == ["REACHED_END", "ERROR", "ERROR", "REACHED_END"]

@@ -9,15 +9,13 @@ import numpy as np
 from references.paper.four_bar_minimal import MinimalFourBar
 from studies.bench.cli import processor
 from studies.bench.store import Array
-from twoloop import consistent_states, ensemble, mechanisms, sweep
+from twoloop import consistent_states, ensemble, mechanisms
 from twoloop.ensembles.in_lanes import threads_of
 from twoloop.ensembles.runs import Runs
 from twoloop.mechanisms import Problem, four_bar
 from twoloop.mechanisms.four_bar import DENSITY, GRAVITY
 
-VARIED, DRAWN, TABLE = "random linkages", "in one call", "table"  # groups of rows
-LANES, SINGLY = "in lanes", "one by one"  # ways of `sweep`, and an option with its default that forbids lanes
-OPTIONS: dict[str, dict[str, Any]] = {LANES: {}, SINGLY: {"max_step": np.inf}}
+VARIED, DRAWN = "random linkages", "in one call"  # groups of rows
 SPAN = 6.0  # s
 SPREAD = 0.02  # of lengths that are varied
 SEED, SEED_DRAWN = 2016, 2017
@@ -39,17 +37,6 @@ def drawn(n: int) -> list[dict[str, Any]]:
 def linkage(L1: float, L2: float, L3: float, ground: float, theta3: float, branch: int) -> Problem:
     """Return a linkage of these lengths, released from rest."""
     return four_bar((L1, L2, L3), ground, theta3, branch)
-
-
-def table_rows(n: int, t_end: float, parallel: str, workers: int) -> Iterator[dict[str, Any]]:
-    """Time `sweep` on n linkages, with the runs made together in SIMD lanes and one at a time."""
-    for way, options in OPTIONS.items():
-        began = time.perf_counter()
-        rows = sweep(linkage, drawn(n), t_span=(0.0, t_end), parallel=parallel, workers=workers, **options)
-        wall, done = time.perf_counter() - began, rows[rows["status"] == "REACHED_END"]
-        row = {"group": TABLE, "way": way, "n_runs": n, "n_threads": workers, "wall": wall, "n_assembled": len(done)}
-        row |= {"n_singly": len(done) - int(done["message"].str.contains(LANES).sum())}
-        yield row | {"energy_median": done["energy_error"].median(), "energy_error": done["energy_error"].max()}
 
 
 def varied(n: int, random: np.random.Generator) -> tuple[Array, Array, Array]:
@@ -155,5 +142,3 @@ def rows(quick: bool) -> Iterator[dict[str, Any]]:
     for n in (200,) if quick else (10_000, 1_000_000):
         yield varied_row(n) | {"processor": processor()}
         yield drawn_row(n) | {"processor": processor()}
-    parallel = ("threads", 1) if quick else ("processes", 2)
-    yield from table_rows(20 if quick else 10_000, SPAN, *parallel)

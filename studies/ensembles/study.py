@@ -210,14 +210,14 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     many = rows[rows["group"] == linkages.VARIED].iloc[-1]
     names = ("n_runs", "n_threads", "wall", "cpu", "n_failed", "n_singly")
     found["million"] = {name: float(many[name]) for name in names} | {"t_end": linkages.SPAN}
-    about = rows[rows["group"].isin((linkages.VARIED, linkages.DRAWN, linkages.TABLE))]
+    about = rows[rows["group"].isin((linkages.VARIED, linkages.DRAWN))]
     found["linkages"] = (
         about.reindex(columns=LINKAGE_COLUMNS).astype(object).where(about.notna(), None).to_dict("records")
     )
     return found | {"answer": _answer(found)}
 
 
-LINKAGE_COLUMNS = ["group", "way", *("n_runs", "n_assembled", "wall", "n_failed", "n_singly", "energy_median")]
+LINKAGE_COLUMNS = ["group", *("n_runs", "n_assembled", "wall", "n_failed", "n_singly", "energy_median")]
 LINKAGE_COLUMNS += ["energy_error", "end_error_any", "end_error_hard"]
 
 

@@ -164,15 +164,6 @@ def test_energies_and_ends_of_many_are_those_of_one(monkeypatch):
     assert linkages.end_error(given[0], runs.q[0, :, -1] + 1e-3, 1.0) == pytest.approx(1e-3, rel=1e-3)
 
 
-def test_a_table_has_the_same_runs_in_both_ways(monkeypatch):
-    monkeypatch.setattr("twoloop.ensembles.in_turn.CALL", 1e9)  # code is worth its time
-    monkeypatch.setattr("twoloop.sweeps.shared_runs.DEAR", 1e9)  # so are linkages that are made twice
-    monkeypatch.setattr("twoloop.sweeps.shared_runs.LONGEST", 1e9)  # s, also where kernels have to be compiled
-    lanes, singly = linkages.table_rows(12, 1.0, "threads", 1)
-    assert lanes["n_assembled"] == singly["n_assembled"] > 6 and singly["n_singly"] > lanes["n_singly"]
-    assert 0.0 < lanes["energy_error"] < 1e-6 and 0.0 < singly["energy_error"] < 1e-6
-
-
 @pytest.mark.slow
 def test_the_quick_run(tmp_path):
     ensembles.STUDY.main(["--quick", "--out", str(tmp_path)])

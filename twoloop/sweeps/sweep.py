@@ -1,4 +1,4 @@
-"""Many runs of one mechanism with different parameters and starts: parallel, with failures as rows, resumable."""
+"""Solve many runs of a mechanism in parallel, as a table that can be resumed; failures are rows."""
 
 from __future__ import annotations
 
@@ -14,16 +14,15 @@ from twoloop.checks.arguments import check_choice, check_flag, check_path, check
 from twoloop.checks.optional import needed
 from twoloop.result.result import Result
 from twoloop.solve import check_method, solve_dae
-from twoloop.sweeps import saved_sweep
-from twoloop.sweeps.cells import OWN, Row, check_parameters, fitting, kind_of
-from twoloop.sweeps.one_run import Work, ends
-from twoloop.sweeps.shared_out import all_rows
+from twoloop.sweeps import saved_rows
+from twoloop.sweeps.executors import solve_runs
+from twoloop.sweeps.one_run import STANDARD_COLUMNS, Row, Work, check_parameters, ends, fit_columns, kind_of
 
 if TYPE_CHECKING:
     from twoloop.problem.problem import Problem
 
 PARALLEL = ("processes", "threads")
-SAVE_EVERY = 10.0  # s
+SAVE_INTERVAL = 10.0  # s
 
 
 def sweep(
@@ -80,8 +79,8 @@ def sweep(
     -------
     pandas.DataFrame
         One row per run in the order of `parameters`, indexed by "run". Columns: the parameters, "status" (that of
-        `Result.status`, or "ERROR" if the run raised an exception), "message", "seconds" of wall-clock time (of runs
-        made together an equal share), and the measures.
+        `Result.status`, or "ERROR" if the run raised an exception), "message", "seconds" of wall-clock time, and the
+        measures.
 
     Raises
     ------
@@ -92,20 +91,8 @@ def sweep(
 
     Notes
     -----
-    Runs of compiled callbacks that differ in parameters and starts only are made together in SIMD lanes, as by
-    `ensemble`, if states at given times are all that is asked for: with `t_eval`, or with the default measures, and no
-    options but these and method, rtol, atol, t_span and check_derivatives. Some runs of each task are still made by
-    `solve_dae`. Of those made in lanes,
-
-    - messages say "in lanes", and numbers agree with those of single runs within the tolerances;
-    - t, q, v, a, lam, energy and reactions of the `Result` are of the lanes. Where `measure` asks for anything else,
-      such as `stats` or `h`, the run is made singly, too. The default measures have the counts of the lanes;
-    - the default measures look at the energy at 101 evenly spaced times, instead of at every step;
-    - `problem_of` is called twice: for lanes, and again just before `measure`. If the second problem is another, the
-      run is a single one. So `problem_of` should be cheap, and must not depend on earlier calls.
-
-    All other runs are separate calls of `solve_dae`, whose rows do not depend on how they are distributed. A process
-    that dies affects a single run: the others of its task are repeated one by one.
+    Each run is a call of `solve_dae`, and its row does not depend on how runs are distributed. A process that dies
+    costs its own run only. Runs that differ in parameters and starts alone are faster by `ensemble`.
 
     Examples
     --------
@@ -119,8 +106,8 @@ def sweep(
     check_choice("parallel", parallel, PARALLEL)
     check_flag("progress", progress)
     n_workers = (os.cpu_count() or 1) if workers is None else check_size("workers", workers, 1)
-    given = check_parameters(problem_of, parameters)
-    options = _check_options(options)
+    runs = check_parameters(problem_of, parameters)
+    _check_options(options)
     if t_span is not None:
         check_span(t_span)
         options["t_span"] = t_span
@@ -131,51 +118,51 @@ def sweep(
     path = None if out is None else check_path(out, "out")
     rows: dict[int, Row] = {}
     if path is not None:
-        settings = saved_sweep.settings(work)
-        rows = saved_sweep.read(pandas, path, given, settings)
+        settings = saved_rows.settings(work)
+        rows = saved_rows.read(pandas, path, runs, settings)
 
     def table() -> Any:
-        made = pandas.DataFrame([rows[number] for number in sorted(rows)], index=sorted(rows)).rename_axis("run")
-        return made if len(made) else pandas.DataFrame(columns=[*given[0], *OWN]).rename_axis("run")
+        numbers = sorted(rows)
+        columns = None if rows else [*runs[0], *STANDARD_COLUMNS]
+        return pandas.DataFrame([rows[number] for number in numbers], numbers, columns).rename_axis("run")
 
-    left = [number for number in range(len(given)) if number not in rows]
+    missing = [number for number in range(len(runs)) if number not in rows]
     kinds = {name: kind for row in rows.values() for name, value in row.items() if (kind := kind_of(value))}
     with (
-        _bar(progress, len(given)) as report,
-        closing(all_rows(work, given, left, n_workers, parallel, client)) as made,
+        _progress_bar(progress, len(runs)) as report,
+        closing(solve_runs(work, runs, missing, n_workers, parallel, client)) as solved,
     ):
-        saved = time.monotonic()
+        last_save = time.monotonic()
         try:
-            for number, row in made:
-                rows[number] = {**given[number], **fitting(row, kinds)}
+            for number, row in solved:
+                rows[number] = {**runs[number], **fit_columns(row, kinds)}
                 report(len(rows))
-                if path is not None and time.monotonic() - saved > SAVE_EVERY:
-                    saved_sweep.write(table(), path, settings)
-                    saved = time.monotonic()
+                if path is not None and time.monotonic() - last_save > SAVE_INTERVAL:
+                    saved_rows.write(table(), path, settings)
+                    last_save = time.monotonic()
         finally:
             if path is not None and rows:
-                saved_sweep.write(table(), path, settings)
+                saved_rows.write(table(), path, settings)
     return table()
 
 
-def _check_options(options: dict[str, Any]) -> dict[str, Any]:
-    of_a_run = ("system", "t_span", "q0", "v0", "store")
-    known = [name for name in inspect.signature(solve_dae).parameters if name not in of_a_run]
-    unknown = [name for name in options if name not in known]
+def _check_options(options: dict[str, Any]) -> None:
+    set_by_sweep = ("system", "t_span", "q0", "v0", "store")
+    names = [name for name in inspect.signature(solve_dae).parameters if name not in set_by_sweep]
+    unknown = [name for name in options if name not in names]
     if unknown:
         raise TypeError(
-            f"sweep has no argument {unknown[0]!r}; those that it hands to solve_dae are {', '.join(known)}"
+            f"sweep has no argument {unknown[0]!r}; those that it hands to solve_dae are {', '.join(names)}"
         )
-    check_method(options.get("method", "SunRadau5"))
+    check_method(options.get("method", "auto"))
     for name in {"rtol", "time_limit"} & set(options):
         check_positive(name, options[name])
-    return options
 
 
 def _check_pickles(work: Work) -> None:
-    for name, each in zip(("problem_of", "measure", "options"), work, strict=True):
+    for name, value in zip(("problem_of", "measure", "options"), work, strict=True):
         try:
-            pickle.dumps(each)
+            pickle.dumps(value)
         except Exception as error:
             raise TypeError(
                 f"{name} cannot be sent to another process: write its functions at the top level of a module, or take "
@@ -184,11 +171,11 @@ def _check_pickles(work: Work) -> None:
 
 
 @contextmanager
-def _bar(progress: bool, n: int) -> Iterator[Callable[[int], None]]:
+def _progress_bar(progress: bool, n: int) -> Iterator[Callable[[int], None]]:
     """Yield a function that takes the number of finished rows and draws a progress bar if requested."""
     if not progress:
-        yield lambda done: None
+        yield lambda n_done: None
         return
     with needed("rich.progress", "rich", "progress=True").Progress() as bar:
         task = bar.add_task(f"{n} runs", total=n)
-        yield lambda done: bar.update(task, completed=done)
+        yield lambda n_done: bar.update(task, completed=n_done)
