@@ -11,7 +11,7 @@ import twoloop
 from tests.problems import pendulum, run, swing
 from tests.processes import run_node
 from twoloop import mechanisms, solve_dae
-from twoloop.result.plotting import violation
+from twoloop.result.views import violation
 
 pytest.importorskip("pandas")  # not among the oldest versions
 pytest.importorskip("matplotlib")

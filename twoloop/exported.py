@@ -23,9 +23,9 @@ from twoloop.problem.stops import Stop as Stop
 from twoloop.problem.system import ConstrainedSystem as ConstrainedSystem
 from twoloop.result.certificate import Certificate as Certificate
 from twoloop.result.certificate import CertificateWarning as CertificateWarning
-from twoloop.result.citations import citation as citation
 from twoloop.result.loading import load as load
 from twoloop.result.result import Result as Result
+from twoloop.result.result import citation as citation
 from twoloop.run.projection import ConsistentState as ConsistentState
 from twoloop.run.projection import consistent_state as consistent_state
 from twoloop.run.record import Statistics as Statistics

@@ -32,8 +32,8 @@ from twoloop.methods.plan import Method
 from twoloop.methods.presets import PRESETS, is_preset
 from twoloop.problem.events import check_events
 from twoloop.problem.system import ConstrainedSystem, check_system
-from twoloop.result.folder import begin_folder, check_folder, end_folder
 from twoloop.result.result import Result
+from twoloop.result.storage import begin_folder, check_folder, end_folder
 from twoloop.run.again import LONGEST, STEPS, Output
 from twoloop.run.asked import Asked
 from twoloop.run.course import Course

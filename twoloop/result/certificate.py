@@ -22,10 +22,7 @@ SPLIT = 100.0  # defect of an interval above which its steps are checked one by 
 MAX_WRONG = 3  # wrong steps after which the rest of an interval is skipped
 NEGLIGIBLE = 1e-10  # relative: smaller singular values of the rows count as zero
 USUAL_GROWTH = 10.0  # error growth over an interval up to which the defect is not corrected for it
-MAX_ATTEMPTS, MAX_ATTEMPTS_PER_STEP = (
-    400,
-    32,
-)  # attempted steps allowed per interval, plus those per step of the run in it
+MAX_ATTEMPTS, MAX_ATTEMPTS_PER_STEP = 400, 32  # attempted steps per interval, plus those per step of the run in it
 LOOSER = (10.0, 100.0)  # factors of the tolerances with which a failed reintegration is repeated
 
 
@@ -105,20 +102,20 @@ def certify(result: Record, rtol: float | None, atol: ArrayLike | None) -> Certi
             f"{': certify its parts, result.arcs' if result.arcs else ''}"
         )
     checker = _Checker(result, result.system, *_tolerances(result, result.system.n_q, rtol, atol))
-    defect, where = 0.0, float(checker.t[0])
+    defect, t_worst = 0.0, float(checker.t[0])
     unseen: list[tuple[float, float]] = []
-    for i, j, found in checker.pieces():
-        if not np.isfinite(found):
+    for i, j, interval_defect in checker.pieces():
+        if not np.isfinite(interval_defect):
             start = unseen.pop()[0] if unseen and unseen[-1][1] == checker.t[i] else float(checker.t[i])
             unseen.append((start, float(checker.t[j])))
-        elif found > defect:
-            defect, where = found, float(checker.t[i])
+        elif interval_defect > defect:
+            defect, t_worst = interval_defect, float(checker.t[i])
     gap = max([checker.gap, *(end - start for start, end in unseen)])
     passed = defect <= LIMIT and not unseen
-    message = _message(result, defect, where, gap, unseen)
+    message = _message(result, defect, t_worst, gap, unseen)
     if defect > LIMIT:
         warnings.warn(message, CertificateWarning, stacklevel=3)
-    return Certificate(defect, where, gap, LIMIT, tuple(unseen), passed, message)
+    return Certificate(defect, t_worst, gap, LIMIT, tuple(unseen), passed, message)
 
 
 def _tolerances(result: Record, n_q: int, rtol: float | None, atol: ArrayLike | None) -> tuple[float, Array]:
@@ -183,26 +180,26 @@ class _Checker:
             j = i + 1
             while j < last and self.t[j + 1] - self.t[i] <= self.longest and self.untested[j] == self.untested[i]:
                 j += 1
-            found = self._defect(i, j)
-            if SPLIT < found < np.inf and j > i + 1:
+            defect = self._defect(i, j)
+            if SPLIT < defect < np.inf and j > i + 1:
                 yield from self._single_steps(i, j)
                 if self.untested[i]:  # velocity errors show up in the positions of later steps only
-                    yield i, j, found / (j - i)
+                    yield i, j, defect / (j - i)
             else:
-                yield i, j, found
+                yield i, j, defect
             i = j
 
     def _single_steps(self, i: int, j: int) -> Iterator[tuple[int, int, float]]:
         """Yield the same for the steps of an interval with a large defect: many small errors, or a few wrong steps."""
-        wrong = 0
+        n_wrong = 0
         for k in range(i, j):
-            found = self._defect(k, k + 1)
-            wrong += found > LIMIT
-            if wrong == MAX_WRONG and not np.isfinite(found):
-                yield k, j, found
+            defect = self._defect(k, k + 1)
+            n_wrong += defect > LIMIT
+            if n_wrong == MAX_WRONG and not np.isfinite(defect):
+                yield k, j, defect
             else:
-                yield k, k + 1, found
-            if wrong == MAX_WRONG:
+                yield k, k + 1, defect
+            if n_wrong == MAX_WRONG:
                 return
 
     def _defect(self, i: int, j: int) -> float:
@@ -210,14 +207,14 @@ class _Checker:
         newton = bool(self.result.stats.n_jacobians) and (self.result.untested is None or self.untested[i])
         stiff = "positions" if self.untested[i] else "all"
         order = (stiff, "explicit") if newton else ("explicit", stiff)
-        found = [(np.inf, "")]
+        defects = [(np.inf, "")]
         for method in order:
-            found.append((self._defect_by(method, 1.0, i, j), method))
-            least, by = min(found)
+            defects.append((self._defect_by(method, 1.0, i, j), method))
+            least, best = min(defects)
             if least <= LIMIT or (least < np.inf and j > i + 1):
                 return least
         if least < np.inf:  # is the step wrong, or do errors grow this fast?
-            growth = self._growth(by, i, j)
+            growth = self._growth(best, i, j)
             return least / (growth if growth > USUAL_GROWTH else 1.0) if growth <= LIMIT else np.inf
         for looser in LOOSER:  # near a singular position rounding may prevent the full accuracy
             for method in order:
@@ -228,12 +225,12 @@ class _Checker:
 
     def _defect_by(self, method: str, looser: float, i: int, j: int) -> float:
         """Return the defect from state i to state j by one method, with tolerances relaxed by a factor."""
-        made = self._remake(method, looser, self.states[i], i, j)
-        if made is None:
+        rerun = self._remake(method, looser, self.states[i], i, j)
+        if rerun is None:
             return np.inf
-        at_end = self._distance(made.end, self.states[j], i, j)
-        several = 1 if j > i + 1 else int(self.n_steps[i])  # steps without stored states between them
-        return max(at_end, self._deviation_between(made.between, i, j)) / float(np.sqrt(several))
+        end_defect = self._distance(rerun.end, self.states[j], i, j)
+        n_steps = 1 if j > i + 1 else int(self.n_steps[i])  # steps without stored states between them
+        return max(end_defect, self._deviation_between(rerun.between, i, j)) / float(np.sqrt(n_steps))
 
     def _deviation_between(self, state: Array, i: int, j: int) -> float:
         """Return the deviation of the dense solution from a reintegrated state, divided by the tolerance."""
@@ -243,13 +240,15 @@ class _Checker:
         table = self.sol.table
         if table.kinds[np.searchsorted(table.t, t) - 1] == APART:  # interpolation is less accurate than the states here
             return 0.0
-        found = self.sol(t)
-        return self._distance(state, np.concatenate([found.q, found.v]), i, j)
+        interpolated = self.sol(t)
+        return self._distance(state, np.concatenate([interpolated.q, interpolated.v]), i, j)
 
     def _growth(self, method: str, i: int, j: int) -> float:
         """Return the factor by which an error of the size of the tolerance grows from state i to state j."""
-        one, other = (self._remake(method, 1.0, start, i, j) for start in (self.states[i], self._perturbed(i)))
-        return np.inf if one is None or other is None else self._distance(one.end, other.end, i, j)
+        reference, perturbed = (
+            self._remake(method, 1.0, start, i, j) for start in (self.states[i], self._perturbed(i))
+        )
+        return np.inf if reference is None or perturbed is None else self._distance(reference.end, perturbed.end, i, j)
 
     def _perturbed(self, i: int) -> Array:
         """Return a state on the constraints that differs from state i by about the tolerances."""
@@ -275,17 +274,19 @@ class _Checker:
         """Integrate from `start` at the time of state i to state j; None if that fails."""
         key = (method, looser)
         if key not in self.remakers:
-            made = explicit() if method == "explicit" else implicit(method == "all")
+            chosen = explicit() if method == "explicit" else implicit(method == "all")
             q, v = self.states[0].reshape(2, -1).copy()
             rtol, atol = looser * float(tighter(self.rtol)), looser * tighter(self.atol)
-            self.remakers[key] = Remaker(self.system, float(self.t[0]), q, v, made, rtol, atol, self.longest)
+            self.remakers[key] = Remaker(self.system, float(self.t[0]), q, v, chosen, rtol, atol, self.longest)
         remaker = self.remakers[key]
         t0, t1 = float(self.t[i]), float(self.t[j])
-        most = MAX_ATTEMPTS + MAX_ATTEMPTS_PER_STEP * (int(self.n_steps[i:j].sum()) + int((t1 - t0) / self.longest))
-        found = remaker.to(t0, start, self._check_time(i, j), t1, most if looser == 1.0 else MAX_ATTEMPTS)
-        if found is not None:
-            self.gap = max(self.gap, found.longest * remaker.spacing)
-        return found
+        max_attempts = MAX_ATTEMPTS + MAX_ATTEMPTS_PER_STEP * (
+            int(self.n_steps[i:j].sum()) + int((t1 - t0) / self.longest)
+        )
+        rerun = remaker.to(t0, start, self._check_time(i, j), t1, max_attempts if looser == 1.0 else MAX_ATTEMPTS)
+        if rerun is not None:
+            self.gap = max(self.gap, rerun.longest * remaker.spacing)
+        return rerun
 
     def _check_time(self, i: int, j: int) -> float:
         """Return the midpoint of the longest interval between states i and j; without `sol` the time of state j."""
@@ -295,15 +296,15 @@ class _Checker:
         return float(0.5 * (self.t[k] + self.t[k + 1]))
 
 
-def _message(result: Record, defect: float, where: float, gap: float, unseen: list[tuple[float, float]]) -> str:
+def _message(result: Record, defect: float, t_worst: float, gap: float, unseen: list[tuple[float, float]]) -> str:
     """Return the outcome in words."""
-    of = result.method or "the run"
+    method = result.method or "the run"
     parts = []
     if defect > LIMIT:
         parts.append(
-            f"Not passed: the step of {of} that starts at t = {where:.6g} ends {defect:.2g} times its tolerance away "
-            f"from the solution of the equations (limit: {LIMIT:g}). It missed a feature, or the tolerance is not met: "
-            "limit max_step, or use another method."
+            f"Not passed: the step of {method} that starts at t = {t_worst:.6g} ends {defect:.2g} times its tolerance "
+            f"away from the solution of the equations (limit: {LIMIT:g}). It missed a feature, or the tolerance is not "
+            "met: limit max_step, or use another method."
         )
     else:
         parts.append(

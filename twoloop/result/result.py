@@ -1,6 +1,6 @@
-"""`Result`, the return value of `solve_dae`: the record of a run and its views."""
+"""Define `Result`, the return value of `solve_dae`: the record of a run with its views, and what to cite for it."""
 
-from __future__ import annotations  # help() shows types by name
+from __future__ import annotations
 
 import os
 from dataclasses import dataclass
@@ -9,13 +9,35 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from twoloop.result.animation import animate
+from twoloop.methods.presets import PRESETS
 from twoloop.result.certificate import Certificate, certify
-from twoloop.result.dataframe import to_dataframe
-from twoloop.result.plotting import plot
 from twoloop.result.reactions import Reaction, reaction
 from twoloop.result.storage import save
+from twoloop.result.views import animate, plot, to_dataframe
 from twoloop.run.record import Record
+
+SOFTWARE = """@software{twoloop,
+  title = {twoloop: two-loop state-space integration of constrained mechanical systems},
+  author = {{The twoloop contributors}},
+  version = VERSION
+}"""
+
+# by prefix of the method name; the sources are those named in the docstrings of the methods
+SOURCES = {
+    "Sun Radau IIB": ("sun",),
+    "Gauss": ("butcher",),
+    "Radau IIA": ("stiff",),
+    "Lobatto IIIE": ("geometric",),
+    "Newmark": ("newmark",),
+    "BDF": ("brenan",),
+    "TRBDF2": ("hosea",),
+    "ESDIRK4": ("kennedy",),
+    "DOP853": ("explicit",),
+    "Lobatto16": ("stiff", "lanes"),
+    "auto": ("lanes", "explicit", "krogh", "shampine", "pryce", "jorba", "hosea", "stiff"),
+    "Adams": ("krogh", "shampine"),
+    "Taylor": ("pryce", "jorba"),
+}
 
 
 @dataclass(frozen=True, repr=False)
@@ -250,3 +272,52 @@ class Result(Record):
             File to write; an existing file is replaced.
         """
         save(self, path)
+
+
+def citation(result: Result) -> str:
+    """Return the BibTeX entries of a result: the paper, its method, and this software.
+
+    Parameters
+    ----------
+    result : Result
+        Result of `solve_dae`, or read from a file.
+
+    Returns
+    -------
+    str
+        Entries for a .bib file. The comment at the top names the method with its options.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the argument is not a result, or comes from another solver.
+
+    Examples
+    --------
+    >>> from twoloop import solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0)
+    >>> from twoloop import citation
+    >>> "@" in citation(result)  # BibTeX
+    True
+    """
+    from twoloop import __version__
+
+    if not isinstance(result, Result):
+        raise TypeError(f"citation needs a result of solve_dae; given {type(result).__name__}")
+    if not result.method:
+        raise ValueError("this result was made by another solver, or by a version that did not record the method")
+    keys = ["paper", *(key for name, sources in SOURCES.items() if result.method.startswith(name) for key in sources)]
+    if any(outer in result.method for outer in (", auto", ", newton")) and "stiff" not in keys:
+        keys.append("stiff")  # simplified Newton iteration in the outer loop
+    preset = next((f' (method="{name}")' for name, method in PRESETS.items() if method.name == result.method), "")
+    entries = bibliography()
+    software = SOFTWARE.replace("VERSION", f"{{{__version__}}}")
+    return "\n\n".join([f"% {result.method}{preset}", *[entries[key] for key in keys], software])
+
+
+def bibliography() -> dict[str, str]:
+    """Return the BibTeX entries of all sources by the keys of `SOURCES`, and that of the paper."""
+    text = Path(__file__).with_name("citations.bib").read_text(encoding="utf-8")
+    return dict(entry.removeprefix("% ").split("\n", 1) for entry in text.strip().split("\n\n"))
