@@ -41,9 +41,7 @@ FAILED = -1.0  # what a sweep gives in place of a change where accelerations can
 
 def suits(own: SharedCode) -> bool:
     """Whether the code of a mechanism takes no longer than some seconds to compile."""
-    equations = own.equations
-    outputs = equations.nearer if own.projects else equations.there
-    return len(outputs.quantities(equations.graph)) <= LONGEST
+    return len(own.equations.nearer.quantities(own.equations.graph)) <= LONGEST
 
 
 class CollocationCode:
@@ -72,9 +70,7 @@ class CollocationCode:
             self.n, len(self.iterated), self.n_rows
         )
 
-        outputs = list(self.equations.accelerations)
-        if own.projects:
-            outputs += [self.equations.closer, self.equations.nearer]
+        outputs = [*self.equations.accelerations, self.equations.closer, self.equations.nearer]
         graph, numbers = self.equations.graph, self.numbers
         told = [[each.sizes, *numbers.structure(graph, each.forms)] for each in outputs]
         self.structure = hashlib.sha256(repr([own.digest, told]).encode()).hexdigest()
@@ -375,10 +371,10 @@ def _compiled(own: SharedCode) -> Collocation:
         "sweep_nodes": code.sweep,
         "judge_nodes": code.judge,
         "end_nodes": code.end,
+        "audit_nodes": code.audit,
+        "closer_ends": code.closer,
+        "nearer_ends": code.nearer,
     }
-    parts["audit_nodes"] = code.audit
-    if own.projects:
-        parts |= {"closer_ends": code.closer, "nearer_ends": code.nearer}
     long = own.parts is not None
 
     def write() -> tuple[list[str], str]:

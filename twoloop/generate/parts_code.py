@@ -47,23 +47,19 @@ class PartsCode:
         self.equations, self.numbers = equations, numbers
         self.n, self.n_rows = equations.system.n_q, len(equations.all_rows)
         self.redundant = len(equations.choice.rows) < self.n_rows
-        self.at_position = {"right": equations.right}
-        if equations.projects:
-            self.at_position |= {"off": equations.off, "faster": equations.faster}
+        self.at_position = {"right": equations.right, "off": equations.off, "faster": equations.faster}
         self.solution = Solution(equations, list(self.at_position.values()))
         self.with_factors = {"solution": self.solution.solved}
-        if equations.projects and self.redundant:
+        if self.redundant:
             self.with_factors["least"] = self.solution.least
 
     def write(self, module: Module, kinds: Callable[[str], tuple[str, list[str]]]) -> list[str]:
         """Put all of them into a module; the names of those that kernels know, whose types `kinds` has."""
-        known: dict[str, Callable[..., Any]] = {}
+        known: dict[str, Callable[..., Any]] = {"own_closer": self._closer, "own_nearer": self._nearer}
         if self.equations.quick is None:
             known["own_there"] = self._there
         else:  # which calls this one where it does not serve
             _write(module.function(MASS_FIRST, *kinds("own_there"), internal=True), self._there)
-        if self.equations.projects:
-            known |= {"own_closer": self._closer, "own_nearer": self._nearer}
         _write(module.function("factors", BIT, POSITION, internal=True), self._factors)
         for name, outputs in self.at_position.items():
             kind = [*POSITION, *[ARRAY] * len(outputs.arrays)]

@@ -89,13 +89,10 @@ class SharedCode:
     digest : str
         Of all that the functions depend on, the values of these apart.
     functions : OwnFunctions
-    projects : bool
-        Whether they project, or give accelerations alone.
     """
 
     def __init__(self, equations: StraightLine, family: Family):
-        self.equations, self.family, self.numbers = equations, family, Coefficients()
-        self.projects, self.parts = equations.projects, None
+        self.equations, self.family, self.numbers, self.parts = equations, family, Coefficients(), None
         if parts_code.is_long(equations):
             self.parts = PartsCode(equations, self.numbers)
         self.outputs = self._outputs()
@@ -113,13 +110,13 @@ class SharedCode:
         """The inner loop that calls them."""
         from twoloop.kernels.evaluation import own_inner
 
-        return own_inner.own_inner_loop if self.projects else own_inner.own_evaluations
+        return own_inner.own_inner_loop
 
     def _outputs(self) -> dict[str, Outputs]:
         """What functions compute that are no parts of others."""
         equations = self.equations
-        outputs = {"own_redundant": equations.redundant} if self.projects else {}
-        if self.parts is None and self.projects:
+        outputs = {"own_redundant": equations.redundant}
+        if self.parts is None:
             outputs |= {"own_closer": equations.closer, "own_nearer": equations.nearer}
         return outputs
 

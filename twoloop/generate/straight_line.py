@@ -98,14 +98,13 @@ class StraightLine:
         The same by dependent coordinates, where that takes fewer operations. `there` holds in more positions.
     right : Outputs
         "r" (n_q,) and "c" (n_c + n_a,), Q and the right-hand sides of the rows of G that are used; without conditions.
-    projects : bool
-        Whether there are `closer` and `nearer`. Rows of A leave positions free.
     closer : Outputs
-        "q" (n_q,), moved by a step of Newton's method towards the constraints, and "moved" (n_q,), by how much.
+        "q" (n_q,), moved by a step of Newton's method towards the constraints, in directions that A allows, and "moved"
+        (n_q,), by how much.
     nearer : Outputs
-        The same, "v" (n_q,) on the rows at the position before the move, and "a" (n_q,), "lam" (n_c,) for these.
+        The same, "v" (n_q,) on the rows at the position before the move, and "a" (n_q,), "lam" (n_c + n_a,) for these.
     off, faster : Outputs
-        "c" (n_c,) of the moves to positions and to velocities on the rows.
+        "c" (n_c + n_a,) of the moves to positions and to velocities on the rows.
     redundant : Outputs
         No arrays; its conditions are that the rows of C_q that do not count hold, too.
     n_operations : int
@@ -124,7 +123,6 @@ class StraightLine:
         self.system, self.choice, self.graph = system, choice, self.equations.graph
         self.nothing, self._beside = Form(self.graph, 0.0, {}), 0  # operations of `quick`
         n, (self.q, self.v) = system.n_q, (self.equations.q, self.equations.v)
-        self.projects = system.n_a == 0
         self.mass = self._made("mass")
         rows = [self._made("jacobian"), self._made("nonholonomic")]
         rates = [self._made("constraint_rate"), self._made("nonholonomic_rate")]
@@ -239,7 +237,8 @@ class StraightLine:
     @cached_property
     def off(self) -> Outputs:
         """See the class."""
-        return Outputs({"c": self._spread([-each for each in self._made("constraint")[list(self.choice.rows)]])}, [])
+        off = [*(-each for each in self._made("constraint")), *[self.nothing] * self.system.n_a]
+        return Outputs({"c": self._spread([off[k] for k in self.choice.rows])}, [])
 
     @cached_property
     def faster(self) -> Outputs:

@@ -90,7 +90,7 @@ class Lobatto16:
         options[kernels.FREE] = 1.0 if self.narrow else 1.0 / UNSEEN
         sizes = n_q, len(made.code.iterated), made.code.n_rows
         plan = Plan(
-            kernels.LOBATTO if self.code.shared.projects else kernels.LOBATTO_SINGLY,
+            kernels.LOBATTO,
             options,
             np.zeros(kernels.memory_size(*sizes)),
             exponent=1.0 / kernels.ORDER,

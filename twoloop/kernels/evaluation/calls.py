@@ -105,12 +105,7 @@ def evaluate_there(f, w, t, q, v, a):
 
 @merged
 def project(f, w, t, q, v, theta, a, lam):
-    """(q, v) moved to the constraints, with a and lam; the last move of a position is at most theta.
-
-    Rows of A leave positions free: with them the dependents are restored from the independents.
-    """
-    if w.Rate.size > w.C.size:
-        return evaluate_state(f, w, t, q, v, theta, a, lam)
+    """(q, v) moved to the constraints, with a and lam; the last move of a position is at most theta."""
     code = f.inner(f, w, tasks.PROJECT, t, q, v, theta, a, lam)
     if code == DONE and has_new_entries(w.G, w.pattern):
         code = f.inner(f, w, tasks.PATTERN, t, q, v, theta, a, lam)

@@ -61,9 +61,9 @@ def _move(f, w, x):
 @merged
 def _move_both(f, w, q, v):
     """Correct q and v by the factors at q; the largest correction of a position, and of a velocity."""
-    rows = w.rows_v
+    rows, n_c = w.rows_v, w.C.size
     for i in range(rows.size):
-        w.g[rows[i]] = -w.C[rows[i]]
+        w.g[rows[i]] = -w.C[rows[i]] if rows[i] < n_c else 0.0
     moved = _move(f, w, q)
     row_residual(w, v, rows)
     for i in range(rows.size):
@@ -73,7 +73,9 @@ def _move_both(f, w, q, v):
 
 @merged
 def to_constraints(f, w, t, q, v, theta, a, lam):
-    """(q, v) put on the constraints, then accelerations and multipliers there; without rows of A only.
+    """(q, v) put on the constraints, then accelerations and multipliers there.
+
+    Rows of A hold for velocities alone; positions are moved in directions that they allow.
 
     Positions are corrected until a correction is at most theta, velocities alike, relative to the largest. Where it is
     at most theta times the smallest pivot, by whose inverse tangents turn, velocities are right after the same pass.

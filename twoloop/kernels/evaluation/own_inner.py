@@ -12,20 +12,8 @@ from twoloop.kernels.evaluation.tasks import EVALUATE_THERE, MULTIPLIERS, PROJEC
 
 
 @kernel(INNER)
-def own_evaluations(f, w, task, t, q, v, theta, a, lam):
-    """Of a mechanism with accelerations alone."""
-    if task == EVALUATE_THERE:
-        w.counters[N_EVALUATIONS] += 1
-        w.counters[N_FACTORIZATIONS] += 1
-        if f.own_there(t, q, v, f.numbers, a):
-            return DONE
-    w.notes[BY_GENERAL] = 1.0
-    return f.general(f, w, task, t, q, v, theta, a, lam)
-
-
-@kernel(INNER)
 def own_inner_loop(f, w, task, t, q, v, theta, a, lam):
-    """Of a mechanism with all of them."""
+    """See the tasks."""
     if task == EVALUATE_THERE:
         w.counters[N_EVALUATIONS] += 1
         w.counters[N_FACTORIZATIONS] += 1

@@ -332,4 +332,3 @@ def lobatto_steps(
 
 
 LOBATTO = Step(lobatto_step, settle_lobatto, lobatto_steps)
-LOBATTO_SINGLY = Step(lobatto_step, settle_lobatto)  # without code for projections
