@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from twoloop.testing.known_problem import Array, KnownProblem
+from twoloop.testing.problem import Array, KnownProblem
 
 
 class NoModel(Exception):

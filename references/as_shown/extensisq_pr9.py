@@ -4,7 +4,7 @@ import numpy as np
 
 from references.driver import imported
 from references.plain_equations import rate_of, start_of
-from twoloop.testing.known_problem import Array, KnownProblem
+from twoloop.testing.problem import Array, KnownProblem
 
 NAME, PACKAGE, DRIFTS = "Pr9, extensisq", "extensisq", True
 

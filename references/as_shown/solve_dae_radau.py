@@ -3,7 +3,7 @@
 import numpy as np
 
 from references.driver import imported
-from twoloop.testing.known_problem import Array, KnownProblem
+from twoloop.testing.problem import Array, KnownProblem
 
 NAME, PACKAGE, DRIFTS = "Radau, solve_dae, stabilised", "solve-dae", False
 

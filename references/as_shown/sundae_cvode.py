@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from references.driver import imported
 from references.plain_equations import rate_of, start_of
-from twoloop.testing.known_problem import Array, KnownProblem
+from twoloop.testing.problem import Array, KnownProblem
 
 NAME, PACKAGE, DRIFTS = "CVODE, scikit-sundae", "scikit-sundae", True
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from references.driver import imported
 from references.plain_equations import NoModel, start_of
-from twoloop.testing.known_problem import Array, KnownProblem
+from twoloop.testing.problem import Array, KnownProblem
 
 NAME, PACKAGE, DRIFTS = "LagrangesMethod, SymPy", "sympy", True
 

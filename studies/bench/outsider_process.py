@@ -20,8 +20,8 @@ from references.equations.accelerations import compiled_gamma
 from twoloop.mechanisms import Problem
 from twoloop.mechanisms.user_file import problem_from
 from twoloop.rows.calibration import calibration_s
-from twoloop.testing.known_problem import Array, KnownProblem
-from twoloop.testing.simulated import simulated
+from twoloop.testing.problem import Array, KnownProblem
+from twoloop.testing.runs import run_simulator
 
 
 def known_problem(problem: Problem, t0: float, q0: Array, v0: Array, t_end: float) -> KnownProblem:
@@ -75,7 +75,7 @@ def run(simulate: Callable[..., Any], problem: Problem, ask: dict[str, Any]) -> 
     times = np.linspace(*posed.t_span, ask["n_times"])
     calibration = calibration_s()
     try:
-        found = simulated(clocked, replace(posed, force=counted), times, ask["value"])
+        found = run_simulator(clocked, replace(posed, force=counted), times, ask["value"])
     except (TypeError, ValueError) as error:  # of another shape
         return {"failure": str(error)}
     if found.error or not found.complete:

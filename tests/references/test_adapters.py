@@ -14,7 +14,7 @@ from tests.problems import pendulum
 from tests.references.adapters import ADAPTERS, ANY_CALLBACK, QUICK, each, start
 from twoloop.mechanisms import double_pendulum, four_bar, knife_edge, rolling_disc, very_flexible_beam
 from twoloop.run.record import Status
-from twoloop.testing.known_problems import MAKERS
+from twoloop.testing.mechanisms import MAKERS
 
 PROBLEM, SMALL = four_bar(), double_pendulum()  # code for the second compiles in a fifth of the time
 KNOWN = MAKERS["double_pendulum"]().reference  # its motion

@@ -16,9 +16,8 @@ from tests.mechanisms.motions import planar, spatial
 from tests.mechanisms.motions.integrate import by_scipy
 from tests.testing.systems import system_of
 from twoloop import ConstraintWarning, mechanisms, solve_dae
-from twoloop.testing.known_motions import FILE, N_TIMES
-from twoloop.testing.known_problem import Motion
-from twoloop.testing.known_problems import MAKERS
+from twoloop.testing.mechanisms import FILE, MAKERS, N_TIMES
+from twoloop.testing.problem import Motion
 
 IN_FEW_COORDINATES = {
     "pendulum": planar.a01,

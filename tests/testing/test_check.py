@@ -14,8 +14,8 @@ from tests.testing.planted import ALPHA, FAULTS, ORDERS, OTHERS, RATTLE, RK, mod
 from tests.testing.systems import system_of
 from twoloop import solve_dae
 from twoloop.testing import check_simulator
-from twoloop.testing.changes import in_a_frame, in_millimetres_and_grams
-from twoloop.testing.known_problems import MAKERS
+from twoloop.testing.mechanisms import MAKERS
+from twoloop.testing.runs import change_frame, change_units
 
 LONG = ("andrews", "heavy_top")  # the dearest to evaluate
 LONGEST = "a misprint in the tableau"  # takes ten seconds
@@ -148,14 +148,14 @@ def test_the_known_motion_itself_passes(name):
 
 
 # --- frames and units are the same problem
-@pytest.mark.parametrize("change", [in_a_frame, in_millimetres_and_grams])
+@pytest.mark.parametrize("change", [change_frame, change_units])
 @pytest.mark.parametrize("name", MAKERS)
 def test_a_problem_seen_otherwise_has_the_same_accelerations(name, change):
     problem = MAKERS[name]()
     seen = change(problem)
     q, v, t = problem.q0 + 0.01, problem.v0 + 0.1, 0.2
     there_q, there_v = seen.T @ q + seen.d, seen.T @ v
-    back_q, back_v, _ = seen.back(there_q, there_v, None)
+    back_q, back_v, _ = seen.to_original(there_q, there_v, None)
     assert back_q == pytest.approx(q, abs=1e-12) and back_v == pytest.approx(v, abs=1e-12)
     for kind in ("constraint", "constraint_rate"):
         here, there = getattr(problem, kind)(t, q), getattr(seen.problem, kind)(t, there_q)
@@ -163,7 +163,7 @@ def test_a_problem_seen_otherwise_has_the_same_accelerations(name, change):
     state = problem.t_span[0], problem.q0, problem.v0
     other = problem.t_span[0], seen.problem.q0, seen.problem.v0
     (a, lam), (there_a, there_lam) = problem.acceleration(*state), seen.problem.acceleration(*other)
-    _, back_a, back_lam = seen.back(there_q, there_a, there_lam)
+    _, back_a, back_lam = seen.to_original(there_q, there_a, there_lam)
     assert back_a == pytest.approx(a, abs=1e-8 * max(1.0, np.abs(a).max()))
     J = problem.jacobian(*state[:2])
     assert J.T @ back_lam == pytest.approx(J.T @ lam, abs=1e-7 * max(1.0, np.abs(lam).max()))

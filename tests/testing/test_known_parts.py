@@ -7,13 +7,13 @@ from tests.marks import slow, slow_but
 from twoloop import solve_dae
 from twoloop.bodies import PlanarModel, SpatialModel
 from twoloop.testing import check_simulator, problems
-from twoloop.testing.spatial_equations import half_spin, turned
+from twoloop.testing.equations import rate_matrix, rotate
 
 WITH_PARTS = {problem.name: problem for problem in problems() if problem.bodies}
 
 
 def rotation(e):
-    return np.column_stack([turned(e, axis) for axis in np.eye(3)])
+    return np.column_stack([rotate(e, axis) for axis in np.eye(3)])
 
 
 def pose_of(body, q, v, planar):
@@ -27,7 +27,7 @@ def pose_of(body, q, v, planar):
     told = {"mass": body.mass, "inertia": np.full(3, body.mass), "position": state[:3], "velocity": rate[:3]}
     if body.inertia.size:
         e = state[3:]
-        spin = turned(e, 2.0 * half_spin(e) @ rate[3:])
+        spin = rotate(e, 2.0 * rate_matrix(e) @ rate[3:])
         told |= {"inertia": body.inertia, "rotation": rotation(e), "angular_velocity": spin}
     return told
 

@@ -8,7 +8,7 @@ from tests.problems import row_errors
 from tests.processes import run_python
 from tests.testing.systems import system_of
 from twoloop import mechanisms
-from twoloop.testing.known_problems import MAKERS
+from twoloop.testing.mechanisms import MAKERS
 
 SAME_NAME = ("pendulum", "double_pendulum", "closed_chain", "four_bar", "redundant_slider_crank", "driven_slider_crank")
 SAME_NAME += ("driven_crank", "andrews", "heavy_top", "spatial_four_bar")

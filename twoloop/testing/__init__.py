@@ -5,21 +5,15 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from twoloop.testing.conformance import check_simulator
-    from twoloop.testing.findings import Failure, Finding, Report
-    from twoloop.testing.known_parts import KnownBody, KnownJoint
-    from twoloop.testing.known_problem import KnownProblem, Motion
-    from twoloop.testing.known_problems import problems
+    from twoloop.testing.mechanisms import problems
+    from twoloop.testing.problem import KnownBody, KnownJoint, KnownProblem, Motion
+    from twoloop.testing.report import Failure, Finding, Report
 
 _MODULES = {
-    "Failure": "findings",
-    "Finding": "findings",
-    "KnownBody": "known_parts",
-    "KnownJoint": "known_parts",
-    "KnownProblem": "known_problem",
-    "Motion": "known_problem",
-    "Report": "findings",
+    **dict.fromkeys(("KnownBody", "KnownJoint", "KnownProblem", "Motion"), "problem"),
+    **dict.fromkeys(("Failure", "Finding", "Report"), "report"),
     "check_simulator": "conformance",
-    "problems": "known_problems",
+    "problems": "mechanisms",
 }
 
 __all__ = ["Failure", "Finding", "KnownBody", "KnownJoint", "KnownProblem", "Motion", "Report", "check_simulator"]

@@ -8,30 +8,35 @@ from typing import Any
 import numpy as np
 
 from twoloop.checks.arguments import check_call, shown
-from twoloop.testing.changes import in_a_frame, in_millimetres_and_grams
-from twoloop.testing.evidence import Evidence
-from twoloop.testing.findings import Finding, Report
-from twoloop.testing.hints import MOVING, with_hints
-from twoloop.testing.known_motions import N_TIMES
-from twoloop.testing.known_problem import KnownProblem, Motion
-from twoloop.testing.known_problems import listed, named
-from twoloop.testing.limited import NO_BOUND, Limited
-from twoloop.testing.measuring import Observed, Settings
-from twoloop.testing.properties import in_transformed, measured
-from twoloop.testing.simulated import Simulate, Simulated, simulated
+from twoloop.testing.hints import MOTION_PROPERTIES, Evidence, add_hints
+from twoloop.testing.mechanisms import N_TIMES, as_list, select_problems
+from twoloop.testing.problem import KnownProblem, Motion
+from twoloop.testing.properties import Observation, Settings, measure_properties, transformed_finding
+from twoloop.testing.report import Finding, Report
+from twoloop.testing.runs import (
+    Simulate,
+    SimulatorRun,
+    TimeLimitedSimulator,
+    change_frame,
+    change_units,
+    run_simulator,
+)
 
 Skipped = tuple[str, str, str]
 TIME_LIMIT = 120.0  # s
-SAYS_SO = "says that it ends"
-WRONG = (
+REPORTS_END = "says that it ends"
+UNBOUNDED_HINT = (
+    "An iteration, or a step size that falls, has no bound: limit the numbers of iterations and of steps, and raise."
+)
+FALSE_SUCCESS_HINT = (
     "Success with a wrong answer: the motion has ended. Check that iterations converge, that C = 0 holds at the end of "
     "a step, and that numbers are finite; otherwise raise."
 )
-REDUNDANT = (
+REDUNDANT_HINT = (
     "A row of C depends on the others here, and [M C_q^T; C_q 0] is singular: use least squares or remove such rows; "
     "for a simulator that does not support them, exclude this problem."
 )
-TRANSFORMATIONS = {"frame": in_a_frame, "units": in_millimetres_and_grams}
+TRANSFORMATIONS = {"frame": change_frame, "units": change_units}
 
 
 def check_simulator(
@@ -106,17 +111,17 @@ def check_simulator(
         given = f"{shown(simulate)} of type {type(simulate).__name__}"
         raise TypeError(f"simulate must be a function of (problem, times, tolerance); given {given}")
     check_call("simulate", "simulate", simulate, ("problem", "times", "tolerance" if steps is None else "step"))
-    settings = settings_of(tolerances, steps, order, time_limit)
+    settings = check_settings(tolerances, steps, order, time_limit)
     findings: list[Finding] = []
     skipped: list[Skipped] = []
-    for problem in named(problems):
-        found, not_found = check_problem(simulate, problem, settings)
-        findings += found
-        skipped += not_found
+    for problem in select_problems(problems):
+        results, omissions = check_problem(simulate, problem, settings)
+        findings += results
+        skipped += omissions
     return Report(tuple(findings), tuple(skipped))
 
 
-def settings_of(
+def check_settings(
     tolerances: Sequence[float], steps: Sequence[int] | None, order: float | None, time_limit: float | None
 ) -> Settings:
     """Return the validated settings of a check."""
@@ -125,7 +130,7 @@ def settings_of(
     if order is not None and not (_number(order) and order > 0.0):
         raise ValueError(f"order must be a positive number; given {order!r}")
     if steps is not None:
-        given = listed("steps", steps)
+        given = as_list("steps", steps)
         whole = all(isinstance(n, int | np.integer) and n > 0 and n % (N_TIMES - 1) == 0 for n in given)
         if not whole or len(given) < 2 or given != sorted(set(given)):
             raise ValueError(
@@ -134,7 +139,7 @@ def settings_of(
         return Settings(None, tuple(given), order, time_limit)
     if order is not None:
         raise ValueError(f"order is for simulators of fixed steps, with steps=; given {order!r} without")
-    values = listed("tolerances", tolerances)
+    values = as_list("tolerances", tolerances)
     if not values or not all(_number(value) and 0.0 < value < 1.0 for value in values):
         raise ValueError(f"tolerances must be numbers between 0 and 1; given {tolerances!r}")
     if values != sorted(set(values), reverse=True):
@@ -148,54 +153,59 @@ def _number(value: Any) -> bool:
 
 def check_problem(simulate: Simulate, problem: KnownProblem, settings: Settings) -> tuple[list[Finding], list[Skipped]]:
     """Return the findings for all properties of one problem, and those that were not measured."""
-    values, motion, limited = settings.of(problem), problem.reference, Limited(simulate, settings.time_limit)
+    values, motion = settings.values(problem), problem.reference
+    limited = TimeLimitedSimulator(simulate, settings.time_limit)
     if problem.ends is not None:
-        return [_ends(limited, problem, values[-1])], []
+        return [_ending_finding(limited, problem, values[-1])], []
     if motion is None:
         raise ValueError(f"problems must have a known motion; {problem.name!r} has no reference")
-    runs = [simulated(limited, problem, motion.t, value) for value in values]
-    findings = [_runs(problem, settings, values, runs)]
+    runs = [run_simulator(limited, problem, motion.t, value) for value in values]
+    findings = [_completion_finding(problem, settings, values, runs)]
     complete = [(value, run) for value, run in zip(values, runs, strict=True) if run.complete]
     if not findings[0].passed:
-        hint = NO_BOUND if limited.over else _hint_from_start(limited, problem, settings, values)
+        hint = UNBOUNDED_HINT if limited.timeout_message else _hint_from_start(limited, problem, settings, values)
         return [replace(findings[0], hint=hint)], [(problem.name, "everything else", "the run did not come to the end")]
     if len({(run.v is None, run.lam is None) for _, run in complete}) > 1:
         raise TypeError(f"simulate must return the same of q, v and lam in every run; on {problem.name!r} it did not")
-    observed = Observed(problem, motion, *(list(each) for each in zip(*complete, strict=True)))
-    findings += confirmed(limited, observed, settings, list(measured(observed, settings)))
+    observation = Observation(problem, motion, *map(list, zip(*complete, strict=True)))
+    findings += confirm_orders(limited, observation, settings, list(measure_properties(observation, settings)))
     skipped: list[Skipped] = []
-    middle = observed.settings[len(observed.settings) // 2]
+    middle = observation.settings[len(observation.settings) // 2]
     for name, change in TRANSFORMATIONS.items():
-        if any(not each.passed and each.property in ("error of q", "limit of q") for each in findings):
+        if any(not finding.passed and finding.property in ("error of q", "limit of q") for finding in findings):
             skipped.append((problem.name, name, "the motion itself is wrong"))
             continue
-        if limited.over:
+        if limited.timeout_message:
             skipped.append((problem.name, name, "a run before it did not end"))
             continue
-        seen = change(problem)
-        run = simulated(limited, seen.problem, motion.t, middle)
-        findings.append(in_transformed(observed, settings, name, seen, run, middle))
-    failed = {each.property: each for each in findings if not each.passed}
-    return with_hints(findings, Evidence(observed, settings, failed, limited)), skipped
+        transformed = change(problem)
+        run = run_simulator(limited, transformed.problem, motion.t, middle)
+        findings.append(transformed_finding(observation, settings, name, transformed, run, middle))
+    failed = {finding.property: finding for finding in findings if not finding.passed}
+    return add_hints(findings, Evidence(observation, settings, failed, limited)), skipped
 
 
-def confirmed(simulate: Simulate, observed: Observed, settings: Settings, findings: list[Finding]) -> list[Finding]:
+def confirm_orders(
+    simulate: Simulate, observation: Observation, settings: Settings, findings: list[Finding]
+) -> list[Finding]:
     """Return the findings, with orders that are too small measured again with steps of half the length.
 
     Errors may vanish by chance at one step size, after which they seem to fall slowly.
     """
-    lost = {each.property for each in findings if each.property.startswith("order of") and not each.passed}
-    if not lost:
+    failed = {finding.property for finding in findings if not finding.passed}
+    low_orders = {name for name in failed if name.startswith("order of")}
+    if not low_orders:
         return findings
-    half = 0.5 * observed.settings[-1]
-    run = simulated(simulate, observed.problem, observed.motion.t, half)
+    half = 0.5 * observation.settings[-1]
+    run = run_simulator(simulate, observation.problem, observation.motion.t, half)
     if not run.complete:
         return findings
-    finer = replace(observed, settings=[*observed.settings[1:], half], runs=[*observed.runs[1:], run])
-    again = {each.property: each for each in measured(finer, settings)}
-    if not all(again[name].passed for name in again if name.startswith(MOVING)):
+    finer = replace(observation, settings=[*observation.settings[1:], half], runs=[*observation.runs[1:], run])
+    finer_findings = {finding.property: finding for finding in measure_properties(finer, settings)}
+    if not all(finer_findings[name].passed for name in finer_findings if name.startswith(MOTION_PROPERTIES)):
         return findings
-    return [again.get(each.property, each) if each.property in lost else each for each in findings]
+    replaced = {name: finding for name, finding in finer_findings.items() if name in low_orders}
+    return [replaced.get(finding.property, finding) for finding in findings]
 
 
 def _hint_from_start(simulate: Simulate, problem: KnownProblem, settings: Settings, values: list[float]) -> str:
@@ -203,66 +213,68 @@ def _hint_from_start(simulate: Simulate, problem: KnownProblem, settings: Settin
     motion = problem.reference
     assert motion is not None
     if "redundant" in problem.tags:
-        return REDUNDANT
+        return REDUNDANT_HINT
     for n in (N_TIMES // 10, 3):
         arrays = {name: getattr(motion, name)[: n + 1] for name in ("t", "q", "v", "lam", "growth")}
-        begun = Motion(**arrays, digits={name: each[: n + 1] for name, each in motion.digits.items()})
+        beginning = Motion(**arrays, digits={name: digits[: n + 1] for name, digits in motion.digits.items()})
         try:
-            runs = [simulated(simulate, problem, begun.t, value) for value in values]
+            runs = [run_simulator(simulate, problem, beginning.t, value) for value in values]
         except (TypeError, ValueError):  # the simulator accepts no other times than those of the motion
             return ""
         if not all(run.complete and run.v is not None for run in runs):
             continue
-        observed = Observed(problem, begun, values, runs)
-        findings = list(measured(observed, settings))
-        failed = {each.property: each for each in findings if not each.passed}
-        hinted = with_hints(findings, Evidence(observed, settings, failed, simulate))
-        said = next((each.hint for each in hinted if each.hint), "")
-        return f"Of the first {begun.t[-1] - begun.t[0]:.2g} s, which it does run: {said}" if said else ""
+        observation = Observation(problem, beginning, values, runs)
+        findings = list(measure_properties(observation, settings))
+        failed = {finding.property: finding for finding in findings if not finding.passed}
+        hinted = add_hints(findings, Evidence(observation, settings, failed, simulate))
+        hint = next((finding.hint for finding in hinted if finding.hint), "")
+        return f"Of the first {beginning.t[-1] - beginning.t[0]:.2g} s, which it does run: {hint}" if hint else ""
     return ""
 
 
-def properties_of(problem: KnownProblem, settings: Settings) -> list[str]:
+def property_names(problem: KnownProblem, settings: Settings) -> list[str]:
     """Return the names of the properties measured on a problem for a simulator that returns q, v and lam."""
     if problem.ends is not None:
-        return [SAYS_SO]
+        return [REPORTS_END]
     kinds = ("error of",) if settings.tolerances else ("error of", "limit of", "order of")
-    names = ["runs", *(f"{kind} {which}" for which in "qv" for kind in kinds)]
+    names = ["runs", *(f"{kind} {variable}" for variable in "qv" for kind in kinds)]
     names += [*(["precision"] if settings.tolerances else []), "constraints", "velocity constraints"]
-    kept = [*problem.invariants, *([] if problem.energy is None else ["energy"])]
-    return [*names, *kept, "multipliers", *TRANSFORMATIONS]
+    invariants = [*problem.invariants, *([] if problem.energy is None else ["energy"])]
+    return [*names, *invariants, "multipliers", *TRANSFORMATIONS]
 
 
-def _runs(problem: KnownProblem, settings: Settings, values: list[float], runs: list[Simulated]) -> Finding:
+def _completion_finding(
+    problem: KnownProblem, settings: Settings, values: list[float], runs: list[SimulatorRun]
+) -> Finding:
     """Check that the required runs reach the end: with fixed steps the two finest."""
-    made = list(zip(values, runs, strict=True))
-    needed = [each for each in made if each[1].hung] or made[0 if settings.tolerances else -2 :]
-    for value, run in needed:
+    outcomes = list(zip(values, runs, strict=True))
+    required = [outcome for outcome in outcomes if outcome[1].timed_out] or outcomes[0 if settings.tolerances else -2 :]
+    for value, run in required:
         if not run.complete:
-            what = run.error or _first_not_finite(run)
-            return Finding(problem.name, "runs", f"{what} (at {value:.3g})", "the end of the motion", False)
+            problem_text = run.error or _first_nonfinite(run)
+            return Finding(problem.name, "runs", f"{problem_text} (at {value:.3g})", "the end of the motion", False)
     return Finding(problem.name, "runs", "the end", "the end of the motion", True)
 
 
-def _first_not_finite(run: Simulated) -> str:
+def _first_nonfinite(run: SimulatorRun) -> str:
     for name, array in (("q", run.q), ("v", run.v), ("lam", run.lam)):
         if array is not None and not np.isfinite(array).all():
             return f"{name} is not finite from t = {run.t[np.argmin(np.isfinite(array).all(axis=1))]:.3g} s on"
     return "no numbers"
 
 
-def _ends(simulate: Simulate, problem: KnownProblem, setting: float) -> Finding:
+def _ending_finding(simulate: Simulate, problem: KnownProblem, setting: float) -> Finding:
     """Check a problem without a motion beyond some time: the simulator must report a failure."""
     assert problem.ends is not None
-    run = simulated(simulate, problem, np.linspace(*problem.t_span, N_TIMES), setting)
+    run = run_simulator(simulate, problem, np.linspace(*problem.t_span, N_TIMES), setting)
     beyond = run.q[run.t > problem.ends + 1e-9]
-    said = not run.hung and (bool(run.error) or not np.isfinite(beyond).all(axis=1).any())
-    what = run.error or ("NaN" if said else f"finite numbers to t = {problem.t_span[1]:.3g} s")
+    reported = not run.timed_out and (bool(run.error) or not np.isfinite(beyond).all(axis=1).any())
+    outcome = run.error or ("NaN" if reported else f"finite numbers to t = {problem.t_span[1]:.3g} s")
     return Finding(
         problem.name,
-        SAYS_SO,
-        what,
+        REPORTS_END,
+        outcome,
         f"an exception, or NaN from t = {problem.ends:.3g} s on",
-        said,
-        "" if said else NO_BOUND if run.hung else WRONG,
+        reported,
+        "" if reported else UNBOUNDED_HINT if run.timed_out else FALSE_SUCCESS_HINT,
     )

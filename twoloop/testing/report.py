@@ -63,8 +63,7 @@ class Failure:
     hint: str
 
     def __str__(self) -> str:
-        measured, allowed = shown(self.measured), shown(self.allowed)
-        return f"{self.problem}: {self.property}: {measured}, allowed {allowed}. {self.hint}".rstrip()
+        return f"{self.problem}: {self.property}: {outcome_text(self)}. {self.hint}".rstrip()
 
 
 @dataclass(frozen=True)
@@ -102,53 +101,55 @@ class Report:
     def failures(self) -> tuple[Failure, ...]:
         """The failed properties, in the order of the problems."""
         return tuple(
-            Failure(each.problem, each.property, each.measured, each.allowed, each.hint)
-            for each in self.findings
-            if not each.passed
+            Failure(finding.problem, finding.property, finding.measured, finding.allowed, finding.hint)
+            for finding in self.findings
+            if not finding.passed
         )
 
     def __str__(self) -> str:
-        names = _in_order(each.problem for each in self.findings)
-        lines = [f"{len(self.findings)} properties on {len(names)} problems: {_count(len(self.failures))}"]
+        names = _unique(finding.problem for finding in self.findings)
+        lines = [f"{len(self.findings)} properties on {len(names)} problems: {_verdict(len(self.failures))}"]
         for name in names:
-            own = [each for each in self.findings if each.problem == name]
-            failed = [each for each in own if not each.passed]
-            lines.append(f"  {name}: {'passed' if not failed else f'{len(failed)} of {len(own)} failed'}")
-            lines += [f"    {each.property}: {shown(each.measured)}, allowed {shown(each.allowed)}" for each in failed]
-            hints = _in_order(each.hint for each in failed if each.hint)
-            lines += [f"    -> {hint}" for hint in hints]
+            findings = [finding for finding in self.findings if finding.problem == name]
+            failed = [finding for finding in findings if not finding.passed]
+            lines.append(f"  {name}: {'passed' if not failed else f'{len(failed)} of {len(findings)} failed'}")
+            lines += [f"    {finding.property}: {outcome_text(finding)}" for finding in failed]
+            lines += [f"    -> {hint}" for hint in _unique(finding.hint for finding in failed if finding.hint)]
         return "\n".join(lines)
 
     def to_markdown(self) -> str:
         """Return the report as Markdown tables: failures with hints, then all measured properties."""
-        lines = [f"# Simulator check: {_count(len(self.failures))}", ""]
+        lines = [f"# Simulator check: {_verdict(len(self.failures))}", ""]
         if self.failures:
             lines += ["| problem | property | measured | allowed | hint |", "|---|---|--:|--:|---|"]
-            lines += [
-                _line(each.problem, each.property, each.measured, each.allowed, each.hint) for each in self.failures
-            ]
-            lines.append("")
+            lines += [*(_table_row(failure, failure.hint) for failure in self.failures), ""]
         lines += ["| problem | property | measured | allowed | |", "|---|---|--:|--:|---|"]
-        for each in self.findings:
-            verdict = "passed" if each.passed else "**failed**"
-            lines.append(_line(each.problem, each.property, each.measured, each.allowed, verdict))
-        lines += [_line(*each[:2], "not measured", "", each[2]) for each in self.skipped]
+        for finding in self.findings:
+            verdict = "passed" if finding.passed else "**failed**"
+            lines.append(_table_row(finding, verdict))
+        for problem, name, reason in self.skipped:
+            lines.append(_table_row(Failure(problem, name, "not measured", "", ""), reason))
         return "\n".join(lines) + "\n"
 
 
-def _line(problem: str, name: str, measured: float | str, allowed: float | str, last: str) -> str:
-    cells = (problem, name, shown(measured), shown(allowed), last)
+def _table_row(row: Finding | Failure, last: str) -> str:
+    cells = (row.problem, row.property, _format_value(row.measured), _format_value(row.allowed), last)
     return "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"
 
 
-def _count(n_failures: int) -> str:
+def outcome_text(row: Finding | Failure) -> str:
+    """Return the measured and the allowed value as text."""
+    return f"{_format_value(row.measured)}, allowed {_format_value(row.allowed)}"
+
+
+def _verdict(n_failures: int) -> str:
     return "all hold" if n_failures == 0 else f"{n_failures} do{'es' * (n_failures == 1)} not hold"
 
 
-def _in_order(names: Iterable[str]) -> list[str]:
+def _unique(names: Iterable[str]) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def shown(value: float | str) -> str:
+def _format_value(value: float | str) -> str:
     """Return a number with three digits, or a text unchanged."""
     return value if isinstance(value, str) else f"{value:.3g}"

@@ -1,12 +1,113 @@
-"""A problem with a known motion: equations as functions of numpy arrays, initial state, and reference."""
+"""Mechanisms with known motions: bodies, joints, equations as functions of numpy arrays, start and reference."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
-from twoloop.testing.known_parts import Array, KnownBody, KnownJoint
-from twoloop.testing.spatial_equations import half_spin, turned
+Array = NDArray[np.float64]
+Drive = tuple[Callable[[float], float], Callable[[float], float], Callable[[float], float]]
+GROUND = -1
+
+
+@dataclass(frozen=True, eq=False)
+class KnownBody:
+    """A point mass, or a rigid body with its centre of mass as reference.
+
+    Attributes
+    ----------
+    mass : float
+        kg.
+    inertia : ndarray (0,), (1,) or (3,)
+        kg m^2: empty for a point, the moment in the plane, or the principal moments in body axes.
+    columns : slice
+        Its coordinates in q: centre of mass, then an angle or four Euler parameters.
+
+    Examples
+    --------
+    >>> from twoloop.testing import problems
+    >>> problem = next(each for each in problems() if each.bodies)
+    >>> problem.bodies[0].mass > 0.0
+    True
+    """
+
+    mass: float
+    inertia: Array
+    columns: slice
+
+
+@dataclass(frozen=True, eq=False)
+class KnownJoint:
+    """A joint between two bodies, or a body and the ground.
+
+    Attributes
+    ----------
+    kind : str
+        "revolute", "spherical" (both bodies share a point), "distance" (of two points), "prismatic" (in the plane: a
+        point of the body stays on a line of the ground, and its angle is constant) or "drive" (the angle of the first
+        body is a function of time).
+    bodies : (int, int)
+        Indices in `KnownProblem.bodies`; -1 is the ground.
+    points : (ndarray, ndarray)
+        Point on each body in body axes, relative to its centre; on the ground in space, m.
+    rows : slice
+        Its rows of C.
+    axis : ndarray or None
+        Direction in the axes of the second body: of a spatial hinge, (3,), or of the line of a slider, (2,).
+    length : float or None
+        Length of a distance, m.
+    motion : tuple of callable or None
+        The angle of a drive as a function of time, rad, and its first two derivatives.
+
+    Examples
+    --------
+    >>> from twoloop.testing import problems
+    >>> problem = next(each for each in problems() if each.joints)
+    >>> len(problem.joints[0].bodies)
+    2
+    """
+
+    kind: str
+    bodies: tuple[int, int]
+    points: tuple[Array, Array]
+    rows: slice
+    axis: Array | None = None
+    length: float | None = None
+    motion: Drive | None = None
+
+
+def skew(a: Array) -> Array:
+    """Return the matrix of the cross product with a vector (3,)."""
+    return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
+
+
+def rotate(e: Array, a: Array) -> Array:
+    """Return R(e) a, a quadratic form in the Euler parameters (4,)."""
+    u = e[1:]
+    return (e[0] ** 2 - u @ u) * a + 2.0 * u * (u @ a) + 2.0 * e[0] * np.cross(u, a)
+
+
+def rotate_jacobian(e: Array, a: Array) -> Array:
+    """Return the derivative (3, 4) of R(e) a with respect to the Euler parameters, which is linear in these."""
+    u = e[1:]
+    by_u = (u @ a) * np.eye(3) + np.outer(u, a) - np.outer(a, u) - e[0] * skew(a)
+    return 2.0 * np.column_stack([e[0] * a + np.cross(u, a), by_u])
+
+
+def rate_matrix(e: Array) -> Array:
+    """Return G (3, 4): the angular velocity in body axes is 2 G e'."""
+    return np.column_stack([-e[1:], e[0] * np.eye(3) - skew(e[1:])])
+
+
+def euler_parameters(R: Array) -> Array:
+    """Return the Euler parameters (4,) of a rotation matrix, computed from the largest one, with e0 >= 0."""
+    products = np.empty((4, 4))
+    products[0, 0], products[1:, 1:] = 1.0 + np.trace(R), R + R.T + (1.0 - np.trace(R)) * np.eye(3)
+    products[0, 1:] = products[1:, 0] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    best = products[int(np.argmax(np.diag(products)))]
+    return best / np.linalg.norm(best) * (1.0 if best[0] >= 0.0 else -1.0)
+
 
 Quantity = Callable[[float, Array, Array], float]
 DIMENSIONS = {  # of parameters: powers of the units of length and mass; the unit of time is s
@@ -158,7 +259,7 @@ class KnownProblem:
 
     def acceleration(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
         """Return the acceleration (n_q,) and multipliers (n_c,) at a consistent state; minimum norm."""
-        return solved(self.mass(t, q), self.force(t, q, v), self.jacobian(t, q), self.gamma(t, q, v))
+        return solve_saddle_point(self.mass(t, q), self.force(t, q, v), self.jacobian(t, q), self.gamma(t, q, v))
 
     def reaction(self, joint: KnownJoint, t: float, q: Array, lam: Array) -> tuple[Array, Array]:
         """Return force (n_axes,), N, and torque (0,), (1,) or (3,), N m, of a joint on its first body, at its point.
@@ -179,14 +280,14 @@ class KnownProblem:
             arm = np.array([c * point[0] - s * point[1], s * point[0] + c * point[1]])
             return force, turning - (arm[0] * force[1] - arm[1] * force[0])
         e = position[3:]
-        torque = 0.5 * turned(e, half_spin(e) @ turning)
-        return force, torque - np.cross(turned(e, point), force)
+        torque = 0.5 * rotate(e, rate_matrix(e) @ turning)
+        return force, torque - np.cross(rotate(e, point), force)
 
     def __repr__(self) -> str:
         return f"KnownProblem({self.name!r}: {', '.join(self.tags)}; n_q = {self.n_q}, n_c = {self.n_c})"
 
 
-def solved(M: Array, Q: Array, J: Array, right: Array) -> tuple[Array, Array]:
+def solve_saddle_point(M: Array, Q: Array, J: Array, gamma: Array) -> tuple[Array, Array]:
     """Return the solution a, lam of M a + J^T lam = Q, J a = right, with minimum norm of lam."""
     n, m = J.shape[1], J.shape[0]
     matrix = np.zeros((n + m, n + m))
@@ -195,9 +296,9 @@ def solved(M: Array, Q: Array, J: Array, right: Array) -> tuple[Array, Array]:
     for _ in range(5):  # equilibration (Ruiz 2001), so that ranks do not depend on units
         size = np.abs(scale[:, None] * matrix * scale).max(axis=1)
         scale /= np.sqrt(np.where(size > 0.0, size, 1.0))
-    right = scale * np.concatenate([Q, right])
-    whole, _, rank, _ = np.linalg.lstsq(scale[:, None] * matrix * scale, right, rcond=1e-12)
-    a, lam = np.split(scale * whole, [n])
+    gamma = scale * np.concatenate([Q, gamma])
+    unknowns, _, rank, _ = np.linalg.lstsq(scale[:, None] * matrix * scale, gamma, rcond=1e-12)
+    a, lam = np.split(scale * unknowns, [n])
     if rank < n + m:  # minimum norm in the original units of the rows
         lam = np.linalg.lstsq(J.T, J.T @ lam, rcond=1e-11)[0]
     return a, lam
