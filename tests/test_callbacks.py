@@ -16,7 +16,7 @@ from twoloop.kernels.compile.callbacks import KINDS, OPTIONAL
 from twoloop.kernels.data.common import KIT, Functions
 from twoloop.kernels.data.flags import GIVEN
 from twoloop.mechanisms import four_bar
-from twoloop.problem.adapters import PythonFunctions
+from twoloop.problem.callbacks import PythonFunctions
 
 
 @pytest.mark.parametrize("kind", KINDS)

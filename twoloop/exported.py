@@ -16,10 +16,10 @@ from twoloop.methods.presets import paper_irk as paper_irk
 from twoloop.methods.presets import paper_newmark as paper_newmark
 from twoloop.methods.runge_kutta import RungeKutta as RungeKutta
 from twoloop.methods.taylor import Taylor as Taylor
-from twoloop.problem.drawing import Drawing as Drawing
-from twoloop.problem.joints import Joint as Joint
+from twoloop.problem.description import Drawing as Drawing
+from twoloop.problem.description import Joint as Joint
+from twoloop.problem.description import Stop as Stop
 from twoloop.problem.problem import Problem as Problem
-from twoloop.problem.stops import Stop as Stop
 from twoloop.problem.system import ConstrainedSystem as ConstrainedSystem
 from twoloop.result.certificate import Certificate as Certificate
 from twoloop.result.certificate import CertificateWarning as CertificateWarning

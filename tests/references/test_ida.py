@@ -18,7 +18,7 @@ from tests.problems import PLAIN, without_tangent
 from twoloop import ConstrainedSystem, callback, consistent_state, solve_dae
 from twoloop.mechanisms import four_bar, moderately_stiff_beam, very_flexible_beam
 from twoloop.mechanisms.ancf_beam import tip_height
-from twoloop.problem.given import callbacks_in
+from twoloop.problem.callbacks import callbacks_in
 from twoloop.run.record import Status
 
 PROBLEM = four_bar()

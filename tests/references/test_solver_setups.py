@@ -25,7 +25,7 @@ from tests.problems import pendulum
 from tests.processes import run_python
 from twoloop import ConstrainedSystem, callback, mechanisms
 from twoloop.mechanisms import double_pendulum, four_bar, projection_pendulum, spatial_slider_crank
-from twoloop.problem.given import callbacks_in
+from twoloop.problem.callbacks import callbacks_in
 
 FOUR_BAR = four_bar()
 PENDULUM = projection_pendulum()

@@ -9,7 +9,7 @@ from sympy.physics.mechanics import dynamicsymbols
 
 from tests.processes import run_python
 from twoloop import solve_dae
-from twoloop.problem import generated
+from twoloop.problem import compiled_functions
 from twoloop.symbolic import from_lagrangian
 from twoloop.symbolic.equations import Equations
 
@@ -25,9 +25,9 @@ def pendulum(**changed):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    monkeypatch.setattr(generated, "sources_folder", lambda: tmp_path / "equations")
-    generated._functions.cache_clear()
-    generated._compiled.cache_clear()
+    monkeypatch.setattr(compiled_functions, "sources_folder", lambda: tmp_path / "equations")
+    compiled_functions._functions.cache_clear()
+    compiled_functions._compiled.cache_clear()
     return tmp_path
 
 
@@ -68,8 +68,8 @@ UNPICKLED = """
 import pickle, sys
 from pathlib import Path
 sys.modules["sympy"] = None
-from twoloop.problem import generated
-generated.sources_folder = lambda: Path("equations").resolve()
+from twoloop.problem import compiled_functions
+compiled_functions.sources_folder = lambda: Path("equations").resolve()
 problem = pickle.loads(Path("problem.pickle").read_bytes())
 system = problem.system
 print(system.mass(0.0, problem.q0)[0, 0], system.gamma(0.0, problem.q0, [3.0, 4.0])[0])

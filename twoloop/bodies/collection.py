@@ -22,7 +22,7 @@ from twoloop.bodies.parts import (
     Numbers,
 )
 from twoloop.checks.arguments import Array, check_positive, check_text, check_vector, shown
-from twoloop.problem.stops import Stop
+from twoloop.problem.description import Stop
 
 Points = tuple[Numbers, Numbers]
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from twoloop.bodies.assembly import Freedom
 from twoloop.checks.arguments import check_finite
+from twoloop.problem.description import Stop
 from twoloop.problem.problem import Problem
-from twoloop.problem.stops import Stop
 
 if TYPE_CHECKING:
     from twoloop.bodies.model import Model

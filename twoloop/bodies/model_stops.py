@@ -12,7 +12,7 @@ from twoloop.bodies.loads import Loads
 from twoloop.bodies.parts import Body, ModelJoint
 from twoloop.bodies.places import placed, turned
 from twoloop.checks.arguments import Array, check_finite, check_not_negative
-from twoloop.problem.stops import Stop
+from twoloop.problem.description import Stop
 
 
 @dataclass(frozen=True, eq=False)

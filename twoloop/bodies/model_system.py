@@ -19,8 +19,8 @@ from twoloop.bodies.tables import Tables
 from twoloop.checks.arguments import Array, shown
 from twoloop.generate.programs import AGREES, BETWEEN, STATES
 from twoloop.generate.tracing import Untraceable
-from twoloop.problem.entries import LARGE
-from twoloop.problem.joints import Joint
+from twoloop.problem.callbacks import LARGE
+from twoloop.problem.description import Joint
 from twoloop.problem.system import ConstrainedSystem
 
 KINDS = ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")

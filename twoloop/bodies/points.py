@@ -9,7 +9,7 @@ import numpy as np
 
 from twoloop.bodies.rotation import rotated
 from twoloop.checks.arguments import Array, check_columns
-from twoloop.problem.drawing import Drawing
+from twoloop.problem.description import Drawing
 
 GROUND = -1
 

@@ -9,7 +9,7 @@ from twoloop.bodies.parts import Body
 from twoloop.bodies.points import Sketch
 from twoloop.bodies.tables import Tables
 from twoloop.checks.arguments import Array
-from twoloop.problem.drawing import Drawing
+from twoloop.problem.description import Drawing
 
 
 def drawing_of(tables: Tables) -> Drawing:

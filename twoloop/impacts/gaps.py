@@ -12,7 +12,7 @@ from twoloop.generate.calls_on_symbols import as_forms, trace
 from twoloop.generate.derivative import Derivative
 from twoloop.generate.programs import AGREES, BETWEEN, STATES, numbers_of, program_of
 from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
-from twoloop.problem.stops import Stop
+from twoloop.problem.description import Stop
 
 
 class Gap(NamedTuple):

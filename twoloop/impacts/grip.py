@@ -11,7 +11,7 @@ from twoloop.checks.arguments import Array
 from twoloop.impacts.gaps import Gap, Gaps
 from twoloop.impacts.laws import NEGLIGIBLE, Rubs, Undetermined
 from twoloop.impacts.rubbing import INDEPENDENT, Signs
-from twoloop.problem.stops import Stop
+from twoloop.problem.description import Stop
 
 AT_REST = 1e-10  # relative to the largest velocities of the last arc: smaller rates count as zero
 ALIKE = 1e-6  # tolerance of the coefficients by which one displacement follows from another

@@ -18,7 +18,7 @@ from twoloop.impacts.laws import NEGLIGIBLE, Undetermined, coulomb, held, impuls
 from twoloop.impacts.rubbing import IDLE, INDEPENDENT, STICKS, Modes, Signs
 from twoloop.methods.presets import PRESETS
 from twoloop.methods.taylor import Taylor
-from twoloop.problem.stops import Stop
+from twoloop.problem.description import Stop
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
 from twoloop.run.impulse import corrected

@@ -12,7 +12,7 @@ from twoloop.checks.arguments import check_positive, check_span, check_times, ch
 from twoloop.impacts.modes import Motion
 from twoloop.impacts.rubbing import Modes
 from twoloop.methods.plan import Method
-from twoloop.problem.stops import Stop
+from twoloop.problem.description import Stop
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.solve import solve_dae

@@ -21,9 +21,8 @@ from twoloop.checks.arguments import check_number, check_positive, check_size
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms import ancf_element as element
 from twoloop.mechanisms.ancf_element import elastic_energy, elastic_tangent
-from twoloop.problem.drawing import Drawing
-from twoloop.problem.given import callbacks_in
-from twoloop.problem.joints import Joint
+from twoloop.problem.callbacks import callbacks_in
+from twoloop.problem.description import Drawing, Joint
 from twoloop.problem.problem import Array, Problem
 from twoloop.problem.system import ConstrainedSystem
 

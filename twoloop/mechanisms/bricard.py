@@ -10,7 +10,7 @@ import numpy as np
 from twoloop.bodies.points import box
 from twoloop.mechanisms.quadratic import ONE, QuadraticSystem, Scalar, difference, fixed
 from twoloop.mechanisms.ready import ready
-from twoloop.problem.joints import Joint
+from twoloop.problem.description import Joint
 from twoloop.problem.problem import Array, Problem
 
 GRAVITY = 9.81

@@ -13,10 +13,8 @@ import numpy as np
 from twoloop.bodies.points import GROUND, BodyPoints, PlanarEnergy
 from twoloop.checks.arguments import check_finite, check_vector
 from twoloop.kernels.compile.callbacks import callback
-from twoloop.problem.description import body_names
-from twoloop.problem.drawing import Drawing
-from twoloop.problem.given import callbacks_in
-from twoloop.problem.joints import Joint
+from twoloop.problem.callbacks import callbacks_in
+from twoloop.problem.description import Drawing, Joint, body_names
 from twoloop.problem.problem import Array, Problem, Reference
 from twoloop.problem.system import ConstrainedSystem
 

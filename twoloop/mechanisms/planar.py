@@ -18,10 +18,8 @@ from twoloop.bodies.planar_places import motion, place_on
 from twoloop.bodies.points import PlanarEnergy, Sketch
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
-from twoloop.problem.drawing import Drawing
-from twoloop.problem.entries import LARGE
-from twoloop.problem.given import callbacks_in
-from twoloop.problem.joints import Joint, unused
+from twoloop.problem.callbacks import LARGE, callbacks_in
+from twoloop.problem.description import Drawing, Joint, unused_name
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
 
@@ -229,7 +227,7 @@ class PlanarBodies:
     ) -> int:
         first = 3 * body
         numbered = tuple(range(self.n_c, self.n_c + rows))
-        name = unused(name, self._named)
+        name = unused_name(name, self._named)
         self._named[name] = Joint(name, numbered, (first, first + 1), (first + 2,), point)
         self._joints.append([kind, float(self.n_c), *numbers])
         self.n_c += rows

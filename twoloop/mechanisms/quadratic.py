@@ -16,9 +16,8 @@ import numpy as np
 from twoloop.bodies.points import LinearPoints
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
-from twoloop.problem.drawing import Drawing
-from twoloop.problem.given import callbacks_in
-from twoloop.problem.joints import Joint
+from twoloop.problem.callbacks import callbacks_in
+from twoloop.problem.description import Drawing, Joint
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
 

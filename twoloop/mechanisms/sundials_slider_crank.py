@@ -8,8 +8,8 @@ import numpy as np
 
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms.computed import computed
-from twoloop.problem.drawing import Drawing
-from twoloop.problem.given import callbacks_in
+from twoloop.problem.callbacks import callbacks_in
+from twoloop.problem.description import Drawing
 from twoloop.problem.problem import Array, Problem, Reference
 from twoloop.problem.system import ConstrainedSystem
 

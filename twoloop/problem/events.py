@@ -1,4 +1,4 @@
-"""Events: zeros of functions event(t, q, v) along the dense solution, by SciPy's rules."""
+"""Find events, zeros of functions event(t, q, v) along the dense solution, by SciPy's rules."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,29 +11,31 @@ import numpy as np
 
 from twoloop.checks.arguments import Array, check_call, shown
 
-SAMPLES = 4  # parts of a step at least, at whose ends the sign is looked at
-WHOLE = 1.0 - 1e-9  # of a step: one of SAMPLES times the time between samples, but for rounding, has SAMPLES parts
+SAMPLES = 4  # least number of parts of a step, at whose ends the sign is checked
+WHOLE = 1.0 - 1e-9  # so that rounding does not add a part to a step of SAMPLES times the time between samples
 PRECISION = 4.0 * float(np.finfo(float).eps)  # of the time of an event, as in SciPy
-MOST = 3000  # iterations of Brent's method, which halves the interval at least every 53rd time: for zeros of high order
+MAX_ITERATIONS = (
+    3000  # iterations of Brent's method, which halves the interval at least every 53rd time: for zeros of high order
+)
 
-_callable: WeakSet[FunctionType] = WeakSet()  # functions whose arguments were checked, which takes 9 µs
+_checked: WeakSet[FunctionType] = WeakSet()  # functions whose arguments were checked, which takes 9 µs
 
 
 class States(Protocol):
-    """Rows [q, v] of a run between its steps."""
+    """Interpolate the states of a run as rows [q, v]."""
 
     def at(self, times: Array) -> Array:
-        """Those at sorted times."""
+        """Return the rows at sorted times."""
         ...
 
     def within(self, t: float) -> Callable[[float], Array]:
-        """What gives the one at a time, for one after another in the step of t."""
+        """Return an interpolant of the step that contains t: a function of time that returns the row."""
         ...
 
 
 @dataclass(frozen=True)
 class Event:
-    """An event function with its attributes, checked."""
+    """Hold an event function with its checked attributes."""
 
     number: int
     function: Callable[..., Any]
@@ -42,12 +44,12 @@ class Event:
 
     @property
     def name(self) -> str:
-        """As messages show it."""
-        own = getattr(self.function, "__name__", "")
-        return f"events[{self.number}]" + (f" ({own})" if own and own != "<lambda>" else "")
+        """Return the name that messages show."""
+        name = getattr(self.function, "__name__", "")
+        return f"events[{self.number}]" + (f" ({name})" if name and name != "<lambda>" else "")
 
     def __call__(self, t: float, q: Array, v: Array) -> float:
-        """Its value, or what is wrong with it; it may write to q and v."""
+        """Evaluate the function, which may write to q and v; raise if the value is not a finite number."""
         try:
             value = self.function(t, q, v)
         except Exception as error:
@@ -64,7 +66,7 @@ class Event:
 
 
 def check_events(events: Any) -> list[Event]:
-    """The event functions with their attributes, or what is wrong with one."""
+    """Return the event functions with their attributes; raise if one is wrong."""
     if events is None:
         return []
     functions = [events] if callable(events) else events
@@ -73,19 +75,19 @@ def check_events(events: Any) -> list[Event]:
             f"events must be a function event(t, q, v) or a list of such; given {shown(events)} of type "
             f"{type(events).__name__}"
         )
-    return [_checked(number, function) for number, function in enumerate(functions)]
+    return [_event(number, function) for number, function in enumerate(functions)]
 
 
-def _checked(number: int, function: Any) -> Event:
+def _event(number: int, function: Any) -> Event:
     if not callable(function):
         raise TypeError(
             f"events[{number}] must be a function event(t, q, v); given {shown(function)} of type "
             f"{type(function).__name__}"
         )
-    if type(function) is not FunctionType or function not in _callable:
+    if type(function) is not FunctionType or function not in _checked:
         check_call(f"events[{number}]", "event", function, ("t", "q", "v"))
         if type(function) is FunctionType:
-            _callable.add(function)
+            _checked.add(function)
     terminal, direction = getattr(function, "terminal", None), getattr(function, "direction", 0)
     expected = f"events[{number}].terminal must be True, False or a positive number of occurrences"
     if terminal is not None and not isinstance(terminal, (bool, int, np.bool_, np.integer)):
@@ -101,7 +103,7 @@ def _checked(number: int, function: Any) -> Event:
 
 
 class EventSearch:
-    """Looks for the events of a run, step by step.
+    """Search for the events of a run, step by step.
 
     Parameters
     ----------
@@ -118,7 +120,7 @@ class EventSearch:
     ended : (Event, float) or None
         The terminal event that ends the run, and when.
     reached : float
-        The end of the last step that was looked at.
+        The end of the last step that was searched.
     """
 
     def __init__(self, events: list[Event], t0: float, row: Array, every: float):
@@ -127,19 +129,21 @@ class EventSearch:
         self.ended: tuple[Event, float] | None = None
         self._n_q = len(row) // 2
         self._every = min((getattr(event.function, "every", every) for event in events), default=every)
-        self._rates = [each for event in events if (each := getattr(event.function, "gap_rate", None)) is not None]
-        own = zip(events, self._own(row[None, :]), strict=True)
-        self._values = [event(t0, q[0], v[0]) for event, (q, v) in own]
+        self._rates = [rate for event in events if (rate := getattr(event.function, "gap_rate", None)) is not None]
+        copies = zip(events, self._copies(row[None, :]), strict=True)
+        self._values = [event(t0, q[0], v[0]) for event, (q, v) in copies]
         self._at_start = True
 
     def search(self, states: States, ends: Array) -> None:
-        """Look at the steps that end at ends[1:], the first of which begins at ends[0]; stop at a terminal event."""
+        """Search the steps that end at ends[1:], the first of which begins at ends[0]; stop at a terminal event."""
         if len(ends) < 2 or self.ended is not None:
             return
         steps = np.diff(ends)
         counts = np.maximum(SAMPLES, np.ceil(WHOLE * steps / self._every)).astype(int)
         first = np.append(0, np.cumsum(counts))
-        begins, parts, lengths, before = (np.repeat(each, counts) for each in (ends[:-1], counts, steps, first[:-1]))
+        begins, parts, lengths, before = (
+            np.repeat(per_step, counts) for per_step in (ends[:-1], counts, steps, first[:-1])
+        )
         times = np.append(begins + (np.arange(first[-1]) - before) / parts * lengths, ends[-1])
         rows = states.at(times)
         if not self._rates:
@@ -152,12 +156,12 @@ class EventSearch:
                 return
 
     def break_off(self) -> None:
-        """Forget what was found in a step whose search was interrupted."""
+        """Drop the events of a step whose search was interrupted."""
         if self.ended is None:
-            self.found = [[(t, row) for t, row in found if t <= self.reached] for found in self.found]
+            self.found = [[(t, row) for t, row in events if t <= self.reached] for events in self.found]
 
     def _with_turns(self, states: States, times: Array, rows: Array) -> tuple[Array, Array]:
-        """Samples, and between them those at which a gap ceases to close: it may be open at both and not there."""
+        """Add the times at which a gap ceases to close: it may be open at both samples and closed between them."""
         if not self._rates:
             return times, rows
         states_at = zip(times.tolist(), *np.split(rows, 2, axis=1), strict=True)
@@ -168,67 +172,67 @@ class EventSearch:
         ]
         if not turns:
             return times, rows
-        new = np.unique(turns)
-        places = np.searchsorted(times, new)
-        return np.insert(times, places, new), np.insert(rows, places, states.at(new), axis=0)
+        turning_times = np.unique(turns)
+        indices = np.searchsorted(times, turning_times)
+        return np.insert(times, indices, turning_times), np.insert(rows, indices, states.at(turning_times), axis=0)
 
-    def _own(self, rows: Array) -> list[tuple[list[Array], list[Array]]]:
-        """Coordinates and velocities for each event, which it may write to."""
+    def _copies(self, rows: Array) -> list[tuple[list[Array], list[Array]]]:
+        """Return copies of coordinates and velocities for each event, which may write to them."""
         return [(list(rows[:, : self._n_q].copy()), list(rows[:, self._n_q :].copy())) for _ in self.events]
 
     def _in_steps(self, states: States, times: Array, rows: Array, ends: list[float]) -> None:
-        """Events between samples of the steps that end at `ends`."""
-        at, own, steps = times.tolist(), self._own(rows), iter(ends)
+        """Search between the samples of the steps that end at `ends`."""
+        t, copies, steps = times.tolist(), self._copies(rows), iter(ends)
         end = next(steps)
-        for k in range(1, len(at)):
+        for k in range(1, len(t)):
             values, active = [], []
-            for event, (q, v), g in zip(self.events, own, self._values, strict=True):
-                values.append(g_new := event(at[k], q[k], v[k]))
+            for event, (q, v), g in zip(self.events, copies, self._values, strict=True):
+                values.append(g_new := event(t[k], q[k], v[k]))
                 if g * g_new <= 0.0 and (g != 0.0 or self._at_start) and crosses(event.direction, g, g_new):
                     active.append((event, (g, g_new)))
             self._values, self._at_start = values, False
             if active:
-                roots = [(*_root(event, states, (at[k - 1], at[k]), both), event) for event, both in active]
+                roots = [(*_root(event, states, (t[k - 1], t[k]), signs), event) for event, signs in active]
                 self._record(sorted(roots, key=lambda root: root[0]))
                 if self.ended is not None:
                     return
-            if at[k] == end:
+            if t[k] == end:
                 self.reached, end = end, next(steps, np.inf)
 
     def _record(self, roots: list[tuple[float, Array, Event]]) -> None:
-        """Note events up to the first terminal one, and those at the same time."""
+        """Record the events up to the first terminal one, and those at the same time."""
         for t, row, event in roots:
             if self.ended is not None and t > self.ended[1]:
                 return
-            found = self.found[event.number]
-            found.append((t, row))
-            if len(found) >= event.terminal and self.ended is None:
+            occurrences = self.found[event.number]
+            occurrences.append((t, row))
+            if len(occurrences) >= event.terminal and self.ended is None:
                 self.ended = (event, t)
 
 
 def _root(
     event: Callable[..., float], states: States, ends: tuple[float, float], values: tuple[float, float]
 ) -> tuple[float, Array]:
-    """When an event is zero between two times at which its values are known, to rounding; the row [q, v] there."""
+    """Return when an event is zero between two times of known values, to rounding, and the row [q, v] then."""
     from scipy.optimize import brentq  # takes a tenth of a second to import, and few runs need it
 
-    known = dict(zip(ends, values, strict=True))
-    for t, value in known.items():
-        if value == 0.0:
+    values_at_ends = dict(zip(ends, values, strict=True))
+    for t, end_value in values_at_ends.items():
+        if end_value == 0.0:
             return t, states.at(np.array([t]))[0]
     row = states.within(ends[0])
 
-    def at(t: float) -> float:
-        if t in known:
-            return known[t]
-        found = row(t)
-        return event(t, found[: len(found) // 2], found[len(found) // 2 :])
+    def value(t: float) -> float:
+        if t in values_at_ends:
+            return values_at_ends[t]
+        q, v = np.split(row(t), 2)
+        return event(t, q, v)
 
-    t = float(brentq(at, *ends, xtol=PRECISION, rtol=PRECISION, maxiter=MOST))
+    t = float(brentq(value, *ends, xtol=PRECISION, rtol=PRECISION, maxiter=MAX_ITERATIONS))
     return t, row(t)
 
 
 def crosses(direction: float, g: float, g_new: float) -> bool:
-    """Whether a function that goes from g to g_new has a zero that counts (`find_active_events` of SciPy)."""
+    """Return whether a function that goes from g to g_new has a zero that counts (`find_active_events` of SciPy)."""
     up, down = g <= 0.0 <= g_new, g_new <= 0.0 <= g
     return (up and direction >= 0.0) or (down and direction <= 0.0)

@@ -1,4 +1,4 @@
-"""What every ready problem offers."""
+"""Define `Problem`, a mechanism with its start, energy and references."""
 
 import copy
 from collections.abc import Callable, Mapping
@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 
 from twoloop.checks.arguments import Array, check_call, check_span, check_text, check_vector, shown
-from twoloop.problem.description import Description, name_and_unit
-from twoloop.problem.drawing import Drawing
-from twoloop.problem.joints import Joint
+from twoloop.problem.description import Description, Drawing, Joint, name_and_unit
 from twoloop.problem.system import ConstrainedSystem, check_system
 
 TAGS = (
@@ -21,7 +19,7 @@ TAGS = (
 
 @dataclass(frozen=True)
 class Reference:
-    """A state that is known from elsewhere.
+    """Hold a state that is known from elsewhere.
 
     Attributes
     ----------
@@ -60,7 +58,7 @@ class Reference:
 
 @dataclass(frozen=True)
 class Condition:
-    """When a benchmark's authors take a run for right.
+    """Decide by the rule of a benchmark's authors whether a run is right.
 
     The error is the root mean square, over outputs and quantities, of |difference| / max(|reference|, threshold).
 
@@ -95,16 +93,16 @@ class Condition:
     source: str
 
     def error(self, q: Array, v: Array, q_known: Array, v_known: Array) -> float:
-        """Error of the states q, v (n_q, n_outputs) against the known ones."""
-        rows, speeds = list(self.coordinates), list(self.velocities)
-        given, known = np.vstack([q[rows], v[speeds]]), np.vstack([q_known[rows], v_known[speeds]])
-        relative = np.abs(given - known) / np.maximum(np.abs(known), self.threshold)
+        """Return the error of the states q, v (n_q, n_outputs) against the known states."""
+        positions, speeds = list(self.coordinates), list(self.velocities)
+        states, expected = np.vstack([q[positions], v[speeds]]), np.vstack([q_known[positions], v_known[speeds]])
+        relative = np.abs(states - expected) / np.maximum(np.abs(expected), self.threshold)
         return float(np.sqrt(np.mean(relative**2)))
 
 
 @dataclass(frozen=True)
 class Problem:
-    """A mechanism ready to run.
+    """Hold a mechanism ready to run.
 
     Attributes
     ----------
@@ -134,8 +132,8 @@ class Problem:
     purpose : str
         What it tests, in plain words.
     conserved : bool or None
-        Whether the energy is an invariant. None: it is not known, and nothing is judged by it; `studies.compare` looks
-        at the energy of its reference then.
+        Whether the energy is an invariant. None: unknown, and nothing is judged by it; `studies.compare` then looks at
+        the energy of its reference.
     invariants : mapping
         Further ones: name to invariant(t, q, v), as `energy`.
     condition : Condition or None
@@ -206,26 +204,26 @@ class Problem:
         unknown = [tag for tag in self.tags if tag not in TAGS]
         if unknown:
             raise ValueError(f"tags must be of {', '.join(TAGS)}; given {unknown[0]!r}")
-        given = self.coordinates
-        if given and not len(given) == len(set(given)) == n_q:
-            raise ValueError(f"coordinates must be n_q = {n_q} different names, or none; given {given!r}")
+        names = self.coordinates
+        if names and not len(names) == len(set(names)) == n_q:
+            raise ValueError(f"coordinates must be n_q = {n_q} different names, or none; given {names!r}")
         if self.drawing is not None:
             self.drawing.at(np.asarray(self.q0, dtype=float))
         system = copy.copy(self.system)
-        system.description = Description(tuple(given), self.energy, self.conserved, self.drawing)
+        system.description = Description(tuple(names), self.energy, self.conserved, self.drawing)
         object.__setattr__(self, "system", system)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the coordinates without their units."""
-        return tuple(name_and_unit(each)[0] for each in self.coordinates)
+        """Return the names of the coordinates without their units."""
+        return tuple(name_and_unit(name)[0] for name in self.coordinates)
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Units of the coordinates; "" for numbers without one."""
-        return tuple(name_and_unit(each)[1] for each in self.coordinates)
+        """Return the units of the coordinates; "" for numbers without a unit."""
+        return tuple(name_and_unit(name)[1] for name in self.coordinates)
 
     @property
     def joints(self) -> tuple[Joint, ...]:
-        """The named joints of the system, whose forces and torques `Result.reactions` gives."""
+        """Return the named joints of the system, whose forces and torques `Result.reactions` returns."""
         return self.system.joints

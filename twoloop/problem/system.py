@@ -1,29 +1,204 @@
-"""The problem: M a + C_q^T lam + A^T mu = Q with C(t, q) = 0 and A v + b = 0, as compiled callbacks and sizes."""
+"""Define `ConstrainedSystem`: M a + C_q^T lam + A^T mu = Q with C(t, q) = 0 and A v + b = 0, as compiled callbacks."""
 
-from __future__ import annotations  # ArrayLike stays a word in help()
+from __future__ import annotations
 
 import copy
+import inspect
+import math
+import re
+import textwrap
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from twoloop.checks.arguments import Array, check_flag, check_size, check_text, shaped
-from twoloop.kernels.compile.callbacks import KINDS
+from twoloop.checks.arguments import Array, check_flag, check_number, check_real, check_size, check_text, shaped, shown
+from twoloop.checks.bounds import check_callback
+from twoloop.checks.sparse_rows import Rows, SparseRows
+from twoloop.kernels.compile.callbacks import KINDS, STATE
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.kernels.data.common import PROGRAMS, Functions
 from twoloop.kernels.data.flags import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS
 from twoloop.kernels.data.kit import Kit
-from twoloop.problem.adapters import PythonFunctions, compile_returning, through_python
-from twoloop.problem.description import Description
-from twoloop.problem.enclosed import Enclosed
-from twoloop.problem.entries import VALUES_OF, DenseFunction, dense_callback
-from twoloop.problem.evaluated import EvaluatedEquations
-from twoloop.problem.given import checked_entries, checked_parameters, given_callbacks, in_place_of, plain_functions
-from twoloop.problem.joints import Joint, check_joints
-from twoloop.problem.pickling import made_again, reduced
-from twoloop.problem.system_methods import add_callbacks
+from twoloop.problem.callbacks import (
+    VALUES_OF,
+    DenseFunction,
+    PythonFunctions,
+    checked_entries,
+    checked_parameters,
+    compile_returning,
+    dense_callback,
+    given_callbacks,
+    plain_functions,
+    store,
+    substitute,
+    through_python,
+)
+from twoloop.problem.compiled_functions import FrozenValues, pickled, unpickled
+from twoloop.problem.description import Description, Joint, check_joints
+
+
+class EvaluatedEquations:
+    """Evaluate the equations of a `ConstrainedSystem`, whose attributes these methods read."""
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...
+
+    def remembered(self, key: Any, make: Callable[[], Any]) -> Any:
+        """Return `make()` and cache it for these parameters; not cached for Python functions, which may change."""
+        if self._python is not None:
+            return make()
+        if key not in self.made:
+            self.made[key] = make()
+        return self.made[key]
+
+    def remembered_at(self, key: Any, state: Any, make: Callable[[], Any]) -> Any:
+        """Return `make()` and cache it until it is asked for at another state."""
+        if self._python is not None:
+            return make()
+        cached = self.made.get(key)
+        if cached is None or cached[0] != state:
+            cached = self.made[key] = state, make()
+        return cached[1]
+
+    def remember_at(self, key: Any, state: Any, value: Any) -> None:
+        """Put a value into the cache of `remembered_at`."""
+        if self._python is None:
+            self.made[key] = state, value
+
+    def arrays_of(self, kind: str) -> list[Array]:
+        """Return zeros for a kind of callback to fill."""
+        return [np.zeros(shape) for shape in self._shapes[kind]]
+
+    def evaluate(self, kind: str, t: float, *state: ArrayLike) -> Any:
+        """Evaluate a callback at (t, q), (t, q, v) or (t, q, lam), as its kind requires.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong, if the callback goes out of the bounds of its arrays, or if there is none and
+            nothing can stand for it, as for gamma: the integrator then finds it by differences.
+        """
+        if kind not in KINDS:
+            raise ValueError(f"kind must be one of {', '.join(KINDS)}; given {shown(kind)}")
+        entry = KINDS[kind]
+        if entry.absent == "kernels" and kind not in self.given:
+            raise ValueError(f"{self.name!r} was given no {kind}")
+        t = check_number("t", t)
+        if not math.isfinite(t):
+            raise ValueError(f"t must be finite; given {t!r}")
+        if len(state) != len(entry.state):
+            expected = ", ".join(("t", *entry.state))
+            raise TypeError(f"{kind} is evaluated at ({expected}); given {len(state)} arrays after t")
+        arrays = []
+        for name, value in zip(entry.state, state, strict=True):
+            array = check_real(name, value)
+            if array.shape != (n := getattr(self, STATE[name]),):
+                raise ValueError(
+                    f"{name} must have shape ({n},), as {STATE[name]} = {n} in {self.name!r}; given {shaped(array)}"
+                )
+            arrays.append(np.ascontiguousarray(array))
+        check_callback(cast(Any, self), kind, t, arrays)
+        out = self.arrays_of(kind)
+        getattr(self.functions, kind)(t, *arrays, self.functions.p, *out)
+        return out[0] if len(out) == 1 else tuple(out)
+
+    def check_returned(self, t: float, q: Array, v: Array) -> None:
+        """Check the arrays that functions given with `compile=True` return at (t, q, v).
+
+        Machine code can only say that a shape is wrong, not which.
+        """
+        for kind, function in self._returning.items():
+            states = {"q": q, "v": v, "lam": np.ones(self.n_c)}
+            arguments = [states[name].copy() for name in KINDS[kind].state]
+            store(kind, self.name, t, function(t, *arguments, *self.parameters_for(kind)), self.arrays_of(kind)[0])
+
+    def velocity_constraint(self, t: float, q: Array, v: Array) -> Array:
+        """Evaluate C_q v + C_t and A v + b, (n_c + n_a,): zero for consistent velocities (eq. (4))."""
+        return self.sparse_rows(t, q) @ np.asarray(v, dtype=np.float64) + self.rates(t, q)
+
+    def rows(self, t: float, q: ArrayLike) -> Array:
+        """Evaluate C_q, then A, (n_c + n_a, n_q)."""
+        return self.jacobian(t, q) if self.n_a == 0 else np.vstack([self.jacobian(t, q), self.nonholonomic(t, q)])
+
+    def sparse_rows(self, t: float, q: ArrayLike) -> Rows:
+        """Evaluate the rows by their entries, where `jacobian_values` returns these."""
+        if self.n_a > 0 or "jacobian" not in self.entries:
+            return self.rows(t, q)
+        values, shape = self.jacobian_values(t, q), (self.n_c, self.n_q)
+        rows, columns = self.entries["jacobian"]
+        pattern = self.remembered("sparse rows", lambda: SparseRows(rows, columns, values, shape))
+        return pattern.with_values(pattern.added(values))  # type: ignore[no-any-return]
+
+    def rates(self, t: float, q: ArrayLike) -> Array:
+        """Evaluate C_t, then b, (n_c + n_a,)."""
+        rate = self.constraint_rate(t, q)
+        return rate if self.n_a == 0 else np.append(rate, self.nonholonomic_rate(t, q))
+
+
+# in a docstring, which has the indentation of the source before Python 3.13, and none since
+PLACEHOLDER = re.compile(r"^( *)\{callbacks\}\n", re.MULTILINE)
+
+
+def add_callbacks(cls: Any) -> Any:
+    """Add a method for each kind of callback to a class, and list all kinds in its signature and docstring."""
+    for kind in KINDS:
+        setattr(cls, kind, _method(kind))
+    plain = cls.from_python.__func__
+    cls.__signature__, plain.__signature__ = _full_signature(cls), _full_signature(plain)
+    cls.__doc__, plain.__doc__ = _with_entries(cls.__doc__, False), _with_entries(plain.__doc__, True)
+    return cls
+
+
+def _method(kind: str) -> Callable[..., Any]:
+    """Return the method of a system that evaluates one kind of callback."""
+    entry = KINDS[kind]
+    parameters = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in ("t", *entry.state)]
+    signature = inspect.Signature(parameters)
+
+    def method(self: Any, *arguments: Any, **named: Any) -> Any:
+        if named or len(arguments) != len(parameters):
+            try:
+                arguments = signature.bind(*arguments, **named).args
+            except TypeError as error:
+                raise TypeError(f"{kind}{signature}: {error}") from None
+        return self.evaluate(kind, *arguments)
+
+    own = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
+    method.__signature__ = signature.replace(parameters=[own, *parameters])  # type: ignore[attr-defined]
+    method.__name__, method.__qualname__ = kind, f"ConstrainedSystem.{kind}"
+    method.__doc__ = f"{entry.meaning[0].upper()}{entry.meaning[1:]}, {entry.size}.\n\nSee `evaluate`."
+    return method
+
+
+def _with_entries(text: str | None, plain: bool) -> str | None:
+    """Return a docstring with the callbacks in their place; None without docstrings (python -OO)."""
+    return text and PLACEHOLDER.sub(lambda place: "".join(_entry(kind, plain, place[1]) for kind in KINDS), text)
+
+
+def _entry(kind: str, plain: bool, indent: str) -> str:
+    """Return the entry of a kind for the parameters of a docstring."""
+    entry = KINDS[kind]
+    called = f"{kind}({', '.join(('t', *entry.state))}) -> {entry.size}: " if plain else ""
+    text = f"{called}{entry.meaning}{'' if plain else ', ' + entry.size}. {entry.note}"
+    if plain and kind == "mass":
+        text += " Or an array: a constant matrix, factored once."
+    head = f"{kind} : {'callable' if plain else 'compiled callback'}{', optional' if entry.optional else ''}"
+    body = textwrap.fill(text, 120, initial_indent=indent + "    ", subsequent_indent=indent + "    ")
+    return f"{indent}{head}\n{body}\n"
+
+
+def _full_signature(function: Any) -> inspect.Signature:
+    """Return the signature of a constructor, with the callbacks by name."""
+    parameters = inspect.signature(function).parameters.values()
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    defaults = {kind: None if entry.optional else inspect.Parameter.empty for kind, entry in KINDS.items()}
+    callbacks = [inspect.Parameter(kind, keyword, default=default) for kind, default in defaults.items()]
+    required = [p for p in parameters if p.default is p.empty and p.kind != p.VAR_KEYWORD]
+    options = [p for p in parameters if p.default is not p.empty]
+    return inspect.Signature([*required, *callbacks, *options])
 
 
 @add_callbacks
@@ -130,14 +305,14 @@ class ConstrainedSystem(EvaluatedEquations):
                     f"({', '.join(entry.arguments)}); given {function!r}. Plain Python functions enter by "
                     "ConstrainedSystem.from_python"
                 )
-        enclosed = Enclosed(self.given)
+        enclosed = FrozenValues(self.given)
         self.enclosed = enclosed if enclosed.any else None
         self._scatter()
         flags = np.zeros(N_FLAGS, dtype=np.int64)
         flags[CONSTANT_MASS] = self.constant_mass
         flags[[place for kind, place in GIVEN.items() if kind in self.given]] = 1
         flags[BANDWIDTH] = -1  # a run decides by the size
-        all_callbacks = {kind: self.given.get(kind) or in_place_of(kind, self.given) for kind in KINDS}
+        all_callbacks = {kind: self.given.get(kind) or substitute(kind, self.given) for kind in KINDS}
         none = (np.zeros(0, np.int64), np.zeros(0))
         programs = dict(zip(PROGRAMS, (*none, *none, *[np.zeros(0, np.int32)] * 2), strict=True))
         self.functions: Any = Functions(**all_callbacks, p=p, flags=flags, **programs)  # type: ignore[call-arg]
@@ -148,10 +323,10 @@ class ConstrainedSystem(EvaluatedEquations):
             kind: [tuple(getattr(self, size) for size in shape) for _, shape in entry.outputs]
             for kind, entry in KINDS.items()
         }
-        self.within_bounds: set[str] = set()  # kinds that check_callback has looked at
+        self.within_bounds: set[str] = set()  # kinds that check_callback has checked
         self.checked = False  # by check_derivatives
-        self.made: dict[Any, Any] = {}  # of its equations: see `remembered`
-        self.shared: dict[Any, Any] = {}  # with systems of other parameters: options that were checked, and runs
+        self.made: dict[Any, Any] = {}  # cache of what follows from the equations, see `remembered`
+        self.shared: dict[Any, Any] = {}  # cache shared with systems of other parameters: checked options, and runs
 
     @property
     def n_mass_values(self) -> int:
@@ -164,10 +339,11 @@ class ConstrainedSystem(EvaluatedEquations):
         return len(self.entries["jacobian"][0]) if "jacobian" in self.entries else 0
 
     def _scatter(self) -> None:
-        """Make dense callbacks of those that give values, where there are none."""
-        made = {kind: VALUES_OF[kind] for kind in self.entries if kind not in self.given}
-        dense = {kind: dense_callback(kind, self.given[of], self.entries[kind]) for kind, of in made.items()}
-        self.given = {kind: each for kind in KINDS if (each := dense.get(kind, self.given.get(kind))) is not None}
+        """Add dense callbacks for those that return values of entries, where there are none."""
+        missing = [kind for kind in self.entries if kind not in self.given]
+        dense = {kind: dense_callback(kind, self.given[VALUES_OF[kind]], self.entries[kind]) for kind in missing}
+        callbacks = self.given | dense
+        self.given = {kind: callbacks[kind] for kind in KINDS if kind in callbacks}
         self.scattered = frozenset(dense)
 
     def __repr__(self) -> str:
@@ -175,7 +351,7 @@ class ConstrainedSystem(EvaluatedEquations):
 
     @property
     def parameters(self) -> Array:
-        """The vector `p` that every callback gets, read-only: `with_parameters` makes a system of others."""
+        """Return the vector `p` that every callback gets, read-only: `with_parameters` makes a system of others."""
         p = self.functions.p[self.called_in_python :].copy()  # kernels want an array that may be written
         p.setflags(write=False)
         return p.view()  # which cannot be made writable again
@@ -188,11 +364,11 @@ class ConstrainedSystem(EvaluatedEquations):
         )
 
     def with_parameters(self, parameters: ArrayLike) -> ConstrainedSystem:
-        """Make a system of the same callbacks, of which nothing is compiled again, and other parameters.
+        """Make a system of the same callbacks, without compilation, and other parameters.
 
-        What is told of a system beside its equations may enclose the parameters, too. Kept are the names of the
-        coordinates, joints without a `point` and `equations`, and the energy where it is generated with the equations;
-        another energy and a drawing are given by a `Problem` of the new system.
+        The new system keeps the names of the coordinates, joints without `point` and `equations`, and an energy that
+        was generated with the equations. It drops another energy, a drawing and other joints, as these may enclose the
+        old parameters: make a `Problem` of the new system to give them.
 
         Parameters
         ----------
@@ -242,7 +418,7 @@ class ConstrainedSystem(EvaluatedEquations):
         name: str = "system",
         **functions: Any,
     ) -> ConstrainedSystem:
-        """Make a system of plain Python functions, each of which takes arrays and returns one.
+        """Make a system of plain Python functions, each of which takes arrays and returns an array.
 
         Parameters
         ----------
@@ -295,43 +471,44 @@ class ConstrainedSystem(EvaluatedEquations):
         }
         if check_flag("compile", compile):
             compiled: dict[str, Any] = {
-                kind: compile_returning(kind, each, kind in taking) for kind, each in functions.items()
+                kind: compile_returning(kind, function, kind in taking) for kind, function in functions.items()
             }
             system = cls(**sizes, **options, **compiled, parameters=plain.p)
             system._returning, system._taking = functions, taking
             return system
-        made = {kind: VALUES_OF[kind] for kind in entries if kind not in functions}
-        sides = {"mass": (n_q, n_q), "jacobian": (n_c, n_q)}
-        functions |= {kind: DenseFunction(functions[of], entries[kind], sides[kind]) for kind, of in made.items()}
-        taking |= {kind for kind, of in made.items() if of in taking}
+        missing = [kind for kind in entries if kind not in functions]
+        shapes = {"mass": (n_q, n_q), "jacobian": (n_c, n_q)}
+        for kind in missing:
+            functions[kind] = DenseFunction(functions[VALUES_OF[kind]], entries[kind], shapes[kind])
+        taking |= {kind for kind in missing if VALUES_OF[kind] in taking}
         python = PythonFunctions(name, functions, taking)
         wrappers: dict[str, Any] = {kind: through_python(kind) for kind in functions}
         system = cls(**sizes, **options, **wrappers, parameters=np.append(python.handle, plain.p))
         system._python, system._taking = python, taking  # the registry holds it weakly
-        system.scattered = frozenset(made)
+        system.scattered = frozenset(missing)
         return system
 
     @property
     def python_functions(self) -> dict[str, Any]:
-        """The plain Python functions by kind, where it is made of these and they are not compiled."""
+        """Return the plain Python functions by kind; empty if they are compiled."""
         return {} if self._python is None else self._python.functions
 
     def parameters_for(self, kind: str) -> tuple[Array, ...]:
-        """What a plain function of a kind takes after the state: the parameters, or nothing."""
+        """Return what a plain function of a kind takes after the state: the parameters, or nothing."""
         return (self.parameters.copy(),) if self.takes_parameters(kind) else ()
 
     def takes_parameters(self, kind: str) -> bool:
-        """Whether a plain function of a kind takes the parameters as its last argument."""
+        """Return whether a plain function of a kind takes the parameters as its last argument."""
         return kind in self._taking
 
     @property
     def called_in_python(self) -> bool:
-        """Whether the callbacks are plain Python functions."""
+        """Return whether the callbacks are plain Python functions."""
         return self._python is not None
 
     @property
     def kit(self) -> Kit:
-        """The callbacks as kernels take them."""
+        """Return the callbacks as kernels take them."""
         return self.remembered(("kit", id(self.functions)), lambda: Kit(self.functions))
 
     def __copy__(self) -> ConstrainedSystem:
@@ -349,11 +526,11 @@ class ConstrainedSystem(EvaluatedEquations):
         return other
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return made_again, (type(self), *reduced(self))
+        return unpickled, (type(self), *pickled(self))
 
 
 def check_system(system: object) -> None:
-    """Raise unless a ConstrainedSystem is given, whose compiled functions enclose what they did when compiled."""
+    """Raise unless this is a ConstrainedSystem whose compiled functions enclose the same values as when compiled."""
     if isinstance(system, ConstrainedSystem):
         change = None if system.enclosed is None else system.enclosed.change()
         if change is None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from twoloop.checks.arguments import Array, check_text
 from twoloop.checks.sparse_rows import SparseRows
-from twoloop.problem.joints import Joint
+from twoloop.problem.description import Joint
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.record import Record
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.problem.adapters import PythonFunctions
+from twoloop.problem.callbacks import PythonFunctions
 from twoloop.problem.events import Event
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.record import Record, Statistics, Status, explained

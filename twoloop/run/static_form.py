@@ -10,7 +10,7 @@ from twoloop.kernels.algebra.static_order import bodies_of
 from twoloop.kernels.algebra.static_program import N_OFF, N_PIVOTS, N_UPDATES, Entries, static_program
 from twoloop.kernels.layout import Static
 from twoloop.methods.plan import Plan
-from twoloop.problem.entries import LARGE
+from twoloop.problem.callbacks import LARGE
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.newton_form import newton_form
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from sympy import Basic
 
 from twoloop.checks.arguments import check_flag, check_text, check_vector, shown
-from twoloop.problem.generated import GeneratedCode, GeneratedEnergy
+from twoloop.problem.compiled_functions import GeneratedCode, GeneratedEnergy
 from twoloop.problem.problem import Problem
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.projection import consistent_state

@@ -1,0 +1,484 @@
+"""Turn what a user gives, plain functions and entries of matrices, into callbacks; stand in for those left out."""
+
+import ctypes
+import inspect
+import math
+import secrets
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from types import FunctionType
+from typing import Any, ClassVar, NamedTuple
+from weakref import WeakValueDictionary
+
+import numpy as np
+from numba import njit, objmode
+from numpy.typing import NDArray
+
+from twoloop.checks.arguments import Array, check_call, check_real, shaped, shown
+from twoloop.kernels.compile.caches import named_apart, watch
+from twoloop.kernels.compile.callbacks import KINDS, compile_callback, stand_in
+from twoloop.kernels.compile.dependencies import digest_of, stands_for
+from twoloop.kernels.compile.private import Dispatcher
+
+Integers = NDArray[np.int64]
+Entries = tuple[Integers, Integers]  # rows and columns
+
+LARGE = 64  # coordinates from which entries are faster than dense matrices; on chains of bars it is 36
+VALUES_OF = {
+    "mass": "mass_values",
+    "jacobian": "jacobian_values",
+}  # kinds that return the values of entries, by their dense kinds
+
+
+def check_entries(name: str, given: Any, shape: tuple[int, int], symmetric: bool) -> Entries:
+    """Return the rows and columns of the entries of a matrix as vectors, or say what is wrong with them."""
+    try:
+        rows, columns = map(np.asarray, given)
+    except (TypeError, ValueError):
+        raise TypeError(f"{name} must be two vectors of int, rows and columns; given {shown(given)}") from None
+    for vector in (rows, columns):
+        if vector.ndim != 1 or (vector.size and not np.issubdtype(vector.dtype, np.integer)):
+            raise TypeError(f"{name} must be two vectors of int, rows and columns; given {shown(given)}")
+    if len(rows) != len(columns):
+        raise ValueError(f"{name} must be as many rows as columns; given {len(rows)} and {len(columns)}")
+    entries = rows.astype(np.int64), columns.astype(np.int64)
+    for label, vector, size in zip(("rows", "columns"), entries, shape, strict=True):
+        outside = np.flatnonzero((vector < 0) | (vector >= size))
+        if outside.size:
+            raise ValueError(
+                f"{label} of {name} must be from 0 to {size - 1}, as the matrix has shape {shape}; given "
+                f"{vector[outside[0]]} at place {outside[0]}"
+            )
+    if symmetric:
+        _check_both_triangles(name, *entries)
+    return entries
+
+
+def _check_both_triangles(name: str, rows: Integers, columns: Integers) -> None:
+    places = set(zip(rows.tolist(), columns.tolist(), strict=True))
+    unmatched = sorted((i, j) for i, j in places if (j, i) not in places)
+    if unmatched:
+        i, j = unmatched[0]
+        raise ValueError(f"{name} must name both triangles of M: ({i}, {j}) is there, and ({j}, {i}) is not")
+
+
+def dense_callback(kind: str, values: Dispatcher, entries: Entries) -> Dispatcher:
+    """Compile the dense callback "mass" or "jacobian" from one that returns values at these entries."""
+    rows, columns = entries
+    n = len(rows)
+
+    def dense(t, q, p, out):  # type: ignore[no-untyped-def]
+        entry_values = np.zeros(n)
+        values(t, q, p, entry_values)
+        for k in range(n):
+            out[rows[k], columns[k]] += entry_values[k]
+
+    return compile_callback(kind, dense, watch(dense))
+
+
+@dataclass(frozen=True, eq=False)
+class DenseFunction:
+    """Make the dense matrix of a plain Python function that returns values of entries; called in the same way."""
+
+    values: Callable[..., Any]
+    entries: Entries
+    shape: tuple[int, int]
+
+    def __call__(self, t: float, q: Any, *p: Any) -> Any:
+        """Return the matrix; of symbols if the function returns symbols."""
+        values = np.asarray(self.values(t, q, *p))
+        if values.shape != self.entries[0].shape:
+            return values  # whose shape is refused where it is stored
+        matrix = np.zeros(self.shape, dtype=values.dtype if values.dtype == object else np.float64)
+        for i, j, value in zip(*(indices.tolist() for indices in self.entries), values, strict=True):
+            matrix[i, j] = matrix[i, j] + value
+        return matrix
+
+
+FIRST_DISPLACEMENT = (
+    2.0**-6
+)  # first displacement, relative to max(1, |q|); a power of two, so that q + displacement is exact
+SHRINKAGE = 0.125  # factor after a displacement over which the constraints bend too much
+N_DISPLACEMENTS = 9
+AGREEMENT = 1e-11  # of the formulas of order 6 and 8, relative to the entry, at which no shorter one is tried
+ROUNDING = 1e-14  # of a constraint, relative to its largest value at the displaced points
+
+# d/dx at 0 from f(k h) - f(-k h), k = 1 ... 4, over h
+ORDER_8 = (4.0 / 5.0, -1.0 / 5.0, 4.0 / 105.0, -1.0 / 280.0)
+ORDER_6 = (3.0 / 4.0, -3.0 / 20.0, 1.0 / 60.0, 0.0)
+
+
+@cache
+def differenced_jacobian(constraint: Dispatcher) -> Dispatcher:
+    """Compile a callback "jacobian" that differences a callback "constraint".
+
+    Central differences of order 8 at four displacements to either side, multiples of 1/64 of max(1, |q_j|) for each
+    coordinate: 8 n_q calls of the constraint. If a formula of order 6 at the same points differs by more than 1e-11 of
+    an entry, the constraint bends on a shorter scale (a coordinate of 3e5 m on a bar of 1 m, a mechanism of
+    micrometres). The displacements are then shortened by 8, again and again, at another 8 calls each, and each entry is
+    taken where the two formulas agree best. For constraints that are smooth on the scale of a metre and a radian,
+    entries are good to about 1e-13 of the largest term in the constraint.
+    """
+
+    def jacobian(t, q, p, Cq):  # type: ignore[no-untyped-def]
+        n_c, n_q = Cq.shape
+        displaced = q.copy()
+        ahead, behind = np.zeros(n_c), np.zeros(n_c)
+        high, low, size, best = np.zeros(n_c), np.zeros(n_c), np.zeros(n_c), np.zeros(n_c)
+        for j in range(n_q):
+            h = FIRST_DISPLACEMENT * 2.0 ** np.floor(np.log2(max(1.0, abs(q[j]))))
+            best[:] = np.inf
+            for _ in range(N_DISPLACEMENTS):
+                high[:] = 0.0
+                low[:] = 0.0
+                size[:] = 0.0
+                for k in range(4):
+                    ahead[:] = 0.0
+                    displaced[j] = q[j] + (k + 1) * h
+                    constraint(t, displaced, p, ahead)
+                    behind[:] = 0.0
+                    displaced[j] = q[j] - (k + 1) * h
+                    constraint(t, displaced, p, behind)
+                    for i in range(n_c):
+                        high[i] += ORDER_8[k] * (ahead[i] - behind[i])
+                        low[i] += ORDER_6[k] * (ahead[i] - behind[i])
+                        size[i] = max(size[i], abs(ahead[i]), abs(behind[i]))
+                displaced[j] = q[j]
+                accepted = True
+                for i in range(n_c):
+                    entry, doubt = high[i] / h, abs(high[i] - low[i]) / h + ROUNDING * size[i] / h
+                    if doubt < best[i]:
+                        best[i] = doubt
+                        Cq[i, j] = entry
+                    elif not np.isfinite(doubt) and best[i] == np.inf:
+                        Cq[i, j] = entry  # nothing finite so far
+                    accepted &= abs(high[i] - low[i]) <= AGREEMENT * abs(high[i]) + ROUNDING * size[i]
+                if accepted:
+                    break
+                h *= SHRINKAGE
+
+    return compile_callback("jacobian", jacobian, watch(jacobian))
+
+
+Address = tuple[int, tuple[int, ...]]  # of a contiguous float64 array, and its shape: numba boxes an array in 0.5 us
+
+KIND_NAMES = tuple(KINDS)
+_ARRAYS: dict[Address, Array] = {}  # by address: arrays of a run do not move
+MAX_ARRAYS = 1000
+REAL = "fiu"  # kinds of dtypes; NumPy counts durations as integers, and these are no forces
+HANDLE_BITS = 52  # a float64 holds the handle exactly; a handle of another process matches none of this one
+
+
+class PythonFunctions:
+    """Register the plain Python functions of a system, which the compiled `through_python` calls.
+
+    The handle, stored before the parameters, leads to them. It is valid in this process and its forks; unpickled
+    elsewhere, the functions are registered again. Functions of the kinds in `taking` get the parameters.
+    """
+
+    registry: ClassVar[WeakValueDictionary[float, "PythonFunctions"]] = WeakValueDictionary()
+
+    def __init__(self, name: str, functions: dict[str, Callable[..., Any]], taking: frozenset[str]):
+        self.name, self.functions, self.taking = name, functions, taking
+        self.handle = secrets.randbits(HANDLE_BITS)
+        self.registry[self.handle] = self
+
+    def call(self, kind: str, arguments: tuple[Any, ...], p: Address, out: Array) -> None:
+        """Call one function with copies of the arrays, check what comes back and write it to `out`."""
+        t = arguments[0]
+        if kind in self.taking:
+            arguments = (*arguments, array_at(*p)[1:].copy())
+        try:
+            value = self.functions[kind](*arguments)
+        except Exception as error:
+            error.add_note(f"raised by {kind} of system {self.name!r} at t = {t!r}")
+            raise
+        store(kind, self.name, t, value, out)
+
+
+def store(kind: str, name: str, t: float, value: Any, out: Array) -> None:
+    """Write what a Python function returned to `out`; raise if its shape or type is wrong."""
+    try:
+        array = np.asarray(value)
+        real = array.dtype.kind in REAL
+    except ValueError:
+        real = False
+    if not real:
+        raise TypeError(
+            f"{kind} of system {name!r} must return a real array of shape {out.shape}; "
+            f"at t = {t!r} it returned {value!r}"
+        )
+    if array.shape != out.shape:
+        raise ValueError(
+            f"{kind} of system {name!r} must return an array of shape {out.shape}; at t = {t!r} it returned shape "
+            f"{array.shape}"
+        )
+    out[...] = array
+
+
+def array_at(address: int, shape: tuple[int, ...]) -> Array:
+    """Return the float64 array at an address; valid during the call of the callback that passed the address."""
+    array = _ARRAYS.get((address, shape))
+    if array is None:
+        if len(_ARRAYS) >= MAX_ARRAYS:
+            _ARRAYS.clear()
+        numbers = (ctypes.c_double * math.prod(shape)).from_address(address)
+        array = _ARRAYS[address, shape] = np.ctypeslib.as_array(numbers).reshape(shape)
+    return array
+
+
+def _call(number: int, handle: float, t: float, state: tuple[Address, ...], p: Address, out: Address) -> None:
+    functions = PythonFunctions.registry.get(handle)
+    if functions is None:
+        raise RuntimeError(
+            "these callbacks lead to Python functions of a system that is not in this process, or no longer: their "
+            "`parameters` are not numbers to keep. Pass the system itself on, by pickle if need be"
+        )
+    functions.call(KIND_NAMES[number], (t, *[array_at(*address).copy() for address in state]), p, array_at(*out))
+
+
+@cache
+def through_python(kind: str) -> Dispatcher:
+    """Compile the callback that calls the Python function of this kind to which `p` leads."""
+    place = KIND_NAMES.index(kind)
+
+    def with_two(t, q, p, out):  # type: ignore[no-untyped-def]
+        number, handle = place, p[0] if p.size > 0 else np.nan
+        at_q, at_p, at_out = (q.ctypes.data, q.shape), (p.ctypes.data, p.shape), (out.ctypes.data, out.shape)
+        with objmode():
+            _call(number, handle, t, (at_q,), at_p, at_out)
+
+    def with_three(t, q, x, p, out):  # type: ignore[no-untyped-def]
+        number, handle = place, p[0] if p.size > 0 else np.nan
+        at_q, at_x = (q.ctypes.data, q.shape), (x.ctypes.data, x.shape)
+        at_p, at_out = (p.ctypes.data, p.shape), (out.ctypes.data, out.shape)
+        with objmode():
+            _call(number, handle, t, (at_q, at_x), at_p, at_out)
+
+    callback_function = with_two if len(KINDS[kind].state) == 1 else with_three
+    callback = compile_callback(kind, callback_function, ("through Python", str(place)))
+    stands_for(callback, digest_of(f"through Python, {place}", __file__))
+    return callback
+
+
+@njit
+def _fill(value, out):  # type: ignore[no-untyped-def]
+    """Copy an array to one of the same shape; numba takes two seconds longer to compile `out[:] = value`."""
+    for k in range(out.size):
+        out.flat[k] = value.flat[k]
+
+
+def compile_returning(kind: str, function: Callable[..., Any], takes_p: bool) -> Dispatcher:
+    """Compile a function that returns its array, and wrap it to the in-place signature of its kind.
+
+    The machine code is kept beside the source of the function, if it has one.
+    """
+    if isinstance(function, ConstantMatrix):
+        matrix = function.matrix  # numba knows what a function encloses, but not the attributes of an object
+
+        def function(t, q):  # type: ignore[no-untyped-def]
+            return matrix
+
+    if not isinstance(function, Dispatcher | FunctionType):
+        raise TypeError(
+            f"{kind}: compile=True takes functions made by def or lambda, with numbers that they enclose; given "
+            f"{function!r} of type {type(function).__name__}. Write such a function, or leave compile=True out"
+        )
+    user = function if isinstance(function, Dispatcher) else njit(named_apart(function, watch(function)))
+    message = f"{kind} returned an array of the wrong shape"
+
+    def with_two(t, q, p, out):  # type: ignore[no-untyped-def]
+        value = user(t, q)
+        if value.shape != out.shape:
+            raise ValueError(message)
+        _fill(value, out)
+
+    def with_three(t, q, x, p, out):  # type: ignore[no-untyped-def]
+        value = user(t, q, x)
+        if value.shape != out.shape:
+            raise ValueError(message)
+        _fill(value, out)
+
+    def with_two_and_p(t, q, p, out):  # type: ignore[no-untyped-def]
+        value = user(t, q, p)
+        if value.shape != out.shape:
+            raise ValueError(message)
+        _fill(value, out)
+
+    def with_three_and_p(t, q, x, p, out):  # type: ignore[no-untyped-def]
+        value = user(t, q, x, p)
+        if value.shape != out.shape:
+            raise ValueError(message)
+        _fill(value, out)
+
+    wrappers: Any = ((with_two, with_two_and_p), (with_three, with_three_and_p))
+    in_place = wrappers[len(KINDS[kind].state) > 1][takes_p]
+    watched = watch(in_place)
+    code = user.py_func.__code__
+    in_place.__code__ = in_place.__code__.replace(co_filename=code.co_filename, co_firstlineno=code.co_firstlineno)
+    in_place.__qualname__ = f"{user.py_func.__qualname__}.{kind}"
+    return compile_callback(kind, in_place, watched, named=user.py_func)
+
+
+@dataclass(frozen=True, eq=False)
+class ConstantMatrix:
+    """Return a constant mass matrix as mass(t, q)."""
+
+    matrix: Array
+
+    def __call__(self, t: float, q: Array) -> Array:
+        """Return the matrix."""
+        return self.matrix
+
+
+def check_arguments(kind: str, function: Callable[..., Any], parameters: bool) -> bool:
+    """Return whether a function that returns its array takes `p` after the arguments of its kind.
+
+    With `parameters` it does, unless that argument is missing, or has a default and another name.
+
+    Raises
+    ------
+    TypeError
+        If it names its arguments t, q, v, but in another order, or takes another number of them.
+    """
+    expected = ("t", *KINDS[kind].state)
+    try:
+        arguments = inspect.signature(function).parameters
+    except (TypeError, ValueError):  # built-in functions have none to look at
+        return parameters
+    names = tuple(arguments)
+    for order in (expected, (*expected, "p")):
+        if sorted(names) == sorted(order) and names != order:
+            raise TypeError(
+                f"{kind} is called as {kind}({', '.join(order)}); the function given takes ({', '.join(names)})"
+            )
+    takes_p = parameters and _takes_p(list(arguments.values()), len(expected))
+    takes_p_alone = not parameters and names == (*expected, "p")
+    remedy = ". Give the numbers that it takes as p: parameters=[...]" if takes_p_alone else ""
+    check_call(kind, kind, function, (*expected, "p") if takes_p else expected, remedy)
+    return takes_p
+
+
+def _takes_p(arguments: list[inspect.Parameter], n: int) -> bool:
+    """Return whether a function takes `p` after n other arguments."""
+    if any(argument.kind == argument.VAR_POSITIONAL for argument in arguments):
+        return True
+    if len(arguments) <= n:
+        return False
+    return arguments[n].kind != inspect.Parameter.KEYWORD_ONLY and (
+        arguments[n].default is inspect.Parameter.empty or arguments[n].name == "p"
+    )
+
+
+def checked_parameters(parameters: Any) -> Array:
+    """Return the parameters as a new vector; raise if they are not finite numbers."""
+    p = check_real("parameters", parameters)
+    if p.ndim != 1 or not np.isfinite(p).all():
+        raise ValueError(f"parameters must be a vector of finite numbers; given {shown(parameters)}")
+    return p
+
+
+def given_callbacks(callbacks: dict[str, Any], n_c: int, n_a: int) -> dict[str, Any]:
+    """Return the callbacks that are given, in the order of KINDS; raise if one is unknown, missing or superfluous."""
+    unknown = [kind for kind in callbacks if kind not in KINDS]
+    if unknown:
+        raise TypeError(f"a system has no argument {unknown[0]!r}; its callbacks are {', '.join(KINDS)}")
+    sizes = {"n_c": n_c, "n_a": n_a}
+    required = [kind for kind, entry in KINDS.items() if not entry.optional or sizes.get(entry.needed_by, 0) > 0]
+    missing = [kind for kind in required if kind not in callbacks or (KINDS[kind].optional and callbacks[kind] is None)]
+    if callbacks.get("mass_values") is not None:
+        missing = [kind for kind in missing if kind != "mass"]
+    if missing:
+        rows = f" with n_a = {n_a}" if "nonholonomic" in missing else ""
+        raise TypeError(f"a system{rows} needs {', '.join(missing)}: not given")
+    given = {kind: callbacks[kind] for kind in KINDS if not _is_left_out(kind, callbacks)}
+    for kind, entry in KINDS.items():
+        if kind in given and sizes.get(entry.shape[0], 1) == 0:
+            rows_of = "nonholonomic rows" if entry.shape[0] == "n_a" else "constraints"
+            raise ValueError(f"{kind} goes with {rows_of}, {entry.shape[0]} > 0; given for {entry.shape[0]} = 0")
+    available = {*given, *(("jacobian",) if "jacobian_values" in given else ())}
+    missing = [kind for kind in ("constraint", "jacobian", "gamma") if "kinematics" in given and kind not in available]
+    if missing:
+        raise ValueError(f"kinematics goes with constraint, jacobian and gamma; {' and '.join(missing)} not given")
+    if "force_by_q" not in given and ("force_by_v" in given or "reaction_by_q" in given):
+        raise ValueError("force_by_v and reaction_by_q go with force_by_q, which is not given")
+    return given
+
+
+def _is_left_out(kind: str, callbacks: dict[str, Any]) -> bool:
+    """Return whether a kind is missing, None, or the stand-in that another system has in its place."""
+    entry, given = KINDS[kind], callbacks.get(kind)
+    if given is None:
+        return kind not in callbacks or entry.optional or kind == "mass"  # in whose place are mass_values
+    return entry.optional and entry.absent != "differences" and given is stand_in(kind)
+
+
+def checked_entries(callbacks: dict[str, Any], n_q: int, n_c: int, mass: Any, jacobian: Any) -> dict[str, Entries]:
+    """Return where the entries of M and C_q are whose values callbacks return; raise if they do not fit."""
+    checked: dict[str, Entries] = {}
+    for kind, entries, shape in (("mass", mass, (n_q, n_q)), ("jacobian", jacobian, (n_c, n_q))):
+        values, name = VALUES_OF[kind], f"{kind}_entries"
+        if (callbacks.get(values) is None) != (entries is None):
+            given, missing = (name, values) if entries is not None else (values, name)
+            raise ValueError(f"{values} and {name} go together: {given} is given, and {missing} is not")
+        if entries is not None:
+            checked[kind] = check_entries(name, entries, shape, symmetric=kind == "mass")
+    return checked
+
+
+class PlainFunctions(NamedTuple):
+    """Plain functions by kind, where the entries are that they return, and which of them take the parameters p."""
+
+    functions: dict[str, Any]
+    entries: dict[str, Entries]
+    constant_mass: bool
+    taking: frozenset[str]
+    p: Array
+
+
+def plain_functions(
+    functions: dict[str, Any], sizes: tuple[int, int, int], entries: tuple[Any, Any], parameters: Any, name: str
+) -> PlainFunctions:
+    """Check the arguments of a system of plain functions; `entries` are those of M and C_q."""
+    n_q, n_c, n_a = sizes
+    if functions.get("kinematics") is not None:
+        raise TypeError(
+            "kinematics fills four arrays in place: compile it by @twoloop.callback('kinematics') and give it "
+            "with compiled callbacks to ConstrainedSystem(...)"
+        )
+    functions = given_callbacks(functions, n_c, n_a)
+    checked = checked_entries(functions, n_q, n_c, *entries)
+    values_shape = checked["mass"][0].shape if "mass" in checked else ()
+    shapes: dict[str, Any] = {"mass": (n_q, n_q), "mass_values": values_shape}
+    masses = [kind for kind in shapes if kind in functions]
+    constant_mass = not any(callable(functions[kind]) for kind in masses)
+    for kind in masses if constant_mass else ():
+        matrix = check_real(kind, functions[kind])
+        if matrix.shape != shapes[kind]:
+            raise ValueError(f"{kind} must have shape {shapes[kind]}; given {shaped(matrix)}")
+        functions[kind] = ConstantMatrix(matrix)
+    for kind, function in functions.items():
+        if not callable(function):
+            raise TypeError(f"{kind} must be a function; given {function!r} of type {type(function).__name__}")
+    with_parameters = parameters is not None
+    taking = frozenset(kind for kind, function in functions.items() if check_arguments(kind, function, with_parameters))
+    p = checked_parameters(() if parameters is None else parameters)
+    if with_parameters and not taking:
+        raise ValueError(
+            f"parameters are given, but none of the functions of {name!r} takes them: let those that need them "
+            "have p as their last argument, as in mass(t, q, p), or leave parameters out"
+        )
+    return PlainFunctions(functions, checked, constant_mass, taking, p)
+
+
+def substitute(kind: str, given: dict[str, Dispatcher]) -> Dispatcher:
+    """Return the callback that stands in for one that is not given."""
+    if KINDS[kind].absent != "differences" or "constraint" not in given:
+        return stand_in(kind)
+    return differenced_jacobian(given["constraint"])
+
+
+def callbacks_in(names: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the callbacks of a module, each named by its kind, for a ConstrainedSystem."""
+    return {kind: names[kind] for kind in KINDS if kind in names}
