@@ -7,10 +7,7 @@ except ImportError as error:
         "twoloop.symbolic needs SymPy: pip install sympy, or this project with its extra: pip install '.[symbolic]'"
     ) from error
 
-from twoloop.symbolic.lagrange import from_lagrangian
-from twoloop.symbolic.matrices import from_matrices
-from twoloop.symbolic.mechanics import from_method
-from twoloop.symbolic.mechanism import SymbolicMechanism
+from twoloop.symbolic.mechanism import SymbolicMechanism, from_lagrangian, from_matrices, from_method
 
 del sympy
 

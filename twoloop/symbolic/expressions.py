@@ -1,4 +1,8 @@
-"""Conversion of the user's expressions to plain symbols, with checks for unsupported terms."""
+"""Convert the user's expressions to plain symbols, and differentiate them with common subexpressions.
+
+`Expr.diff` traverses a sum of products again for every derivative, which takes ten times as long for a chain of ten
+links.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -9,16 +13,19 @@ from sympy.core.function import AppliedUndef
 from sympy.core.relational import Equality
 
 from twoloop.checks.arguments import check_finite, check_number
-from twoloop.symbolic.differentiation import Differentiation
-from twoloop.symbolic.printing import FUNCTIONS
 
+# supported functions of SymPy; they have the same names in math
+FUNCTIONS = (
+    *(sympy.sin, sympy.cos, sympy.tan, sympy.asin, sympy.acos, sympy.atan, sympy.atan2),
+    *(sympy.sinh, sympy.cosh, sympy.tanh, sympy.asinh, sympy.exp, sympy.log),
+)
 SMOOTH = (sympy.Add, sympy.Mul, sympy.Pow, sympy.Number, sympy.NumberSymbol, *FUNCTIONS)
 NOT_SMOOTH = (sympy.Abs, sympy.sign, sympy.Heaviside, sympy.DiracDelta, sympy.Piecewise, sympy.Max, sympy.Min)
 POSITIONS, VELOCITIES = "positions", "velocities"  # permitted dependence, besides t and the parameters
 
 
 class Reader:
-    """Replaces coordinates, velocities, speeds, time and parameters by the symbols of the generated code.
+    """Replace coordinates, velocities, speeds, time and parameters by the symbols of the generated code.
 
     Parameters
     ----------
@@ -42,10 +49,10 @@ class Reader:
     """
 
     def __init__(self, coordinates: Any, parameters: Any, speeds: Mapping[Any, Any] | None = None):
-        functions = sequence("coordinates", coordinates)
-        self.time = _time_of(functions)
-        self.names = tuple(str(each.func) for each in functions)
-        self.values = _values_of(parameters, self.time)
+        functions = as_list("coordinates", coordinates)
+        self.time = _time_symbol(functions)
+        self.names = tuple(str(function.func) for function in functions)
+        self.values = _parameter_values(parameters, self.time)
         symbols = list(parameters or ())
         n = len(functions)
         self.t = Symbol("t")
@@ -53,11 +60,11 @@ class Reader:
         self.v = [Symbol(f"v{i}") for i in range(n)]
         self.p = [Symbol(f"p{i}") for i in range(len(symbols))]
         self.differentiation = Differentiation()
-        self._velocities = {Derivative(each, self.time): v for each, v in zip(functions, self.v, strict=True)}
-        self._known = {self.time: self.t}
-        self._known |= dict(zip(functions, self.q, strict=True)) | dict(zip(symbols, self.p, strict=True))
+        self._velocities = {Derivative(function, self.time): v for function, v in zip(functions, self.v, strict=True)}
+        self._symbols = {self.time: self.t}
+        self._symbols |= dict(zip(functions, self.q, strict=True)) | dict(zip(symbols, self.p, strict=True))
         self.speeds: dict[Any, Expr] = {}
-        self.speeds = {u: self.read(f"speeds[{u}]", each, VELOCITIES) for u, each in (speeds or {}).items()}
+        self.speeds = {u: self.read(f"speeds[{u}]", function, VELOCITIES) for u, function in (speeds or {}).items()}
 
     def read(self, argument: str, expression: Any, depends: str) -> Expr:
         """Return an expression in plain symbols.
@@ -70,20 +77,20 @@ class Reader:
         """
         expression = _sympified(argument, expression)
         self._check(argument, expression, depends)
-        return expression.xreplace(self._known | self._velocities | self.speeds)
+        return expression.xreplace(self._symbols | self._velocities | self.speeds)
 
     def read_all(self, argument: str, expressions: Any, depends: str) -> list[Expr]:
         """Return a list of expressions in plain symbols."""
-        given = sequence(argument, expressions)
-        return [self.read(f"{argument}[{i}]", each, depends) for i, each in enumerate(given)]
+        entries = as_list(argument, expressions)
+        return [self.read(f"{argument}[{i}]", entry, depends) for i, entry in enumerate(entries)]
 
     def _check(self, argument: str, expression: Expr, depends: str) -> None:
-        waiting, seen = [expression], set()
-        while waiting:
-            node = waiting.pop()
-            if node in seen or node in self._known:
+        pending, visited = [expression], set()
+        while pending:
+            node = pending.pop()
+            if node in visited or node in self._symbols:
                 continue
-            seen.add(node)
+            visited.add(node)
             if isinstance(node, (Derivative, AppliedUndef)):
                 self._check_function(argument, node, depends)
             elif isinstance(node, Symbol):
@@ -94,10 +101,10 @@ class Reader:
                     "an event end the run where it switches"
                 )
             elif not isinstance(node, SMOOTH) or (node.is_Number and not node.is_finite):
-                known = ", ".join(sorted(each.__name__ for each in FUNCTIONS))
-                raise ValueError(f"{argument} must be made of real numbers, powers and {known}; given {node}")
+                names = ", ".join(sorted(function.__name__ for function in FUNCTIONS))
+                raise ValueError(f"{argument} must be made of real numbers, powers and {names}; given {node}")
             else:
-                waiting.extend(node.args)
+                pending.extend(node.args)
 
     def _check_function(self, argument: str, node: Expr, depends: str) -> None:
         if node in self._velocities or node in self.speeds:
@@ -108,7 +115,7 @@ class Reader:
                 )
             return
         if isinstance(node, Derivative):
-            if node.expr in self._known or node.expr in self.speeds:
+            if node.expr in self._symbols or node.expr in self.speeds:
                 raise ValueError(
                     f"{argument} may not depend on accelerations; given {node}. They are what is solved for"
                 )
@@ -127,7 +134,7 @@ class Reader:
         )
 
 
-def sequence(argument: str, given: Any) -> list[Any]:
+def as_list(argument: str, given: Any) -> list[Any]:
     """Return the entries of a list, a tuple or a matrix of one column."""
     if given is None:
         return []
@@ -138,7 +145,7 @@ def sequence(argument: str, given: Any) -> list[Any]:
     return list(given)
 
 
-def square(argument: str, given: Any, n: int) -> sympy.MatrixBase:
+def as_matrix(argument: str, given: Any, n: int) -> sympy.MatrixBase:
     """Return a matrix (n, n) of expressions."""
     try:
         matrix = sympy.ImmutableMatrix(given)
@@ -149,32 +156,36 @@ def square(argument: str, given: Any, n: int) -> sympy.MatrixBase:
     return matrix
 
 
-def column(argument: str, given: Any, n: int, each: str) -> list[Any]:
+def as_column(argument: str, given: Any, n: int, meaning: str) -> list[Any]:
     """Return a list of n expressions."""
-    entries = sequence(argument, given)
+    entries = as_list(argument, given)
     if len(entries) != n:
-        raise ValueError(f"{argument} must have {n} entries, one for each {each}; given {len(entries)}")
+        raise ValueError(f"{argument} must have {n} entries, one for each {meaning}; given {len(entries)}")
     return entries
 
 
-def _time_of(coordinates: Sequence[Any]) -> Symbol:
+def _time_symbol(coordinates: Sequence[Any]) -> Symbol:
     if not coordinates:
         raise ValueError("coordinates must name at least one; given none")
-    for each in coordinates:
-        if not isinstance(each, AppliedUndef) or len(each.args) != 1 or not isinstance(each.args[0], Symbol):
+    for coordinate in coordinates:
+        if (
+            not isinstance(coordinate, AppliedUndef)
+            or len(coordinate.args) != 1
+            or not isinstance(coordinate.args[0], Symbol)
+        ):
             raise TypeError(
                 "coordinates must be functions of time, as sympy.physics.mechanics.dynamicsymbols makes them; given "
-                f"{each!r}"
+                f"{coordinate!r}"
             )
-    times = {each.args[0] for each in coordinates}
+    times = {coordinate.args[0] for coordinate in coordinates}
     if len(times) > 1:
         raise ValueError(f"coordinates must be functions of one time; given {', '.join(sorted(map(repr, times)))}")
-    if len({str(each) for each in coordinates}) < len(coordinates):
+    if len({str(coordinate) for coordinate in coordinates}) < len(coordinates):
         raise ValueError(f"coordinates must differ in their names; given {', '.join(map(str, coordinates))}")
     return times.pop()
 
 
-def _values_of(parameters: Any, time: Symbol) -> dict[str, float]:
+def _parameter_values(parameters: Any, time: Symbol) -> dict[str, float]:
     if parameters is not None and not isinstance(parameters, Mapping):
         raise TypeError(f"parameters must map symbols to numbers; given {parameters!r}")
     values: dict[str, float] = {}
@@ -183,11 +194,11 @@ def _values_of(parameters: Any, time: Symbol) -> dict[str, float]:
             raise TypeError(f"parameters must have SymPy symbols other than the time as keys; given {symbol!r}")
         if symbol.name in values:
             raise ValueError(f"parameters must have different names; given two called {symbol.name}")
-        values[symbol.name] = number(f"parameters[{symbol}]", value)
+        values[symbol.name] = as_number(f"parameters[{symbol}]", value)
     return values
 
 
-def number(argument: str, value: Any) -> float:
+def as_number(argument: str, value: Any) -> float:
     """Return a finite number, also from SymPy numbers."""
     if isinstance(value, sympy.Number) and value.is_real:
         value = float(value)
@@ -206,3 +217,76 @@ def _sympified(argument: str, expression: Any) -> Expr:
     if not isinstance(expression, Expr):
         raise TypeError(f"{argument} must be a SymPy expression; given {expression!r}")
     return expression.doit()  # evaluates unevaluated derivatives
+
+
+ZERO, ONE = sympy.S.Zero, sympy.S.One
+
+Entries = dict[Any, Expr]  # nonzero entries of an array by index
+
+
+class Differentiation:
+    """Differentiate expressions in plain symbols with memoisation."""
+
+    def __init__(self) -> None:
+        self._symbols: dict[Expr, frozenset[Symbol]] = {}
+        self._derivatives: dict[tuple[Expr, Symbol], Expr] = {}
+
+    def symbols_of(self, expression: Expr) -> frozenset[Symbol]:
+        """Return the symbols on which an expression depends."""
+        if expression.is_Symbol:
+            return frozenset((expression,))
+        symbols = self._symbols.get(expression)
+        if symbols is None:
+            symbols = frozenset().union(*map(self.symbols_of, expression.args))
+            self._symbols[expression] = symbols
+        return symbols
+
+    def derivative(self, expression: Expr, symbol: Symbol) -> Expr:
+        """Return the derivative of an expression with respect to a symbol."""
+        if expression == symbol:
+            return ONE
+        if symbol not in self.symbols_of(expression):
+            return ZERO
+        result = self._derivatives.get((expression, symbol))
+        if result is None:
+            result = self._derivatives[expression, symbol] = self._derive(expression, symbol)
+        return result
+
+    def _derive(self, expression: Expr, symbol: Symbol) -> Expr:
+        args = expression.args
+        dependent = [(i, argument) for i, argument in enumerate(args) if symbol in self.symbols_of(argument)]
+        if expression.is_Add:
+            return sympy.Add(*(self.derivative(argument, symbol) for _, argument in dependent))
+        if expression.is_Mul:
+            return sympy.Add(
+                *(sympy.Mul(*args[:i], self.derivative(argument, symbol), *args[i + 1 :]) for i, argument in dependent)
+            )
+        if expression.is_Pow:
+            base, exponent = args
+            base_term = exponent * base ** (exponent - 1) * self.derivative(base, symbol)
+            return base_term + expression * sympy.log(base) * self.derivative(exponent, symbol)
+        return sympy.Add(*(expression.fdiff(i + 1) * self.derivative(argument, symbol) for i, argument in dependent))
+
+    def jacobian(self, expressions: Sequence[Expr], symbols: Sequence[Symbol]) -> Entries:
+        """Return the entries (i, j) of the Jacobian of expressions with respect to symbols."""
+        columns = {symbol: j for j, symbol in enumerate(symbols)}
+        return nonzero(
+            ((i, j), self.derivative(expression, symbol))
+            for i, expression in enumerate(expressions)
+            for symbol, j in columns.items()
+            if symbol in self.symbols_of(expression)
+        )
+
+    def hessian(self, expressions: Sequence[Expr], symbols: Sequence[Symbol]) -> Entries:
+        """Return the same for a gradient: the symmetric entries of the Hessian are computed once."""
+        upper = nonzero(
+            ((i, j), self.derivative(expression, symbols[j]))
+            for i, expression in enumerate(expressions)
+            for j in range(i, len(symbols))
+        )
+        return upper | {(j, i): entry for (i, j), entry in upper.items()}
+
+
+def nonzero(entries: Iterable[tuple[Any, Expr]]) -> Entries:
+    """Return the nonzero entries."""
+    return {index: entry for index, entry in entries if entry != 0}
