@@ -1,6 +1,7 @@
 """Reports from templates: Jinja2 that fails on what is not defined, and one style of numbers."""
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -98,6 +99,6 @@ def render(name: str, findings: Mapping[str, Any], tables: Mapping[str, str], **
     Raises jinja2.UndefinedError if the template uses a name that is not defined.
     """
     text = environment().get_template(f"{name}.md.j2").render(f=findings, tables=tables, **more)
-    while "\n\n\n" in text:  # left by conditions that did not hold
-        text = text.replace("\n\n\n", "\n\n")
+    text = re.sub(r"\n{3,}", "\n\n", text)  # left by conditions that did not hold
+    text = re.sub(r"(?m)^\|.*\|$", lambda line: re.sub(r" *(?<!\\)\| *", "|", line[0]), text)  # rows of tables
     return text.strip("\n") + "\n"

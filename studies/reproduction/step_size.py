@@ -22,7 +22,7 @@ ERR_OUT, TOL = 1e-9, 1e-5  # of the paper's procedures; Atol = Rtol of the defau
 PAPER = (IRK, NEWMARK, QUARTER)
 PERIODS = 2.0  # of the motion, at the start, that the figure shows
 CURVE = 1200  # most points of a curve: of more steps, the shortest and the longest in each of half as many bins
-COLUMNS = ("h_median", "retried", "n_evaluations")
+COLUMNS = ("h_median", "n_evaluations")
 
 
 def runs(quick: bool) -> list[Run]:

@@ -10,7 +10,7 @@ import pandas as pd
 
 from studies.bench import cli, figures, tables
 from studies.bench.cli import Call, StudyError
-from studies.bench.index import write_index
+from studies.bench.index import short, write_index
 from studies.bench.render import listed, number, render
 from studies.bench.store import Output
 from studies.bench.study import rows_of
@@ -66,7 +66,8 @@ def report(output: Output) -> None:
     read = {name: read_rows(output.call, name) for name in PARTS}
     rows = {name: own for name, (own, _) in read.items()}
     stamps = {name: stamp.split("; ") for name, (_, stamp) in read.items()}
-    found = findings_of(rows) | {"processor": "; ".join(dict.fromkeys(stamp[3] for stamp in stamps.values()))}
+    processors = dict.fromkeys(short(stamp[3].split(",")[0]) for stamp in stamps.values())
+    found = findings_of(rows) | {"processor": listed(processors)}
     output.save_findings(found)
     for name, part in PARTS.items():
         figures.save(part.figure_of(rows[name], found[name]), output, name)

@@ -136,25 +136,14 @@ def grid(rows: pd.DataFrame, group: str, paper: bool) -> str:
     return table(["err_in \\ err_out", *map(power, TOLERANCES)], lines)
 
 
-def counts(rows: pd.DataFrame) -> str:
-    """Make a table of evaluations and errors along err_out, with the finest inner loop; err_in hardly changes them."""
-    lines = []
-    for name, group in zip(("Runge–Kutta", "Newmark"), FAMILIES, strict=True):
-        own = [machine(rows, group, ERR_IN, err_out) for err_out in TOLERANCES]
-        for what, key in (("evaluations", "n_evaluations"), ("largest error (m, rad)", "error_q")):
-            lines.append([f"{name}, {what}", *("–" if run is None else number(float(run[key])) for run in own)])
-    return table(["err_out", *map(power, TOLERANCES)], lines)
-
-
 def beside(rows: pd.DataFrame) -> str:
     """Make a table of the solvers beside the procedures, with these at their tightest, from the largest error down."""
     own = rows[rows["group"].isin(FAMILIES) & (rows["err_in"] == ERR_IN) & (rows["err_out"] == ERR_IN)]
     chosen = pd.concat([own, rows[rows["group"] == "beside"]])
     lines = []
     for _, run in chosen.sort_values("error_q", ascending=False).iterrows():
-        numbers = [run["call_s"], run["error_q"], run["violation_q"]]
-        lines.append([run["solver"], tables.setting(run), *map(number, numbers)])
-    return table(["solver", "setting", "CPU time (s)", "largest error (m, rad)", "violation of C (m)"], lines)
+        lines.append([run["solver"], tables.setting(run), number(run["call_s"]), number(run["error_q"])])
+    return table(["solver", "setting", "CPU time (s)", "largest error (m, rad)"], lines)
 
 
 def picture(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
@@ -190,7 +179,7 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
 
 def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
     """Make the tables of the report, and print those of the times."""
-    ready = {"counts": counts(rows), "beside": beside(rows)}
+    ready = {"beside": beside(rows)}
     for name, group in zip(("irk", "newmark"), FAMILIES, strict=True):
         ready |= {name: grid(rows, group, paper=False), f"{name}_paper": grid(rows, group, paper=True)}
         print(f"\n{group}, CPU time in s over {number(found['t_end'])} s\n{ready[name]}")

@@ -225,7 +225,7 @@ def test_circular_and_stand_in_limit_the_verdict():
 def test_the_report_has_every_claim_once_under_its_verdict(folder):
     text, rows = (folder / "claims.md").read_text(), pd.read_csv(folder / "claims.csv", comment="#")
     for _, row in rows.iterrows():
-        assert text.count(f"- {row['statement']}: {row['number']}.\n") == 1
+        assert text.count(f"|{row['statement']}|{row['number']}|\n") == 1
     assert "nan" not in text
     claims.main(["--redraw", "--out", str(folder)])
     assert (folder / "claims.md").read_text() == text

@@ -65,7 +65,7 @@ def test_euler_parameters(mechanisms, capsys):
     assert set(own["status"]) == {"REACHED_END"} and own["error_q"].max() < 1e-2 and own["energy"].abs().max() > 0.0
     others = rows[rows["solver"] != solvers[0]]
     assert set(others["status"]) == {"REACHED_END"} and others["error_q"].max() < 1e-2
-    assert "DOP853, projected" in text and "both two-loop" not in text and "| DOP853, compiled=False |" in text
+    assert "DOP853, projected" in text and "both two-loop" not in text and "|DOP853, compiled=False|" in text
     said = capsys.readouterr().out
     assert "making the reference of 'heavy top' to 0.02 s, at most 300 s a run" in said and "it holds to" in said
 

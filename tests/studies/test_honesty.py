@@ -219,7 +219,7 @@ def test_silent_failures_are_counted_by_trap_and_solver():
     assert (sharp["others"]["n"], sharp["others"]["gross"], sharp["own"]["failed"]) == (2, 1, 1)
     answer = "The default is silently wrong in 1 of 2 runs under sharp forces, 2 of 2 under forces shorter than 1/2000 "
     assert found["answer"] == answer + "of the run, 0 of 1 at singular positions."
-    assert f"**Answer**: {found['answer']}" in text and "| sharp forces¹ | 2 | 1 | 2 | 0 | 2 | 1 |" in text
+    assert f"**Answer**: {found['answer']}" in text and "|sharp forces¹|2|1|2|0|2|1|" in text
     assert found["wrong_traps"] == [{"trap": "dead point", "wrong": 1}] and found["pulses"]["wrong"] == [(1e-4, 1)]
     (figure,) = findings.figures_of(pd.DataFrame(), found).values()
     assert [text.get_text() for text in figure.axes[0].texts][-3:] == ["  1 of 2", "  0 of 2", "  1 of 2"]

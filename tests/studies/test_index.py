@@ -82,19 +82,19 @@ def test_the_index_has_a_line_a_report_in_its_order(tmp_path):
     names = list(index.REPORTS)
     for name in reversed(names):
         made(tmp_path, name, f"Answer of {name}.")
-    lines = [line for line in written(tmp_path).splitlines() if line.startswith("| [")]
+    lines = [line for line in written(tmp_path).splitlines() if line.startswith("|[")]
     assert len(lines) == len(names) >= 10
     for name, line in zip(names, lines, strict=True):
         question = index.REPORTS[name].question
         cells = [f"[{name}]({name}.md)", question, f"Answer of {name}.", "2026-11-25", "AMD EPYC"]
-        assert line == f"| {' | '.join(cells)} |"
+        assert line == f"|{'|'.join(cells)}|"
 
 
 def test_what_has_no_answer_is_left_out(tmp_path):
     made(tmp_path, "scale", None)
     made(tmp_path, "energy")
     (tmp_path / "energy.csv").unlink()
-    assert "| [" not in written(tmp_path)
+    assert "|[" not in written(tmp_path)
     (tmp_path / "scale.json").write_text("{")
     with pytest.raises(StudyError, match=r"scale\.json cannot be read .* python -m studies\.scale again"):
         written(tmp_path)
@@ -119,6 +119,6 @@ def test_the_committed_index_is_that_of_the_committed_reports():
         line = index.line_of(REPORTS, name)
         if line:
             answers += 1
-            assert f"| {line['answer']} | {line['date']} | {line['processor']} |" in text, "run a study with --redraw"
+            assert f"|{line['answer']}|{line['date']}|{line['processor']}|" in text, "run a study with --redraw"
             assert len(line["answer"].split()) <= 30, name
     assert answers >= 1

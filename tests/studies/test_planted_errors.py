@@ -67,7 +67,7 @@ def test_faults_are_counted_by_who_catches_them(tmp_path):
     assert found["by"] == {"solve_dae": 1, "known motion": 1, "bounds": 1, "tests": 1, NONE: 1}
     answer = "The checks catch 4 of 5 planted faults; solve_dae itself refuses or stops 1 of them."
     assert found["answer"] == answer and f"{answer} No check catches: none." in text
-    assert "| tableau | 5 | 1 | 1 | 1 | 1 |" in text
+    assert "|tableau|5|1|1|1|1|" in text
 
 
 def test_every_run_with_a_fault_has_a_bound_of_its_evaluations():

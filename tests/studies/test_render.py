@@ -55,5 +55,7 @@ def test_a_template_that_uses_what_is_not_there_fails(tmp_path, monkeypatch):
     monkeypatch.setattr(render, "TEMPLATES", tmp_path)
     (tmp_path / "x.md.j2").write_text("{% if f.a %}\n{{ f.a|num }}\n{% endif %}\n\n\n\n{{ stamp }}\n")
     assert render.render("x", {"a": 0.5}, {}, stamp="s") == "0.50\n\ns\n"
+    (tmp_path / "x.md.j2").write_text("a | b\n| {{ f.a }} | max(\\|q\\|, 1) |\n")
+    assert render.render("x", {"a": "b c"}, {}) == "a | b\n|b c|max(\\|q\\|, 1)|\n"  # rows of tables alone
     with pytest.raises(jinja2.UndefinedError, match="a"):
         render.render("x", {}, {}, stamp="s")

@@ -87,7 +87,7 @@ def test_who_is_right_where():
     found, text = said(validation, made_up(own, **stopped))
     assert found["only"]["others"] == found["short"] == ["A02, N = 1"] and found["default"] == 1
     assert found["counts"]["own"] == {"right": 8, "inexact": 0, "wrong": 0, SAID: 8, "ended": 8}
-    assert "| the default | 8 | 4 | 0 | 0 | 4 |" in text and "| SciPy | 8 | 8 | 0 | 0 | 0 |" in text
+    assert "|the default|8|4|0|0|4|" in text and "|SciPy|8|8|0|0|0|" in text
     found = said(validation, made_up([*own, ("A02, N = 1", THEIRS)], **stopped))[0]
     assert found["none"] == ["A02, N = 1"] and found["answer"].endswith("on 1; on 1 no solver is.")
 

@@ -323,7 +323,7 @@ def test_the_committed_report_is_that_of_the_committed_findings():
         column = mechanisms.RESOLVED.index(line["error"])
         ratios = [each["ratio"][column] for each in found["cells"] if not each["singular"]]
         assert line["median"] == pytest.approx(np.median([ratio for ratio in ratios if ratio]))
-        assert f"| {number(line['median'])} | {number(line['least'])} | {number(line['most'])} |" in text
+        assert f"|{number(line['median'])}|{number(line['least'])}|{number(line['most'])}|" in text
     verdicts = [verdict for each in found["cells"] if not each["singular"] for verdict in each["verdict"]]
     assert found["default"]["slower"] == verdicts.count("behind") + verdicts.count("missed")
 
