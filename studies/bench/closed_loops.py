@@ -2,7 +2,7 @@
 
 import math
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from itertools import pairwise
 from typing import Any
 
@@ -79,15 +79,14 @@ def parallelogram() -> ModelProblem:
     return _linkage("parallelogram", 1.0, 2.0, 1.0, 2.0, 0.5 * math.pi, 8.0).problem((0.0, 2.0))
 
 
-def parallelogram_motion(times: Array, torque: float = 0.0) -> tuple[Array, Array, float]:
+def parallelogram_motion(times: Array) -> tuple[Array, Array, float]:
     """Return q and v (9, n_t) of the parallelogram that does not fold, and the difference of two solutions.
 
-    `torque`: on its crank, N m.
     Its bars turn alike, with a moment of inertia of 2/3 + 2 kg m^2 and the weight of 3 kg at the end of a bar of 1 m.
     """
 
     def rates(t: float, y: Array) -> list[float]:
-        return [y[1], (torque - 3.0 * 9.81 * math.cos(y[0])) / (2.0 / 3.0 + 2.0)]
+        return [y[1], -3.0 * 9.81 * math.cos(y[0]) / (2.0 / 3.0 + 2.0)]
 
     span, start = (0.0, float(times[-1])), [0.5 * math.pi, 8.0]
     runs = [solve_ivp(rates, span, start, each, t_eval=times, rtol=1e-12, atol=1e-12).y for each in ("DOP853", "LSODA")]
@@ -232,7 +231,7 @@ def governor(Q: Array = UPRIGHT) -> ModelProblem:
     return model.problem((0.0, 5.0))
 
 
-def stewart(Q: Array = UPRIGHT, stiffness: float = 600.0, damping: float = 0.0) -> ModelProblem:
+def stewart(Q: Array = UPRIGHT) -> ModelProblem:
     """Build a platform on six legs, each two bodies that slide on one another, with a spring from base to platform."""
     model = SpatialModel(gravity=Q @ [0.0, 0.0, -9.81], name="Stewart platform")
     moving = {"velocity": Q @ [0.3, 0.1, 0.0], "rotation": Q}
@@ -250,12 +249,27 @@ def stewart(Q: Array = UPRIGHT, stiffness: float = 600.0, damping: float = 0.0) 
         model.prismatic(f"cylinder {k}", f"piston {k}", at=0.5 * (foot + top), axis=along)
         model.spherical(f"piston {k}", "platform", at=top)
         long = 1.05 * float(np.linalg.norm(top - foot))
-        model.spring("ground", foot, "platform", top, stiffness=stiffness, damping=damping, length=long)
+        model.spring("ground", foot, "platform", top, stiffness=600.0, length=long)
     return model.problem((0.0, 3.0))
 
 
 SPATIAL = (rssr, bricard, governor, stewart)
-MECHANISMS = (
-    *(four_bar, crank_rocker, parallelogram, six_bar, slider_crank, squeezer, closed_chain),
-    *SPATIAL,
-)
+MECHANISMS = (*(four_bar, crank_rocker, parallelogram, six_bar, slider_crank, squeezer, closed_chain), *SPATIAL)
+LIGHTER = {", a body 1e2 times lighter": 1e2, ", a body 1e4 times lighter": 1e4}  # how names end
+LIGHT = {closed_chain: 25, stewart: 0, bricard: 2}  # number of the body that is lighter, else the second one
+
+
+def _lightened(build: Callable[[], ModelProblem], ending: str) -> Callable[[], ModelProblem]:
+    def make() -> ModelProblem:
+        given = build()
+        model: Any = given.model
+        model.name = given.name + ending
+        model.bodies[LIGHT.get(build, 1)].inertia[:] /= LIGHTER[ending]  # mass and moments
+        return model.problem(given.t_span)
+
+    make.__name__ = build.__name__ + ending.replace(", ", "_").replace(" ", "_")
+    return make
+
+
+# without the parallelogram, whose known motion is that of its own masses
+LIGHTENED = tuple(_lightened(each, by) for each in MECHANISMS if each is not parallelogram for by in LIGHTER)

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from references.engines.rigid import Motion, Prepared, Rigid, coordinates, largest_moment, rigid_of, states, tensor
-from studies.bench.changed_loops import DRIVEN
 from studies.bench.closed_loops import parallelogram, parallelogram_motion
 from studies.bench.store import Array, Row
 from twoloop import ConstraintWarning, solve_dae
@@ -59,8 +58,8 @@ class Loop:
 
         Raises RuntimeError if one of them fails.
         """
-        if self.problem.name in (PARALLEL, PARALLEL + DRIVEN):  # no method crosses its singular positions so tightly
-            q, v, apart = parallelogram_motion(self.times, self.rigid.torques[0, 2])
+        if self.problem.name == PARALLEL:  # no method crosses its singular positions so tightly
+            q, v, apart = parallelogram_motion(self.times)
             return self.motion(q, v), apart
         plain = partial(self.solve, TIGHT, self.times, compiled=False)  # references are no reason to compile
         runs = [plain(method=method) for method in ("DOP853", "RadauIIA9")]

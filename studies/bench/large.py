@@ -136,11 +136,7 @@ def in_space(made: Assembly, tilt: float) -> Assembly:
         c, s, J = np.cos(angle), np.sin(angle), planar.inertias[k]
         turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         model.body(
-            f"bar {k}",
-            mass=planar.masses[k],
-            inertia=(0.6 * J, 0.6 * J, J),
-            position=(x, y, 0.0),
-            rotation=turned,
+            f"bar {k}", mass=planar.masses[k], inertia=(0.6 * J, 0.6 * J, J), position=(x, y, 0.0), rotation=turned
         )
     for k, (i, (a, b), j, _) in enumerate(planar.pins):
         (x, y, angle), (c, s) = places[i], (np.cos(places[i, 2]), np.sin(places[i, 2]))

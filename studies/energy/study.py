@@ -17,19 +17,7 @@ from studies.bench.solvers import CYRK, HEYOKA, IDA_C, IRK
 from studies.bench.study import Study, rows_of
 from studies.bench.tables import setting, setting_of, where
 from studies.energy.drift import DRIFTING, IRREGULAR, IS_LOST, NO_DRIFT, bound, verdict
-from studies.energy.runs import (
-    EVEN,
-    GAUSS,
-    LASTING,
-    NEWMARK,
-    ONE,
-    RADAU,
-    SUN,
-    SWITCHING,
-    TRAPEZOIDAL,
-    measure,
-    runs,
-)
+from studies.energy.runs import EVEN, GAUSS, LASTING, NEWMARK, ONE, RADAU, SUN, SWITCHING, TRAPEZOIDAL, measure, runs
 
 SHARES = (1e-3, 1e-5, 1e-7)  # of the largest kinetic energy: energy errors at which costs are compared
 KEEPING = f"{GAUSS}, symmetric partition"

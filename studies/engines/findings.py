@@ -1,5 +1,6 @@
 """Which engines are run with which settings, and what their rows say: cost at equal error, orders, silent errors."""
 
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -7,24 +8,21 @@ import pandas as pd
 
 from references.engines.engine import engines
 from studies.bench import tables
-from studies.bench.changed_loops import RATIOS, SERVO
+from studies.bench.closed_loops import LIGHTER
 from studies.bench.end_states import EXACT
 from studies.bench.engine_runs import LIMIT
 from studies.bench.render import number, power
 from twoloop.audit.step_audit import LOST, order_and_floor
 
-GATE, RUN, MASS, TURN, MOTOR, ENERGY = "gate", "run", "mass", "turn", "motor", "energy"  # groups of rows
+GATE, RUN, MASS = "gate", "run", "mass"  # groups of rows
 ERRORS = (1e-2, 1e-3, 1e-4, 1e-6)
-PROBED = 5000  # steps of the runs with motors, other masses and turned frames
+PROBED = 5000  # steps of the runs with other masses
 TIGHT = 1e-8  # tolerance of twoloop in these
 OURS = "twoloop"  # which is compared with the engines
 PROBES = {  # label: group of rows, end of the names of the mechanisms, measure
     "positions": (RUN, "", "error_q"),
-    "positions, a light body": (MASS, max(RATIOS, key=RATIOS.__getitem__), "error_q"),
-    "positions, with a PD motor": (MOTOR, SERVO, "error_q"),
-    "positions, turned in space": (TURN, "", "error_q"),
+    "positions, a light body": (MASS, max(LIGHTER, key=LIGHTER.__getitem__), "error_q"),
     "force in a joint": (RUN, "", "error_f"),
-    "energy over 100 s": (ENERGY, "", "energy"),
 }
 
 
@@ -54,39 +52,36 @@ DEFAULT = f"{OURS}, default"
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """Compare the default with the fastest engine at each error; then times, orders and silent errors of each."""
     runs, gates = rows[rows["group"] == RUN], rows[rows["group"] == GATE]
-    found: dict[str, Any] = {
-        "cases": list(dict.fromkeys(runs["case"])),
-        "errors": list(ERRORS),
-        "exact": EXACT,
-        "limit": LIMIT,
-    }
-    found |= {"lost": LOST, "tight": TIGHT, "probed": PROBED, "apart": float(runs["floor"].astype(float).max())}
+    found: dict[str, Any] = {"cases": list(dict.fromkeys(runs["case"])), "errors": list(ERRORS)}
+    found |= {"exact": EXACT, "limit": LIMIT, "lost": LOST, "probed": PROBED}
+    found["apart"] = float(runs["floor"].astype(float).max())
     found["absent"] = sorted(set(gates[gates["status"] == "NOT_AVAILABLE"]["family"]))
     found["versions"] = rows.dropna(subset="version").groupby("family")["version"].first().astype(str).to_dict()
     found["gates"] = gates[gates["status"] != "PASSED"][["case", "solver", "message"]].to_dict("records")
     found["n_gates"] = int((gates["status"] == "PASSED").sum())
     found["against"] = {power(error): _against(runs, error) for error in ERRORS}
-    best: dict[str, str] = {}
-    for engine, name in NAMES.items():
-        if solver := DEFAULT if engine == OURS else _best(runs[runs["family"] == name]):
-            best[name] = solver
-    found["best"] = best
+    solvers = {name: DEFAULT if name == OURS else _best(runs[runs["family"] == name]) for name in NAMES.values()}
+    found["best"] = best = {name: solver for name, solver in solvers.items() if solver}
     found["settings"] = {solver: HOW.get(solver, "nothing") for solver in best.values() if solver != DEFAULT}
     found["times"] = {name: _times(runs[runs["solver"] == solver]) for name, solver in best.items()}
     shown = [each.name for each in CONFIGURATIONS if each.name in best.values() or each.name.endswith("default")]
     found["configurations"] = [_configuration(name, runs[runs["solver"] == name]) for name in shown]
-    found["probes"] = {
-        label: {name: _probe(rows[rows["solver"] == solver], *probe) for name, solver in best.items()}
-        for label, probe in PROBES.items()
-    }
+    found["probes"] = {label: {} for label in PROBES}
+    for (label, probe), (name, solver) in product(PROBES.items(), best.items()):
+        found["probes"][label][name] = _probe(rows[rows["solver"] == solver], *probe)
     return found | {"answer": _answer(found)}
 
 
+def ends_of(found: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    """List the largest and the smallest error at which an engine and the default are compared."""
+    compared = [(error, line) for error, line in found["against"].items() if line["compared"]]
+    return [compared[0], compared[-1]] if compared else []
+
+
 def _answer(found: dict[str, Any]) -> str:
-    compared = {error: line for error, line in found["against"].items() if line["compared"]}
-    if not compared:
+    if not (ends := ends_of(found)):
         return "No engine and twoloop reach the same error."
-    (loose, first), *_, (tight, last) = [*compared.items()] * 2
+    (loose, first), (tight, last) = ends
     return (
         f"For an error of {loose} twoloop is faster than every engine on {first['ahead']} of {first['compared']} "
         f"mechanisms (median {number(first['ratio'])} times), for {tight} on {last['ahead']} of {last['compared']} "
@@ -162,7 +157,7 @@ def _probe(rows: pd.DataFrame, group: str, ending: str, measure: str) -> float |
     """
     own = rows[(rows["group"] == group) & rows["case"].str.endswith(ending)]
     own = own[own["status"].isin(("REACHED_END", "FAILED"))]
-    own = own[(own["n_steps"] == PROBED) | (own["tol"] == TIGHT) | (group == ENERGY)]
+    own = own[(own["n_steps"] == PROBED) | (own["tol"] == TIGHT)]
     if own.empty or measure not in own:
         return None
     value = float(own[measure].astype(float).where(own["status"] == "REACHED_END", np.inf).median())

@@ -4,39 +4,30 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
-from itertools import product
 from typing import Any
 
 import matplotlib.pyplot as plt
-import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
 from references.engines.engine import engines
-from references.engines.rigid import Motion, Prepared, coordinates
+from references.engines.rigid import Motion, Prepared
 from studies.bench import figures
-from studies.bench.changed_loops import IN_A_FRAME, LIGHTENED, MOTORISED
 from studies.bench.cli import version_of
-from studies.bench.closed_loops import MECHANISMS, four_bar, rssr
+from studies.bench.closed_loops import LIGHTENED, MECHANISMS, four_bar, rssr
 from studies.bench.engine_runs import INSTANTS, LIMIT, Loop, errors, gate, timed
 from studies.bench.render import number
 from studies.bench.solvers import GIVEN
 from studies.bench.store import Output, Row
 from studies.bench.study import Study
 from studies.engines import findings
-from studies.engines.findings import CONFIGURATIONS, NAMES, OURS, RUN, TIGHT, Configuration, findings_of
+from studies.engines.findings import CONFIGURATIONS, GATE, MASS, NAMES, OURS, RUN, TIGHT, Configuration
 from twoloop.audit.step_audit import LOST
 
 N_STEPS = (100, 200, 500, 1500, 5000, 15_000, 50_000, 150_000)  # multiples of INSTANTS
 TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
 # by group: steps of engines, tolerances of twoloop
-VALUES: dict[str, Any] = {
-    RUN: (N_STEPS, TOLERANCES),
-    **dict.fromkeys((findings.MASS, findings.MOTOR, findings.TURN), ((findings.PROBED,), (TIGHT,))),
-}
-CHANGED = {findings.MASS: LIGHTENED, findings.TURN: IN_A_FRAME, findings.MOTOR: MOTORISED}
-SHORT = 0.1  # s: motions that last no longer are too fast for the steps of the long ones
-LONG, LONG_STEPS, LONG_INSTANTS, LONG_LIMIT = 100.0, 50_000, 200, 20.0  # s; how it is run; s of CPU
+VALUES: dict[str, Any] = {RUN: (N_STEPS, TOLERANCES), MASS: ((findings.PROBED,), (TIGHT,))}
 SHOWN, AS_IT_COMES = ("four-bar", "RSSR", "Stewart platform"), "MuJoCo, default"  # in the figure
 EVERYWHERE = [each for each in CONFIGURATIONS if each.everywhere]
 MEASURES = ("h", "tol", "n_steps", "call_s", "stepping_s", "error_q", "error_v", "error_f", "gap", "energy", "floor")
@@ -63,16 +54,16 @@ def gated(build: Callable[[], Any], engine: str) -> tuple[str, str]:
 
 
 def make(output: Output) -> pd.DataFrame:
-    """Make the rows of the checks, of runs, also with other masses, frames and motors, and of the energy over 100 s."""
+    """Make the rows of the checks, and of runs, also with a light body."""
     quick = output.call.quick
-    groups: dict[str, Any] = {RUN: (four_bar, rssr)} if quick else {RUN: MECHANISMS} | CHANGED
+    groups: dict[str, Any] = {RUN: (four_bar, rssr)} if quick else {RUN: MECHANISMS, MASS: LIGHTENED}
     with output.kept() as kept:
         rows: list[Row] = []
         for group, build in ((group, build) for group, builds in groups.items() for build in builds):
             for engine, name in list(NAMES.items())[:-1]:  # twoloop is last
                 status, message = gated(build, engine)
-                row = _row(findings.GATE, build, solver=name, family=name, status=status, message=message)
-                rows.append(kept.made(f"{findings.GATE} {build.__name__} {engine}", partial(dict, row)))
+                row = _row(GATE, build, solver=name, family=name, status=status, message=message)
+                rows.append(kept.made(f"{GATE} {build.__name__} {engine}", partial(dict, row)))
             for each in CONFIGURATIONS if group == RUN else EVERYWHERE:
                 values: Any = VALUES[group][each.engine == OURS]
                 cost: list[float] = []  # of the run before, and its steps
@@ -83,25 +74,14 @@ def make(output: Output) -> pd.DataFrame:
                     rows.append(row)
                     if row["status"] in STOPPED:
                         break
-        for build, each in () if quick else product(MECHANISMS, EVERYWHERE):
-            if loop_of(build).t_end > SHORT:
-                rows.append(
-                    kept.made(f"{findings.ENERGY} {build.__name__} {each.name}", partial(energy_row, build, each))
-                )
     versions = {engine.name: version_of(engine.package) for engine in engines().values()}
     return (table := pd.DataFrame(rows)).assign(version=table["family"].map(versions))
 
 
 def _row(group: str, build: Callable[[], Any], **more: Any) -> Row:
     loop = loop_of(build)
-    return {
-        "group": group,
-        "case": loop.problem.name,
-        "span": loop.t_end,
-        **dict.fromkeys(MEASURES),
-        "message": "",
-        **more,
-    }
+    told = {"group": group, "case": loop.problem.name, "span": loop.t_end}
+    return {**told, **dict.fromkeys(MEASURES), "message": "", **more}
 
 
 def _prepared(build: Callable[[], Any], each: Configuration) -> tuple[Prepared | None, Row]:
@@ -155,33 +135,6 @@ def _ours(loop: Loop, tolerance: float, compiled: Any) -> tuple[Callable[[], Mot
     return lambda: run(loop.times), lambda k: run(t0=1e-9 * (k + 1) * loop.t_end)
 
 
-def energy_row(build: Callable[[], Any], each: Configuration) -> Row:
-    """Measure the largest change of the energy over a long time, over the largest kinetic energy of the reference."""
-    loop = loop_of(build)
-    row = _row(findings.ENERGY, build, solver=each.name, family=NAMES[each.engine], status="REACHED_END")
-    if each.engine == OURS:
-        longer = Loop(replace(loop.problem, t_span=(0.0, LONG)))
-        result = longer.solve(TIGHT, times=np.linspace(0.0, LONG, LONG_INSTANTS + 1))
-        row |= {"tol": TIGHT, "call_s": result.stats.cpu_time}
-        t, q, v, message = result.t, result.q, result.v, "" if result.success else result.message
-    else:
-        row |= {"h": LONG / LONG_STEPS, "n_steps": LONG_STEPS}
-        prepared, why = _prepared(build, each)
-        if prepared is None:
-            return row | why
-        share = 100
-        if share * prepared.run(LONG / share, LONG_STEPS // share, 1).stepping_s > LONG_LIMIT:
-            return row | {"status": "TIME_LIMIT", "message": f"not run: would take more than {LONG_LIMIT:g} s"}
-        motion = prepared.run(LONG, LONG_STEPS, LONG_INSTANTS)
-        row |= {"call_s": motion.call_s}
-        t, message = motion.t, motion.message
-        q, v = coordinates(motion, loop.rigid.planar)
-    if message:
-        return row | {"status": "FAILED", "message": message}
-    energies = loop.problem.energy(t, q, v)
-    return row | {"energy": float(np.abs(energies - energies[0]).max() / loop.kinetic)}
-
-
 # one configuration a line, those that come closest, and MuJoCo as it comes
 COLORS = {"Drake": figures.TEAL, "MuJoCo": figures.NAVY, "Pinocchio": figures.ORANGE, "Exudyn": figures.TAN}
 
@@ -212,13 +165,12 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
 
 
 def _message(found: dict[str, Any]) -> str:
-    reached = {error: line for error, line in found["against"].items() if line["compared"]}
-    if not reached:
+    if not (ends := findings.ends_of(found)):
         return "No engine and twoloop reach the same error"
-    (loose, first), *_, (tight, last) = [*reached.items()] * 2
+    (loose, first), (tight, last) = ends
     text = f"For an error of {tight} the fastest engine takes {number(last['ratio'])} times as long as twoloop (median)"
     n = len(first["slower"])
     return text + (f"; for {loose} an engine is faster on {n} of {first['compared']} mechanisms" if n else "")
 
 
-STUDY = Study("engines", __doc__, make, findings_of, figures_of)
+STUDY = Study("engines", __doc__, make, findings.findings_of, figures_of)

@@ -1,6 +1,7 @@
 """Test models of closed loops in physics engines: inertia, accelerations, motions; what the gates catch."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from references.engines import engine as catalogue
 from references.engines.rigid import rigid_of
 from studies.bench import closed_loops
-from studies.bench.changed_loops import IN_A_FRAME, LIGHTENED, MOTORISED
+from studies.bench.closed_loops import ASKEW, LIGHTENED, SPATIAL
 from studies.bench.engine_runs import Loop, errors, gate
 from twoloop import audit
 from twoloop.audit.poses import gaps
@@ -86,9 +87,11 @@ def test_gates_catch_a_loop_an_inertia_a_mass_and_a_torque(loops, engine):
 
 
 @engines
-@pytest.mark.parametrize("make", [MOTORISED[1], MOTORISED[3]])
+@pytest.mark.parametrize("make", [closed_loops.four_bar, closed_loops.crank_rocker])
 def test_motors_do_what_they_should(engine, make):
-    loop = Loop(replace(make(), t_span=(0.0, 1.0)))
+    model = make().model
+    model.torsion_spring(model.joints[0], stiffness=200.0, damping=5.0, angle=0.5)  # a PD motor
+    loop = Loop(model.problem((0.0, 1.0)))
     off = errors(loop, prepared(engine, loop.rigid).run(1.0, 2000, 50))
     assert off["error_q"] < 0.02 and off["error_v"] < 0.02
     idle = [force for force in loop.problem.model.forces if force.kind != TORSION]
@@ -115,7 +118,7 @@ def test_the_force_of_a_joint_has_the_sign_of_ours_at_rest_and_its_size_in_motio
     f = np.linalg.solve([[1.5, -1.0], [1.3, 1.4]], [-9.81 * 0.5, -2.0 * 9.81 * 0.7])
     for told in (loop.reference[0].f, prepared(engine, loop.rigid).run(0.1, 1000, 50).f):
         np.testing.assert_allclose(told[1:, :2], np.tile(f, (50, 1)), rtol=2e-3)
-    turned = Loop(replace(IN_A_FRAME[0](), t_span=(0.0, 0.2)))
+    turned = Loop(replace(closed_loops.rssr(ASKEW), t_span=(0.0, 0.2)))
     assert errors(turned, prepared(engine, turned.rigid).run(0.2, 2000, 50))["error_f"] < 0.02
     assert np.isnan(Loop(replace(closed_loops.bricard(), t_span=(0.0, 0.05))).reference[0].f).all()  # not unique
 
@@ -144,7 +147,9 @@ def test_an_engine_is_audited_by_a_small_adapter(engine):
     assert made.order > 1.7 and made.reaching.error <= 1e-4
 
 
-@pytest.mark.parametrize("make", (*closed_loops.MECHANISMS, *IN_A_FRAME, *LIGHTENED[2:4]))
+@pytest.mark.parametrize(
+    "make", (*closed_loops.MECHANISMS, *(partial(each, ASKEW) for each in SPATIAL), *LIGHTENED[2:4])
+)
 def test_loops_are_cut_between_bodies_that_move_and_close(make):
     problem = closed_loops.closed_chain(6) if make is closed_loops.closed_chain else make()
     rigid = rigid_of(problem)
