@@ -5,8 +5,8 @@ from twoloop.ensembles.consistent_states import consistent_states as consistent_
 from twoloop.ensembles.ensemble import ensemble as ensemble
 from twoloop.ensembles.integrator import Integrator as Integrator
 from twoloop.ensembles.runs import Runs as Runs
+from twoloop.impacts.motion import solve_with_friction as solve_with_friction
 from twoloop.impacts.motion import solve_with_stops as solve_with_stops
-from twoloop.impacts.stick_slip import solve_with_friction as solve_with_friction
 from twoloop.kernels.compile.callbacks import callback as callback
 from twoloop.methods.bdf import BDF as BDF
 from twoloop.methods.dop853 import DOP853 as DOP853

@@ -9,7 +9,7 @@ from tests.marks import slow
 from tests.problems import unconstrained
 from twoloop import ConstrainedSystem, Status, Stop, load, solve_with_stops
 from twoloop.bodies import PlanarModel, SpatialModel
-from twoloop.impacts.laws import Rubs, Undetermined, coulomb, impulses
+from twoloop.impacts.friction import Tangents, Undetermined, coulomb_forces, impulses
 
 GRAVITY = 9.81
 TIGHT = {"rtol": 1e-10, "atol": 1e-10}
@@ -303,13 +303,13 @@ def test_a_jam_is_said():
 def test_an_impact_that_would_add_energy_is_refused():
     """T. R. Kane: Newton's restitution and friction that turns the sliding round."""
     D, u = np.array([[1.0, 0.5], [0.5, 1.0]]), np.array([-1.0, -0.5])
-    rubs = Rubs(np.array([0]), np.array([1.0]), np.array([0]))
+    tangents = Tangents(np.array([0]), np.array([1.0]), np.array([0]))
     with pytest.raises(Undetermined, match="would add energy"):
-        impulses(D, u, np.array([0.9]), rubs)
-    assert impulses(D, u, np.array([0.3]), rubs)[0] > 0.0
+        impulses(D, u, np.array([0.9]), tangents)
+    assert impulses(D, u, np.array([0.3]), tangents)[0] > 0.0
 
 
-NO_RUBS = Rubs(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=np.int64))
+NO_TANGENTS = Tangents(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=np.int64))
 
 
 @pytest.mark.parametrize("joints", [0, 2])
@@ -322,7 +322,7 @@ def test_stops_that_depend_on_one_another_keep_their_conditions(joints):
         D, c = W @ W.T, numbers.normal(size=n + joints)
         most = numbers.uniform(0.1, 2.0, joints)
         try:
-            x, _ = coulomb(D, c, most, NO_RUBS)
+            x, _ = coulomb_forces(D, c, most, NO_TANGENTS)
         except Undetermined:
             continue
         found += 1

@@ -1,36 +1,125 @@
-"""A system with some of its stops closed, sliding or sticking: additional constraints and friction."""
+"""Trace the gaps of stops, and extend a system by the gaps of closed stops as constraints."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from twoloop.checks.arguments import Array
+from twoloop.checks.arguments import Array, shown
+from twoloop.generate.calls_on_symbols import as_forms, trace
+from twoloop.generate.derivative import Derivative
 from twoloop.generate.derived import standing_for
+from twoloop.generate.programs import AGREES, BETWEEN, STATES, numbers_of, program_of
 from twoloop.generate.traced_values import unchecked
-from twoloop.impacts.gaps import Gaps
+from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import codes, noted
 from twoloop.methods.dop853 import DOP853
+from twoloop.problem.description import Stop
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.impulse import NEGLIGIBLE
 from twoloop.run.run import Run
 
 
-class WithContacts:
-    """Callbacks of a system extended by the gaps of closed stops as constraints, and by their friction.
+class Gap(NamedTuple):
+    """Gaps of k stops, their rates, the part of their second derivatives without v', and their gradients (k, n_q)."""
+
+    g: Array
+    u: Array
+    bias: Array
+    W: Array
+
+
+class Gaps:
+    """Evaluate the gap functions of stops, or the slides of stops with friction.
+
+    Parameters
+    ----------
+    function : "gap" or "slide"
+    stops : sequence of Stop
+    t0, q0 : float, ndarray (n_q,)
+        State near which the traced programs are compared with the functions.
+
+    Raises ValueError if a gap function cannot be traced, or disagrees with its trace.
+    """
+
+    def __init__(self, function: str, stops: Sequence[Stop], t0: float, q0: Array):
+        self.n, self._n_q, self._function = len(stops), len(q0), function
+        graph = Graph()
+        (t,) = graph.inputs(1, False)
+        q, v = graph.inputs(self._n_q, False), graph.inputs(self._n_q, True)
+        outputs: list[Form] = []
+        for stop in stops:
+            try:
+                value = np.array(trace(getattr(stop, function), t, symbols(q)), dtype=object)
+                (gap,) = as_forms(graph, value.reshape(1))
+            except (Untraceable, ValueError) as error:
+                raise ValueError(
+                    f"{function} of {stop.name!r} must be a number computed from t and q by numpy functions, without "
+                    f"branches: {error}"
+                ) from None
+            outputs += _with_derivatives(graph, gap, t, q, v)
+        program = program_of(graph, 1 + 2 * self._n_q, dict(enumerate(outputs)))
+        self._p = np.array(numbers_of(program))
+        self._last: tuple[Any, Gap] | None = None
+        self._compare(stops, t0, q0)
+
+    def at(self, t: float, q: Array, v: Array) -> Gap:
+        """Evaluate the gaps at a state."""
+        from twoloop.bodies.program_results import results  # compiled on import
+
+        state = t, q.tobytes(), v.tobytes()
+        if self._last is not None and self._last[0] == state:  # the events of all stops ask for the same state
+            return self._last[1]
+        values = results(0, t, q, v, self._p)[: self.n * (3 + self._n_q)].reshape(self.n, 3 + self._n_q)
+        self._last = state, Gap(values[:, 0], values[:, 1], values[:, 2], values[:, 3:])
+        return self._last[1]
+
+    def _compare(self, stops: Sequence[Stop], t0: float, q0: Array) -> None:
+        """Raise unless the traced programs return the values of the functions, at q0 and near it."""
+        displacements = np.random.default_rng(4).uniform(-0.3, 0.3, (STATES, len(q0)))
+        displacements[0] = 0.0
+        for k, displacement in enumerate(displacements):
+            t, q = t0 + BETWEEN * k, q0 + displacement
+            traced = self.at(t, q, np.zeros_like(q)).g
+            for stop, traced_value in zip(stops, traced, strict=True):
+                value: Any = getattr(stop, self._function)(t, q.copy())
+                if k == 0 and not (np.ndim(value) == 0 and np.isfinite(value)):
+                    raise ValueError(
+                        f"{self._function} of {stop.name!r} must return a finite number; it returned {shown(value)}"
+                    )
+                if np.isfinite(value) and abs(value - traced_value) > AGREES * (1.0 + abs(traced_value)):
+                    raise ValueError(
+                        f"{self._function} of {stop.name!r} has another value at t = {t:g} than when it was traced: it "
+                        "must depend on t and q alone, without branches"
+                    )
+
+
+def _with_derivatives(graph: Graph, gap: Form, t: Form, q: Sequence[Form], v: Sequence[Form]) -> list[Form]:
+    """Return a gap, its rate, the part of its second derivative without v', and its gradient."""
+    unit = Form(graph, 1.0, {})
+    (t_input,), q_inputs = t.terms, [next(iter(coordinate.terms)) for coordinate in q]
+    direction = {t_input: unit, **dict(zip(q_inputs, v, strict=True))}
+    rate = Derivative(graph, direction).of(gap)
+    bias = Derivative(graph, direction).of(rate)
+    return [gap, rate, bias, *(Derivative(graph, {q_input: unit}).of(gap) for q_input in q_inputs)]
+
+
+class ContactSystem:
+    """Extend the callbacks of a system by the gaps of closed stops as constraints, and by their friction.
 
     Parameters
     ----------
     system : ConstrainedSystem
     gaps, slides : Gaps
-    which : list of int
+    closed : list of int
         Indices of the closed stops.
-    sticks : dict
+    sticking : dict
         Displacements along the surface that do not change, by indices of slides: these are constraints as well.
-    slips : list of (int, int, float)
-        For each stop that slides: its place in `which`, the index of its slide, and its coefficient of friction, with
+    slipping : list of (int, int, float)
+        For each stop that slides: its place in `closed`, the index of its slide, and its coefficient of friction, with
         the sign of the sliding.
     """
 
@@ -39,69 +128,72 @@ class WithContacts:
         system: ConstrainedSystem,
         gaps: Gaps,
         slides: Gaps,
-        which: list[int],
-        sticks: dict[int, float],
-        slips: list[tuple[int, int, float]],
+        closed: list[int],
+        sticking: dict[int, float],
+        slipping: list[tuple[int, int, float]],
     ):
-        self._system, self._gaps, self._which = system, gaps, which
-        self._slides, self._held, self._slips = slides, list(sticks), slips
-        self._from = np.array(list(sticks.values()))
-        self._still = np.zeros(system.n_q)
-        self._derived = standing_for(system, unchecked)[0] if slips else system
+        self._system, self._gaps, self._closed = system, gaps, closed
+        self._slides, self._sticking, self._slipping = slides, list(sticking), slipping
+        self._offsets = np.array(list(sticking.values()))
+        self._zero_velocity = np.zeros(system.n_q)
+        self._derived = standing_for(system, unchecked)[0] if slipping else system
 
     def _rows(self, part: str, t: float, q: Array, v: Array) -> Array:
         """Return a part of a `Gap` for closed stops, followed by that for the displacements that do not change."""
-        closed = getattr(self._gaps.at(t, q, v), part)[self._which]
-        return np.concatenate([closed, getattr(self._slides.at(t, q, v), part)[self._held]]) if self._held else closed
+        rows = getattr(self._gaps.at(t, q, v), part)[self._closed]
+        if not self._sticking:
+            return rows
+        return np.concatenate([rows, getattr(self._slides.at(t, q, v), part)[self._sticking]])
 
-    def _of(self, kind: str, t: float, *state: Array) -> Array:
-        (out,) = self._system.arrays_of(kind)
-        getattr(self._system.functions, kind)(t, *state, self._system.functions.p, out)
-        return np.asarray(out)
+    def _call(self, kind: str, t: float, *state: Array) -> Array:
+        (values,) = self._system.arrays_of(kind)
+        getattr(self._system.functions, kind)(t, *state, self._system.functions.p, values)
+        return np.asarray(values)
 
     def constraint(self, t: float, q: Array) -> Array:
         """Evaluate C, followed by the gaps."""
-        gaps = self._rows("g", t, q, self._still)
-        gaps[len(self._which) :] -= self._from
-        return np.append(self._of("constraint", t, q), gaps)
+        gaps = self._rows("g", t, q, self._zero_velocity)
+        gaps[len(self._closed) :] -= self._offsets
+        return np.append(self._call("constraint", t, q), gaps)
 
     def jacobian(self, t: float, q: Array) -> Array:
         """Evaluate C_q, followed by the gradients of the gaps."""
         rows = self._system.jacobian(t, q) if self._system.n_c else np.zeros((0, self._system.n_q))
-        return np.vstack([rows, self._rows("W", t, q, self._still)])
+        return np.vstack([rows, self._rows("W", t, q, self._zero_velocity)])
 
     def constraint_rate(self, t: float, q: Array) -> Array:
         """Evaluate C_t, followed by the time derivatives of the gaps."""
-        return np.append(self._system.constraint_rate(t, q), self._rows("u", t, q, self._still))
+        return np.append(self._system.constraint_rate(t, q), self._rows("u", t, q, self._zero_velocity))
 
     def gamma(self, t: float, q: Array, v: Array) -> Array:
         """Evaluate the right-hand side of C_q a = gamma, followed by that of the gaps."""
-        own = self._of("gamma", t, q, v) if self._system.n_c else np.zeros(0)
-        return np.append(own, -self._rows("bend", t, q, v))
+        own = self._call("gamma", t, q, v) if self._system.n_c else np.zeros(0)
+        return np.append(own, -self._rows("bias", t, q, v))
 
     def force(self, t: float, q: Array, v: Array) -> Array:
         """Evaluate Q, and the friction of the stops that slide, which follows from their forces."""
-        Q = self._of("force", t, q, v)
-        if not self._slips:
+        Q = self._call("force", t, q, v)
+        if not self._slipping:
             return Q
         system, slides = self._derived, self._slides.at(t, q, v).W
         rows = np.vstack([system.rows(t, q), self._rows("W", t, q, v)])
-        own = [system.gamma(t, q, v)] if system.n_c else []
-        own += [system.nonholonomic_gamma(t, q, v)] if system.n_a else []
-        n, first = system.n_q, system.n_q + system.n_c + system.n_a
-        K = np.block([[self._of("mass", t, q), rows.T], [rows, np.zeros((len(rows),) * 2)]])
-        for place, k, coefficient in self._slips:
-            K[:n, first + place] -= coefficient * slides[k]
-        found = np.linalg.lstsq(K, np.concatenate([Q, *own, -self._rows("bend", t, q, v)]), rcond=NEGLIGIBLE)[0]
-        return Q + sum(coefficient * found[first + place] * slides[k] for place, k, coefficient in self._slips)
+        right_sides = [system.gamma(t, q, v)] if system.n_c else []
+        right_sides += [system.nonholonomic_gamma(t, q, v)] if system.n_a else []
+        n, first_stop = system.n_q, system.n_q + system.n_c + system.n_a
+        K = np.block([[self._call("mass", t, q), rows.T], [rows, np.zeros((len(rows),) * 2)]])
+        for place, k, coefficient in self._slipping:
+            K[:n, first_stop + place] -= coefficient * slides[k]
+        right = np.concatenate([Q, *right_sides, -self._rows("bias", t, q, v)])
+        forces = np.linalg.lstsq(K, right, rcond=NEGLIGIBLE)[0][first_stop:]
+        return Q + sum(coefficient * forces[place] * slides[k] for place, k, coefficient in self._slipping)
 
-    def made(self, names: str) -> ConstrainedSystem:
-        """Return the system with these callbacks."""
+    def build(self, names: str) -> ConstrainedSystem:
+        """Return the extended system."""
         system = self._system
         functions: dict[str, Any] = {
             kind: getattr(self, kind) for kind in ("constraint", "jacobian", "constraint_rate")
         }
-        functions["mass"] = lambda t, q: self._of("mass", t, q)
+        functions["mass"] = lambda t, q: self._call("mass", t, q)
         functions["force"] = self.force
         if "gamma" in system.given or system.n_c == 0:
             functions["gamma"] = self.gamma
@@ -110,30 +202,30 @@ class WithContacts:
                 functions[kind] = getattr(system, kind)
         sizes: dict[str, Any] = {
             "n_q": system.n_q,
-            "n_c": system.n_c + len(self._which) + len(self._held),
+            "n_c": system.n_c + len(self._closed) + len(self._sticking),
             "n_a": system.n_a,
         }
         return ConstrainedSystem.from_python(**sizes, **functions, name=f"{system.name} on {names}")
 
 
 class Accelerations:
-    """Accelerations and multipliers of a system at any state, computed as in its runs."""
+    """Compute accelerations and multipliers of a system at any state, as in its runs."""
 
     def __init__(self, system: ConstrainedSystem, t: float, q: Array, v: Array, atol: Array):
         derived, _ = standing_for(system, unchecked)
         plan = DOP853().plan(system.n_q, 1e-8, 1e-8, False)
         self._run = Run(derived, plan, t, q, v, 1e-8, atol, None)
-        self._run.work.notes[noted.GENERATION] = 1.0  # the ranks are known
+        self._run.work.notes[noted.GENERATION] = 1.0  # the run has determined the ranks
         self._n = system.n_q
         self._last: tuple[tuple[float, bytes, bytes], Array] | None = None
 
     def at(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
         """Return a (n_q,) and [lam; mu]; NaN if they do not exist."""
-        run, n, asked = self._run, self._n, (t, q.tobytes(), v.tobytes())
-        if self._last is None or self._last[0] != asked:  # events of all rows ask for the same state
+        run, n, key = self._run, self._n, (t, q.tobytes(), v.tobytes())
+        if self._last is None or self._last[0] != key:  # the events of all rows ask for the same state
             state = np.concatenate([q, v, np.zeros(len(run.state) - 2 * n)])
             if direct(run.kernels.start)(run.kit, run.work, t, state) != codes.DONE:
                 state[2 * n :] = np.nan
-            self._last = asked, state
+            self._last = key, state
         state = self._last[1]
         return state[2 * n : 3 * n], state[3 * n :]

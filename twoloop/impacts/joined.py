@@ -1,4 +1,4 @@
-"""Joins the arcs between impacts into one result."""
+"""Join the arcs between impacts into one result."""
 
 from __future__ import annotations
 
@@ -92,51 +92,52 @@ class ArcSolution:
             raise ValueError(f"t must be a number or (n,), from {self.t_min!r} to {self.t_max!r}; given {times!r:.100}")
         flat = np.atleast_1d(times)
         first = self.arcs[0]
-        made = [np.empty((len(each), len(flat))) for each in (first.q, first.v, first.a, self._own_rows(first.lam))]
-        which = np.searchsorted([arc.t[0] for arc in self.arcs], flat, side="right") - 1
-        for k in np.unique(which):
-            own = np.flatnonzero(which == k)
+        parts = (first.q, first.v, first.a, self._multipliers(first.lam))
+        outputs = [np.empty((len(part), len(flat))) for part in parts]
+        arc_of_time = np.searchsorted([arc.t[0] for arc in self.arcs], flat, side="right") - 1
+        for k in np.unique(arc_of_time):
+            in_arc = np.flatnonzero(arc_of_time == k)
             assert self.arcs[k].sol is not None
-            state = self.arcs[k].sol(flat[own])
-            for out, found in zip(made, (state.q, state.v, state.a, self._own_rows(state.lam)), strict=True):
-                out[:, own] = found
+            state = self.arcs[k].sol(flat[in_arc])
+            for out, values in zip(outputs, (state.q, state.v, state.a, self._multipliers(state.lam)), strict=True):
+                out[:, in_arc] = values
         if times.ndim == 0:
-            return ArcState(float(times), *(each[:, 0] for each in made))
-        return ArcState(times, *made)
+            return ArcState(float(times), *(out[:, 0] for out in outputs))
+        return ArcState(times, *outputs)
 
-    def _own_rows(self, lam: Array) -> Array:
-        return own_rows(lam, self._n_c, self._n_rows)
+    def _multipliers(self, lam: Array) -> Array:
+        return system_multipliers(lam, self._n_c, self._n_rows)
 
     def __repr__(self) -> str:
         return f"ArcSolution(from t = {self.t_min:g} to {self.t_max:g} s, {len(self.arcs)} arcs)"
 
 
-def own_rows(lam: Array, n_c: int, n_rows: int) -> Array:
-    """Return the multipliers of the system itself, without those of closed stops, which follow those of C."""
+def system_multipliers(lam: Array, n_c: int, n_rows: int) -> Array:
+    """Return the multipliers of the system, without those of closed stops, which follow those of C."""
     return np.vstack([lam[:n_c], lam[len(lam) - (n_rows - n_c) :]])
 
 
-def joined(
+def join_arcs(
     system: ConstrainedSystem,
     arcs: Sequence[Result],
     impacts: Sequence[Impact],
     times: Array | None,
     stagnated: str,
-    tale: str,
+    summary: str,
 ) -> Result:
-    """Return one result of all arcs, at the ends of their steps or at output times; `tale` ends its message."""
+    """Return one result of all arcs, at the ends of their steps or at output times; `summary` ends its message."""
     last, n_rows = arcs[-1], system.n_c + system.n_a
     table: list[Array]
     if times is None:
-        parts = [(arc.t, arc.q, arc.v, arc.a, own_rows(arc.lam, system.n_c, n_rows)) for arc in arcs]
-        table = [np.concatenate(each, axis=-1) for each in zip(*parts, strict=True)]
+        parts = [(arc.t, arc.q, arc.v, arc.a, system_multipliers(arc.lam, system.n_c, n_rows)) for arc in arcs]
+        table = [np.concatenate(columns, axis=-1) for columns in zip(*parts, strict=True)]
     else:
         table = list(ArcSolution(arcs, system.n_c, system.n_a)(times[times <= last.t[-1]]))
     status, message = (Status.STAGNATED, stagnated) if stagnated else (last.status, last.message)
     if not stagnated and len(arcs) > 1:
-        message += f" {tale}"
-    known: dict[str, Any] = {
-        name: _all(arcs, name) for name in ("rejected_error", "rejected_convergence", "partitioned")
+        message += f" {summary}"
+    counts: dict[str, Any] = {
+        name: _concatenated(arcs, name) for name in ("rejected_error", "rejected_convergence", "partitioned")
     }
     changes = CHANGES if impacts or any(arc.system is not system for arc in arcs) else ""
     t, q, v, a, lam = table
@@ -145,10 +146,10 @@ def joined(
         h=np.concatenate([arc.h for arc in arcs]),
         status=status,
         message=message + (explained(status) if stagnated else ""),
-        stats=_total([arc.stats for arc in arcs]),
+        stats=_sum_statistics([arc.stats for arc in arcs]),
         rank=arcs[0].rank,
         redundant=arcs[0].redundant,
-        **known,
+        **counts,
         sol=ArcSolution(arcs, system.n_c, system.n_a),  # type: ignore[arg-type]  # same interface
         widest_gap=max(arc.widest_gap or 0.0 for arc in arcs),
         system=system,
@@ -156,19 +157,19 @@ def joined(
         compiled=arcs[0].compiled,
         rtol=arcs[0].rtol,
         atol=arcs[0].atol,
-        untested=_all(arcs, "untested"),
+        untested=_concatenated(arcs, "untested"),
         changes=changes,
         arcs=tuple(arcs),
         impacts=tuple(impacts),
     )
 
 
-def _all(arcs: Sequence[Result], name: str) -> Any:
+def _concatenated(arcs: Sequence[Result], name: str) -> Any:
     parts = [getattr(arc, name) for arc in arcs]
     return None if any(part is None for part in parts) else np.concatenate(parts)
 
 
-def _total(parts: Sequence[Statistics]) -> Statistics:
+def _sum_statistics(parts: Sequence[Statistics]) -> Statistics:
     return Statistics(
-        **{each.name: sum(getattr(part, each.name) or 0 for part in parts) for each in fields(Statistics)}
+        **{field.name: sum(getattr(part, field.name) or 0 for part in parts) for field in fields(Statistics)}
     )

@@ -1,24 +1,431 @@
-"""`solve_with_stops`: arcs between impacts, and rest in contact with stops."""
+"""Integrate motions arc by arc, between impacts, contact and release, sliding and sticking."""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Sequence
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from twoloop.checks.arguments import check_positive, check_span, check_times, check_tolerance, check_vector, shown
-from twoloop.impacts.modes import Motion
-from twoloop.impacts.rubbing import Modes
+from twoloop.checks.arguments import (
+    Array,
+    check_positive,
+    check_span,
+    check_times,
+    check_tolerance,
+    check_vector,
+    shown,
+)
+from twoloop.impacts.contact import Accelerations, ContactSystem, Gap, Gaps
+from twoloop.impacts.friction import (
+    AT_REST,
+    IDLE,
+    INDEPENDENT,
+    NEGLIGIBLE,
+    STICKS,
+    FrictionModes,
+    Mode,
+    Modes,
+    Signs,
+    StopFriction,
+    Undetermined,
+    coulomb_forces,
+    holding_forces,
+    impulses,
+    responses,
+)
+from twoloop.impacts.joined import Impact, join_arcs
 from twoloop.methods.plan import Method
+from twoloop.methods.presets import PRESETS
+from twoloop.methods.taylor import Taylor
 from twoloop.problem.description import Stop
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
-from twoloop.solve import solve_dae
+from twoloop.run.impulse import corrected
+from twoloop.run.record import Status
+from twoloop.solve import check_method, solve_dae
 
-OF_A_RUN = {"system", "t_span", "q0", "v0", "method", "rtol", "atol", "t_eval", "step_size"}
-OF_A_RUN |= {"events", "dense_output", "store"}
+if TYPE_CHECKING:
+    from twoloop.bodies.model_problem import ModelProblem
+
+LOW = 0.01  # relative to the absolute tolerance: a rebound below this height ends in contact
+SAMPLES = 2000  # smallest number of evaluations of gaps, forces and rates of sliding over a motion
+CLOSED = 1e3  # squares of rates, over this height and the accelerations, of stops that may press one another
+ROUNDING = 1e-13  # relative to max(1, |q|)
+LEAST_STEP = 1e-9  # first step of an arc, relative to max(1 s, t)
+ZERO = 1e-20  # m or rad, or per s: smaller coordinates and rates are rounding errors
+STALLED = 1e-13  # relative to max(1 s, t): shorter arcs count as stalled ...
+MAX_STALLED = 30  # ... and this many stalled arcs in a row end the motion
+RELEASED = 1e-7  # relative reduction of the static friction of a joint just released, which prevents chattering
+AT_MOST = 1e-9  # relative: margin of a joint held by its full friction
+
+
+class Motion:
+    """Integrate a motion arc by arc; its state is coordinates, closed stops, and sticking joints.
+
+    Parameters
+    ----------
+    stops : sequence of Stop
+    modes : Modes
+        Provides the system in each mode.
+    t, q, v : float, ndarray (n_q,), ndarray (n_q,)
+    options : dict
+        Options of the runs.
+    """
+
+    def __init__(self, stops: Sequence[Stop], modes: Modes, t: float, q: Array, v: Array, options: dict[str, Any]):
+        self.system, self.modes, self.stops, self.options = modes.system, modes, list(stops), options
+        self.t, self.q, self.v = t, q, v
+        self.e = np.array([stop.restitution for stop in stops])
+        self.gaps, self.friction = Gaps("gap", stops, t, q), StopFriction(stops, t, q)
+        self.low = max(LOW * float(options["atol"].min()), ROUNDING * max(1.0, float(np.abs(q).max())))
+        closed = np.flatnonzero(self.gaps.at(t, q, v).g < -100.0 * self.low)
+        if closed.size:
+            gap = float(self.gaps.at(t, q, v).g[closed[0]])
+            raise ValueError(f"gaps must not be negative at q0; that of {stops[closed[0]].name!r} is {gap:.3g}")
+        self.arcs: list[Result] = []
+        self.impacts: list[Impact] = []
+        self.opened: list[int] = []  # stops whose force has just vanished
+        self.speeds = np.abs(v)  # largest velocities of the last arc
+        self.still: set[int] = set()  # joints that have stopped or stick
+        self.released: set[int] = set()  # joints that stuck in the last arc
+        self._contact_systems: dict[Any, tuple[ConstrainedSystem, ConstrainedSystem]] = {}
+        self._acceleration_cache: dict[int, tuple[ConstrainedSystem, Accelerations]] = {}
+
+    def integrate(self, t1: float, times: Array | None) -> Result:
+        """Integrate to the end."""
+        stalled, self.sample_interval = 0, (t1 - self.t) / SAMPLES
+        while True:
+            t_before = self.t
+            try:
+                self._run_arc(self._resolve(), t1)
+            except Undetermined as error:
+                if not self.arcs:
+                    raise
+                return self._result(times, f"Stopped at t = {self.t:.10g}: {error}.")
+            arc = self.arcs[-1]
+            if arc.status != Status.EVENT or self.t >= t1:
+                return self._result(times)
+            stalled = stalled + 1 if self._is_stalled(t_before) else 0
+            if stalled == MAX_STALLED:
+                names = dict.fromkeys(name for impact in self.impacts[-9:] for name in impact.stops)
+                stops = f" ({', '.join(map(repr, names))})" if names else ""
+                reason = (
+                    f"Stopped at t = {self.t:.10g}: {stalled} impacts or other changes in a row at this time{stops}. "
+                    "Look for stops that push against each other, or loosen atol."
+                )
+                return self._result(times, reason)
+
+    def _result(self, times: Array | None, stagnated: str = "") -> Result:
+        return join_arcs(self.system, self.arcs, self.impacts, times, stagnated, self._summary)
+
+    def _is_stalled(self, before: float) -> bool:
+        return self.t - before <= STALLED * max(1.0, abs(self.t))
+
+    @property
+    def _summary(self) -> str:
+        changes = f"{len(self.arcs) - 1} changes between sliding and sticking."
+        if self.stops and (self.modes.n or self.friction.place):
+            return f"{len(self.impacts)} impacts, {len(self.arcs) - 1} changes of sliding, sticking or contact."
+        return changes if self.modes.n else f"{len(self.impacts)} impacts."
+
+    def _resolve(self) -> Mode:
+        """Apply an impact; return which joints and stops slide or stick, and which stops stay closed."""
+        gap = self.gaps.at(self.t, self.q, self.v)
+        near = np.flatnonzero(gap.g <= self.low)
+        slow = np.zeros(near.size, dtype=bool)
+        if near.size:
+            for _ in range(MAX_STALLED):
+                slow = self._apply_impulses(gap, near)
+                gap = self.gaps.at(self.t, self.q, self.v)
+                # the law lets a stop close that opened before: it is hit next
+                if not (gap.u[near] < -AT_REST * (np.abs(gap.W[near]) @ self.speeds)).any():
+                    break
+            slow &= ~np.isin(near, self.opened)  # an opened stop has no force
+        closing = near[slow]
+        signs, resting_joints = self._sliding(self.v)
+        if not closing.size and not resting_joints:
+            return Mode(signs)
+        a, c_rubs = self._free(signs, resting_joints, self.v)
+        gap = self.gaps.at(self.t, self.q, self.v)
+        touching, slide, tangents = self.friction.rows(closing.tolist(), self.t, self.q, self.v, self.speeds)
+        c = np.concatenate([gap.W[closing] @ a + gap.bias[closing], c_rubs, slide.W @ a + slide.bias])
+        W = np.vstack([gap.W[closing], self.modes.along(self.q)[resting_joints], slide.W])
+        D = W @ responses(self.system, self.t, self.q, W)
+        n, end = len(closing), len(closing) + len(resting_joints)
+        reduction = np.array([(1.0 - RELEASED) if k in self.friction.released else 1.0 for k in touching])
+        tangents = tangents._replace(coefficient=tangents.coefficient * reduction)
+        force, slides = coulomb_forces(D, c, self._available_friction(resting_joints), tangents)
+        pushes = force[:n] > 0.0
+        base = np.flatnonzero(pushes).tolist()
+        accelerations = (D @ force + c)[n:end]  # accelerations of the joints
+        terms = (np.abs(D) @ np.abs(force) + np.abs(c))[n:end] + D.diagonal()[n:end] * self.modes.static[resting_joints]
+        for k, sign, moves, row in zip(
+            resting_joints, np.sign(accelerations), np.abs(accelerations) > AT_MOST * terms, range(n, end), strict=True
+        ):
+            signs[k] = int(sign) if moves else self._sticks(k, force[row], D, row, base, pushes.sum())
+        rubbing = [(k, end + i, int(slides[i])) for i, k in enumerate(touching) if pushes[tangents.normal[i]]]
+        sticks = self.friction.groups(D, base, {k: row for k, row, sign in rubbing if not sign})
+        slips = {k: sign for k, _, sign in rubbing if sign}
+        return Mode(signs, tuple(closing[pushes].tolist()), slips, sticks)
+
+    def _available_friction(self, joints: list[int]) -> Array:
+        """Return the friction available to joints at rest; slightly reduced for those just released."""
+        reduced = np.minimum(self.modes.kinetic, (1.0 - RELEASED) * self.modes.static)
+        return np.array([(reduced if k in self.released else self.modes.static)[k] for k in joints])
+
+    def _sticks(self, k: int, force: float, D: Array, row: int, base: list[int], n_pushing: int) -> int | None:
+        """Return STICKS, or IDLE if pushing stops and sticking joints already hold the joint.
+
+        The friction of an idle joint stays constant until one of these releases it; it is zero if stops alone hold it.
+        """
+        weights = np.linalg.lstsq(D[np.ix_(base, base)], D[base, row], rcond=NEGLIGIBLE)[0]
+        if D[row, row] - D[row, base] @ weights > INDEPENDENT * D[row, row]:
+            base.append(row)
+            return STICKS
+        self.modes.idle_friction[k] = force if np.abs(weights[n_pushing:]).max(initial=0.0) > INDEPENDENT else 0.0
+        return IDLE
+
+    def _apply_impulses(self, gap: Gap, near: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Apply the impulses at closed stops to the velocities; return which of these stops would hardly open."""
+        touching, slide, tangents = self.friction.rows(near.tolist(), self.t, self.q, self.v, self.speeds)
+        tangents = tangents._replace(sign=0 * tangents.sign)  # the direction after the impact counts
+        W = np.vstack([gap.W[near], slide.W])
+        X = responses(self.system, self.t, self.q, W)  # dry friction of joints causes no impulse
+        D, n = W @ X, len(near)
+        before, u = self.v, np.append(gap.u[near], slide.u)
+        u[np.abs(u) <= ROUNDING * (np.abs(W) @ self.speeds)] = 0.0
+        P = impulses(D, u, self.e[near], tangents)
+        v = before + X @ P
+        slow = self._hardly_open(near, v)
+        if (slow & (P[:n] > 0.0) & (self.e[near] > 0.0)).any():
+            P = impulses(D, u, np.where(slow, 0.0, self.e[near]), tangents)
+            v = before + X @ P
+            slow = self._hardly_open(near, v)
+        hit = P[:n] > 0.0
+        if hit.any():
+            names = tuple(self.stops[k].name for k in near[hit])
+            friction_impulses = {k: float(x) for k, x in zip(touching, P[n:], strict=True)}
+            friction = np.array([friction_impulses.get(k, 0.0) for k in near[hit].tolist()])
+            self.impacts.append(Impact(self.t, names, before.copy(), v.copy(), P[:n][hit], friction))
+            self.still, self.released, self.friction.still, self.friction.released = set(), set(), set(), set()
+        self.v = v
+        return slow
+
+    def _hardly_open(self, near: NDArray[np.int64], v: Array) -> NDArray[np.bool_]:
+        """Return which stops would rebound by less than the relevant height, pressed together by the others."""
+        signs, resting_joints = self._sliding(v)
+        a, c_rubs = self._free(signs, resting_joints, v)
+        gap = self.gaps.at(self.t, self.q, v)
+        u, c = gap.u[near], gap.W[near] @ a + gap.bias[near]
+        rounding = ROUNDING * np.abs(v).max() ** 2
+        touching = u * np.abs(u) <= CLOSED * self.low * np.abs(c).max() + rounding
+        W = np.vstack([gap.W[near[touching]], self.modes.along(self.q)[resting_joints]])
+        D, n = W @ responses(self.system, self.t, self.q, W), int(touching.sum())
+        force = holding_forces(D, np.append(c[touching], c_rubs), n, self._available_friction(resting_joints))
+        pressure = np.zeros(len(near))
+        pressure[touching] = (D.diagonal() * force)[:n]
+        return np.asarray(u * np.abs(u) <= 2.0 * self.low * pressure + rounding, dtype=bool)
+
+    def _sliding(self, v: Array) -> tuple[Signs, list[int]]:
+        """Return the sliding direction of each joint, and the joints at rest."""
+        W = self.modes.along(self.q)
+        u = W @ v
+        moves = np.abs(u) > AT_REST * (np.abs(W) @ self.speeds)
+        slow = [k for k in range(len(u)) if k in self.still or k in self.released or not moves[k]]
+        return [0 if k in slow else int(np.sign(u[k])) for k in range(len(u))], slow
+
+    def _free(self, signs: Signs, resting_joints: list[int], v: Array) -> tuple[Array, Array]:
+        """Return accelerations of coordinates and of joints at rest, without contact forces and friction at rest."""
+        a = self._accelerations(self.modes.free(signs, self.t, self.q)).at(self.t, self.q, v)[0]
+        return a, self.modes.accelerations(signs, resting_joints, self.t, self.q, v, a)
+
+    def _accelerations(self, system: ConstrainedSystem, cached: bool = True) -> Accelerations:
+        if id(system) in self._acceleration_cache:
+            return self._acceleration_cache[id(system)][1]
+        accelerations = Accelerations(system, self.t, self.q, self.v, self.options["atol"])
+        if cached:
+            self._acceleration_cache[id(system)] = system, accelerations
+        return accelerations
+
+    def _with_contacts(self, system: ConstrainedSystem, mode: Mode, cached: bool) -> ConstrainedSystem:
+        """Return a system with some stops closed."""
+        resting, friction = mode.resting, self.friction
+        if not resting:
+            return system
+        key = id(system), resting, tuple(mode.slips.items())
+        if cached and key in self._contact_systems:
+            return self._contact_systems[key][1]
+        sticking = {k for group in mode.sticks.values() for k in group}
+        names = ", ".join(f"{self.stops[k].name}{' (sticks)' if k in sticking else ''}" for k in resting)
+        displacements = friction.slides.at(self.t, self.q, self.v).g
+        sticks = {friction.place[k]: float(displacements[friction.place[k]]) for k in mode.sticks}
+        slips = [
+            (resting.index(k), friction.place[k], sign * friction.coefficient(k)) for k, sign in mode.slips.items()
+        ]
+        extended = ContactSystem(system, self.gaps, friction.slides, list(resting), sticks, slips).build(names)
+        if cached:
+            self._contact_systems[key] = system, extended
+        return extended
+
+    def _run_arc(self, mode: Mode, t1: float) -> None:
+        """Integrate until a gap closes or opens, or a joint or a stop that rubs comes to rest or is released."""
+        signs, resting = mode.signs, mode.resting
+        free, rows = self.modes.mode(signs, self.t, self.q)
+        # the rows of what sticks depend on where it sticks
+        cacheable = not {STICKS, IDLE} & set(signs) and not mode.sticks
+        system = self._with_contacts(free, mode, cacheable)
+        if system.n_c and (resting or self.modes.n):
+            self._project(system, resting)
+        start = self.gaps.at(self.t, self.q, self.v)
+        accelerations = self._accelerations(system, cacheable) if resting or STICKS in signs else None
+
+        def multiplier(row: int, t: float, q: Array, v: Array) -> float:
+            assert accelerations is not None
+            return float(accelerations.at(t, q, v)[1][row])
+
+        def friction(k: int, t: float, q: Array, v: Array) -> float:
+            return -multiplier(rows[k], t, q, v) * self.modes.row_sign(k, system, rows[k], t, q)
+
+        def contact_force(k: int) -> Any:
+            row = free.n_c + resting.index(k)
+            return terminal(lambda t, q, v: -multiplier(row, t, q, v))
+
+        def friction_balance(row: int, group: list[int], t: float, q: Array, v: Array) -> tuple[float, float]:
+            loads = [(free.n_c + resting.index(k), self.friction.coefficient(k)) for k in group]
+            return multiplier(row, t, q, v), sum(-mu * multiplier(normal, t, q, v) for normal, mu in loads)
+
+        events = [self._changes(k, sign, friction) for k, sign in enumerate(signs)]
+        events += [contact_force(k) if k in resting else self._closes(k, start) for k in range(len(self.stops))]
+        n = len(events)
+        events += [terminal(self._rests(k, sign)) for k, sign in mode.slips.items()]
+        for row, group in enumerate(mode.sticks.values(), free.n_c + len(resting)):
+            events.append(terminal(self._slips(partial(friction_balance, row, group))))
+        for event in events:
+            event.every = self.sample_interval
+        options = {**self.options, "check_derivatives": self.options.get("check_derivatives", True) and not self.arcs}
+        if self.arcs and self.options.get("first_step") is None and self.arcs[-1].h.size:
+            least = LEAST_STEP * max(1.0, abs(self.t))  # coordinates near zero have no scale for an initial step
+            options["first_step"] = min(max(0.1 * float(self.arcs[-1].h.max()), least), t1 - self.t)
+        if resting:
+            options |= untraced(options)
+        arc = solve_dae(system, (self.t, t1), self.q, self.v, events=events, dense_output=True, **options)
+        self.arcs.append(arc)
+        ended = {k for k in range(len(events)) if arc.t_events is not None and arc.t_events[k].size}
+        self.friction.update(mode, {k for i, k in enumerate([*mode.slips, *mode.sticks], n) if i in ended})
+        n = len(signs)
+        if arc.t.size:
+            self.speeds = np.abs(arc.v).max(axis=1)
+            t_before, self.t = self.t, float(arc.t[-1])
+            # else parallel stops take over from one another, with forces of rounding
+            if not self._is_stalled(t_before):
+                self.opened = []
+            self.q, self.v = arc.q[:, -1].copy(), arc.v[:, -1].copy()
+            if any(n + k in ended for k in range(len(self.stops)) if k not in resting):
+                self.v = self._landing(arc)
+        self.opened += [k for k in resting if n + k in ended]
+        self.released = {k for k in ended if k < n and signs[k] == STICKS}
+        self.still = {k for k in range(n) if (not signs[k]) != (k in ended)}
+
+    def _landing(self, arc: Result) -> Array:
+        """Return the velocities at the end of an arc that ends in an impact.
+
+        The slope of a polynomial over short steps multiplies rounding of q. Where that may be more than the tolerance,
+        and explains how far the velocities are from those by Simpson's rule for the last step, the latter are taken.
+        """
+        v, h = arc.v[:, -1].copy(), float(arc.t[-1] - arc.t[-2]) if arc.t.size > 1 else 0.0
+        noise = ROUNDING * max(1.0, float(np.abs(arc.q[:, -1]).max()))
+        tolerance = 0.1 * float(self.options["atol"].min())
+        if not 0.0 < h * tolerance <= noise:
+            return v
+        assert arc.sol is not None
+        middle = arc.sol(float(arc.t[-2]) + 0.5 * h)
+        integrated = arc.v[:, -2] + h / 6.0 * (arc.a[:, -2] + 4.0 * middle.a + arc.a[:, -1])
+        return integrated if tolerance < np.abs(integrated - v).max() <= noise / h else v
+
+    def _project(self, system: ConstrainedSystem, resting: tuple[int, ...]) -> None:
+        """Project the state onto the constraints of a mode, from which it deviates by less than the tolerances."""
+        self.q = corrected(system, self.t, self.q)
+        if resting:
+            self.q[np.abs(self.q) < ZERO] = 0.0
+            gap = self.gaps.at(self.t, self.q, self.v)
+            W, u = gap.W[list(resting)], gap.u[list(resting)]
+            X = responses(self.system, self.t, self.q, W)
+            self.v = self.v - X @ np.linalg.lstsq(W @ X, u, rcond=NEGLIGIBLE)[0]
+        rows, violation = system.rows(self.t, self.q), system.velocity_constraint(self.t, self.q, self.v)
+        self.v = self.v - np.linalg.lstsq(rows, violation, rcond=NEGLIGIBLE)[0]
+        self.v[np.abs(self.v) < max(ZERO, 1e-16 * float(self.speeds.max()))] = 0.0
+
+    def _closes(self, k: int, start: Gap) -> Any:
+        """Return the event of a gap that is open or about to open; zero where it is as closed as at the start."""
+        g0, u0, t0, low = float(start.g[k]), float(start.u[k]), self.t, self.low
+        opens = u0 > 0.0 and u0 * u0 > low * 1e-6
+
+        def closes(t: float, q: Array, v: Array) -> float:
+            g = float(self.gaps.at(t, q, v).g[k])
+            if g0 > low:
+                return g
+            if opens:
+                return (g - g0) / (t - t0) if t > t0 else u0
+            return g - min(g0, 0.0) + low
+
+        event = terminal(closes)
+        event.gap_rate = lambda t, q, v: float(self.gaps.at(t, q, v).u[k])
+        return event
+
+    def _changes(self, k: int, sign: int | None, friction: Any) -> Any:
+        """Return the event that ends the mode of a joint."""
+        if sign is IDLE:
+            return terminal(lambda t, q, v: 1.0)
+        if sign != STICKS:
+            return terminal(self._stops(k, sign))
+        return terminal(self._slips(lambda t, q, v: (friction(k, t, q, v), self.modes.static[k])))
+
+    def _rests(self, k: int, sign: int) -> Any:
+        """Return the event of a stop that ceases to slide; one that begins to slide is at rest initially."""
+        slide, slides = self.friction.place[k], self.friction.slides
+        u0 = sign * float(slides.at(self.t, self.q, self.v).u[slide])
+        offset = u0 - self.low if k in self.friction.still | self.friction.released else 0.0
+        return lambda t, q, v: sign * float(slides.at(t, q, v).u[slide]) - offset
+
+    def _stops(self, k: int, sign: int) -> Any:
+        """Return the event of a joint that comes to rest; a joint that begins to slide is at rest initially."""
+        u0 = sign * float(self.modes.along(self.q, k) @ self.v)
+        offset = u0 - self.low if k in self.still or k in self.released else 0.0
+        return lambda t, q, v: sign * float(self.modes.along(q, k) @ v) - offset
+
+    def _slips(self, balance: Any) -> Any:
+        """Return the event of friction that is exceeded, from what is needed and there; all of it may slip at once."""
+        needed, available = balance(self.t, self.q, self.v)
+        if abs(needed) > (1.0 + RELEASED) * available:
+            raise Undetermined(f"friction of {abs(needed):.10g} is needed, but it has {available:.10g}")
+        fully_used = abs(needed) > (1.0 - AT_MOST) * available
+        margin = max(1.0, abs(needed) / available) * (1.0 + AT_MOST) if fully_used else 1.0
+
+        def reserve(t: float, q: Array, v: Array) -> float:
+            needed, available = balance(t, q, v)
+            return float(margin * available - abs(needed))
+
+        return reserve
+
+
+def untraced(options: dict[str, Any]) -> dict[str, Any]:
+    """Return the options that change for arcs with closed stops, whose callbacks cannot be traced."""
+    method = PRESETS["auto"] if isinstance(check_method(options["method"]), Taylor) else options["method"]
+    return {"method": method, "compiled": False}
+
+
+def terminal(event: Any) -> Any:
+    """Make an event terminal, with direction from positive to negative."""
+    event.terminal, event.direction = True, -1
+    return event
+
+
+SET_BY_MOTION = {"system", "t_span", "q0", "v0", "method", "rtol", "atol", "t_eval", "step_size"}
+SET_BY_MOTION |= {"events", "dense_output", "store"}
 
 
 def solve_with_stops(
@@ -91,20 +498,96 @@ def solve_with_stops(
     t0, t1 = check_span(t_span)
     q, v = check_vector("q0", q0, system.n_q), check_vector("v0", v0, system.n_q)
     stops = [stops] if isinstance(stops, Stop) else stops
-    if not isinstance(stops, (list, tuple)) or not stops or not all(isinstance(each, Stop) for each in stops):
+    if not isinstance(stops, (list, tuple)) or not stops or not all(isinstance(stop, Stop) for stop in stops):
         raise TypeError(f"stops must be a Stop or a list of them; given {shown(stops)}")
     options |= checked_options("solve_with_stops", options, method, rtol, atol, system.n_q)
     times = None if t_eval is None else check_times(t_eval, t0, t1, None)
-    return Motion(stops, Modes(system), t0, q, v, options).to(t1, times)
+    return Motion(stops, Modes(system), t0, q, v, options).integrate(t1, times)
 
 
 def checked_options(
     caller: str, options: dict[str, Any], method: str | Method, rtol: float, atol: ArrayLike, n_q: int
 ) -> dict[str, Any]:
     """Return options of runs that include method and tolerances; raise TypeError for unknown options."""
-    known = inspect.signature(solve_dae).parameters.keys() - OF_A_RUN
-    wrong = [name for name in options if name not in known]
-    if wrong:
-        raise TypeError(f"{caller} has no option {wrong[0]!r}; those of runs are {', '.join(sorted(known))}")
+    names = inspect.signature(solve_dae).parameters.keys() - SET_BY_MOTION
+    unknown = [name for name in options if name not in names]
+    if unknown:
+        raise TypeError(f"{caller} has no option {unknown[0]!r}; those of runs are {', '.join(sorted(names))}")
     check_positive("rtol", rtol)
     return {"method": method, "rtol": rtol, "atol": check_tolerance("atol", atol, n_q)}
+
+
+def solve_with_friction(
+    problem: ModelProblem,
+    t_span: tuple[float, float] | None = None,
+    method: str | Method = "auto",
+    rtol: float = 1e-8,
+    atol: ArrayLike = 1e-8,
+    *,
+    t_eval: ArrayLike | None = None,
+    **options: Any,
+) -> Result:
+    """Integrate a model with dry friction, and with its stops: joints slide, stop, stick, and are released.
+
+    The friction of a sliding joint is a constant force; a sticking joint is a constraint, released when its force
+    exceeds the static friction. When joints come to rest, their friction forces and the forces of closed stops are
+    the bounded minimum of F^T D F / 2 + c^T F, with c the joint accelerations without friction; joints stick where the
+    bound is not active. Impacts are those of `solve_with_stops`: load-independent friction causes no impulse, so an
+    impact may release sticking joints.
+
+    Parameters
+    ----------
+    problem : ModelProblem
+        Problem of a model with `dry_friction`; the run starts at its q0 and v0.
+    t_span : (float, float), optional
+        None: the time span of the problem.
+    method, rtol, atol
+        As for `solve_dae`. While stops are closed, "auto" takes the place of "Taylor", which cannot trace their forces.
+    t_eval : array_like, optional
+        Output times. None: the ends of steps.
+    **options
+        Further keyword arguments of `solve_dae`: max_step, compiled, time_limit (of each arc), ...
+
+    Returns
+    -------
+    Result
+        `.arcs` are the runs between changes of mode; the names of their systems contain the sticking joints and the
+        closed stops. `.impacts` as for `solve_with_stops`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is invalid, the model has no dry friction, or a joint with friction cannot slide independently.
+
+    Notes
+    -----
+    Mode changes are located like events, by checks four times per step and at least every two-thousandth of the motion:
+    a joint that reverses twice between two of these is missed; reduce `max_step` if needed.
+
+    Examples
+    --------
+    >>> from twoloop import solve_with_friction
+    >>> from twoloop.bodies import PlanarModel
+    >>> model = PlanarModel(name="block")
+    >>> block = model.box("block", (0.2, 0.1), mass=1.0, position=(0.0, 0.0), velocity=(1.0, 0.0))
+    >>> rail = model.prismatic("ground", block, at=(0.0, 0.0), axis=(1.0, 0.0))
+    >>> friction = model.dry_friction(rail, 2.0)
+    >>> result = solve_with_friction(model.problem((0.0, 1.0)))
+    >>> round(float(result.q[0, -1]), 6)  # v**2 / (2 a), m
+    0.25
+    """
+    from twoloop.bodies.model_problem import ModelProblem  # slow to import
+
+    if not isinstance(problem, ModelProblem):
+        raise TypeError(f"problem must be a model's problem, as returned by model.problem(); given {shown(problem)}")
+    if problem.model is None:
+        raise ValueError(f"{problem.name!r} came from another process without its model: make it again there")
+    if not problem.model.dry:
+        raise ValueError(
+            f"{problem.name!r} has no dry friction: add some with model.dry_friction(...), or use solve_dae"
+        )
+    t0, t1 = problem.t_span if t_span is None else check_span(t_span)
+    options |= checked_options("solve_with_friction", options, method, rtol, atol, problem.system.n_q)
+    times = None if t_eval is None else check_times(t_eval, t0, t1, None)
+    start = t0, problem.q0.copy(), problem.v0.copy()
+    return Motion(problem.stops, FrictionModes(problem), *start, options).integrate(t1, times)

@@ -1,0 +1,384 @@
+"""Compute contact forces and impulses, with Coulomb friction of stops or joints that slide or stick."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear, nnls
+
+from twoloop.checks.arguments import Array
+from twoloop.impacts.contact import Gap, Gaps
+from twoloop.problem.description import Stop
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.impulse import NEGLIGIBLE, scaled_equations
+
+if TYPE_CHECKING:
+    from twoloop.bodies.model_problem import ModelProblem
+
+EVEN_WEIGHT = 1e-6  # relative weight of the regularisation that distributes a shared load evenly
+SOLVER_SCALE = 1e3  # scales the problem so that its gradients exceed the tolerance of the solver
+MAX_SOLVER_ITERATIONS = 1000
+MAX_LOAD_ITERATIONS = 200  # fixed-point iterations of the loads that bound the friction ...
+LOAD_TOLERANCE = 1e-10  # ... until they change by less, relative to the largest
+OUTSIDE = 1e-9  # relative: smallest part of rates and accelerations outside the range of D; smaller ones are rounding
+CLOSING_TOLERANCE = 1e-6  # relative: largest rate or acceleration at which a stop may still close
+SLIDING_TOLERANCE = 1e-9  # relative to the terms of an acceleration: smaller accelerations are rounding
+
+
+class Undetermined(ValueError):
+    """No admissible distribution of the load among sticking joints and stops was found."""
+
+
+class Tangents(NamedTuple):
+    """Tangents of stops with friction: the rows of their normals, coefficients, directions of sliding (0: at rest)."""
+
+    normal: NDArray[np.int64]
+    coefficient: Array
+    sign: NDArray[np.int64]
+
+
+def responses(system: ConstrainedSystem, t: float, q: Array, W: Array) -> Array:
+    """Return the velocity changes (n_q, k) by unit impulses: M X + G^T Y = W^T with G X = 0, for all constraints."""
+    matrix, lengths, _ = scaled_equations(system, t, q)
+    right = np.vstack([W.T, np.zeros((len(lengths), len(W)))])
+    return np.asarray(np.linalg.lstsq(matrix, right, rcond=NEGLIGIBLE)[0][: system.n_q], dtype=float)
+
+
+def solve_complementarity(D: Array, b: Array) -> Array:
+    """Solve the linear complementarity problem x >= 0, D x + b >= 0, x^T (D x + b) = 0; D symmetric semidefinite.
+
+    x minimises x^T D x / 2 + b^T x: the non-negative least-squares problem |B x - y| with B^T B = D and B^T y = -b.
+    """
+    if not len(b):
+        return np.zeros(0)
+    x = nnls(*_squares(D, b))[0]
+    active = x > 0.0
+    x[active] = np.linalg.lstsq(D[np.ix_(active, active)], -b[active], rcond=NEGLIGIBLE)[0]
+    return np.maximum(x, 0.0)
+
+
+def solve_bounded(D: Array, c: Array, n: int, limit: Array) -> Array:
+    """Return forces that minimise x^T D x / 2 + c^T x subject to bounds: D x + c vanishes where no bound is active.
+
+    The first n, of stops, are non-negative; the others, of friction, are bounded by `limit`. The sum of x^2 / limit is
+    added with a small weight, so that a load that could be shared in any proportion is shared evenly.
+    """
+    tiny = np.finfo(np.float64).tiny
+    B, y = _squares(D, c)
+    size = np.sqrt(D.diagonal().max())
+    # scale of the forces, so that the unknowns are of order 1
+    unit = max(float(np.linalg.norm(y)) / size, NEGLIGIBLE * float(limit.max()), tiny)
+    bound = np.maximum(limit / unit, tiny)
+    regularisation = np.zeros((len(limit), len(c)))
+    regularisation[:, n:] = np.diag(EVEN_WEIGHT * np.sqrt(bound.min() / bound))
+    matrix, right = np.vstack([B / size, regularisation]), np.append(y / (size * unit), 0.0 * limit)
+    limits = np.append(np.zeros(n), -bound), np.append(np.full(n, np.inf), bound)
+    solution = lsq_linear(
+        SOLVER_SCALE * matrix, SOLVER_SCALE * right, limits, "bvls", tol=1e-14, max_iter=MAX_SOLVER_ITERATIONS
+    )
+    x, free = solution.x, solution.active_mask == 0
+    residual = (D @ x + c / unit)[free]  # caused by the small weight
+    x[free] -= np.linalg.lstsq(D[np.ix_(free, free)], residual, rcond=NEGLIGIBLE)[0]
+    return np.asarray(unit * np.clip(x, *limits))
+
+
+def holding_forces(D: Array, c: Array, n: int, limit: Array) -> Array:
+    """Return forces of n stops, and of joints that friction of at most `limit` holds, for free accelerations c."""
+    return solve_bounded(D, c, n, limit) if len(limit) else solve_complementarity(D, c)
+
+
+def coulomb_forces(D: Array, c: Array, limit: Array, tangents: Tangents) -> tuple[Array, NDArray[np.int64]]:
+    """Return forces at stops, in joints at rest, and at stops that rub; and the directions in which the latter slide.
+
+    The forces of stops are non-negative and complementary to the accelerations (or velocities) D x + c; friction
+    opposes sliding with its coefficient times the force of the stop, or is less than that at rest. These bounds follow
+    from the forces by fixed-point iteration; the state of each contact being known, the equations are then linear.
+    """
+    n_tangents = len(tangents.normal)
+    n = len(c) - len(limit) - n_tangents
+    tangent_rows = np.arange(len(c) - n_tangents, len(c))
+    moving = tangents.sign != 0
+    kept = np.setdiff1d(np.arange(len(c)), tangent_rows[moving])
+    x, tolerance = np.zeros(len(c)), NEGLIGIBLE * np.abs(c).max(initial=0.0) / D.diagonal().max(initial=1e-300)
+    for _ in range(MAX_LOAD_ITERATIONS):
+        new, load = np.zeros(len(c)), tangents.coefficient * x[tangents.normal]
+        new[tangent_rows] = -tangents.sign * load
+        right, bounds = (c + D @ new)[kept], np.append(limit, load[~moving])
+        D_kept = D[np.ix_(kept, kept)]
+        new[kept] = holding_forces(D_kept, right, n, bounds)
+        change, x = np.abs(new - x).max(), new
+        if change <= LOAD_TOLERANCE * np.abs(x).max() + tolerance:
+            break
+    else:
+        raise Undetermined("friction of stops is so large that their forces are not determined: they may jam")
+    acceleration, terms = D @ x + c, np.abs(D) @ np.abs(x) + np.abs(c)
+    if acceleration[:n].min(initial=0.0) < -CLOSING_TOLERANCE * np.abs(c).max(initial=0.0):
+        raise Undetermined("stops push against each other: no motion opens all of them or keeps them closed")
+    slides = np.where(
+        moving,
+        tangents.sign,
+        np.sign(acceleration[tangent_rows])
+        * (np.abs(acceleration[tangent_rows]) > SLIDING_TOLERANCE * terms[tangent_rows]),
+    ).astype(int)
+    return (
+        _solve_contacts(D, c, x, n, Tangents(tangents.normal, tangents.coefficient, slides)) if n_tangents else x
+    ), slides
+
+
+def _solve_contacts(D: Array, c: Array, x: Array, n: int, tangents: Tangents) -> Array:
+    """Solve the linear equations of contacts whose states are known; those of joints stay as they are."""
+    tangent_rows = np.arange(len(c) - len(tangents.normal), len(c))
+    pushes = np.append(x[:n] > 0.0, np.zeros(len(c) - n, dtype=bool))
+    loads = np.zeros((len(c), len(c)))  # x = loads y, where y are forces of stops and friction at rest
+    loads[pushes, pushes] = 1.0
+    loads[tangent_rows, tangents.normal] = -tangents.sign * tangents.coefficient * pushes[tangents.normal]
+    holds = pushes.copy()
+    holds[tangent_rows] = (tangents.sign == 0) & pushes[tangents.normal]
+    loads[holds, holds] = 1.0
+    A = (D @ loads)[np.ix_(holds, holds)]
+    if np.linalg.eigvals(A).real.min(initial=0.0) < -NEGLIGIBLE * np.abs(A).max(initial=0.0):
+        raise Undetermined("friction of stops is so large that their forces are not unique (P. Painlevé): they may jam")
+    fixed = np.where(pushes, 0.0, x)
+    fixed[tangent_rows] = 0.0
+    y = np.zeros(len(c))
+    y[holds] = np.linalg.lstsq(A, -(c + D @ fixed)[holds], rcond=NEGLIGIBLE)[0]
+    return np.asarray(loads @ y + fixed)
+
+
+def _squares(D: Array, b: Array) -> tuple[Array, Array]:
+    """Return B and y with B^T B = D and B^T y = -b.
+
+    Where rows of stops depend on one another, b may have a part outside the range of D: of parallel stops, which close
+    at different rates. B has a small row for it.
+    """
+    values, vectors = np.linalg.eigh(0.5 * (D + D.T))
+    components, threshold = vectors.T @ b, NEGLIGIBLE * values.max(initial=0.0)
+    kept = (values > threshold) | (np.abs(components) > OUTSIDE * np.abs(b).max(initial=0.0))
+    roots = np.sqrt(np.maximum(values[kept], threshold))
+    return roots[:, None] * vectors[:, kept].T, -components[kept] / roots
+
+
+def impulses(D: Array, u: Array, restitution: Array, tangents: Tangents) -> Array:
+    """Return the impulses at k stops, followed by those of friction, with rates u, by Moreau's law.
+
+    J. J. Moreau, Unilateral contact and dry friction in finite freedom dynamics, CISM 302 (1988): u+ + e u- >= 0, the
+    impulse is non-negative, and their product is zero; the impulse of friction opposes the rate of sliding after the
+    impact, and is at most the coefficient times the impulse. The energy does not increase without friction if all e
+    are equal; with friction it may where the rate of sliding is reversed (T. R. Kane, 1984), which is refused.
+    """
+    shift = np.append(restitution * u[: len(restitution)], 0.0 * tangents.coefficient)
+    P = coulomb_forces(D, u + shift, np.zeros(0), tangents)[0]
+    if len(tangents.normal) and P @ (u + 0.5 * (D @ P)) > NEGLIGIBLE * (np.abs(P) @ np.abs(u)):
+        raise Undetermined("an impact with friction would add energy by the law of impacts; use another restitution")
+    return P
+
+
+Signs = list[int | None]  # for each joint the sliding direction, or one of the following
+STICKS, IDLE = 0, None  # held by friction; already held by stops and other joints
+INDEPENDENT = 1e-9  # relative: smallest compliance of a joint with the others held, compared with a free joint
+
+
+class Modes:
+    """Provide the system of each mode; in this base class a system without friction, which has a single mode."""
+
+    def __init__(self, system: ConstrainedSystem):
+        self.system, self.n = system, 0
+        self.static = self.kinetic = np.zeros(0)
+        self.idle_friction: dict[int, float] = {}  # constant friction of IDLE joints
+
+    def along(self, q: Array, k: int | None = None) -> Array:
+        """Return the gradients of the joint displacements: none."""
+        return np.zeros((0, len(q)))
+
+    def free(self, signs: Signs, t: float, q: Array) -> ConstrainedSystem:
+        """Return the system."""
+        return self.system
+
+    def accelerations(self, signs: Signs, resting: list[int], t: float, q: Array, v: Array, a: Array) -> Array:
+        """Return the accelerations of joints at rest: none."""
+        return np.zeros(0)
+
+    def mode(self, signs: Signs, t: float, q: Array) -> tuple[ConstrainedSystem, dict[int, int]]:
+        """Return the system; there are no rows of sticking joints."""
+        return self.system, {}
+
+    def row_sign(self, k: int, system: ConstrainedSystem, row: int, t: float, q: Array) -> float:
+        """Return the sign of the row of a sticking joint relative to its sliding direction."""
+        return float(np.sign(system.jacobian(t, q)[row] @ self.along(q, k)))
+
+
+class FrictionModes(Modes):
+    """A model with dry friction in joints, each of which slides, with a sign, or sticks: 0.
+
+    Parameters
+    ----------
+    problem : ModelProblem
+
+    Raises ValueError if a joint cannot slide independently of the others.
+    """
+
+    def __init__(self, problem: ModelProblem):
+        assert problem.model is not None
+        super().__init__(problem.system)
+        self._problem, self._model, self._frictions = problem, problem.model, problem.model.dry
+        self.n, self.static = len(self._frictions), np.array([friction.static for friction in self._frictions])
+        self.kinetic = np.array([friction.kinetic for friction in self._frictions])
+        self._forces = [self._model.pull(friction, problem.parameters) for friction in self._frictions]
+        self._sliding_systems: dict[tuple[int | None, ...], ConstrainedSystem] = {}
+        self._check_independent(problem.t_span[0], problem.q0)
+
+    def along(self, q: Array, k: int | None = None) -> Array:
+        """Return the gradients of the joint displacements, (n, n_q); or of one joint, (n_q,)."""
+        if k is None:
+            return np.array([self.along(q, joint) for joint in range(self.n)])
+        return self._forces[k].force(0.0, q, np.zeros_like(q))
+
+    def _check_independent(self, t: float, q: Array) -> None:
+        """Raise unless each joint can slide while the others stick; otherwise the frictions are not determined."""
+        W = self.along(q)
+        D = W @ responses(self.system, t, q, W)
+        scale = (W**2).sum(axis=1) / float(np.abs(self.system.mass(t, q)).max())
+        for k, friction in enumerate(self._frictions):
+            D_before = D[:k, :k]
+            compliance = D[k, k] - D[k, :k] @ np.linalg.lstsq(D_before, D[:k, k], rcond=NEGLIGIBLE)[0]
+            if not compliance > INDEPENDENT * scale[k]:
+                others = ", ".join(repr(friction.name) for friction in self._frictions[:k])
+                raise ValueError(
+                    f"the joint of {friction.name!r} cannot slide by itself: drives or other joints hold it"
+                    f"{f', or its motion depends on {others}' if k else ''}, so that its friction is not determined "
+                    "while it sticks; remove it and assign all of the friction to another joint"
+                )
+
+    def free(self, signs: Signs, t: float, q: Array) -> ConstrainedSystem:
+        """Return the system with some joints sliding and the others without friction."""
+        key = tuple(signs)
+        if key not in self._sliding_systems:
+            self._sliding_systems[key] = self._build(self._problem.name, signs, {}, t, q)[0]
+        return self._sliding_systems[key]
+
+    def accelerations(self, signs: Signs, resting: list[int], t: float, q: Array, v: Array, a: Array) -> Array:
+        """Return the accelerations of joints at rest for given accelerations a of the coordinates."""
+        if not resting:
+            return np.zeros(0)
+        holding_forces, rows = self.mode(signs, t, q)
+        R, gamma = holding_forces.jacobian(t, q), holding_forces.gamma(t, q, v)
+        return np.array(
+            [self.row_sign(k, holding_forces, rows[k], t, q) * (R[rows[k]] @ a - gamma[rows[k]]) for k in resting]
+        )
+
+    def mode(self, signs: Signs, t: float, q: Array) -> tuple[ConstrainedSystem, dict[int, int]]:
+        """Return the system with some joints sliding and the others held in place, and the rows of the latter."""
+        if not {STICKS, IDLE} & set(signs):
+            return self.free(signs, t, q), {}
+        names = [friction.name for friction, sign in zip(self._frictions, signs, strict=True) if sign == STICKS]
+        gauge, rows = self._build("gauge", signs, dict.fromkeys(names, np.nan), t, q)
+        values, quarter = (gauge.constraint(t, q) for t in (0.0, 0.5 * np.pi)) if names else ((), ())
+        holding_forces = {}
+        for friction in (friction for friction in self._frictions if friction.name in names):
+            (row,) = rows[friction.name]
+            turns = self._model.dimension == 3 and friction.joint.kind == "revolute"  # its row is A cos t + B sin t
+            holding_forces[friction.name] = float(np.arctan2(-values[row], quarter[row]) if turns else values[row])
+        suffix = f", {', '.join(names)} sticks" if names else ""
+        system, rows = self._build(self._problem.name + suffix, signs, holding_forces, t, q)
+        return system, {
+            k: rows[friction.name][0] for k, friction in enumerate(self._frictions) if friction.name in names
+        }
+
+    def _build(
+        self, name: str, signs: Signs, holding_forces: dict[str, float], t: float, q: Array
+    ) -> tuple[ConstrainedSystem, dict[str, tuple[int, ...]]]:
+        forces = {
+            friction.name: -(sign or 0) * friction.kinetic
+            for friction, sign in zip(self._frictions, signs, strict=True)
+        }
+        forces |= {self._frictions[k].name: self.idle_friction[k] for k, sign in enumerate(signs) if sign is IDLE}
+        return self._model.mode(name, self._problem.parameters, forces, holding_forces, t, q)
+
+
+AT_REST = 1e-10  # relative to the largest velocities of the last arc: smaller rates count as zero
+COUPLING_TOLERANCE = 1e-6  # tolerance of the coefficients by which one displacement follows from another
+
+
+class Mode(NamedTuple):
+    """State of the contacts between two changes: directions of joints, closed stops, and which stops slide or stick.
+
+    Attributes
+    ----------
+    signs : list
+    resting : tuple of int
+    slips : dict
+        Direction of sliding by stop.
+    sticks : dict
+        By one stop of each group that sticks together, all stops of the group.
+    """
+
+    signs: Signs
+    resting: tuple[int, ...] = ()
+    slips: dict[int, int] = {}  # noqa: RUF012
+    sticks: dict[int, list[int]] = {}  # noqa: RUF012
+
+
+class StopFriction:
+    """Track which stops of a motion slide or stick.
+
+    Parameters
+    ----------
+    stops : sequence of Stop
+    t, q : float, ndarray (n_q,)
+    """
+
+    def __init__(self, stops: Sequence[Stop], t: float, q: Array):
+        self._stops = stops
+        with_friction = [k for k, stop in enumerate(stops) if stop.friction > 0.0]
+        self.place = {k: i for i, k in enumerate(with_friction)}
+        self.slides = Gaps("slide", [stops[k] for k in with_friction], t, q)
+        self.still: set[int] = set()  # stops that have come to rest or stick
+        self.released: set[int] = set()  # stops that stuck in the last arc
+
+    def rows(
+        self, closed: Sequence[int], t: float, q: Array, v: Array, speeds: Array
+    ) -> tuple[list[int], Gap, Tangents]:
+        """Return which of the closed stops have friction, their displacements, and how they slide."""
+        of = [k for k in closed if k in self.place]
+        every = self.slides.at(t, q, v)
+        made = Gap(*(each[[self.place[k] for k in of]] for each in every))
+        holding_forces = np.array([k in self.still or k in self.released for k in of], dtype=bool)
+        moves = ~holding_forces & (np.abs(made.u) > AT_REST * (np.abs(made.W) @ speeds))
+        signs = (np.sign(made.u) * moves).astype(int)
+        places = np.array([list(closed).index(k) for k in of], dtype=int)
+        return of, made, Tangents(places, np.array([self._stops[k].friction for k in of]), signs)
+
+    def coefficient(self, k: int) -> float:
+        """Return the coefficient of friction of a stop."""
+        return self._stops[k].friction
+
+    def groups(self, D: Array, base: list[int], rows: dict[int, int]) -> dict[int, list[int]]:
+        """Return stops that stick, in groups with one displacement; D has the rows `base`, and `rows` of the stops."""
+        groups: dict[int, list[int]] = {}
+        first: dict[int, int] = {}  # stop of a row
+        for k, row in rows.items():
+            weights = np.linalg.lstsq(D[np.ix_(base, base)], D[base, row], rcond=NEGLIGIBLE)[0]
+            if D[row, row] - D[row, base] @ weights > INDEPENDENT * D[row, row]:
+                base.append(row)
+                groups[k], first[row] = [k], k
+                continue
+            others = [i for i, weight in zip(base, weights, strict=True) if abs(weight) > COUPLING_TOLERANCE]
+            if (
+                len(others) != 1
+                or others[0] not in first
+                or abs(abs(weights[base.index(others[0])]) - 1.0) > COUPLING_TOLERANCE
+            ):
+                raise Undetermined(
+                    f"the friction of {self._stops[k].name!r} is not determined: other stops and joints hold it already"
+                )
+            groups[first[others[0]]].append(k)
+        return groups
+
+    def update(self, mode: Mode, ended: set[int]) -> None:
+        """Update which stops came to rest or were released, from those whose events ended the arc."""
+        self.released = {k for stop, group in mode.sticks.items() if stop in ended for k in group}
+        self.still = {k for stop, group in mode.sticks.items() if stop not in ended for k in group}
+        self.still |= mode.slips.keys() & ended
