@@ -25,9 +25,8 @@ from twoloop import Result
 from twoloop.mechanisms import Problem
 from twoloop.mechanisms.user_file import problem_from
 from twoloop.methods.code_for import is_small
-from twoloop.rows.calibration import CALIBRATION, calibration_s
 from twoloop.rows.leaderboard import boards
-from twoloop.rows.row_format import text_of
+from twoloop.rows.row_format import CALIBRATION, calibration_s, format_rows
 
 GROUP = "compare"
 FOLDER = "compare"  # of the report, unless --out is given
@@ -123,7 +122,7 @@ def report(
     rows = tables.medians(rows)
     columns = {"error": "error_q", "floor": "floor", "error_end": "error_over", "floor_end": "floor_over"}
     own = [in_format(run, columns, given["versions"]) for run in rows.to_dict("records")]
-    output.write("compare.jsonl", text_of(own))
+    output.write("compare.jsonl", format_rows(own))
     findings = findings_of(rows, case, errors)
     if output.call.redraw:  # without making the reference again
         findings |= {key: output.load_findings().get(key) for key in ("source", "published")}

@@ -9,7 +9,7 @@ import pytest
 from tests.problems import quick
 from twoloop import solve_dae
 from twoloop.__main__ import main
-from twoloop.audit import audit_mjcf, audit_simulator, mjcf_audit, step_audit
+from twoloop.audit import audit_mjcf, audit_simulator, mjcf, simulator
 from twoloop.bodies import PlanarModel
 
 FILE = """
@@ -108,8 +108,8 @@ class TestInMuJoCo:
             (x, R), apart = true(problem, error)
             return (x + 0.02 * np.linspace(0.0, 1.0, len(x))[:, None, None], R), apart
 
-        true = step_audit.reference
-        monkeypatch.setattr(step_audit, "reference", other)
+        true = simulator.reference
+        monkeypatch.setattr(simulator, "reference", other)
         made = audit_mjcf(file_with(tmp_path), error=1e-3, t_end=0.2)
         assert "Do not trust this audit" in str(made) and not made.advice
 
@@ -173,13 +173,13 @@ class TestInMuJoCo:
             model.bodies[1].inertia[0] *= 1.01
             return model
 
-        from_mjcf = mjcf_audit.from_mjcf
-        monkeypatch.setattr(mjcf_audit, "from_mjcf", other)
+        from_mjcf = mjcf.from_mjcf
+        monkeypatch.setattr(mjcf, "from_mjcf", other)
         with pytest.raises(ValueError, match=r"masses and inertias differ by .* of 'crank'"):
             audit_mjcf(file_with(tmp_path))
 
     def test_the_command_ends_with_one_line_and_a_status(self, tmp_path, capsys, monkeypatch):
-        monkeypatch.setattr(step_audit, "FINEST", 0.5)
+        monkeypatch.setattr(simulator, "FINEST", 0.5)
         path = file_with(tmp_path)
         with pytest.raises(SystemExit, match=r"--out takes a file that ends in .json or .csv; given"):
             main(["audit", str(path), "--out", str(tmp_path / "audit.txt")])

@@ -10,8 +10,8 @@ import pytest
 from twoloop import mechanisms
 from twoloop.__main__ import main
 from twoloop.rows import leaderboard, row_format
-from twoloop.rows.leaderboard import ARCHIVE, boards, chosen, seconds
-from twoloop.rows.row_format import FIELDS, mistakes, read_rows, text_of
+from twoloop.rows.leaderboard import ARCHIVE, boards, seconds, select_rows
+from twoloop.rows.row_format import FIELDS, find_errors, format_rows, read_rows
 
 ROW = {"schema": 1, "mechanism": "four_bar", "t_end": 10, "solver": "mine", "family": "me", "version": "3"}
 ROW |= {"processor": "abacus", "setting": "tol", "value": 1e-6, "status": "REACHED_END", "times_s": [0.1, 0.11, 0.09]}
@@ -47,7 +47,9 @@ def row(**more):
     ],
 )
 def test_a_mistake_is_named_by_line_and_field(more, says):
-    rows, found = mistakes(["", text_of([row()]), text_of([row(value=1e-7, **{}) | {}]), text_of([row(**more)])])
+    rows, found = find_errors(
+        ["", format_rows([row()]), format_rows([row(value=1e-7, **{}) | {}]), format_rows([row(**more)])]
+    )
     assert len(rows) == 2 and found and all(each.startswith("line 4: ") for each in found)
     assert any(says.replace("\\\\", "\\") in each for each in found), found
 
@@ -58,22 +60,24 @@ def test_a_mistake_is_named_by_line_and_field(more, says):
         ("{", 'given "{", expected a JSON object on a line of its own: '),
         (json.dumps(row(value=float("nan"))), "value: given NaN, expected a number > 0; leave out what is not known"),
         (json.dumps(row(times_s=[0.1, float("nan")])), "times_s: given [0.1, NaN], expected a list of numbers > 0"),
-        (text_of([row()])[:-2] + ',"t_end":3}', "t_end stands twice"),
-        (text_of([row(times_s=[5.0])]), "the run of line 1 again"),
+        (format_rows([row()])[:-2] + ',"t_end":3}', "t_end stands twice"),
+        (format_rows([row(times_s=[5.0])]), "the run of line 1 again"),
         ("[" * 100_000, "expected a JSON object"),
     ],
 )
 def test_lines_that_are_no_rows(line, says):
-    rows, found = mistakes([text_of([row()]), line])
+    rows, found = find_errors([format_rows([row()]), line])
     assert len(rows) == 1 and len(found) == 1 and found[0].startswith("line 2: ") and says in found[0]
 
 
 def test_files_are_checked_from_the_command_line(tmp_path, capsys, monkeypatch):
     good, bad, none = (tmp_path / name for name in ("good.jsonl.gz", "bad.jsonl", "none.jsonl"))
-    good.write_bytes(gzip.compress(text_of([row(), row(status="RAISED", times_s=[], error_end=..., value=1)]).encode()))
+    good.write_bytes(
+        gzip.compress(format_rows([row(), row(status="RAISED", times_s=[], error_end=..., value=1)]).encode())
+    )
     main(["rows", "check", str(good)])
     assert "2 good rows, of 1 solvers on 1 mechanisms" in capsys.readouterr().out
-    bad.write_text(30 * text_of([row(schema=0)]))
+    bad.write_text(30 * format_rows([row(schema=0)]))
     none.write_text("\n")
     with pytest.raises(SystemExit, match="1"):
         main(["rows", "check", str(good), str(bad)])
@@ -83,13 +87,13 @@ def test_files_are_checked_from_the_command_line(tmp_path, capsys, monkeypatch):
         with pytest.raises(ValueError, match=says):
             read_rows(path)
     mark = tmp_path / "mark.jsonl"
-    mark.write_bytes(b"\xef\xbb\xbf" + text_of([row(mechanism="fuor_bar")]).encode())
+    mark.write_bytes(b"\xef\xbb\xbf" + format_rows([row(mechanism="fuor_bar")]).encode())
     main(["rows", "check", str(mark)])
     assert "'fuor_bar' is taken for one of your own; the ready one is 'four_bar'" in capsys.readouterr().out
     with pytest.raises(SystemExit):
         main(["rows", "check", str(none)])
     assert "there is no row" in capsys.readouterr().out
-    monkeypatch.setattr(row_format, "LARGEST", 50)
+    monkeypatch.setattr(row_format, "MAX_BYTES", 50)
     with pytest.raises(ValueError, match=r"good\.jsonl\.gz cannot be read: more than 5e"):
         read_rows(good)
     monkeypatch.undo()
@@ -136,22 +140,22 @@ def test_the_rows_that_are_shipped(tmp_path):
     assert all(each["version"] not in ("", "unknown") for each in rows)
     ready = {name for name in mechanisms.__all__ if inspect.isfunction(getattr(mechanisms, name))}
     assert len(ready & {each["mechanism"] for each in rows}) >= 18
-    assert all(each["t_end"] == 100 for each in chosen(rows, "four_bar", 100.0))
-    here, *others = boards(chosen(rows, "four_bar", 10.0), 1e-6)
+    assert all(each["t_end"] == 100 for each in select_rows(rows, "four_bar", 100.0))
+    here, *others = boards(select_rows(rows, "four_bar", 10.0), 1e-6)
     assert not others and len(here.entries) > 20 and here.measure == "error_end"
 
 
 @pytest.fixture
 def small(tmp_path, monkeypatch):
     """An archive of two rows."""
-    (tmp_path / "small.jsonl").write_text(text_of([row(), row(t_end=100, processor="slate")]))
+    (tmp_path / "small.jsonl").write_text(format_rows([row(), row(t_end=100, processor="slate")]))
     monkeypatch.setattr(leaderboard, "ARCHIVE", tmp_path / "small.jsonl")
 
 
 @pytest.mark.usefixtures("small")
 def test_the_leaderboard(tmp_path, capsys):
     mine = tmp_path / "mine.jsonl"
-    mine.write_text(text_of([row(solver="yours", times_s=[1e-3] * 5, calibration="a", calibration_s=1e-2)]))
+    mine.write_text(format_rows([row(solver="yours", times_s=[1e-3] * 5, calibration="a", calibration_s=1e-2)]))
     main(["leaderboard", "--mechanism", "four_bar", "--t-end", "10", "--with", str(mine)])
     out = capsys.readouterr().out
     assert out.count("four_bar to 10 s") == 1 and "100 s" not in out and "time: CPU time of the whole call" in out

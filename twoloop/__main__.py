@@ -13,13 +13,13 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from twoloop import Result, __version__, kernels, mechanisms, solve_dae
-from twoloop.audit.mjcf_audit import audit_mjcf, check_ending
+from twoloop.audit.mjcf import audit_mjcf, check_ending
 from twoloop.checks.optional import needed
 from twoloop.kernels.compile.caches import folder_of
 from twoloop.mechanisms.user_file import problem_from
 from twoloop.methods.presets import PRESETS
 from twoloop.rows.leaderboard import leaderboard
-from twoloop.rows.row_format import SHOWN, mistakes, read_lines
+from twoloop.rows.row_format import MAX_ERRORS, find_errors, read_lines
 
 NEEDED = ("numpy", "scipy", "numba")
 OPTIONAL = ("pandas", "pyarrow", "matplotlib", "pillow", "rich", "sympy", "dask")
@@ -164,9 +164,9 @@ def check_rows(files: Sequence[Path]) -> None:
     """
     failed = False
     for file in files:
-        rows, wrong = mistakes(read_lines(file))
+        rows, wrong = find_errors(read_lines(file))
         failed |= bool(wrong) or not rows
-        for each in wrong[:SHOWN]:
+        for each in wrong[:MAX_ERRORS]:
             print(f"{file}: {each}")
         more = f", {len(wrong)} mistakes" if wrong else ""
         n_solvers, n_mechanisms = (len({row[name] for row in rows}) for name in ("solver", "mechanism"))

@@ -22,7 +22,7 @@ from studies.bench.collector import NOTHING_RUN, Run, Warm
 from studies.bench.progress import Progress
 from studies.bench.store import KeptRows, Row
 from studies.bench.tables import TIGHTEST
-from twoloop.rows.equal_error import DECADE, LOOSEST, NEAR
+from twoloop.rows.leaderboard import DECADE, LOOSEST, NEAR
 
 FAR = 20.0
 RUNNING = 2

@@ -13,7 +13,7 @@ from references.engines.rigid import Motion, Prepared, Rigid, coordinates, large
 from studies.bench.closed_loops import parallelogram, parallelogram_motion
 from studies.bench.store import Array, Row
 from twoloop import ConstraintWarning, solve_dae
-from twoloop.audit.poses import gaps
+from twoloop.audit.simulator import gaps
 from twoloop.bodies.model_problem import ModelProblem
 
 PARALLEL = parallelogram().name

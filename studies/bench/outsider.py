@@ -38,7 +38,7 @@ class Outsider:
     `where`: FILE.py:FUNCTION, or a file of `references.as_shown` by its name. `mechanism`: as `problem_from` takes it.
 
     `name`: in rows. `digest`: of the file. `calibrated`: s of the calibration beside the last call
-    (`twoloop.rows.calibration`).
+    (`twoloop.rows.row_format`).
 
     Raises StudyError if there is no such file, its header cannot be read or obeyed.
     """

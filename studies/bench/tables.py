@@ -11,7 +11,17 @@ from studies.bench.collector import NOTHING_RUN
 from studies.bench.names import label
 from studies.bench.render import number, power
 from studies.bench.store import Array
-from twoloop.rows.equal_error import DECADE, FEWEST, INTERVAL, LEAST, Runs, cheapest, cost_at, place_of, resampled
+from twoloop.rows.leaderboard import (
+    DECADE,
+    FEWEST,
+    INTERVAL,
+    LEAST,
+    Runs,
+    bootstrap_medians,
+    cheapest_run,
+    interpolate_cost,
+    locate_target,
+)
 
 SETTINGS = ("err_out", "h", "tol")  # a procedure along err_out has a tol, too, which does not vary
 
@@ -128,8 +138,8 @@ def time_for(rows: pd.DataFrame, target: float, what: str = "call_s") -> float:
     where the target is below what the reference resolves.
     """
     runs = runs_with(rows, what)
-    place = place_of(runs, target)
-    return float("nan") if place is None else float(cost_at(runs.of(what), place))
+    place = locate_target(runs, target)
+    return float("nan") if place is None else float(interpolate_cost(runs.column(what), place))
 
 
 Costs = dict[str, tuple[float, Array]]  # by solver the time at an error, and draws of it (RESAMPLES,)
@@ -144,15 +154,18 @@ def costs_at(rows: pd.DataFrame | Mapping[str, Runs], target: float, doubt: bool
     """
     found = {}
     for solver, runs in (by_solver(rows, "call_s") if isinstance(rows, pd.DataFrame) else rows).items():
-        place = place_of(runs, target, unasked=True)
+        place = locate_target(runs, target, include_unaimed=True)
         if place is None:
             continue
-        if doubt and place_of(runs, target) is None:
+        if doubt and locate_target(runs, target) is None:
             n_good = place[0]
-            place = n_good + (n_good < len(runs.errors) and not runs.of("astray")[n_good]), None
-        costs, drawn = runs.of("call_s"), runs.drawn
+            place = n_good + (n_good < len(runs.errors) and not runs.column("astray")[n_good]), None
+        costs, drawn = runs.column("call_s"), runs.resamples
         known = not np.isnan(drawn[np.argmin(costs[: place[0]])]).any()  # of the cheapest
-        found[solver] = float(cost_at(costs, place)), cost_at(drawn if known else np.nan * drawn, place)
+        found[solver] = (
+            float(interpolate_cost(costs, place)),
+            interpolate_cost(drawn if known else np.nan * drawn, place),
+        )
     return found
 
 
@@ -171,7 +184,7 @@ def near_misses(rows: pd.DataFrame, target: float) -> Costs:
 def each_run(runs: pd.DataFrame) -> Costs:
     """What runs take, each by itself: no solver's name, but that of the row."""
     times = runs["times"] if "times" in runs else len(runs) * [()]
-    costs = zip(runs["call_s"].astype(float), resampled(times), strict=True)
+    costs = zip(runs["call_s"].astype(float), bootstrap_medians(times), strict=True)
     return {f"row {k}": cost for k, cost in zip(runs.index, costs, strict=True)}
 
 
@@ -211,9 +224,9 @@ def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
     lines = []
     for solver, runs in by_solver(rows, *COSTS).items():
         ours = len(runs.rows) > 0 and told["family"][runs.rows[0]] == "two-loop"
-        if (place := place_of(runs, target, unasked=ours)) is not None:
-            run = {name: column[cheapest(runs, place)] for name, column in told.items()}
-            line = run | {what: float(cost_at(runs.of(what), place)) for what in COSTS}
+        if (place := locate_target(runs, target, include_unaimed=ours)) is not None:
+            run = {name: column[cheapest_run(runs, place)] for name, column in told.items()}
+            line = run | {what: float(interpolate_cost(runs.column(what), place)) for what in COSTS}
             lines.append(line | {"solver": solver, "setting": setting(run)})
     return pd.DataFrame(lines, columns=["solver", *RANKED, "setting"]).sort_values("call_s", ignore_index=True)
 

@@ -12,7 +12,7 @@ from studies.bench.closed_loops import LIGHTER
 from studies.bench.end_states import EXACT
 from studies.bench.engine_runs import LIMIT
 from studies.bench.render import number, power
-from twoloop.audit.step_audit import LOST, order_and_floor
+from twoloop.audit.simulator import LOST, order_and_floor
 
 GATE, RUN, MASS = "gate", "run", "mass"  # groups of rows
 ERRORS = (1e-2, 1e-3, 1e-4, 1e-6)

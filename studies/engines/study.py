@@ -22,7 +22,7 @@ from studies.bench.store import Output, Row
 from studies.bench.study import Study
 from studies.engines import findings
 from studies.engines.findings import CONFIGURATIONS, GATE, MASS, NAMES, OURS, RUN, TIGHT, Configuration
-from twoloop.audit.step_audit import LOST
+from twoloop.audit.simulator import LOST
 
 N_STEPS = (100, 200, 500, 1500, 5000, 15_000, 50_000, 150_000)  # multiples of INSTANTS
 TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)

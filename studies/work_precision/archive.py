@@ -18,7 +18,7 @@ from studies.compare import GROUP as LENGTH
 from studies.work_precision.mechanisms import GROUP
 from studies.work_precision.study import with_one_name
 from twoloop.rows.leaderboard import ARCHIVE
-from twoloop.rows.row_format import Row, text_of
+from twoloop.rows.row_format import Row, format_rows
 
 MEASURED = {  # what the errors of a group are
     GROUP: {"error_end": "error_q", "floor_end": "floor"},
@@ -38,7 +38,9 @@ def archived(rows: pd.DataFrame, versions: dict[str, str]) -> list[Row]:
 def made_of(folder: Path) -> str:
     """Write the archive of the rows in a folder of reports, as text."""
     rows, _ = read_rows(folder / "work_precision.csv", "group", "case", "solver", "t_end")
-    return text_of(archived(with_one_name(rows), json.loads((folder / "work_precision.json").read_text())["versions"]))
+    return format_rows(
+        archived(with_one_name(rows), json.loads((folder / "work_precision.json").read_text())["versions"])
+    )
 
 
 def main(words: Sequence[str] | None = None) -> None:

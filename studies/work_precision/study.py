@@ -34,7 +34,7 @@ from studies.bench.store import KeptRows, Output
 from studies.compare import runs_of
 from studies.work_precision import first_calls, mechanisms, minimal, processors
 from studies.work_precision.mechanisms import HEADLINE, RESOLVED
-from twoloop.rows.calibration import CALIBRATION, calibration_s
+from twoloop.rows.row_format import CALIBRATION, calibration_s
 
 ERRORS = (1e-2, 1e-4, 1e-6)  # between which runs over whole motions are made
 FURTHER = ("Gauss6", IRK_LINE, QUARTER, IDA_INDEX_1)

@@ -13,7 +13,7 @@ from studies.bench import closed_loops
 from studies.bench.closed_loops import ASKEW, LIGHTENED, SPATIAL
 from studies.bench.engine_runs import Loop, errors, gate
 from twoloop import audit
-from twoloop.audit.poses import gaps
+from twoloop.audit.simulator import gaps
 from twoloop.bodies import PlanarModel, SpatialModel
 from twoloop.bodies.parameter_layout import TORSION
 

@@ -11,7 +11,7 @@ from studies.work_precision import archive
 from studies.work_precision.study import with_one_name
 from twoloop import mechanisms
 from twoloop.rows.leaderboard import ARCHIVE
-from twoloop.rows.row_format import mistakes, read_lines, text_of
+from twoloop.rows.row_format import find_errors, format_rows, read_lines
 
 AGAIN = "make it again by python -m studies.work_precision.archive"
 
@@ -19,10 +19,10 @@ AGAIN = "make it again by python -m studies.work_precision.archive"
 def test_the_archive_is_of_the_rows_of_the_report():
     rows = with_one_name(read_rows(REPORTS / "work_precision.csv")[0])
     kept = [line for line in read_lines(ARCHIVE) if '"mechanism":"four_bar_second"' in line]
-    versions = {row["family"]: row["version"] for row in mistakes(kept)[0] if row["family"] != "two-loop"}
+    versions = {row["family"]: row["version"] for row in find_errors(kept)[0] if row["family"] != "two-loop"}
     versions |= {package_of(family): version for family, version in versions.items()}
     made = archive.archived(rows[rows["case"] == "four-bar, second"], versions)
-    assert text_of(made).splitlines() == kept, AGAIN
+    assert format_rows(made).splitlines() == kept, AGAIN
     runs = rows[rows["group"].isin(archive.MEASURED)]
     settings = ["case", "group", "solver", "tol", "h", "err_out", "t_end"]
     assert len(runs.drop_duplicates(settings)) == len([line for line in read_lines(ARCHIVE) if line]), AGAIN

@@ -60,7 +60,7 @@ def test_the_page_of_the_docs_runs_outside_the_repository(file, code, monkeypatc
     assert len(mine) == 3 and all(row["calibration_s"] > 0.0 and row["evaluations"] > 0 for row in mine)
     assert mine[-1]["error"] < 1e-5 and "keeps_constraints" not in mine[0] and mine[0]["mechanism"] == "swing"
     elsewhere = file.parent / "elsewhere.jsonl"
-    elsewhere.write_text(row_format.text_of(row | {"processor": "abacus"} for row in own))
+    elsewhere.write_text(row_format.format_rows(row | {"processor": "abacus"} for row in own))
     compare.main([*again, "--with", str(elsewhere)])
     assert "swing to 0.512345 s, error 0.001 over the motion, m or rad; abacus" in (out / "compare.md").read_text()
     for words, says in (

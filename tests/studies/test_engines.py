@@ -13,7 +13,7 @@ from studies.bench.engine_runs import Loop
 from studies.bench.render import render
 from studies.engines import study as engines
 from twoloop.audit import audit_mjcf
-from twoloop.audit.step_audit import order_and_floor
+from twoloop.audit.simulator import order_and_floor
 
 STEPS = np.array([1e-2, 3e-3, 1e-3, 3e-4])
 RUNS = {"family": "MuJoCo", "status": "REACHED_END", "message": "", "floor": 1e-11, "gap": 1e-6, "span": 1.0}

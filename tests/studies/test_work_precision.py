@@ -20,7 +20,7 @@ from studies.bench.store import KeptRows
 from studies.work_precision import first_calls, mechanisms, minimal, processors, study
 from tests.studies.of_study import median
 from twoloop.mechanisms import andrews
-from twoloop.rows.equal_error import LOOSEST
+from twoloop.rows.leaderboard import LOOSEST
 
 FOUR_BAR, N = mechanisms.HEADLINE, len(mechanisms.RESOLVED)
 ANGLES, *_, CVODE = MINIMAL

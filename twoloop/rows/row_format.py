@@ -1,28 +1,60 @@
-"""Format of rows: one solver at one setting on one mechanism, as a JSON object on a line of its own."""
+"""Exchange format of rows: one solver at one setting on one mechanism, as a JSON object on a line of its own."""
 
 import gzip
 import json
 import math
 import re
+import time
 import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+# The calibration is timed along with solver calls, which makes times on different machines comparable: steps of the
+# classical Runge-Kutta method on a pendulum with its multiplier. Like a solver in Python, it spends its time in calls
+# and small arrays; it does not depend on the version of a solver. Machine code scales differently between processors,
+# and versions of Python differ in speed: rows contain both.
+CALIBRATION = "rk4-pendulum-1"  # rename whenever `calibration_s` changes
+STEPS = 200
+REPEATS = 3  # the fastest counts
+
 SCHEMA = 1
 REACHED_END = "REACHED_END"
 SETTINGS = ("tol", "h", "err_out")
-LONGEST = 500  # characters of a text
-LARGEST = 10**9  # bytes of a file, uncompressed, as a guard against decompression bombs
-SHOWN = 20  # errors listed in an exception
+MAX_CHARACTERS = 500  # characters of a text
+MAX_BYTES = 10**9  # bytes of a file, uncompressed, as a guard against decompression bombs
+MAX_ERRORS = 20  # errors listed in an exception
 IDENTITY = ("mechanism", "t_end", "solver", "version", "processor", "setting", "value")  # identifies a run
 
 TEXT = "printable text"
-TRIMMED = f"no blanks around it, at most {LONGEST} letters"
+TRIMMED = f"no blanks around it, at most {MAX_CHARACTERS} letters"
 _NO_LETTER = re.compile("[^A-Z]+")
 
 Row = dict[str, Any]
+
+
+def _rate(state: NDArray[np.float64]) -> NDArray[np.float64]:
+    q, v = state[:2], state[2:]
+    matrix = np.array([[1.0, 0.0, q[0]], [0.0, 1.0, q[1]], [q[0], q[1], 0.0]])
+    return np.concatenate([v, np.linalg.solve(matrix, np.array([0.0, -9.81, -(v @ v)]))[:2]])
+
+
+def calibration_s() -> float:
+    """Return the CPU time of the calibration, s: the minimum of three repetitions."""
+    times = []
+    for _ in range(REPEATS):
+        state, h, began = np.array([1.0, 0.0, 0.0, 0.0]), 0.01, time.process_time()
+        for _ in range(STEPS):
+            first = _rate(state)
+            second = _rate(state + 0.5 * h * first)
+            third = _rate(state + 0.5 * h * second)
+            state = state + h / 6.0 * (first + 2.0 * (second + third) + _rate(state + h * third))
+        times.append(time.process_time() - began)
+    return min(times)
 
 
 @dataclass(frozen=True)
@@ -53,7 +85,7 @@ def _number(value: Any) -> bool:
 
 
 def _printable(value: Any) -> bool:
-    return isinstance(value, str) and value.isprintable() and value != "" and len(value) <= LONGEST
+    return isinstance(value, str) and value.isprintable() and value != "" and len(value) <= MAX_CHARACTERS
 
 
 def _name(value: Any) -> bool:
@@ -81,7 +113,7 @@ def _flag(about: str) -> Field:
 
 
 def _times(value: Any) -> bool:
-    return isinstance(value, list) and all(_number(each) and each > 0 for each in value)
+    return isinstance(value, list) and all(_number(time) and time > 0 for time in value)
 
 
 FIELDS: dict[str, Field] = {
@@ -122,7 +154,7 @@ FIELDS: dict[str, Field] = {
 }
 
 
-def mistakes(lines: Iterable[str]) -> tuple[list[Row], list[str]]:
+def find_errors(lines: Iterable[str]) -> tuple[list[Row], list[str]]:
     """Return the valid rows in lines of text, and the errors: line, field, given and expected value.
 
     Returns
@@ -131,44 +163,45 @@ def mistakes(lines: Iterable[str]) -> tuple[list[Row], list[str]]:
         Rows of the lines without errors; null fields are omitted.
     list of str
     """
-    rows, found, seen = [], [], dict[tuple[Any, ...], int]()
+    rows, errors, first_lines = [], [], dict[tuple[Any, ...], int]()
     for number, line in enumerate(lines, 1):
         if not line.strip():
             continue
-        row, wrong = _row(line)
-        if not wrong:
+        row, row_errors = _parse_row(line)
+        if not row_errors:
             key = tuple(row[name] for name in IDENTITY)
-            first = seen.setdefault(key, number)
+            first = first_lines.setdefault(key, number)
             if first != number:
-                what = ", ".join(f"{name} {row[name]}" for name in IDENTITY)
-                wrong = [f"the run of line {first} again ({what}); put the times of all repetitions into one row"]
-        found += [f"line {number}: {each}" for each in wrong]
-        rows += [] if wrong else [row]
-    return rows, found
+                identity = ", ".join(f"{name} {row[name]}" for name in IDENTITY)
+                row_errors = [
+                    f"the run of line {first} again ({identity}); put the times of all repetitions into one row"
+                ]
+        errors += [f"line {number}: {error}" for error in row_errors]
+        rows += [] if row_errors else [row]
+    return rows, errors
 
 
-def _row(line: str) -> tuple[Row, list[str]]:
+def _parse_row(line: str) -> tuple[Row, list[str]]:
     """Return the row of a line, and its errors."""
     try:
-        given = json.loads(line, object_pairs_hook=_once)
+        fields = json.loads(line, object_pairs_hook=_unique_fields)
     except (ValueError, RecursionError) as error:
-        return {}, [f"given {_shown(line.strip())}, expected a JSON object on a line of its own: {error}"]
-    if not isinstance(given, dict):
-        return {}, [f"given {_shown(given)}, expected a JSON object on a line of its own"]
-    if not FIELDS["schema"].holds(given.get("schema")):
-        said = f"given {_shown(given['schema'])}" if "schema" in given else "missing"
-        return {}, [f"schema: {said}, expected {SCHEMA}, which this version of twoloop reads"]
-    row = {name: value for name, value in given.items() if value is not None}
-    wrong = [f"{name}: there is no such field; fields are {', '.join(FIELDS)}" for name in row if name not in FIELDS]
-    wrong += [
-        f"{name}: missing, expected {each.expected}" for name, each in FIELDS.items() if each.needed and name not in row
+        return {}, [f"given {_format_value(line.strip())}, expected a JSON object on a line of its own: {error}"]
+    if not isinstance(fields, dict):
+        return {}, [f"given {_format_value(fields)}, expected a JSON object on a line of its own"]
+    if not FIELDS["schema"].holds(fields.get("schema")):
+        value = f"given {_format_value(fields['schema'])}" if "schema" in fields else "missing"
+        return {}, [f"schema: {value}, expected {SCHEMA}, which this version of twoloop reads"]
+    row = {name: value for name, value in fields.items() if value is not None}
+    errors = [f"{name}: there is no such field; fields are {', '.join(FIELDS)}" for name in row if name not in FIELDS]
+    missing = [name for name, field in FIELDS.items() if field.needed and name not in row]
+    errors += [f"{name}: missing, expected {FIELDS[name].expected}" for name in missing]
+    errors += [
+        f"{name}: given {_format_value(row[name])}, expected {_expected(name, row[name])}"
+        for name, field in FIELDS.items()
+        if name in row and not field.holds(row[name])
     ]
-    wrong += [
-        f"{name}: given {_shown(row[name])}, expected {_expected(name, row[name])}"
-        for name, each in FIELDS.items()
-        if name in row and not each.holds(row[name])
-    ]
-    return row, wrong or list(_joint_errors(row))
+    return row, errors or list(_joint_errors(row))
 
 
 def _joint_errors(row: Row) -> Iterable[str]:
@@ -192,19 +225,19 @@ def _expected(name: str, given: Any) -> str:
         return f"{REACHED_END} in these letters, or what happened instead"
     if isinstance(given, str) and FIELDS[name].expected == TEXT:
         return f"{TEXT}, {TRIMMED}"
-    unknown = "; leave out what is not known" if isinstance(given, float) and not math.isfinite(given) else ""
-    return f"{FIELDS[name].expected}{unknown}"
+    hint = "; leave out what is not known" if isinstance(given, float) and not math.isfinite(given) else ""
+    return f"{FIELDS[name].expected}{hint}"
 
 
-def _once(pairs: list[tuple[str, Any]]) -> Row:
-    made = dict(pairs)
-    if len(made) < len(pairs):
+def _unique_fields(pairs: list[tuple[str, Any]]) -> Row:
+    fields = dict(pairs)
+    if len(fields) < len(pairs):
         names = [name for name, _ in pairs]
         raise ValueError(f"{next(name for name in names if names.count(name) > 1)} stands twice")
-    return made
+    return fields
 
 
-def _shown(value: Any) -> str:
+def _format_value(value: Any) -> str:
     text = json.dumps(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
@@ -216,9 +249,9 @@ def read_lines(path: Path) -> list[str]:
     """
     try:
         with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
-            data = file.read(LARGEST + 1)
-        if len(data) > LARGEST:
-            raise ValueError(f"more than {LARGEST:.0e} bytes; divide it")
+            data = file.read(MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
+            raise ValueError(f"more than {MAX_BYTES:.0e} bytes; divide it")
         return data.decode("utf-8-sig").split("\n")  # optional byte order mark
     except (OSError, EOFError, ValueError, zlib.error) as error:
         raise ValueError(f"{path} cannot be read: {error}") from None
@@ -229,15 +262,15 @@ def read_rows(path: Path) -> list[Row]:
 
     Raises ValueError if it cannot be read, has no rows, or a row is invalid.
     """
-    rows, wrong = mistakes(read_lines(path))
-    if wrong:
-        more = [f"... and {len(wrong) - SHOWN} more"] if len(wrong) > SHOWN else []
-        raise ValueError("\n".join([f"{path} is not in the format of rows:", *wrong[:SHOWN], *more]))
+    rows, errors = find_errors(read_lines(path))
+    if errors:
+        remainder = [f"... and {len(errors) - MAX_ERRORS} more"] if len(errors) > MAX_ERRORS else []
+        raise ValueError("\n".join([f"{path} is not in the format of rows:", *errors[:MAX_ERRORS], *remainder]))
     if not rows:
         raise ValueError(f"{path} has no rows")
     return rows
 
 
-def text_of(rows: Iterable[Row]) -> str:
+def format_rows(rows: Iterable[Row]) -> str:
     """Return rows as the lines of a file."""
     return "".join(json.dumps(row, separators=(",", ":"), ensure_ascii=False, allow_nan=False) + "\n" for row in rows)
