@@ -3,8 +3,7 @@
     python -m studies.bench_commits BASE [--head COMMIT] [--short]
 
 Each commit gets a work tree of its own, and a process that compiles its own kernels there (minutes, the first time);
-without --head the second is the folder as it is. Time is CPU time of the process; instructions are counted where the
-machine lets a process count its own.
+without --head the second is the folder as it is. Time is CPU time of the process.
 """
 
 import argparse
@@ -81,24 +80,21 @@ def _ask(side: str, process: subprocess.Popen[str], name: str) -> dict[str, Any]
 
 
 def compared(measured: Mapping[str, Measured], sides: tuple[str, str]) -> Iterator[list[Any]]:
-    """Lines of the table: benchmark, medians of both sides in µs, their ratio, instructions and counts of both."""
+    """Lines of the table: benchmark, medians of both sides in µs, their ratio, and counts of both."""
     for name in measured[sides[0]]:
         cells: list[Any] = [name]
         both = [measured[side][name] for side in sides]
         errors = [next((each["error"] for each in runs if "error" in each), "") for runs in both]
         if any(errors):
-            yield [*cells, *(error.split(":")[0] or "ran" for error in errors), "–", "–", "–"]
+            yield [*cells, *(error.split(":")[0] or "ran" for error in errors), "–", "–"]
             continue
         times = [median(each["cpu"] for each in runs) for runs in both]
         ratio = times[1] / times[0] if times[0] else float("nan")
         verdict = "=" if abs(ratio - 1.0) < NOISE else number(ratio)
-        counted = [[each["instructions"] for each in runs if each["instructions"] is not None] for runs in both]
-        instructions = " → ".join(number(median(values), 4) for values in counted if all(counted))
         old, new = (runs[-1]["counts"] for runs in both)
         before = {what: "" if old == new else f"{old.get(what, '–')} → " for what in new}
         counts = ", ".join(f"{before[what]}{value} {what}" for what, value in new.items())
-        cells += [*(number(1e6 * value) for value in times), verdict]
-        yield [*cells, instructions or "not counted here", counts or "–"]
+        yield [*cells, *(number(1e6 * value) for value in times), verdict, counts or "–"]
 
 
 @contextmanager
@@ -131,7 +127,7 @@ def _work(words: Sequence[str] | None) -> None:
         folders = {given.base: stack.enter_context(work_tree(given.base))}
         folders[sides[1]] = stack.enter_context(work_tree(given.head)) if given.head else ROOT
         measured = measure(folders, names, rounds)
-    header = ["benchmark", f"{sides[0]} (µs)", f"{sides[1]} (µs)", "ratio", "instructions", "counts"]
+    header = ["benchmark", f"{sides[0]} (µs)", f"{sides[1]} (µs)", "ratio", "counts"]
     print(table(header, compared(measured, sides)))
     print(f"\nFour-bar, 10 s, tolerance 1e-8; medians of {rounds}, interleaved; =: within {100 * NOISE:g} %.")
 

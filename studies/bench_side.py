@@ -6,10 +6,7 @@ Each line of the input is the name of a benchmark, each line of the output what 
 needs nothing of the commit but `solve_dae` and `mechanisms.four_bar`, so that it runs on old commits.
 """
 
-import ctypes
 import json
-import platform
-import struct
 import sys
 import time
 from collections.abc import Callable
@@ -20,34 +17,13 @@ TOLERANCE = 1e-8
 T_END = 10.0  # s of motion
 WARM_UP = 0.1
 SOL_POINTS = 10_000
-PERF_EVENT_OPEN = {"x86_64": 298, "aarch64": 241}  # number of the system call
-EXCLUDED = 0b1100000  # kernel and hypervisor
-
-
-class Instructions:
-    """A counter of the instructions of this process in user space; `None` everywhere where the machine has none."""
-
-    def __init__(self) -> None:
-        self.file = None
-        number = PERF_EVENT_OPEN.get(platform.machine())
-        if number is None or platform.system() != "Linux":
-            return
-        # struct perf_event_attr: hardware event 1, instructions retired
-        attributes = struct.pack("IIQQQQQ", 0, 112, 1, 0, 0, 0, EXCLUDED) + bytes(112 - 48)
-        handle = ctypes.CDLL(None, use_errno=True).syscall(number, attributes, 0, -1, -1, 0)
-        if handle >= 0:
-            self.file = open(handle, "rb", buffering=0)  # noqa: SIM115  (for the life of the process)
-
-    def read(self) -> int | None:
-        """Instructions so far."""
-        return None if self.file is None else struct.unpack("Q", self.file.read(8))[0]
 
 
 Measured = tuple[dict[str, int], int, float | None]
 
 
 def benchmarks(solve_dae: Callable[..., Any], problem: Any) -> dict[str, Callable[[], Measured]]:
-    """By name, functions that return counts, by how many units time and instructions are divided, and the time.
+    """By name, functions that return counts, by how many units the time is divided, and the time.
 
     The time is that of the integration, without the checks of the input; None: that of the call.
     """
@@ -86,7 +62,7 @@ def main() -> None:
     from twoloop import solve_dae
     from twoloop.mechanisms import four_bar
 
-    problem, counter, warm = four_bar(), Instructions(), set()
+    problem, warm = four_bar(), set()
     made = benchmarks(solve_dae, problem)
     solve_dae(problem.system, (0.0, WARM_UP), problem.q0, problem.v0)
     started = time.process_time() - began
@@ -94,16 +70,15 @@ def main() -> None:
         name = line.strip()
         try:
             if name == "compile":
-                answer: dict[str, Any] = {"cpu": started, "instructions": None, "counts": {}}
+                answer: dict[str, Any] = {"cpu": started, "counts": {}}
             else:
                 if name not in warm:
                     made[name]()
                     warm.add(name)
-                before, began = counter.read(), time.process_time()
+                began = time.process_time()
                 counts, units, seconds = made[name]()
-                cpu, after = time.process_time() - began if seconds is None else seconds, counter.read()
-                instructions = None if before is None or after is None else (after - before) / units
-                answer = {"cpu": cpu / units, "instructions": instructions, "counts": counts}
+                cpu = time.process_time() - began if seconds is None else seconds
+                answer = {"cpu": cpu / units, "counts": counts}
         except Exception as error:  # a method that one of the commits does not have, or a run that fails there
             answer = {"error": f"{type(error).__name__}: {error}"}
         print(json.dumps(answer), flush=True)

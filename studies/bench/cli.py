@@ -34,6 +34,11 @@ class Call:
     out: Path  # folder of the report
     redraw: bool  # make report and figures again from the saved rows
     command: str  # for the stamp
+    only: tuple[str, ...] = ()  # groups and solvers whose rows are measured again, beside the saved rows of the others
+
+    def wants(self, *names: str) -> bool:
+        """Return whether rows of a group or solver of one of these names are to be made."""
+        return not self.only or any(name in self.only for name in names)
 
 
 def parser(
@@ -54,12 +59,16 @@ def call_of(name: str, given: argparse.Namespace, words: Sequence[str] | None) -
     """The call that a parsed command line stands for."""
     out = given.out or (REPORTS / "quick" if given.quick else REPORTS)
     command = " ".join(["python -m", f"studies.{name}", *(sys.argv[1:] if words is None else words)])
-    return Call(name, given.quick, out, given.redraw, command)
+    return Call(name, given.quick, out, given.redraw, command, tuple(getattr(given, "only", None) or ()))
 
 
-def parse(name: str, description: str | None, words: Sequence[str] | None) -> Call:
-    """Read the command line of a study that has the common options only."""
-    return call_of(name, parser(name, description).parse_args(words), words)
+def parse(name: str, description: str | None, words: Sequence[str] | None, parts: bool = False) -> Call:
+    """Read the command line of a study that has the common options, and `--only` if it can measure parts again."""
+    made = parser(name, description)
+    if parts:
+        what = "measure the rows of these groups or solvers again, as the CSV file names them; the others stay"
+        made.add_argument("--only", nargs="+", metavar="NAME", help=what)
+    return call_of(name, made.parse_args(words), words)
 
 
 def main(work: Callable[[Sequence[str] | None], None], words: Sequence[str] | None = None) -> None:

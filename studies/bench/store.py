@@ -162,7 +162,7 @@ class Output:
 
     def kept(self, settings: Mapping[str, Any] | None = None) -> "KeptRows":
         """The rows of an unfinished run of this study; `settings`: what they depend on beside sources and keys."""
-        depends = {"study": self.call.study, "quick": self.call.quick, **(settings or {})}
+        depends = {"study": self.call.study, "quick": self.call.quick, "only": self.call.only, **(settings or {})}
         return KeptRows(self.file(f"{self.call.study}.partial.jsonl"), depends)
 
     def _kind(self) -> str:

@@ -1,15 +1,18 @@
 """A study, from its command line to the index: rows, then findings, figures, tables and the report."""
 
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
 from studies.bench import cli, figures, tables
+from studies.bench.cli import Call, StudyError
 from studies.bench.collector import Measure, Run, collect
 from studies.bench.index import write_index
 from studies.bench.progress import track
@@ -19,18 +22,6 @@ from studies.bench.store import Output, Row
 Make = Callable[[Output], pd.DataFrame]
 
 
-def run(name: str, about: str | None, words: Sequence[str] | None, work: Callable[[Output], None]) -> None:
-    """Call `work(output)` for the command line `words` of the study `name`, and write the index anew."""
-
-    def inside(words: Sequence[str] | None) -> None:
-        with Output(cli.parse(name, about, words)) as output:
-            work(output)
-            write_index(output)
-        print(f"wrote the files of {name} to {output.path}")
-
-    cli.main(inside, words)
-
-
 def run_rows(
     name: str,
     about: str | None,
@@ -38,15 +29,56 @@ def run_rows(
     make: Make,
     report: Callable[[Output, pd.DataFrame, str], Any],
     curves: bool = False,
+    parts: bool = False,
 ) -> None:
-    """Make rows, or with --redraw read those that were saved; `report(output, rows, stamp)` writes all else."""
+    """Make rows, or with --redraw read those that were saved; `report(output, rows, stamp)` writes all else.
 
-    def work(output: Output) -> None:
-        if not output.call.redraw:
-            output.save_rows(make(output), cli.stamp(output.call.command))
-        report(output, *output.load_rows(curves))  # the same from new rows and from saved ones
+    `parts`: `make` leaves out what `Call.wants` does not want.
+    """
 
-    run(name, about, words, work)
+    def work(words: Sequence[str] | None) -> None:
+        with Output(cli.parse(name, about, words, parts)) as output:
+            if output.call.only:
+                output.save_rows(*renewed(*output.load_rows(curves), lambda: make(output), output.call))
+            elif not output.call.redraw:
+                output.save_rows(make(output), cli.stamp(output.call.command))
+            report(output, *output.load_rows(curves))  # the same from new rows and from saved ones
+            write_index(output)
+        print(f"wrote the files of {name} to {output.path}")
+
+    cli.main(work, words)
+
+
+def renewed(old: pd.DataFrame, line: str, make: Callable[[], pd.DataFrame], call: Call) -> tuple[pd.DataFrame, str]:
+    """Put new rows of some groups or solvers in the place of the old ones, with commit and processor; tell the stamp.
+
+    Raises StudyError if the old rows have no group or solver of a name.
+    """
+    named = old[[column for column in ("group", "solver", "way") if column in old]].astype(str)
+    if unknown := set(call.only) - set(named.to_numpy().ravel()):
+        known = "; ".join(dict.fromkeys(named.drop(columns="group", errors="ignore").to_numpy().ravel()))
+        raise StudyError(f"no rows are of {', '.join(sorted(unknown))}; solvers are {known}")
+    commit, (_, _, _, machine, *_) = re.search(r"commit (\w+)", line), line.split("; ")
+    for column, value in (("commit", commit[1] if commit else "unknown"), ("processor", machine.split(",")[0])):
+        old = old.assign(**{column: old[column].fillna(value) if column in old else value})
+    new = make().assign(commit=cli.commit(), processor=cli.processor())
+    rows = pd.concat([old[~named.isin(call.only).any(axis=1)], new], ignore_index=True)
+    columns = [name for name in ("group", "case", "trap", "mechanism", "solver", "way") if name in old]
+    places = {key: k for k, key in reversed(list(enumerate(map(tuple, old[columns].astype(str).to_numpy()))))}
+    order = [places.get(key, len(old)) for key in map(tuple, rows[columns].astype(str).to_numpy())]
+    rows = rows.iloc[np.argsort(order, kind="stable")].reset_index(drop=True)
+    return rows, stamp_of(rows, cli.stamp(f"python -m studies.{call.study}"), cli.commit())
+
+
+def stamp_of(rows: pd.DataFrame, line: str, commit: str) -> str:
+    """Name in a stamp the rows of other commits: their groups or solvers if these are few."""
+    pure = (rows.groupby("group", dropna=False)["commit"].nunique() == 1).all()
+    column = "group" if pure else "way" if "way" in rows else "solver"
+    apart = []
+    for (other, processor), own in rows[rows["commit"] != commit].groupby(["commit", "processor"], sort=False):
+        names = list(dict.fromkeys(own[column].dropna()))
+        apart.append(f"{', '.join(names) if 0 < len(names) < 5 else 'other rows'}: commit {other}, {processor}")
+    return line.replace(f"commit {commit}", f"commit {commit} ({'; '.join(apart)})", 1) if apart else line
 
 
 def rows_of(runs: Callable[[bool], Iterable[Run]], measure: Measure) -> Make:
@@ -54,7 +86,8 @@ def rows_of(runs: Callable[[bool], Iterable[Run]], measure: Measure) -> Make:
 
     def make(output: Output) -> pd.DataFrame:
         with output.kept() as kept:
-            return collect(runs(output.call.quick), kept, measure)
+            wanted = (run for run in runs(output.call.quick) if output.call.wants(run.solver.name, run.group))
+            return collect(wanted, kept, measure)
 
     return make
 
@@ -68,6 +101,7 @@ def kept_rows(*parts: Callable[[bool], Iterable[tuple[str, Callable[[], Any]]]])
 
     def make(output: Output) -> pd.DataFrame:
         keyed = list(chain.from_iterable(part(output.call.quick) for part in parts))
+        keyed = [each for each in keyed if output.call.wants(*each[0].split(" | "))]
         with output.kept() as kept:
             made = [kept.made(key, partial(kept_row, run)) for key, run in track(keyed, lambda each: each[0])]
         return pd.DataFrame([row for each in made for row in each.get("rows", [each])])
@@ -98,7 +132,7 @@ class Study:
 
     def main(self, words: Sequence[str] | None = None) -> None:
         """Make the rows, or with --redraw read those that were saved, and write the report."""
-        run_rows(self.name, self.about, words, self.make, self.report, self.curves)
+        run_rows(self.name, self.about, words, self.make, self.report, self.curves, parts=True)
 
     def report(self, output: Output, rows: pd.DataFrame, line: str) -> None:
         """Write findings, figures and report; `line`: the stamp of the rows."""

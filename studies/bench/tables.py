@@ -70,41 +70,28 @@ def errors_of(runs: pd.DataFrame) -> Array:
 
 
 TIGHTEST = 1e-13  # tolerance of which tighter ones are of no use
-LIMITED = ("TIME_LIMIT", "MAX_STEPS")  # statuses of runs that we ended
-CAPPED = "steps were not enough|TOO_MUCH_WORK"  # in the messages of adapters whose most steps were used up
-COSTS = ("call_s", "call_q1", "call_q3", "n_evaluations")
+COSTS = ("call_s", "n_evaluations")
 RANKED = (*("family", "called_from", "keeps_constraints", *COSTS), *("violation_q", "violation_v", "energy"))
 NEARLY = 1.25  # runs whose error is above one by a smaller factor nearly get there
-UNASKED = "not run at such an error"
 UNLIKE = 3.0  # times the median time of the repetitions of a run: such a one was not the run alone
-SPREAD = 0.05  # of the median: times whose quartiles are closer are shown without them
 
 
 def medians(rows: pd.DataFrame) -> pd.DataFrame:
-    """One row a run: the repetition of median error, with medians of the times and quartiles of those of the calls.
+    """Return one row a run: the repetition of median error, with the median of the times of the calls.
 
     The rows are those of `collect`, in its order: the repetitions of a run one below the other. A run of which any
-    repetition failed is represented by a failed one if half of them or more failed. `times` holds those of all that
-    are `alike`; `unlike` is how many are not.
+    repetition failed is represented by a failed one if half of them or more failed. `times`: of all that are `alike`.
     """
     firsts = np.flatnonzero(rows["repeat"].diff().fillna(-1) <= 0)
     errors, times = rows["error_q"].astype(float).fillna(np.inf).to_numpy(), rows["call_s"].to_numpy(float)
-    inside = rows["inside_s"].to_numpy(float) if "inside_s" in rows else np.full(len(rows), np.nan)
-    chosen, quartiles, kept, insides = [], [], [], []
+    chosen, kept = [], []
     for run in np.split(np.arange(len(rows)), firsts[1:]):
         chosen.append(run[np.argsort(errors[run], kind="stable")[len(run) // 2]])
-        same = run[alike(times[run], errors[run])]
-        known = times[same]
-        kept.append(tuple(known))
-        insides.append(np.median(inside[same]) if same.size else np.nan)
-        quartiles.append(np.percentile(known, (25, 50, 75)) if known.size else np.full(3, np.nan))
+        kept.append(tuple(times[run[alike(times[run], errors[run])]]))
     found = rows.iloc[chosen].drop(columns="repeat").reset_index(drop=True)
-    found[["call_q1", "call_s", "call_q3"]] = np.array(quartiles)
-    found = found.assign(inside_s=insides) if "inside_s" in rows else found
+    middle = [np.percentile(known, 50) if known else np.nan for known in kept]
     repeats = np.diff(firsts, append=len(rows))
-    timed = np.add.reduceat(~np.isnan(times), firsts) if len(rows) else repeats
-    found = found.assign(repeats=repeats, times=pd.Series(kept, dtype=object))
-    return found.assign(unlike=timed - np.array([len(each) for each in kept], int))
+    return found.assign(call_s=middle, repeats=repeats, times=pd.Series(kept, dtype=object))
 
 
 def alike(times: Array, errors: Array) -> NDArray[np.bool_]:
@@ -217,8 +204,8 @@ def compared(own: Costs, others: Costs) -> dict[str, Any]:
 def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
     """Rank the solvers of one case that reach an error, cheapest first; others' only where asked for about so much.
 
-    Returns solver, family, called_from, keeps_constraints, call_s, call_q1, call_q3, n_evaluations for this error (on
-    the log-log line between two runs), and violation_q, violation_v, energy, setting of the cheapest run near it.
+    Returns solver, family, called_from, keeps_constraints, call_s, n_evaluations for this error (on the log-log line
+    between two runs), and violation_q, violation_v, energy, setting of the cheapest run near it.
     """
     told = {name: rows[name].to_numpy() for name in (*RANKED, *SETTINGS) if name in rows and name not in COSTS}
     lines = []
@@ -246,72 +233,24 @@ def of_both(ranked: pd.DataFrame) -> dict[str, dict[str, Any] | None]:
     return {"ours": best(ranked[own]), "others": best(ranked[~own])}
 
 
-def missed(rows: pd.DataFrame, target: float) -> bool:
-    """Whether one solver, which was put to a case, was asked for all that it can and has not reached an error.
-
-    That is: at its tightest tolerance, or until it failed by itself where a looser one had ended. Where it was stopped
-    by a limit of ours, of time or of steps, at a setting finer than the last that ended, it was not asked.
-    """
-    errors, settings = rows["error_q"].astype(float), setting_of(rows)
-    if (errors <= target).any():
-        return False
-    last = settings[errors.notna().to_numpy()].min(initial=np.inf)
-    if (stopped_by_us(rows) & ~(settings > last)).any():
-        return False
-    finest = float(np.nanmin(settings, initial=np.inf))
-    return bool(finest < last < np.inf or finest <= TIGHTEST * (1.0 + 1e-9))
-
-
-def stopped_by_us(rows: pd.DataFrame) -> NDArray[np.bool_]:
-    """Which runs a limit of ours ended: the time of a run, or the most steps that an adapter allows."""
-    said = rows["message"].fillna("") if "message" in rows else pd.Series("", rows.index)
-    return (rows["status"].isin(LIMITED) | said.str.contains(CAPPED)).to_numpy(bool)
-
-
-def why_not(rows: pd.DataFrame, target: float) -> str:
-    """What a table shows for a solver without a time at an error: that of a better run, or why there is none."""
-    reached = rows[rows["error_q"].notna()]
-    if reached.empty:
-        return rows["status"].iloc[0].lower().replace("_", " ")
-    finer = setting_of(rows) < setting_of(reached).min()
-    stopped = bool((stopped_by_us(rows) & finer).any()) and bool((reached["error_q"] > target).all())
-    if not stopped and not missed(rows, target):
-        better = as_good(rows, target)
-        return UNASKED if np.isnan(better) else f"≤ {number(better)}"
-    return f"least error {number(float(reached['error_q'].min()))}" + (", then our limit" if stopped else "")
-
-
 def work_precision(
     rows: pd.DataFrame, targets: Iterable[float], solvers: Sequence[str] = (), coded: bool | None = None
 ) -> list[list[str]]:
-    """Lines of a table: solver, called from, CPU time with quartiles in seconds for each target.
+    """Return lines of a table: solver, called from, CPU time in seconds for each target, "–" where it has none.
 
     `coded`: as `names.label` has it.
-    Instead of a dash the cell of a target that is not reached says how far the solver came.
     """
     lines = []
     for solver in solvers or list(dict.fromkeys(rows["solver"])):
-        runs = rows[rows["solver"] == solver]
-        if runs.empty:
-            continue
-        line = [label(solver, coded), str(runs["called_from"].iloc[0])]
-        for target in targets:
-            middle, low, high = (time_for(runs, target, what) for what in ("call_s", "call_q1", "call_q3"))
-            line.append(why_not(runs, target) if np.isnan(middle) else with_quartiles(middle, low, high))
-        lines.append(line)
+        if len(runs := rows[rows["solver"] == solver]):
+            times = [number(time_for(runs, target)) for target in targets]
+            lines.append([label(solver, coded), str(runs["called_from"].iloc[0]), *times])
     return lines
 
 
 def as_good(runs: pd.DataFrame, target: float) -> float:
-    """Time of the cheapest run of a solver that is at least as good as an error, however much better; NaN: none is."""
+    """Return the time of the cheapest run of a solver whose error is at most the target; NaN: there is none."""
     return float(runs[runs["error_q"].astype(float) <= target]["call_s"].astype(float).min())
-
-
-def with_quartiles(middle: float, low: float, high: float) -> str:
-    """Seconds, the quartiles in brackets where they are more than `SPREAD` of the median apart."""
-    texts = [number(value) for value in (low, middle, high)]
-    near = high - low <= SPREAD * middle or len(set(texts)) == 1
-    return texts[1] if near else f"{texts[1]} ({texts[0]}–{texts[2]})"
 
 
 def setting(row: Mapping[str, Any]) -> str:

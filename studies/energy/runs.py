@@ -12,24 +12,10 @@ from references.casadi.integrators import solve_cvodes
 from references.diffrax.dopri8 import solve_diffrax
 from references.paper.four_bar_minimal import MinimalFourBar
 from references.scipy.index1 import solve_index1
+from studies.bench import solvers
 from studies.bench.collector import REPEATS, Case, Run, Solver
 from studies.bench.headline import OWN_CODE
 from studies.bench.reference_motion import ReferenceMotion
-from studies.bench.solvers import (
-    CATALOGUE,
-    CVODE_C,
-    CVODE_C_PROJECTED,
-    CVODES,
-    CYRK,
-    DEFAULT,
-    DIFFRAX,
-    HEYOKA,
-    IDA_C,
-    IRK,
-    OWN_BDF,
-    OWN_EXPLICIT,
-    at_instants,
-)
 from studies.bench.store import Array
 from studies.energy.drift import drift, windows
 from twoloop import BDF, Newmark, Result, RungeKutta, paper_irk, solve_dae
@@ -46,14 +32,14 @@ LONG, QUICK = 10_000.0, 75.0  # s
 FLOOR = 1e-9  # m, rad; the one-coordinate solution after 10,000 s, some thousand periods
 TIME_LIMIT = 300.0  # CPU s
 MOST_STEPS = 30_000_000  # of solvers that count them and do not look at the clock
-NOT_QUICK = (DIFFRAX, CVODES, CVODE_C_PROJECTED, CYRK)  # compile for seconds
+NOT_QUICK = (solvers.DIFFRAX, solvers.CVODES, solvers.CVODE_C_PROJECTED, solvers.CYRK)  # compile for seconds
 GOLDEN = (3.0 - math.sqrt(5.0)) / 2.0  # of a period: far from every fraction of few parts, so no phase is left out
 
 SUN, GAUSS, RADAU, MIDPOINT = "Sun Radau IIB(3)", "Gauss(3)", "Radau IIA(3)", "implicit midpoint"
 NEWMARK = "Newmark, β = 1/2"
 TABLEAUX = {SUN: sun_radau_iib(3), GAUSS: gauss(3), RADAU: radau_iia(3), MIDPOINT: gauss(1)}
 METHODS: dict[str, Method] = {name: RungeKutta(tableau) for name, tableau in TABLEAUX.items()}
-METHODS |= {NEWMARK: Newmark(0.5), IRK: paper_irk(), OWN_BDF: BDF()}
+METHODS |= {NEWMARK: Newmark(0.5), solvers.IRK: paper_irk(), solvers.OWN_BDF: BDF()}
 LASTING, EVEN = "lasting", "symmetric"  # choices of the partition
 H, H_SMALL = 0.02, 0.01  # s; H_SMALL for methods of order 2
 FIXED: dict[str, dict[str, tuple[str, ...]]] = {
@@ -62,14 +48,14 @@ FIXED: dict[str, dict[str, tuple[str, ...]]] = {
 }
 COARSER = {GAUSS: (0.04, 0.03), MIDPOINT: (0.02,)}  # s, further steps of what is free of drift on SWITCHING, EVEN
 CONTROLLED = {
-    ONE: {IRK: LASTING, GAUSS: LASTING},
-    SWITCHING: {IRK: LASTING, SUN: LASTING, GAUSS: EVEN, OWN_BDF: LASTING},
+    ONE: {solvers.IRK: LASTING, GAUSS: LASTING},
+    SWITCHING: {solvers.IRK: LASTING, SUN: LASTING, GAUSS: EVEN, solvers.OWN_BDF: LASTING},
 }
 TOL = 1e-5  # Rtol = Atol
 # of those on SWITCHING which may set a price: all others take three times as long for no smaller an energy error
 REPEATED = (
-    *(DEFAULT, OWN_CODE, OWN_EXPLICIT, "Gauss12", GAUSS, MIDPOINT, CVODE_C, CYRK, HEYOKA),
-    "Exudyn, TrapezoidalIndex2",
+    *(solvers.DEFAULT, OWN_CODE, solvers.OWN_EXPLICIT, "Gauss12", GAUSS, MIDPOINT, "Exudyn, TrapezoidalIndex2"),
+    *(solvers.CVODE_C, solvers.CYRK, solvers.HEYOKA),
 )
 LSODA, PROJECTED = "LSODA, index 1", "DOP853, projected"
 ALPHA, TRAPEZOIDAL = "Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2"
@@ -123,7 +109,7 @@ def _index1(method: str, stabilisation: str, case: Case, tol: float, repeat: int
 
 
 def _long(solve: Callable[..., Result], case: Case, tol: float, repeat: int) -> Result:
-    return at_instants(solve, case, rtol=tol, atol=tol, most_steps=MOST_STEPS)
+    return solvers.at_instants(solve, case, rtol=tol, atol=tol, most_steps=MOST_STEPS)
 
 
 def _exudyn(solver: str, case: Case, h: float, repeat: int) -> Result:
@@ -138,17 +124,17 @@ FINE = (1e-6, 1e-8, 1e-10, 1e-12)
 FINER = (1e-6, 3e-7, 1e-7, 3e-8, 1e-8, 3e-9, 1e-9, 3e-10, 1e-10, 3e-11, 1e-11, 1e-12)  # of those that set the price
 # on SWITCHING: settings, loose to tight (quick: the first), and how each stores states at the case's instants
 OTHERS: dict[str, tuple[tuple[float, ...], Callable[[Case, float, int], Result]]] = {
-    DEFAULT: (FINER, partial(_controlled, "auto")),
+    solvers.DEFAULT: (FINER, partial(_controlled, "auto")),
     OWN_CODE: (FINER, partial(_controlled, "auto", compiled=True)),
-    OWN_EXPLICIT: (FINE, partial(_controlled, "DOP853")),
+    solvers.OWN_EXPLICIT: (FINE, partial(_controlled, "DOP853")),
     "Gauss12": ((1e-5, 1e-7), partial(_controlled, "Gauss12")),
-    IDA_C: (FINE, CATALOGUE[IDA_C].run),
-    CVODE_C: (FINER, CATALOGUE[CVODE_C].run),
-    CYRK: (FINER, CATALOGUE[CYRK].run),
-    CVODE_C_PROJECTED: (FINE, CATALOGUE[CVODE_C_PROJECTED].run),
-    DIFFRAX: (FINE, partial(_long, solve_diffrax)),
-    CVODES: (FINE, partial(_long, solve_cvodes)),
-    HEYOKA: ((*FINER, 1e-14), CATALOGUE[HEYOKA].run),
+    solvers.IDA_C: (FINE, solvers.CATALOGUE[solvers.IDA_C].run),
+    solvers.CVODE_C: (FINER, solvers.CATALOGUE[solvers.CVODE_C].run),
+    solvers.CYRK: (FINER, solvers.CATALOGUE[solvers.CYRK].run),
+    solvers.CVODE_C_PROJECTED: (FINE, solvers.CATALOGUE[solvers.CVODE_C_PROJECTED].run),
+    solvers.DIFFRAX: (FINE, partial(_long, solve_diffrax)),
+    solvers.CVODES: (FINE, partial(_long, solve_cvodes)),
+    solvers.HEYOKA: ((*FINER, 1e-14), solvers.CATALOGUE[solvers.HEYOKA].run),
     LSODA: ((1e-8, 1e-10, 1e-12), partial(_index1, "LSODA", "none")),
     PROJECTED: ((1e-7, 1e-9, 1e-11), partial(_index1, "DOP853", "projection")),
     ALPHA: ((0.01,), partial(_exudyn, "GeneralizedAlpha")),
@@ -175,7 +161,7 @@ def _once(quick: bool) -> Iterator[Run]:
     cases = {name: case_of(name, QUICK if quick else LONG) for name in GEOMETRIES}
     for name, (values, run) in OTHERS.items():
         for value in () if quick and name in NOT_QUICK else reversed(values[:1] if quick else values):
-            yield Run(cases[SWITCHING], replace(CATALOGUE[name], run=run), value, "other", 1)
+            yield Run(cases[SWITCHING], replace(solvers.CATALOGUE[name], run=run), value, "other", 1)
     for geometry, controlled in CONTROLLED.items():
         for name, partition in controlled.items():
             yield Run(cases[geometry], _two_loop(name, "tol", partition), TOL, "controlled", 1)

@@ -60,11 +60,13 @@ def make(output: Output) -> pd.DataFrame:
     with output.kept() as kept:
         rows: list[Row] = []
         for group, build in ((group, build) for group, builds in groups.items() for build in builds):
-            for engine, name in list(NAMES.items())[:-1]:  # twoloop is last
+            for engine, name in list(NAMES.items())[:-1] if output.call.wants(GATE) else ():  # twoloop is last
                 status, message = gated(build, engine)
                 row = _row(GATE, build, solver=name, family=name, status=status, message=message)
                 rows.append(kept.made(f"{GATE} {build.__name__} {engine}", partial(dict, row)))
             for each in CONFIGURATIONS if group == RUN else EVERYWHERE:
+                if not output.call.wants(each.name, group):
+                    continue
                 values: Any = VALUES[group][each.engine == OURS]
                 cost: list[float] = []  # of the run before, and its steps
                 for value in values[1:4:2] if quick else values:

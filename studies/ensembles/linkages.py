@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from references.paper.four_bar_minimal import MinimalFourBar
-from studies.bench.cli import processor
+from studies.bench.cli import Call
 from studies.bench.store import Array
 from twoloop import consistent_states, ensemble, mechanisms
 from twoloop.ensembles.in_lanes import threads_of
@@ -136,9 +136,8 @@ def drawn_row(n: int, t_end: float = SPAN) -> dict[str, Any]:
     return row
 
 
-def rows(quick: bool) -> Iterator[dict[str, Any]]:
-    """Make the rows of all groups, the larger numbers last."""
+def rows(call: Call) -> Iterator[dict[str, Any]]:
+    """Make the rows of both groups, the larger numbers last."""
     varied_row(16)  # compiles what is not on disk
-    for n in (200,) if quick else (10_000, 1_000_000):
-        yield varied_row(n) | {"processor": processor()}
-        yield drawn_row(n) | {"processor": processor()}
+    for n in (200,) if call.quick else (10_000, 1_000_000):
+        yield from (make(n) for group, make in ((VARIED, varied_row), (DRAWN, drawn_row)) if call.wants(group))

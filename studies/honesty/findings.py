@@ -13,26 +13,15 @@ from studies.bench.end_states import EXACT, JUDGED
 from studies.bench.render import number, power
 from studies.bench.sharp_forces import T_END
 from studies.bench.solvers import GIVEN
+from studies.honesty import traps
 from studies.honesty.solvers import DEFAULT, KINDS, LIMITED, LOOK, OWN_SUFFIX, kind_of
-from studies.honesty.traps import (
-    FORCE,
-    INPUT,
-    LINKAGE,
-    MISTAKE,
-    SEED,
-    SHAPES,
-    SHORT,
-    SINGULAR,
-    TOLERANCES,
-    WIDTHS,
-    name_of,
-)
 
 RIGHT, SAID, SILENT, HANG, NOT_RUN = "right", "reported failure", "silently wrong", "hangs", "not run"
 BAD = (SILENT, HANG)
 LOOSENESS = 1e3  # an answer is right within so many times the tolerance ...
 LEAST = 1e-10  # ... of which no less counts: rounding decides there
 USUAL = 1e-8  # tolerance of all traps that are not about tolerances
+GROUPS = (traps.FORCE, traps.SHORT, traps.MISTAKE, traps.SINGULAR)
 PUBLISHED, AUTHORS = "published", "authors"  # groups of the rows of validation
 BRIEF = LOOK * T_END  # s: forces that change with time are evaluated at least so often
 PLAIN = f"auto, not compiled{OWN_SUFFIX}"
@@ -40,8 +29,8 @@ DRAWN = {"gross": figures.RED, "slight": figures.ORANGE}  # parts of the bars
 
 
 def _brief(shape: str, below: bool) -> Callable[[pd.DataFrame], pd.Series]:
-    names = [name_of(shape, width) for width in WIDTHS if (width < BRIEF) is below]
-    return lambda rows: (rows["group"] == SHORT) & rows["trap"].isin(names)
+    names = [traps.name_of(shape, width) for width in traps.WIDTHS if (width < BRIEF) is below]
+    return lambda rows: (rows["group"] == traps.SHORT) & rows["trap"].isin(names)
 
 
 def _of(group: str) -> Callable[[pd.DataFrame], pd.Series]:
@@ -49,15 +38,15 @@ def _of(group: str) -> Callable[[pd.DataFrame], pd.Series]:
 
 
 TABLE: dict[str, tuple[str, Callable[[pd.DataFrame], pd.Series]]] = {  # kinds of traps: words, and which rows they are
-    "sharp": ("sharp forces", _of(FORCE)),
+    "sharp": ("sharp forces", _of(traps.FORCE)),
     "gust_long": ("gusts of 3 and 10 ms", _brief("gust", False)),
     "gust_short": ("gusts of 0.1 to 1 ms", _brief("gust", True)),
     "pulse_long": ("pulses of 3 and 10 ms", _brief("pulse", False)),
     "pulse_short": ("pulses of 0.1 to 1 ms", _brief("pulse", True)),
-    "singular": ("singular positions", _of(SINGULAR)),
-    "linkages": ("random four-bar linkages", _of(LINKAGE)),
-    "mistakes": ("mistakes and hard motions", _of(MISTAKE)),
-    "input": ("inconsistent start, wrong derivative", _of(INPUT)),
+    "singular": ("singular positions", _of(traps.SINGULAR)),
+    "linkages": ("random four-bar linkages", _of(traps.LINKAGE)),
+    "mistakes": ("mistakes and hard motions", _of(traps.MISTAKE)),
+    "input": ("inconsistent start, wrong derivative", _of(traps.INPUT)),
     "published": ("published mechanisms", _of(PUBLISHED)),
     "authors": ("benchmark authors' own conditions", _of(AUTHORS)),
 }
@@ -124,7 +113,7 @@ def best_limited(ran: pd.DataFrame, shape: str) -> dict[str, Any] | None:
 def pulses_of(ran: pd.DataFrame) -> dict[str, Any]:
     """Count the pulses of each width that the default misses."""
     own = ran[ran["solver"] == DEFAULT]
-    by_width = {width: graded(own[own["trap"] == name_of("pulse", width)]) for width in WIDTHS}
+    by_width = {width: graded(own[own["trap"] == traps.name_of("pulse", width)]) for width in traps.WIDTHS}
     missed = [(width, each["wrong"]) for width, each in by_width.items() if each["wrong"]]
     return {"n": max(each["n"] for each in by_width.values()), "wrong": missed}
 
@@ -138,17 +127,17 @@ def wrong_traps(ran: pd.DataFrame) -> list[dict[str, Any]]:
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """Count silent failures by kind of trap, and those under sharp forces by kind of solver."""
     ran = rows[rows["outcome"] != NOT_RUN]
-    forces, short, mistakes, singular = (ran[ran["group"] == group] for group in (FORCE, SHORT, MISTAKE, SINGULAR))
+    forces, short, mistakes, singular = (ran[ran["group"] == group] for group in GROUPS)
     found: dict[str, Any] = {"table": table_of(ran), "kinds": kinds_of(forces), "pulses": pulses_of(short)}
     found["n"] = int((~ran["group"].isin((PUBLISHED, AUTHORS))).sum())
-    found |= {f"best_{shape}": best_limited(short, shape) for shape in SHAPES}
+    found |= {f"best_{shape}": best_limited(short, shape) for shape in traps.SHAPES}
     found["limited"] = graded(forces[forces["solver"].str.endswith(LIMITED)])
     found |= {"wrong_traps": wrong_traps(mistakes), "n_forces": int(forces["trap"].nunique())}
-    found["singular"] = {"tolerances": [max(TOLERANCES), min(TOLERANCES)]}
+    found["singular"] = {"tolerances": [max(traps.TOLERANCES), min(traps.TOLERANCES)]}
     found["singular"]["plain"] = graded(singular[singular["solver"] == PLAIN])["failed"]
     found |= {"look": LOOK, "brief": BRIEF, "t_end": T_END, "exact": EXACT, "usual": USUAL, "looseness": LOOSENESS}
     found["least"] = LOOSENESS * LEAST
-    return found | {"seed": SEED, "answer": answer_of(found["table"])}
+    return found | {"seed": traps.SEED, "answer": answer_of(found["table"])}
 
 
 def answer_of(table: Mapping[str, Any]) -> str:

@@ -2,7 +2,6 @@
 
 import time
 import warnings
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -16,32 +15,9 @@ from studies.bench.apart import apart, heard
 from studies.bench.cli import StudyError
 from studies.bench.store import Array, Output, Row, read_rows
 from studies.bench.study import Study
-from studies.honesty.findings import (
-    HANG,
-    LEAST,
-    LOOSENESS,
-    NOT_RUN,
-    RIGHT,
-    SAID,
-    SILENT,
-    figures_of,
-    findings_of,
-    of_validation,
-)
-from studies.honesty.solvers import (
-    CVODE_C,
-    CYRK,
-    CYRK_RADAU,
-    HEYOKA,
-    LIMITED,
-    OWN_SUFFIX,
-    PROJECTED,
-    Call,
-    largest_step,
-    solvers,
-    why_not,
-)
-from studies.honesty.traps import FORCE, LINKAGE, SEED, SHORT, Trap, traps
+from studies.honesty import findings
+from studies.honesty import solvers as catalogue
+from studies.honesty.traps import FORCE, GROUPS, LINKAGE, SEED, SHORT, Trap, traps
 from twoloop import ConstrainedSystem, solve_dae
 from twoloop.__main__ import compile_all
 from twoloop.kernels.compile import callbacks
@@ -55,7 +31,8 @@ REFUSALS = (  # in messages of an adapter, or of twoloop, that does not take the
     *("NotSymbolic", "compiled=True needs equations", "needs callbacks whose operations it can see"),
     *("must be positive definite", "cannot keep a constant one", "LinAlgError"),
 )
-BUILT = (HEYOKA, CVODE_C, PROJECTED, CYRK, CYRK_RADAU)  # are built for each system, which takes longer than a run
+# are built for each system, which takes longer than a run
+BUILT = (catalogue.HEYOKA, catalogue.CVODE_C, catalogue.PROJECTED, catalogue.CYRK, catalogue.CYRK_RADAU)
 
 
 def right_answer(trap: Trap) -> Array | None:
@@ -90,7 +67,7 @@ def _end(system: ConstrainedSystem, trap: Trap, method: str, tolerance: float) -
     return q
 
 
-def cell(call: Call, trap: Trap, truth: Array | None) -> Row:
+def cell(call: catalogue.Call, trap: Trap, truth: Array | None) -> Row:
     """Make a run and describe what came of it."""
     result, made = heard(partial(call, trap))
     made |= {"error": None, "evaluated": True}
@@ -105,13 +82,13 @@ def cell(call: Call, trap: Trap, truth: Array | None) -> Row:
 def outcome(row: Row, trap: Trap, has_answer: bool) -> str:
     """Judge a run that came back."""
     if row["status"] == "RAISED" and any(words in row["message"] for words in REFUSALS):
-        return NOT_RUN
+        return findings.NOT_RUN
     if row["status"] != "REACHED_END":
-        return HANG if row["status"] == HANG else SAID
-    limit = LOOSENESS * max(trap.tolerance, LEAST) * trap.sensitivity
+        return findings.HANG if row["status"] == findings.HANG else findings.SAID
+    limit = findings.LOOSENESS * max(trap.tolerance, findings.LEAST) * trap.sensitivity
     if has_answer and row["error"] is not None and row["error"] <= limit:
-        return RIGHT
-    return SAID if row["warned"] or UNCONTROLLED in row["message"] else SILENT
+        return findings.RIGHT
+    return findings.SAID if row["warned"] or UNCONTROLLED in row["message"] else findings.SILENT
 
 
 def about(name: str, trap: Trap) -> dict[str, str]:
@@ -119,49 +96,50 @@ def about(name: str, trap: Trap) -> dict[str, str]:
     return {"group": trap.group, "trap": trap.name, "mechanism": trap.mechanism, "solver": name}
 
 
-def run(name: str, call: Call, trap: Trap, truth: Array | None) -> Row:
+def run(name: str, call: catalogue.Call, trap: Trap, truth: Array | None) -> Row:
     """Make one cell in a process of its own, which is ended when it does not come back."""
     row: Row = {**about(name, trap), "tol": trap.tolerance, "n_drawn": trap.n_drawn}
     row["seed"] = SEED if trap.group in (FORCE, SHORT, LINKAGE) else None
-    row["max_step"] = None if name.endswith(OWN_SUFFIX) else largest_step(name.endswith(LIMITED), trap)
+    limited = name.endswith(catalogue.LIMITED)
+    row["max_step"] = None if name.endswith(catalogue.OWN_SUFFIX) else catalogue.largest_step(limited, trap)
     began, no_answer = time.monotonic(), {"message": "", "error": None, "warned": ""}
     try:
         row |= apart(partial(cell, call, trap, truth), trap.time_limit + GRACE)
     except TimeoutError:
-        row |= {"status": HANG, **no_answer}
+        row |= {"status": findings.HANG, **no_answer}
     except EOFError:
         row |= {"status": "CRASHED", **no_answer, "message": "the process ended without an answer"}
     row["seconds"] = time.monotonic() - began
     return row | {"outcome": outcome(row, trap, truth is not None)}
 
 
-def make(output: Output, groups: Sequence[str] | None = None) -> pd.DataFrame:
-    """Make all cells, or those of some groups of traps.
-
-    The adapters' own checks of a start are off: the solvers are to answer alone.
-    """
+def make(output: Output) -> pd.DataFrame:
+    """Make all cells. The adapters' own checks of a start are off: the solvers are to answer alone."""
+    only, quick = output.call.only, output.call.quick
+    groups = only if only and set(only) <= set(GROUPS) else None
     rows: list[Row] = []
     compiled: set[tuple[Any, ...]] = set()
     compile_all()  # what a child of a slow machine compiles may exceed its time limit, and is lost with it
 
-    def made(name: str, call: Call, trap: Trap, truth: Array | None) -> Row:
-        if why := why_not(name, trap):
-            return about(name, trap) | {"outcome": NOT_RUN, "status": "", "message": why}
+    def made(name: str, call: catalogue.Call, trap: Trap, truth: Array | None) -> Row:
+        if why := catalogue.why_not(name, trap):
+            return about(name, trap) | {"outcome": findings.NOT_RUN, "status": "", "message": why}
         warm_up(name, call, trap, compiled)
         return run(name, call, trap, truth)
 
-    with output.kept({"groups": groups}) as kept, patch("references.driver.check_start"):
-        for trap in traps(output.call.quick, groups):
-            known = solvers(output.call.quick, trap.group)
+    with output.kept() as kept, patch("references.driver.check_start"):
+        for trap in traps(quick, groups):
+            known = catalogue.solvers(quick, trap.group)
+            known = {name: call for name, call in known.items() if output.call.wants(name, trap.group)}
             keys = {name: " | ".join(about(name, trap).values()) for name in known}
             truth = None if all(key in kept for key in keys.values()) else right_answer(trap)
             rows += [kept.made(keys[name], partial(made, name, call, trap, truth)) for name, call in known.items()]
     return pd.DataFrame(rows)
 
 
-def warm_up(name: str, call: Call, trap: Trap, compiled: set[tuple[Any, ...]]) -> None:
+def warm_up(name: str, call: catalogue.Call, trap: Trap, compiled: set[tuple[Any, ...]]) -> None:
     """Compile in this process what the children call, on a harmless motion."""
-    shared = name.removesuffix(LIMITED)
+    shared = name.removesuffix(catalogue.LIMITED)
     sane, tolerance = trap.sane or trap.system, 1e-4
     functions = (getattr(sane.functions, kind) for kind in callbacks.KINDS)
     made_for: tuple[Any, ...] = (shared, sane.n_q, sane.n_c, sane.called_in_python, *functions)
@@ -192,7 +170,7 @@ def validated(output: Output) -> pd.DataFrame:
     path = output.file("validation.csv")
     if not path.is_file():
         return pd.DataFrame()
-    return of_validation(read_rows(path, "group", "case", "solver", "family", "tol", "outcome", "error_q")[0])
+    return findings.of_validation(read_rows(path, "group", "case", "solver", "family", "tol", "outcome", "error_q")[0])
 
 
-STUDY = WithValidation("honesty", __doc__, make, findings_of, figures_of)
+STUDY = WithValidation("honesty", __doc__, make, findings.findings_of, findings.figures_of)

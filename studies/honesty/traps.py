@@ -29,7 +29,8 @@ from twoloop.mechanisms import Problem, four_bar, n_four_bar
 NEVER = 1e30  # s
 # groups of traps: a start or a derivative that checks of the input find; a mistake in a model or a setting, or a hard
 # motion; a sharp force; a force so short that a solver may step over it; a random linkage; singular positions
-INPUT, MISTAKE, FORCE, SHORT, LINKAGE, SINGULAR = "input", "mistake", "force", "short", "linkage", "singular"
+GROUPS = ("input", "mistake", "force", "short", "linkage", "singular")
+INPUT, MISTAKE, FORCE, SHORT, LINKAGE, SINGULAR = GROUPS
 AGREE = 1e-8  # m or rad: how far two methods may differ in the motion under a force
 SEED = 20261126  # of all draws: the day. Draw by a new seed when the methods have been changed to pass these
 GROWN = 100.0  # how much errors may grow in a motion under a force, up to which two methods can agree on it

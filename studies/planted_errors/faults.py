@@ -286,7 +286,6 @@ def in_report() -> Iterator[Fault]:
     yield fault("columns of the table of costs swapped", tables, "work_precision", columns_swapped, TABLES)
     yield fault("costs at equal error 10 % too small", tables, "time_for", lambda time: 0.9 * time, TABLES)
     yield fault("a ranking that begins with the dearest", tables, "ranking", lambda rows: rows.iloc[::-1], TABLES)
-    yield fault("no reason given for an empty cell", tables, "why_not", lambda text: "–", TABLES)
     yield fault("failed runs left out", tables, "medians", lambda rows: rows[rows["status"] == "REACHED_END"], TABLES)
     yield fault("violations counted as 0", metrics, "violations", halved, METRICS)
     yield fault("deviations 1.5 times too large", metrics, "deviation", lambda q_v: (1.5 * q_v[0], q_v[1]), METRICS)

@@ -12,27 +12,12 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from studies.bench import figures
+from studies.bench import figures, solvers
 from studies.bench.collector import Run, warm_up
 from studies.bench.end_states import DECADES, EXACT, JUDGED, SAID, TIME_LIMIT, case_of, row_of
 from studies.bench.names import label
 from studies.bench.render import power
-from studies.bench.solvers import (
-    ADAMS,
-    CATALOGUE,
-    CVODE_C,
-    CVODE_C_PROJECTED,
-    CVODES,
-    CYRK,
-    EXUDYN,
-    GIVEN,
-    HEYOKA,
-    IDA_C,
-    IDA_C_STATES,
-    OWN_BDF,
-    OWN_EXPLICIT,
-    TAYLOR,
-)
+from studies.bench.solvers import CATALOGUE, GIVEN
 from studies.bench.store import Output, Row
 from studies.bench.study import Study
 from twoloop import mechanisms
@@ -48,10 +33,11 @@ MAKE: tuple[Callable[[], Problem], ...] = (
     *(mechanisms.spatial_four_bar, mechanisms.bricard, mechanisms.governor),
 )
 QUICK = (0, 2, 4, 10, 14)  # of MAKE
-OWN = (GIVEN, TAYLOR, ADAMS, OWN_EXPLICIT, "Gauss12", "RadauIIA5", OWN_BDF)
+OWN = (GIVEN, solvers.TAYLOR, solvers.ADAMS, solvers.OWN_EXPLICIT, "Gauss12", "RadauIIA5", solvers.OWN_BDF)
 OTHERS = (
-    *(IDA_C, IDA_C_STATES, HEYOKA, CYRK, "CyRK, Radau", CVODE_C, CVODE_C_PROJECTED, CVODES, "Radau, solve_dae"),
-    *("LSODA, index 1", "DOP853, index 1", "DOP853, projected", "Radau, index 1", "BDF, index 1"),
+    *(solvers.IDA_C, solvers.IDA_C_STATES, solvers.HEYOKA, solvers.CYRK, "CyRK, Radau", solvers.CVODE_C),
+    *(solvers.CVODE_C_PROJECTED, solvers.CVODES, "Radau, solve_dae", "LSODA, index 1", "DOP853, index 1"),
+    *("DOP853, projected", "Radau, index 1", "BDF, index 1"),
 )
 QUICK_OTHERS = ("DOP853, index 1",)
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
@@ -68,7 +54,7 @@ TIGHT = 1e-10  # tolerance at which digits are compared
 USUAL = 1e-8  # the default tolerance of a careful user: what is wrong at this and tighter ones is counted apart
 COMPILING = 120.0  # s of CPU of what a solver builds before it runs on a problem
 REACH = {"q": 9, "v": 7, "lam": 5}  # digits at TIGHT that are the target ...
-AIMED = (GIVEN, OWN_EXPLICIT, "Gauss12", "RadauIIA5")  # ... of these
+AIMED = (GIVEN, solvers.OWN_EXPLICIT, "Gauss12", "RadauIIA5")  # ... of these
 CONSTRAINED = "IDA|solve_dae"  # in the names of other solvers that get the constraints; the rest gets accelerations
 OUTCOMES = ("right", "inexact", "wrong", SAID)
 PROJECTS = {  # of other solvers, by a part of their names; the rest is SciPy's
@@ -99,7 +85,7 @@ def modelled(made: Sequence[Callable[[], Problem]], quick: bool) -> Iterator[Run
     """Yield the runs of Exudyn on the mechanisms of which it has a model of its own."""
     for case in (replace(case_of(make()), time_limit=MODELLED_LIMIT) for make in made):
         if case.name in MODELS:
-            for name in (f"Exudyn, {solver}" for solver in EXUDYN[: 1 if quick else None]):
+            for name in (f"Exudyn, {solver}" for solver in solvers.EXUDYN[: 1 if quick else None]):
                 for n in QUICK_STEPS if quick else STEPS:
                     yield Run(case, CATALOGUE[name], case.t_end / n, MODELLED, repeats=1)
 
@@ -107,6 +93,7 @@ def modelled(made: Sequence[Callable[[], Problem]], quick: bool) -> Iterator[Run
 def make(output: Output) -> pd.DataFrame:
     """Make the rows."""
     todo, warm = runs(output.call.quick), set[tuple[Any, ...]]()
+    todo = [run for run in todo if output.call.wants(run.solver.name, run.group)]
 
     def made(run: Run) -> Row:
         # what is built for a mechanism, or for each of its tolerances, is no part of the run and its time limit

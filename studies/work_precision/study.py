@@ -13,23 +13,11 @@ import pandas as pd
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from studies.bench import adaptive, cases, figures, headline, study, tables
+from studies.bench import adaptive, cases, figures, headline, solvers, study, tables
 from studies.bench.collector import REPEATS, Case, Run, row_of
 from studies.bench.index import short
 from studies.bench.render import number, power, render
 from studies.bench.row_files import versions
-from studies.bench.solvers import (
-    COMPARED,
-    COMPARED_OWN,
-    IDA_C_BANDED,
-    IDA_C_ORDER_2,
-    IDA_INDEX_1,
-    IRK_LINE,
-    OTHER_SOLVERS,
-    QUARTER,
-    RADAU,
-    TOLERANCES,
-)
 from studies.bench.store import KeptRows, Output
 from studies.compare import runs_of
 from studies.work_precision import first_calls, mechanisms, minimal, processors
@@ -37,10 +25,10 @@ from studies.work_precision.mechanisms import HEADLINE, RESOLVED
 from twoloop.rows.row_format import CALIBRATION, calibration_s
 
 ERRORS = (1e-2, 1e-4, 1e-6)  # between which runs over whole motions are made
-FURTHER = ("Gauss6", IRK_LINE, QUARTER, IDA_INDEX_1)
-STIFF = ("TRBDF2", *RADAU[1:], IDA_C_ORDER_2, IDA_C_BANDED)  # in their place on stiff cases
+FURTHER = ("Gauss6", solvers.IRK_LINE, solvers.QUARTER, solvers.IDA_INDEX_1)
+STIFF = ("TRBDF2", *solvers.RADAU[1:], solvers.IDA_C_ORDER_2, solvers.IDA_C_BANDED)  # in their place on stiff cases
 BETWEEN = (7e-4, 5e-4, 3e-4, 2e-4)  # tolerances of the first of these, whose loose runs lie on no line
-QUICK = (*COMPARED[:4], "RadauIIA5", "IDA, stabilised")  # others take seconds to compile or to run
+QUICK = (*solvers.COMPARED[:4], "RadauIIA5", "IDA, stabilised")  # others take seconds to compile or to run
 QUICK_CASES = ("four-bar",)  # the beams' references take seconds
 TIME_LIMIT = 3.0  # s of CPU of a run: slower ones are of no use beside others
 MARKS = {"alone": "ours", "missed": "others", "none": "–"}  # cells of the picture without a ratio
@@ -51,8 +39,10 @@ def runs(case: Case, quick: bool) -> list[Run]:
     stiff = "stiff" in case.tags
     if quick:
         return runs_of(case, QUICK, quick)
-    made = runs_of(case, dict.fromkeys((*COMPARED_OWN, *OTHER_SOLVERS, *(STIFF if stiff else FURTHER))), quick)
-    coarse = (case.tolerances or TOLERANCES)[::2]
+    made = runs_of(
+        case, dict.fromkeys((*solvers.COMPARED_OWN, *solvers.OTHER_SOLVERS, *(STIFF if stiff else FURTHER))), quick
+    )
+    coarse = (case.tolerances or solvers.TOLERANCES)[::2]
     made = [run for run in made if run.solver.setting != "tol" or run.value in coarse]
     rough = {run.solver.name: run for run in made if stiff and run.solver.name == STIFF[0]}.values()
     return made + [replace(run, value=value) for run in rough for value in BETWEEN]

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from references.equations.many_at_once import by_diffrax, by_heyoka
-from studies.bench.cli import StudyError, processor
+from studies.bench.cli import Call, StudyError, processor
 from studies.ensembles import linkages
 from studies.ensembles import study as ensembles
 from studies.ensembles.study import CVODE, CYRK, DIFFRAX, ENSEMBLE, ERRORS, HEYOKA, PROPAGATE, SINGLE, TOLERANCES
@@ -120,11 +120,12 @@ def test_a_package_that_is_not_there_is_a_row(monkeypatch, few):
     assert row["way"] == HEYOKA and "not installed" in row["message"]
 
 
-def test_rows_have_their_processor(monkeypatch):
+def test_rows_have_their_processor(monkeypatch, tmp_path):
     made = rows(**{ENSEMBLE: 0.01, HEYOKA: 0.05}).to_dict("records")
     monkeypatch.setattr(ensembles, "rows_of", lambda of, names, quick: made[:-2])
     monkeypatch.setattr(linkages, "rows", lambda quick: made[-2:])
-    table = ensembles.make(SimpleNamespace(call=SimpleNamespace(quick=True)))
+    call = Call("ensembles", True, tmp_path, False, "")
+    table = ensembles.make(SimpleNamespace(call=call))
     assert (table["processor"] == processor()).all()
 
 

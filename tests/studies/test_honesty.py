@@ -9,11 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies.bench.cli import Call, StudyError
+from studies.bench.cli import Call
 from studies.bench.sharp_forces import families
 from studies.bench.sharp_motion import Motion
 from studies.bench.store import Output
-from studies.honesty import again, findings
+from studies.honesty import findings
 from studies.honesty import solvers as honesty_solvers
 from studies.honesty import study as honesty
 from studies.honesty.findings import HANG, NOT_RUN, RIGHT, SAID, SILENT
@@ -239,12 +239,3 @@ def test_published_mechanisms_and_the_authors_conditions_stand_in_the_table(tmp_
     got = {key: [line["default"][what] for what in ("n", "ended", "wrong", "gross")] for key, line in table.items()}
     assert got == {"published": [3, 2, 1, 0], "authors": [3, 2, 1, 1]}
     assert [table["published"][who]["n"] for who in ("own", "others")] == [0, 1]
-
-
-def test_groups_of_other_commits_stand_beside_that_of_the_newest_rows():
-    stamp = "`python -m studies.honesty`; 2026-11-26; commit abc; AMD EPYC, 2 cores"
-    rows = pd.DataFrame({"group": ["input", "short"], "commit": ["abc", "def"], "processor": "Xeon (6)"})
-    assert again.told(stamp, rows[:1], "abc") == stamp
-    assert again.told(stamp, rows, "abc") == stamp.replace("abc", "abc (short: commit def, Xeon (6))")
-    with pytest.raises(StudyError, match="give groups of traps"):
-        again.main(["long"])

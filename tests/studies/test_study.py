@@ -1,8 +1,10 @@
-"""What the studies with series share."""
+"""What studies share: curves by keys, and rows that are measured again beside others."""
 
 import pandas as pd
 import pytest
 
+from studies.bench import study as shared
+from studies.bench.cli import Call, StudyError, commit, processor
 from studies.bench.store import key
 from studies.energy import runs as energy
 from studies.reproduction import motion, step_size, violation
@@ -29,3 +31,39 @@ def test_a_key_survives_the_file_of_rows(tmp_path):
     rows.to_csv(tmp_path / "rows.csv", index=False)
     read = pd.read_csv(tmp_path / "rows.csv")
     assert [key(row) for _, row in read.iterrows()] == [key(row) for _, row in rows.iterrows()]
+
+
+STAMP = "`python -m studies.x`; 2026-11-26; commit abc; AMD EPYC, 2 cores; Linux"
+OLD = pd.DataFrame(
+    {"group": "run", "case": ["a", "a", "b", "b"], "solver": ["x", "y"] * 2, "call_s": [1.0, 2.0, 3.0, 4.0]}
+)
+
+
+def renewed(*only):
+    new = OLD[OLD["solver"].isin(only) | OLD["group"].isin(only)].assign(call_s=9.0)[::-1]
+    return shared.renewed(OLD, STAMP, lambda: new, Call("x", False, None, False, "", only))
+
+
+def test_rows_measured_again_take_the_place_of_those_of_their_solver():
+    rows, line = renewed("x")
+    assert rows["call_s"].tolist() == [9.0, 2.0, 9.0, 4.0] and rows["solver"].tolist() == ["x", "y"] * 2
+    assert (
+        rows["commit"].tolist() == [commit(), "abc"] * 2 and rows["processor"].tolist() == [processor(), "AMD EPYC"] * 2
+    )
+    assert f"commit {commit()} (y: commit abc, AMD EPYC); " in line
+    rows, line = renewed("run")
+    assert (rows["call_s"] == 9.0).all() and "abc" not in line
+    with pytest.raises(StudyError, match="no rows are of z; solvers are x; y"):
+        renewed("z", "x")
+
+
+def test_groups_of_other_commits_stand_beside_that_of_the_newest_rows():
+    rows = pd.DataFrame({"group": ["input", "short"], "commit": ["abc", "def"], "processor": "Xeon (6)"})
+    assert shared.stamp_of(rows[:1], STAMP, "abc") == STAMP
+    assert shared.stamp_of(rows, STAMP, "abc") == STAMP.replace("abc", "abc (short: commit def, Xeon (6))")
+
+
+def test_a_study_makes_the_runs_that_are_wanted(tmp_path):
+    call = Call("energy", True, tmp_path, False, "", ("heyoka",))
+    assert call.wants("heyoka") and call.wants("other", "heyoka") and not call.wants("other")
+    assert Call("energy", True, tmp_path, False, "").wants("other")
