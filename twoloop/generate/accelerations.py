@@ -15,7 +15,6 @@ from twoloop.generate.straight_line import Outputs, StraightLine
 from twoloop.generate.written import Written, conditions_hold
 
 ARRAY = f"{DOUBLE}*"
-MASS_FIRST = "mass_first"  # t, q, v, numbers and a
 
 
 def write_accelerations(
@@ -93,9 +92,7 @@ def _outputs(emit: Emitter, equations: StraightLine, written: Written, outputs: 
 
 def _function(emit: Emitter, equations: StraightLine, outputs: Outputs, numbers: Coefficients) -> str:
     """The name of the function of the module that eliminates M first; `numbers` are those that it reads."""
-    module, name = emit.builder.module, f"{MASS_FIRST}_{emit.suffix}"
-    if module.defines(MASS_FIRST):  # made of parts
-        return MASS_FIRST
+    module, name = emit.builder.module, f"mass_first_{emit.suffix}"
     if not module.defines(name):
         n, given = equations.system.n_q, _numbers(emit)
         kinds = [emit.double, ARRAY, ARRAY, *[ARRAY] * len(given), ARRAY]
@@ -104,6 +101,9 @@ def _function(emit: Emitter, equations: StraightLine, outputs: Outputs, numbers:
         t, q, v, *places, filled = builder.arguments
         for attribute, place in zip(("numbers", "constants"), places, strict=False):
             setattr(inner, attribute, place)
+        if equations.parts is not None:
+            builder.ret(equations.parts.there(inner, t, q, v, places[0], filled))
+            return name
         written = Written(inner, numbers)
         written.define(0, t)
         for first, array in ((1, q), (1 + n, v)):

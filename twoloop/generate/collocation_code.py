@@ -62,7 +62,7 @@ class CollocationCode:
     """
 
     def __init__(self, own: SharedCode):
-        self.equations, self.numbers = own.equations, Coefficients()
+        self.equations, self.numbers, self.parts = own.equations, own.numbers, own.parts
         self.n, self.n_rows = self.equations.system.n_q, len(self.equations.all_rows)
         self.iterated = self._iterated()
         self.others = [i for i in range(self.n) if i not in self.iterated]
@@ -70,7 +70,10 @@ class CollocationCode:
             self.n, len(self.iterated), self.n_rows
         )
 
-        outputs = [*self.equations.accelerations, self.equations.closer, self.equations.nearer]
+        if self.parts is None:
+            outputs = [*self.equations.accelerations, self.equations.closer, self.equations.nearer]
+        else:  # the digest of `own` tells the others
+            outputs = self.equations.accelerations[:1]
         graph, numbers = self.equations.graph, self.numbers
         told = [[each.sizes, *numbers.structure(graph, each.forms)] for each in outputs]
         self.structure = hashlib.sha256(repr([own.digest, told]).encode()).hexdigest()
@@ -244,31 +247,51 @@ class CollocationCode:
 
     def closer(self, emit: LaneEmitter, room: Value, numbers: Value) -> None:
         """Positions at the ends of eight steps, moved towards the constraints; FINE and MOVED."""
-        self._project(emit, room, numbers, self.equations.closer)
+        if self.parts is None:
+            self._project(emit, room, numbers, self.equations.closer)
+        else:
+            self._project_in_parts(emit, room, numbers, self.parts.closer, ("moved", "q"))
 
     def nearer(self, emit: LaneEmitter, room: Value, numbers: Value) -> None:
         """The same, and velocities, accelerations and multipliers there."""
-        self._project(emit, room, numbers, self.equations.nearer)
+        if self.parts is None:
+            self._project(emit, room, numbers, self.equations.nearer)
+        else:
+            self._project_in_parts(emit, room, numbers, self.parts.nearer, ("a", "moved", "q", "v", "lam"))
 
     # what they are made of
 
     def _project(self, emit: LaneEmitter, room: Value, numbers: Value, outputs: Outputs) -> None:
-        builder, n = emit.builder, self.n
         emit.numbers = emit.constants = numbers
-        inputs = [_get(emit, room, self.ends + LANES * k) for k in range(1 + 2 * n)]
+        inputs = [_get(emit, room, self.ends + LANES * k) for k in range(1 + 2 * self.n)]
         written, arrays = results_of(emit, self.equations.graph, outputs, inputs, self.numbers)
         values = dict(zip(outputs.arrays, arrays, strict=True))
         holds = conditions_hold(emit, written, outputs, [value for array in arrays for value in array])
-        places = {"q": self.ends + LANES, "v": self.ends + LANES * (1 + n), "a": self.end_a, "lam": self.lam}
-        for name, place in places.items():
+        for name, place in self._places_of_ends().items():
             for k, value in enumerate(values.get(name, [])):
                 _put(emit, value, room, place + LANES * k)
+        self._keep_moved(emit, room, values["moved"], holds)
+
+    def _project_in_parts(
+        self, emit: LaneEmitter, room: Value, numbers: Value, write: Callable[..., Value], names: tuple[str, ...]
+    ) -> None:
+        """The same by a function of parts_code.py, which fills arrays of these names."""
+        one, moved = Emitter(emit.builder), emit.builder.room(DOUBLE, LANES * self.n)
+        places = {name: one.pointer(room, place) for name, place in self._places_of_ends().items()} | {"moved": moved}
+        state = _get(emit, room, self.ends), places["q"], places["v"]
+        holds = write(emit, *state, numbers, *(places[name] for name in names))
+        self._keep_moved(emit, room, [_get(emit, moved, LANES * k) for k in range(self.n)], holds)
+
+    def _places_of_ends(self) -> dict[str, int]:
+        return {"q": self.ends + LANES, "v": self.ends + LANES * (1 + self.n), "a": self.end_a, "lam": self.lam}
+
+    def _keep_moved(self, emit: LaneEmitter, room: Value, values: Sequence[Value], holds: Value) -> None:
         moved = emit.constant(0.0)
-        for value in values["moved"]:
+        for value in values:
             moved = emit.larger(emit.function("fabs", value), moved)
         _put(emit, moved, room, at.MOVED)
         before = _get(emit, room, at.FINE)
-        _put(emit, builder.select(holds, before, emit.constant(0.0)), room, at.FINE)
+        _put(emit, emit.builder.select(holds, before, emit.constant(0.0)), room, at.FINE)
 
     def _integrate(self, emit: LaneEmitter, room: Value, state: Value) -> Value:
         """Positions and velocities at the nodes from accelerations there; the largest change of a velocity."""

@@ -4,21 +4,20 @@ Accelerations and both projections take the same factors and solve with them. Wh
 faster than the length of a block, and the values of long equations pass through memory in any case, as there are more
 of them than registers. So each part is a function of its own, and the functions that kernels know call them: the
 factors of a position, the solution with them, which gives accelerations and the corrections that move q and v onto the
-constraints, right-hand sides, and, with redundant rows, multipliers of least norm.
+constraints, right-hand sides, and, with redundant rows, multipliers of least norm. All of them are for numbers, or for
+states in lanes.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from twoloop.generate.accelerations import MASS_FIRST
+from twoloop.generate import llvm_code
 from twoloop.generate.coefficients import Coefficients
-from twoloop.generate.llvm_code import ZERO, Emitter
-from twoloop.generate.llvm_text import BIT, DOUBLE, Builder, Module, Value, integer
+from twoloop.generate.llvm_code import Emitter
+from twoloop.generate.llvm_text import BIT, DOUBLE, Module, Value, integer, width_of
 from twoloop.generate.straight_line import Outputs, Solution, StraightLine
-from twoloop.generate.written import NOWHERE, TRUE, Place, Written, conditions_hold
+from twoloop.generate.written import NOWHERE, Place, Written, conditions_hold
 
-ARRAY = f"{DOUBLE}*"
-POSITION = [DOUBLE, ARRAY, ARRAY, ARRAY, ARRAY]  # t, q, v, numbers, kept
 LONG = 500  # operations from which on equations are written in parts
 
 
@@ -45,6 +44,7 @@ class PartsCode:
 
     def __init__(self, equations: StraightLine, numbers: Coefficients):
         self.equations, self.numbers = equations, numbers
+        equations.parts = self
         self.n, self.n_rows = equations.system.n_q, len(equations.all_rows)
         self.redundant = len(equations.choice.rows) < self.n_rows
         self.at_position = {"right": equations.right, "off": equations.off, "faster": equations.faster}
@@ -52,30 +52,42 @@ class PartsCode:
         self.with_factors = {"solution": self.solution.solved}
         if self.redundant:
             self.with_factors["least"] = self.solution.least
+        self._parts: dict[str, Callable[..., Value]] = {"factors": self._factors}
+        self._parts |= {name: self._at_position(outputs) for name, outputs in self.at_position.items()}
+        self._parts |= {name: self._with_factors(outputs) for name, outputs in self.with_factors.items()}
+
+    def described(self) -> Iterable[Any]:
+        """What the functions depend on, the values of numbers apart."""
+        equations, solution, numbers = self.equations, self.solution, self.numbers
+        yield solution.kept.sizes, list(numbers.structure(equations.graph, solution.kept.forms))
+        for outputs in self.at_position.values():
+            yield outputs.sizes, list(numbers.structure(equations.graph, outputs.forms, solution.known))
+        for outputs in self.with_factors.values():
+            yield outputs.sizes, list(numbers.structure(solution.graph, outputs.forms))
 
     def write(self, module: Module, kinds: Callable[[str], tuple[str, list[str]]]) -> list[str]:
-        """Put all of them into a module; the names of those that kernels know, whose types `kinds` has."""
-        known: dict[str, Callable[..., Any]] = {"own_closer": self._closer, "own_nearer": self._nearer}
+        """Put the functions that kernels know into a module; their names. `kinds` has their types."""
+        known = {"own_closer": self.closer, "own_nearer": self.nearer}
         if self.equations.quick is None:
-            known["own_there"] = self._there
-        else:  # which calls this one where it does not serve
-            _write(module.function(MASS_FIRST, *kinds("own_there"), internal=True), self._there)
-        _write(module.function("factors", BIT, POSITION, internal=True), self._factors)
-        for name, outputs in self.at_position.items():
-            kind = [*POSITION, *[ARRAY] * len(outputs.arrays)]
-            _write(module.function(name, BIT, kind, internal=True), self._at_position(outputs))
-        for name, outputs in self.with_factors.items():
-            kind = [ARRAY] * (4 + len(outputs.arrays))
-            _write(module.function(name, BIT, kind, internal=True), self._with_factors(outputs))
+            known["own_there"] = self.there
         for name, emit in known.items():
-            _write(module.function(name, *kinds(name)), emit)
+            llvm_code.write(module, name, kinds(name), emit)
         return list(known)
 
     # the parts
 
+    def _call(self, emit: Emitter, name: str, arguments: Sequence[Value]) -> Value:
+        """Whether what a part computes holds; it is written when it is first called."""
+        module, full_name = emit.builder.module, f"{name}_{emit.suffix}"
+        if not module.defines(full_name):
+            builder = module.function(full_name, emit.bit, [value.type for value in arguments], internal=True)
+            builder.ret(self._parts[name](emit.like(builder), *builder.arguments))
+        return emit.builder.call(full_name, emit.bit, arguments)
+
     def _written(self, emit: Emitter, arguments: Sequence[Value], places: Mapping[int, Place] = NOWHERE) -> Written:
         """For code at t, q, v, of which numbers are the next argument."""
-        written, emit.numbers = Written(emit, self.numbers, places), arguments[3]
+        written = Written(emit, self.numbers, places)
+        _read(emit, arguments[3])
         written.take(self.equations.graph, arguments[:3])
         return written
 
@@ -102,7 +114,7 @@ class PartsCode:
 
     def _with_factors(self, outputs: Outputs) -> Callable[..., Value]:
         def emit_part(emit: Emitter, r: Value, c: Value, kept: Value, numbers: Value, *out: Value) -> Value:
-            emit.numbers = numbers
+            _read(emit, numbers)
             written = Written(emit, self.numbers)
             written.take(self.solution.graph, [r, c, kept])
             results = written.results(self.solution.graph, outputs)
@@ -111,24 +123,27 @@ class PartsCode:
 
         return emit_part
 
-    # what kernels call
+    # what kernels call, and code in lanes
 
-    def _there(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, a: Value) -> Value:
-        kept, r, c, lam = _rooms(emit, self.solution.n_kept, self.n, self.n_rows, self.n_rows)
+    def there(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, a: Value) -> Value:
+        """Accelerations."""
+        kept, r, c, lam = self._rooms(emit)
         at = [t, q, v, numbers, kept]
-        _leave_unless(emit, "factors", at)
-        _leave_unless(emit, "right", [*at, r, c])
-        return emit.builder.call("solution", BIT, [r, c, kept, numbers, a, lam])
+        holds = self._call(emit, "factors", at)
+        holds = _both(emit, holds, self._call(emit, "right", [*at, r, c]))
+        return _both(emit, holds, self._call(emit, "solution", [r, c, kept, numbers, a, lam]))
 
-    def _closer(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, moved: Value, out: Value) -> Value:
-        kept, r, c, lam = _rooms(emit, self.solution.n_kept, self.n, self.n_rows, self.n_rows)
-        _leave_unless(emit, "factors", [t, q, v, numbers, kept])
+    def closer(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, moved: Value, out: Value) -> Value:
+        """Positions moved towards the constraints."""
+        kept, r, c, lam = self._rooms(emit)
+        at = [t, q, v, numbers, kept]
         _clear(emit, self.n, r)
-        self._correct(emit, "off", [t, q, v, numbers, kept], r, c, moved, lam)
+        holds = self._correct(emit, self._call(emit, "factors", at), "off", at, r, c, moved, lam)
+        _leave_unless(emit, holds)
         _sum(emit, self.n, q, moved, out)
-        return TRUE
+        return holds
 
-    def _nearer(
+    def nearer(
         self,
         emit: Emitter,
         t: Value,
@@ -141,38 +156,55 @@ class PartsCode:
         new_v: Value,
         lam: Value,
     ) -> Value:
-        n, n_rows = self.n, self.n_rows
-        kept, r, c, change, u = _rooms(emit, self.solution.n_kept, n, n_rows, n, n)
+        """The same, and velocities, accelerations and multipliers."""
+        kept, r, c, change = self._rooms(emit)
+        (u,) = _rooms(emit, self.n)
         at = [t, q, v, numbers, kept]
-        _leave_unless(emit, "factors", at)
-        _clear(emit, n, r)
-        self._correct(emit, "off", at, r, c, moved, lam)
-        self._correct(emit, "faster", at, r, c, change, lam)
-        _sum(emit, n, v, change, u)
-        _leave_unless(emit, "right", [t, q, u, numbers, kept, r, c])
-        _leave_unless(emit, "solution", [r, c, kept, numbers, a, c if self.redundant else lam])
+        _clear(emit, self.n, r)
+        holds = self._correct(emit, self._call(emit, "factors", at), "off", at, r, c, moved, lam)
+        holds = self._correct(emit, holds, "faster", at, r, c, change, lam)
+        _sum(emit, self.n, v, change, u)
+        holds = _both(emit, holds, self._call(emit, "right", [t, q, u, numbers, kept, r, c]))
+        solution = [r, c, kept, numbers, a, c if self.redundant else lam]
+        holds = _both(emit, holds, self._call(emit, "solution", solution))
         if self.redundant:
-            _leave_unless(emit, "least", [c, c, kept, numbers, lam])
-        _sum(emit, n, q, moved, new_q)
-        _sum(emit, n, v, change, new_v)
-        return TRUE
+            holds = _both(emit, holds, self._call(emit, "least", [c, c, kept, numbers, lam]))
+        _leave_unless(emit, holds)
+        _sum(emit, self.n, q, moved, new_q)
+        _sum(emit, self.n, v, change, new_v)
+        return holds
 
-    def _correct(self, emit: Emitter, what: str, at: list[Value], r: Value, c: Value, out: Value, lam: Value) -> None:
+    def _rooms(self, emit: Emitter) -> list[Value]:
+        """For what is kept, r, c, and a solution."""
+        return _rooms(emit, self.solution.n_kept, self.n, self.n_rows, max(self.n, self.n_rows))
+
+    def _correct(
+        self, emit: Emitter, holds: Value, what: str, at: list[Value], r: Value, c: Value, out: Value, lam: Value
+    ) -> Value:
         """The solution where r is zero, in the metric of M; the multipliers do not matter."""
-        _leave_unless(emit, what, [*at, c])
-        _leave_unless(emit, "solution", [r, c, at[-1], at[-2], out, lam])
+        holds = _both(emit, holds, self._call(emit, what, [*at, c]))
+        return _both(emit, holds, self._call(emit, "solution", [r, c, at[-1], at[-2], out, lam]))
+
+
+def _read(emit: Emitter, numbers: Value) -> None:
+    """Say where numbers stand, which lanes have in common."""
+    emit.numbers = numbers
+    if width_of(emit.double) > 1:
+        emit.constants = numbers  # type: ignore[attr-defined]
 
 
 def _rooms(emit: Emitter, *sizes: int) -> list[Value]:
-    return [emit.builder.room(DOUBLE, size) for size in sizes]
+    return [emit.builder.room(DOUBLE, size * width_of(emit.double)) for size in sizes]
 
 
-def _leave_unless(emit: Emitter, name: str, arguments: Sequence[Value]) -> None:
-    emit.builder.leave_unless(emit.builder.call(name, BIT, arguments))
+def _both(emit: Emitter, one: Value, other: Value) -> Value:
+    return emit.builder.both(one, other)
 
 
-def _write(builder: Builder, emit: Callable[..., Any]) -> None:
-    builder.ret(emit(Emitter(builder), *builder.arguments))
+def _leave_unless(emit: Emitter, holds: Value) -> None:
+    """Change nothing that is given where it does not hold; in lanes, others may hold."""
+    if holds.type == BIT:
+        emit.builder.leave_unless(holds)
 
 
 def _store(emit: Emitter, arrays: Sequence[Sequence[Value]], out: Sequence[Value]) -> None:
@@ -183,7 +215,7 @@ def _store(emit: Emitter, arrays: Sequence[Sequence[Value]], out: Sequence[Value
 
 def _clear(emit: Emitter, n: int, out: Value) -> None:
     with emit.loop(integer(0), integer(n), []) as (j, _, _):
-        emit.store(ZERO, emit.pointer(out, j))
+        emit.store(emit.constant(0.0), emit.pointer(out, j))
 
 
 def _sum(emit: Emitter, n: int, one: Value, other: Value, out: Value) -> None:

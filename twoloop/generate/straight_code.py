@@ -130,14 +130,10 @@ class SharedCode:
     def _described(self) -> Iterable[Any]:
         equations, parts, numbers = self.equations, self.parts, self.numbers
         yield equations.system.n_q, equations.choice.rows, equations.choice.added
-        kept = [] if parts is None else [parts.solution.kept]
-        for outputs in (*self.outputs.values(), *kept, *self._accelerations):
+        for outputs in (*self.outputs.values(), *self._accelerations):
             yield outputs.sizes, list(numbers.structure(equations.graph, outputs.forms))
         if parts is not None:
-            for outputs in parts.at_position.values():
-                yield outputs.sizes, list(numbers.structure(equations.graph, outputs.forms, parts.solution.known))
-            for outputs in parts.with_factors.values():
-                yield outputs.sizes, list(numbers.structure(parts.solution.graph, outputs.forms))
+            yield from parts.described()
 
     def _write(self) -> tuple[list[str], str]:
         from twoloop.kernels.data.common import KIT

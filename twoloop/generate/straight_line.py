@@ -107,6 +107,8 @@ class StraightLine:
         "c" (n_c + n_a,) of the moves to positions and to velocities on the rows.
     redundant : Outputs
         No arrays; its conditions are that the rows of C_q that do not count hold, too.
+    parts : PartsCode or None
+        Writes the elimination of M in parts, where equations are long: see parts_code.py, which sets it.
     n_operations : int
         Of callbacks and elimination, without solutions.
     traced : Traced
@@ -117,6 +119,8 @@ class StraightLine:
     Untraceable
         Saying why the equations cannot be had.
     """
+
+    parts: Any = None
 
     def __init__(self, system: ConstrainedSystem, choice: Choice, equations: Equations | None = None):
         self.equations = Equations(system) if equations is None else equations

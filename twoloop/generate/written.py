@@ -5,7 +5,7 @@ from typing import Any
 
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.llvm_code import Emitter, Quantities
-from twoloop.generate.llvm_text import BIT, DOUBLE, Value
+from twoloop.generate.llvm_text import BIT, Value
 from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE, sine_and_cosine
 from twoloop.generate.straight_line import Outputs
 from twoloop.generate.tracing import Form, Graph
@@ -57,7 +57,7 @@ class Written:
         """Take the inputs of a graph, which are given as numbers or in memory, and loaded there first."""
         first = 0
         for argument, size in zip(given, graph.sizes, strict=True):
-            if argument.type == DOUBLE:
+            if argument.type == self.emit.double:
                 self.define(first, argument)
             else:
                 self._places |= {first + j: (argument, j) for j in range(size)}
