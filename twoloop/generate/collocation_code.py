@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from twoloop.generate import lane_emitter, llvm_code, lobatto_tables
 from twoloop.generate.accelerations import write_accelerations
-from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.llvm_code import Emitter
 from twoloop.generate.llvm_text import BIT, DOUBLE, INTEGER, Module, Value, constant, constants, integer

@@ -67,7 +67,7 @@ class PartsCode:
 
     def write(self, module: Module, kinds: Callable[[str], tuple[str, list[str]]]) -> list[str]:
         """Put the functions that kernels know into a module; their names. `kinds` has their types."""
-        known = {"own_closer": self.closer, "own_nearer": self.nearer}
+        known: dict[str, Callable[..., Any]] = {"own_closer": self.closer, "own_nearer": self.nearer}
         if self.equations.quick is None:
             known["own_there"] = self.there
         for name, emit in known.items():
