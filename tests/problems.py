@@ -115,7 +115,7 @@ def driven_cart(place, speed, **more):
 def entry(helper):
     """A helper of the kernels, which has no entry from Python, as a function of Python's; its machine code is kept."""
 
-    @kept_when_called()
+    @kept_when_called(pipeline_class=KernelCompiler, **OPTIONS)
     def call(arguments):
         return helper(*arguments)
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scipy.linalg import null_space
 
 from tests.bodies.random_models import Both
+from tests.marks import slow
 from tests.problems import assert_same, quick, worst
 from twoloop import mechanisms, solve_dae
 from twoloop.generate.accelerations import write_accelerations
@@ -112,10 +113,10 @@ def test_accelerations_are_those_of_the_callbacks(name):
 @pytest.mark.parametrize(
     ("planar", "kinds"),
     [
-        (True, ["revolute"] * 4),
+        slow(True, ["revolute"] * 4),
         (True, ["revolute"] * 3 + ["prismatic"]),
-        (False, ["revolute", "spherical", "universal", "revolute"]),
-        (False, ["revolute", "cylindrical", "spherical", "prismatic"]),
+        slow(False, ["revolute", "spherical", "universal", "revolute"]),
+        slow(False, ["revolute", "cylindrical", "spherical", "prismatic"]),
     ],
 )
 def test_so_are_those_of_random_loops_of_bodies(planar, kinds):

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.marks import slow
 from tests.test_rooms import documentation
 from twoloop import Status, mechanisms, solve_dae
 from twoloop.bodies import PlanarModel, SpatialModel
@@ -68,7 +69,10 @@ def names(tmp_path_factory):
     return run
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if page not in ELSEWHERE])
+CODE = [page for page in PAGES if page not in ELSEWHERE]
+
+
+@pytest.mark.parametrize("page", [slow(page) if page == "certificate" else page for page in CODE])
 def test_the_code_of_a_page_runs(page, names, recwarn):
     assert (len(blocks(f"docs/{page}.md")) == 0) == (page in WITHOUT_CODE)
     names(page)
@@ -355,17 +359,24 @@ def test_a_joint_is_drawn_by_moving_it(tmp_path, monkeypatch):
         list(joints.positions(forbidden, *joints.problem_of(forbidden, joints.planar)))
 
 
-def test_the_gallery_shows_every_ready_mechanism(tmp_path, monkeypatch):
+MAKERS = {name for name in mechanisms.__all__ if name[0].islower()} - {"ancf_beam"}
+
+
+def test_the_gallery_shows_every_ready_mechanism():
+    text = text_of("docs/reference/gallery.md")
+    assert set(re.findall(r"^## (\w+)$", text, re.MULTILINE)) == MAKERS and text.count("- *Tests*: ") == len(MAKERS)
+
+
+@pytest.mark.slow
+def test_the_gallery_animates_every_ready_mechanism(tmp_path, monkeypatch):
     documentation("shapes")
     gallery = documentation("gallery")
-    makers = {name for name in mechanisms.__all__ if name[0].islower()} - {"ancf_beam"}
     text = text_of("docs/reference/gallery.md")
-    assert set(re.findall(r"^## (\w+)$", text, re.MULTILINE)) == makers and text.count("- *Tests*: ") == len(makers)
     monkeypatch.setattr(gallery, "LONGEST", 0.01)  # s: whole motions are for the build
     gallery.animate(tmp_path)
-    assert {file.stem for file in tmp_path.iterdir()} == makers
+    assert {file.stem for file in tmp_path.iterdir()} == MAKERS
     shown = documentation("for_sphinx").with_animations(text)
-    assert set(re.findall(r'src="\.\./animations/(\w+)\.html"', shown)) == makers and "![" not in shown
+    assert set(re.findall(r'src="\.\./animations/(\w+)\.html"', shown)) == MAKERS and "![" not in shown
     problem = four_bar()
     gallery.picture(problem, gallery.motion(problem), tmp_path / "four_bar.png")
     assert (tmp_path / "four_bar.png").stat().st_size > 1000

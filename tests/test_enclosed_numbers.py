@@ -62,7 +62,7 @@ def pull_of(place, t):
 def system(pull):
     """A pendulum with this force along -y."""
     force = lambda t, q, v: np.array([0.0, -pull(t)])  # noqa: E731
-    return pendulum(compile=True, constant_mass=True, gamma=False, jacobian=None, force=force)
+    return pendulum(compile=True, constant_mass=True, force=force)
 
 
 @pytest.fixture(autouse=True)

@@ -43,7 +43,7 @@ def switching(t, q, v):
 
 
 def smooth(force):
-    return pendulum(compile=True, constant_mass=True, force=force)
+    return pendulum(constant_mass=True, force=force)
 
 
 def position(angle):
@@ -153,7 +153,7 @@ SHORT_CHANGES = {
 @pytest.mark.parametrize("callback", SHORT_CHANGES)
 def test_short_changes_are_seen_in_every_callback(callback):
     """A jacobian that is not given, rows of A and a mass that varies with time were not checked for it."""
-    system = ConstrainedSystem.from_python(**{**HILL, **SHORT_CHANGES[callback], "compile": True})
+    system = ConstrainedSystem.from_python(**HILL | SHORT_CHANGES[callback])
     q, v = ([0.0, 0.1], [0.0, 0.0]) if system.n_c else ([0.0, 0.0], [0.0, 0.0])
     result = solve_dae(system, (0.0, 1.0), q, v, "DOP853", 1e-3, 1e-3)
     assert result.success and result.h.max() <= 0.01 * (1.0 + 1e-9)

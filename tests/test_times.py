@@ -54,7 +54,7 @@ def test_a_drive_starts_at_zero_far_from_the_time_zero(method, t0):
     tolerance = {1e5: 1e-8, -1e7: 1e-6, 1e9: 1e-4}[t0] if method not in ("Newmark", "BDF") else 1e-4
     system = unconstrained(
         lambda t, q, v: np.array([0.0, -4.0 * (q[1] - q[0])]),
-        **{"n_q": 2, "n_c": 1, "compile": True},
+        **{"n_q": 2, "n_c": 1},
         constraint=lambda t, q: np.array([q[0] - np.sin(3.0 * (t - t0))]),
         jacobian=lambda t, q: np.array([[1.0, 0.0]]),
         constraint_rate=lambda t, q: np.array([-3.0 * np.cos(3.0 * (t - t0))]),

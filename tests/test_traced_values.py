@@ -249,7 +249,7 @@ def in_kernels(system, t, q, v):
 READY = sorted({name for name in mechanisms.__all__ if name[0].islower()} - {"ancf_beam", "n_four_bar"})
 
 
-@pytest.mark.parametrize("name", quick(READY, 6))
+@pytest.mark.parametrize("name", quick(READY, 3))
 def test_of_every_ready_mechanism_they_are_those_of_its_formulas(name):
     problem = getattr(mechanisms, name)()
     system, v = problem.system, problem.v0 + np.linspace(0.5, 1.5, problem.system.n_q)
@@ -308,7 +308,6 @@ def driven_along_a_rail(parameters=(9.81, 0.2)):
         constraint=lambda t, q, p: np.array([0.5 * ((q[0] - p[1] * np.sin(3.0 * t)) ** 2 + q[1] ** 2 - 1.0)]),
         constraint_rate=lambda t, q, p: np.array([-3.0 * p[1] * np.cos(3.0 * t) * (q[0] - p[1] * np.sin(3.0 * t))]),
         parameters=parameters,
-        compile=True,
     )
 
 

@@ -16,12 +16,12 @@ from references.sundials.residual import FORMS, Implicit, iteration_matrix_at, r
 from tests.marks import slow
 from tests.problems import PLAIN, without_tangent
 from twoloop import ConstrainedSystem, callback, consistent_state, solve_dae
-from twoloop.mechanisms import four_bar, moderately_stiff_beam, very_flexible_beam
+from twoloop.mechanisms import double_pendulum, four_bar, moderately_stiff_beam, very_flexible_beam
 from twoloop.mechanisms.ancf_beam import tip_height
 from twoloop.problem.callbacks import callbacks_in
 from twoloop.run.record import Status
 
-PROBLEM = four_bar()
+PROBLEM, SMALL = four_bar(), double_pendulum()
 # largest error of q at 1001 instants over 10 s: three times the largest of 15 runs that differ in rounding
 BOUNDS = {1e-5: 5.4e-2, 1e-7: 1.3e-3, 1e-9: 2.4e-5, 1e-11: 3e-7}
 SCALES = {"q": 1.0, "v": 10.0, "a": 250.0, "lam": 250.0}  # errors against those of q, about
@@ -108,17 +108,18 @@ def test_moving_pivot_without_gamma_and_with_a_mass_that_varies():
         assert np.abs(mine[:, -1] - theirs[:, -1]).max() < 1e-4
 
 
-# the pendulum moves its pivot and has a mass that varies, of which the four-bar has neither
+# the pendulum moves its pivot and has a mass that varies, of which the others have neither; the matrix of the double
+# pendulum is compiled for the tests of adapters, too
 @pytest.mark.parametrize(
     ("of", "form"),
     [
-        ("exact tangent", "stabilised"),
-        *[slow(of, form) for of in ("moving pivot", "four-bar") for form in FORMS],
-        slow("exact tangent", "index1"),
+        ("double pendulum", "stabilised"),
+        *[slow(of, form) for of in ("moving pivot", "four-bar", "exact tangent") for form in FORMS],
     ],
 )
 def test_jacobian_is_that_of_the_residual(of, form):
-    system = PROBLEM.system if of == "four-bar" else pendulum(SPRING if of == "exact tangent" else GOOD)[0]
+    ready = {"four-bar": PROBLEM, "double pendulum": SMALL}
+    system = ready[of].system if of in ready else pendulum(SPRING if of == "exact tangent" else GOOD)[0]
     tangent = spring_tangent if of == "exact tangent" else None
     size = 2 * system.n_q + system.n_c * (1 if form == "index1" else 2)
     rng = np.random.default_rng(5)
@@ -143,6 +144,7 @@ def test_jacobian_is_that_of_the_residual(of, form):
 
 
 # --- failures
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "flag"),
     [(RAISES, "IDA_RES_FAIL (-8)"), *((kind, "IDA_CONV_FAIL (-4)") for kind in (NAN, MASS, CONSTRAINT, JACOBIAN))],
@@ -181,6 +183,7 @@ def allocated():
     return sizes[4] + sizes[7]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallinfo2"), reason="needs glibc")
 @pytest.mark.usefixtures("collected_alone")
 def test_runs_leave_nothing_behind():

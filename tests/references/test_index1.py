@@ -33,6 +33,7 @@ def test_takes_the_steps_of_solve_ivp_on_equations_written_apart():
     assert worst(ours.h, np.diff(ours.t)) == 0.0
 
 
+@pytest.mark.slow
 def test_drift_and_its_cures():
     """Over 100 s: growth without bound, a bound that the tolerance sets, nothing but rounding."""
     system = LINKAGES["default"].system
@@ -76,6 +77,7 @@ def test_lsoda_does_not_step_towards_a_singularity_without_end():
     assert 0.69 < result.t[-1] <= 0.7 and result.stats.n_accepted < 20000
 
 
+@pytest.mark.slow
 def test_at_equal_error_the_projected_solver_costs_what_dop853_of_twoloop_does():
     # the same tableau on q'' = a, projected after every step; cost over error on the log-log lines through the runs
     target, counts = 1e-6, []

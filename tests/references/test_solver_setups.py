@@ -44,6 +44,7 @@ def error(problem, result):
     return np.abs(result.q[:, -1] - problem.reference.q).max()
 
 
+@pytest.mark.slow
 def test_ida_tests_positions_and_velocities_without_the_integrals_of_the_multipliers():
     made = {test: run(solve_ida_c, FOUR_BAR, 1e-7, 1e-7, error_test=test) for test in ("states", "positions")}
     assert 1e-9 < error(FOUR_BAR, made["states"]) < 2e-4

@@ -104,6 +104,7 @@ def test_where_no_solver_reaches_the_end_the_report_lists_them(mechanisms):
     assert "not compared" in text and "not applicable" in text
 
 
+@pytest.mark.slow
 def test_a_run_that_cannot_be_measured_is_a_row(mechanisms, monkeypatch):
     def measure(problem, result, *others):
         if result.method == "DOP853":

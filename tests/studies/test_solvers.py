@@ -11,6 +11,7 @@ from studies.bench.metrics import violations
 from studies.bench.solvers import CATALOGUE, DEFAULT, EXUDYN, GIVEN, IRK, LINE_UP, TOLERANCES, gear
 from studies.reproduction import step_size, violation
 from studies.validation import study as validation
+from tests.marks import slow
 from twoloop import solve_dae
 from twoloop.mechanisms import four_bar
 
@@ -32,7 +33,12 @@ def setting(name):
 
 
 @pytest.mark.parametrize(
-    "name", [name for name in CATALOGUE if CATALOGUE[name].family == "two-loop" or not name.startswith(COMPILING)]
+    "name",
+    [
+        slow(name) if name.startswith("GSTIFF") else name  # its kernel takes six seconds to compile
+        for name in CATALOGUE
+        if CATALOGUE[name].family == "two-loop" or not name.startswith(COMPILING)
+    ],
 )
 def test_every_solver_runs_at_one_setting(name):
     problem = four_bar()
