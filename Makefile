@@ -79,35 +79,33 @@ bench: compile-all ## two commits side by side: make bench BASE=main [HEAD=branc
 # the inner loop is there; two processes of about equal work, neither of which imports, and so compiles, what the other
 # does: what Newton's matrices and large systems have in common, and bodies in space, are in one of them
 compile: install ## compile the kernels, and the callbacks of bodies, mechanisms and studies, on two cores
-	@echo "Compiling (once, on both cores) the steps of most methods, interpolation, and the runs in SIMD lanes"
+	@echo "Compiling (once, on both cores) the kernels, and the callbacks of bodies, mechanisms and studies"
 	@$(RUN) -c "from twoloop.kernels.evaluation import calls, own_inner; from twoloop.kernels.control import controller"
 	@$(RUN) -c "from twoloop.kernels.steps import diagonal_step, newton_step; \
 	from twoloop.kernels.evaluation import static_inner; from twoloop.bodies import spatial_callbacks, spatial_programs; \
-	from studies.bench import sharp_callbacks" & \
+	from studies.bench import sharp_callbacks; $(CALLBACKS_OF_TESTS)" & \
 	$(RUN) -c "from twoloop.kernels import advance, agreement, interpolation, short_loops; \
 	from twoloop.kernels.algebra import dependents, independent, pivots, scaling; from twoloop.kernels.control import switching; \
 	from twoloop.kernels.evaluation import first_look, traced; \
 	from twoloop.kernels.lanes import lane_dop853, lane_runs, lane_starts, lane_taylor; \
 	from twoloop.kernels.steps import adams_step, asking_step, bdf_step, bridge, explicit_step, lobatto_step, \
-	fixed_point_step, newmark_step, paper_step, taylor_step; from twoloop.bodies import planar_callbacks, planar_programs" && wait $$!
-	@echo "Compiling the callbacks of the ready mechanisms and of studies"
-	@$(RUN) -c "from twoloop.mechanisms import *" & $(RUN) -c "from studies.honesty import traps" && wait $$!
+	fixed_point_step, newmark_step, paper_step, taylor_step; from twoloop.bodies import planar_callbacks, planar_programs; \
+	from twoloop.mechanisms import *; from studies.honesty import traps; $(CALLBACKS_OF_MORE_TESTS)" && wait $$!
 
 # kernels that slow tests alone need
 compile-all: compile
 	@echo "Compiling the steps of implicit methods in lanes"
 	@$(RUN) -c "from twoloop.kernels.lanes import lane_implicit"
 
-# the callbacks of tests are compiled before: both workers would do that. Files in the order of tests/conftest.py: sorted
-# by how many tests they have, long ones with few tests would come last
+# files in the order of tests/conftest.py: sorted by how many tests they have, long ones with few tests would come last
 SHARED := -n 2 --dist loadfile --no-loadscope-reorder
 
+# what tests compile when they are imported is compiled before: both workers would do that
+test: CALLBACKS_OF_TESTS := import tests.compiled, tests.problems, tests.test_bounds, tests.test_callbacks, \
+	tests.test_repeated_calls, tests.test_other_parameters, tests.test_certificate
+test: CALLBACKS_OF_MORE_TESTS := import tests.studies.test_honesty, tests.test_differential, \
+	tests.test_derivative_campaign, tests.references.test_equations, tests.references.test_ida
 test: compile ## the tests that a change needs, on two cores
-	@echo "Compiling the callbacks of tests"
-	@$(RUN) -c "import tests.compiled, tests.problems, tests.test_bounds, tests.test_callbacks, tests.test_repeated_calls, \
-	tests.test_other_parameters, tests.test_certificate, tests.test_traced_values, tests.test_sweep_together" & \
-	$(RUN) -c "import tests.studies.test_honesty, tests.test_differential, tests.test_derivative_campaign, \
-	tests.references.test_equations, tests.references.test_ida" && wait $$!
 	$(RUN) -m pytest $(SHARED) $(ARGS)
 
 test-all: compile-all ## all tests, the slow ones too: about twenty minutes
