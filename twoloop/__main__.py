@@ -16,7 +16,7 @@ from twoloop import Result, __version__, kernels, mechanisms, solve_dae
 from twoloop.audit.mjcf import audit_mjcf, check_ending
 from twoloop.checks.optional import needed
 from twoloop.kernels.compile.caches import folder_of
-from twoloop.mechanisms.user_file import problem_from
+from twoloop.mechanisms.registry import problem_from
 from twoloop.methods.presets import PRESETS
 from twoloop.rows.leaderboard import leaderboard
 from twoloop.rows.row_format import MAX_ERRORS, find_errors, read_lines

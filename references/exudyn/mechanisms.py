@@ -16,8 +16,8 @@ from references.exudyn.run import SOLVERS, check_steps, run
 from references.lines import CannotRun, Line
 from twoloop.bodies.rotation import euler_parameters, rotated_rate, rotation_matrix
 from twoloop.mechanisms import bricard, n_four_bar
-from twoloop.mechanisms.bricard import AXES, CORNERS, FRAMES
-from twoloop.mechanisms.governor import BALL, CUBE, DAMPING, DENSITY, HEIGHT, LENGTH, SLACK, STIFFNESS, WIDTH, box
+from twoloop.mechanisms.natural import BRICARD_AXES, BRICARD_CORNERS, BRICARD_FRAMES
+from twoloop.mechanisms.spatial import BALL, CUBE, DAMPING, DENSITY, HEIGHT, LENGTH, SLACK, STIFFNESS, WIDTH, box
 from twoloop.problem.problem import Array, Problem
 from twoloop.result.result import Result
 
@@ -163,10 +163,10 @@ def _governor(problem: Problem) -> Model:
 def _bricard(problem: Problem) -> Model:
     model = Model((0.0, -problem.parameters["gravity"], 0.0))
     width = problem.parameters["width"] ** 2 / 12.0
-    for (begin, end), R in zip(pairwise(CORNERS), FRAMES, strict=True):
+    for (begin, end), R in zip(pairwise(BRICARD_CORNERS), BRICARD_FRAMES, strict=True):
         q = np.concatenate([0.5 * (begin + end), euler_parameters(R)])
         model.body(1.0, (2.0 * width, 1.0 / 12.0 + width, 1.0 / 12.0 + width), q, np.zeros(7))
-    for hinge, (corner, axis) in enumerate(zip(CORNERS, AXES, strict=True)):
+    for hinge, (corner, axis) in enumerate(zip(BRICARD_CORNERS, BRICARD_AXES, strict=True)):
         after = hinge if hinge < 5 else GROUND
         model.joint(hinge - 1 if hinge else GROUND, after, corner, frame(axis), REVOLUTE)
     return model

@@ -18,7 +18,7 @@ import numpy as np
 from references.driver import cpu_time
 from references.equations.accelerations import compiled_gamma
 from twoloop.mechanisms import Problem
-from twoloop.mechanisms.user_file import problem_from
+from twoloop.mechanisms.registry import problem_from
 from twoloop.rows.row_format import calibration_s
 from twoloop.testing.problem import Array, KnownProblem
 from twoloop.testing.runs import run_simulator

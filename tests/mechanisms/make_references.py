@@ -11,7 +11,7 @@ import numpy as np
 
 from tests.mechanisms.motions import known_motions
 from tests.mechanisms.motions.integrate import by_extrapolation, by_scipy
-from twoloop.mechanisms.computed import FILE
+from twoloop.mechanisms.registry import REFERENCES
 
 BEST = 15.5  # digits of the numbers in the file
 ENOUGH = 15.0
@@ -88,9 +88,9 @@ def main(names):
             continue
         new = computed(problem, motion, end)
         print(name, new["digits"], new["agrees"], flush=True)
-        whole = json.loads(FILE.read_text(encoding="utf-8")) if FILE.exists() else {}
+        whole = json.loads(REFERENCES.read_text(encoding="utf-8")) if REFERENCES.exists() else {}
         whole[name] = new
-        FILE.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
+        REFERENCES.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

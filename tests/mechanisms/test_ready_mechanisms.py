@@ -23,7 +23,7 @@ from twoloop import ConstraintWarning, mechanisms
 from twoloop.bodies.rotation import euler_parameters, euler_rates
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.mechanisms import four_bar
-from twoloop.mechanisms.momentum import Momentum
+from twoloop.mechanisms.spatial import Momentum
 
 COMPUTED, CLOSED = known_motions(), closed_forms()
 PROBLEMS = {name: problem for name, (problem, *_) in {**COMPUTED, **CLOSED}.items()}

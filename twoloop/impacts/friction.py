@@ -211,7 +211,7 @@ class Modes:
 
 
 class FrictionModes(Modes):
-    """A model with dry friction in joints, each of which slides, with a sign, or sticks: 0.
+    """Provide the systems of a model with dry friction in joints, each of which slides, with a sign, or sticks: 0.
 
     Parameters
     ----------

@@ -13,30 +13,22 @@ from twoloop.problem.problem import Condition, Problem, Reference
 if TYPE_CHECKING:
     from twoloop.mechanisms.ancf_beam import ancf_beam, moderately_stiff_beam, very_flexible_beam
     from twoloop.mechanisms.andrews import andrews
-    from twoloop.mechanisms.bricard import bricard
-    from twoloop.mechanisms.chain import closed_chain, double_pendulum
-    from twoloop.mechanisms.driven_crank import driven_crank
     from twoloop.mechanisms.four_bar import four_bar
-    from twoloop.mechanisms.governor import governor
-    from twoloop.mechanisms.heavy_top import heavy_top
     from twoloop.mechanisms.knife_edge import knife_edge
     from twoloop.mechanisms.n_four_bar import n_four_bar
-    from twoloop.mechanisms.pendulum import pendulum, projection_pendulum
+    from twoloop.mechanisms.natural import bricard, closed_chain, double_pendulum, pendulum, projection_pendulum
     from twoloop.mechanisms.rolling_disc import rolling_disc
-    from twoloop.mechanisms.slider_crank import driven_slider_crank, redundant_slider_crank
-    from twoloop.mechanisms.spatial_four_bar import spatial_four_bar
-    from twoloop.mechanisms.spatial_slider_crank import spatial_slider_crank
+    from twoloop.mechanisms.slider_cranks import driven_crank, driven_slider_crank, redundant_slider_crank
+    from twoloop.mechanisms.spatial import governor, heavy_top, spatial_four_bar, spatial_slider_crank
     from twoloop.mechanisms.sundials_slider_crank import sundials_slider_crank
 
-_ELSEWHERE = {  # functions whose modules have other names
-    "closed_chain": "chain",
-    "double_pendulum": "chain",
-    "driven_slider_crank": "slider_crank",
-    "moderately_stiff_beam": "ancf_beam",
-    "projection_pendulum": "pendulum",
-    "redundant_slider_crank": "slider_crank",
-    "very_flexible_beam": "ancf_beam",
+_MODULES = {  # of mechanisms whose modules have other names
+    "ancf_beam": ("moderately_stiff_beam", "very_flexible_beam"),
+    "natural": ("bricard", "closed_chain", "double_pendulum", "pendulum", "projection_pendulum"),
+    "slider_cranks": ("driven_crank", "driven_slider_crank", "redundant_slider_crank"),
+    "spatial": ("governor", "heavy_top", "spatial_four_bar", "spatial_slider_crank"),
 }
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 __all__ = ["Condition", "Problem", "Reference", "ancf_beam", "andrews", "bricard", "closed_chain", "double_pendulum"]
 __all__ += ["driven_crank", "driven_slider_crank", "four_bar", "governor", "heavy_top", "knife_edge"]
@@ -47,7 +39,7 @@ __all__ += ["rolling_disc", "spatial_four_bar", "spatial_slider_crank", "sundial
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"{__name__}.{_ELSEWHERE.get(name, name)}"), name)
+    value = getattr(import_module(f"{__name__}.{_MODULE_OF.get(name, name)}"), name)
     globals()[name] = value
     return value
 
@@ -57,7 +49,7 @@ def __dir__() -> list[str]:
 
 
 class _Package(ModuleType):
-    """A package in which `four_bar` is the function; Python would replace it by the submodule of that name."""
+    """Keep `four_bar` the function; Python would replace it by the submodule of that name."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         if isinstance(value, ModuleType) and name in __all__:

@@ -1,7 +1,18 @@
-"""The flexible beam on a moving base of Sect. 4.2, with the elements of `ancf_element`.
+"""Define the flexible beam on a moving base of Sect. 4.2: planar shear-deformable elements in absolute coordinates.
 
-The beam of Hussein, Negrut & Shabana (2008), doi 10.1007/s11071-007-9328-9: pinned to a base that moves along x.
-Coordinates: 6 per node (see `ancf_element`), 6 (n + 1) for n elements, from the base to the tip.
+The beam of Hussein, Negrut & Shabana (2008), doi 10.1007/s11071-007-9328-9: pinned to a base that moves along x. The
+elements of Omar & Shabana (2001), J. Sound Vib. 243(3), 565-576. Coordinates of a node: [r_x r_y, (dr/dx)_x (dr/dx)_y,
+(dr/dy)_x (dr/dy)_y], position and the slopes along the two material axes; e (12,) of an element: node A, then B. There
+are 6 (n + 1) coordinates for n elements, from the base to the tip. In an element of length l, with xi = x/l and the
+thickness coordinate y, r = sum S_i e_i with
+
+    S_1 = 1 - 3 xi^2 + 2 xi^3    S_2 = l (xi - 2 xi^2 + xi^3)    S_3 = (1 - xi) y
+    S_4 = 3 xi^2 - 2 xi^3        S_5 = l (xi^3 - xi^2)           S_6 = xi y
+
+so that dr/dx = s + y k and dr/dy = d: the slope s of the centre line is quadratic in xi, the director d linear, and
+its rate k = (d_B - d_A)/l constant. Green-Lagrange strains with the plane-strain law [lambda + 2 mu, lambda, mu] over
+the whole volume; the integral over y is done in closed form and the one along xi at 5 Gauss points, both exact, so
+that the numbers are those of the usual 5 x 3 points.
 
 The element locks: its director is constant over the thickness, so the transverse stress is not relieved in bending,
 and (lambda + 2 mu) acts in place of E. At Poisson's ratio 0.3 the bending stiffness is (lambda + 2 mu)/E = 1.346 times
@@ -19,23 +30,244 @@ from numpy.typing import ArrayLike
 from twoloop.bodies.points import LinearPoints
 from twoloop.checks.arguments import check_number, check_positive, check_size
 from twoloop.kernels.compile.callbacks import callback
-from twoloop.mechanisms import ancf_element as element
-from twoloop.mechanisms.ancf_element import elastic_energy, elastic_tangent
+from twoloop.kernels.data.common import compiled
 from twoloop.problem.callbacks import callbacks_in
 from twoloop.problem.description import Drawing, Joint
 from twoloop.problem.problem import Array, Problem
 from twoloop.problem.system import ConstrainedSystem
+
+# indices in p: length of an element; lambda + 2 mu, lambda and mu times the area of the cross-section, N; means of y^2
+# and y^4 over the thickness; mass of a unit of length, kg/m; gravity along -y, m/s^2
+LENGTH, STIFFNESS, LAME, SHEAR, SECOND, FOURTH, MASS, FALL, N_ELEMENT_PARAMETERS = range(9)
+
+
+def _gauss_points() -> Array:
+    """Return for each of 5 Gauss points on [0, 1]: weight, and factors of (r_B - r_A)/l, s_A, s_B and d_B."""
+    x, w = np.polynomial.legendre.leggauss(5)
+    xi = 0.5 * (1.0 + x)
+    return np.column_stack([0.5 * w, 6.0 * xi * (1.0 - xi), (1.0 - xi) * (1.0 - 3.0 * xi), xi * (3.0 * xi - 2.0), xi])
+
+
+POINTS = _gauss_points()
+
+
+@compiled
+def _resultants(sx, sy, kx, ky, dx, dy, p):
+    """Return derivatives of the energy per unit length, where r_x = s + y k and r_y = d.
+
+    eps_11 = axial + y s.k + y^2 kk, eps_22 = thick, 2 eps_12 = s.d + y k.d; their parts have the resultants n0, n1,
+    n2, m0, g0, g1.
+    """
+    j2, j4 = p[SECOND], p[FOURTH]
+    axial = 0.5 * (sx * sx + sy * sy - 1.0)
+    kk = 0.5 * (kx * kx + ky * ky)
+    thick = 0.5 * (dx * dx + dy * dy - 1.0)
+    mean = axial + j2 * kk
+    n0 = p[STIFFNESS] * mean + p[LAME] * thick
+    n1 = p[STIFFNESS] * j2 * (sx * kx + sy * ky)
+    n2 = p[STIFFNESS] * (j2 * axial + j4 * kk) + p[LAME] * j2 * thick
+    m0 = p[STIFFNESS] * thick + p[LAME] * mean
+    g0 = p[SHEAR] * (sx * dx + sy * dy)
+    g1 = p[SHEAR] * j2 * (kx * dx + ky * dy)
+    return n0, n1, n2, m0, g0, g1
+
+
+@compiled
+def element_force(e, p, Q):
+    """Add the elastic force of one element with coordinates e (12,), -dU/de, to Q (12,)."""
+    l = p[LENGTH]
+    cx, cy = (e[6] - e[0]) / l, (e[7] - e[1]) / l
+    kx, ky = (e[10] - e[4]) / l, (e[11] - e[5]) / l
+    Fcx = Fcy = Fkx = Fky = 0.0
+    for g in range(5):
+        w = POINTS[g, 0] * l
+        s1, s2, s5, xi = POINTS[g, 1], POINTS[g, 2], POINTS[g, 3], POINTS[g, 4]
+        sx = s1 * cx + s2 * e[2] + s5 * e[8]
+        sy = s1 * cy + s2 * e[3] + s5 * e[9]
+        dx = (1.0 - xi) * e[4] + xi * e[10]
+        dy = (1.0 - xi) * e[5] + xi * e[11]
+        n0, n1, n2, m0, g0, g1 = _resultants(sx, sy, kx, ky, dx, dy, p)
+        Fsx = w * (n0 * sx + n1 * kx + g0 * dx)
+        Fsy = w * (n0 * sy + n1 * ky + g0 * dy)
+        Fdx = w * (m0 * dx + g0 * sx + g1 * kx)
+        Fdy = w * (m0 * dy + g0 * sy + g1 * ky)
+        Fkx += w * (n1 * sx + n2 * kx + g1 * dx)
+        Fky += w * (n1 * sy + n2 * ky + g1 * dy)
+        Fcx += s1 * Fsx
+        Fcy += s1 * Fsy
+        Q[2] -= s2 * Fsx
+        Q[3] -= s2 * Fsy
+        Q[8] -= s5 * Fsx
+        Q[9] -= s5 * Fsy
+        Q[4] -= (1.0 - xi) * Fdx
+        Q[5] -= (1.0 - xi) * Fdy
+        Q[10] -= xi * Fdx
+        Q[11] -= xi * Fdy
+    Q[0] += Fcx / l
+    Q[1] += Fcy / l
+    Q[6] -= Fcx / l
+    Q[7] -= Fcy / l
+    Q[4] += Fkx / l
+    Q[5] += Fky / l
+    Q[10] -= Fkx / l
+    Q[11] -= Fky / l
+
+
+@compiled
+def element_tangent(e, p, K):
+    """Add the derivative of the elastic force of one element with coordinates e (12,) to K (12, 12), symmetric."""
+    l = p[LENGTH]
+    stiffness, lame, shear = p[STIFFNESS], p[LAME], p[SHEAR]
+    j2, j4 = p[SECOND], p[FOURTH]
+    kx, ky = (e[10] - e[4]) / l, (e[11] - e[5]) / l
+    for g in range(5):
+        w = -POINTS[g, 0] * l
+        xi = POINTS[g, 4]
+        # contributions of the vectors r_A, s_A, r_B, s_B to s, and of d_A, d_B to k and d
+        places = (0, 2, 6, 8)
+        in_s = (-POINTS[g, 1] / l, POINTS[g, 2], POINTS[g, 1] / l, POINTS[g, 3])
+        in_k = (-1.0 / l, 1.0 / l)
+        in_d = (1.0 - xi, xi)
+        sx = sy = 0.0
+        for i in range(4):
+            sx += in_s[i] * e[places[i]]
+            sy += in_s[i] * e[places[i] + 1]
+        dx = (1.0 - xi) * e[4] + xi * e[10]
+        dy = (1.0 - xi) * e[5] + xi * e[11]
+        n0, n1, n2, m0, g0, g1 = _resultants(sx, sy, kx, ky, dx, dy, p)
+        # second derivatives of the energy of a unit of length, xx, xy, yx, yy; those without yx are symmetric
+        ss_xx = w * (n0 + stiffness * (sx * sx + j2 * kx * kx) + shear * dx * dx)
+        ss_xy = w * (stiffness * (sx * sy + j2 * kx * ky) + shear * dx * dy)
+        ss_yy = w * (n0 + stiffness * (sy * sy + j2 * ky * ky) + shear * dy * dy)
+        sk_xx = w * (n1 + 2.0 * stiffness * j2 * sx * kx)
+        sk_xy = w * stiffness * j2 * (sx * ky + kx * sy)
+        sk_yy = w * (n1 + 2.0 * stiffness * j2 * sy * ky)
+        sd_xx = w * (g0 + (lame + shear) * sx * dx)
+        sd_xy = w * (lame * sx * dy + shear * dx * sy)
+        sd_yx = w * (lame * sy * dx + shear * dy * sx)
+        sd_yy = w * (g0 + (lame + shear) * sy * dy)
+        kk_xx = w * (n2 + stiffness * (j2 * sx * sx + j4 * kx * kx) + shear * j2 * dx * dx)
+        kk_xy = w * (stiffness * (j2 * sx * sy + j4 * kx * ky) + shear * j2 * dx * dy)
+        kk_yy = w * (n2 + stiffness * (j2 * sy * sy + j4 * ky * ky) + shear * j2 * dy * dy)
+        kd_xx = w * (g1 + (lame + shear) * j2 * kx * dx)
+        kd_xy = w * j2 * (lame * kx * dy + shear * dx * ky)
+        kd_yx = w * j2 * (lame * ky * dx + shear * dy * kx)
+        kd_yy = w * (g1 + (lame + shear) * j2 * ky * dy)
+        dd_xx = w * (m0 + stiffness * dx * dx + shear * (sx * sx + j2 * kx * kx))
+        dd_xy = w * (stiffness * dx * dy + shear * (sx * sy + j2 * kx * ky))
+        dd_yy = w * (m0 + stiffness * dy * dy + shear * (sy * sy + j2 * ky * ky))
+        for i in range(4):
+            I = places[i]
+            for j in range(4):
+                J = places[j]
+                K[I, J] += in_s[i] * in_s[j] * ss_xx
+                K[I, J + 1] += in_s[i] * in_s[j] * ss_xy
+                K[I + 1, J] += in_s[i] * in_s[j] * ss_xy
+                K[I + 1, J + 1] += in_s[i] * in_s[j] * ss_yy
+            for j in range(2):
+                J = 4 + 6 * j
+                xx = in_s[i] * (in_k[j] * sk_xx + in_d[j] * sd_xx)
+                xy = in_s[i] * (in_k[j] * sk_xy + in_d[j] * sd_xy)
+                yx = in_s[i] * (in_k[j] * sk_xy + in_d[j] * sd_yx)
+                yy = in_s[i] * (in_k[j] * sk_yy + in_d[j] * sd_yy)
+                K[I, J] += xx
+                K[J, I] += xx
+                K[I, J + 1] += xy
+                K[J + 1, I] += xy
+                K[I + 1, J] += yx
+                K[J, I + 1] += yx
+                K[I + 1, J + 1] += yy
+                K[J + 1, I + 1] += yy
+        for i in range(2):
+            I = 4 + 6 * i
+            for j in range(2):
+                J = 4 + 6 * j
+                both = in_k[i] * in_k[j]
+                dd = in_d[i] * in_d[j]
+                kd = in_k[i] * in_d[j]
+                dk = in_d[i] * in_k[j]
+                K[I, J] += both * kk_xx + dd * dd_xx + (kd + dk) * kd_xx
+                K[I, J + 1] += both * kk_xy + dd * dd_xy + kd * kd_xy + dk * kd_yx
+                K[I + 1, J] += both * kk_xy + dd * dd_xy + kd * kd_yx + dk * kd_xy
+                K[I + 1, J + 1] += both * kk_yy + dd * dd_yy + (kd + dk) * kd_yy
+
+
+@callback("mass")
+def mass(t, q, p, M):
+    l = p[LENGTH]
+    m = p[MASS] * l
+    places = (0, 2, 6, 8)  # r_A, s_A, r_B, s_B
+    # cubic Hermite polynomials over one another, and the linear ones of d_A, d_B; the two kinds do not couple
+    hermite = (
+        (156.0, 22.0 * l, 54.0, -13.0 * l),
+        (22.0 * l, 4.0 * l * l, 13.0 * l, -3.0 * l * l),
+        (54.0, 13.0 * l, 156.0, -22.0 * l),
+        (-13.0 * l, -3.0 * l * l, -22.0 * l, 4.0 * l * l),
+    )
+    for first in range(0, q.size - 6, 6):
+        for k in range(2):
+            for i in range(4):
+                for j in range(4):
+                    M[first + places[i] + k, first + places[j] + k] += m * hermite[i][j] / 420.0
+            A, B = first + 4 + k, first + 10 + k
+            M[A, A] += m * p[SECOND] / 3.0
+            M[A, B] += m * p[SECOND] / 6.0
+            M[B, A] += m * p[SECOND] / 6.0
+            M[B, B] += m * p[SECOND] / 3.0
+
+
+@callback("force")
+def force(t, q, v, p, Q):
+    l = p[LENGTH]
+    weight = p[MASS] * l * p[FALL]
+    for first in range(0, q.size - 6, 6):
+        Q[first + 1] -= weight / 2.0
+        Q[first + 3] -= weight * l / 12.0
+        Q[first + 7] -= weight / 2.0
+        Q[first + 9] += weight * l / 12.0
+        element_force(q[first : first + 12], p, Q[first : first + 12])
+
+
+@callback("force_by_q")
+def elastic_tangent(t, q, v, p, K):
+    """Add the derivative dQ/dq of `force` to K (n_q, n_q): symmetric, couples neighbouring nodes only."""
+    for first in range(0, q.size - 6, 6):
+        element_tangent(q[first : first + 12], p, K[first : first + 12, first : first + 12])
+
+
+def elastic_energy(q: Array, p: Array) -> Any:
+    """Return the elastic energy of a chain of equal elements, J, for q (n_q,) or (n_q, n_t)."""
+    nodes = q.reshape(-1, 3, 2, *q.shape[1:])
+    (rA, sA, dA), (rB, sB, dB) = np.moveaxis(nodes[:-1], 1, 0), np.moveaxis(nodes[1:], 1, 0)
+    l, j2, j4 = p[LENGTH], p[SECOND], p[FOURTH]
+
+    def dot(a: Array, b: Array) -> Array:
+        return (a * b).sum(axis=1)
+
+    k = (dB - dA) / l
+    kk = 0.5 * dot(k, k)
+    total = 0.0
+    for weight, s1, s2, s5, xi in POINTS:
+        s = s1 * (rB - rA) / l + s2 * sA + s5 * sB
+        d = (1.0 - xi) * dA + xi * dB
+        axial, thick = 0.5 * (dot(s, s) - 1.0), 0.5 * (dot(d, d) - 1.0)
+        squares = axial**2 + j2 * (dot(s, k) ** 2 + 2.0 * axial * kk) + j4 * kk**2 + thick**2
+        shear = dot(s, d) ** 2 + j2 * dot(k, d) ** 2
+        density = 0.5 * (p[STIFFNESS] * squares + p[SHEAR] * shear) + p[LAME] * thick * (axial + j2 * kk)
+        total = total + weight * l * density.sum(axis=0)
+    return total
+
 
 __all__ = ["ancf_beam", "elastic_tangent", "midpoint_deflection", "moderately_stiff_beam", "tip_height"]
 __all__ += ["very_flexible_beam"]
 
 GRAVITY = 9.81  # m/s^2
 N_DRAWN = 8  # segments drawn per element
-LARGEST = 1e50  # bound of the parameters in SI units, so that products of a few of them are finite
+MAX_PARAMETER = 1e50  # bound of the parameters in SI units, so that products of a few of them are finite
 STARTS = {"node": "only the base node moving (start='node')", "beam": "all of it moving (start='beam')"}
 
 # p: the parameters of the elements, then those of the base's motion
-AMPLITUDE, FREQUENCY, N_PARAMETERS = range(element.N_ELEMENT_PARAMETERS, element.N_ELEMENT_PARAMETERS + 3)
+AMPLITUDE, FREQUENCY, N_PARAMETERS = range(N_ELEMENT_PARAMETERS, N_ELEMENT_PARAMETERS + 3)
 
 
 @callback("constraint")
@@ -62,7 +294,7 @@ def gamma(t, q, v, p, Qd):
 
 @dataclass(frozen=True, eq=False)
 class Energy:
-    """Kinetic, elastic and gravitational energy of a beam, J, as a function of t, q and v."""
+    """Evaluate the kinetic, elastic and gravitational energy of a beam, J, at t, q and v."""
 
     M: Array
     p: Array
@@ -70,7 +302,7 @@ class Energy:
     def __call__(self, t: Any, q: ArrayLike, v: ArrayLike) -> Any:
         """Evaluate for one state, or for many given as columns."""
         q, v = np.asarray(q), np.asarray(v)
-        weight = self.p[element.FALL] * self.M[1::6].sum(axis=0)
+        weight = self.p[FALL] * self.M[1::6].sum(axis=0)
         return 0.5 * (v * (self.M @ v)).sum(axis=0) + elastic_energy(q, self.p) + weight @ q
 
 
@@ -88,7 +320,7 @@ def ancf_beam(
     width: float = 0.02,
     gravity: float = GRAVITY,
 ) -> Problem:
-    """A beam pinned to a base that moves by amplitude sin(angular_frequency t) along x, with gravity along -y.
+    """Return a beam pinned to a base that moves by amplitude sin(angular_frequency t) along x, with gravity along -y.
 
     It is initially straight along +x. Constraints:
     C_1 = r_x(base) - amplitude sin(angular_frequency t), C_2 = r_y(base).
@@ -156,8 +388,8 @@ def ancf_beam(
                 raise ValueError(f"{name} must be finite; given {value!r}")
         else:
             check_positive(name, value)
-        if abs(value) > LARGEST:
-            raise ValueError(f"{name} must be at most {LARGEST:g}; given {value!r}")
+        if abs(value) > MAX_PARAMETER:
+            raise ValueError(f"{name} must be at most {MAX_PARAMETER:g}; given {value!r}")
     if gravity < 0.0:
         raise ValueError(f"gravity must be at least 0, it acts along -y; given {gravity!r}")
     if not -1.0 < poisson_ratio < 0.5:
@@ -168,17 +400,16 @@ def ancf_beam(
     lame = youngs_modulus * poisson_ratio / ((1.0 + poisson_ratio) * (1.0 - 2.0 * poisson_ratio))
     shear = 0.5 * youngs_modulus / (1.0 + poisson_ratio)
     p = np.zeros(N_PARAMETERS)
-    p[element.LENGTH] = l
-    p[[element.STIFFNESS, element.LAME, element.SHEAR]] = (lame + 2.0 * shear) * area, lame * area, shear * area
-    p[[element.SECOND, element.FOURTH]] = height**2 / 12.0, height**4 / 80.0
-    p[[element.MASS, element.FALL]] = density * area, gravity
+    p[LENGTH] = l
+    p[[STIFFNESS, LAME, SHEAR]] = (lame + 2.0 * shear) * area, lame * area, shear * area
+    p[[SECOND, FOURTH]] = height**2 / 12.0, height**4 / 80.0
+    p[[MASS, FALL]] = density * area, gravity
     p[[AMPLITUDE, FREQUENCY]] = amplitude, angular_frequency
 
     name = f"ANCF beam, {n_elements} elements, E = {youngs_modulus:g} N/m^2, start={start!r}"
     system = ConstrainedSystem(
         n_q=6 * (n_elements + 1),
         n_c=2,
-        **callbacks_in(vars(element)),
         **callbacks_in(globals()),
         force_by_q=elastic_tangent,
         parameters=p,
@@ -203,7 +434,7 @@ def ancf_beam(
         energy=Energy(M, p),
         drawing=_centre_line(n_elements, l),
         parameters={"n_elements": n_elements, "start": start, **parameters},
-        note=f"start assumed, the paper's text does not tell it: straight along x, gravity across it, {STARTS[start]}",
+        note=f"start assumed, as the paper does not state it: straight along x, gravity across it, {STARTS[start]}",
         source="L. Zhang and Zhang, Nonlinear Dynamics (2016), Sect. 4.2; Hussein, Negrut and Shabana (2008)",
         tags=("open chain", "flexible", "planar", "driven", "stiff"),
         purpose="A flexible body on a driven base: frequencies from those wanted to those that only cost steps.",
@@ -237,7 +468,7 @@ def _centre_line(n_elements: int, l: float) -> Drawing:
 
 
 def very_flexible_beam(n_elements: int = 4, start: str = "node") -> Problem:
-    """The paper's beam of 2e6 N/m^2 on a base that moves by -0.02 m sin(10 pi t); see `ancf_beam`.
+    """Return the paper's beam of 2e6 N/m^2 on a base that moves by -0.02 m sin(10 pi t); see `ancf_beam`.
 
     With 4 elements the frequencies of the straight beam are 0 (rotation about the pin), 1.771, 6.220, 14.75, ...,
     3358.5 rad/s. The lowest bending frequency is 19 % above the Euler-Bernoulli value of 1.4836 rad/s: locking
@@ -256,7 +487,7 @@ def very_flexible_beam(n_elements: int = 4, start: str = "node") -> Problem:
 
 
 def moderately_stiff_beam(n_elements: int = 4, start: str = "node") -> Problem:
-    """The paper's beam of 2e8 N/m^2 on a base that moves by -0.01 m sin(2 pi t); see `ancf_beam`.
+    """Return the paper's beam of 2e8 N/m^2 on a base that moves by -0.01 m sin(2 pi t); see `ancf_beam`.
 
     Its frequencies are ten times those of `very_flexible_beam`, up to 33585 rad/s.
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from twoloop.kernels.compile.callbacks import callback
-from twoloop.mechanisms.computed import computed
+from twoloop.mechanisms.registry import stored_reference
 from twoloop.problem.callbacks import callbacks_in
 from twoloop.problem.description import Drawing
 from twoloop.problem.problem import Array, Problem, Reference
@@ -117,7 +117,7 @@ def gamma(t, q, v, p, Qd):
 
 @dataclass(frozen=True, eq=False)
 class Energy:
-    """Kinetic energy, spring energy, and the potential -TORQUE beta of the constant torque, J."""
+    """Evaluate kinetic energy, spring energy, and the potential -TORQUE beta of the constant torque, J."""
 
     def __call__(self, t: Any, q: Array, v: Array) -> Any:
         """Evaluate for one state, or for many given as columns."""
@@ -156,7 +156,7 @@ def joints(q: Array) -> Array:
 
 
 def andrews() -> Problem:
-    """The mechanism released from rest, as published, over 0.03 s.
+    """Return Andrews' squeezing mechanism released from rest, as published, over 0.03 s.
 
     Examples
     --------
@@ -184,7 +184,7 @@ def andrews() -> Problem:
         drawing=Drawing(joints, BARS, (1, 2, 6, 8)),
         parameters=PARAMETERS,
         note="The energy counts the potential of the constant torque and is conserved.",
-        reference=computed("Andrews' squeezing mechanism"),
+        reference=stored_reference("Andrews' squeezing mechanism"),
         published=PUBLISHED,
         source=(
             "Test Set for IVP Solvers, 'andrews'; Hairer & Wanner, Solving Ordinary Differential Equations II, VII.7; "

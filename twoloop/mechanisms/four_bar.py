@@ -124,7 +124,7 @@ def four_bar(
     theta3: float = 0.0,
     branch: int = -1,
 ) -> Problem:
-    """A four-bar linkage of uniform rods of 1 kg/m under gravity 9.81 m/s^2, released from rest.
+    """Return a four-bar linkage of uniform rods of 1 kg/m under gravity 9.81 m/s^2, released from rest.
 
     The default geometry is *assumed*: the paper's Table 2 is missing from the text that we worked from. It agrees with
     the motion described there: bar 3 starts horizontally, and its centre returns to y = 0 without crossing it.

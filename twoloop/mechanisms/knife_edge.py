@@ -57,7 +57,7 @@ def motion(t: float) -> tuple[Array, Array]:
 
 
 def knife_edge() -> Problem:
-    """The blade initially pointing down the slope, at rest except for its constant spin of 1.7 rad/s.
+    """Return a knife edge that initially points down its slope, at rest except for its constant spin of 1.7 rad/s.
 
     Examples
     --------

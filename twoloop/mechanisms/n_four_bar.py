@@ -14,7 +14,7 @@ from scipy.special import ellipj, ellipk
 from twoloop.checks.arguments import check_size
 from twoloop.mechanisms.planar import GROUND, PlanarBodies
 from twoloop.mechanisms.quadratic import QuadraticSystem, fixed, point
-from twoloop.mechanisms.ready import ready
+from twoloop.mechanisms.registry import ready
 from twoloop.problem.description import body_names
 from twoloop.problem.problem import Array, Condition, Problem, Reference
 
@@ -24,7 +24,7 @@ SETS = ("tips", "bodies")
 
 @dataclass(frozen=True)
 class Synchronous:
-    """The motion with parallel cranks, by Jacobi's elliptic functions.
+    """Evaluate the motion with parallel cranks, by Jacobi's elliptic functions.
 
     phi'' = -w^2 cos(phi), w^2 = g 3 (3n + 1) / (2 (4n + 1)), from phi = pi/2 at -1 rad/s: a rotating pendulum.
     """
@@ -54,7 +54,7 @@ class Synchronous:
 
 
 def n_four_bar(n: int = 2, coordinates: str = "tips") -> Problem:
-    """The N-four-bar mechanism of IFToMM's library of benchmarks, A02.
+    """Return the N-four-bar mechanism of IFToMM's library of benchmarks, A02.
 
     Parameters
     ----------

@@ -1,4 +1,6 @@
-"""Common callbacks of planar mechanisms: x, y of the centre of mass and angle of each body; pins, distances, drives.
+"""Compile common callbacks of planar mechanisms with pins, distances and drives.
+
+Coordinates are x, y of the centre of mass and the angle of each body.
 
 The callbacks are compiled once for all of them; the parameters hold the joints, which `PlanarBodies` collects::
 
@@ -26,7 +28,7 @@ from twoloop.problem.system import ConstrainedSystem
 PIN = 0.0  # both points coincide: two rows
 DISTANCE = 1.0  # half the squared distance of the points is `value`: one row
 COORDINATE = 2.0  # q[i] = ax + ay t + bx sin(by t): one row
-WIDTH = 9  # numbers of a joint
+N_NUMBERS = 9  # of a joint
 GROUND = -1
 
 
@@ -55,7 +57,7 @@ def force(t, q, v, p, Q):
 @callback("constraint")
 def constraint(t, q, p, C):
     first = 3 + 2 * int(p[0])
-    for k in range(first, first + WIDTH * int(p[1]), WIDTH):
+    for k in range(first, first + N_NUMBERS * int(p[1]), N_NUMBERS):
         row, i, j = int(p[k + 1]), int(p[k + 2]), int(p[k + 5])
         if p[k] == COORDINATE:
             C[row] = q[i] - p[k + 3] - p[k + 4] * t - p[k + 6] * math.sin(p[k + 7] * t)
@@ -71,7 +73,7 @@ def constraint(t, q, p, C):
 @callback("jacobian")
 def jacobian(t, q, p, Cq):
     first = 3 + 2 * int(p[0])
-    for k in range(first, first + WIDTH * int(p[1]), WIDTH):
+    for k in range(first, first + N_NUMBERS * int(p[1]), N_NUMBERS):
         row, i, j = int(p[k + 1]), int(p[k + 2]), int(p[k + 5])
         if p[k] == COORDINATE:
             Cq[row, i] = 1.0
@@ -91,7 +93,7 @@ def jacobian(t, q, p, Cq):
 @callback("constraint_rate")
 def constraint_rate(t, q, p, Ct):
     first = 3 + 2 * int(p[0])
-    for k in range(first, first + WIDTH * int(p[1]), WIDTH):
+    for k in range(first, first + N_NUMBERS * int(p[1]), N_NUMBERS):
         if p[k] == COORDINATE:
             Ct[int(p[k + 1])] = -p[k + 4] - p[k + 6] * p[k + 7] * math.cos(p[k + 7] * t)
 
@@ -99,7 +101,7 @@ def constraint_rate(t, q, p, Ct):
 @callback("gamma")
 def gamma(t, q, v, p, Qd):
     first = 3 + 2 * int(p[0])
-    for k in range(first, first + WIDTH * int(p[1]), WIDTH):
+    for k in range(first, first + N_NUMBERS * int(p[1]), N_NUMBERS):
         row, i, j = int(p[k + 1]), int(p[k + 2]), int(p[k + 5])
         if p[k] == COORDINATE:
             Qd[row] = -p[k + 6] * p[k + 7] ** 2 * math.sin(p[k + 7] * t)
@@ -117,7 +119,7 @@ def gamma(t, q, v, p, Qd):
 @callback("kinematics")
 def kinematics(t, q, v, p, C, Cq, Ct, Qd):
     first = 3 + 2 * int(p[0])
-    for k in range(first, first + WIDTH * int(p[1]), WIDTH):
+    for k in range(first, first + N_NUMBERS * int(p[1]), N_NUMBERS):
         row, i, j = int(p[k + 1]), int(p[k + 2]), int(p[k + 5])
         if p[k] == COORDINATE:
             s, c, frequency = math.sin(p[k + 7] * t), math.cos(p[k + 7] * t), p[k + 7]
@@ -153,12 +155,12 @@ def mass_values(t, q, p, values):
 
 @callback("jacobian_values")
 def jacobian_values(t, q, p, values):
-    first, place_of = 3 + 2 * int(p[0]), 0
-    for k in range(first, first + WIDTH * int(p[1]), WIDTH):
+    first, index = 3 + 2 * int(p[0]), 0
+    for k in range(first, first + N_NUMBERS * int(p[1]), N_NUMBERS):
         i, j = int(p[k + 2]), int(p[k + 5])
         if p[k] == COORDINATE:
-            values[place_of] = 1.0
-            place_of += 1
+            values[index] = 1.0
+            index += 1
             continue
         ax, ay, adx, ady = place_on(q, i, p[k + 3], p[k + 4])
         bx, by, bdx, bdy = place_on(q, j, p[k + 6], p[k + 7])
@@ -167,13 +169,13 @@ def jacobian_values(t, q, p, values):
             if body < 0:
                 continue
             if p[k] == PIN:
-                values[place_of], values[place_of + 1] = sign, sign * dx
-                values[place_of + 2], values[place_of + 3] = sign, sign * dy
-                place_of += 4
+                values[index], values[index + 1] = sign, sign * dx
+                values[index + 2], values[index + 3] = sign, sign * dy
+                index += 4
             else:
-                values[place_of], values[place_of + 1] = sign * fx, sign * fy
-                values[place_of + 2] = sign * (fx * dx + fy * dy)
-                place_of += 3
+                values[index], values[index + 1] = sign * fx, sign * fy
+                values[index + 2] = sign * (fx * dx + fy * dy)
+                index += 3
 
 
 def jacobian_entries(joints: Sequence[Sequence[float]]) -> tuple[list[int], list[int]]:
@@ -195,7 +197,7 @@ def jacobian_entries(joints: Sequence[Sequence[float]]) -> tuple[list[int], list
 
 
 class PlanarBodies:
-    """Collects planar bodies and joints, which are named by kind and bodies: "pin rod-ground".
+    """Collect planar bodies and joints, which are named by kind and bodies: "pin rod-ground".
 
     Parameters
     ----------
@@ -262,19 +264,19 @@ class PlanarBodies:
         """Return the system of the joints added so far."""
         bodies = np.column_stack([self.masses, self.inertias])
         sizes = [len(bodies), len(self._joints), self.gravity]
-        moves = any(joint[0] == COORDINATE and (joint[4] or joint[6]) for joint in self._joints)
+        driven_by_time = any(joint[0] == COORDINATE and (joint[4] or joint[6]) for joint in self._joints)
         n_q = 3 * len(bodies)
-        given: dict[str, Any] = callbacks_in(globals())
-        if not moves:
-            del given["constraint_rate"]
+        callbacks: dict[str, Any] = callbacks_in(globals())
+        if not driven_by_time:
+            del callbacks["constraint_rate"]
         if n_q >= LARGE:
-            given |= {"mass_entries": (range(n_q), range(n_q)), "jacobian_entries": jacobian_entries(self._joints)}
-            del given["kinematics"]  # which fills a full matrix
+            callbacks |= {"mass_entries": (range(n_q), range(n_q)), "jacobian_entries": jacobian_entries(self._joints)}
+            del callbacks["kinematics"]  # which fills a full matrix
         else:
-            del given["mass_values"], given["jacobian_values"]
+            del callbacks["mass_values"], callbacks["jacobian_values"]
         parameters = np.concatenate([sizes, bodies.ravel(), np.ravel(self._joints)])
-        fixed: dict[str, Any] = {"constant_mass": True, "joints": list(self._named.values()), "name": name}
-        return ConstrainedSystem(n_q=n_q, n_c=self.n_c, parameters=parameters, **given, **fixed)
+        options: dict[str, Any] = {"constant_mass": True, "joints": list(self._named.values()), "name": name}
+        return ConstrainedSystem(n_q=n_q, n_c=self.n_c, parameters=parameters, **callbacks, **options)
 
     @property
     def energy(self) -> PlanarEnergy:

@@ -1,4 +1,4 @@
-"""Common callbacks of mechanisms with constant mass and force and quadratic constraints.
+"""Compile common callbacks of mechanisms with constant mass and force and quadratic constraints.
 
 Points and vectors fixed to bodies as coordinates ("natural" coordinates) give such constraints. The callbacks are
 compiled once for all of them; the parameters hold the terms, which `QuadraticSystem` collects::
@@ -26,7 +26,7 @@ ONE: Scalar = {None: 1.0}
 
 
 @helper
-def places(n_q, p):
+def offsets(n_q, p):
     """Return the offsets of the constants, the mass entries, the linear and the quadratic terms."""
     constants = 4 + n_q
     entries = constants + int(p[0])
@@ -36,7 +36,7 @@ def places(n_q, p):
 
 @callback("mass")
 def mass(t, q, p, M):
-    first = places(q.size, p)[1]
+    first = offsets(q.size, p)[1]
     for k in range(first, first + 3 * int(p[1]), 3):
         M[int(p[k]), int(p[k + 1])] = p[k + 2]
 
@@ -49,7 +49,7 @@ def force(t, q, v, p, Q):
 
 @callback("constraint")
 def constraint(t, q, p, C):
-    constants, _, linear, quadratic = places(q.size, p)
+    constants, _, linear, quadratic = offsets(q.size, p)
     for row in range(C.size):
         C[row] = p[constants + row]
     for k in range(linear, linear + 3 * int(p[2]), 3):
@@ -60,7 +60,7 @@ def constraint(t, q, p, C):
 
 @callback("jacobian")
 def jacobian(t, q, p, Cq):
-    _, _, linear, quadratic = places(q.size, p)
+    _, _, linear, quadratic = offsets(q.size, p)
     for k in range(linear, linear + 3 * int(p[2]), 3):
         Cq[int(p[k]), int(p[k + 1])] += p[k + 2]
     for k in range(quadratic, quadratic + 4 * int(p[3]), 4):
@@ -71,14 +71,14 @@ def jacobian(t, q, p, Cq):
 
 @callback("gamma")
 def gamma(t, q, v, p, Qd):
-    quadratic = places(q.size, p)[3]
+    quadratic = offsets(q.size, p)[3]
     for k in range(quadratic, quadratic + 4 * int(p[3]), 4):
         Qd[int(p[k])] -= 2.0 * p[k + 3] * v[int(p[k + 1])] * v[int(p[k + 2])]
 
 
 @dataclass(frozen=True, eq=False)
 class Energy:
-    """Kinetic energy with a constant mass and potential of a constant force, J, for one state or many."""
+    """Evaluate kinetic energy with a constant mass and potential of a constant force, J, for one state or many."""
 
     mass: Array
     force: Array
@@ -90,7 +90,7 @@ class Energy:
 
 
 class QuadraticSystem:
-    """Collects the rows of a mechanism.
+    """Collect the rows of a mechanism.
 
     Parameters
     ----------
@@ -175,17 +175,17 @@ class QuadraticSystem:
         """Return the lines so far, and the paths of the points given."""
         points: list[Sequence[Scalar]] = []
 
-        def number(place: Sequence[Scalar]) -> int:
-            if place not in points:
-                points.append(place)
-            return points.index(place)
+        def index(position: Sequence[Scalar]) -> int:
+            if position not in points:
+                points.append(position)
+            return points.index(position)
 
-        bars = tuple((number(first), number(second)) for first, second in self._lines)
-        traces = tuple(number(place) for place in traced)
+        bars = tuple((index(first), index(second)) for first, second in self._lines)
+        traces = tuple(index(position) for position in traced)
         matrix = np.zeros((len(points), len(points[0]), self.force.size))
         constant = np.zeros(matrix.shape[:2])
-        for k, place in enumerate(points):
-            for axis, scalar in enumerate(place):
+        for k, position in enumerate(points):
+            for axis, scalar in enumerate(position):
                 constant[k, axis] = scalar.get(None, 0.0)
                 for i, coefficient in scalar.items():
                     if i is not None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from twoloop.kernels.compile.callbacks import callback
-from twoloop.mechanisms.computed import computed
+from twoloop.mechanisms.registry import stored_reference
 from twoloop.problem.callbacks import callbacks_in
 from twoloop.problem.description import Drawing
 from twoloop.problem.problem import Array, Problem
@@ -96,7 +96,7 @@ def rim(q: Array) -> Array:
 
 
 def rolling_disc() -> Problem:
-    """A disc of 2 kg and 0.4 m radius that initially leans by 0.3 rad, and wobbles as it rolls.
+    """Return a disc of 2 kg and 0.4 m radius that initially leans by 0.3 rad, and wobbles as it rolls.
 
     Examples
     --------
@@ -110,13 +110,7 @@ def rolling_disc() -> Problem:
     sy, cy = math.sin(yaw), math.cos(yaw)
     x = RADIUS * (AHEAD * math.cos(lean) * sy - TURN * cy)
     y = RADIUS * (-AHEAD * math.cos(lean) * cy - TURN * sy)
-    system = ConstrainedSystem(
-        n_q=6,
-        n_c=1,
-        n_a=2,
-        **callbacks_in(globals()),
-        name="rolling disc",
-    )
+    system = ConstrainedSystem(n_q=6, n_c=1, n_a=2, **callbacks_in(globals()), name="rolling disc")
     return Problem(
         name="rolling disc",
         system=system,
@@ -128,7 +122,7 @@ def rolling_disc() -> Problem:
         drawing=Drawing(rim, (*pairwise((*range(N_RIM), 0)), (0, N_RIM // 2), (N_RIM // 4, 3 * N_RIM // 4)), (N_RIM,)),
         parameters={"mass": MASS, "radius": RADIUS, "gravity": GRAVITY, "angles": ANGLES},
         note="Mass, radius and start were chosen for this project.",
-        reference=computed("rolling disc"),
+        reference=stored_reference("rolling disc"),
         source="textbook problem; Bloch, Nonholonomic Mechanics and Control (2003), Sect. 1.4",
         tags=("open chain", "rigid", "spatial", "non-holonomic"),
         purpose="Holonomic and non-holonomic rows together, a mass matrix that varies, and energy that is conserved.",

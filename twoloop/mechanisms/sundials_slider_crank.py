@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from twoloop.kernels.compile.callbacks import callback
-from twoloop.mechanisms.computed import computed
+from twoloop.mechanisms.registry import stored_reference
 from twoloop.problem.callbacks import callbacks_in
 from twoloop.problem.description import Drawing
 from twoloop.problem.problem import Array, Problem, Reference
@@ -56,7 +56,7 @@ def gamma(t, q, v, p, Qd):
 
 @dataclass(frozen=True, eq=False)
 class Energy:
-    """Kinetic energy, spring energy, and the potential of F; the damper dissipates it."""
+    """Evaluate kinetic energy, spring energy, and the potential of F; the damper dissipates them."""
 
     p: Array
 
@@ -79,7 +79,7 @@ def joints(q: Array) -> Array:
 
 
 def sundials_slider_crank() -> Problem:
-    """The mechanism released from rest with its crank upright, over 10 s.
+    """Return the slider-crank of SUNDIALS' example released from rest with its crank upright, over 10 s.
 
     Examples
     --------
@@ -107,7 +107,7 @@ def sundials_slider_crank() -> Problem:
         energy=Energy(p),
         drawing=Drawing(joints, ((0, 1), (1, 2), (3, 4)), (1, 4)),
         parameters=PARAMETERS,
-        reference=computed("SUNDIALS slider-crank"),
+        reference=stored_reference("SUNDIALS slider-crank"),
         published=Reference(
             t=10.0,
             q=np.array([1.2757, 1.0236, -0.49881]),

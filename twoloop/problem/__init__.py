@@ -1,1 +1,1 @@
-"""What a user writes: systems, callbacks in plain Python, joints, events, drawings, and the problem of them all."""
+"""What a user writes: systems, callbacks in plain Python, joints, events, drawings, and problems of these."""

@@ -330,12 +330,12 @@ class ConstrainedSystem(EvaluatedEquations):
 
     @property
     def n_mass_values(self) -> int:
-        """Number of entries of M that `mass_values` gives."""
+        """Return the number of entries of M that `mass_values` returns."""
         return len(self.entries["mass"][0]) if "mass" in self.entries else 0
 
     @property
     def n_jacobian_values(self) -> int:
-        """Number of entries of C_q that `jacobian_values` gives."""
+        """Return the number of entries of C_q that `jacobian_values` returns."""
         return len(self.entries["jacobian"][0]) if "jacobian" in self.entries else 0
 
     def _scatter(self) -> None:

@@ -133,7 +133,7 @@ def _tolerances(result: Record, n_q: int, rtol: float | None, atol: ArrayLike | 
 
 
 class _Checker:
-    """Verifies the intervals between the states of a result by reintegration.
+    """Verify the intervals between the states of a result by reintegration.
 
     Attributes
     ----------

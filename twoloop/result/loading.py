@@ -164,7 +164,7 @@ def _is_number(value: Any) -> bool:
 
 
 class SavedFields:
-    """Arrays and other fields of a file, which are checked one by one.
+    """Check the arrays and other fields of a file one by one.
 
     Raises
     ------

@@ -77,7 +77,7 @@ def check_folder(store: Any) -> Path:
 
 
 def begin_folder(path: Path, n_q: int) -> OnDisk:
-    """Create a folder, which counts as that of an interrupted run until `end_folder`."""
+    """Create the folder of a run; until `end_folder` it counts as that of an interrupted run."""
     buffers = OnDisk(path)
     metadata = {"format": FORMAT, "n_q": n_q, "status": int(Status.INTERRUPTED), "message": INTERRUPTED, "stats": {}}
     (path / METADATA_FILE).write_text(json.dumps(metadata), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Views of a result: pandas table, matplotlib plots, and animations as HTML page, GIF or film."""
+"""Show a result as a pandas table, as plots, and as an animation: HTML page, GIF or film."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Many runs of one mechanism in parallel, with rows that are saved."""
+"""Many runs in parallel, as a table whose rows are saved."""

@@ -1,7 +1,7 @@
-"""A planar slider-crank of three bodies in absolute coordinates: with a redundant row, and driven.
+"""Slider-cranks of three planar bodies, with a redundant row or driven, and a pendulum on a driven crank.
 
-Coordinates x, y, angle of crank, rod and slider. The redundant row is the distance of the crank pin from the slider,
-which equals the length of the rod.
+Coordinates are x, y and angle of each body. The redundant row is the distance of the crank pin from the slider, which
+equals the length of the rod.
 """
 
 import cmath
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from twoloop.mechanisms.planar import GROUND, PlanarBodies, states
-from twoloop.mechanisms.ready import ready
+from twoloop.mechanisms.registry import ready
 from twoloop.problem.description import body_names
 from twoloop.problem.problem import Array, Problem, Reference
 
@@ -56,7 +56,7 @@ def positions(angle: float, rate: float, acceleration: float = 0.0) -> tuple[Arr
 
 
 def redundant_slider_crank() -> Problem:
-    """The slider-crank with nine rows of rank eight, moving freely under gravity; the crank starts at 8 rad/s.
+    """Return the slider-crank with nine rows of rank eight, moving freely under gravity; the crank starts at 8 rad/s.
 
     Examples
     --------
@@ -83,7 +83,7 @@ def redundant_slider_crank() -> Problem:
 
 @dataclass(frozen=True)
 class Driven:
-    """The motion of the driven slider-crank, determined by the drive."""
+    """Evaluate the motion of the driven slider-crank, which the drive determines."""
 
     def __call__(self, t: float) -> tuple[Array, Array]:
         """Return the states q, v (9,) at t."""
@@ -100,7 +100,7 @@ class Driven:
 
 
 def driven_slider_crank() -> Problem:
-    """The slider-crank with the crank angle 0.5 + 4 t + 0.3 sin(3 t): nine rows for nine coordinates.
+    """Return the slider-crank with the crank angle 0.5 + 4 t + 0.3 sin(3 t): nine rows for nine coordinates.
 
     Examples
     --------
@@ -140,4 +140,49 @@ def driven_slider_crank() -> Problem:
         ),
         conserved=False,
         coordinates=NAMES,
+    )
+
+
+def driven_crank() -> Problem:
+    """Return a pendulum on a crank at 2.5 t + 0.2 sin(t) rad; it starts 0.4 rad off the vertical at -1 rad/s.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import driven_crank
+    >>> problem = driven_crank()
+    >>> problem.system.n_q, problem.system.n_c, problem.t_span[1]
+    (6, 5, 3.0)
+    """
+    crank, rod = 0.3, 1.0  # m
+    masses = (0.4, 1.0)  # kg
+    inertias = (masses[0] * crank**2 / 12.0, masses[1] * rod**2 / 12.0)  # kg m^2
+    drive = {"start": 0.0, "rate": 2.5, "amplitude": 0.2, "frequency": 1.0}
+    angle, rate = 0.4 - 0.5 * np.pi, -1.0  # of the pendulum at the start, from the x axis, rad and rad/s
+    rows = PlanarBodies(("crank", "rod"), masses, inertias, GRAVITY)
+    rows.pin(0, (-0.5 * crank, 0.0), GROUND, (0.0, 0.0))
+    rows.pin(1, (-0.5 * rod, 0.0), 0, (0.5 * crank, 0.0))
+    rows.drive(2, **drive)
+    crank_rate = drive["rate"] + drive["amplitude"] * drive["frequency"]
+    pin, half = complex(crank), cmath.rect(0.5 * rod, angle)
+    pin_v = 1j * crank_rate * pin
+    q0 = states((0.5 * pin, 0.0), (pin + half, angle))
+    v0 = states((0.5 * pin_v, crank_rate), (pin_v + 1j * rate * half, rate))
+    return ready(
+        *(rows, "driven crank", q0, v0, 3.0),
+        parameters={
+            "crank": crank,
+            "rod": rod,
+            "masses": masses,
+            "inertias": inertias,
+            "gravity": GRAVITY,
+            "drive": drive,
+        },
+        source=SOURCE,
+        tags=("open chain", "rigid", "planar", "driven"),
+        purpose=(
+            "A constraint that depends on time beside a motion that is free: C_t and C_tt act on the free part, and "
+            "the energy is not conserved."
+        ),
+        conserved=False,
+        coordinates=body_names("crank", "rod"),
     )
