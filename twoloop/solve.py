@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
-from operator import is_
 from typing import Any
 
 import numpy as np
@@ -47,6 +46,7 @@ from twoloop.run.short_changes import MOST, closer, may_be_missed
 Array = NDArray[np.float64]
 
 ROUNDING = 1e-15
+NO_OPTIONS: Any = (None,) * 12, None
 NO_BAR = nullcontext(lambda t: None)  # in the place of what shows how far a run is
 SAME = 1e-9  # relative: a step and a span that differ by less are one, however they were rounded
 
@@ -187,29 +187,32 @@ def solve_dae(
     (True, True)
     """
     check_system(system)
-    given = (
-        *(method, rtol, atol, first_step, max_step, max_steps, step_size),
-        *(dense_output, progress, time_limit, check_derivatives, compiled),
-    )
-    known = system.shared.get("options")
-    if known is None or not all(map(is_, given, known[0])):
-        known = given, check_options(system, *given)
+    # options that are the objects of the last call were checked there; to compare them in a loop takes twice as long
+    last, asked = system.shared.get("options", NO_OPTIONS)
+    m, r, a, first, longest, most, size, dense, shows, limit, checks, code = last
+    same = m is method and r is rtol and a is atol and first is first_step and longest is max_step and most is max_steps
+    same = same and size is step_size and dense is dense_output and shows is progress and limit is time_limit
+    if not (same and checks is check_derivatives and code is compiled):
+        last = method, rtol, atol, first_step, max_step, max_steps, step_size, dense_output, progress, time_limit
+        last = *last, check_derivatives, compiled
+        asked = check_options(system, *last)
         if type(atol) is float and is_preset(method):  # an array, or another object, may be changed by who gives it
-            system.shared["options"] = known
-    asked: Asked = known[1]
+            system.shared["options"] = last, asked
     event_functions = None if events is None else check_events(events)
     t0, t1 = check_span(t_span)
-    if not (is_vector(q0, system.n_q) and is_vector(v0, system.n_q)):
+    if is_vector(q0, system.n_q) and is_vector(v0, system.n_q):
+        q0, v0 = np.ascontiguousarray(q0), np.ascontiguousarray(v0)
+    else:
         q0, v0 = check_vector("q0", q0, system.n_q), check_vector("v0", v0, system.n_q)
     if step_size is not None and step_size > (t1 - t0) * (1.0 + SAME):
         raise ValueError(f"step_size must not exceed the length of t_span, {t1 - t0:g}; given {step_size!r}")
     times = None if t_eval is None else check_times(t_eval, t0, t1, step_size)
     folder = None if store is None else check_folder(store)
-    with Interrupts() as interrupts:
-        own = getattr(asked.method, "error_tol", None)  # of positions, which a method tests by itself
-        at_ends = times is not None and times.size <= 2 and set(times.tolist()) <= {t0, t1}
+    interrupts = Interrupts()
+    try:
         in_time = time_limit is None or time_limit >= LONGEST
-        if folder is event_functions is own is None and in_time and not progress:
+        at_ends = times is not None and times.size <= 2 and set(times.tolist()) <= {t0, t1}
+        if folder is event_functions is asked.own_tolerance is None and in_time and not progress:
             output = STEPS if times is None and not dense_output else Output(times, at_ends, bool(dense_output))
             made = record_again(system, t0, t1, q0, v0, asked, output, interrupts)
             if made is not None and not interrupts.asked:
@@ -242,12 +245,17 @@ def solve_dae(
             record = replace(record, stats=replace(record.stats, cpu_time=spent + record.stats.cpu_time))
         give_back(run.work)
         told = asked.told | {"system": system, "atol": asked.atol.copy()}
-        if own is not None:  # Newmark's own test, of positions, has its place
+        if (own := asked.own_tolerance) is not None:  # Newmark's own test, of positions, has its place
             told |= {"rtol": own, "atol": np.full(system.n_q, own), "untested": np.ones(len(record.h), dtype=bool)}
         result = record_of(Result, vars(record) | told | {"compiled": with_code})
         if isinstance(kept, OnDisk):
             end_folder(kept, result)
         return result
+    except KeyboardInterrupt:
+        if not interrupts.answers():
+            raise
+    finally:
+        interrupts.leave()
     return record_of(Result, vars(not_begun(system, t0, event_functions, asked.method.name)))
 
 

@@ -13,8 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
+FLOAT, ARRAY = np.dtype(np.float64), np.ndarray
 NUMBERS = (float, int)  # but not bool
 FAR = 1e300  # s: times that need no closer look whether they are finite
+SURELY_APART = 1e-14  # of the ends of a span
 NEAR = 8.0  # times that differ by less than so many spacings of floating-point numbers cannot be told apart
 HOLDS = {"U": "text", "S": "text", "M": "dates", "m": "time differences", "c": "complex numbers"}  # by NumPy's kind
 SHOWN = 120  # characters of what was given, in a message
@@ -155,7 +157,7 @@ def check_vector(name: str, value: ArrayLike, n: int) -> Array:
 
 def is_vector(value: Any, n: int) -> TypeGuard[Array]:
     """Whether a value is a float vector of length n, as it is; its numbers may not be finite."""
-    return type(value) is np.ndarray and value.dtype == np.float64 and value.shape == (n,)
+    return type(value) is ARRAY and value.dtype == FLOAT and value.shape == (n,)
 
 
 def check_columns(name: str, value: Array, n: int) -> None:
@@ -184,6 +186,8 @@ def check_span(t_span: tuple[float, float]) -> tuple[float, float]:
     """Return start and end, or say what is wrong with them."""
     t0, t1 = t_span if type(t_span) is tuple and len(t_span) == 2 else (0.0, 0.0)
     if type(t0) in NUMBERS and type(t1) in NUMBERS and -FAR < t0 < t1 < FAR:
+        if t1 - t0 > SURELY_APART * (abs(t0) + abs(t1)):  # which takes less than their spacing
+            return float(t0), float(t1)
         t0, t1 = float(t0), float(t1)
     else:
         times = check_real("t_span", t_span)

@@ -10,7 +10,7 @@ from twoloop.kernels.control import clock as at
 from twoloop.kernels.control.sudden import PLACES
 from twoloop.kernels.data import codes, noted
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, WORK, exact, f8, i8, kernel, merged
-from twoloop.kernels.data.counters import N_ACCEPTED
+from twoloop.kernels.data.counters import N_ACCEPTED, N_COUNTERS
 from twoloop.kernels.data.finite import finite_vector
 from twoloop.kernels.data.flags import FORM
 from twoloop.kernels.data.tolerances import GAP, LONGEST_UNSEEN, LOOK
@@ -116,11 +116,15 @@ def tell_steps(steps, counts, h, changes, untested):
             changes[i, k], counts[i] = count - counts[i], count
 
 
-REFUSED, IN_DOUBT, READY = range(3)  # another way has to be gone; a closer look has to be taken; at the start
+# how `go` ended, where it does not return how many steps it took: another way has to be gone; a closer look has to be
+# taken at the start; something has to be looked at, or more steps have to be taken, as `told` says
+REFUSED, IN_DOUBT, OTHERWISE = -1, -2, -3
 
 # Arrays of a run that starts again and again, of looks at its starts and of choices; and room for its states and steps.
 # `begin_numbers` is what `numbers` is full of before a start, `begin_memory` what stands in `memory` at `places`: of
-# the rest, nearly all, to clear it takes less than to copy it. `saved` and `saved_integers`: all that counts at a start
+# the rest, nearly all, to clear it takes less than to copy it. `begun`: the last start, see BEGUN. `saved` and
+# `saved_integers`: all that counts there, once a second run began there; `start_rows`, the rows that count there.
+# `told` is followed by counters, times and steps, and these by `states`: all ends where those begin
 AGAIN = Reference(
     "Again",
     {
@@ -128,10 +132,11 @@ AGAIN = Reference(
             ("looked", "lam", "room", "least", "bounds", "scratch", "constants", "saved", "search"), VECTOR
         ),
         **dict.fromkeys(("begin_numbers", "numbers", "begin_memory", "memory", "lasting", "options"), VECTOR),
-        **dict.fromkeys(("tolerances", "control", "clock", "state", "new_state", "end", "t", "told"), VECTOR),
+        **dict.fromkeys(("tolerances", "control", "clock", "state", "new_state", "begun", "end", "t", "told"), VECTOR),
         **dict.fromkeys(("mass", "rows", "ways", "pattern", "states", "steps"), MATRIX),
         **dict.fromkeys(("chosen", "expected", "lapack", "lasting_integers", "saved_integers"), INTEGERS),
         **dict.fromkeys(("places", "filled", "kinds", "counted", "search_places", "blocks", "found"), INTEGERS),
+        "start_rows": INTEGERS,
     },
 )
 AGAIN.add_function("look", i8(KIT, f8, *(VECTOR,) * 5, *(MATRIX,) * 4, VECTOR))
@@ -139,20 +144,20 @@ AGAIN.add_function("choose", i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS
 AGAIN.add_function("dependents", i8(MATRIX, INTEGERS, INTEGERS, i8, VECTOR, INTEGERS, INTEGERS))
 AGAIN.add_function("start", i8(KIT, WORK, f8, VECTOR))
 AGAIN.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS))
-# in `constants`: of starts, the flag of an M that varies, else 0, the smallest pivot with which one is taken and the
-# form of the equations; of steps, a first one, or 0, and what set_sizes takes; of ends, the pivot below which speeds
-# are looked at, how many times what accelerations give these may change by, and how many looks at sudden changes two
-# of these must be apart
-ACCURACY, REUSE, NEARLY_SINGULAR, RANK, SCALE, CONTRADICTS, OF_MASS, LEAST_PIVOT, IN_FORM = range(9)
-FIRST, LEAST, LONGEST, LOOKS_WITHIN, NEAR, MOST_TURNED, LOOKS = range(9, 16)
+# in `constants`: of starts, what `choose` takes, the flag of an M that varies, else 0, the smallest pivot with which
+# one is taken and the form of the equations; of steps, a first one, or 0, and what set_sizes takes; of ends, the pivot
+# below which speeds are looked at, how many times what accelerations give these may change by, and how many looks at
+# sudden changes two of these must be apart
+ACCURACY, REUSE, NEARLY_SINGULAR, RANK, WEAK, SCALE, CONTRADICTS, OF_MASS, LEAST_PIVOT, IN_FORM = range(10)
+FIRST, LEAST, LONGEST, LOOKS_WITHIN, NEAR, MOST_TURNED, LOOKS = range(10, 17)
 PLACE, N_KEPT, N_ADDED, KEPT = range(4)  # in `expected`, which is empty without code; those that help follow those kept
 
 
 @merged
-def _is_expected(b, weak):
+def _is_expected(b):
     """Whether the rows that count, those that help M, and the coordinates that follow are those of the code."""
     b.scratch[0] = 0.0
-    place = b.choose(b.mass, b.rows, b.constants[RANK], weak, b.bounds, b.scratch, b.chosen)
+    place = b.choose(b.mass, b.rows, b.constants[RANK], b.constants[WEAK], b.bounds, b.scratch, b.chosen)
     n_kept, n_added = b.expected[N_KEPT], b.expected[N_ADDED]
     if b.chosen[0] != n_kept:
         return False
@@ -194,17 +199,15 @@ def _agree(w, b, n):
     return True
 
 
-@kernel(i8(KIT, KIT, WORK, AGAIN, f8, f8, VECTOR, VECTOR, VECTOR, f8, types.boolean), vectorized=True)
-def begin(f, given, w, b, t, t1, q, v, sizes, weak, sure):
-    """Whether a run to t1 begins at a state, with the same choices as the run before it; its start is then saved.
+@merged
+def _begin(f, given, w, b, t, t1, q, v, sizes, sure):
+    """Begin a run to t1 at a state, with the same choices as the run before it; 0, or why it cannot.
 
-    `given`: the system that is looked at, with `sizes` as of `look`; `weak` as of `choose`. `sure`: the state is known
-    to be consistent.
+    `given`: the system that is looked at, with `sizes` as of `look`. `sure`: the state is known to be consistent.
     """
     n = q.size
     if not (finite_vector(q) and finite_vector(v)):
         return REFUSED
-    f.flags[FORM] = int(b.constants[IN_FORM])  # which a run may have changed
     for k in range(b.looked.size):
         b.looked[k] = 0.0
     found = b.look(given, t, q, v, sizes, b.lam, b.room, b.mass, b.rows, b.ways, b.pattern, b.least)
@@ -212,7 +215,7 @@ def begin(f, given, w, b, t, t1, q, v, sizes, weak, sure):
         return REFUSED
     if found & CONSISTENT == 0 and not sure:
         return IN_DOUBT
-    if b.expected.size > 0 and not _is_expected(b, weak):
+    if b.expected.size > 0 and not _is_expected(b):
         return REFUSED
     _copy(b.begin_numbers, b.numbers)
     for j in range(b.state.size):
@@ -231,32 +234,50 @@ def begin(f, given, w, b, t, t1, q, v, sizes, weak, sure):
         _limit_steps(b.control, b.tolerances, span, b.constants[LONGEST], within)
         b.clock[at.H_NEXT] = min(first if first > 0.0 else _first_step(b.state, n, t, span, b.constants[LEAST]), span)
         b.control[at.SHORTEST] = SHORTEST_STEP * b.clock[at.H_NEXT]
+    _copy(w.rows_v, b.start_rows)
+    return 0
+
+
+@merged
+def _save(b):
     i, j = b.numbers.size, b.numbers.size + b.lasting.size
     _copy(b.numbers, b.saved[:i])
     _copy(b.lasting, b.saved[i:j])
     _copy(b.state, b.saved[j:])
     _copy(b.lasting_integers, b.saved_integers)
-    return READY
 
 
 @merged
-def _begin_again(f, b):
-    """Put all that counts back to where the last start left it."""
-    f.flags[FORM] = int(b.constants[IN_FORM])  # which a run may have changed
+def _put_back(b):
     i, j = b.numbers.size, b.numbers.size + b.lasting.size
     _copy(b.saved[:i], b.numbers)
     _copy(b.saved[i:j], b.lasting)
     _copy(b.saved[j:], b.state)
     _copy(b.saved_integers, b.lasting_integers)
-    for k in range(b.memory.size):
-        b.memory[k] = 0.0
-    for k in range(b.places.size):
-        b.memory[b.places[k]] = b.begin_memory[k]
+
+
+# in `begun`, before t, t1, q and v: how often a run began there, up to IS_SAVED
+HOW_OFTEN, BEGUN = 0, 1
+NEVER, IS_SAVED = 0.0, 2.0
+
+
+@exact
+def _begins_as_before(begun, t, t1, q, v):
+    """Whether a start is the last one, to the bit; it becomes that."""
+    n, same = q.size, begun[HOW_OFTEN] > NEVER
+    for k in range(2 + 2 * n):
+        x = t if k == 0 else t1 if k == 1 else q[k - 2] if k < 2 + n else v[k - 2 - n]
+        before = begun[BEGUN + k]
+        same = same and x == before and math.copysign(1.0, x) == math.copysign(1.0, before)
+        begun[BEGUN + k] = x
+    return same
 
 
 # in `told`: numbers of states, the first included, and of steps; as numbers, whether nothing has to be looked at,
-# velocities turned in the last step, and all states lie in a box; and what stands in the workspace
-N_STATES, N_STEPS, PLAIN, TURNED, INSIDE, CHECKED, DEFECT, WIDEST, N_TOLD = range(9)
+# velocities turned in the last step, and all states lie in a box; what stands in the workspace; the code of `advance`,
+# and whether the start is new. Then counters
+N_STATES, N_STEPS, PLAIN, TURNED, INSIDE, CHECKED, DEFECT, WIDEST, CODE, IS_NEW, N_TOLD = range(11)
+FRONT = N_TOLD + N_COUNTERS
 
 
 @merged
@@ -269,26 +290,63 @@ def _turned(b, k, n):
     return change > b.constants[MOST_TURNED] * (b.t[k] - b.t[k - 1]) * min(first, last)
 
 
-@kernel(i8(KIT, WORK, AGAIN, f8, MATRIX, i8, i8), vectorized=True)
-def go(f, w, b, t1, box, n_rows, n_steps):
-    """The first chunk of the steps of a run to t1 from its saved start: how `advance` ended, and `told`.
+@merged
+def _tell(w, b, box, n_rows, n_steps, code, is_new):
+    """Put down what is told of a run with so many rows, behind the first, and steps; their number, if all is well.
 
-    Or what is told, where so many rows, behind the first, and steps were made. `box` has rows [t, q, v], or nothing.
+    `box` has rows [t, q, v], or nothing.
     """
-    code = at.GO_ON
-    if n_steps < 0:
-        _begin_again(f, b)
-        b.end[0], b.t[0] = t1, b.clock[at.T]
-        _copy(b.state, b.states[0])
-        arrays = b.tolerances, b.control, b.clock, b.state, b.new_state
-        code = b.advance(f, w, b.options, b.memory, *arrays, b.end, b.t[1:], b.states[1:], b.steps, b.filled)
-        n_rows, n_steps = b.filled[0], b.filled[1]
     turned = n_rows > 0 and _turned(b, n_rows, w.Q.size)
     inside = box.shape[1] > 0 and _lie_within(b.t[: 1 + n_rows], b.states, box)
     near = b.clock[at.PIVOT_AT_OUTPUT] < b.constants[NEAR]
     missed = b.clock[at.BRIEFEST] < b.constants[LOOKS] * b.clock[at.WIDEST_LOOK]
-    b.told[N_STATES], b.told[N_STEPS], b.told[PLAIN] = 1 + n_rows, n_steps, not (turned or near or missed)
-    b.told[TURNED], b.told[INSIDE] = turned, inside
-    b.told[CHECKED] = w.counters[N_ACCEPTED] > 0 and w.notes[noted.UNCHECKED] == 0.0
-    b.told[DEFECT], b.told[WIDEST] = w.notes[noted.LARGEST_DEFECT], w.notes[noted.WIDEST_GAP]
-    return code
+    plain, width = not (turned or near or missed), b.steps.shape[1]
+    begin = b.told.size - FRONT - 1 - n_rows - width * n_steps
+    told = b.told[begin:]
+    told[N_STATES], told[N_STEPS], told[PLAIN] = 1 + n_rows, n_steps, plain
+    told[TURNED], told[INSIDE], told[CODE], told[IS_NEW] = turned, inside, code, is_new
+    told[CHECKED] = w.counters[N_ACCEPTED] > 0 and w.notes[noted.UNCHECKED] == 0.0
+    told[DEFECT], told[WIDEST] = w.notes[noted.LARGEST_DEFECT], w.notes[noted.WIDEST_GAP]
+    for k in range(N_COUNTERS):
+        told[N_TOLD + k] = w.counters[k]
+    _copy(b.t[: 1 + n_rows], told[FRONT : FRONT + 1 + n_rows])
+    for k in range(n_steps):
+        _copy(b.steps[k], told[FRONT + 1 + n_rows + k * width : FRONT + 1 + n_rows + (k + 1) * width])
+    well = code == at.ALL_OUTPUT_DONE and plain and inside and n_rows == n_steps
+    b.filled[0], b.filled[1] = n_rows, n_steps
+    return n_steps if well else OTHERWISE
+
+
+@kernel(i8(WORK, AGAIN, MATRIX, i8, i8, i8))
+def tell(w, b, box, n_rows, n_steps, code):
+    """The same, for Python, of steps beyond the first chunk."""
+    return _tell(w, b, box, n_rows, n_steps, code, False)
+
+
+@kernel(i8(KIT, KIT, WORK, AGAIN, f8, f8, VECTOR, VECTOR, VECTOR, MATRIX, types.boolean), vectorized=True)
+def go(f, given, w, b, t, t1, q, v, sizes, box, sure):
+    """Begin a run to t1 and make the first chunk of its steps: how many these are, if all is well with them.
+
+    A start that is the last one to the bit is looked at once more, and then saved for those that follow.
+    """
+    f.flags[FORM] = int(b.constants[IN_FORM])  # which a run may have changed
+    same, often = _begins_as_before(b.begun, t, t1, q, v), b.begun[HOW_OFTEN]
+    if same and often == IS_SAVED:
+        _put_back(b)
+    else:
+        b.begun[HOW_OFTEN] = NEVER
+        refused = _begin(f, given, w, b, t, t1, q, v, sizes, sure or same)
+        if refused != 0:
+            return refused
+        if same:
+            _save(b)
+        b.begun[HOW_OFTEN] = IS_SAVED if same else 1.0
+    for k in range(b.memory.size):
+        b.memory[k] = 0.0
+    for k in range(b.places.size):
+        b.memory[b.places[k]] = b.begin_memory[k]
+    b.end[0], b.t[0] = t1, t
+    _copy(b.state, b.states[0])
+    arrays = b.tolerances, b.control, b.clock, b.state, b.new_state
+    code = b.advance(f, w, b.options, b.memory, *arrays, b.end, b.t[1:], b.states[1:], b.steps, b.filled)
+    return _tell(w, b, box, b.filled[0], b.filled[1], code, not same)

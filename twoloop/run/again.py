@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.consistency import Look
-from twoloop.generate.choices import SINGULAR_MASS
 from twoloop.generate.exact_derivatives import farthest
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Sample
 from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.control.clock import N_STEP_COLUMNS
 from twoloop.kernels.data import flags, intervals, noted
 from twoloop.kernels.layout import short_loops
 from twoloop.problem.system import ConstrainedSystem
@@ -33,7 +33,7 @@ from twoloop.run.interrupts import Interrupts
 from twoloop.run.kept import OF_STEPS
 from twoloop.run.messages import message_of, outcome, said_of_reached, unless_turned
 from twoloop.run.movable import Kin, Movable
-from twoloop.run.pace import INTERRUPTED, STAGNATED, Pace
+from twoloop.run.pace import STAGNATED, Pace
 from twoloop.run.passage import beyond, bridge, bridging_kit, give_way, load
 from twoloop.run.record import DEFAULTS, Status
 from twoloop.run.run import Run
@@ -50,6 +50,7 @@ LATER = (*OF_STEPS, "stats")  # fields that are put together apart from the othe
 OTHERS = {name: value for name, value in DEFAULTS.items() if name not in LATER}
 SHORT = 1e-3  # s of CPU time of the last run: then it is the time that elapses, which takes less to look at
 NO_PACE = Pace(0.0)  # of a run that came to its end at once
+REACHED_END = Status.REACHED_END  # which an enumeration takes longer to find
 
 
 class Output(NamedTuple):
@@ -103,13 +104,17 @@ class Again:
         looked, room = system if self.movable is None else self.movable.system, LARGEST // len(run.state)
         self.look, self.loops, self.rest = Look(looked), short_loops(), 0
         self.known, self.given = arrays_of(run, self.look, code, definite, asked, room), looked.kit
-        self._begin, self._go, self._advance = map(direct, (self.loops.begin, self.loops.go, run.kernels.advance))
+        self._go, self._tell, self._advance = map(direct, (self.loops.go, self.loops.tell, run.kernels.advance))
+        # in the block of all that is kept: where states begin, and what is told of one that is the only one
+        self.states_from, self.width = self.known.told.size, len(run.state)
+        self.one_state_from = self.states_from - self.loops.FRONT - 1
         self.plan, self.kit, self.form, self.memory = run.plan, run.kit, run.kit.flags[flags.FORM], run.memory
         self.looks: Looks | None = None  # of a run of several chunks
         self.loading, self.spent = 0.0, np.inf  # CPU time of a step that a run came to, and of the last run, s
         self.kinds, self.between = np.empty(room, dtype=np.int64), Between(run)
-        self.dependent: dict[bytes, tuple[NDArray[np.int64], str]] = {}  # by the rows that count
-        self.call: tuple[int, float, float, bytes, bytes] | None = None  # the last one, whose start is saved
+        self.of_run = run.rank, run.redundant, bool(run.plan.own)
+        self.unusual = kin is not None or run.said_of_rows != ""  # what is not known at its start alone
+        self.dependent = {self.known.start_rows.tobytes(): (run.redundant, run.said_of_rows)}  # by the rows that count
 
     @staticmethod
     def suits(run: Run) -> bool:
@@ -138,73 +143,135 @@ class Again:
     ) -> dict[str, Any] | None:
         """The fields of the result of a run of a system; None: make it the long way.
 
-        But for the status they are put together when they are asked for, from copies of the arrays.
+        But for the status they are put together when they are asked for, from a copy of the arrays.
         """
-        run, movable, territory, known = self.run, self.movable, self.territory, self.known
-        done = run.a.ALL_OUTPUT_DONE
+        run, territory, known, loops = self.run, self.territory, self.known, self.loops
         if self.rest > 0:
             self.rest -= 1
             return None
-        if movable is None:
-            if territory.is_due() or (self.check_derivatives and not system.checked):
-                return None
-        else:
-            movable.take(system)
-            self.look.system = movable.system
+        if self.movable is not None:
+            if self.movable.take(system):
+                self.look.system, known.begun[loops.HOW_OFTEN] = self.movable.system, loops.NEVER
+        elif territory.is_due() or (self.check_derivatives and not system.checked):
+            return None
         if self.looks is not None:
             self._forget_chunks()
-        call = id(system), t0, t1, q0.tobytes(), v0.tobytes()  # of the last call the system is kept
-        if call != self.call:  # one that begins as the last needs no second look
-            self.call = None
-            if not self._begins(t0, t1, q0, v0, interrupts):
-                return None
-            self.call = call
+        run.t0, told, at_times, words = t0, None, None, ""
+        arrays = run.kit, self.given, run.work, known, t0, t1, q0, v0, self.look.sizes(), territory.known
         clock = time.perf_counter if self.spent < SHORT else time.process_time
         began = clock()
         try:
-            code = self._go(run.kit, run.work, known, t1, territory.known, -1, -1)
-            if code != done:
-                code = self._steps_beyond(code, t1, interrupts)
-            elif output is not STEPS:
-                self.kinds[: known.filled[1]] = kinds_of(run, known.steps[: known.filled[1]])
+            n = self._go(*arrays, False)
+            if n == loops.IN_DOUBT:
+                interrupts.listen()
+                n = self._go(*arrays, True) if self.look.is_surely(0, t0, q0, v0) else loops.REFUSED
+            if n == loops.REFUSED:
+                return None
+            if n < 0 or self.unusual or output is not STEPS:
+                told = self._go_on(t1, output, interrupts)
         except Exception:  # of a callback; the long way knows what to do
-            code = INTERRUPTED
-        states, taken, plain, turned, inside, checked, defect, gap = known.told.tolist()
-        n_states, n_steps, plain = int(states), int(taken), plain and self.looks is None
-        t, rows, steps = known.t[:n_states], known.states[:n_states], known.steps[:n_steps]
-        if output is not STEPS and output.between is not None and code == done:
-            self.between.find(output.between, t, rows, self.kinds[:n_steps], self.look.pattern)
+            self.rest, known.begun[loops.HOW_OFTEN] = IN_VAIN, loops.NEVER
+            return None
         self.spent = spent = clock() - began - self.loading
-        if code != done or not (plain or self._is_to_be_trusted(t, rows, t1, output, turned)):
+        fields: dict[str, Any] = {"status": REACHED_END}
+        n_rows = n
+        if told is not None:
+            n_rows, n = known.filled.tolist()
+            found = self._looked_at(told, t1, q0, v0, output, interrupts, fields)
+            if found is None:
+                known.begun[loops.HOW_OFTEN] = loops.NEVER
+                return None
+            at_times, words = found
+        begin, end = self.one_state_from - n_rows - n * N_STEP_COLUMNS, self.states_from
+        data = known.block[begin : end if at_times is not None else end + (1 + n_rows) * self.width].copy()
+        fields["later"] = later = partial(_field, data, at_times, self.of_run, spent, system, t1, asked)
+        if words:
+            fields |= message_of(run, words, run.system if self.movable is None else system, later)
+        territory.count()  # a run that goes the long way is counted there
+        return fields
+
+    def _go_on(self, t1: float, output: Output, interrupts: Interrupts) -> list[float]:
+        """Take the steps beyond the first chunk, and find states between steps; what is told of the run."""
+        run, known, loops, done = self.run, self.known, self.loops, self.run.a.ALL_OUTPUT_DONE
+        told = self._told()
+        if told[loops.IS_NEW]:
+            run.compared_to[0] = -np.inf
+        if told[loops.CODE] != done:
+            self._steps_beyond(int(told[loops.CODE]), t1, interrupts)
+            told = [*self._told()[: loops.IS_NEW], told[loops.IS_NEW]]
+        elif output is not STEPS:
+            self.kinds[: known.filled[1]] = kinds_of(run, known.steps[: known.filled[1]])
+        if output.between is not None and told[loops.CODE] == done:
+            n_rows, n_steps = known.filled.tolist()
+            t, rows = known.t[: 1 + n_rows], known.states[: 1 + n_rows]
+            self.between.find(output.between, t, rows, self.kinds[:n_steps], self.look.pattern)
+        return told
+
+    def _told(self) -> list[float]:
+        n_rows, n_steps = self.known.filled.tolist()
+        begin = self.one_state_from - n_rows - n_steps * N_STEP_COLUMNS
+        told: list[float] = self.known.told[begin : begin + self.loops.N_TOLD].tolist()
+        return told
+
+    def _looked_at(
+        self,
+        told: list[float],
+        t1: float,
+        q0: Array,
+        v0: Array,
+        output: Output,
+        interrupts: Interrupts,
+        fields: dict[str, Any],
+    ) -> tuple[tuple[Array, Array] | None, str] | None:
+        """Output times and rows there, None: all steps, and the words of a message; None where it is not to be trusted.
+
+        `fields` gets `sol`.
+        """
+        run, known, loops, movable = self.run, self.known, self.loops, self.movable
+        n_rows, n_steps = known.filled.tolist()
+        t, rows, code = known.t[: 1 + n_rows], known.states[: 1 + n_rows], int(told[loops.CODE])
+        plain, inside = told[loops.PLAIN] and self.looks is None, bool(told[loops.INSIDE])
+        trusted = plain or self._is_to_be_trusted(t, rows, t1, output, told[loops.TURNED])
+        if code != run.a.ALL_OUTPUT_DONE or not trusted:
             self.rest = max(self.rest, IN_VAIN)
+            return None
+        if told[loops.IS_NEW] and not self._agrees(t1, q0, v0, interrupts):
             return None
         if not inside or movable is not None:
             interrupts.listen()
-            if (run.compared_to[0] < t1 or territory.is_due()) and not self._compared(t, rows, bool(inside)):
+            if (run.compared_to[0] < t1 or self.territory.is_due()) and not self._compared(t, rows, inside):
                 return None
             run.compared_to[0] = t1
-        fields: dict[str, Any] = {"status": Status.REACHED_END}
         if output.dense:
-            table = Table(t.copy(), rows[:, : 3 * system.n_q].copy(), self.kinds[:n_steps].copy())
+            table = Table(t.copy(), rows[:, : 3 * run.system.n_q].copy(), self.kinds[:n_steps].copy())
             fields["sol"] = DenseSolution(interpolator_of(run, table.states[0]), table, t1)
-        if output.times is None:
-            t, rows = t.copy(), rows.copy()
-        else:
-            ends = [0 if time == t0 else -1 for time in output.times.tolist()]
-            at_times = rows[ends] if output.at_ends else self.between.completed(output.times)
-            if at_times is None:
+        at_times, words = None, ""
+        if output.times is not None:
+            ends = [0 if time == run.t0 else -1 for time in output.times.tolist()]
+            found = rows[ends] if output.at_ends else self.between.completed(output.times)
+            if found is None:
                 return None
-            t, rows = output.times.copy(), at_times
-        of_run = run.rank, run.redundant, defect if checked else None, gap, self.plan.own
-        arrays = t, rows, steps.copy(), run.work.counters.copy()
-        fields["later"] = later = partial(_told, arrays, spent, of_run, system, t1, asked)
+            at_times = output.times.copy(), found
         if not plain:  # after all that may send it the long way: it may warn, and takes the workspace
             words = outcome(run, code, t1, NO_PACE)[1]
             if self.looks is not None:
                 words += said_of_stiffness(self.looks, run.kit, run.work)
-            fields |= message_of(run, words, run.system if movable is None else system, later)
-        territory.count()  # a run that goes the long way is counted there
-        return fields
+        return at_times, words
+
+    def _agrees(self, t1: float, q0: Array, v0: Array, interrupts: Interrupts) -> bool:
+        """Whether a system of other parameters is as it should be at a new start, where other rows may be redundant."""
+        run = self.run
+        if run.said_of_rows:  # rounding may decide which row is left out
+            interrupts.listen()
+            counted = self.known.start_rows.tobytes()
+            if counted not in self.dependent:
+                there = run.at(run.t0, q0, v0)
+                if there is None:
+                    return False
+                self.dependent[counted] = there.redundant, there.said_of_rows
+            redundant, run.said_of_rows = self.dependent[counted]
+            self.of_run = run.rank, redundant, bool(self.plan.own)
+        return self.movable is None or self.movable.agrees(run.t0, q0, v0, t1, self.look.mass, self.check_derivatives)
 
     def _forget_chunks(self) -> None:
         """Put back what a run of several chunks may have changed, beside arrays."""
@@ -214,8 +281,8 @@ class Again:
             run.plan, run.kit, run.functions, run.substituted = self.plan, self.kit, self.kit.functions, False
             run.memory = self.memory
 
-    def _steps_beyond(self, code: int, t1: float, interrupts: Interrupts) -> int:
-        """How the steps end that go on after the first chunk, which ended so; `told` is of all."""
+    def _steps_beyond(self, code: int, t1: float, interrupts: Interrupts) -> None:
+        """Take the steps after the first chunk, which ended so, and tell of all."""
         interrupts.listen()
         run, known, a = self.run, self.known, self.run.a
         self.looks = looks = Looks(run.plan)
@@ -271,35 +338,7 @@ class Again:
             code = self._advance(kit, run.work, *arrays, known.end, *room, known.filled)
             more, taken = known.filled.tolist()
             n_rows, n_steps, across = n_rows + more, n_steps + taken, plan is not run.plan
-        self._go(kit, run.work, known, t1, self.territory.known, n_rows, n_steps)  # which only tells
-        return code
-
-    def _begins(self, t0: float, t1: float, q0: Array, v0: Array, interrupts: Interrupts) -> bool:
-        """Whether the run begins at another start, which is then saved."""
-        run, look, system, code = self.run, self.look, self.look.system, 0
-        weak = 0.0 if system.constant_mass and system.made.get("no weak mass", False) else SINGULAR_MASS
-        state = np.ascontiguousarray(q0), np.ascontiguousarray(v0)
-        for sure in (False, True):
-            try:
-                numbers = t0, t1, *state, look.sizes(), weak, sure
-                code = self._begin(run.kit, self.given, run.work, self.known, *numbers)
-            except Exception:  # of a callback, which is called by itself then
-                return False
-            if code != self.loops.IN_DOUBT:
-                break
-            interrupts.listen()
-            if not look.is_surely(0, t0, *state):
-                return False
-        if code != self.loops.READY:
-            return False
-        run.t0, run.compared_to[0] = t0, -np.inf
-        if run.said_of_rows:  # rounding may decide which row is left out
-            interrupts.listen()
-            counted = run.work.rows_v.tobytes()
-            if counted not in self.dependent:
-                self.dependent[counted] = run.redundant_rows(self.look.rows)
-            run.redundant, run.said_of_rows = self.dependent[counted]
-        return self.movable is None or self.movable.agrees(t1, self.look.mass, self.check_derivatives)
+        self._tell(run.work, known, self.territory.known, n_rows, n_steps, code)
 
     def _is_to_be_trusted(self, t: Array, rows: Array, t1: float, output: Output, turned: float) -> bool:
         """Whether nothing speaks against a run that ended near singular positions or crossed some, as in `Course`."""
@@ -331,22 +370,28 @@ class Again:
         return right
 
 
-def _told(
-    arrays: tuple[Any, ...],
+def _field(
+    data: Array,
+    at_times: tuple[Array, Array] | None,
+    of_run: tuple[int, NDArray[np.int64], bool],
     spent: float,
-    of_run: tuple[Any, ...],
     system: ConstrainedSystem,
     t1: float,
     asked: Asked,
     name: str,
 ) -> dict[str, Any]:
-    """A field of a result, with those that are put together with it."""
-    t, rows, steps, counted = arrays
+    """A field of a result, with those that are put together with it; `data` is what `go` tells."""
     if name == "message":
         return {name: said_of_reached(t1, asked.step_size is not None)}
+    loops, n_states, n_steps = short_loops(), int(data[0]), int(data[1])
+    begin, end = (places := loops.FRONT + n_states), places + n_steps * N_STEP_COLUMNS
     if name in LATER:
-        return of_steps(steps, BEFORE.copy()) | {"stats": statistics(counted, spent)} | asked.told
-    rank, redundant, defect, gap, own = of_run
-    told = {"rank": rank, "redundant": redundant.copy(), "defect": defect, "widest_gap": gap, "compiled": bool(own)}
-    told |= {"system": system, "atol": asked.atol.copy()}
+        counted = data[loops.N_TOLD : loops.FRONT].astype(np.int64)
+        of_all = of_steps(data[begin:end].reshape(n_steps, N_STEP_COLUMNS), BEFORE.copy())
+        return of_all | {"stats": statistics(counted, spent)} | asked.told
+    rank, redundant, own = of_run
+    defect = float(data[loops.DEFECT]) if data[loops.CHECKED] else None
+    told = {"rank": rank, "redundant": redundant.copy(), "defect": defect, "compiled": own}
+    told |= {"widest_gap": float(data[loops.WIDEST]), "system": system, "atol": asked.atol.copy()}
+    t, rows = (data[loops.FRONT : begin], data[end:].reshape(n_states, -1)) if at_times is None else at_times
     return OTHERS | of_states(system.n_q, t, rows) | told | asked.told

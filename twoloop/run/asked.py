@@ -1,7 +1,7 @@
 """What the options of a call ask of a run, beside what it is to keep."""
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,12 @@ from twoloop.methods.code_for import Compiled
 from twoloop.methods.plan import Method
 from twoloop.methods.presets import identity
 from twoloop.run.run import Run
+
+
+@lru_cache(maxsize=1024)
+def _key(*_: Any) -> object:
+    """An object that stands for these options: it is found in a dictionary at once."""
+    return object()
 
 
 @dataclass(frozen=True)
@@ -29,10 +35,16 @@ class Asked:
     check_derivatives: bool
 
     @cached_property
-    def key(self) -> Any:
+    def key(self) -> object:
         """What calls have in common that ask for the same."""
         sizes = self.first_step, self.max_step, self.max_steps, self.step_size
-        return identity(self.method), self.rtol, self.atol.tobytes(), *sizes, self.compiled, self.check_derivatives
+        tolerances = self.rtol, self.atol.tobytes()
+        return _key(identity(self.method), *tolerances, *sizes, self.compiled, self.check_derivatives)
+
+    @cached_property
+    def own_tolerance(self) -> float | None:
+        """The tolerance of positions of a method that tests these by itself."""
+        return getattr(self.method, "error_tol", None)
 
     @cached_property
     def told(self) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.consistency import Look
-from twoloop.generate.choices import BOUNDS, LEAST, RANK, Choice, Dependents
+from twoloop.generate.choices import BOUNDS, LEAST, RANK, SINGULAR_MASS, Choice, Dependents
 from twoloop.generate.straight_code import OwnCode
 from twoloop.kernels.algebra.lapack import addresses
 from twoloop.kernels.data import noted
@@ -24,7 +24,7 @@ NEARER = 0.1  # of the smallest pivot at the start of the first run: below it, a
 
 
 def arrays_of(run: Run, look: Look, code: OwnCode | None, definite: bool, asked: Asked, room: int) -> SimpleNamespace:
-    """The arrays that `begin` and `go` of kernels/short_loops.py read and write, with room for so many steps.
+    """The arrays that `go` of kernels/short_loops.py reads and writes, with room for so many steps.
 
     The run is at its start; its clock, control and tolerances become parts of one array. `look` is of its system, or of
     the one that it stands for; `code` is the machine code that its plan calls; `definite`: whether M has an inverse.
@@ -45,10 +45,14 @@ def arrays_of(run: Run, look: Look, code: OwnCode | None, definite: bool, asked:
     dependents = Dependents(system, () if choice is None else choice.rows)
     search = dependents.arguments if dependents.find else (nothing, nothing, 0, np.zeros(0), nothing, nothing)
     places = np.flatnonzero(memory.view(np.int64))  # -0 is not what is cleared
+    weak = 0.0 if system.constant_mass and system.made.get("no weak mass", False) else SINGULAR_MASS
     of_start: tuple[float, ...]
-    of_start = max(run.rtol, GAMMA_ACCURACY), run.reuse, 0.0 if run.plan.watchful else 1.0, RANK, scale, CONTRADICTS
-    of_start += of_mass, NEARER * run.work.notes[noted.PIVOT], run.kit.flags[FORM]
+    of_start = max(run.rtol, GAMMA_ACCURACY), run.reuse, 0.0 if run.plan.watchful else 1.0, RANK, weak, scale
+    of_start += CONTRADICTS, of_mass, NEARER * run.work.notes[noted.PIVOT], run.kit.flags[FORM]
     of_steps = asked.first_step or 0.0, run.least_atol, asked.max_step, run.plan.looks_within
+    columns, width = run.a.N_STEP_COLUMNS, len(run.state)
+    block = np.empty(loops.FRONT + 1 + (1 + columns) * room + width * (1 + room))
+    told, states = np.split(block, [len(block) - width * (1 + room)])
     known = SimpleNamespace(
         **look.arrays,
         **{"numbers": numbers, "begin_numbers": numbers.copy()},
@@ -61,9 +65,10 @@ def arrays_of(run: Run, look: Look, code: OwnCode | None, definite: bool, asked:
         **{"bounds": BOUNDS, "scratch": np.zeros(pivots.room_size(n_rows, system.n_q)), "expected": expected},
         **{"chosen": np.zeros(2 + 3 * n_rows, dtype=np.int64), "blocks": np.array(blocks, dtype=np.int64).ravel()},
         **dict(zip(("kinds", "counted", "_", "search", "search_places", "found"), search, strict=True)),
-        **{"end": np.zeros(1), "t": np.empty(room + 1), "states": np.empty((room + 1, len(run.state)))},
-        **{"steps": np.empty((room, run.a.N_STEP_COLUMNS)), "filled": np.zeros(2, dtype=np.int64)},
-        **{"told": np.zeros(loops.N_TOLD), "look": first_look.look, "choose": pivots.choose, "dependents": find},
+        **{"begun": np.zeros(loops.BEGUN + 2 + 2 * system.n_q), "start_rows": run.work.rows_v.copy()},
+        **{"end": np.zeros(1), "t": np.empty(room + 1), "states": states.reshape(room + 1, width)},
+        **{"steps": np.empty((room, columns)), "filled": np.zeros(2, dtype=np.int64), "told": told, "block": block},
+        **{"look": first_look.look, "choose": pivots.choose, "dependents": find},
         **{"start": run.kernels.start, "advance": run.kernels.advance},
     )
     known.table = loops.AGAIN.table(known)

@@ -8,7 +8,7 @@ which may take long and from which every caller expects exceptions; elsewhere it
 import _signal  # type: ignore[import-not-found]  # `signal` makes enumerations of handlers, which takes 8 microseconds
 import signal
 from contextlib import suppress
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -38,9 +38,6 @@ class Interrupts:
 
     asked, _stands_in = 0, False
 
-    def __enter__(self) -> "Interrupts":
-        return self
-
     def listen(self) -> "Interrupts":
         """Keep signals from here on, but for those within the functions of a user."""
         if _signal.getsignal(signal.SIGINT) is signal.default_int_handler:
@@ -49,13 +46,15 @@ class Interrupts:
                 self._stands_in = True
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: Any, trace: TracebackType | None) -> bool:
-        """Whether what was raised is Ctrl-C to be answered by a result: not the fourth, nor a user's handler's."""
-        if kind is KeyboardInterrupt:
-            self.listen()  # where the handler is Python's own
+    def answers(self) -> bool:
+        """Whether Ctrl-C that was raised is to be answered by a result: not the fourth, nor a user's handler's."""
+        self.listen()  # where the handler is Python's own
+        return self._stands_in and self.asked <= IMPATIENCE
+
+    def leave(self) -> None:
+        """Let Python's own handler have its place again."""
         if self._stands_in:
             _signal.signal(signal.SIGINT, signal.default_int_handler)
-        return kind is KeyboardInterrupt and self._stands_in and self.asked <= IMPATIENCE
 
     def _heard(self, number: int, frame: FrameType | None) -> None:
         self.asked += 1

@@ -118,10 +118,12 @@ class Movable:
         """The vector that the arrays hold."""
         return self._functions.p  # type: ignore[no-any-return]
 
-    def take(self, system: ConstrainedSystem) -> None:
-        """Be for a system of the family."""
-        if system is not self.given:
-            self._take(system)
+    def take(self, system: ConstrainedSystem) -> bool:
+        """Be for a system of the family; whether it was for another one."""
+        if system is self.given:
+            return False
+        self._take(system)
+        return True
 
     def _take(self, system: ConstrainedSystem) -> None:
         self.given = system
@@ -135,21 +137,20 @@ class Movable:
         for traced in self.run.traced:
             traced.trusted = False
 
-    def agrees(self, t1: float, mass: Array, with_derivatives: bool) -> bool:
-        """Whether callbacks at the start of the run, to t1, and about it are as they should be, and M as it was.
+    def agrees(self, t0: float, q: Array, v: Array, t1: float, mass: Array, with_derivatives: bool) -> bool:
+        """Whether callbacks at the start of a run to t1, and about it are as they should be, and M as it was.
 
         `mass`: M at the start.
         """
-        run, system, n = self.run, self.system, self.system.n_q
-        q, v = run.state[:n].copy(), run.state[n : 2 * n].copy()
+        run, system = self.run, self.system
         if not self._mass_agrees:
             system.remember_at("definite mass", None, is_definite(mass))
             known = self.kin.definite, bool(run.kit.flags[DIAGONAL_MASS])
-            self._mass_agrees = known == (has_definite_mass(system, run.t0, q), is_diagonal(mass))
+            self._mass_agrees = known == (has_definite_mass(system, t0, q), is_diagonal(mass))
         try:
             if with_derivatives:
-                check_derivatives(system, run.t0, q, lambda: exact_near(system, run.t0, q, v))
-            refuse_wrong(run.traced, system, run.t0, t1, q, v)
+                check_derivatives(system, t0, q, lambda: exact_near(system, t0, q, v))
+            refuse_wrong(run.traced, system, t0, t1, q, v)
         except Exception:  # of a callback, too; the long way says what it is
             return False
         return self._mass_agrees

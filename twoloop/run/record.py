@@ -215,9 +215,12 @@ class Record:
 
 def record_of(kind: type[AnyRecord], fields: dict[str, Any]) -> AnyRecord:
     """A record with these fields, which it takes over: the constructor of a frozen dataclass with thirty is slow."""
-    made = object.__new__(kind)
-    object.__setattr__(made, "__dict__", fields)
+    made = _new(kind)
+    _set_fields(made, fields)
     return made
+
+
+_new, _set_fields = object.__new__, vars(Record)["__dict__"].__set__
 
 
 class _Deferred:

@@ -272,9 +272,11 @@ class SampledRun:
         run = self.run
         run.t0, run.said_of_start = float(run.clock[run.a.T]), ""
         wanted = Wanted(np.array([end]), True, False, None, InMemory())
-        with Interrupts().listen() as interrupts:
-            course = Course(run, end, wanted, lambda t: None, None, interrupts)
-            record = course.to_end(False)
+        interrupts = Interrupts().listen()
+        try:
+            record = Course(run, end, wanted, lambda t: None, None, interrupts).to_end(False)
+        finally:
+            interrupts.leave()
         run.control[run.a.STORE_ALL], run.work.notes[noted.KINK_AFTER] = 0.0, np.inf
         steps = np.zeros((len(record.h), run.a.N_STEP_COLUMNS))
         steps[:, run.a.H], steps[:, run.a.JACOBIANS] = record.h, record.untested
