@@ -118,7 +118,7 @@ class Look:
         self.mass, self.rows, self.pattern = mass.reshape(n, n), rows.reshape(n_rows, n), pattern.reshape(n_rows, n)
         self.arrays = {
             **{"looked": looked, "lam": _ones(system.n_c), "room": self._room, "mass": self.mass, "rows": self.rows},
-            **{"ways": ways(n), "pattern": self.pattern, "least": LEAST},
+            **{"ways": ways(n)[1:], "pattern": self.pattern, "least": LEAST},
         }
         self.definite: bool | None = None
 

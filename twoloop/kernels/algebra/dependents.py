@@ -23,27 +23,23 @@ def room_size(n_rows: int, n: int) -> tuple[int, int]:
 
 
 @compiled
-def _constant(R, K, row_left, column_left, row_sizes, column_sizes):
+def _constant(R, K, row_left, row_sizes, column_sizes):
     """The place, n times the row plus the column, of the number with the least fill; -1: there is none."""
     best, best_fill, best_size, (m, n) = -1, 0, 0, R.shape
-    row_sizes[:] = 0
-    column_sizes[:] = 0
     for i in range(m):
+        if not row_left[i]:
+            continue
+        largest, size = -1.0, row_sizes[i]
         for j in range(n):
-            if row_left[i] and column_left[j] and K[i, j] != NONE:
-                row_sizes[i] += 1
-                column_sizes[j] += 1
-    for i in range(m):
-        if row_left[i]:
-            largest = 0.0
-            for j in range(n):
-                if column_left[j]:
-                    largest = max(largest, abs(R[i, j]))
-            for j in range(n):
-                if column_left[j] and K[i, j] == NUMBER and abs(R[i, j]) > SMALL * largest:
-                    fill = (row_sizes[i] - 1) * (column_sizes[j] - 1)
-                    if best < 0 or fill < best_fill or (fill == best_fill and row_sizes[i] < best_size):
-                        best, best_fill, best_size = i * n + j, fill, row_sizes[i]
+            if K[i, j] == NUMBER:
+                fill = (size - 1) * (column_sizes[j] - 1)
+                if best < 0 or fill < best_fill or (fill == best_fill and size < best_size):
+                    if largest < 0.0:
+                        largest = 0.0
+                        for k in range(n):
+                            largest = max(largest, abs(R[i, k]))
+                    if abs(R[i, j]) > SMALL * largest:
+                        best, best_fill, best_size = i * n + j, fill, size
     return best
 
 
@@ -120,25 +116,31 @@ def _varying(R, K, row_left, column_left, squares, rows, column_sizes, found):
 
 
 @compiled
-def _subtract(R, K, column_left, r, j, i):
-    """Take row i, solved for column j, times its entry there from row r."""
+def _subtract(R, K, column_left, row_sizes, column_sizes, r, j, i):
+    """Take row i, solved for column j, times its entry there from row r, which has none there then."""
     factor, kind = R[r, j], K[r, j]
+    R[r, j], K[r, j] = 0.0, NONE
     if kind == NONE:
         return
-    R[r, j], K[r, j] = 0.0, NONE
+    row_sizes[r] -= 1
     for c in range(R.shape[1]):
         if column_left[c] and K[i, c] != NONE:
             change = factor * R[i, c]
-            left = R[r, c] - change
+            left, had_one = R[r, c] - change, K[r, c] != NONE
             K[r, c] = max(K[r, c], kind, K[i, c])
             if K[r, c] == NUMBER and abs(left) <= ROUNDING * abs(change):
                 left, K[r, c] = 0.0, NONE
             R[r, c] = left
+            more = (K[r, c] != NONE) - had_one
+            row_sizes[r], column_sizes[c] = row_sizes[r] + more, column_sizes[c] + more
 
 
 @compiled
-def _eliminate(R, K, row_left, column_left, i, k, j, l):
-    """Solve rows i and k for columns j and l, or one for one, and take these out of the other rows."""
+def _eliminate(R, K, row_left, column_left, row_sizes, column_sizes, i, k, j, l):
+    """Solve rows i and k for columns j and l, or one for one, and take these out of the other rows.
+
+    `row_sizes` and `column_sizes` are kept of single rows: how many entries there are.
+    """
     m, n = R.shape
     row_left[i] = row_left[k] = column_left[j] = column_left[l] = 0
     if i == k:
@@ -147,6 +149,7 @@ def _eliminate(R, K, row_left, column_left, i, k, j, l):
             if column_left[c] and K[i, c] != NONE:
                 R[i, c] /= pivot
                 K[i, c] = max(kind, K[i, c])
+                column_sizes[c] -= 1
     else:
         a, b, c, d = R[i, j], R[i, l], R[k, j], R[k, l]
         has_a, has_b, has_c, has_d = K[i, j] != NONE, K[i, l] != NONE, K[k, j] != NONE, K[k, l] != NONE
@@ -160,9 +163,9 @@ def _eliminate(R, K, row_left, column_left, i, k, j, l):
                 K[k, column] = VARIES if (has_a and has_y) or (has_c and has_x) else NONE
     for r in range(m):
         if row_left[r]:
-            _subtract(R, K, column_left, r, j, i)
+            _subtract(R, K, column_left, row_sizes, column_sizes, r, j, i)
             if i != k:
-                _subtract(R, K, column_left, r, l, k)
+                _subtract(R, K, column_left, row_sizes, column_sizes, r, l, k)
 
 
 @kernel(i8(MATRIX, INTEGERS, INTEGERS, i8, VECTOR, INTEGERS, INTEGERS))
@@ -182,26 +185,29 @@ def dependents(G, kinds, rows, n_kept, room, work, out):
     row_left, both = work[end : end + n_kept], work[end + n_kept : end + 3 * n_kept]
     row_sizes, end = both[:n_kept], end + 3 * n_kept
     column_left, column_sizes = work[end : end + n], work[end + n : end + 2 * n]
+    column_left[:] = 1
+    column_sizes[:] = 0
     for i in range(n_kept):
-        row_left[i] = 1
+        row_left[i], row_sizes[i] = 1, 0
         for j in range(n):
             R[i, j], K[i, j] = G[rows[i], j], kinds[rows[i] * n + j]
             squares[j] += R[i, j] * R[i, j]
-    column_left[:] = 1
+            there = K[i, j] != NONE
+            row_sizes[i], column_sizes[j] = row_sizes[i] + there, column_sizes[j] + there
     n_left, n_blocks = n_kept, 0
     while n_left > 0:
         found = out[4 * n_blocks : 4 * n_blocks + 4]
-        place = _constant(R, K, row_left, column_left, row_sizes, column_sizes)
+        place = _constant(R, K, row_left, row_sizes, column_sizes)
         if place < 0:
             break
         found[0] = found[1] = place // n
         found[2] = found[3] = place % n
-        _eliminate(R, K, row_left, column_left, found[0], found[1], found[2], found[3])
+        _eliminate(R, K, row_left, column_left, row_sizes, column_sizes, found[0], found[1], found[2], found[3])
         n_left, n_blocks = n_left - 1, n_blocks + 1
     while n_left > 0:
         found = out[4 * n_blocks : 4 * n_blocks + 4]
         if not _varying(R, K, row_left, column_left, squares, both, column_sizes, found):
             return 0
-        _eliminate(R, K, row_left, column_left, found[0], found[1], found[2], found[3])
+        _eliminate(R, K, row_left, column_left, row_sizes, column_sizes, found[0], found[1], found[2], found[3])
         n_left, n_blocks = n_left - (1 if found[0] == found[1] else 2), n_blocks + 1
     return n_blocks

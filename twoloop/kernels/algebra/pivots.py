@@ -9,6 +9,9 @@ from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, f8, 
 ROUNDING = 1e-12  # relative: what a bound may be missed by
 NOT_DEFINITE, STAYS_SINGULAR = -1, -2
 TINY = 1e-300
+# smallest over largest eigenvalue of M, from which on pivots that keep one of the bounds, 1e-5 at least, say that all
+# rows count and none has to help M: what is left of a row is 1e-6 of it then, where 1e-9 would do
+LIKE = 1e-7
 
 
 def room_size(n_rows: int, n: int) -> int:
@@ -48,6 +51,18 @@ def _count_weak(mass, weak, A):
     for i in range(len(mass)):
         A[i, i] -= weak * largest
     return _n_weak(A)
+
+
+@compiled
+def _dominates(mass):
+    """Whether the diagonal of M shows that its eigenvalues are of like size, by Gershgorin's circles."""
+    least, largest = math.inf, 0.0
+    for i in range(len(mass)):
+        beside = 0.0
+        for j in range(len(mass)):
+            beside += abs(mass[i, j])
+        least, largest = min(least, 2.0 * mass[i, i] - beside), max(largest, beside)
+    return least > LIKE * largest
 
 
 @merged
@@ -111,7 +126,7 @@ def _add_rows(mass, G, weak, scale, A, x, order, added):
 
 
 @merged
-def _first_bound_kept(mass, G, kept, n_rows, bounds, factors, solved, S, sizes):
+def _first_bound_kept(mass, G, kept, n_rows, bounds, factors, solved_room, S_room, sizes):
     """Place of the first bound that no pivot is below, each over what it is without the other rows; how many, if none.
 
     No pivot is below the least eigenvalue of S = G M^-1 G^T with a diagonal of 1, and that is above a bound where S
@@ -120,6 +135,8 @@ def _first_bound_kept(mass, G, kept, n_rows, bounds, factors, solved, S, sizes):
     copy_matrix(mass, factors)
     if not ldl_factor(factors):
         return NOT_DEFINITE
+    solved = solved_room[: len(mass) * n_rows].reshape((len(mass), n_rows))
+    S = S_room[: 2 * n_rows * n_rows].reshape((2 * n_rows, n_rows))
     for k in range(n_rows):
         for i in range(len(mass)):
             solved[i, k] = G[kept[k], i]
@@ -158,12 +175,20 @@ def choose(given, G, least, weak, bounds, room, chosen):
     most = min(n_rows, n) + 1
     kept, added, order = chosen[2 : 2 + n_rows], chosen[2 + n_rows : 2 + 2 * n_rows], chosen[2 + 2 * n_rows :]
     end = most * n
-    basis = room[:end].reshape((most, n))
-    n_kept = first_rows(G, least, basis, room[end : end + most * most].reshape((most, most)), kept)
+    basis, factors = room[:end].reshape((most, n)), room[end : end + most * most].reshape((most, most))
     mass, end = room[end : end + n * n].reshape((n, n)), end + n * n
     A, end = room[end : end + n * n].reshape((n, n)), end + n * n
     x, end = room[end : end + n], end + n
     sizes, end = room[end : end + n_rows], end + n_rows
+    solved, S = room[end : end + n * n_rows], room[end + n * n_rows :]
+    if n_rows <= n and _dominates(given):
+        for k in range(n_rows):
+            kept[k] = k
+        place = _first_bound_kept(given, G, kept, n_rows, bounds, A, solved, S, sizes)
+        if 0 <= place < bounds.size:  # no row is nearly a sum of others, and M has an inverse
+            chosen[0], chosen[1], room[0] = n_rows, 0, 1.0
+            return place
+    n_kept = first_rows(G, least, basis, factors, kept)
     copy_matrix(given, mass)
     n_added, scale = 0, 1.0
     if n_kept > 0 and weak > 0.0 and _count_weak(mass, weak, A) > 0:
@@ -172,8 +197,6 @@ def choose(given, G, least, weak, bounds, room, chosen):
         n_added = _add_rows(mass, G, weak, scale, A, x, order, added)
     chosen[0], chosen[1], place = n_kept, max(n_added, 0), n_added
     if n_added >= 0:
-        solved, end = room[end : end + n * n_kept].reshape((n, n_kept)), end + n * n_kept
-        S = room[end : end + 2 * n_kept * n_kept].reshape((2 * n_kept, n_kept))
         place = _first_bound_kept(mass, G, kept, n_kept, bounds, A, solved, S, sizes)
     room[0] = scale
     return place

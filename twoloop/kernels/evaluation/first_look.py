@@ -51,7 +51,12 @@ def _empty(rows):
 @exact
 def _symmetric(mass, allowed):
     """Whether no entry differs from its counterpart by more than this share of the largest."""
-    largest, off = 0.0, 0.0
+    largest, off, same = 0.0, 0.0, True
+    for i in range(len(mass)):
+        for j in range(i):
+            same = same and mass[i, j] == mass[j, i]
+    if same:
+        return True
     for i in range(len(mass)):
         for j in range(len(mass)):
             largest, off = max(largest, abs(mass[i, j])), max(off, abs(mass[i, j] - mass[j, i]))
@@ -218,6 +223,7 @@ def look(f, t, q, v, sizes, lam, room, mass, rows, ways, pattern, least):
             found |= DEFINITE
         elif not _definite(mass, least[2] / SURELY, scratch):
             found |= INDEFINITE
+    _note_entries(rows, pattern)
     near = room[end : end + n_rows * n].reshape((n_rows, n))
     _note_entries_near(f, t, q, ways, room[end + n_rows * n : end + n_rows * n + n], near, n_c, pattern)
     return found
