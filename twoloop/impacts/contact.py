@@ -167,8 +167,8 @@ class ContactSystem:
 
     def gamma(self, t: float, q: Array, v: Array) -> Array:
         """Evaluate the right-hand side of C_q a = gamma, followed by that of the gaps."""
-        own = self._call("gamma", t, q, v) if self._system.n_c else np.zeros(0)
-        return np.append(own, -self._rows("bias", t, q, v))
+        right_sides = self._call("gamma", t, q, v) if self._system.n_c else np.zeros(0)
+        return np.append(right_sides, -self._rows("bias", t, q, v))
 
     def force(self, t: float, q: Array, v: Array) -> Array:
         """Evaluate Q, and the friction of the stops that slide, which follows from their forces."""

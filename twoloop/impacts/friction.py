@@ -18,6 +18,11 @@ from twoloop.run.impulse import NEGLIGIBLE, scaled_equations
 if TYPE_CHECKING:
     from twoloop.bodies.model_problem import ModelProblem
 
+Signs = list[int | None]  # for each joint the sliding direction, or one of the following
+STICKS, IDLE = 0, None  # held by friction; already held by stops and other joints
+INDEPENDENT = 1e-9  # relative: smallest compliance of a joint with the others held, compared with a free joint
+AT_REST = 1e-10  # relative to the largest velocities of the last arc: smaller rates count as zero
+COUPLING_TOLERANCE = 1e-6  # tolerance of the coefficients by which one displacement follows from another
 EVEN_WEIGHT = 1e-6  # relative weight of the regularisation that distributes a shared load evenly
 SOLVER_SCALE = 1e3  # scales the problem so that its gradients exceed the tolerance of the solver
 MAX_SOLVER_ITERATIONS = 1000
@@ -101,14 +106,14 @@ def coulomb_forces(D: Array, c: Array, limit: Array, tangents: Tangents) -> tupl
     n = len(c) - len(limit) - n_tangents
     tangent_rows = np.arange(len(c) - n_tangents, len(c))
     moving = tangents.sign != 0
-    kept = np.setdiff1d(np.arange(len(c)), tangent_rows[moving])
+    unknown = np.setdiff1d(np.arange(len(c)), tangent_rows[moving])
     x, tolerance = np.zeros(len(c)), NEGLIGIBLE * np.abs(c).max(initial=0.0) / D.diagonal().max(initial=1e-300)
     for _ in range(MAX_LOAD_ITERATIONS):
         new, load = np.zeros(len(c)), tangents.coefficient * x[tangents.normal]
         new[tangent_rows] = -tangents.sign * load
-        right, bounds = (c + D @ new)[kept], np.append(limit, load[~moving])
-        D_kept = D[np.ix_(kept, kept)]
-        new[kept] = holding_forces(D_kept, right, n, bounds)
+        right, bounds = (c + D @ new)[unknown], np.append(limit, load[~moving])
+        D_kept = D[np.ix_(unknown, unknown)]
+        new[unknown] = holding_forces(D_kept, right, n, bounds)
         change, x = np.abs(new - x).max(), new
         if change <= LOAD_TOLERANCE * np.abs(x).max() + tolerance:
             break
@@ -117,15 +122,11 @@ def coulomb_forces(D: Array, c: Array, limit: Array, tangents: Tangents) -> tupl
     acceleration, terms = D @ x + c, np.abs(D) @ np.abs(x) + np.abs(c)
     if acceleration[:n].min(initial=0.0) < -CLOSING_TOLERANCE * np.abs(c).max(initial=0.0):
         raise Undetermined("stops push against each other: no motion opens all of them or keeps them closed")
-    slides = np.where(
-        moving,
-        tangents.sign,
-        np.sign(acceleration[tangent_rows])
-        * (np.abs(acceleration[tangent_rows]) > SLIDING_TOLERANCE * terms[tangent_rows]),
-    ).astype(int)
-    return (
-        _solve_contacts(D, c, x, n, Tangents(tangents.normal, tangents.coefficient, slides)) if n_tangents else x
-    ), slides
+    if not n_tangents:
+        return x, np.zeros(0, dtype=int)
+    starts = np.sign(acceleration) * (np.abs(acceleration) > SLIDING_TOLERANCE * terms)
+    slides = np.where(moving, tangents.sign, starts[tangent_rows]).astype(int)
+    return _solve_contacts(D, c, x, n, tangents._replace(sign=slides)), slides
 
 
 def _solve_contacts(D: Array, c: Array, x: Array, n: int, tangents: Tangents) -> Array:
@@ -156,9 +157,9 @@ def _squares(D: Array, b: Array) -> tuple[Array, Array]:
     """
     values, vectors = np.linalg.eigh(0.5 * (D + D.T))
     components, threshold = vectors.T @ b, NEGLIGIBLE * values.max(initial=0.0)
-    kept = (values > threshold) | (np.abs(components) > OUTSIDE * np.abs(b).max(initial=0.0))
-    roots = np.sqrt(np.maximum(values[kept], threshold))
-    return roots[:, None] * vectors[:, kept].T, -components[kept] / roots
+    significant = (values > threshold) | (np.abs(components) > OUTSIDE * np.abs(b).max(initial=0.0))
+    roots = np.sqrt(np.maximum(values[significant], threshold))
+    return roots[:, None] * vectors[:, significant].T, -components[significant] / roots
 
 
 def impulses(D: Array, u: Array, restitution: Array, tangents: Tangents) -> Array:
@@ -176,11 +177,6 @@ def impulses(D: Array, u: Array, restitution: Array, tangents: Tangents) -> Arra
     return P
 
 
-Signs = list[int | None]  # for each joint the sliding direction, or one of the following
-STICKS, IDLE = 0, None  # held by friction; already held by stops and other joints
-INDEPENDENT = 1e-9  # relative: smallest compliance of a joint with the others held, compared with a free joint
-
-
 class Modes:
     """Provide the system of each mode; in this base class a system without friction, which has a single mode."""
 
@@ -189,25 +185,25 @@ class Modes:
         self.static = self.kinetic = np.zeros(0)
         self.idle_friction: dict[int, float] = {}  # constant friction of IDLE joints
 
-    def along(self, q: Array, k: int | None = None) -> Array:
+    def gradients(self, q: Array, k: int | None = None) -> Array:
         """Return the gradients of the joint displacements: none."""
         return np.zeros((0, len(q)))
 
-    def free(self, signs: Signs, t: float, q: Array) -> ConstrainedSystem:
+    def sliding_system(self, signs: Signs, t: float, q: Array) -> ConstrainedSystem:
         """Return the system."""
         return self.system
 
-    def accelerations(self, signs: Signs, resting: list[int], t: float, q: Array, v: Array, a: Array) -> Array:
+    def joint_accelerations(self, signs: Signs, resting: list[int], t: float, q: Array, v: Array, a: Array) -> Array:
         """Return the accelerations of joints at rest: none."""
         return np.zeros(0)
 
-    def mode(self, signs: Signs, t: float, q: Array) -> tuple[ConstrainedSystem, dict[int, int]]:
+    def system_of(self, signs: Signs, t: float, q: Array) -> tuple[ConstrainedSystem, dict[int, int]]:
         """Return the system; there are no rows of sticking joints."""
         return self.system, {}
 
     def row_sign(self, k: int, system: ConstrainedSystem, row: int, t: float, q: Array) -> float:
         """Return the sign of the row of a sticking joint relative to its sliding direction."""
-        return float(np.sign(system.jacobian(t, q)[row] @ self.along(q, k)))
+        return float(np.sign(system.jacobian(t, q)[row] @ self.gradients(q, k)))
 
 
 class FrictionModes(Modes):
@@ -224,82 +220,74 @@ class FrictionModes(Modes):
         assert problem.model is not None
         super().__init__(problem.system)
         self._problem, self._model, self._frictions = problem, problem.model, problem.model.dry
+        self._names = [friction.name for friction in self._frictions]
         self.n, self.static = len(self._frictions), np.array([friction.static for friction in self._frictions])
         self.kinetic = np.array([friction.kinetic for friction in self._frictions])
         self._forces = [self._model.pull(friction, problem.parameters) for friction in self._frictions]
         self._sliding_systems: dict[tuple[int | None, ...], ConstrainedSystem] = {}
         self._check_independent(problem.t_span[0], problem.q0)
 
-    def along(self, q: Array, k: int | None = None) -> Array:
+    def gradients(self, q: Array, k: int | None = None) -> Array:
         """Return the gradients of the joint displacements, (n, n_q); or of one joint, (n_q,)."""
         if k is None:
-            return np.array([self.along(q, joint) for joint in range(self.n)])
+            return np.array([self.gradients(q, joint) for joint in range(self.n)])
         return self._forces[k].force(0.0, q, np.zeros_like(q))
 
     def _check_independent(self, t: float, q: Array) -> None:
         """Raise unless each joint can slide while the others stick; otherwise the frictions are not determined."""
-        W = self.along(q)
+        W = self.gradients(q)
         D = W @ responses(self.system, t, q, W)
         scale = (W**2).sum(axis=1) / float(np.abs(self.system.mass(t, q)).max())
         for k, friction in enumerate(self._frictions):
             D_before = D[:k, :k]
             compliance = D[k, k] - D[k, :k] @ np.linalg.lstsq(D_before, D[:k, k], rcond=NEGLIGIBLE)[0]
             if not compliance > INDEPENDENT * scale[k]:
-                others = ", ".join(repr(friction.name) for friction in self._frictions[:k])
+                others = ", ".join(map(repr, self._names[:k]))
                 raise ValueError(
                     f"the joint of {friction.name!r} cannot slide by itself: drives or other joints hold it"
                     f"{f', or its motion depends on {others}' if k else ''}, so that its friction is not determined "
                     "while it sticks; remove it and assign all of the friction to another joint"
                 )
 
-    def free(self, signs: Signs, t: float, q: Array) -> ConstrainedSystem:
+    def sliding_system(self, signs: Signs, t: float, q: Array) -> ConstrainedSystem:
         """Return the system with some joints sliding and the others without friction."""
         key = tuple(signs)
         if key not in self._sliding_systems:
             self._sliding_systems[key] = self._build(self._problem.name, signs, {}, t, q)[0]
         return self._sliding_systems[key]
 
-    def accelerations(self, signs: Signs, resting: list[int], t: float, q: Array, v: Array, a: Array) -> Array:
+    def joint_accelerations(self, signs: Signs, resting: list[int], t: float, q: Array, v: Array, a: Array) -> Array:
         """Return the accelerations of joints at rest for given accelerations a of the coordinates."""
         if not resting:
             return np.zeros(0)
-        holding_forces, rows = self.mode(signs, t, q)
-        R, gamma = holding_forces.jacobian(t, q), holding_forces.gamma(t, q, v)
-        return np.array(
-            [self.row_sign(k, holding_forces, rows[k], t, q) * (R[rows[k]] @ a - gamma[rows[k]]) for k in resting]
-        )
+        system, rows = self.system_of(signs, t, q)
+        R, gamma = system.jacobian(t, q), system.gamma(t, q, v)
+        return np.array([self.row_sign(k, system, rows[k], t, q) * (R[rows[k]] @ a - gamma[rows[k]]) for k in resting])
 
-    def mode(self, signs: Signs, t: float, q: Array) -> tuple[ConstrainedSystem, dict[int, int]]:
+    def system_of(self, signs: Signs, t: float, q: Array) -> tuple[ConstrainedSystem, dict[int, int]]:
         """Return the system with some joints sliding and the others held in place, and the rows of the latter."""
         if not {STICKS, IDLE} & set(signs):
-            return self.free(signs, t, q), {}
-        names = [friction.name for friction, sign in zip(self._frictions, signs, strict=True) if sign == STICKS]
+            return self.sliding_system(signs, t, q), {}
+        names = [name for name, sign in zip(self._names, signs, strict=True) if sign == STICKS]
         gauge, rows = self._build("gauge", signs, dict.fromkeys(names, np.nan), t, q)
         values, quarter = (gauge.constraint(t, q) for t in (0.0, 0.5 * np.pi)) if names else ((), ())
-        holding_forces = {}
-        for friction in (friction for friction in self._frictions if friction.name in names):
+        positions = {}
+        for friction in self._frictions:
+            if friction.name not in names:
+                continue
             (row,) = rows[friction.name]
             turns = self._model.dimension == 3 and friction.joint.kind == "revolute"  # its row is A cos t + B sin t
-            holding_forces[friction.name] = float(np.arctan2(-values[row], quarter[row]) if turns else values[row])
+            positions[friction.name] = float(np.arctan2(-values[row], quarter[row]) if turns else values[row])
         suffix = f", {', '.join(names)} sticks" if names else ""
-        system, rows = self._build(self._problem.name + suffix, signs, holding_forces, t, q)
-        return system, {
-            k: rows[friction.name][0] for k, friction in enumerate(self._frictions) if friction.name in names
-        }
+        system, rows = self._build(self._problem.name + suffix, signs, positions, t, q)
+        return system, {k: rows[name][0] for k, name in enumerate(self._names) if name in names}
 
     def _build(
-        self, name: str, signs: Signs, holding_forces: dict[str, float], t: float, q: Array
+        self, name: str, signs: Signs, positions: dict[str, float], t: float, q: Array
     ) -> tuple[ConstrainedSystem, dict[str, tuple[int, ...]]]:
-        forces = {
-            friction.name: -(sign or 0) * friction.kinetic
-            for friction, sign in zip(self._frictions, signs, strict=True)
-        }
-        forces |= {self._frictions[k].name: self.idle_friction[k] for k, sign in enumerate(signs) if sign is IDLE}
-        return self._model.mode(name, self._problem.parameters, forces, holding_forces, t, q)
-
-
-AT_REST = 1e-10  # relative to the largest velocities of the last arc: smaller rates count as zero
-COUPLING_TOLERANCE = 1e-6  # tolerance of the coefficients by which one displacement follows from another
+        forces = {name: -(signs[k] or 0) * self.kinetic[k] for k, name in enumerate(self._names)}
+        forces |= {self._names[k]: self.idle_friction[k] for k, sign in enumerate(signs) if sign is IDLE}
+        return self._model.mode(name, self._problem.parameters, forces, positions, t, q)
 
 
 class Mode(NamedTuple):
@@ -342,14 +330,13 @@ class StopFriction:
         self, closed: Sequence[int], t: float, q: Array, v: Array, speeds: Array
     ) -> tuple[list[int], Gap, Tangents]:
         """Return which of the closed stops have friction, their displacements, and how they slide."""
-        of = [k for k in closed if k in self.place]
-        every = self.slides.at(t, q, v)
-        made = Gap(*(each[[self.place[k] for k in of]] for each in every))
-        holding_forces = np.array([k in self.still or k in self.released for k in of], dtype=bool)
-        moves = ~holding_forces & (np.abs(made.u) > AT_REST * (np.abs(made.W) @ speeds))
-        signs = (np.sign(made.u) * moves).astype(int)
-        places = np.array([list(closed).index(k) for k in of], dtype=int)
-        return of, made, Tangents(places, np.array([self._stops[k].friction for k in of]), signs)
+        stops = [k for k in closed if k in self.place]
+        slides = Gap(*(part[[self.place[k] for k in stops]] for part in self.slides.at(t, q, v)))
+        at_rest = np.array([k in self.still or k in self.released for k in stops], dtype=bool)
+        moves = ~at_rest & (np.abs(slides.u) > AT_REST * (np.abs(slides.W) @ speeds))
+        signs = (np.sign(slides.u) * moves).astype(int)
+        normals = np.array([list(closed).index(k) for k in stops], dtype=int)
+        return stops, slides, Tangents(normals, np.array([self.coefficient(k) for k in stops]), signs)
 
     def coefficient(self, k: int) -> float:
         """Return the coefficient of friction of a stop."""
@@ -366,11 +353,8 @@ class StopFriction:
                 groups[k], first[row] = [k], k
                 continue
             others = [i for i, weight in zip(base, weights, strict=True) if abs(weight) > COUPLING_TOLERANCE]
-            if (
-                len(others) != 1
-                or others[0] not in first
-                or abs(abs(weights[base.index(others[0])]) - 1.0) > COUPLING_TOLERANCE
-            ):
+            equal = [i for i in others if abs(abs(weights[base.index(i)]) - 1.0) <= COUPLING_TOLERANCE]
+            if len(others) != 1 or others != equal or others[0] not in first:
                 raise Undetermined(
                     f"the friction of {self._stops[k].name!r} is not determined: other stops and joints hold it already"
                 )

@@ -153,7 +153,7 @@ class Motion:
         gap = self.gaps.at(self.t, self.q, self.v)
         touching, slide, tangents = self.friction.rows(closing.tolist(), self.t, self.q, self.v, self.speeds)
         c = np.concatenate([gap.W[closing] @ a + gap.bias[closing], c_rubs, slide.W @ a + slide.bias])
-        W = np.vstack([gap.W[closing], self.modes.along(self.q)[resting_joints], slide.W])
+        W = np.vstack([gap.W[closing], self.modes.gradients(self.q)[resting_joints], slide.W])
         D = W @ responses(self.system, self.t, self.q, W)
         n, end = len(closing), len(closing) + len(resting_joints)
         reduction = np.array([(1.0 - RELEASED) if k in self.friction.released else 1.0 for k in touching])
@@ -223,7 +223,7 @@ class Motion:
         u, c = gap.u[near], gap.W[near] @ a + gap.bias[near]
         rounding = ROUNDING * np.abs(v).max() ** 2
         touching = u * np.abs(u) <= CLOSED * self.low * np.abs(c).max() + rounding
-        W = np.vstack([gap.W[near[touching]], self.modes.along(self.q)[resting_joints]])
+        W = np.vstack([gap.W[near[touching]], self.modes.gradients(self.q)[resting_joints]])
         D, n = W @ responses(self.system, self.t, self.q, W), int(touching.sum())
         force = holding_forces(D, np.append(c[touching], c_rubs), n, self._available_friction(resting_joints))
         pressure = np.zeros(len(near))
@@ -232,7 +232,7 @@ class Motion:
 
     def _sliding(self, v: Array) -> tuple[Signs, list[int]]:
         """Return the sliding direction of each joint, and the joints at rest."""
-        W = self.modes.along(self.q)
+        W = self.modes.gradients(self.q)
         u = W @ v
         moves = np.abs(u) > AT_REST * (np.abs(W) @ self.speeds)
         slow = [k for k in range(len(u)) if k in self.still or k in self.released or not moves[k]]
@@ -240,8 +240,8 @@ class Motion:
 
     def _free(self, signs: Signs, resting_joints: list[int], v: Array) -> tuple[Array, Array]:
         """Return accelerations of coordinates and of joints at rest, without contact forces and friction at rest."""
-        a = self._accelerations(self.modes.free(signs, self.t, self.q)).at(self.t, self.q, v)[0]
-        return a, self.modes.accelerations(signs, resting_joints, self.t, self.q, v, a)
+        a = self._accelerations(self.modes.sliding_system(signs, self.t, self.q)).at(self.t, self.q, v)[0]
+        return a, self.modes.joint_accelerations(signs, resting_joints, self.t, self.q, v, a)
 
     def _accelerations(self, system: ConstrainedSystem, cached: bool = True) -> Accelerations:
         if id(system) in self._acceleration_cache:
@@ -274,7 +274,7 @@ class Motion:
     def _run_arc(self, mode: Mode, t1: float) -> None:
         """Integrate until a gap closes or opens, or a joint or a stop that rubs comes to rest or is released."""
         signs, resting = mode.signs, mode.resting
-        free, rows = self.modes.mode(signs, self.t, self.q)
+        free, rows = self.modes.system_of(signs, self.t, self.q)
         # the rows of what sticks depend on where it sticks
         cacheable = not {STICKS, IDLE} & set(signs) and not mode.sticks
         system = self._with_contacts(free, mode, cacheable)
@@ -308,8 +308,8 @@ class Motion:
             event.every = self.sample_interval
         options = {**self.options, "check_derivatives": self.options.get("check_derivatives", True) and not self.arcs}
         if self.arcs and self.options.get("first_step") is None and self.arcs[-1].h.size:
-            least = LEAST_STEP * max(1.0, abs(self.t))  # coordinates near zero have no scale for an initial step
-            options["first_step"] = min(max(0.1 * float(self.arcs[-1].h.max()), least), t1 - self.t)
+            least_step = LEAST_STEP * max(1.0, abs(self.t))  # coordinates near zero have no scale for an initial step
+            options["first_step"] = min(max(0.1 * float(self.arcs[-1].h.max()), least_step), t1 - self.t)
         if resting:
             options |= untraced(options)
         arc = solve_dae(system, (self.t, t1), self.q, self.v, events=events, dense_output=True, **options)
@@ -393,9 +393,9 @@ class Motion:
 
     def _stops(self, k: int, sign: int) -> Any:
         """Return the event of a joint that comes to rest; a joint that begins to slide is at rest initially."""
-        u0 = sign * float(self.modes.along(self.q, k) @ self.v)
+        u0 = sign * float(self.modes.gradients(self.q, k) @ self.v)
         offset = u0 - self.low if k in self.still or k in self.released else 0.0
-        return lambda t, q, v: sign * float(self.modes.along(q, k) @ v) - offset
+        return lambda t, q, v: sign * float(self.modes.gradients(q, k) @ v) - offset
 
     def _slips(self, balance: Any) -> Any:
         """Return the event of friction that is exceeded, from what is needed and there; all of it may slip at once."""

@@ -39,10 +39,10 @@ def mass(t, q, p, M):
 def force(t, q, v, p, Q):
     s, c = math.sin(q[4]), math.cos(q[4])
     yaw, lean, spin = v[3], v[4], v[5]
-    more = 2.0 * s * c * (AXIAL - ACROSS)
+    coupling = 2.0 * s * c * (AXIAL - ACROSS)
     Q[2] = -MASS * GRAVITY
-    Q[3] = -more * lean * yaw + AXIAL * c * lean * spin
-    Q[4] = 0.5 * more * yaw * yaw - AXIAL * c * yaw * spin
+    Q[3] = -coupling * lean * yaw + AXIAL * c * lean * spin
+    Q[4] = 0.5 * coupling * yaw * yaw - AXIAL * c * yaw * spin
     Q[5] = AXIAL * c * lean * yaw
 
 
@@ -73,9 +73,9 @@ def nonholonomic(t, q, p, A):
 def nonholonomic_gamma(t, q, v, p, Qa):
     sy, cy, s, c = math.sin(q[3]), math.cos(q[3]), math.sin(q[4]), math.cos(q[4])
     yaw, lean, spin = v[3], v[4], v[5]
-    both = yaw * yaw + lean * lean
-    Qa[0] = RADIUS * (2.0 * cy * c * lean * yaw - sy * s * both + spin * sy * yaw)
-    Qa[1] = RADIUS * (2.0 * sy * c * lean * yaw + cy * s * both - spin * cy * yaw)
+    squares = yaw * yaw + lean * lean
+    Qa[0] = RADIUS * (2.0 * cy * c * lean * yaw - sy * s * squares + spin * sy * yaw)
+    Qa[1] = RADIUS * (2.0 * sy * c * lean * yaw + cy * s * squares - spin * cy * yaw)
 
 
 def energy(t: Any, q: Array, v: Array) -> Any:

@@ -166,8 +166,8 @@ def _method(kind: str) -> Callable[..., Any]:
                 raise TypeError(f"{kind}{signature}: {error}") from None
         return self.evaluate(kind, *arguments)
 
-    own = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
-    method.__signature__ = signature.replace(parameters=[own, *parameters])  # type: ignore[attr-defined]
+    self_parameter = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
+    method.__signature__ = signature.replace(parameters=[self_parameter, *parameters])  # type: ignore[attr-defined]
     method.__name__, method.__qualname__ = kind, f"ConstrainedSystem.{kind}"
     method.__doc__ = f"{entry.meaning[0].upper()}{entry.meaning[1:]}, {entry.size}.\n\nSee `evaluate`."
     return method
@@ -393,14 +393,14 @@ class ConstrainedSystem(EvaluatedEquations):
             )
         if p.size != size:
             raise ValueError(f"parameters of {self.name!r} must be {size} numbers, as they are; given {shaped(p)}")
-        other = copy.copy(self)
+        system = copy.copy(self)
         if self.called_in_python:
             p = np.append(self.functions.p[:1], p)  # the handle of Python functions
-        other.functions = self.functions._replace(p=p, flags=self.functions.flags.copy())
-        other.within_bounds, other.checked, other.made = set(), False, {}
-        other.description = self.description.with_parameters(p)
-        other.joints = tuple(joint for joint in self.joints if joint.point is None and joint.equations is None)
-        return other
+        system.functions = self.functions._replace(p=p, flags=self.functions.flags.copy())
+        system.within_bounds, system.checked, system.made = set(), False, {}
+        system.description = self.description.with_parameters(p)
+        system.joints = tuple(joint for joint in self.joints if joint.point is None and joint.equations is None)
+        return system
 
     @classmethod
     def from_python(
@@ -512,18 +512,18 @@ class ConstrainedSystem(EvaluatedEquations):
         return self.remembered(("kit", id(self.functions)), lambda: Kit(self.functions))
 
     def __copy__(self) -> ConstrainedSystem:
-        other = object.__new__(type(self))
-        vars(other).update(vars(self), within_bounds=set(self.within_bounds))
-        return other
+        system = object.__new__(type(self))
+        vars(system).update(vars(self), within_bounds=set(self.within_bounds))
+        return system
 
     def __deepcopy__(self, memo: dict[int, Any]) -> ConstrainedSystem:
-        other = memo[id(self)] = copy.copy(self)
+        system = memo[id(self)] = copy.copy(self)
         p = self.functions.p.copy()
         if self._python is not None:  # numbers of its own for functions of its own
-            other._python = PythonFunctions(self.name, copy.deepcopy(self._python.functions, memo), self._taking)
-            p[0] = other._python.handle
-        other.functions = self.functions._replace(p=p, flags=self.functions.flags.copy())
-        return other
+            system._python = PythonFunctions(self.name, copy.deepcopy(self._python.functions, memo), self._taking)
+            p[0] = system._python.handle
+        system.functions = self.functions._replace(p=p, flags=self.functions.flags.copy())
+        return system
 
     def __reduce__(self) -> tuple[Any, ...]:
         return unpickled, (type(self), *pickled(self))

@@ -210,17 +210,17 @@ class _Checker:
         defects = [(np.inf, "")]
         for method in order:
             defects.append((self._defect_by(method, 1.0, i, j), method))
-            least, best = min(defects)
-            if least <= LIMIT or (least < np.inf and j > i + 1):
-                return least
-        if least < np.inf:  # is the step wrong, or do errors grow this fast?
+            smallest, best = min(defects)
+            if smallest <= LIMIT or (smallest < np.inf and j > i + 1):
+                return smallest
+        if smallest < np.inf:  # is the step wrong, or do errors grow this fast?
             growth = self._growth(best, i, j)
-            return least / (growth if growth > USUAL_GROWTH else 1.0) if growth <= LIMIT else np.inf
+            return smallest / (growth if growth > USUAL_GROWTH else 1.0) if growth <= LIMIT else np.inf
         for looser in LOOSER:  # near a singular position rounding may prevent the full accuracy
             for method in order:
-                least = self._defect_by(method, looser, i, j)
-                if least < np.inf:
-                    return least
+                smallest = self._defect_by(method, looser, i, j)
+                if smallest < np.inf:
+                    return smallest
         return np.inf
 
     def _defect_by(self, method: str, looser: float, i: int, j: int) -> float:
@@ -264,10 +264,10 @@ class _Checker:
     def _allowed(self, state: Array) -> Array:
         return np.tile(self.atol, 2) + self.rtol * np.abs(state) + self.rounding
 
-    def _distance(self, state: Array, other: Array, i: int, j: int) -> float:
+    def _distance(self, state: Array, reference: Array, i: int, j: int) -> float:
         """Return the largest difference of two states over the tolerance, in the components that the steps tested."""
         with np.errstate(invalid="ignore"):  # states that are not finite give NaN
-            error = np.abs(state - other) / self._allowed(other)
+            error = np.abs(state - reference) / self._allowed(reference)
         return float((error[: len(self.atol)] if self.untested[i:j].any() else error).max())
 
     def _remake(self, method: str, looser: float, start: Array, i: int, j: int) -> Remade | None:

@@ -217,7 +217,7 @@ class SavedFields:
     def _check_solution(self) -> None:
         """Check the table of the dense solution and its lookup data."""
         n_q, n_rows = self.sizes
-        t = self._times("sol_t", least=1)
+        t = self._times("sol_t", minimum=1)
         self._check("sol_t", bool((np.diff(t) > 0.0).all()), "increasing times")
         self._finite("sol_states", (len(t), 3 * n_q))
         kinds = self._array("sol_kinds", (len(t) - 1,), np.int64)
@@ -288,9 +288,11 @@ class SavedFields:
         self._check(name, all(np.isfinite(block).all() for block in blocks), "finite")
         return array
 
-    def _times(self, name: str, least: int = 0) -> Array:
+    def _times(self, name: str, minimum: int = 0) -> Array:
         t = self._finite(name, (None,))
-        self._check(name, len(t) >= least and bool((np.diff(t) >= 0.0).all()), f"at least {least} times in their order")
+        self._check(
+            name, len(t) >= minimum and bool((np.diff(t) >= 0.0).all()), f"at least {minimum} times in their order"
+        )
         return t
 
     def _check(self, name: str, valid: bool, expected: str) -> None:
@@ -313,11 +315,11 @@ class SavedFields:
             raise self._wrong(name, "a finite number", shown(value))
         return float(value)
 
-    def _whole(self, name: str, least: int, most: int, or_none: bool) -> int | None:
+    def _whole(self, name: str, minimum: int, maximum: int, or_none: bool) -> int | None:
         value = self.metadata.get(name)
-        if (value is None and or_none) or (type(value) is int and least <= value <= most):
+        if (value is None and or_none) or (type(value) is int and minimum <= value <= maximum):
             return value
-        raise self._wrong(name, f"a whole number from {least} to {most}", shown(value))
+        raise self._wrong(name, f"a whole number from {minimum} to {maximum}", shown(value))
 
     def _choice(self, name: str, choices: list[int]) -> int:
         value = self._value(name, int)

@@ -60,10 +60,10 @@ def reaction(result: Record, name: str) -> Reaction:
             "twoloop.load(path, system)"
         )
     system = result.system
-    known = {joint.name: joint for joint in system.joints}
-    if name not in known:
-        raise ValueError(f"name must be a joint of {system.name!r}: {', '.join(map(repr, known))}; given {name!r}")
-    joint = known[name]
+    joints = {joint.name: joint for joint in system.joints}
+    if name not in joints:
+        raise ValueError(f"name must be a joint of {system.name!r}: {', '.join(map(repr, joints))}; given {name!r}")
+    joint = joints[name]
     multipliers = result.lam if joint.equations is None else np.linalg.solve(joint.equations.T, result.lam)
     generalized = np.empty((len(joint.translation + joint.rotation), result.t.size))
     for k, t in enumerate(result.t):
