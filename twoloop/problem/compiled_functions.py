@@ -213,7 +213,7 @@ def _code_of(helper: Any) -> str:
     return digest.hash.hexdigest()
 
 
-class Reference:
+class PickledCall:
     """Pickle as a call, `find(*arguments)`, that the other process makes."""
 
     def __init__(self, find: Callable[..., Any], *arguments: Any):
@@ -238,10 +238,10 @@ def portable(system_name: str, kind: str, function: Any) -> Any:
     """
     if isinstance(function, Dispatcher):
         if (code := code_of(function)) is not None:
-            return Reference(GeneratedCode.callback, code, kind)
+            return PickledCall(GeneratedCode.callback, code, kind)
         path = function.py_func.__module__, function.py_func.__qualname__
         try:
-            return Reference(by_name, *path) if by_name(*path) is function else function
+            return PickledCall(by_name, *path) if by_name(*path) is function else function
         except (AttributeError, ImportError):  # made within a function: numba sends its source along
             return function
     try:
