@@ -54,6 +54,20 @@ def write_own_accelerations(
     llvm_code.write(module, name, kind, emit_all)
 
 
+def write_mass_first(
+    emit: Emitter, equations: StraightLine, inputs: Sequence[Value], numbers: Coefficients
+) -> tuple[list[Value], Value]:
+    """The same by the elimination of M alone, where there is another way, too."""
+    n = equations.system.n_q
+    place, filled = _room(emit, 2 * n), _room(emit, n)
+    for i, value in enumerate(inputs[1:]):
+        emit.store(value, place, i)
+    name = _function(emit, equations, equations.accelerations[1], numbers)
+    given = [inputs[0], place, emit.pointer(place, n), *_numbers(emit), filled]
+    holds = emit.builder.call(name, emit.bit, given)
+    return [emit.load(filled, i) for i in range(n)], holds
+
+
 def _accelerations(
     emit: Emitter, equations: StraightLine, written: Written, state: Callable[[], list[Value]]
 ) -> tuple[list[Value], Value]:

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.generate import lane_emitter, llvm_code, lobatto_tables
-from twoloop.generate.accelerations import write_accelerations
+from twoloop.generate.accelerations import write_accelerations, write_mass_first
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.llvm_code import Emitter
-from twoloop.generate.llvm_text import BIT, DOUBLE, INTEGER, Module, Value, constant, constants, integer
+from twoloop.generate.llvm_text import BIT, DOUBLE, INTEGER, NOTHING, Module, Value, constant, constants, integer
 from twoloop.generate.lobatto_tables import tables
 from twoloop.generate.straight_code import OwnCode, SharedCode
 from twoloop.generate.straight_line import Outputs
@@ -35,7 +35,24 @@ from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL
 Array = NDArray[np.float64]
 LONGEST = 8000  # operations of a projection
 SMALLEST = 1e-300  # in place of a coefficient of zero
-FAILED = -1.0  # what a sweep gives in place of a change where accelerations cannot be had
+FAILED = -1.0  # what an audit gives in place of a defect where accelerations cannot be had
+INFINITE = float("inf")
+CAREFULLY = 8.0  # steps made by the elimination of M after one in which the other accelerations would not do
+FIRST_DEGREE = 3.0  # of the polynomial that predicts the second step
+
+# the iteration
+KAPPA = 0.02  # of the tolerance: what it may leave; errors are then at most those of other methods of ours
+TARGET = 6.0  # sweeps that a step is to take; more where a polynomial of high degree predicts well
+MORE = 7  # sweeps beyond the target, after which a step is refused
+SLOW = 0.8  # contraction that is too slow
+LEAST_RHO, MOST_RHO = 1e-3, 0.9
+SLOW_START, FAST_START = 0.3, 0.04  # contraction of the first step: between these is well
+STAGNANT = 0.5  # changes that fall no further, and are as small as NOISE relative to the values, are rounding
+# of steps without an estimate of their error; forces may have rounding errors of their own
+ROUNDING_OF_FIXED, NOISE_OF_FIXED, MOST_OF_FIXED = 1e-16, 1e-9, 60.0
+LEAST_CHANGE = 1e-30  # over what may be left
+SHARE = 0.5  # what the estimate of the error counts
+ALLOWED = 16.0  # the defect between nodes, over the tolerances: most of it does not last to the end
 
 
 def suits(own: SharedCode) -> bool:
@@ -65,7 +82,8 @@ class CollocationCode:
         self.n, self.n_rows = self.equations.system.n_q, len(self.equations.all_rows)
         self.iterated = self._iterated()
         self.others = [i for i in range(self.n) if i not in self.iterated]
-        self.a, self.q, self.v, self.polynomials, self.ends, self.end_a, self.lam, self.size = at.places(
+        self.has_others = len(self.equations.accelerations) > 1
+        self.a, self.q, self.v, self.polynomials, self.spectra, self.ends, self.end_a, self.lam, self.size = at.places(
             self.n, len(self.iterated), self.n_rows
         )
 
@@ -87,8 +105,85 @@ class CollocationCode:
 
     # the functions
 
-    def begin(self, emit: LaneEmitter, room: Value, state: Value, tolerances: Value) -> None:
-        """Weights of errors, accelerations as predicted, positions and velocities at the nodes by these.
+    def attempt(self, emit: LaneEmitter, room: Value, state: Value, tolerances: Value, numbers: Value) -> Value:
+        """Make the stages of a step: how that ended, see data/collocation.py, and what is to be known of it.
+
+        Where conditions of the accelerations of the fewest operations fail, another function makes the step, and some
+        of the next ones, by those that eliminate M first. They are looked at once, for the last sweep.
+        """
+        builder, one = emit.builder, Emitter(emit.builder)
+        emit.numbers = emit.constants = numbers
+
+        def careful() -> Value:
+            name = self._careful(emit, [each.type for each in (room, state, tolerances, numbers)])
+            return builder.call(name, DOUBLE, [room, state, tolerances, numbers])
+
+        def quick(inputs: list[Value]) -> tuple[list[Value], Callable[[], Value]]:
+            outputs = self.equations.accelerations[0]
+            written, (a,) = results_of(emit, self.equations.graph, outputs, inputs, self.numbers)
+            return a, lambda: conditions_hold(emit, written, outputs, self._accelerations(emit, room))
+
+        def otherwise() -> Value:
+            if not self.has_others:
+                return constant(DOUBLE, float(at.LEFT))
+            one.store(constant(DOUBLE, CAREFULLY), room, at.CAREFUL)
+            return careful()
+
+        if self.has_others:
+            left = one.load(room, at.CAREFUL)
+            with self._leaving(emit, builder.compare("fcmp ogt", left, llvm_code.ZERO)):
+                one.store(one.subtract(left, llvm_code.ONE), room, at.CAREFUL)
+                builder.ret(careful())
+        self._prepare(emit, room, state, tolerances)
+        return self._iterate(emit, room, state, tolerances, quick, otherwise)
+
+    def _careful(self, emit: LaneEmitter, kinds: list[str]) -> str:
+        """The name of the function of the module that makes steps by accelerations that eliminate M first."""
+        module, name = emit.builder.module, "careful_nodes"
+        if not module.defines(name):
+            builder = module.function(name, DOUBLE, kinds, internal=True)
+            inner, (room, state, tolerances, numbers) = emit.like(builder), builder.arguments
+            inner.numbers = inner.constants = numbers
+
+            def evaluate(inputs: list[Value]) -> tuple[list[Value], Callable[[], Value]]:
+                a, holds = write_mass_first(inner, self.equations, inputs, self.numbers)
+                return a, lambda: holds
+
+            self._prepare(inner, room, state, tolerances)
+            builder.ret(
+                self._iterate(inner, room, state, tolerances, evaluate, lambda: constant(DOUBLE, float(at.LEFT)))
+            )
+        return name
+
+    def _accelerations(self, emit: LaneEmitter, room: Value) -> list[Value]:
+        """What is in memory: what else is done with a number after a loop has to wait on the stack in each turn."""
+        return [_get(emit, room, self.a + LANES * i) for i in range(self.n)]
+
+    @contextmanager
+    def _leaving(self, emit: LaneEmitter, condition: Value) -> Iterator[None]:
+        """What is done, and returned, where a condition holds."""
+        builder = emit.builder
+        leave, go_on = builder.append_block(), builder.append_block()
+        builder.branch(condition, leave, go_on)
+        builder.position_at_end(leave)
+        yield
+        builder.position_at_end(go_on)
+
+    def _prepare(self, emit: LaneEmitter, *arguments: Value) -> None:
+        """Call the function that begins a step."""
+        self._call(emit, "begin_nodes", self._begin, arguments)
+
+    def _call(self, emit: LaneEmitter, name: str, write: Callable[..., None], arguments: Sequence[Value]) -> None:
+        """Call a function of the module, which `write` writes, for those that share it."""
+        module = emit.builder.module
+        if not module.defines(name):
+            builder = module.function(name, NOTHING, [each.type for each in arguments], internal=True)
+            write(emit.like(builder), *builder.arguments)
+            builder.ret(None)
+        emit.builder.run(name, arguments)
+
+    def _begin(self, emit: LaneEmitter, room: Value, state: Value, tolerances: Value) -> None:
+        """Weights of errors, and positions and velocities at the nodes by the accelerations that are predicted.
 
         Errors are relative to what positions and velocities are at the beginning, or what half a step adds if that is
         more. Where no error is estimated, they are relative, of values below 1 absolute.
@@ -96,64 +191,157 @@ class CollocationCode:
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
         fixed = builder.compare("fcmp oeq", one.load(tolerances, ESTIMATE), llvm_code.ZERO)
         h, rtol = one.load(room, at.H), builder.select(fixed, llvm_code.ONE, one.load(tolerances, RTOL))
-        half = one.multiply(h, constant(DOUBLE, 0.5))
-        with one.loop(integer(0), integer(n), [llvm_code.ZERO]) as (i, (most,), new):
-            q, v, a = (one.function("fabs", one.load(one.pointer(state, i), m * n)) for m in range(3))
-            q, v = (_larger(one, each, one.multiply(half, slope)) for each, slope in ((q, v), (v, a)))
-            atol = builder.select(fixed, llvm_code.ONE, one.load(one.pointer(tolerances, i), ATOL))
-            of_v, of_q = (one.add(atol, one.multiply(rtol, each)) for each in (v, q))
-            of_q = one.divide(of_q, h)
-            least = builder.select(builder.compare("fcmp olt", of_v, of_q), of_v, of_q)
-            weight = one.divide(llvm_code.ONE, _larger(one, least, constant(DOUBLE, SMALLEST)))
-            one.store(weight, one.pointer(room, i), at.WEIGHTS)
-            new.append(_larger(one, weight, most))
-        (of_all,) = new
-        x = one.divide(h, one.load(room, at.H_BEFORE))
-        powers = [x]
-        while len(powers) < LANES:
-            powers.append(one.multiply(powers[-1], x))
-        powers_vector = emit.vector(powers)
-        _put(emit, powers_vector, room, at.POWERS)
+        several, starts = self._several(emit)
+        zero = several.constant(0.0)
+        length, half, relative = (several.splat(each) for each in (h, one.multiply(h, constant(DOUBLE, 0.5)), rtol))
+        largest = [zero] * 3
+        for start in starts:
+            q, v, a = (several.function("fabs", several.load(one.pointer(state, m * n + start))) for m in range(3))
+            longest = several.larger(q, several.multiply(half, v)), several.larger(v, several.multiply(half, a))
+            atol = several.load(one.pointer(tolerances, ATOL + start))
+            atol = builder.select(fixed, several.constant(1.0), atol)
+            of_q, of_v = (several.fused(relative, each, atol) for each in longest)
+            by_v = builder.compare("fcmp olt", several.multiply(of_v, length), of_q)
+            allowed = several.larger(builder.select(by_v, of_v, of_q), several.constant(SMALLEST))
+            weight = several.divide(builder.select(by_v, several.constant(1.0), length), allowed)
+            several.store(weight, one.pointer(room, at.WEIGHTS + start))
+            iterated = [float(start + k in self.iterated) for k in range(several.lanes)]
+            counted = several.multiply(
+                weight, constants(iterated) if several.lanes > 1 else constant(DOUBLE, *iterated)
+            )
+            size = several.multiply(counted, several.fused(length, a, v))
+            largest = [several.larger(*pair) for pair in zip((weight, counted, size), largest, strict=True)]
+        of_all, of_iterated, size = (several.largest_lane(each) for each in largest)
+        if self.iterated:
+            one.store(one.divide(of_all, of_iterated), room, at.STRICTER)
+            one.store(size, room, at.SIZE)
+        powers = self._powers(emit, one.divide(h, one.load(room, at.H_BEFORE)))
+        _put(emit, powers, room, at.POWERS)
         degree = emit.splat(one.load(room, at.DEGREE))
         known = constants([float(k) for k in range(LANES)])
-        kept = builder.select(builder.compare("fcmp olt", known, degree), powers_vector, emit.constant(0.0))
+        kept = builder.select(builder.compare("fcmp olt", known, degree), powers, emit.constant(0.0))
         old = self._polynomial(emit, room, other=False)
         nodes = np.array(tables().nodes)
-        with _over(emit, self.iterated, [llvm_code.ZERO] * 2) as (k, i, (most, largest), new):
-            weight = one.load(one.pointer(room, i), at.WEIGHTS)
-            v, a = (one.load(one.pointer(state, i), m * n) for m in (1, 2))
-            size = one.add(one.function("fabs", v), one.multiply(h, one.function("fabs", a)))
-            new += [_larger(one, weight, most), _larger(one, one.multiply(weight, size), largest)]
-            a0 = emit.splat(a)
+        # integrals of the polynomial from the beginning to the nodes: rows belong to its powers, from 0 on
+        velocities = np.array([nodes ** (k + 1) / (k + 1) for k in range(LANES + 1)])
+        positions = np.array([nodes ** (k + 2) / ((k + 1) * (k + 2)) for k in range(LANES + 1)])
+        with _over(emit, self.iterated) as (k, i, _, _):
             scaled = emit.multiply(_get(emit, one.pointer(old, _lanes(emit, k))), kept)
-            total = a0
-            for degree_, each in enumerate(_splats(emit, scaled)):
-                total = emit.fused(each, constants(nodes ** (degree_ + 1)), total)
-            _put(emit, total, one.pointer(room, _lanes(emit, i)), self.a)
-        if self.iterated:
-            one.store(one.divide(of_all, new[0]), room, at.STRICTER)
-            one.store(new[1], room, at.SIZE)
-        self._integrate(emit, room, state)
+            _put(emit, scaled, room, at.SCALED)
+            terms = [one.load(one.pointer(state, i), 2 * n), *(one.load(room, at.SCALED + j) for j in range(LANES))]
+            self._put_stages(
+                emit, room, state, k, i, [self._sums(emit, each, terms) for each in (velocities, positions)]
+            )
 
-    def sweep(self, emit: LaneEmitter, room: Value, state: Value, numbers: Value) -> Value:
-        """Accelerations at the nodes anew; the largest change of what follows from them, or FAILED."""
+    def _powers(self, emit: LaneEmitter, x: Value) -> Value:
+        """x to the powers 1 to 8, one in each lane."""
+        builder, power = emit.builder, emit.splat(x)
+        factors = []
+        for bit in (1, 2, 4, 8):
+            has = Value(emit.bit, f"<{', '.join(f'{BIT} {int(bool(k + 1 & bit))}' for k in range(LANES))}>")
+            factors.append(builder.select(has, power, emit.constant(1.0)))
+            power = emit.multiply(power, power)
+        return emit.multiply(emit.multiply(*factors[:2]), emit.multiply(*factors[2:]))
+
+    def _several(self, emit: LaneEmitter) -> tuple[LaneEmitter, list[int]]:
+        """For arithmetic on coordinates side by side: where vectors of them begin, the last of which may overlap."""
+        lanes = min(LANES, 1 << (self.n.bit_length() - 1))
+        return LaneEmitter(emit.builder, lanes), [*range(0, self.n - lanes, lanes), self.n - lanes]
+
+    def _iterate(
+        self,
+        emit: LaneEmitter,
+        room: Value,
+        state: Value,
+        tolerances: Value,
+        evaluate: Callable[[list[Value]], tuple[list[Value], Callable[[], Value]]],
+        otherwise: Callable[[], Value],
+    ) -> Value:
+        """Sweeps over the stages until they are right, or the step is given up; and what is to be known of it.
+
+        `evaluate` gives accelerations of [t, q, v] and what says whether they may be used; where they may not,
+        `otherwise` does the step.
+        """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
-        emit.numbers = emit.constants = numbers
-        t, h = emit.splat(one.load(room, at.T)), emit.splat(one.load(room, at.H))
-        t = emit.fused(constants(tables().nodes), h, t)
-        zero = emit.constant(0.0)
-        q, v = [zero] * n, [zero] * n
+
+        def number(value: float) -> Value:
+            return constant(DOUBLE, value)
+
+        estimated = builder.compare("fcmp one", one.load(tolerances, ESTIMATE), llvm_code.ZERO)
+        degree, stricter = one.load(room, at.DEGREE), one.load(room, at.STRICTER)
+        target = builder.select(
+            builder.compare("fcmp oge", degree, number(6.0)),
+            builder.select(builder.compare("fcmp oge", degree, number(7.0)), number(TARGET + 2), number(TARGET + 1)),
+            number(TARGET),
+        )
+        most = builder.select(estimated, one.add(target, number(MORE)), number(MOST_OF_FIXED))
+        kappa, noise = (
+            builder.select(estimated, number(usual), number(fixed))
+            for usual, fixed in ((KAPPA, ROUNDING_OF_FIXED), (at.NOISE, NOISE_OF_FIXED))
+        )
+        noise = one.multiply(noise, one.multiply(one.load(room, at.SIZE), stricter))
+        may_guess = builder.compare("fcmp ogt", one.load(room, at.MAY_GUESS), llvm_code.ZERO)
+        t, h = one.load(room, at.T), one.load(room, at.H)
+        times = emit.fused(constants(tables().nodes), emit.splat(h), emit.splat(t))
+        rho_before = one.load(room, at.RHO)
+        before, loop, after = builder.block, builder.append_block(), builder.append_block()
+        builder.go_to(loop)
+        builder.position_at_end(loop)
+        carried = [builder.phi(DOUBLE) for _ in range(3)]
+        sweeps, change_before, rho = carried
+        for phi, value in zip(carried, (llvm_code.ZERO, llvm_code.ONE, rho_before), strict=True):
+            phi.add_incoming(value, before)
+        q, v = [emit.constant(0.0)] * n, [emit.constant(0.0)] * n
         for k, i in enumerate(self.iterated):
             q[i], v[i] = _get(emit, room, self.q + LANES * k), _get(emit, room, self.v + LANES * k)
-        a, holds = write_accelerations(emit, self.equations, [t, *q, *v], self.numbers)
+        a, holds = evaluate([times, *q, *v])
         for i, value in enumerate(a):
             _put(emit, value, room, self.a + LANES * i)
-        change = self._integrate(emit, room, state)
-        all_hold = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [holds])
-        return builder.select(all_hold, change, constant(DOUBLE, FAILED))
+        change = one.multiply(stricter, self._integrate(emit, room, state))
+        m = one.add(sweeps, llvm_code.ONE)
 
-    def judge(self, emit: LaneEmitter, room: Value, state: Value) -> None:
-        """ERROR, CURVED and LARGEST, over the tolerances.
+        def holds_that(name: str, x: Value, y: Value | float) -> Value:
+            return builder.compare(f"fcmp {name}", x, y if isinstance(y, Value) else number(y))
+
+        def either(x: Value, y: Value) -> Value:
+            return builder.operation("or", x, y)
+
+        contraction = one.divide(change, one.larger(change_before, number(SMALLEST)))
+        contraction = one.smaller(one.larger(contraction, number(LEAST_RHO)), number(MOST_RHO))
+        rho_now = builder.select(holds_that("ogt", m, 1.0), contraction, rho)
+        out_of_range = either(holds_that("olt", rho_now, FAST_START), holds_that("ogt", rho_now, SLOW_START))
+        guessed = builder.both(
+            builder.both(may_guess, holds_that("oeq", m, 2.0)),
+            builder.both(out_of_range, holds_that("ogt", change, 0.0)),
+        )
+        stagnant = builder.both(
+            holds_that("ogt", m, 2.0),
+            builder.both(
+                holds_that("oge", change, one.multiply(number(STAGNANT), change_before)),
+                holds_that("ole", change, noise),
+            ),
+        )
+        made = either(holds_that("ole", one.multiply(rho_now, change), kappa), stagnant)
+        slow = builder.both(builder.both(holds_that("ogt", m, 3.0), estimated), holds_that("oge", rho_now, SLOW))
+        refused = either(either(slow, holds_that("oge", m, most)), holds_that("uge", change, INFINITE))
+        goes_on = builder.operation("or", either(guessed, made), refused)
+        for phi, value in zip(carried, (m, change, rho_now), strict=True):
+            phi.add_incoming(value, builder.block)
+        builder.branch(goes_on, after, loop)
+        builder.position_at_end(after)
+        all_hold = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [holds()])
+        with self._leaving(emit, builder.operation("xor", all_hold, Value(BIT, "true"))):
+            builder.ret(otherwise())
+        for value, place in ((m, at.SWEEPS), (change, at.CHANGE), (target, at.TARGETED), (rho_now, at.RHO)):
+            one.store(value, room, place)
+        ended = builder.select(made, number(at.MADE), number(at.REFUSED))
+        ended = builder.select(guessed, number(at.GUESSED), ended)
+        with builder.if_then(builder.both(builder.compare("fcmp oeq", ended, number(at.MADE)), estimated)):
+            self._call(emit, "judge_nodes", self._judge, [room, state])
+        return ended
+
+    def _judge(self, emit: LaneEmitter, room: Value, state: Value) -> None:
+        """ERROR and CURVED, over the tolerances; and by how much the next step may be longer for convergence's sake.
 
         The coefficients of a in Legendre polynomials tell how fast they fall: t is the larger one of degrees 7 and 8, s
         of 5 and 6, f of all from 3 on. The error is estimated as t (t / s)^1.5 or, if that is more, t^2 / f. Errors of
@@ -161,29 +349,46 @@ class CollocationCode:
         are smaller by decades, which costs few steps, as the estimate is of order 12.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
-        with one.loop(integer(0), integer(n), [llvm_code.ZERO] * 3) as (i, (error, curved, largest), new):
+        size = (self.ends - self.spectra) // 3
+        with one.loop(integer(0), integer(n), []) as (i, _, _):
             a0 = one.load(one.pointer(state, i), 2 * n)
             values = emit.function("fabs", self._combined(emit, tables().spectrum, a0, room, i))
-            before, top = (_larger(one, *(builder.extract(values, k + m) for m in range(2))) for k in (4, 6))
-            first = _larger(one, *(builder.extract(values, k) for k in (2, 3)))
-            falls = one.divide(top, _larger(one, _larger(one, before, top), constant(DOUBLE, SMALLEST)))
-            far = one.divide(
-                top, _larger(one, _larger(one, first, _larger(one, before, top)), constant(DOUBLE, SMALLEST))
-            )
-            falls = _larger(one, one.multiply(falls, one.function("sqrt", falls)), far)
-            weight = one.load(one.pointer(room, i), at.WEIGHTS)
-            new.append(_larger(one, one.multiply(one.multiply(top, weight), falls), error))
-            new.append(_larger(one, one.multiply(before, weight), curved))
-            middle = one.load(one.pointer(room, _lanes(emit, i)), self.a + LANES // 2 - 1)
-            for each in (a0, middle):
-                largest = _larger(one, one.multiply(one.function("fabs", each), weight), largest)
-            new.append(largest)
+            pairs = emit.larger(values, builder.shuffle(values, values, [1, 0, 3, 2, 5, 4, 7, 6]))
+            for row, lane in enumerate((2, 4, 6)):
+                one.store(builder.extract(pairs, lane), one.pointer(room, i), self.spectra + row * size)
+        several, starts = self._several(emit)
+        error = curved = several.constant(0.0)
+        least = several.constant(SMALLEST)
+        for start in starts:
+            first, before, top = (several.load(one.pointer(room, self.spectra + m * size + start)) for m in range(3))
+            weight = several.load(one.pointer(room, at.WEIGHTS + start))
+            of_last = several.larger(several.larger(before, top), least)
+            falls = several.divide(top, of_last)
+            far = several.divide(top, several.larger(first, of_last))
+            falls = several.larger(several.multiply(falls, several.function("sqrt", falls)), far)
+            error = several.larger(several.multiply(several.multiply(top, weight), falls), error)
+            curved = several.larger(several.multiply(before, weight), curved)
         h = one.load(room, at.H)
-        for value, place in zip(new, (at.ERROR, at.CURVED, at.LARGEST), strict=True):
-            one.store(one.multiply(value, h), room, place)
+        error = one.multiply(one.multiply(several.largest_lane(error), h), constant(DOUBLE, SHARE))
+        one.store(error, room, at.ERROR)
+        one.store(one.multiply(several.largest_lane(curved), h), room, at.CURVED)
+        m, change, target, rho = (one.load(room, place) for place in (at.SWEEPS, at.CHANGE, at.TARGETED, at.RHO))
+        two = LaneEmitter(builder, 2)
+        more = one.divide(one.multiply(rho, change), constant(DOUBLE, KAPPA))
+        more = one.add(more, constant(DOUBLE, LEAST_CHANGE))
+        by_rho = two.logarithm(two.vector([more, rho]))
+        left = one.fused(one.subtract(target, m), builder.extract(by_rho, 1), builder.extract(by_rho, 0))
+        further = one.divide(one.add(left, llvm_code.ONE), one.add(target, constant(DOUBLE, 2.0)))
+        by_error = one.multiply(builder.extract(two.logarithm(two.splat(error)), 0), constant(DOUBLE, 1.0 / at.ORDER))
+        factors = two.exponential(two.negative(two.vector([further, by_error])))
+        one.store(builder.extract(factors, 0), room, at.FACTOR)
+        one.store(builder.extract(factors, 1), room, at.FACTOR_OF_ERROR)
 
     def audit(self, emit: LaneEmitter, room: Value, state: Value, numbers: Value) -> Value:
-        """The largest defect between nodes: what a step as long as this one would make of it, over the tolerances."""
+        """What a step as long as this one would make of the largest defect between nodes, over what is allowed.
+
+        And by how much the next may be longer.
+        """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
         emit.numbers = emit.constants = numbers
         t, h = emit.splat(one.load(room, at.T)), emit.splat(one.load(room, at.H))
@@ -197,18 +402,36 @@ class CollocationCode:
             v[i] = emit.fused(h, of_v, emit.splat(v0))
             q[i] = emit.fused(emit.multiply(h, h), of_q, emit.fused(length, emit.splat(v0), emit.splat(q0)))
         a, holds = write_accelerations(emit, self.equations, [emit.add(t, length), *q, *v], self.numbers)
-        worst = zero
+        worst = largest = zero
         for i, value in enumerate(a):
             a0 = one.load(state, 2 * n + i)
             off = emit.subtract(value, self._combined(emit, tables().values_between, a0, room, integer(i)))
             weight = emit.splat(one.load(room, at.WEIGHTS + i))
             worst = emit.larger(emit.multiply(emit.function("fabs", off), weight), worst)
-        largest = builder.call(f"llvm.vector.reduce.fmax.{emit.suffix}", DOUBLE, [emit.multiply(worst, h)])
+            largest = emit.larger(emit.multiply(emit.function("fabs", value), weight), largest)
+        beyond_noise = emit.fused(emit.constant(-at.NOISE), largest, worst)
+        scaled = emit.multiply(beyond_noise, emit.multiply(h, emit.constant(1.0 / ALLOWED)))
+        defect = one.larger(emit.largest_lane(scaled), llvm_code.ZERO)
+        two = LaneEmitter(builder, 2)
+        power = two.multiply(
+            two.logarithm(two.splat(one.larger(defect, constant(DOUBLE, 1e-9)))), two.constant(-1.0 / 9)
+        )
+        one.store(builder.extract(two.exponential(power), 0), room, at.FACTOR_OF_DEFECT)
         all_hold = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [holds])
-        return builder.select(all_hold, largest, constant(DOUBLE, FAILED))
+        return builder.select(all_hold, defect, constant(DOUBLE, FAILED))
+
+    def retry(self, emit: LaneEmitter, room: Value, state: Value) -> None:
+        """Let the polynomial of a step that was refused predict the shorter one in its place."""
+        one, old = Emitter(emit.builder), self._polynomial(emit, room, other=False)
+        with _over(emit, self.iterated) as (k, i, _, _):
+            a0 = one.load(one.pointer(state, i), 2 * self.n)
+            _put(emit, self._combined(emit, tables().begin, a0, room, i), one.pointer(old, _lanes(emit, k)))
 
     def end(self, emit: LaneEmitter, room: Value, state: Value, new_state: Value) -> None:
-        """[q, v, a] at the end of the step, and the polynomial that predicts the next, with the best DEGREE of this."""
+        """[q, v, a] at the end of the step, and the polynomial that predicts the next, with the degree it is to have.
+
+        The best degree is the one that would have predicted the end of this step best, near the one that it had.
+        """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
         last, h = LANES - 1, one.load(room, at.H)
         powers, new = _get(emit, room, at.POWERS), self._polynomial(emit, room, other=True)
@@ -219,30 +442,42 @@ class CollocationCode:
             a0, a1 = one.load(one.pointer(state, i), 2 * n), one.load(one.pointer(room, _lanes(emit, i)), self.a + last)
             for value, begin in ((one.load(place, self.q + last), 0), (one.load(place, self.v + last), n), (a1, 2 * n)):
                 one.store(value, here, begin)
-            terms = emit.multiply(_get(emit, one.pointer(old, _lanes(emit, k))), powers)
-            off = emit.splat(one.subtract(a0, a1))
-            for j, each in enumerate(_splats(emit, terms)):
-                off = emit.fused(each, constants([float(m >= j) for m in range(LANES)]), off)
+            sums = emit.multiply(_get(emit, one.pointer(old, _lanes(emit, k))), powers)
+            for distance in (1, 2, 4):  # of all terms up to each degree
+                shifted = [LANES + k if k < distance else k - distance for k in range(LANES)]
+                sums = emit.add(sums, builder.shuffle(sums, zero, shifted))
+            off = emit.add(sums, emit.splat(one.subtract(a0, a1)))
             weight = emit.splat(one.load(one.pointer(room, i), at.WEIGHTS))
             carried.append(emit.larger(emit.multiply(emit.function("fabs", off), weight), worst))
             _put(emit, self._combined(emit, tables().end, a0, room, i), one.pointer(new, _lanes(emit, k)))
-        _put(emit, carried[0], room, at.WORST)
+        self._choose_degree(emit, room, carried[0])
         if self.others:
+            ends = [constants(table[1:, last]) for table in (tables().velocities, tables().positions)]
+            of_first = [constant(DOUBLE, table[0, last]) for table in (tables().velocities, tables().positions)]
             with _over(emit, self.others) as (_, i, _, _):
                 first, here = one.pointer(state, i), one.pointer(new_state, i)
                 a = _get(emit, one.pointer(room, _lanes(emit, i)), self.a)
                 q, v, a0 = (one.load(first, m * n) for m in range(3))
-                sums = []
-                for table in (tables().velocities, tables().positions):
-                    products = emit.multiply(constants(table[1:, last]), a)
-                    total = builder.call(
-                        f"llvm.vector.reduce.fadd.{emit.suffix}", DOUBLE, [constant(DOUBLE, -0.0), products], "reassoc"
-                    )
-                    sums.append(one.add(total, one.multiply(constant(DOUBLE, table[0, last]), a0)))
-                further = one.multiply(h, one.add(v, one.multiply(h, sums[1])))
+                of_v, of_q = _two_sums(emit, *(emit.multiply(a, end) for end in ends))
+                of_v, of_q = (one.fused(factor, a0, each) for factor, each in zip(of_first, (of_v, of_q), strict=True))
+                further = one.multiply(h, one.fused(h, of_q, v))
                 one.store(one.add(q, further), here, 0)
-                one.store(one.add(v, one.multiply(h, sums[0])), here, n)
+                one.store(one.add(v, one.multiply(h, of_v)), here, n)
                 one.store(builder.extract(a, last), here, 2 * n)
+
+    def _choose_degree(self, emit: LaneEmitter, room: Value, worst: Value) -> None:
+        """NEXT_DEGREE, from the errors of predictions of degree 1 to 8 at the end of the step."""
+        builder, one = emit.builder, Emitter(emit.builder)
+        least = one.negative(emit.largest_lane(emit.negative(worst)))
+        good = builder.compare("fcmp ole", worst, emit.splat(one.multiply(least, constant(DOUBLE, 1.2))))
+        bits = builder.convert("zext", builder.convert("bitcast", good, f"i{LANES}"), INTEGER)
+        bits = builder.operation("or", bits, integer(1 << LANES - 1))
+        first = builder.call("llvm.cttz.i64", INTEGER, [bits, Value(BIT, "true")])
+        best, before = one.add(one.number(first), llvm_code.ONE), one.load(room, at.DEGREE)
+        lowest, highest = (one.add(before, constant(DOUBLE, each)) for each in (-2.0, 2.0))
+        degree = one.smaller(one.larger(best, one.larger(lowest, constant(DOUBLE, 2.0))), highest)
+        predicts = builder.compare("fcmp one", one.load(room, at.PREDICTS), llvm_code.ZERO)
+        one.store(builder.select(predicts, degree, constant(DOUBLE, FIRST_DEGREE)), room, at.NEXT_DEGREE)
 
     def closer(self, emit: LaneEmitter, room: Value, numbers: Value) -> None:
         """Positions at the ends of eight steps, moved towards the constraints; FINE and MOVED."""
@@ -294,35 +529,47 @@ class CollocationCode:
 
     def _integrate(self, emit: LaneEmitter, room: Value, state: Value) -> Value:
         """Positions and velocities at the nodes from accelerations there; the largest change of a velocity."""
-        one, n = Emitter(emit.builder), self.n
-        h = emit.splat(one.load(room, at.H))
-        length = emit.multiply(h, constants(tables().nodes))
-        squared = emit.multiply(h, h)
+        one = Emitter(emit.builder)
         with _over(emit, self.iterated, [emit.constant(0.0)]) as (k, i, (largest,), new):
-            place, begin = one.pointer(room, _lanes(emit, k)), one.pointer(state, i)
-            q0, v0, a0 = (one.load(begin, m * n) for m in range(3))
-            of_v = self._combined(emit, tables().velocities, a0, room, i)
-            of_q = self._combined(emit, tables().positions, a0, room, i)
-            v = emit.fused(h, of_v, emit.splat(v0))
-            q = emit.fused(squared, of_q, emit.fused(length, emit.splat(v0), emit.splat(q0)))
-            change = emit.function("fabs", emit.subtract(v, _get(emit, place, self.v)))
+            before = _get(emit, one.pointer(room, _lanes(emit, k)), self.v)
+            terms = self._values(emit, one.load(one.pointer(state, i), 2 * self.n), room, i)
+            sums = [self._sums(emit, table, terms) for table in (tables().velocities, tables().positions)]
+            v = self._put_stages(emit, room, state, k, i, sums)
             weight = emit.splat(one.load(one.pointer(room, i), at.WEIGHTS))
+            change = emit.function("fabs", emit.subtract(v, before))
             new.append(emit.larger(emit.multiply(change, weight), largest))
-            _put(emit, v, place, self.v)
-            _put(emit, q, place, self.q)
-        result: Value = emit.builder.call(f"llvm.vector.reduce.fmax.{emit.suffix}", DOUBLE, [new[0]])
-        return result
+        return emit.largest_lane(new[0])
 
-    def _combined(self, emit: LaneEmitter, table: Array, first: Value, room: Value, i: Value) -> Value:
-        """The sum of rows of a table times values of coordinate i at the nodes; `first` is that at the beginning."""
+    def _put_stages(
+        self, emit: LaneEmitter, room: Value, state: Value, k: Value, i: Value, sums: Sequence[Value]
+    ) -> Value:
+        """Velocities and positions of coordinate i, the k-th that is iterated, at the nodes; and these velocities."""
+        one = Emitter(emit.builder)
+        h = emit.splat(one.load(room, at.H))
+        place, begin = one.pointer(room, _lanes(emit, k)), one.pointer(state, i)
+        q0, v0 = (emit.splat(one.load(begin, m * self.n)) for m in range(2))
+        v = emit.fused(h, sums[0], v0)
+        inner = emit.fused(h, sums[1], emit.multiply(constants(tables().nodes), v0))
+        _put(emit, v, place, self.v)
+        _put(emit, emit.fused(h, inner, q0), place, self.q)
+        return v
+
+    def _values(self, emit: LaneEmitter, first: Value, room: Value, i: Value) -> list[Value]:
+        """Values of coordinate i at all nodes; `first` is that at the beginning."""
         one = Emitter(emit.builder)
         place = one.pointer(room, _lanes(emit, i))
-        sums: list[Value] = [emit.multiply(emit.splat(first), constants(table[0]))]
-        sums.append(emit.multiply(emit.splat(one.load(place, self.a)), constants(table[1])))
-        for node in range(1, LANES):
-            value = emit.splat(one.load(place, self.a + node))
-            sums[node % 2] = emit.fused(value, constants(table[node + 1]), sums[node % 2])
-        return emit.add(*sums)
+        return [first, *(one.load(place, self.a + node) for node in range(LANES))]
+
+    def _combined(self, emit: LaneEmitter, table: Array, first: Value, room: Value, i: Value) -> Value:
+        """The sum of rows of a table times such values."""
+        return self._sums(emit, table, self._values(emit, first, room, i))
+
+    def _sums(self, emit: LaneEmitter, table: Array, terms: Sequence[Value]) -> Value:
+        """The sum of rows of a table times numbers."""
+        sums = [emit.multiply(emit.splat(term), constants(row)) for term, row in zip(terms[:2], table[:2], strict=True)]
+        for k, (term, row) in enumerate(zip(terms[2:], table[2:], strict=True)):
+            sums[(k + 1) % 2] = emit.fused(emit.splat(term), constants(row), sums[(k + 1) % 2])
+        return emit.apart(*sums)
 
     def _polynomial(self, emit: LaneEmitter, room: Value, other: bool) -> Value:
         """Where the coefficients begin of the polynomial of the last accepted step, or of the step being made."""
@@ -331,11 +578,6 @@ class CollocationCode:
         size = LANES * len(self.iterated)
         place = builder.select(second, integer(self.polynomials + size), integer(self.polynomials))
         return one.pointer(room, place)
-
-
-def _larger(one: Emitter, a: Value, b: Value) -> Value:
-    """The larger of two numbers."""
-    return one.builder.select(one.builder.compare("fcmp ogt", a, b), a, b)
 
 
 def _lanes(emit: LaneEmitter, k: Value) -> Value:
@@ -352,9 +594,14 @@ def _put(emit: LaneEmitter, value: Value, base: Value, place: int = 0) -> None:
     Emitter(emit.builder).store_vector(value, base, place)
 
 
-def _splats(emit: LaneEmitter, vector: Value) -> list[Value]:
-    """Each number of a vector in all lanes."""
-    return [emit.splat(emit.builder.extract(vector, k)) for k in range(LANES)]
+def _two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
+    """The sums of the numbers of two vectors, which are added side by side."""
+    builder, half = emit.builder, LANES // 2
+    lower, upper = ([*range(k, k + half), *range(LANES + k, LANES + k + half)] for k in (0, half))
+    total = emit.add(builder.shuffle(a, b, lower), builder.shuffle(a, b, upper))
+    for distance in (2, 1):
+        total = emit.add(total, builder.shuffle(total, total, [k ^ distance for k in range(LANES)]))
+    return [builder.extract(total, k) for k in (0, half)]
 
 
 @contextmanager
@@ -389,11 +636,10 @@ def _compiled(own: SharedCode) -> Collocation:
 
     code = CollocationCode(own)
     parts: dict[str, Callable[..., Any]] = {
-        "begin_nodes": code.begin,
-        "sweep_nodes": code.sweep,
-        "judge_nodes": code.judge,
-        "end_nodes": code.end,
+        "attempt_nodes": code.attempt,
         "audit_nodes": code.audit,
+        "retry_nodes": code.retry,
+        "end_nodes": code.end,
         "closer_ends": code.closer,
         "nearer_ends": code.nearer,
     }

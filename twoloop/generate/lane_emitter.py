@@ -21,7 +21,7 @@ class LaneEmitter(Emitter):
 
     def __init__(self, builder: Builder, lanes: int = LANES):
         super().__init__(builder)
-        self.lanes, self.suffix = lanes, f"v{lanes}f64"
+        self.lanes, self.suffix = lanes, f"v{lanes}f64" if lanes > 1 else Emitter.suffix
         self.double, self.whole_number, self.bit = (vector_of(kind, lanes) for kind in (DOUBLE, INTEGER, BIT))
 
     def like(self, builder: Builder) -> "LaneEmitter":
@@ -30,6 +30,8 @@ class LaneEmitter(Emitter):
 
     def splat(self, value: Value) -> Value:
         """A number of all lanes."""
+        if self.lanes == 1:
+            return value
         vector = self.builder.insert(undefined(vector_of(value.type, self.lanes)), value, 0)
         return self.builder.first_everywhere(vector)
 
@@ -71,18 +73,17 @@ class LaneEmitter(Emitter):
             made = self.builder.insert(made, one.function(name, self.builder.extract(x, lane)), lane)
         return made
 
-    def larger(self, a: Value, b: Value) -> Value:
-        """The larger of two numbers."""
-        return self.builder.select(self.builder.compare("fcmp ogt", a, b), a, b)
-
-    def smaller(self, a: Value, b: Value) -> Value:
-        """The smaller of two numbers."""
-        return self.builder.select(self.builder.compare("fcmp olt", a, b), a, b)
+    def largest_lane(self, x: Value) -> Value:
+        """The largest number of all lanes; LLVM's own reduction takes one after another, for the sake of NaN."""
+        width = self.lanes
+        while width > 2:
+            width //= 2
+            x = self.larger(*(self.builder.shuffle(x, x, range(k, k + width)) for k in (0, width)))
+        return x if width == 1 else self.larger(*(self.builder.extract(x, k) for k in (0, 1)))
 
     def largest_whole(self, x: Value) -> Value:
         """The largest number of all lanes, which is whole, as an integer."""
-        largest = self.builder.call(f"llvm.vector.reduce.fmax.{self.suffix}", DOUBLE, [x])
-        return self.builder.convert("fptosi", largest, INTEGER)
+        return self.builder.convert("fptosi", self.largest_lane(x), INTEGER)
 
     def logarithm(self, x: Value) -> Value:
         """log2 x to a hundredth of a per cent of 1, of what is not negative, as if none were below SMALLEST."""

@@ -25,6 +25,7 @@ from twoloop.generate.llvm_text import (
 from twoloop.kernels.data.common import OPTIONS
 
 FLAGS = " ".join(sorted(OPTIONS["fastmath"]))
+LONG = 4  # terms of a sum that is made of two
 ZERO, ONE = constant(DOUBLE, 0.0), constant(DOUBLE, 1.0)
 # functions of LLVM; others are those of libm
 INTRINSICS = {name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqrt", "rint", "ceil", "fabs")}
@@ -66,6 +67,10 @@ class Emitter:
         """a + b."""
         return self.builder.operation(f"fadd {FLAGS}", a, b)
 
+    def apart(self, a: Value, b: Value) -> Value:
+        """a + b of two sums that stay apart: LLVM would make one chain of them, to spare an operation."""
+        return self.builder.operation("fadd", a, b)
+
     def subtract(self, a: Value, b: Value) -> Value:
         """a - b."""
         return self.builder.operation(f"fsub {FLAGS}", a, b)
@@ -85,6 +90,14 @@ class Emitter:
     def negative(self, a: Value) -> Value:
         """-a."""
         return self.builder.negative(FLAGS, a)
+
+    def larger(self, a: Value, b: Value) -> Value:
+        """The larger of two numbers."""
+        return self.builder.select(self.builder.compare("fcmp ogt", a, b), a, b)
+
+    def smaller(self, a: Value, b: Value) -> Value:
+        """The smaller of two numbers."""
+        return self.builder.select(self.builder.compare("fcmp olt", a, b), a, b)
 
     def times(self, factor: float, a: Value) -> Value:
         """A multiple of a number by a known one."""
@@ -216,6 +229,10 @@ class Quantities:
             return self._emit.times(coefficient, self.value(quantity))
         if key not in self._sums:
             total: Any = None if constant == 0.0 and terms else self._emit.known(constant)
+            half = len(terms) // 2 if len(terms) >= LONG else 0
+            if half:  # two chains of additions, which do not wait for one another
+                self._sums[key] = self._emit.apart(self.sum(terms[:half], constant), self.sum(terms[half:]))
+                return self._sums[key]
             for quantity, coefficient in terms:
                 value = self.value(quantity)
                 if total is None:

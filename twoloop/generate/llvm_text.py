@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 DOUBLE, INTEGER, WORD, BIT, NOTHING = "double", "i64", "i32", "i1", "void"
+LINE = 8  # doubles in a line of the cache
 LONGEST = 400  # lines of a block of a divided function; longer ones take more than twice as long to compile
 
 
@@ -157,7 +158,9 @@ class Builder:
         arguments = ", ".join(map(str, self.arguments))
         body = "\n".join(block.text() for block in self._blocks)
         linkage = "internal " if self.internal else ""
-        return f"define {linkage}{self.result} @{self.name}({arguments}) noinline {{\n{body}\n}}"
+        # vectors that wait on the stack would lie across two lines of the cache, and take twice as long
+        attributes = "noinline alignstack(64)" if f"<{LINE} x" in body else "noinline"
+        return f"define {linkage}{self.result} @{self.name}({arguments}) {attributes} {{\n{body}\n}}"
 
     def append_block(self) -> Block:
         """A new block, which stands in the text where it is gone on with, once: values are numbered in that order."""
@@ -269,6 +272,11 @@ class Builder:
     def extract(self, vector: Value, place: int) -> Value:
         """An element of a vector."""
         return self._value(element_of(vector.type), f"extractelement {vector}, {WORD} {place}")
+
+    def shuffle(self, a: Value, b: Value, places: Sequence[int]) -> Value:
+        """Elements of two vectors of a type, those of the second counted on from the first."""
+        mask = f"<{len(places)} x {WORD}> <{', '.join(f'{WORD} {place}' for place in places)}>"
+        return self._value(vector_of(element_of(a.type), len(places)), f"shufflevector {a}, {b}, {mask}")
 
     def first_everywhere(self, vector: Value) -> Value:
         """A vector of its first element."""

@@ -33,9 +33,10 @@ def sine_and_cosine(emit: Emitter, x: Value) -> tuple[Value, Value]:
     for part in HALF_PI:
         rest = emit.fused(turns, emit.constant(-part), rest)
     square = builder.operation("fmul", rest, rest)
-    sine = emit.fused(builder.operation("fmul", square, rest), _polynomial(emit, square, SINES), rest)
+    fourth = builder.operation("fmul", square, square)
+    sine = emit.fused(builder.operation("fmul", square, rest), _polynomial(emit, square, fourth, SINES), rest)
     cosine = emit.fused(square, emit.constant(-0.5), emit.constant(1.0))
-    cosine = emit.fused(builder.operation("fmul", square, square), _polynomial(emit, square, COSINES), cosine)
+    cosine = emit.fused(fourth, _polynomial(emit, square, fourth, COSINES), cosine)
     quarter = builder.convert("fptosi", turns, emit.whole_number)
     odd, following = builder.convert("trunc", quarter, emit.bit), builder.add(quarter, whole(1))
     made = []
@@ -46,8 +47,13 @@ def sine_and_cosine(emit: Emitter, x: Value) -> tuple[Value, Value]:
     return made[0], made[1]
 
 
-def _polynomial(emit: Emitter, x: Value, coefficients: tuple[float, ...]) -> Value:
-    total: Value = emit.constant(coefficients[-1])
-    for coefficient in reversed(coefficients[:-1]):
-        total = emit.fused(total, x, emit.constant(coefficient))
+def _polynomial(emit: Emitter, x: Value, square: Value, coefficients: tuple[float, ...]) -> Value:
+    """A polynomial of x, whose square is given; pairs of terms do not wait for one another."""
+    pairs = [
+        emit.fused(emit.constant(second), x, emit.constant(first))
+        for first, second in zip(coefficients[::2], coefficients[1::2], strict=True)
+    ]
+    total: Value = pairs.pop()
+    while pairs:
+        total = emit.fused(total, square, pairs.pop())
     return total

@@ -30,8 +30,8 @@ class Tables(NamedTuple):
         The polynomial and these integrals at the places between nodes.
     spectrum : (9, 8)
         Coefficients of the Legendre polynomials 1 to 8 on [0, 1], which are 1 at its end.
-    end : (9, 8)
-        Coefficients of the powers 1 to 8 of the time from the end.
+    begin, end : (9, 8)
+        Coefficients of the powers 1 to 8 of the time from the beginning, and from the end.
     """
 
     nodes: Array
@@ -42,6 +42,7 @@ class Tables(NamedTuple):
     velocities_between: Array
     positions_between: Array
     spectrum: Array
+    begin: Array
     end: Array
 
 
@@ -55,13 +56,16 @@ def tables() -> Tables:
     norms = np.array([np.longdouble(2) / (2 * k + 1) for k in range(N)])
     norms[N - 1] = np.longdouble(2) / (N - 1)  # what the quadrature gives of the square of the last one
     coefficients = values[:N] * weights / norms[:, None]  # (k, node): Legendre coefficients of the Lagrange polynomials
-    powers = [[comb(n, k) * comb(n + k, k) for n in range(N)] for k in range(1, N)]
+    powers = [
+        np.array([[sign ** (n + k) * comb(n, k) * comb(n + k, k) for n in range(N)] for k in range(1, N)]).T
+        for sign in (-1, 1)
+    ]
     made = (
         *((each + 1) / 2 for each in (x[1:], between)),
         *_integrals(coefficients, x[1:])[1:],
         *_integrals(coefficients, between),
         coefficients[1:].T,
-        coefficients.T @ np.array(powers, dtype=np.longdouble).T,
+        *(coefficients.T @ each.astype(np.longdouble) for each in powers),
     )
     return Tables(*(each.astype(np.float64) for each in made))
 

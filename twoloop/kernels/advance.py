@@ -7,7 +7,7 @@ import numpy as np
 
 from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control import clock as at
-from twoloop.kernels.control.controller import EXPONENT, FACTOR_MIN, SAFETY, factor_of, remember
+from twoloop.kernels.control.controller import EXPONENT, FACTOR_MIN, SAFETY, UNFORESEEN, factor_of, remember
 from twoloop.kernels.control.landing import NEAR, off_grid, on_grid
 from twoloop.kernels.control.progress import count_step
 from twoloop.kernels.control.singular import (
@@ -50,7 +50,6 @@ from twoloop.kernels.evaluation.calls import (
 from twoloop.kernels.evaluation.kinks import JUMP, RAMP, SMOOTH, find_kink, unexplained
 from twoloop.kernels.evaluation.partition import CHANGED
 
-UNFORESEEN = 10.0  # an error that is so large was not foreseen: the force jumps, or bends, within the step
 REFUSED = 0.95  # of a refused step is what the next one is at most
 FIRST_JUDGED = 2  # accepted step after which a provisional method may give way: the first one may be a guess
 
@@ -144,9 +143,9 @@ def _failed(f, w, control, clock, t, size, code, retried, state):
         return at.HAS_TO_GIVE_WAY
     if control[at.FIXED_STEP] > 0.0:
         if not poor or t == retried:
-            return at.NEAR_SINGULAR if near_singular(w, control, clock) else at.FIXED_STEP_FAILED
+            return at.NEAR_SINGULAR if near_singular(f, w, control, clock, t, state[:n]) else at.FIXED_STEP_FAILED
     else:
-        if size < SHORT * clock[at.H_LONG] and near_singular(w, control, clock):
+        if size < SHORT * clock[at.H_LONG] and near_singular(f, w, control, clock, t, state[:n]):
             return at.NEAR_SINGULAR
         clock[at.H_LIMIT] = control[at.LIMIT_FACTOR] * size
         clock[at.LIMIT_AGE] = 0.0
@@ -157,8 +156,9 @@ def _failed(f, w, control, clock, t, size, code, retried, state):
 
 
 @merged
-def _refused(f, w, control, clock, t, size, proposal):
+def _refused(f, w, control, clock, t, size, proposal, state):
     """What becomes of a step whose error is too large: a shorter one, a tiny one by a spacing, or steps across."""
+    n = w.Q.size
     w.counters[N_REJECTED_ERROR] += 1
     clock[at.FAILURE_CODE] = DONE
     if with_care(f, w, control, clock, size):
@@ -166,7 +166,7 @@ def _refused(f, w, control, clock, t, size, proposal):
     clock[at.H_NEXT] = min(proposal, REFUSED * size, size - np.spacing(abs(t + size)))
     if lost_at_singular(f, clock, size):
         return at.HAS_TO_BE_DENSE
-    if size < SHORT * clock[at.H_LONG] and near_singular(w, control, clock):
+    if size < SHORT * clock[at.H_LONG] and near_singular(f, w, control, clock, t, state[:n]):
         return at.NEAR_SINGULAR
     return at.GO_ON
 
@@ -176,9 +176,17 @@ def _may_go_on(control, clock):
     """Whether the method makes steps in a row, and nothing else has to be looked at before each of them."""
     if control[at.IN_A_ROW] == 0.0 or control[at.FIXED_STEP] > 0.0 or clock[at.LEAPS] == 1.0:
         return False
-    if control[at.SPACING] > 0.0 or control[at.DRIVEN] == 1.0:
+    if control[at.SPACING] > 0.0 or clock[at.T] == clock[at.JUMP_FROM]:
         return False
-    return clock[at.FAILURE_CODE] == DONE and clock[at.T] >= clock[at.ROUGH_TO]
+    return clock[at.FAILURE_CODE] == DONE
+
+
+@merged
+def _was_last(f, w, clock, outputs, state):
+    """Go on to the next output time from one that was reached; whether there is none."""
+    note_output(f, w, clock, state)
+    clock[at.NEXT_OUTPUT] += 1.0
+    return int(clock[at.NEXT_OUTPUT]) == outputs.size
 
 
 _ADVANCE = i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS)
@@ -207,17 +215,25 @@ def advance(
         if w.counters[N_ACCEPTED] >= control[at.MAX_STEPS]:
             return at.MAX_STEPS_REACHED
         if _may_go_on(control, clock):
-            first, goal = filled[0], outputs[int(clock[at.NEXT_OUTPUT])]
+            first, target = filled[0], outputs[int(clock[at.NEXT_OUTPUT])]
+            goal = min(target, clock[at.JUMP_FROM])
             if min(out_t.size - first, out_steps.shape[0] - filled[1]) < LANES and first + filled[1] > 0:
                 return at.PAUSED
             rows = out_t[first:], out_state[first:], out_steps[filled[1] :]
             made = f.attempt_many(f, w, options, memory, tolerances, control, clock, goal, state, new_state, *rows)
             if made > 0:
+                lands = clock[at.T] == target
                 if control[at.STORE_ALL] == 1.0:
                     filled[0] += made
+                elif lands:
+                    out_t[first] = target
+                    copy(state, out_state[first])
+                    filled[0] += 1
                 filled[1] += made
                 attempts += made
-                end = look_at_partition(f, w, control, clock, out_steps[filled[1] - 1, at.H], False, state)
+                if lands and _was_last(f, w, clock, outputs, state):
+                    return at.ALL_OUTPUT_DONE
+                end = look_at_partition(f, w, control, clock, out_steps[filled[1] - 1, at.H], lands, state)
                 if end != at.GO_ON:
                     return end
                 continue
@@ -287,7 +303,7 @@ def advance(
             clock[at.H_NEXT] = size if control[at.FIRST_GIVEN] == 1.0 else proposal
             continue
         if not accepted:
-            end = _refused(f, w, control, clock, t, size, proposal)
+            end = _refused(f, w, control, clock, t, size, proposal, state)
             if end != at.GO_ON:
                 return end
             continue
@@ -315,12 +331,10 @@ def advance(
         if clock[at.LIMIT_AGE] > control[at.LIMIT_MEMORY]:
             clock[at.H_LIMIT] = control[at.LIMIT_START]
             clock[at.FAILURE_CODE] = DONE  # until then it is why steps are short
-        if lands or fixed:
+        if lands and _was_last(f, w, clock, outputs, state):
+            return at.ALL_OUTPUT_DONE
+        if fixed and not lands:
             note_output(f, w, clock, state)
-        if lands:
-            clock[at.NEXT_OUTPUT] += 1.0
-            if int(clock[at.NEXT_OUTPUT]) == outputs.size:
-                return at.ALL_OUTPUT_DONE
         if FIRST_JUDGED <= w.counters[N_ACCEPTED] <= control[at.PROVISIONAL] and clock[at.H_NEXT] <= tolerances[GAP]:
             clock[at.H_FAILED] = clock[at.H_NEXT]
             return at.HAS_TO_GIVE_WAY

@@ -10,6 +10,7 @@ from twoloop.generate.lobatto_tables import tables
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.time_dependence import may_be_narrow
 from twoloop.generate.traced_values import Check, unchecked
+from twoloop.kernels.data.collocation import ORDER
 from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import LARGEST_MOVE, Plan
 from twoloop.problem.system import ConstrainedSystem
@@ -93,7 +94,7 @@ class Lobatto16:
             kernels.LOBATTO,
             options,
             np.zeros(kernels.memory_size(*sizes)),
-            exponent=1.0 / kernels.ORDER,
+            exponent=1.0 / ORDER,
             watchful=True,
             projects=True,
             looks_within=True,

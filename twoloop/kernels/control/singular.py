@@ -24,9 +24,18 @@ NEARER = 0.25  # of the smallest sine at the start of a step: one that ends near
 
 
 @merged
-def near_singular(w, control, clock):
-    """Whether C_q was close to losing rank when the partition was chosen, and the caller wants to know."""
-    return control[at.BRIDGE] == 1.0 and w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]
+def near_singular(f, w, control, clock, t, q):
+    """Whether C_q was close to losing rank when the partition was chosen, and the caller wants to know.
+
+    Where steps have no use for partitions, the last one may be old: with a run that has come near such a position once
+    it is chosen anew.
+    """
+    if control[at.BRIDGE] == 0.0:
+        return False
+    old = f.flags[STRAIGHT] == 1 and w.notes[NEARLY_SINGULAR] == 1.0
+    if old and renew_partition(f, w, t, q) != DONE:
+        return True
+    return w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]
 
 
 @merged
@@ -119,4 +128,4 @@ def look_at_partition(f, w, control, clock, size, lands, state):
             return at.RANK_LOST
         if control[at.BRIDGE] == 0.0 and w.notes[PIVOT] < UNDETERMINED * clock[at.LARGEST_PIVOT]:
             return at.RANK_LOST  # no step led across, and velocities would follow from rounding
-    return at.NEAR_SINGULAR if short and near_singular(w, control, clock) else at.GO_ON
+    return at.NEAR_SINGULAR if short and near_singular(f, w, control, clock, clock[at.T], state[:n]) else at.GO_ON

@@ -190,13 +190,12 @@ OWN_FUNCTIONS = {
     "own_closer": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR),
     "own_nearer": types.boolean(f8, *[VECTOR] * 8),
     "own_redundant": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
-    # of collocation, on a memory that data/collocation.py describes: (room, state, tolerances), (room, state, numbers),
-    # with the change of velocities, and the defect between nodes, as their results, (room, state), (room, state,
+    # of collocation, on a memory that data/collocation.py describes: (room, state, tolerances, numbers), with how the
+    # stages ended as its result; (room, state, numbers), with the defect between nodes; (room, state); (room, state,
     # new_state); (room, numbers)
-    "begin_nodes": types.none(*[VECTOR] * 3),
-    "sweep_nodes": f8(*[VECTOR] * 3),
+    "attempt_nodes": f8(*[VECTOR] * 4),
     "audit_nodes": f8(*[VECTOR] * 3),
-    "judge_nodes": types.none(*[VECTOR] * 2),
+    "retry_nodes": types.none(*[VECTOR] * 2),
     "end_nodes": types.none(*[VECTOR] * 3),
     "closer_ends": types.none(*[VECTOR] * 2),
     "nearer_ends": types.none(*[VECTOR] * 2),

@@ -13,11 +13,14 @@ import math
 
 from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control import clock as at
+from twoloop.kernels.control.controller import UNFORESEEN
+from twoloop.kernels.control.landing import off_grid
 from twoloop.kernels.control.predictor import departure, keep_predicted
 from twoloop.kernels.control.progress import count_step
+from twoloop.kernels.control.singular import COLLAPSED, SHORT, SINGULAR_PIVOT
 from twoloop.kernels.data import collocation as room_at
 from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED, UNSUITED
-from twoloop.kernels.data.collocation import LANES, places
+from twoloop.kernels.data.collocation import GUESSED, LANES, LEFT, MADE, REFUSED, places
 from twoloop.kernels.data.common import ATTEMPT, MANY, SETTLE, Attempt, Step, compiled, inlined, kernel, merged
 from twoloop.kernels.data.counters import (
     N_ACCEPTED,
@@ -27,34 +30,23 @@ from twoloop.kernels.data.counters import (
     N_OUTER,
     N_REJECTED_ERROR,
 )
-from twoloop.kernels.data.noted import BY_GENERAL, DEFECT, NEARLY_SINGULAR, ORIENTATION_NEW, ROUNDED
+from twoloop.kernels.data.noted import BY_GENERAL, DEFECT, NEARLY_SINGULAR, ORIENTATION_NEW, PIVOT, ROUNDED
 from twoloop.kernels.data.tolerances import ESTIMATE, LOOK, ROUNDING, allowed
 from twoloop.kernels.evaluation.calls import check_redundant, project
-from twoloop.kernels.evaluation.gamma import representable
 from twoloop.kernels.evaluation.onto_constraints import ABOVE_ROUNDING
 
 # FREE: how many times LOOK a step may be long that nothing is looked at within, beside the nodes
 THETA, N_ITERATED, N_ROWS, FREE, N_OPTIONS = range(5)
 
-KAPPA = 0.05  # of the tolerance: what the iteration may leave; errors are then at most those of other methods of ours
-TARGET = 6.0  # sweeps that a step is to take
-MORE = 7  # sweeps beyond the target, after which a step is refused
-SLOW = 0.8  # contraction that is too slow
-LEAST_RHO, MOST_RHO = 1e-3, 0.9
-SLOW_START, FAST_START, WANTED_START = 0.3, 0.04, 0.12  # contraction of the first step: between the first two is well
+WANTED_START = 0.12  # contraction of the first step, see collocation_code.py
 MOST_STARTS = 4
-STAGNANT, NOISE = 0.5, 1e-13  # changes that fall no further, and are this small relative to the values, are rounding
-# of steps without an estimate of their error; forces may have rounding errors of their own
-ROUNDING_OF_FIXED, NOISE_OF_FIXED, MOST_OF_FIXED = 1e-16, 1e-9, 60.0
-ORDER, SHARE = 12.0, 0.5  # of the estimate of the error; and what it counts
 SHORTER, SAFETY = 0.6, 0.65
-UNFORESEEN = 10.0  # an error that is so large is looked at elsewhere
 LIMITED, STRAIGHT = 24.0, 0.1  # such steps, after which another method goes on; what the iteration leaves of CURVED
-REFUSALS = 12.0  # of REFUSED, which each accepted step lessens by 1 and each that did not converge raises by 2
+REFUSALS = 12.0  # of UNMADE, which each accepted step lessens by 1 and each that did not converge raises by 2
 BETWEEN = 0.0908  # of a step, the longest part that an audit leaves unseen: half that between two nodes
-ALLOWED = 16.0  # the defect between nodes, over the tolerances: most of it does not last to the end
 EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
-MADE, REFUSED, GUESSED, LEFT = range(4)
+GROWTH_AT_ONCE = 30.0  # after a step at the beginning that needed a single sweep
+LEAST_TREND, FAR = 0.5, 3.0
 _places = merged(places)
 
 
@@ -70,36 +62,12 @@ def _room(memory):
 
 
 @merged
-def _sweeps(f, room, tolerances, state, first):
-    """Iterate the stages: how that ended, after how many sweeps, the last change, and how many there should be."""
-    estimated = tolerances[ESTIMATE] == 1.0
-    target, kappa, noise, most = TARGET, KAPPA, NOISE, MOST_OF_FIXED
-    if room[room_at.DEGREE] >= 7.0:
-        target += 2.0
-    elif room[room_at.DEGREE] >= 6.0:
-        target += 1.0
-    if estimated:
-        most = target + MORE
-    else:
-        kappa, noise = ROUNDING_OF_FIXED, NOISE_OF_FIXED
-    noise *= room[room_at.SIZE] * room[room_at.STRICTER]
-    rho, before, m = room[room_at.RHO], math.inf, 0.0
-    while True:
-        change = room[room_at.STRICTER] * f.sweep_nodes(room, state, f.own_numbers)
-        m += 1.0
-        if not change >= 0.0:
-            return LEFT, m, change, target
-        if m > 1.0:
-            rho = min(max(change / before, LEAST_RHO), MOST_RHO) if before > 0.0 else LEAST_RHO
-            room[room_at.RHO] = rho
-        begins = first and estimated and m == 2.0 and room[room_at.STARTS] < MOST_STARTS and change > 0.0
-        if begins and not FAST_START <= rho <= SLOW_START:
-            return GUESSED, m, change, target
-        if rho * change <= kappa or (m > 2.0 and change >= STAGNANT * before and change <= noise):
-            return MADE, m, change, target
-        if not change < math.inf or (m > 3.0 and rho >= SLOW and estimated) or m >= most:
-            return REFUSED, m, change, target
-        before = change
+def _keep_refused(f, room, state):
+    """The polynomial of a step with too large an error is good enough to predict a shorter one in its place."""
+    f.retry_nodes(room, state)
+    if room[room_at.KEPT_DEGREE] == 0.0:
+        room[room_at.KEPT_DEGREE] = max(room[room_at.DEGREE], 3.0)
+    room[room_at.DEGREE], room[room_at.H_BEFORE], room[room_at.PREDICTS] = 8.0, room[room_at.H], 1.0
 
 
 @compiled
@@ -110,79 +78,73 @@ def _collocate(f, w, options, room, tolerances, t, h, state):
     if estimated and h > longest * (1.0 + ROUNDING):
         return REFUSED, h / longest, longest / h
     room[room_at.T], room[room_at.H], room[room_at.DEFECT] = t, h, -1.0
+    room[room_at.MAY_GUESS] = 0.0
     if first:
         room[room_at.H_BEFORE], room[room_at.DEGREE], room[room_at.RHO] = h, 0.0, WANTED_START
-    f.begin_nodes(room, state, tolerances)
-    ended, m, change, target = _sweeps(f, room, tolerances, state, first)
-    rho = room[room_at.RHO]
-    w.counters[N_OUTER] += int(m)
-    w.counters[N_EVALUATIONS] += LANES * int(m)
-    w.counters[N_FACTORIZATIONS] += LANES * int(m)
+        room[room_at.MAY_GUESS] = 1.0 if estimated and room[room_at.STARTS] < MOST_STARTS else 0.0
+    ended = int(f.attempt_nodes(room, state, tolerances, f.own_numbers))
+    m = int(room[room_at.SWEEPS])
+    w.counters[N_OUTER] += m
+    w.counters[N_EVALUATIONS] += LANES * m
+    w.counters[N_FACTORIZATIONS] += LANES * m
     if ended == GUESSED:
         room[room_at.STARTS] += 1.0
-        return ended, 2.0, min(max(WANTED_START / rho, 0.05), 30.0)
+        return ended, 2.0, min(max(WANTED_START / room[room_at.RHO], 0.05), 30.0)
     if ended != MADE:
-        room[room_at.REFUSED] += 2.0
+        room[room_at.UNMADE] += 2.0
         return ended, 2.0, SHORTER
     if not estimated:
         return MADE, 0.0, 1.0
-    f.judge_nodes(room, state)
-    error = SHARE * room[room_at.ERROR]
+    error = room[room_at.ERROR]
     if not error <= 1.0:
-        return REFUSED, error, min(max(0.9 * error ** (-1.0 / ORDER), 0.3), 0.9)
+        _keep_refused(f, room, state)
+        return REFUSED, error, min(max(0.9 * room[room_at.FACTOR_OF_ERROR], 0.3), 0.9)
     most = GROWTH_EARLY if room[room_at.N_STEPS] < EARLY else GROWTH
+    if most > GROWTH and m == 1:
+        most = GROWTH_AT_ONCE
     if h > options[FREE] * tolerances[LOOK] * (1.0 + ROUNDING):
         w.counters[N_EVALUATIONS] += LANES
         defect = f.audit_nodes(room, state, f.own_numbers)
         if defect < 0.0:
             return LEFT, 2.0, SHORTER
-        defect = max(0.0, defect - NOISE * room[room_at.LARGEST]) / ALLOWED
+        of_defect = 0.9 * room[room_at.FACTOR_OF_DEFECT]
         if defect > 1.0:
-            return REFUSED, min(defect, UNFORESEEN), max(0.3, 0.9 * defect ** (-1.0 / 9.0))
+            _keep_refused(f, room, state)
+            return REFUSED, min(defect, UNFORESEEN), max(0.3, of_defect)
         room[room_at.DEFECT] = defect
-        most = min(most, 0.9 * max(defect, 1e-9) ** (-1.0 / 9.0))
+        most = min(most, of_defect)
     most = min(most, longest / h)
-    left = math.log2(rho * change / KAPPA + 1e-30) + (target - m) * math.log2(rho)
-    factor = 2.0 ** (-(left + 1.0) / (target + 2.0))
+    beyond = room[room_at.SWEEPS] - room[room_at.TARGETED]
     # the motion hardly bends within the step, which nonetheless takes about all its sweeps
-    limited = room[room_at.CURVED] < STRAIGHT and m >= target - 1.0
+    limited = room[room_at.CURVED] < STRAIGHT and beyond >= -1.0
     room[room_at.LIMITED] = max(0.0, room[room_at.LIMITED] + (1.0 if limited else -1.0))
+    factor = room[room_at.FACTOR]
+    # how long a step may be changes from one to the next, mostly by as much as it did before
+    allowed_h = h * min(room[room_at.FACTOR_OF_ERROR], FAR)
     if error > 1e-6 and room[room_at.CURVED] >= STRAIGHT:
-        factor = min(factor, SAFETY * error ** (-1.0 / ORDER))
-    if m > target + 1.0:
+        trend = 1.0 if first else min(max(allowed_h / room[room_at.ALLOWED_H], LEAST_TREND), 1.0)
+        factor = min(factor, SAFETY * trend * room[room_at.FACTOR_OF_ERROR])
+    room[room_at.ALLOWED_H] = allowed_h
+    if beyond > 1.0:
         most = min(most, 0.9)
     return MADE, error, min(max(factor, 0.4), most)
 
 
 @merged
-def _next_degree(room):
-    """The degree of the polynomial that would have predicted the end of this step best, near the one that it had."""
-    if room[room_at.PREDICTS] == 0.0:
-        return 3.0
-    least = math.inf
-    for k in range(LANES):
-        least = min(least, room[room_at.WORST + k])
-    best = LANES
-    for k in range(LANES - 1, -1, -1):
-        if room[room_at.WORST + k] <= 1.2 * least:
-            best = k + 1
-    degree = min(max(float(best), room[room_at.DEGREE] - 2.0), room[room_at.DEGREE] + 2.0)
-    return min(max(degree, 2.0), 8.0)
-
-
-@merged
 def _accept(room):
     """The polynomial of this step predicts the next."""
+    if room[room_at.KEPT_DEGREE] > 0.0:
+        room[room_at.NEXT_DEGREE], room[room_at.KEPT_DEGREE] = room[room_at.KEPT_DEGREE], 0.0
     room[room_at.WHICH] = 1.0 - room[room_at.WHICH]
     room[room_at.DEGREE], room[room_at.H_BEFORE] = room[room_at.NEXT_DEGREE], room[room_at.H]
-    room[room_at.PREDICTS], room[room_at.REFUSED] = 1.0, max(0.0, room[room_at.REFUSED] - 1.0)
+    room[room_at.PREDICTS], room[room_at.UNMADE] = 1.0, max(0.0, room[room_at.UNMADE] - 1.0)
     room[room_at.N_STEPS] += 1.0
 
 
 @merged
 def _is_unsuited(w, room):
     """Whether another method should go on: near a singular position, and where stiffness limits the steps."""
-    stiff = room[room_at.LIMITED] >= LIMITED or room[room_at.REFUSED] >= REFUSALS
+    stiff = room[room_at.LIMITED] >= LIMITED or room[room_at.UNMADE] >= REFUSALS
     return stiff or w.notes[NEARLY_SINGULAR] == 1.0
 
 
@@ -209,7 +171,7 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
         return Attempt(DONE, error, factor)
     w.notes[DEFECT] = room[room_at.DEFECT]
     f.end_nodes(room, state, new_state)
-    room[room_at.NEXT_DEGREE], room[room_at.TRIED] = _next_degree(room), 1.0
+    room[room_at.TRIED] = 1.0
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
     keep_predicted(w, q1)
     code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
@@ -221,7 +183,7 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
 @merged
 def _project_all(f, w, options, room, n, n_ends, out_t, out_state):
     """Put the states of so many rows on the constraints, in the lanes of `room`, with accelerations and multipliers."""
-    ends = _places(n, int(options[N_ITERATED]), int(options[N_ROWS]))[4]
+    ends = _places(n, int(options[N_ITERATED]), int(options[N_ROWS]))[5]
     for k in range(LANES):
         row = min(k, n_ends - 1)
         room[ends + k] = out_t[row]
@@ -245,14 +207,21 @@ def _project_all(f, w, options, room, n, n_ends, out_t, out_state):
 
 
 @merged
-def _take(f, w, options, room, tolerances, n, k, t, row, state):
-    """Make `row`, a state beside the constraints, that of lane k, on them; whether it was near enough."""
-    _, _, _, _, ends, end_a, lam, _ = _places(n, int(options[N_ITERATED]), int(options[N_ROWS]))
+def _take(f, w, options, room, tolerances, driven, n, k, t, row, state):
+    """Make `row`, a state beside the constraints, that of lane k, on them; whether it was near enough.
+
+    Where constraints depend on time (`driven`), a velocity that they change is one that the accelerations at the nodes
+    do not explain: see kinks.py.
+    """
+    _, _, _, _, _, ends, end_a, lam, _ = _places(n, int(options[N_ITERATED]), int(options[N_ROWS]))
     if room[room_at.FINE + k] == 0.0:
         return False
     for i in range(n):
         q = room[ends + LANES * (1 + i) + k]
         if not abs(q - row[i]) <= allowed(tolerances, i, q, q):
+            return False
+        v = room[ends + LANES * (1 + n + i) + k]
+        if driven and not abs(v - row[n + i]) <= allowed(tolerances, i, v, v):
             return False
     for i in range(n):
         row[i], row[n + i] = room[ends + LANES * (1 + i) + k], room[ends + LANES * (1 + n + i) + k]
@@ -268,30 +237,48 @@ def _take(f, w, options, room, tolerances, n, k, t, row, state):
 
 
 @merged
+def _may_follow(w, room, control, clock, h):
+    """Whether a step of this length may be made in a row, and nothing has to be looked at before it."""
+    long = clock[at.H_LONG]
+    if h <= control[at.SHORTEST] or h < COLLAPSED * long or _is_unsuited(w, room):
+        return False
+    near = control[at.BRIDGE] == 1.0 and w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]
+    return not (near and h < SHORT * long)
+
+
+@merged
 def _make(f, w, options, room, tolerances, control, clock, goal, state, n_most, out_t, out_state, out_steps):
     """Steps in a row, at most so many, beside the constraints; how many."""
     n, t, n_ends = w.Q.size, clock[at.T], 0
-    while n_ends < n_most:
-        h = min(clock[at.H_NEXT], control[at.MAX_STEP])
-        short = h < 0.5 * clock[at.H_LONG] or h <= control[at.SHORTEST]
-        if short or h > 0.5 * (goal - t) or _is_unsuited(w, room):
-            return n_ends
-        h = representable(t, h)
+    while n_ends < n_most and t < goal:
+        wanted = min(clock[at.H_NEXT], control[at.MAX_STEP])
+        if not _may_follow(w, room, control, clock, wanted):
+            break
+        h, reaches = off_grid(control, t, wanted, goal - t, False)
+        if reaches:
+            h = goal - t
         ended, error, factor = _collocate(f, w, options, room, tolerances, t, h, state)
-        if ended == GUESSED or (ended == REFUSED and error <= UNFORESEEN):
+        if ended == LEFT:
+            break
+        if ended == MADE and t < clock[at.ROUGH_TO] and control[at.ROUGH] > 1.0:
+            rooted = room[room_at.FACTOR_OF_ERROR] * control[at.ROUGH] ** (-1.0 / room_at.ORDER)
+            factor = min(factor, SAFETY * rooted)
+            if error * control[at.ROUGH] > 1.0:
+                ended, factor = REFUSED, min(max(0.9 * rooted, 0.3), 0.9)
+        if ended != MADE:
             clock[at.H_NEXT] = h * factor
             w.counters[N_REJECTED_ERROR] += 1 if ended == REFUSED else 0
+            if ended == REFUSED and error > UNFORESEEN:
+                clock[at.ROUGH_TO] = t + h
             continue
-        if ended != MADE:
-            return n_ends
         f.end_nodes(room, state, state)
-        room[room_at.NEXT_DEGREE] = _next_degree(room)
         _accept(room)
-        t += h
+        t = goal if reaches else t + h
         out_t[n_ends], out_steps[n_ends, at.H] = t, h
         room[room_at.DEFECTS + n_ends] = room[room_at.DEFECT]
         copy(state[: 2 * n], out_state[n_ends, : 2 * n])
-        clock[at.H_NEXT] = h * factor
+        # a step cut short by an output time says little about the next
+        clock[at.H_NEXT] = max(h * factor, wanted) if h < wanted else h * factor
         n_ends += 1
     return n_ends
 
@@ -314,13 +301,14 @@ def lobatto_steps(
     if n_most > control[at.MAX_STEPS] - w.counters[N_ACCEPTED]:
         n_most = int(control[at.MAX_STEPS]) - w.counters[N_ACCEPTED]
     copy(state, new_state)
+    driven = control[at.DRIVEN] == 1.0
     n_ends = _make(f, w, options, room, tolerances, control, clock, goal, state, n_most, out_t, out_state, out_steps)
     if n_ends == 0:
         return 0
     _project_all(f, w, options, room, n, n_ends, out_t, out_state)
     for k in range(n_ends):
         h = out_steps[k, at.H]
-        if not _take(f, w, options, room, tolerances, n, k, out_t[k], out_state[k], state):
+        if not _take(f, w, options, room, tolerances, driven, n, k, out_t[k], out_state[k], state):
             if k == 0:
                 copy(new_state, state)
             clock[at.H_NEXT], room[room_at.PREDICTS] = SHORTER * h, 0.0
