@@ -1,4 +1,4 @@
-"""Two commits side by side: what a step, an evaluation and a start cost in each, repetitions interleaved.
+"""Two commits side by side: what a step of each method and a start cost, repetitions interleaved.
 
     python -m studies.bench_commits BASE [--head COMMIT] [--short]
 
@@ -21,19 +21,18 @@ from typing import Any
 from studies.bench import cli
 from studies.bench.cli import ROOT, StudyError
 from studies.bench.render import number, table
-from studies.bench_side import METHODS
+from studies.bench_side import START
 
 SIDE = Path(__file__).with_name("bench_side.py")
-NAMES = ("compile", "evaluation", *(f"step of {method}" for method in METHODS), "sol")
-ROUNDS, SHORT_ROUNDS = 15, 1
-SHORT = ("compile", "evaluation", "step of Adams")
+METHODS = ("Taylor", "Adams", "DOP853", "Gauss12", "SunRadau5", "RadauIIA5", "RadauIIA9", "BDF", "TRBDF2", "auto")
+ROUNDS = 15
 NOISE = 0.05  # medians that differ by less are called equal
 
-Measured = dict[str, list[dict[str, Any]]]  # by benchmark, the repetitions
+Measured = dict[str, list[dict[str, Any]]]  # by method, the repetitions
 
 
 def measure(folders: Mapping[str, Path], names: Sequence[str], rounds: int) -> dict[str, Measured]:
-    """By side, what each repetition of each benchmark took; the sides take turns, and who is first changes.
+    """By side, what each repetition of each method took; the sides take turns, and who is first changes.
 
     Raises StudyError if a process ends before it has answered, with what it said.
     """
@@ -43,7 +42,7 @@ def measure(folders: Mapping[str, Path], names: Sequence[str], rounds: int) -> d
         for turn in range(rounds):
             for name in names:
                 order = list(folders) if turn % 2 == 0 else list(folders)[::-1]
-                for side in order if turn == 0 or name != "compile" else ():
+                for side in order if turn == 0 or name != START else ():
                     measured[side][name].append(_ask(side, processes[side], name))
     return measured
 
@@ -80,7 +79,7 @@ def _ask(side: str, process: subprocess.Popen[str], name: str) -> dict[str, Any]
 
 
 def compared(measured: Mapping[str, Measured], sides: tuple[str, str]) -> Iterator[list[Any]]:
-    """Lines of the table: benchmark, medians of both sides in µs, their ratio, and counts of both."""
+    """Lines of the table: method, medians of both sides in µs, their ratio, and counts of both."""
     for name in measured[sides[0]]:
         cells: list[Any] = [name]
         both = [measured[side][name] for side in sides]
@@ -117,9 +116,9 @@ def _work(words: Sequence[str] | None) -> None:
     parser = argparse.ArgumentParser(prog="python -m studies.bench_commits", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("base", help="the commit to compare with")
     parser.add_argument("--head", help="the other commit; without it the folder as it is")
-    parser.add_argument("--short", action="store_true", help="one round of a few benchmarks")
+    parser.add_argument("--short", action="store_true", help="one round of one method")
     given = parser.parse_args(words)
-    names, rounds = (SHORT, SHORT_ROUNDS) if given.short else (NAMES, ROUNDS)
+    names, rounds = ((START, "Adams"), 1) if given.short else ((START, *METHODS), ROUNDS)
     with ExitStack() as stack:
         sides = (given.base, given.head or "here")
         if sides[0] == sides[1]:
@@ -127,14 +126,10 @@ def _work(words: Sequence[str] | None) -> None:
         folders = {given.base: stack.enter_context(work_tree(given.base))}
         folders[sides[1]] = stack.enter_context(work_tree(given.head)) if given.head else ROOT
         measured = measure(folders, names, rounds)
-    header = ["benchmark", f"{sides[0]} (µs)", f"{sides[1]} (µs)", "ratio", "counts"]
+    header = ["a step of", f"{sides[0]} (µs)", f"{sides[1]} (µs)", "ratio", "counts"]
     print(table(header, compared(measured, sides)))
     print(f"\nFour-bar, 10 s, tolerance 1e-8; medians of {rounds}, interleaved; =: within {100 * NOISE:g} %.")
 
 
-def main(words: Sequence[str] | None = None) -> None:
-    cli.main(_work, words)
-
-
 if __name__ == "__main__":
-    main()
+    cli.main(_work)

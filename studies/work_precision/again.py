@@ -18,11 +18,9 @@ from studies.bench.cli import StudyError
 from studies.bench.headline import OWN_CODE
 from studies.bench.row_files import versions
 from studies.bench.store import KeptRows, Output
-from studies.compare import GROUP as LENGTH
 from studies.work_precision import first_calls, mechanisms, minimal, study
 
 DEFAULT_BESIDE, BESIDE = "the default and CyRK", (OWN_CODE, "CyRK, DOP853", "CyRK, Vern8")
-AT_LENGTH = ", at length"  # after the name of a case: the runs over its whole motion
 IN_ANGLES = ", in angles"  # after that of a mechanism: the runs of its equations in minimal coordinates
 
 
@@ -49,8 +47,6 @@ def parts() -> dict[str, Part]:
         found[family] = Part(mechanisms.GROUP, None, partial(mechanisms.collect, own), family)
     beside = [run for run in runs if run.solver.name in BESIDE]
     found[DEFAULT_BESIDE] = Part(mechanisms.GROUP, None, partial(mechanisms.collect, beside), solvers=BESIDE)
-    for case in study.known_cases(False):
-        found[case.name + AT_LENGTH] = Part(LENGTH, case.name, partial(study.at_length, [case], False))
     found["first calls"] = Part(first_calls.GROUP, None, partial(first_calls.collect, quick=False))
     for name in minimal.problems(False):
         found[name + IN_ANGLES] = Part(minimal.GROUP, name, partial(minimal.collect, quick=False, names=[name]))

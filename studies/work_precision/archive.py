@@ -14,25 +14,18 @@ from studies.bench import cli, tables
 from studies.bench.cli import REPORTS
 from studies.bench.row_files import in_format
 from studies.bench.store import read_rows
-from studies.compare import GROUP as LENGTH
 from studies.work_precision.mechanisms import GROUP
 from studies.work_precision.study import with_one_name
 from twoloop.rows.leaderboard import ARCHIVE
 from twoloop.rows.row_format import Row, format_rows
 
-MEASURED = {  # what the errors of a group are
-    GROUP: {"error_end": "error_q", "floor_end": "floor"},
-    LENGTH: {"error": "error_q", "floor": "floor"},
-}
+ERRORS = {"error_end": "error_q", "floor_end": "floor"}  # by their names in the format
 
 
 def archived(rows: pd.DataFrame, versions: dict[str, str]) -> list[Row]:
     """Convert rows of all runs compared to the format; `versions`: of the other projects' packages."""
-    found = []
-    for group, columns in MEASURED.items():
-        medians = tables.medians(rows[rows["group"] == group])
-        found += [in_format(run, columns, versions) for run in medians.to_dict("records")]
-    return found
+    medians = tables.medians(rows[rows["group"] == GROUP])
+    return [in_format(run, ERRORS, versions) for run in medians.to_dict("records")]
 
 
 def made_of(folder: Path) -> str:

@@ -1,10 +1,6 @@
-"""Every mechanism with every solver: what an accuracy costs, and whether twoloop or another solver is faster.
-
-Four cases are also run over their whole motion (`at_length`), for the page in the browser and the archive of rows.
-"""
+"""Every mechanism with every solver: what an accuracy costs, and whether twoloop or another solver is faster."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -13,50 +9,23 @@ import pandas as pd
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from studies.bench import adaptive, cases, figures, headline, solvers, study, tables
-from studies.bench.collector import REPEATS, Case, Run, row_of
+from studies.bench import figures, headline, study, tables
+from studies.bench.collector import REPEATS
 from studies.bench.index import short
 from studies.bench.render import number, power, render
 from studies.bench.row_files import versions
-from studies.bench.store import KeptRows, Output
-from studies.compare import runs_of
+from studies.bench.store import Output
 from studies.work_precision import first_calls, mechanisms, minimal, processors
 from studies.work_precision.mechanisms import HEADLINE, RESOLVED
 from twoloop.rows.row_format import CALIBRATION, calibration_s
 
-ERRORS = (1e-2, 1e-4, 1e-6)  # between which runs over whole motions are made
-FURTHER = ("Gauss6", solvers.IRK_LINE, solvers.QUARTER, solvers.IDA_INDEX_1)
-STIFF = ("TRBDF2", *solvers.RADAU[1:], solvers.IDA_C_ORDER_2, solvers.IDA_C_BANDED)  # in their place on stiff cases
-BETWEEN = (7e-4, 5e-4, 3e-4, 2e-4)  # tolerances of the first of these, whose loose runs lie on no line
-QUICK = (*solvers.COMPARED[:4], "RadauIIA5", "IDA, stabilised")  # others take seconds to compile or to run
-QUICK_CASES = ("four-bar",)  # the beams' references take seconds
-TIME_LIMIT = 3.0  # s of CPU of a run: slower ones are of no use beside others
 MARKS = {"alone": "ours", "missed": "others", "none": "–"}  # cells of the picture without a ratio
-
-
-def runs(case: Case, quick: bool) -> list[Run]:
-    """List the runs of a case, at every other value of the grid: `adaptive` adds values between them where needed."""
-    stiff = "stiff" in case.tags
-    if quick:
-        return runs_of(case, QUICK, quick)
-    made = runs_of(
-        case, dict.fromkeys((*solvers.COMPARED_OWN, *solvers.OTHER_SOLVERS, *(STIFF if stiff else FURTHER))), quick
-    )
-    coarse = (case.tolerances or solvers.TOLERANCES)[::2]
-    made = [run for run in made if run.solver.setting != "tol" or run.value in coarse]
-    rough = {run.solver.name: run for run in made if stiff and run.solver.name == STIFF[0]}.values()
-    return made + [replace(run, value=value) for run in rough for value in BETWEEN]
-
-
-def known_cases(quick: bool) -> list[Case]:
-    return [replace(case, time_limit=TIME_LIMIT) for case in cases.load(quick) if not quick or case.name in QUICK_CASES]
 
 
 def make(output: Output) -> pd.DataFrame:
     quick = output.call.quick
     with output.kept() as kept:
-        made = [at_length(known_cases(quick), quick, kept)]
-        made += [mechanisms.collect(mechanisms.runs(quick), kept)]
+        made = [mechanisms.collect(mechanisms.runs(quick), kept)]
         made += [first_calls.collect(kept, quick), minimal.collect(kept, quick)]
     return calibrated(pd.concat(made, ignore_index=True))
 
@@ -64,13 +33,6 @@ def make(output: Output) -> pd.DataFrame:
 def calibrated(rows: pd.DataFrame) -> pd.DataFrame:
     """Add the time that a fixed calculation takes now, by which times of several processors can be compared."""
     return rows.assign(calibration=CALIBRATION, calibration_s=calibration_s())
-
-
-def at_length(known: Sequence[Case], quick: bool, kept: KeptRows) -> pd.DataFrame:
-    """Make the rows of cases over their whole motion."""
-    made = [run for case in known for run in runs(case, quick)]
-    row = lambda run, repeat, built: row_of(run, repeat, None, built)  # noqa: E731
-    return adaptive.collect(made, kept, row, lambda run: True, () if quick else ERRORS)
 
 
 def part(rows: pd.DataFrame, group: str) -> pd.DataFrame:

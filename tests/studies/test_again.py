@@ -31,8 +31,6 @@ def test_a_mechanism_measured_again_takes_the_place_of_its_rows():
     assert made["call_s"].tolist() == [2.0, 3.0, 4.0, 9.0]
     calls = again.replaced(KEPT, parts["first calls"], rows((first_calls.GROUP, "four-bar", 8.0, "new")))
     assert calls["call_s"].tolist() == [1.0, 2.0, 4.0, 8.0]
-    length = again.replaced(KEPT, parts["four-bar" + again.AT_LENGTH], rows(("compare", "four-bar", 7.0, "new")))
-    assert length["call_s"].tolist() == [1.0, 2.0, 3.0, 7.0]
     angles = again.replaced(
         pd.concat([KEPT, rows((minimal.GROUP, "four-bar", 5.0, "old"), (minimal.GROUP, "A02, N = 1", 6.0, "old"))]),
         *(again.parts()["four-bar" + again.IN_ANGLES], rows((minimal.GROUP, "four-bar", 0.5, "new"))),

@@ -5,9 +5,10 @@ import subprocess
 import pytest
 
 from studies import bench_commits
+from studies.bench import cli
 from studies.bench.cli import ROOT, StudyError
 from studies.bench_commits import compared, measure, work_tree
-from studies.bench_side import benchmarks
+from studies.bench_side import START, step
 from twoloop import solve_dae
 from twoloop.mechanisms import four_bar
 
@@ -18,14 +19,14 @@ def measured(cpu, **counts):
 
 @pytest.mark.slow
 def test_the_same_folder_twice_does_the_same_work():
-    found = measure({"a": ROOT, "b": ROOT}, ("compile", "step of Adams", "step of Unknown"), 2)
-    a, b = found["a"]["step of Adams"], found["b"]["step of Adams"]
+    found = measure({"a": ROOT, "b": ROOT}, (START, "Adams", "Unknown"), 2)
+    a, b = found["a"]["Adams"], found["b"]["Adams"]
     assert len(a) == len(b) == 2 and a[0]["counts"] == b[0]["counts"]
     assert a[0]["counts"]["steps"] > 500 and a[0]["cpu"] > 0.0
-    assert len(found["a"]["compile"]) == 1  # of a start there is one
-    assert "KeyError" in found["a"]["step of Unknown"][0]["error"]
+    assert len(found["a"][START]) == 1  # of a start there is one
+    assert "ValueError" in found["a"]["Unknown"][0]["error"]
     lines = {line[0]: line for line in compared(found, ("a", "b"))}
-    assert lines["step of Unknown"][1:4] == ["KeyError", "KeyError", "–"] and "→" not in lines["step of Adams"][-1]
+    assert lines["Unknown"][1:4] == ["ValueError", "ValueError", "–"] and "→" not in lines["Adams"][-1]
 
 
 def test_medians_ratio_and_counts_are_of_both_sides():
@@ -35,8 +36,8 @@ def test_medians_ratio_and_counts_are_of_both_sides():
 
 
 def test_a_side_that_ends_is_an_error(tmp_path):
-    with pytest.raises(StudyError, match="the process of old ended without an answer to 'evaluation'"):
-        measure({"old": broken(tmp_path)}, ("evaluation",), 1)
+    with pytest.raises(StudyError, match="the process of old ended without an answer to 'Adams'"):
+        measure({"old": broken(tmp_path)}, ("Adams",), 1)
 
 
 def broken(path):
@@ -64,11 +65,11 @@ def test_a_work_tree_is_made_and_removed(tmp_path):
 
 def test_the_same_commit_twice_is_refused():
     with pytest.raises(SystemExit, match="base and head are the same"):
-        bench_commits.main(["HEAD", "--head", "HEAD"])
+        cli.main(bench_commits._work, ["HEAD", "--head", "HEAD"])
 
 
-def test_benchmarks_count_what_they_divide_by():
-    made = benchmarks(solve_dae, four_bar())
-    counts, units, seconds = made["step of Adams"]()
-    assert counts["steps"] == units and counts["evaluations"] > units and seconds > 0.0
-    assert made["evaluation"]()[1] == made["step of DOP853"]()[0]["evaluations"]
+def test_a_step_is_timed_and_its_counts_are_told():
+    made = step(solve_dae, four_bar(), "Adams")
+    assert made["counts"]["evaluations"] > made["counts"]["steps"] > 500 and made["cpu"] > 0.0
+    with pytest.raises(ValueError, match="method"):
+        step(solve_dae, four_bar(), "Unknown")

@@ -10,7 +10,7 @@ import pytest
 
 from references import driver
 from references.driver import user_call
-from studies.bench import cases, headline
+from studies.bench import headline
 from studies.bench.cli import REPORTS, StudyError
 from studies.bench.collector import Run
 from studies.bench.end_states import case_of
@@ -151,15 +151,6 @@ def test_every_solver_has_its_settings_and_every_mechanism_is_there():
     heyoka = [run.value for run in todo if run.solver.name == "heyoka" and run.case.name == FOUR_BAR]
     assert heyoka == list(mechanisms.BUILT) and all(run.repeats == 5 for run in todo)
     assert mechanisms.problems(False)["four-bar, second"].reference.digits["q"] > 11.5
-
-
-def test_stiff_cases_have_solvers_of_their_own():
-    for case in cases.load(False):
-        made = study.runs(case, False)
-        names = {run.solver.name for run in made}
-        assert names >= {*OTHER_SOLVERS, "auto", "auto, compiled"}
-        assert (names >= set(study.STIFF)) == ("stiff" in case.tags)
-        assert len({run.key(0) for run in made}) == len(made) and {run.repeats for run in made} == {5}
 
 
 class Kept(dict):

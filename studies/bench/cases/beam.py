@@ -56,7 +56,3 @@ def case(kind: str, name: str, quick: bool, t_end: float | None = None) -> Case:
     about: dict[str, Any] = {"conserved": False, "watched": (problem.q0.size - 5,)}  # the tip's height
     about |= {"tolerances": TOLERANCES, "time_limit": TIME_LIMIT, "timed": 0.004 if quick else 0.1}
     return Case(name, problem, t_end, partial(_known, problem, t_end), tags=TAGS[kind], note=NOTE, **about)
-
-
-def cases(quick: bool) -> list[Case]:
-    return [case(kind, f"{kind} beam", quick) for kind in MAKE]
