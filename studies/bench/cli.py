@@ -6,12 +6,13 @@ import platform
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 from twoloop import ConstraintWarning
 
@@ -40,18 +41,26 @@ class Call:
         """Return whether rows of a group or solver of one of these names are to be made."""
         return not self.only or any(name in self.only for name in names)
 
+    def wanted(self, runs: Iterable[Any]) -> list[Any]:
+        """Choose the runs whose rows are to be made."""
+        return [run for run in runs if self.wants(run.solver.name, run.group)]
+
 
 def parser(
     name: str,
     description: str | None,
     quick: str = "a small version in seconds, into reports/quick",
     folder: str = "reports",
+    parts: bool = False,
 ) -> argparse.ArgumentParser:
     """The options that all studies have; `name` is what follows `python -m studies.`."""
     made = argparse.ArgumentParser(prog=f"python -m studies.{name}", description=description)
     made.add_argument("--quick", action="store_true", help=quick)
     made.add_argument("--out", type=Path, help=f"folder for the report (default: {folder})")
     made.add_argument("--redraw", action="store_true", help="write report and figures again from the saved rows")
+    if parts:
+        what = "measure the rows of these groups or solvers again, as the CSV file names them; the others stay"
+        made.add_argument("--only", nargs="+", metavar="NAME", help=what)
     return made
 
 
@@ -64,11 +73,7 @@ def call_of(name: str, given: argparse.Namespace, words: Sequence[str] | None) -
 
 def parse(name: str, description: str | None, words: Sequence[str] | None, parts: bool = False) -> Call:
     """Read the command line of a study that has the common options, and `--only` if it can measure parts again."""
-    made = parser(name, description)
-    if parts:
-        what = "measure the rows of these groups or solvers again, as the CSV file names them; the others stay"
-        made.add_argument("--only", nargs="+", metavar="NAME", help=what)
-    return call_of(name, made.parse_args(words), words)
+    return call_of(name, parser(name, description, parts=parts).parse_args(words), words)
 
 
 def main(work: Callable[[Sequence[str] | None], None], words: Sequence[str] | None = None) -> None:

@@ -34,7 +34,8 @@ TIMED = (
     *("work_precision", "compare", "table3", "table3_full", "energy", "ensembles", "engines", "scale"),
     *("beam", "violation", "ablation"),  # parts of the study of reproduction
 )
-MADE_BY = dict.fromkeys(("motion", "step_size", "violation", "beam", "ablation"), "reproduction")
+MADE_BY = {part: f"reproduction {part}" for part in ("motion", "step_size", "violation", "beam", "ablation")}
+MADE_BY |= {"table3_full": "table3 --full"}
 LOCK = "twoloop-timed.lock"  # in the machine's folder of temporary files
 NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 
@@ -185,7 +186,7 @@ def read_rows(path: Path, *columns: str) -> tuple[pd.DataFrame, str]:
 
 def command_of(name: str) -> str:
     """Tell the command that makes NAME.csv."""
-    return f"python -m studies.{MADE_BY[name]} {name}" if name in MADE_BY else f"python -m studies.{name}"
+    return f"python -m studies.{MADE_BY.get(name, name)}"
 
 
 def key(row: pd.Series) -> str:

@@ -17,7 +17,7 @@ from studies.bench.collector import Measure, Run, collect
 from studies.bench.index import write_index
 from studies.bench.progress import track
 from studies.bench.render import render, table
-from studies.bench.store import Output, Row
+from studies.bench.store import Output, Row, command_of
 
 Make = Callable[[Output], pd.DataFrame]
 
@@ -38,15 +38,21 @@ def run_rows(
 
     def work(words: Sequence[str] | None) -> None:
         with Output(cli.parse(name, about, words, parts)) as output:
-            if output.call.only:
-                output.save_rows(*renewed(*output.load_rows(curves), lambda: make(output), output.call))
-            elif not output.call.redraw:
-                output.save_rows(make(output), cli.stamp(output.call.command))
-            report(output, *output.load_rows(curves))  # the same from new rows and from saved ones
+            report(output, *saved(output, make, curves))
             write_index(output)
         print(f"wrote the files of {name} to {output.path}")
 
     cli.main(work, words)
+
+
+def saved(output: Output, make: Make, curves: bool = False) -> tuple[pd.DataFrame, str]:
+    """Make and save rows, all or parts of them again, unless they are to be read; return them as they are read."""
+    call = output.call
+    if call.only:
+        output.save_rows(*renewed(*output.load_rows(curves), lambda: make(output), call))
+    elif not call.redraw:
+        output.save_rows(make(output), cli.stamp(call.command))
+    return output.load_rows(curves)  # the same from new rows and from saved ones
 
 
 def renewed(old: pd.DataFrame, line: str, make: Callable[[], pd.DataFrame], call: Call) -> tuple[pd.DataFrame, str]:
@@ -67,7 +73,7 @@ def renewed(old: pd.DataFrame, line: str, make: Callable[[], pd.DataFrame], call
     places = {key: k for k, key in reversed(list(enumerate(map(tuple, old[columns].astype(str).to_numpy()))))}
     order = [places.get(key, len(old)) for key in map(tuple, rows[columns].astype(str).to_numpy())]
     rows = rows.iloc[np.argsort(order, kind="stable")].reset_index(drop=True)
-    return rows, stamp_of(rows, cli.stamp(f"python -m studies.{call.study}"), cli.commit())
+    return rows, stamp_of(rows, cli.stamp(command_of(call.study)), cli.commit())
 
 
 def stamp_of(rows: pd.DataFrame, line: str, commit: str) -> str:
@@ -86,8 +92,7 @@ def rows_of(runs: Callable[[bool], Iterable[Run]], measure: Measure) -> Make:
 
     def make(output: Output) -> pd.DataFrame:
         with output.kept() as kept:
-            wanted = (run for run in runs(output.call.quick) if output.call.wants(run.solver.name, run.group))
-            return collect(wanted, kept, measure)
+            return collect(output.call.wanted(runs(output.call.quick)), kept, measure)
 
     return make
 

@@ -88,7 +88,7 @@ def make(output: Output, geometry: Geometry | None = None) -> pd.DataFrame:
         raise StudyError(f"no run with these lengths: {error}") from None
     # the calls of a cell are long enough to be timed one by one
     with output.kept() as kept:
-        rows = collect(runs(replace(case, timed=0.0), output.call.quick), kept)
+        rows = collect(output.call.wanted(runs(replace(case, timed=0.0), output.call.quick)), kept)
     return rows.assign(assumed=geometry is None)
 
 

@@ -71,7 +71,7 @@ def make(output: Output) -> pd.DataFrame:
 
     quick = output.call.quick
     first, second = four_bar.cases(quick)
-    todo, errors = runs(first, second, quick), () if quick else TARGETS
+    todo, errors = output.call.wanted(runs(first, second, quick)), () if quick else TARGETS
     compared = [run for run in todo if run.group == "comparison"]
     with output.kept() as kept:
         rows = collect([run for run in todo if run.group != "comparison"], kept, highest)

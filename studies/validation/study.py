@@ -92,8 +92,7 @@ def modelled(made: Sequence[Callable[[], Problem]], quick: bool) -> Iterator[Run
 
 def make(output: Output) -> pd.DataFrame:
     """Make the rows."""
-    todo, warm = runs(output.call.quick), set[tuple[Any, ...]]()
-    todo = [run for run in todo if output.call.wants(run.solver.name, run.group)]
+    todo, warm = output.call.wanted(runs(output.call.quick)), set[tuple[Any, ...]]()
 
     def made(run: Run) -> Row:
         # what is built for a mechanism, or for each of its tolerances, is no part of the run and its time limit
