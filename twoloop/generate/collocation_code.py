@@ -33,7 +33,7 @@ from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL
 
 Array = NDArray[np.float64]
-LONGEST = 8000  # operations of a projection
+LONGEST = 5000  # operations of the equations: code of as many takes 2 s to compile
 SMALLEST = 1e-300  # in place of a coefficient of zero
 FAILED = -1.0  # what an audit gives in place of a defect where accelerations cannot be had
 INFINITE = float("inf")
@@ -57,7 +57,7 @@ ALLOWED = 16.0  # the defect between nodes, over the tolerances: most of it does
 
 def suits(own: SharedCode) -> bool:
     """Whether the code of a mechanism takes no longer than some seconds to compile."""
-    return len(own.equations.nearer.quantities(own.equations.graph)) <= LONGEST
+    return own.equations.n_operations <= LONGEST
 
 
 class CollocationCode:

@@ -18,12 +18,14 @@ from twoloop.generate.llvm_text import BIT, DOUBLE, Module, Value, integer, widt
 from twoloop.generate.straight_line import Outputs, Solution, StraightLine
 from twoloop.generate.written import NOWHERE, Place, Written, conditions_hold
 
-LONG = 500  # operations from which on equations are written in parts
+# operations from which on equations are written in parts, which takes half as long to build: where these are for
+# projections alone, and where accelerations, too, would take half as long again by them
+LONG, LONG_OF_ALL = 200, 500
 
 
 def is_long(equations: StraightLine) -> bool:
     """Whether equations are worth their calls."""
-    return equations.n_operations > LONG
+    return equations.n_operations > (LONG_OF_ALL if equations.quick is None else LONG)
 
 
 class PartsCode:
