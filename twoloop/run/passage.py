@@ -7,7 +7,8 @@ from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import codes, noted, tolerances
 from twoloop.kernels.data.kit import Kit
 from twoloop.kernels.steps.named_step import loaded
-from twoloop.methods.plan import Plan, kept_plan
+from twoloop.methods.plan import INNER_TOL, LARGEST_MOVE, Plan
+from twoloop.methods.tableaux import gauss
 from twoloop.run.impulse import beyond_jump
 from twoloop.run.run import Run
 from twoloop.run.workspace import kit_of, kit_with
@@ -50,14 +51,11 @@ def _renew_kit(run: Run) -> None:
 
 def bridge(run: Run) -> tuple[Plan, Array]:
     """The plan and the controls for steps across a singular position, see kernels/steps/bridge.py."""
-    from twoloop.kernels.steps import bridge
-    from twoloop.methods.presets import PRESETS
-
     a, clock = run.a, run.clock
     run.crossings.append([(float(clock[a.T]), run.state.copy())])
-    plan = kept_plan(PRESETS["DOP853"], run.system.n_q, run.rtol, run.least_atol).fresh()
+    plan = _plan_across(run.system.n_q)
     control = run.control.copy()
-    control[: a.N_RULE] = plan.changed(least_error=0.0).rule
+    control[: a.N_RULE] = plan.rule
     control[a.SYMMETRIC], control[a.BRIDGE], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
     control[a.GIVES_WAY] = control[a.IN_A_ROW] = 0.0
     if control[a.FIXED_STEP] == 0.0:
@@ -65,7 +63,16 @@ def bridge(run: Run) -> tuple[Plan, Array]:
     clock[a.H_LIMIT], clock[a.LIMIT_AGE] = np.inf, 0.0
     run.lengths = [float(clock[a.H_LONG]) * part for part in BRIDGES]
     clock[a.H_NEXT] = run.lengths.pop(0)
-    return plan.changed(step=bridge.BRIDGING), control
+    return plan, control
+
+
+def _plan_across(n_q: int) -> Plan:
+    """The plan of steps across a singular position."""
+    from twoloop.kernels.steps import bridge
+
+    tableau = gauss(bridge.S)
+    options = bridge.options_array(tableau.A, tableau.b, tableau.c, INNER_TOL, LARGEST_MOVE)
+    return Plan(bridge.BRIDGING, options, np.zeros(bridge.memory_size(n_q)), exponent=1.0 / bridge.ORDER)
 
 
 def bridging_kit(kit: Kit) -> Kit:
