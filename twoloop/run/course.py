@@ -210,8 +210,10 @@ class Course:
         if self.code == a.HAS_TO_BE_DENSE or run.is_lost_without_dense(self.code):
             run.change_form()
             self.plan, self.kit, self.code = run.plan, run.kit, a.PAUSED
-        elif self.code == a.HAS_TO_GIVE_WAY:
+        elif self.code == a.HAS_TO_GIVE_WAY or self._stalls(across):
             give_way(run)
+            if self.code == a.STEP_TOO_SMALL:
+                run.clock[a.H_NEXT] = run.first_step(float(run.clock[a.T]), self.t1, run.state)
             self.plan, self.control, self.kit, self.code = run.plan, run.control, run.kit, a.PAUSED
         elif self.code == a.HAS_TO_LOAD:
             began = time.monotonic()
@@ -228,6 +230,12 @@ class Course:
             self.plan, self.control, self.code = beyond(run, self.plan, self.control, self.code, n_steps)
             if self.plan is run.plan:
                 self.kit = run.kit
+
+    def _stalls(self, across: bool) -> bool:
+        """Whether a method that has a substitute takes no step, though no singular position is near."""
+        run, a = self.run, self.run.a
+        stalls = self.code == a.STEP_TOO_SMALL and run.control[a.GIVES_WAY] == 1.0
+        return stalls and not across and run.work.notes[noted.NEARLY_SINGULAR] != 1.0
 
     def _record(self, check_derivatives: bool) -> Record:
         run, recorder, code = self.run, self.recorder, self.code
