@@ -171,6 +171,7 @@ def four_bar(
     is_default = (*lengths_array.tolist(), ground, theta3, branch) == (*DEFAULT_LENGTHS, DEFAULT_GROUND, 0.0, -1)
     L1, L2, L3 = lengths_array.tolist()
     masses = DENSITY * lengths_array
+    points = np.array([[0.0, 0.0], [0.5 * L1, 0.0], [-0.5 * L3, 0.0], [ground, 0.0]])
     system = ConstrainedSystem(
         n_q=9,
         n_c=8,
@@ -188,7 +189,7 @@ def four_bar(
         t_span=(0.0, 100.0),
         energy=PlanarEnergy(masses, masses * lengths_array**2 / 12.0, GRAVITY),
         conserved=True,
-        drawing=_drawing(L1, L3, ground),
+        drawing=Drawing(BodyPoints((GROUND, 0, 2, GROUND), points), ((0, 1), (1, 2), (2, 3)), (1, 2)),
         parameters={
             "L1": L1,
             "L2": L2,
@@ -226,11 +227,6 @@ def _joints(L2: float, L3: float, ground: float) -> list[Joint]:
         Joint("2-3", (4, 5), *bars[2], point=(-0.5 * L3, 0.0), equations=E),
         Joint("A", (6, 7), *bars[2], point=(ground, 0.0), in_space=True, equations=E),
     ]
-
-
-def _drawing(L1: float, L3: float, ground: float) -> Drawing:
-    points = np.array([[0.0, 0.0], [0.5 * L1, 0.0], [-0.5 * L3, 0.0], [ground, 0.0]])
-    return Drawing(BodyPoints((GROUND, 0, 2, GROUND), points), ((0, 1), (1, 2), (2, 3)), (1, 2))
 
 
 def _assemble(lengths: Array, ground: float, theta3: float, branch: int) -> Array:

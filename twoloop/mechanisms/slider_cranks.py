@@ -6,7 +6,6 @@ equals the length of the rod.
 
 import cmath
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -39,7 +38,7 @@ def _rows(redundant: bool) -> PlanarBodies:
     return rows
 
 
-def positions(angle: float, rate: float, acceleration: float = 0.0) -> tuple[Array, Array, Array]:
+def _states(angle: float, rate: float, acceleration: float = 0.0) -> tuple[Array, Array, Array]:
     """Return coordinates, velocities and accelerations (9,) for an angle of the crank, from the triangle."""
     pin = cmath.rect(CRANK, angle)
     pin_v, pin_a = 1j * rate * pin, (1j * acceleration - rate**2) * pin
@@ -66,7 +65,7 @@ def redundant_slider_crank() -> Problem:
     (9, 9, 2.0)
     """
     rows = _rows(True)
-    q0, v0, _ = positions(ANGLE, RATE)
+    q0, v0, _ = _states(ANGLE, RATE)
     return ready(
         *(rows, "redundant slider-crank", q0, v0, 2.0),
         conserved=True,
@@ -81,22 +80,16 @@ def redundant_slider_crank() -> Problem:
     )
 
 
-@dataclass(frozen=True)
-class Driven:
-    """Evaluate the motion of the driven slider-crank, which the drive determines."""
+def _driven_states(t: float) -> tuple[Array, Array, Array]:
+    """Return coordinates, velocities and accelerations (9,) of the driven slider-crank, which the drive determines."""
+    start, rate, amplitude, frequency = DRIVE.values()
+    s, c = math.sin(frequency * t), math.cos(frequency * t)
+    return _states(start + rate * t + amplitude * s, rate + amplitude * frequency * c, -amplitude * frequency**2 * s)
 
-    def __call__(self, t: float) -> tuple[Array, Array]:
-        """Return the states q, v (9,) at t."""
-        q, v, _ = self.full(t)
-        return q, v
 
-    def full(self, t: float) -> tuple[Array, Array, Array]:
-        """Return states and accelerations at t."""
-        start, rate, amplitude, frequency = DRIVE.values()
-        s, c = math.sin(frequency * t), math.cos(frequency * t)
-        return positions(
-            start + rate * t + amplitude * s, rate + amplitude * frequency * c, -amplitude * frequency**2 * s
-        )
+def driven_motion(t: float) -> tuple[Array, Array]:
+    """Return the states q, v (9,) of the driven slider-crank at t."""
+    return _driven_states(t)[:2]
 
 
 def driven_slider_crank() -> Problem:
@@ -111,9 +104,8 @@ def driven_slider_crank() -> Problem:
     """
     rows = _rows(False)
     rows.drive(2, **DRIVE)
-    motion = Driven()
-    q0, v0 = motion(0.0)
-    q, v, a = motion.full(2.0)
+    q0, v0 = driven_motion(0.0)
+    q, v, a = _driven_states(2.0)
     system = rows.system("driven slider-crank")
     force = np.tile([0.0, -GRAVITY, 0.0], 3) * np.repeat(MASSES, 3)
     inertia = np.column_stack([MASSES, MASSES, INERTIAS]).ravel()
@@ -131,7 +123,7 @@ def driven_slider_crank() -> Problem:
             digits={"q": 14.0, "v": 14.0, "lam": 13.0},
             verified="positions by the law of cosines, velocities by differences, the drive's torque by its power",
         ),
-        motion=motion,
+        motion=driven_motion,
         source=SOURCE,
         tags=("closed chain", "rigid", "planar", "driven"),
         purpose=(

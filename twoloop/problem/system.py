@@ -8,7 +8,7 @@ import math
 import re
 import textwrap
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -37,106 +37,6 @@ from twoloop.problem.callbacks import (
 )
 from twoloop.problem.compiled_functions import FrozenValues, pickled, unpickled
 from twoloop.problem.description import Description, Joint, check_joints
-
-
-class EvaluatedEquations:
-    """Evaluate the equations of a `ConstrainedSystem`, whose attributes these methods read."""
-
-    if TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> Any: ...
-
-    def remembered(self, key: Any, make: Callable[[], Any]) -> Any:
-        """Return `make()` and cache it for these parameters; not cached for Python functions, which may change."""
-        if self._python is not None:
-            return make()
-        if key not in self.made:
-            self.made[key] = make()
-        return self.made[key]
-
-    def remembered_at(self, key: Any, state: Any, make: Callable[[], Any]) -> Any:
-        """Return `make()` and cache it until it is asked for at another state."""
-        if self._python is not None:
-            return make()
-        cached = self.made.get(key)
-        if cached is None or cached[0] != state:
-            cached = self.made[key] = state, make()
-        return cached[1]
-
-    def remember_at(self, key: Any, state: Any, value: Any) -> None:
-        """Put a value into the cache of `remembered_at`."""
-        if self._python is None:
-            self.made[key] = state, value
-
-    def arrays_of(self, kind: str) -> list[Array]:
-        """Return zeros for a kind of callback to fill."""
-        return [np.zeros(shape) for shape in self._shapes[kind]]
-
-    def evaluate(self, kind: str, t: float, *state: ArrayLike) -> Any:
-        """Evaluate a callback at (t, q), (t, q, v) or (t, q, lam), as its kind requires.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong, if the callback goes out of the bounds of its arrays, or if there is none and
-            nothing can stand for it, as for gamma: the integrator then finds it by differences.
-        """
-        if kind not in KINDS:
-            raise ValueError(f"kind must be one of {', '.join(KINDS)}; given {shown(kind)}")
-        entry = KINDS[kind]
-        if entry.absent == "kernels" and kind not in self.given:
-            raise ValueError(f"{self.name!r} was given no {kind}")
-        t = check_number("t", t)
-        if not math.isfinite(t):
-            raise ValueError(f"t must be finite; given {t!r}")
-        if len(state) != len(entry.state):
-            expected = ", ".join(("t", *entry.state))
-            raise TypeError(f"{kind} is evaluated at ({expected}); given {len(state)} arrays after t")
-        arrays = []
-        for name, value in zip(entry.state, state, strict=True):
-            array = check_real(name, value)
-            if array.shape != (n := getattr(self, STATE[name]),):
-                raise ValueError(
-                    f"{name} must have shape ({n},), as {STATE[name]} = {n} in {self.name!r}; given {shaped(array)}"
-                )
-            arrays.append(np.ascontiguousarray(array))
-        check_callback(cast(Any, self), kind, t, arrays)
-        out = self.arrays_of(kind)
-        getattr(self.functions, kind)(t, *arrays, self.functions.p, *out)
-        return out[0] if len(out) == 1 else tuple(out)
-
-    def check_returned(self, t: float, q: Array, v: Array) -> None:
-        """Check the arrays that functions given with `compile=True` return at (t, q, v).
-
-        Machine code can only say that a shape is wrong, not which.
-        """
-        for kind, function in self._returning.items():
-            states = {"q": q, "v": v, "lam": np.ones(self.n_c)}
-            arguments = [states[name].copy() for name in KINDS[kind].state]
-            store(kind, self.name, t, function(t, *arguments, *self.parameters_for(kind)), self.arrays_of(kind)[0])
-
-    def velocity_constraint(self, t: float, q: Array, v: Array) -> Array:
-        """Evaluate C_q v + C_t and A v + b, (n_c + n_a,): zero for consistent velocities (eq. (4))."""
-        return self.sparse_rows(t, q) @ np.asarray(v, dtype=np.float64) + self.rates(t, q)
-
-    def rows(self, t: float, q: ArrayLike) -> Array:
-        """Evaluate C_q, then A, (n_c + n_a, n_q)."""
-        return self.jacobian(t, q) if self.n_a == 0 else np.vstack([self.jacobian(t, q), self.nonholonomic(t, q)])
-
-    def sparse_rows(self, t: float, q: ArrayLike) -> Rows:
-        """Evaluate the rows by their entries, where `jacobian_values` returns these."""
-        if self.n_a > 0 or "jacobian" not in self.entries:
-            return self.rows(t, q)
-        values, shape = self.jacobian_values(t, q), (self.n_c, self.n_q)
-        rows, columns = self.entries["jacobian"]
-        pattern = self.remembered("sparse rows", lambda: SparseRows(rows, columns, values, shape))
-        return pattern.with_values(pattern.added(values))  # type: ignore[no-any-return]
-
-    def rates(self, t: float, q: ArrayLike) -> Array:
-        """Evaluate C_t, then b, (n_c + n_a,)."""
-        rate = self.constraint_rate(t, q)
-        return rate if self.n_a == 0 else np.append(rate, self.nonholonomic_rate(t, q))
-
 
 # in a docstring, which has the indentation of the source before Python 3.13, and none since
 PLACEHOLDER = re.compile(r"^( *)\{callbacks\}\n", re.MULTILINE)
@@ -202,7 +102,7 @@ def _full_signature(function: Any) -> inspect.Signature:
 
 
 @add_callbacks
-class ConstrainedSystem(EvaluatedEquations):
+class ConstrainedSystem:
     """A constrained mechanical system, M(t, q) a + C_q^T lam + A^T mu = Q(t, q, v).
 
     Constraints are C(t, q) = 0 (with eq. (1) of the paper) and, if there are any, A(t, q) v + b(t, q) = 0, which need
@@ -510,6 +410,97 @@ class ConstrainedSystem(EvaluatedEquations):
     def kit(self) -> Kit:
         """Return the callbacks as kernels take them."""
         return self.remembered(("kit", id(self.functions)), lambda: Kit(self.functions))
+
+    def remembered(self, key: Any, make: Callable[[], Any]) -> Any:
+        """Return `make()` and cache it for these parameters; not cached for Python functions, which may change."""
+        if self._python is not None:
+            return make()
+        if key not in self.made:
+            self.made[key] = make()
+        return self.made[key]
+
+    def remembered_at(self, key: Any, state: Any, make: Callable[[], Any]) -> Any:
+        """Return `make()` and cache it until it is asked for at another state."""
+        if self._python is not None:
+            return make()
+        cached = self.made.get(key)
+        if cached is None or cached[0] != state:
+            cached = self.made[key] = state, make()
+        return cached[1]
+
+    def remember_at(self, key: Any, state: Any, value: Any) -> None:
+        """Put a value into the cache of `remembered_at`."""
+        if self._python is None:
+            self.made[key] = state, value
+
+    def arrays_of(self, kind: str) -> list[Array]:
+        """Return zeros for a kind of callback to fill."""
+        return [np.zeros(shape) for shape in self._shapes[kind]]
+
+    def evaluate(self, kind: str, t: float, *state: ArrayLike) -> Any:
+        """Evaluate a callback at (t, q), (t, q, v) or (t, q, lam), as its kind requires.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong, if the callback goes out of the bounds of its arrays, or if there is none and
+            nothing can stand for it, as for gamma: the integrator then finds it by differences.
+        """
+        if kind not in KINDS:
+            raise ValueError(f"kind must be one of {', '.join(KINDS)}; given {shown(kind)}")
+        entry = KINDS[kind]
+        if entry.absent == "kernels" and kind not in self.given:
+            raise ValueError(f"{self.name!r} was given no {kind}")
+        t = check_number("t", t)
+        if not math.isfinite(t):
+            raise ValueError(f"t must be finite; given {t!r}")
+        if len(state) != len(entry.state):
+            expected = ", ".join(("t", *entry.state))
+            raise TypeError(f"{kind} is evaluated at ({expected}); given {len(state)} arrays after t")
+        arrays = []
+        for name, value in zip(entry.state, state, strict=True):
+            array = check_real(name, value)
+            if array.shape != (n := getattr(self, STATE[name]),):
+                raise ValueError(
+                    f"{name} must have shape ({n},), as {STATE[name]} = {n} in {self.name!r}; given {shaped(array)}"
+                )
+            arrays.append(np.ascontiguousarray(array))
+        check_callback(self, kind, t, arrays)
+        out = self.arrays_of(kind)
+        getattr(self.functions, kind)(t, *arrays, self.functions.p, *out)
+        return out[0] if len(out) == 1 else tuple(out)
+
+    def check_returned(self, t: float, q: Array, v: Array) -> None:
+        """Check the arrays that functions given with `compile=True` return at (t, q, v).
+
+        Machine code can only say that a shape is wrong, not which.
+        """
+        for kind, function in self._returning.items():
+            states = {"q": q, "v": v, "lam": np.ones(self.n_c)}
+            arguments = [states[name].copy() for name in KINDS[kind].state]
+            store(kind, self.name, t, function(t, *arguments, *self.parameters_for(kind)), self.arrays_of(kind)[0])
+
+    def velocity_constraint(self, t: float, q: Array, v: Array) -> Array:
+        """Evaluate C_q v + C_t and A v + b, (n_c + n_a,): zero for consistent velocities (eq. (4))."""
+        return self.sparse_rows(t, q) @ np.asarray(v, dtype=np.float64) + self.rates(t, q)
+
+    def rows(self, t: float, q: ArrayLike) -> Array:
+        """Evaluate C_q, then A, (n_c + n_a, n_q)."""
+        return self.jacobian(t, q) if self.n_a == 0 else np.vstack([self.jacobian(t, q), self.nonholonomic(t, q)])
+
+    def sparse_rows(self, t: float, q: ArrayLike) -> Rows:
+        """Evaluate the rows by their entries, where `jacobian_values` returns these."""
+        if self.n_a > 0 or "jacobian" not in self.entries:
+            return self.rows(t, q)
+        values, shape = self.jacobian_values(t, q), (self.n_c, self.n_q)
+        rows, columns = self.entries["jacobian"]
+        pattern = self.remembered("sparse rows", lambda: SparseRows(rows, columns, values, shape))
+        return pattern.with_values(pattern.added(values))  # type: ignore[no-any-return]
+
+    def rates(self, t: float, q: ArrayLike) -> Array:
+        """Evaluate C_t, then b, (n_c + n_a,)."""
+        rate = self.constraint_rate(t, q)
+        return rate if self.n_a == 0 else np.append(rate, self.nonholonomic_rate(t, q))
 
     def __copy__(self) -> ConstrainedSystem:
         system = object.__new__(type(self))

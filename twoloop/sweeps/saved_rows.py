@@ -154,7 +154,7 @@ def _fingerprint_of_package() -> str:
 
 
 class _Fingerprint(Digest):
-    """Follows plain functions, classes and objects as well; installed code is represented by its name and version."""
+    """Follow plain functions, classes and objects as well; installed code is represented by its name and version."""
 
     def __init__(self) -> None:
         super().__init__()
