@@ -401,7 +401,8 @@ class CollocationCode:
             of_q = self._combined(emit, tables().positions_between, a0, room, integer(i))
             v[i] = emit.fused(h, of_v, emit.splat(v0))
             q[i] = emit.fused(emit.multiply(h, h), of_q, emit.fused(length, emit.splat(v0), emit.splat(q0)))
-        a, holds = write_accelerations(emit, self.equations, [emit.add(t, length), *q, *v], self.numbers)
+        write = write_mass_first if self.has_others else write_accelerations
+        a, holds = write(emit, self.equations, [emit.add(t, length), *q, *v], self.numbers)
         worst = largest = zero
         for i, value in enumerate(a):
             a0 = one.load(state, 2 * n + i)
