@@ -35,15 +35,15 @@ class Call:
     out: Path  # folder of the report
     redraw: bool  # make report and figures again from the saved rows
     command: str  # for the stamp
-    only: tuple[str, ...] = ()  # groups and solvers whose rows are measured again, beside the saved rows of the others
+    only: tuple[str, ...] = ()  # whose rows are measured again, beside the saved rows of the others
 
     def wants(self, *names: str) -> bool:
-        """Return whether rows of a group or solver of one of these names are to be made."""
+        """Return whether the rows of a run are to be made whose group, case, family and solver have these names."""
         return not self.only or any(name in self.only for name in names)
 
     def wanted(self, runs: Iterable[Any]) -> list[Any]:
         """Choose the runs whose rows are to be made."""
-        return [run for run in runs if self.wants(run.solver.name, run.group)]
+        return [run for run in runs if self.wants(run.group, run.case.name, run.solver.family, run.solver.name)]
 
 
 def parser(
@@ -59,7 +59,7 @@ def parser(
     made.add_argument("--out", type=Path, help=f"folder for the report (default: {folder})")
     made.add_argument("--redraw", action="store_true", help="write report and figures again from the saved rows")
     if parts:
-        what = "measure the rows of these groups or solvers again, as the CSV file names them; the others stay"
+        what = "measure the rows of these groups, cases, families or solvers of the CSV file again; the others stay"
         made.add_argument("--only", nargs="+", metavar="NAME", help=what)
     return made
 

@@ -78,7 +78,7 @@ def line_of(folder: Path, name: str) -> dict[str, Any] | None:
 
 def made_on(rows: pd.DataFrame, stamp: str) -> tuple[str, list[str]]:
     """Tell the date of a stamp, and the processors on which the rows were measured: those of their column if any."""
-    day, parts = re.search(r"\d{4}-\d{2}-\d{2}", stamp), stamp.split("; ")
+    day, parts = re.search(r"\d{4}-\d{2}-\d{2}( to \d{4}-\d{2}-\d{2})?", stamp), stamp.split("; ")
     known = rows["processor"].dropna().unique().tolist() if "processor" in rows else []
     known = known or [part.split(",")[0] for part in parts if re.search(r", \d+ cores", part)]
     return day[0] if day else "unknown", list(dict.fromkeys(map(short, known)))

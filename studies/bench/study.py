@@ -20,6 +20,7 @@ from studies.bench.render import render, table
 from studies.bench.store import Output, Row, command_of
 
 Make = Callable[[Output], pd.DataFrame]
+NAMED = ("group", "case", "family", "solver", "way")  # columns by whose names rows are measured again
 
 
 def run_rows(
@@ -56,24 +57,30 @@ def saved(output: Output, make: Make, curves: bool = False) -> tuple[pd.DataFram
 
 
 def renewed(old: pd.DataFrame, line: str, make: Callable[[], pd.DataFrame], call: Call) -> tuple[pd.DataFrame, str]:
-    """Put new rows of some groups or solvers in the place of the old ones, with commit and processor; tell the stamp.
+    """Put new rows of some names in the place of the old ones, with commit and processor; tell the stamp.
 
-    Raises StudyError if the old rows have no group or solver of a name.
+    Raises StudyError if the old rows, or the new ones, have no group, case, family or solver of a name.
     """
-    named = old[[column for column in ("group", "solver", "way") if column in old]].astype(str)
-    if unknown := set(call.only) - set(named.to_numpy().ravel()):
-        known = "; ".join(dict.fromkeys(named.drop(columns="group", errors="ignore").to_numpy().ravel()))
-        raise StudyError(f"no rows are of {', '.join(sorted(unknown))}; solvers are {known}")
+    columns = [column for column in NAMED if column in old]
+    replaced = old[columns].isin(call.only).any(axis=1)
+    if unknown := set(call.only) - set(old[columns].to_numpy().ravel()):
+        known = "; ".join(f"{column}: {', '.join(map(str, old[column].dropna().unique()))}" for column in columns)
+        raise StudyError(f"no rows are of {', '.join(sorted(unknown))}; there are {known}")
     commit, (_, _, _, machine, *_) = re.search(r"commit (\w+)", line), line.split("; ")
     for column, value in (("commit", commit[1] if commit else "unknown"), ("processor", machine.split(",")[0])):
         old = old.assign(**{column: old[column].fillna(value) if column in old else value})
     new = make().assign(commit=cli.commit(), processor=cli.processor())
-    rows = pd.concat([old[~named.isin(call.only).any(axis=1)], new], ignore_index=True)
-    columns = [name for name in ("group", "case", "trap", "mechanism", "solver", "way") if name in old]
-    places = {key: k for k, key in reversed(list(enumerate(map(tuple, old[columns].astype(str).to_numpy()))))}
-    order = [places.get(key, len(old)) for key in map(tuple, rows[columns].astype(str).to_numpy())]
+    if missing := set(call.only) - set(new.reindex(columns=columns).to_numpy().ravel()):
+        raise StudyError(f"no rows of {', '.join(sorted(missing))} were made; nothing is changed")
+    rows = pd.concat([old[~replaced], new], ignore_index=True)
+    keys = [name for name in (*NAMED, "trap", "mechanism") if name in old]
+    places = {key: k for k, key in reversed(list(enumerate(map(tuple, old[keys].astype(str).to_numpy()))))}
+    order = [places.get(key, len(old)) for key in map(tuple, rows[keys].astype(str).to_numpy())]
     rows = rows.iloc[np.argsort(order, kind="stable")].reset_index(drop=True)
-    return rows, stamp_of(rows, cli.stamp(command_of(call.study)), cli.commit())
+    now, before = cli.stamp(command_of(call.study)), line.split("; ")[1][:10]
+    if not replaced.all() and before not in now:
+        now = now.replace("; ", f"; {before} to ", 1)
+    return rows, stamp_of(rows, now, cli.commit())
 
 
 def stamp_of(rows: pd.DataFrame, line: str, commit: str) -> str:

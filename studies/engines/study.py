@@ -57,15 +57,19 @@ def make(output: Output) -> pd.DataFrame:
     """Make the rows of the checks, and of runs, also with a light body."""
     quick = output.call.quick
     groups: dict[str, Any] = {RUN: (four_bar, rssr)} if quick else {RUN: MECHANISMS, MASS: LIGHTENED}
+
+    def wants(group: str, build: Callable[[], Any], *names: str) -> bool:
+        return output.call.wants(group, loop_of(build).problem.name, *names)
+
     with output.kept() as kept:
         rows: list[Row] = []
         for group, build in ((group, build) for group, builds in groups.items() for build in builds):
-            for engine, name in list(NAMES.items())[:-1] if output.call.wants(GATE) else ():  # twoloop is last
+            for engine, name in list(NAMES.items())[:-1] if wants(GATE, build) else ():  # twoloop is last
                 status, message = gated(build, engine)
                 row = _row(GATE, build, solver=name, family=name, status=status, message=message)
                 rows.append(kept.made(f"{GATE} {build.__name__} {engine}", partial(dict, row)))
             for each in CONFIGURATIONS if group == RUN else EVERYWHERE:
-                if not output.call.wants(each.name, group):
+                if not wants(group, build, NAMES[each.engine], each.name):
                     continue
                 values: Any = VALUES[group][each.engine == OURS]
                 cost: list[float] = []  # of the run before, and its steps

@@ -174,11 +174,11 @@ def make(output: Output) -> pd.DataFrame:
     quick, rows = output.call.quick, []
     n = N_QUICK if quick else N_RUNS
     sets = [lambda: linkages_of(n), *(lambda name=name, t=t: of_starts(name, n, t) for name, t in STARTS.items())]
-    for build in sets[: 1 if quick else None] if output.call.wants(GROUP, *WAYS) else ():
+    for build in sets[: 1 if quick else None] if output.call.wants(GROUP, LINKAGES, *STARTS, *WAYS) else ():
         of = build()
         # diffrax takes ten seconds to compile, and minutes for larger mechanisms
         names = [way for way in WAYS if way != DIFFRAX or (of.name == LINKAGES and not quick)]
-        names = [way for way in names if output.call.wants(way, GROUP)]
+        names = [way for way in names if output.call.wants(GROUP, of.name, way)]
         rows += list(rows_of(of, names, quick))
     return pd.DataFrame([*rows, *linkages.rows(output.call)]).assign(processor=processor())
 

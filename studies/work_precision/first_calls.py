@@ -27,7 +27,7 @@ import numpy as np
 import pandas as pd
 
 from references.driver import cpu_time, user_call
-from studies.bench.cli import ROOT
+from studies.bench.cli import ROOT, Call
 from studies.bench.collector import REPEATS, Run, attempt, timed
 from studies.bench.end_states import case_of
 from studies.bench.solvers import CATALOGUE, COMPILED, CVODE_C, CYRK, DEFAULT, DIFFRAX, HEYOKA, IDA_C
@@ -48,17 +48,16 @@ LIMIT = 120.0  # s of CPU of a call
 EQUATIONS = "equations"  # folder of twoloop's code for single mechanisms in a folder of caches
 
 
-def collect(kept: KeptRows, quick: bool) -> pd.DataFrame:
+def collect(kept: KeptRows, call: Call) -> pd.DataFrame:
     """Make the rows, one a mechanism and solver."""
 
     def made(name: str, solver: str) -> Row:
         row: Row = {"group": GROUP, "case": name, "solver": solver, "tol": TOLERANCE, "repeat": 0}
         return row | {"family": CATALOGUE[solver].family, **dict.fromkeys(TIMES), **in_process(__name__, name, solver)}
 
-    pairs = product(list(MECHANISMS)[: 1 if quick else None], QUICK if quick else (DEFAULT, *BUILDING))
-    return pd.DataFrame(
-        [kept.made(f"{GROUP} | {name} | {solver}", partial(made, name, solver)) for name, solver in pairs]
-    )
+    pairs = product(list(MECHANISMS)[: 1 if call.quick else None], QUICK if call.quick else (DEFAULT, *BUILDING))
+    wanted = [pair for pair in pairs if call.wants(GROUP, *pair, CATALOGUE[pair[1]].family)]
+    return pd.DataFrame([kept.made(" | ".join((GROUP, *pair)), partial(made, *pair)) for pair in wanted])
 
 
 def in_process(module: str, *words: str) -> Row:

@@ -4,7 +4,6 @@ On the mechanisms whose loops close in closed form (`minimal.equations`). The ro
 ranking of solvers of a DAE sees. A part of `studies.work_precision`.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +12,7 @@ import pandas as pd
 
 from references.minimal.equations import has_minimal
 from studies.bench import adaptive, headline
+from studies.bench.cli import Call
 from studies.bench.collector import REPEATS, Run
 from studies.bench.end_states import case_of
 from studies.bench.solvers import CATALOGUE, HEYOKA, MINIMAL
@@ -33,11 +33,11 @@ def problems(quick: bool) -> dict[str, Problem]:
     return {name: problem for name, problem in mechanisms.problems(quick).items() if has_minimal(problem)}
 
 
-def runs(quick: bool, names: Sequence[str] = ()) -> list[Run]:
-    """List the runs of all solvers on the mechanisms of these names, or on all."""
-    found, known = [], problems(quick)
-    for name in names or known:
-        case = replace(case_of(known[name]), name=name, time_limit=TIME_LIMIT, timed=mechanisms.TIMED)
+def runs(quick: bool) -> list[Run]:
+    """List the runs of all solvers."""
+    found = []
+    for name, problem in problems(quick).items():
+        case = replace(case_of(problem), name=name, time_limit=TIME_LIMIT, timed=mechanisms.TIMED)
         values = mechanisms.QUICK_TOLERANCES if quick else TOLERANCES
         repeats = 1 if quick else REPEATS
         for solver in MINIMAL:
@@ -46,11 +46,10 @@ def runs(quick: bool, names: Sequence[str] = ()) -> list[Run]:
     return found
 
 
-def collect(kept: KeptRows, quick: bool, names: Sequence[str] = ()) -> pd.DataFrame:
-    """Make the rows of all runs, the repetitions interleaved."""
-    return adaptive.collect(
-        runs(quick, names), kept, mechanisms.row_at_end, lambda run: True, () if quick else mechanisms.RESOLVED
-    )
+def collect(kept: KeptRows, call: Call) -> pd.DataFrame:
+    """Make the rows of the runs, the repetitions interleaved."""
+    todo, errors = call.wanted(runs(call.quick)), () if call.quick else mechanisms.RESOLVED
+    return adaptive.collect(todo, kept, mechanisms.row_at_end, lambda run: True, errors)
 
 
 def findings_of(rows: pd.DataFrame, everywhere: pd.DataFrame) -> list[dict[str, Any]]:

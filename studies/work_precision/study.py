@@ -23,10 +23,10 @@ MARKS = {"alone": "ours", "missed": "others", "none": "–"}  # cells of the pic
 
 
 def make(output: Output) -> pd.DataFrame:
-    quick = output.call.quick
+    call = output.call
     with output.kept() as kept:
-        made = [mechanisms.collect(mechanisms.runs(quick), kept)]
-        made += [first_calls.collect(kept, quick), minimal.collect(kept, quick)]
+        made = [mechanisms.collect(call.wanted(mechanisms.runs(call.quick)), kept)]
+        made += [first_calls.collect(kept, call), minimal.collect(kept, call)]
     return calibrated(pd.concat(made, ignore_index=True))
 
 
@@ -74,9 +74,9 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
 
 
 def versions_of(output: Output) -> dict[str, str]:
-    """Tell the versions of the packages with which the rows were measured; if these are read again, as told then."""
-    known = output.file("work_precision.json")
-    return dict(output.load_findings()["versions"]) if output.call.redraw and known.is_file() else versions()
+    """Tell the versions of the packages with which the rows were measured; of those that are kept, as told then."""
+    old = (output.call.redraw or output.call.only) and output.file("work_precision.json").is_file()
+    return (output.load_findings()["versions"] if old else {}) | ({} if old and output.call.redraw else versions())
 
 
 def measured_on(rows: pd.DataFrame) -> dict[str, Any]:
@@ -151,4 +151,4 @@ def heat_map(found: dict[str, Any]) -> Figure:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    study.run_rows("work_precision", __doc__, words, make, report)
+    study.run_rows("work_precision", __doc__, words, make, report, parts=True)

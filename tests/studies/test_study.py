@@ -1,13 +1,18 @@
 """What studies share: curves by keys, and rows that are measured again beside others."""
 
+from datetime import date
+
 import pandas as pd
 import pytest
 
 from studies.bench import study as shared
 from studies.bench.cli import Call, StudyError, commit, processor
-from studies.bench.store import key
+from studies.bench.row_files import versions
+from studies.bench.store import Output, key
 from studies.energy import runs as energy
 from studies.reproduction import motion, step_size, violation
+from studies.work_precision import mechanisms, minimal
+from studies.work_precision import study as work_precision
 
 
 def rows_of(study, quick):
@@ -50,11 +55,14 @@ def test_rows_measured_again_take_the_place_of_those_of_their_solver():
     assert (
         rows["commit"].tolist() == [commit(), "abc"] * 2 and rows["processor"].tolist() == [processor(), "AMD EPYC"] * 2
     )
-    assert f"commit {commit()} (y: commit abc, AMD EPYC); " in line
+    assert f"2026-11-26 to {date.today()}; commit {commit()} (y: commit abc, AMD EPYC); " in line
     rows, line = renewed("run")
-    assert (rows["call_s"] == 9.0).all() and "abc" not in line
-    with pytest.raises(StudyError, match="no rows are of z; solvers are x; y"):
+    assert (rows["call_s"] == 9.0).all() and "abc" not in line and " to " not in line
+    with pytest.raises(StudyError, match="no rows are of z; there are group: run; case: a, b; solver: x, y"):
         renewed("z", "x")
+    call = Call("x", False, None, False, "", ("y",))
+    with pytest.raises(StudyError, match="no rows of y were made; nothing is changed"):
+        shared.renewed(OLD, STAMP, lambda: OLD[:1], call)
 
 
 def test_groups_of_other_commits_stand_beside_that_of_the_newest_rows():
@@ -66,4 +74,17 @@ def test_groups_of_other_commits_stand_beside_that_of_the_newest_rows():
 def test_a_study_makes_the_runs_that_are_wanted(tmp_path):
     call = Call("energy", True, tmp_path, False, "", ("heyoka",))
     assert call.wants("heyoka") and call.wants("other", "heyoka") and not call.wants("other")
+    for runs, only in ((mechanisms.runs, "four-bar"), (mechanisms.runs, "SUNDIALS"), (minimal.runs, minimal.GROUP)):
+        todo, wanted = runs(True), Call("x", True, tmp_path, False, "", (only,)).wanted(runs(True))
+        assert {only} <= {name for run in wanted for name in (run.group, run.case.name, run.solver.family)}
+        assert (len(wanted) == len(todo)) == (only == minimal.GROUP) and wanted
     assert Call("energy", True, tmp_path, False, "").wants("other")
+
+
+def test_versions_of_kept_rows_are_as_told_then(tmp_path):
+    (tmp_path / "work_precision.json").write_text('{"versions": {"heyoka": "1", "scipy": "1"}}')
+    told = {}
+    for name, redraw, only in (("read", True, ()), ("part", False, ("heyoka",)), ("all", False, ())):
+        told[name] = work_precision.versions_of(Output(Call("work_precision", False, tmp_path, redraw, "", only)))
+    assert told["read"] == {"heyoka": "1", "scipy": "1"} and told["part"] == {"heyoka": "1"} | versions()
+    assert told["all"] == versions() and versions()["scipy"] != "1"
