@@ -173,15 +173,15 @@ def plain_jacobian(t, q):
     return q.reshape((1, 2))
 
 
-def made(force=light_weight, **changed):
+def make_system(force=light_weight, **changed):
     functions = {"mass": plain_mass, "force": force, "constraint": plain_constraint, "jacobian": plain_jacobian}
     return ConstrainedSystem.from_python(n_q=2, n_c=1, **{**functions, "name": "own", **changed})
 
 
 SYSTEMS = {
-    "plain": made,
-    "plain, array mass": lambda: made(mass=LOADS),
-    "compile=True, array mass": lambda: made(mass=LOADS, compile=True),
+    "plain": make_system,
+    "plain, array mass": lambda: make_system(mass=LOADS),
+    "compile=True, array mass": lambda: make_system(mass=LOADS, compile=True),
     "compiled": lambda: ConstrainedSystem(**HEAVY_PENDULUM, parameters=[3.0], constant_mass=True, name="own"),
     "four-bar": lambda: four_bar().system,
 }
@@ -200,7 +200,7 @@ OTHERS = []
 
 def observed_beside_others(system):
     """In a process where more and more systems are, whose numbers a foreign one must not meet."""
-    OTHERS.extend(made(force=heavy_weight) for _ in range(5))
+    OTHERS.extend(make_system(force=heavy_weight) for _ in range(5))
     return observed(system), [other.force(0.0, AT, MOVING).tolist() for other in OTHERS]
 
 
@@ -242,7 +242,7 @@ def enclosing():
 @pytest.mark.parametrize("compiled", [False, True])
 @pytest.mark.parametrize("force", [lambda t, q, v: np.zeros(2), enclosing()], ids=["lambda", "closure"])
 def test_functions_without_a_name_of_their_own_say_so(force, compiled):
-    system = made(force=force, compile=compiled)
+    system = make_system(force=force, compile=compiled)
     words = r"(?s)force of 'own', .*(<lambda>|enclosing.<locals>.force), cannot be pickled.*top level of a module"
     with pytest.raises(TypeError, match=words):
         pickle.dumps(system)

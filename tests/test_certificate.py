@@ -24,9 +24,9 @@ def force(t, q, v, p, Q):
     Q[0], Q[1] = -tangential * q[1], tangential * q[0] - 9.81
 
 
-def swing(gust=0.0, at=1.5, width=1.0, friction=0.0, below=1.0):
+def swing(gust=0.0, t_gust=1.5, width=1.0, friction=0.0, below=1.0):
     """A pendulum under a gust along its path, and dry friction that is smooth below a speed."""
-    return ConstrainedSystem(**{**PENDULUM, "force": force}, parameters=[gust, at, width, friction, below])
+    return ConstrainedSystem(**{**PENDULUM, "force": force}, parameters=[gust, t_gust, width, friction, below])
 
 
 def swung(method="auto", tolerance=1e-6, system=None, **options):
@@ -42,9 +42,9 @@ def silently(result, **tolerances):
 
 def refused(result, **tolerances):
     with pytest.warns(CertificateWarning, match="Not passed"):
-        found = result.certify(**tolerances)
-    assert not found and found.defect > found.limit and str(found).startswith("Not passed")
-    return found
+        certificate = result.certify(**tolerances)
+    assert not certificate and certificate.defect > certificate.limit and str(certificate).startswith("Not passed")
+    return certificate
 
 
 METHODS = ["auto", "Taylor", "Adams", "Gauss8", "SunRadau5", "RadauIIA9", "TRBDF2", "ESDIRK4", "BDF", "PaperIRK"]
@@ -52,9 +52,9 @@ METHODS = ["auto", "Taylor", "Adams", "Gauss8", "SunRadau5", "RadauIIA9", "TRBDF
 
 @pytest.mark.parametrize(("method", "tolerance"), quick([(name, tol) for tol in (1e-4, 1e-10) for name in METHODS], 6))
 def test_right_runs_pass(default_four_bar, method, tolerance):
-    found = silently(run(default_four_bar, 1.0, method=method, rtol=tolerance, atol=tolerance))
-    assert found and found.passed and 0.0 < found.defect <= found.limit
-    assert found.gap < 1.0 / 700.0 and found.unseen == () and str(found) == found.message
+    certificate = silently(run(default_four_bar, 1.0, method=method, rtol=tolerance, atol=tolerance))
+    assert certificate and certificate.passed and 0.0 < certificate.defect <= certificate.limit
+    assert certificate.gap < 1.0 / 700.0 and certificate.unseen == () and str(certificate) == certificate.message
 
 
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
@@ -80,9 +80,9 @@ def test_velocities_that_were_not_tested_do_not_count(method):
 def test_a_gust_that_a_run_does_not_know(method, options):
     result = swung(method, **options)
     assert silently(result)
-    at = float(0.5 * (result.t[0] + result.t[-1]))
-    found = refused(replace(result, system=swing(20.0, at, 0.03)))
-    assert found.t < at + 0.06 and (len(result.t) == 2 or found.t > at - 1.0)
+    t_gust = float(0.5 * (result.t[0] + result.t[-1]))
+    certificate = refused(replace(result, system=swing(20.0, t_gust, 0.03)))
+    assert certificate.t < t_gust + 0.06 and (len(result.t) == 2 or certificate.t > t_gust - 1.0)
 
 
 @pytest.mark.parametrize("tolerance", quick([1e-6, 1e-10]))
@@ -90,8 +90,8 @@ def test_what_lasts_as_long_as_the_gap_is_seen_wherever_it_is(tolerance):
     result = swung(tolerance=tolerance)
     gap = silently(result).gap
     assert gap < END / 700.0
-    for at in np.linspace(0.2, 2.6, 12) ** 1.1:
-        assert refused(replace(result, system=swing(20.0, at, 0.5 * gap))).defect > 1e3
+    for t_gust in np.linspace(0.2, 2.6, 12) ** 1.1:
+        assert refused(replace(result, system=swing(20.0, t_gust, 0.5 * gap))).defect > 1e3
 
 
 def test_a_stored_state_that_was_altered(default_four_bar):

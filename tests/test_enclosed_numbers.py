@@ -160,7 +160,7 @@ def test_a_changed_number_is_refused_by_its_name_until_it_is_as_it_was(how, made
     function, change, name = pulls()[how]
     pull = njit(function)
 
-    def again():
+    def make_system():
         if made == "compile=True":
             return system(pull)
 
@@ -170,13 +170,13 @@ def test_a_changed_number_is_refused_by_its_name_until_it_is_as_it_was(how, made
 
         return ConstrainedSystem(n_q=2, n_c=0, mass=unit_mass, force=force, name="pendulum")
 
-    swing = again()
+    swing = make_system()
     before = solve_dae(swing, (0.0, 1.0), *START)
     change(4.0)
     with pytest.raises(ValueError, match=rf"force of 'pendulum' was compiled with {name} = .*, which is .* now"):
         solve_dae(swing, (0.0, 1.0), *START)
-    other = solve_dae(again(), (0.0, 1.0), *START)
-    assert abs(other.q[:, -1] - before.q[:, -1]).max() > 0.1
+    changed = solve_dae(make_system(), (0.0, 1.0), *START)
+    assert abs(changed.q[:, -1] - before.q[:, -1]).max() > 0.1
     change(9.81)
     assert (solve_dae(swing, (0.0, 1.0), *START).q == before.q).all()
 
@@ -193,16 +193,16 @@ def test_a_callback_that_was_compiled_before_the_change_is_refused_in_a_new_syst
 
 
 def test_an_equal_helper_and_an_equal_tuple_are_no_change():
-    def made():
+    def make_law():
         @njit
         def law(t):
             return 9.81 + 0.0 * t
 
         return law
 
-    law, pair = made(), (np.array([9.81]), 1.0)
+    law, pair = make_law(), (np.array([9.81]), 1.0)
     swing = system(njit(lambda t: 0.5 * (law(t) + pair[0][0])))
-    law, pair = made(), (np.array([9.81]), 1.0)
+    law, pair = make_law(), (np.array([9.81]), 1.0)
     assert solve_dae(swing, (0.0, 1.0), *START).success
 
 

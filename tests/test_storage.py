@@ -21,13 +21,13 @@ from twoloop import Result, Statistics, Status
 from twoloop.mechanisms import closed_chain, four_bar
 from twoloop.run import course
 
-EVERY = [field.name for field in fields(Result) if field.name != "sol"]
-TELLS = [name for name in EVERY if name not in ("stats", "system", "redundant")]
+FIELDS = [field.name for field in fields(Result) if field.name != "sol"]
+COMPARED = [name for name in FIELDS if name not in ("stats", "system", "redundant")]
 
 
-def same(one, other, names=EVERY):
+def same(first, second, names=FIELDS):
     for name in names:
-        a, b = getattr(one, name), getattr(other, name)
+        a, b = getattr(first, name), getattr(second, name)
         if isinstance(a, list):
             assert len(a) == len(b)
             assert all((x == y).all() and x.shape == y.shape for x, y in zip(a, b, strict=True)), name
@@ -41,14 +41,14 @@ def same(one, other, names=EVERY):
 def test_there_and_back(default_four_bar, tmp_path, method):
     result = run(default_four_bar, 1.0, method=method, dense_output=True, events=at_one())
     result.save(tmp_path / "run.npz")
-    again = twoloop.load(tmp_path / "run.npz", default_four_bar.system)
-    same(result, again)
-    again.save(tmp_path / "again.npz")  # what is between its steps cannot be found anew
-    again = twoloop.load(tmp_path / "again.npz", default_four_bar.system)
+    loaded = twoloop.load(tmp_path / "run.npz", default_four_bar.system)
+    same(result, loaded)
+    loaded.save(tmp_path / "again.npz")  # what is between its steps cannot be found anew
+    loaded = twoloop.load(tmp_path / "again.npz", default_four_bar.system)
     t = np.linspace(0.0, 1.0, 57)
-    one, other = result.sol(t), again.sol(t)
-    assert np.abs(one.q - other.q).max() < 1e-12 and np.abs(one.v - other.v).max() < 1e-11
-    assert np.abs(one.lam - other.lam).max() < 1e-9 and (again.sol.t_min, again.sol.t_max) == (0.0, 1.0)
+    expected, actual = result.sol(t), loaded.sol(t)
+    assert np.abs(expected.q - actual.q).max() < 1e-12 and np.abs(expected.v - actual.v).max() < 1e-11
+    assert np.abs(expected.lam - actual.lam).max() < 1e-9 and (loaded.sol.t_min, loaded.sol.t_max) == (0.0, 1.0)
 
 
 SAYS = {
@@ -103,17 +103,19 @@ STORED = [
 
 @pytest.mark.parametrize("options", quick(STORED, 4))
 def test_a_stored_run_is_the_same_as_another(default_four_bar, tmp_path, options):
-    expected, found = (run(default_four_bar, 1.0, **options, **more) for more in ({}, {"store": tmp_path / "run"}))
-    again = twoloop.load(tmp_path / "run", default_four_bar.system)
+    expected, stored = (run(default_four_bar, 1.0, **options, **store) for store in ({}, {"store": tmp_path / "run"}))
+    loaded = twoloop.load(tmp_path / "run", default_four_bar.system)
     between = "t_eval" in options and "step_size" not in options  # where other times make another partition
-    same(expected, found, [name for name in TELLS if not (between and name in ("a", "lam"))])
-    assert worst(found.a, expected.a) < 1e-10 and worst(found.lam, expected.lam) < 1e-10
-    same(found, again, TELLS)
-    assert again.stats == found.stats
+    same(expected, stored, [name for name in COMPARED if not (between and name in ("a", "lam"))])
+    assert worst(stored.a, expected.a) < 1e-10 and worst(stored.lam, expected.lam) < 1e-10
+    same(stored, loaded, COMPARED)
+    assert loaded.stats == stored.stats
     if expected.sol is not None:
         t = np.linspace(expected.sol.t_min, expected.sol.t_max, 101)
-        one, others = expected.sol(t), (found.sol(t), again.sol(t))
-        assert all((getattr(one, name) == getattr(other, name)).all() for other in others for name in ("q", "v", "lam"))
+        state, states = expected.sol(t), (stored.sol(t), loaded.sol(t))
+        assert all(
+            (getattr(state, name) == getattr(other, name)).all() for other in states for name in ("q", "v", "lam")
+        )
 
 
 @pytest.mark.parametrize("options", quick([{}, {"t_eval": True}, {"dense_output": True}]))
@@ -174,16 +176,16 @@ print(result.status.name, result.t[-1], result.t.size)
 def test_ctrl_c_and_the_death_of_the_process(default_four_bar, tmp_path, name):
     command = [sys.executable, "-c", DIES, str(tmp_path / "run"), name]
     out = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    found = twoloop.load(tmp_path / "run", default_four_bar.system)
-    assert found.status is Status.INTERRUPTED and 1.0 < found.t[-1] < 4.5
-    known = run(default_four_bar, 5.0, max_step=1e-3)
-    assert worst(found.q, known.q[:, : found.t.size]) < 1e-10
+    stored = twoloop.load(tmp_path / "run", default_four_bar.system)
+    assert stored.status is Status.INTERRUPTED and 1.0 < stored.t[-1] < 4.5
+    expected = run(default_four_bar, 5.0, max_step=1e-3)
+    assert worst(stored.q, expected.q[:, : stored.t.size]) < 1e-10
     if name == "SIGINT":
-        assert "Interrupted from the keyboard" in found.message
-        assert out.stdout.split() == ["INTERRUPTED", str(found.t[-1]), str(found.t.size)]
+        assert "Interrupted from the keyboard" in stored.message
+        assert out.stdout.split() == ["INTERRUPTED", str(stored.t[-1]), str(stored.t.size)]
     else:
-        assert out.returncode == -signal.SIGKILL and "The run was interrupted" in found.message
-        assert found.h.size in (found.t.size - 1, found.t.size)
+        assert out.returncode == -signal.SIGKILL and "The run was interrupted" in stored.message
+        assert stored.h.size in (stored.t.size - 1, stored.t.size)
 
 
 # --- files of results with anything in them: a `ValueError` that names the field, and never a crash

@@ -61,8 +61,8 @@ def test_rows_are_those_of_single_runs(rows):
     assert rows["theta3"].tolist() == [each["theta3"] for each in ANGLES]
     for number in (0, 1, 3, 4, 5):
         problem = linkage(**ANGLES[number])
-        alone = solve_dae(problem.system, (0.0, 0.3), problem.q0, problem.v0, rtol=1e-6)
-        assert rows.loc[number, "lowest"] == alone.q[1::3].min() and rows.loc[number, "status"] == "REACHED_END"
+        single = solve_dae(problem.system, (0.0, 0.3), problem.q0, problem.v0, rtol=1e-6)
+        assert rows.loc[number, "lowest"] == single.q[1::3].min() and rows.loc[number, "status"] == "REACHED_END"
         assert rows.loc[number, "system"] == "four-bar"
 
 
@@ -76,8 +76,8 @@ def test_a_failure_is_a_row(rows):
 
 
 def test_threads_give_the_same_numbers(rows):
-    other = sweep(linkage, ANGLES, measure=heights, workers=2, parallel="threads", t_span=(0.0, 0.3), rtol=1e-6)
-    pd.testing.assert_frame_equal(other.drop(columns="seconds"), rows.drop(columns="seconds"))
+    by_threads = sweep(linkage, ANGLES, measure=heights, workers=2, parallel="threads", t_span=(0.0, 0.3), rtol=1e-6)
+    pd.testing.assert_frame_equal(by_threads.drop(columns="seconds"), rows.drop(columns="seconds"))
 
 
 def test_a_dask_cluster_gives_the_same_numbers(rows):
@@ -86,8 +86,8 @@ def test_a_dask_cluster_gives_the_same_numbers(rows):
         distributed.LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None) as cluster,
         distributed.Client(cluster) as client,
     ):
-        other = sweep(linkage, ANGLES, measure=heights, client=client, t_span=(0.0, 0.3), rtol=1e-6)
-    pd.testing.assert_frame_equal(other.drop(columns="seconds"), rows.drop(columns="seconds"))
+        by_dask = sweep(linkage, ANGLES, measure=heights, client=client, t_span=(0.0, 0.3), rtol=1e-6)
+    pd.testing.assert_frame_equal(by_dask.drop(columns="seconds"), rows.drop(columns="seconds"))
 
 
 def test_an_interrupted_sweep_goes_on(tmp_path, monkeypatch):
@@ -96,18 +96,18 @@ def test_an_interrupted_sweep_goes_on(tmp_path, monkeypatch):
     monkeypatch.setattr(saved_rows, "settings", lambda work: saved_rows.Settings("the same", {}))  # of both functions
     with pytest.raises(KeyboardInterrupt):
         sweep(interrupted, ANGLES, **options)
-    kept = pd.read_parquet(out)
-    assert 0 < len(kept) < len(ANGLES) and "INTERRUPTED" not in set(kept["status"])
+    saved = pd.read_parquet(out)
+    assert 0 < len(saved) < len(ANGLES) and "INTERRUPTED" not in set(saved["status"])
     MADE.clear()
     rows = sweep(counted, ANGLES, **options)
-    assert sorted(MADE) == sorted(each["theta3"] for k, each in enumerate(ANGLES) if k not in kept.index)
-    assert len(rows) == len(ANGLES) and (rows.loc[kept.index, "seconds"] == kept["seconds"]).all()
+    assert sorted(MADE) == sorted(each["theta3"] for k, each in enumerate(ANGLES) if k not in saved.index)
+    assert len(rows) == len(ANGLES) and (rows.loc[saved.index, "seconds"] == saved["seconds"]).all()
     MADE.clear()
-    again = sweep(counted, ANGLES, **options)
+    repeated = sweep(counted, ANGLES, **options)
     assert MADE == []
-    pd.testing.assert_frame_equal(again, rows)
-    more = sweep(counted, [*ANGLES, {"theta3": 0.15}], **options)
-    assert MADE == [0.15] and len(more) == 7
+    pd.testing.assert_frame_equal(repeated, rows)
+    extended = sweep(counted, [*ANGLES, {"theta3": 0.15}], **options)
+    assert MADE == [0.15] and len(extended) == 7
 
 
 def test_rows_of_another_sweep_are_refused(tmp_path):

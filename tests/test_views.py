@@ -46,9 +46,11 @@ def test_energy_needs_a_problem(result, default_four_bar):
 def test_a_result_from_a_file_knows_what_its_system_knows(result, default_four_bar, tmp_path):
     result.save(tmp_path / "run.npz")
     assert twoloop.load(tmp_path / "run.npz").coordinates[0] == "q0"
-    table, other = result.to_dataframe(), twoloop.load(tmp_path / "run.npz", default_four_bar.system).to_dataframe()
-    assert list(other.columns) == list(table.columns)
-    np.testing.assert_allclose(other, table, rtol=1e-13)  # of another layout in memory, the energy is rounded otherwise
+    table, loaded = result.to_dataframe(), twoloop.load(tmp_path / "run.npz", default_four_bar.system).to_dataframe()
+    assert list(loaded.columns) == list(table.columns)
+    np.testing.assert_allclose(
+        loaded, table, rtol=1e-13
+    )  # of another layout in memory, the energy is rounded otherwise
 
 
 def test_panels_for_units_energy_and_violation(result, tmp_path):
@@ -71,9 +73,9 @@ def test_violation_is_that_of_the_rows(result, default_four_bar):
 
 def test_results_of_lambdas_travel_without_their_system():
     done = solve_dae(pendulum(force=lambda t, q, v: np.array([0.0, -1.0])), (0.0, 0.1), [-1.0, 0.0], [0.0, 0.0])
-    other = pickle.loads(pickle.dumps(done))
-    assert other.system is None and done.system is not None
-    np.testing.assert_array_equal(other.q, done.q)
+    unpickled = pickle.loads(pickle.dumps(done))
+    assert unpickled.system is None and done.system is not None
+    np.testing.assert_array_equal(unpickled.q, done.q)
 
 
 # --- animations: pages, GIFs and films of results. No browser is needed: the script of a page runs under node
@@ -133,19 +135,19 @@ def played(path):
 
 
 def test_the_script_of_a_planar_page(swung, tmp_path):
-    said = played(swung.animate(tmp_path / "swing.html"))
-    times = [said[when] for when in ("first", "second", "paused", "chosen")]  # the second after a second of three
+    drawing = played(swung.animate(tmp_path / "swing.html"))
+    times = [drawing[when] for when in ("first", "second", "paused", "chosen")]  # the second after a second of three
     assert times == ["t = 0.00 s", "t = 0.333 s", "t = 0.333 s", "t = 0.0400 s"]
-    calls = [name for name, *_ in said["drawn"]]
+    calls = [name for name, *_ in drawing["drawn"]]
     assert calls.count("fillRect") == 1 and calls.count("arc") == 1 and "lineTo" in calls
-    assert all(x is not None for _, *numbers in said["drawn"] for x in numbers)  # NaN is null in JSON
-    (_, x, y, _, _), *_ = [call for call in said["drawn"] if call[0] == "fillRect"]
+    assert all(x is not None for _, *numbers in drawing["drawn"] for x in numbers)  # NaN is null in JSON
+    (_, x, y, _, _), *_ = [call for call in drawing["drawn"] if call[0] == "fillRect"]
     assert 0 < x < 1440 and 0 < y < 960
 
 
 def test_a_spatial_page_can_be_turned(crank, tmp_path):
-    said = played(crank.animate(tmp_path / "crank.html", seconds=1.0))
-    lines = [call for call in said["turned"] if call[0] == "lineTo"]
+    drawing = played(crank.animate(tmp_path / "crank.html", seconds=1.0))
+    lines = [call for call in drawing["turned"] if call[0] == "lineTo"]
     assert lines and all(0 < x < 1440 and 0 < y < 960 for _, x, y in lines)
-    first = [call for call in said["drawn"] if call[0] == "lineTo"]
+    first = [call for call in drawing["drawn"] if call[0] == "lineTo"]
     assert first[0] != lines[0]

@@ -96,9 +96,9 @@ def test_a_block_on_a_belt_sticks_and_slips():
     hold = (x1 - (x0 - (x1 - x0))) / speed  # it is caught at 2 x0 - x1, the mirror image of where it was released
     first = caught + (x1 - x0 * (1.0 - np.cos(w * caught))) / speed
     expected = [caught, *(first + k * (slip + hold) + shift for k in range(9) for shift in (0.0, slip))]
-    found = changes(result)
-    np.testing.assert_allclose(found, expected[: len(found)], atol=1e-9)
-    assert len(found) >= 6
+    change_times = changes(result)
+    np.testing.assert_allclose(change_times, expected[: len(change_times)], atol=1e-9)
+    assert len(change_times) >= 6
 
 
 def rotor(torque, **friction):

@@ -48,11 +48,11 @@ def test_a_ball_bounces_to_rest(tmp_path):
     np.testing.assert_allclose(result.sol(0.5 * first).q[1], 1.0 - 0.5 * GRAVITY * (0.5 * first) ** 2, atol=1e-9)
     assert result.sol(first).v[1] == pytest.approx(e * GRAVITY * drop) and (result.sol([3.9, 0.0]).q[1] == [0, 1]).all()
     result.save(tmp_path / "run.npz")
-    again = load(tmp_path / "run.npz", problem.system)
-    assert (again.q == result.q).all() and again.changes == result.changes
-    for each in (result, again, pickle.loads(pickle.dumps(result))):
+    loaded = load(tmp_path / "run.npz", problem.system)
+    assert (loaded.q == result.q).all() and loaded.changes == result.changes
+    for copied in (result, loaded, pickle.loads(pickle.dumps(result))):
         with pytest.raises(ValueError, match="impacts"):
-            each.certify()
+            copied.certify()
     assert result.arcs[0].certify().passed
 
 
@@ -163,9 +163,9 @@ def test_parallel_stops_let_go_at_once():
     force = lambda t, q, v: np.array([-10.0 + lift * np.sin(rate * t + phase) - k * (q[0] - 0.1)])  # noqa: E731
     lifted = unconstrained(force, mass=np.diag([mass]))
     stops = [Stop(lambda t, q: q[0], name="one"), Stop(lambda t, q: 3.0 * q[0], name="other")]
-    both, alone = (solve_with_stops(lifted, (0.0, 0.9), [0.0], [0.0], each) for each in (stops, stops[0]))
-    assert both.success, both.message
-    np.testing.assert_allclose(both.q[:, -1], alone.q[:, -1], atol=1e-8)
+    parallel, single = (solve_with_stops(lifted, (0.0, 0.9), [0.0], [0.0], chosen) for chosen in (stops, stops[0]))
+    assert parallel.success, parallel.message
+    np.testing.assert_allclose(parallel.q[:, -1], single.q[:, -1], atol=1e-8)
 
 
 def test_rebounds_from_a_wall_towards_which_another_turns_the_load_die_out():
@@ -315,21 +315,21 @@ NO_TANGENTS = Tangents(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dty
 @pytest.mark.parametrize("joints", [0, 2])
 def test_stops_that_depend_on_one_another_keep_their_conditions(joints):
     """Up to four stops in two directions, whose rates need not fit together, with joints that friction holds."""
-    numbers, found = np.random.default_rng(3), 0
+    numbers, n_solved = np.random.default_rng(3), 0
     for _ in range(200):
         n = int(numbers.integers(1, 5))
         W = np.vstack([numbers.normal(size=(n, 2)) @ np.eye(2, 4), numbers.normal(size=(joints, 4))])
         D, c = W @ W.T, numbers.normal(size=n + joints)
-        most = numbers.uniform(0.1, 2.0, joints)
+        limit = numbers.uniform(0.1, 2.0, joints)
         try:
-            x, _ = coulomb_forces(D, c, most, NO_TANGENTS)
+            x, _ = coulomb_forces(D, c, limit, NO_TANGENTS)
         except Undetermined:
             continue
-        found += 1
+        n_solved += 1
         opens, close = D @ x + c, 1e-7 * (1.0 + np.abs(x).max())
         assert (x[:n] >= 0.0).all() and (opens[:n] >= -close).all()
         assert (x[:n] * opens[:n] <= close * (1.0 + x[:n])).all()
-        assert (np.abs(x[n:]) <= most * (1.0 + 1e-9)).all()
+        assert (np.abs(x[n:]) <= limit * (1.0 + 1e-9)).all()
         slides = np.abs(opens[n:]) > close
-        np.testing.assert_allclose(x[n:][slides], (-np.sign(opens[n:]) * most)[slides], rtol=1e-6)
-    assert found > 100
+        np.testing.assert_allclose(x[n:][slides], (-np.sign(opens[n:]) * limit)[slides], rtol=1e-6)
+    assert n_solved > 100

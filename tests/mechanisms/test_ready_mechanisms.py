@@ -75,10 +75,10 @@ def test_it_says_what_it_is(name):
 @pytest.mark.parametrize("name", slow_but(COMPUTED.keys() - LONG, COMPUTED))
 def test_references_by_equations_in_few_coordinates(name):
     """In double precision by SciPy; the numbers themselves are from extended precision, by extrapolation."""
-    problem, (rate, start, known), end = COMPUTED[name]
+    problem, (rate, start, states), t_end = COMPUTED[name]
     reference = problem.reference
-    assert reference.t == end and min(reference.digits["q"], reference.digits["v"]) >= 12.0
-    q, v = known(end, by_scipy(rate, start, end))
+    assert reference.t == t_end and min(reference.digits["q"], reference.digits["v"]) >= 12.0
+    q, v = states(t_end, by_scipy(rate, start, t_end))
     assert digits(np.array(q, dtype=float), reference.q) > 10.5 and digits(np.array(v, dtype=float), reference.v) > 9.5
 
 
@@ -95,19 +95,21 @@ def test_references_again_in_extended_precision(name):
 def test_references_obey_the_mechanisms_own_equations(name):
     """On all rows, with the multipliers stored; the acceleration is then unique where the mass is regular."""
     problem = PROBLEMS[name]
-    system, known = problem.system, problem.reference
-    assert np.abs(system.constraint(known.t, known.q)).max(initial=0.0) < 1e-14
-    assert np.abs(system.velocity_constraint(known.t, known.q, known.v)).max() < 1e-13 * max(1.0, np.abs(known.v).max())
-    assert known.lam.shape == (system.n_c + system.n_a,)
+    system, reference = problem.system, problem.reference
+    assert np.abs(system.constraint(reference.t, reference.q)).max(initial=0.0) < 1e-14
+    assert np.abs(system.velocity_constraint(reference.t, reference.q, reference.v)).max() < 1e-13 * max(
+        1.0, np.abs(reference.v).max()
+    )
+    assert reference.lam.shape == (system.n_c + system.n_a,)
 
 
 @pytest.mark.parametrize("name", CLOSED)
 def test_closed_forms_by_an_equation(name):
-    problem, (rate, start, known) = CLOSED[name]
+    problem, (rate, start, states) = CLOSED[name]
     times = np.linspace(0.1, 1.0, 10) * problem.t_span[1]
     for t, y in zip(times, by_scipy(rate, start, times[-1], times).T, strict=True):
-        for exact, wanted in zip(problem.motion(t), known(t, y), strict=True):
-            assert digits(exact, np.array(wanted, dtype=float)) > 10.5
+        for exact, expected in zip(problem.motion(t), states(t, y), strict=True):
+            assert digits(exact, np.array(expected, dtype=float)) > 10.5
     assert problem.reference.q == pytest.approx(problem.motion(problem.t_span[1])[0], abs=0.0)
 
 
@@ -168,8 +170,8 @@ def test_nine_digits(name, method):
 @pytest.mark.parametrize("name", [name for name in REGULAR if name in RUN_HERE or PROBLEMS[name].invariants])
 def test_invariants(name):
     problem, result = PROBLEMS[name], end_of(name, "Gauss12")
-    kept = dict(problem.invariants) | ({"energy": problem.energy} if problem.conserved else {})
-    for quantity in kept.values():
+    invariants = dict(problem.invariants) | ({"energy": problem.energy} if problem.conserved else {})
+    for quantity in invariants.values():
         values = quantity(result.t, result.q, result.v)
         assert values.shape == result.t.shape
         assert values[0] == pytest.approx(quantity(0.0, problem.q0, problem.v0), rel=1e-14)
@@ -214,24 +216,26 @@ def test_bars_are_rigid_but_for_springs(name):
 @every
 def test_many_states_at_once_are_those_one_by_one(problem):
     q = np.column_stack([problem.q0, problem.q0 + 0.1])
-    both = problem.drawing.at(q)
-    assert both.shape[1] == (2 if "planar" in problem.tags else 3)
+    points = problem.drawing.at(q)
+    assert points.shape[1] == (2 if "planar" in problem.tags else 3)
     for k in range(2):
-        np.testing.assert_allclose(both[..., k], problem.drawing.at(q[:, k]), rtol=0.0, atol=1e-14)
+        np.testing.assert_allclose(points[..., k], problem.drawing.at(q[:, k]), rtol=0.0, atol=1e-14)
 
 
 @every
 def test_problems_can_be_sent_to_other_processes(problem):
-    other, t, v = pickle.loads(pickle.dumps(problem)), 0.3, problem.v0 + 0.1
-    assert vars(other).keys() == vars(problem).keys() and other.parameters == problem.parameters
-    assert repr(other.system.joints) == repr(problem.system.joints) == repr(other.joints)
+    received, t, v = pickle.loads(pickle.dumps(problem)), 0.3, problem.v0 + 0.1
+    assert vars(received).keys() == vars(problem).keys() and received.parameters == problem.parameters
+    assert repr(received.system.joints) == repr(problem.system.joints) == repr(received.joints)
     for kind in set(problem.system.given) - {"kinematics"}:
         state = {"q": problem.q0, "v": v, "lam": np.ones(problem.system.n_c)}
-        given = [state[name] for name in KINDS[kind].state]
-        np.testing.assert_array_equal(getattr(other.system, kind)(t, *given), getattr(problem.system, kind)(t, *given))
-    np.testing.assert_array_equal(other.drawing.at(problem.q0), problem.drawing.at(problem.q0))
-    assert other.energy(0.0, other.q0, other.v0) == problem.energy(0.0, problem.q0, problem.v0)
-    assert other.system.description.coordinates == problem.coordinates == other.coordinates
+        arguments = [state[name] for name in KINDS[kind].state]
+        np.testing.assert_array_equal(
+            getattr(received.system, kind)(t, *arguments), getattr(problem.system, kind)(t, *arguments)
+        )
+    np.testing.assert_array_equal(received.drawing.at(problem.q0), problem.drawing.at(problem.q0))
+    assert received.energy(0.0, received.q0, received.v0) == problem.energy(0.0, problem.q0, problem.v0)
+    assert received.system.description.coordinates == problem.coordinates == received.coordinates
 
 
 lengths = st.floats(0.3, 3.0)
