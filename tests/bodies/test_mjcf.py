@@ -83,7 +83,7 @@ def test_a_leg_by_hand_and_from_a_file(tmp_path):
     assert [joint.name for joint in read_model.joints] == ["joint hip", "knee"]  # as a body is called hip
 
 
-@pytest.mark.parametrize("seed", [0, 1, *(slow(k) for k in (2, 3))])
+@pytest.mark.parametrize("seed", [0, *(slow(k) for k in (1, 2, 3))])
 def test_random_models_written_and_read_again_move_alike(seed, tmp_path):
     both = Both(seed, False, n=6)
     kinds = ("revolute", "universal", "cylindrical", "table", "prismatic", "spherical", "fixed")

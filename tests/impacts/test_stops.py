@@ -168,6 +168,7 @@ def test_parallel_stops_let_go_at_once():
     np.testing.assert_allclose(parallel.q[:, -1], single.q[:, -1], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_rebounds_from_a_wall_towards_which_another_turns_the_load_die_out():
     """Without the wall on the left, the load would lift the body off the slope."""
     pressed = unconstrained(lambda t, q, v: np.array([-6.0, -1.0]), 2)

@@ -202,7 +202,7 @@ def spring(**tangents):
     return ConstrainedSystem.from_python(mass=np.kron(np.eye(COPIES), np.eye(4) + 0.1), **sizes, **functions)
 
 
-@pytest.mark.parametrize(("banded", "reaction"), [(False, {}), (True, {"reaction_by_q": rod_by_q})])
+@pytest.mark.parametrize(("banded", "reaction"), [slow(False, {}), (True, {"reaction_by_q": rod_by_q})])
 def test_tangents_replace_differences(monkeypatch, banded, reaction):
     monkeypatch.setattr(workspace_module, "banded_pays", lambda *sizes: banded)
     systems = spring(), spring(force_by_q=spring_by_q, force_by_v=spring_by_v, **reaction)

@@ -41,8 +41,9 @@ ADAPTERS: dict[str, Any] = {
     "collocation, CasADi": _by_collocation,
     "GSTIFF": lambda *start, tol=None, **options: solve_gear(*start, 1e-3, 2, **options),
 }
-# one of each way to call a solver, of those that need no long compilation: the other tests are slow
-QUICK = ("DOP853, index 1", "IDA, stabilised", "IDA from C, stabilised")
+# one of each way to call a solver, of those that need no long compilation: the other tests are slow.
+# DOP853 at index 1 has tests of its own, in test_index1.py
+QUICK = ("IDA, stabilised", "IDA from C, stabilised")
 # callbacks in Python, too
 ANY_CALLBACK = (*(name for name, line in FOUND.items() if not (line.traces or line.compiled_callbacks)), "GSTIFF")
 

@@ -99,6 +99,7 @@ def test_a_line_goes_through_all_runs_whose_error_is_known_in_the_order_of_the_s
     assert figures.line_of(made[:0]).empty  # a quick run has not all solvers of a figure
 
 
+@pytest.mark.slow
 def test_a_work_precision_figure_has_labels_on_at_most_six_lines_and_better_is_left(tmp_path):
     made = rows(auto=1.0, heyoka=2.0, **{f"Gauss{k}": 1.0 * k for k in (4, 6, 8, 10, 12)})
     with pytest.raises(ValueError, match="at most 6 lines; given 7"):

@@ -134,6 +134,7 @@ def test_refusals_have_these_messages():
         assert honesty.run("x", partial(own, method), trap, None)["outcome"] == NOT_RUN
 
 
+@pytest.mark.slow
 def test_motions_and_forces_have_known_ends():
     known = {trap.name: trap for trap in of_linkages()}
     for trap in (known["dead point"], known["assemblies nearly meet"], *islice(singular_positions(), 1)):

@@ -71,6 +71,7 @@ def test_tangents_are_the_derivatives(name):
         assert pytest.approx(reaction, rel=1e-6, abs=1e-6) == R
 
 
+@pytest.mark.slow
 def test_counts_are_those_of_the_hand_written_mechanism():
     for make in (symbolic_four_bar, symbolic_knife_edge):
         problem, mechanism = make()
