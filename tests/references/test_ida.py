@@ -140,9 +140,6 @@ def test_jacobian_is_that_of_the_residual(of, form):
         assert np.abs(computed[j] - column).max() < 1e-5
 
 
-# --- output and statistics
-
-
 # --- failures
 @pytest.mark.slow
 @pytest.mark.parametrize(
@@ -163,9 +160,6 @@ def test_python_functions_are_refused():
     system = ConstrainedSystem.from_python(**PLAIN)
     with pytest.raises(ValueError, match=r"system must have compiled callbacks.*compile=True.*solve_ida"):
         solve_ida_c(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0])
-
-
-# --- the wheel
 
 
 class _Mallinfo(ctypes.Structure):

@@ -152,12 +152,6 @@ def test_solve_dae_starts_from_rest_with_a_step_that_rounding_does_not_spoil(tol
     assert result.success, result.message
 
 
-# --- CasADi
-
-
-# --- diffrax
-
-
 # --- mass matrices that are singular without the constraints, as with Euler parameters
 SOLVERS = (
     "DOP853, projected",

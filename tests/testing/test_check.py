@@ -277,6 +277,3 @@ def test_the_report():
     assert {row.count("|") for row in rows} == {6}
     assert "| pendulum | frame | not measured |  | the motion itself is wrong |" in rows
     assert sum("**failed**" in row for row in rows) == len(report.failures)
-
-
-# --- wrong answers; wrong arguments are in tests/bad_input/simulators.py
