@@ -54,18 +54,18 @@ def write_own_accelerations(
     llvm_code.write(module, name, kind, emit_all)
 
 
-def write_mass_first(
-    emit: Emitter, equations: StraightLine, inputs: Sequence[Value], numbers: Coefficients
-) -> tuple[list[Value], Value]:
-    """The same by the elimination of M alone, where there is another way, too."""
-    n = equations.system.n_q
-    place, filled = _room(emit, 2 * n), _room(emit, n)
+def call_accelerations(
+    emit: Emitter, equations: StraightLine, way: int, inputs: Sequence[Value], numbers: Coefficients, filled: Value
+) -> Value:
+    """Fill an array with the accelerations at [t, q, v] by a function of the module; whether they may be used.
+
+    `way` is a place in `equations.accelerations`: 0, that of the fewest operations; -1, the elimination of M.
+    """
+    place = _room(emit, 2 * equations.system.n_q)
     for i, value in enumerate(inputs[1:]):
         emit.store(value, place, i)
-    name = _function(emit, equations, equations.accelerations[1], numbers)
-    given = [inputs[0], place, emit.pointer(place, n), *_numbers(emit), filled]
-    holds = emit.builder.call(name, emit.bit, given)
-    return [emit.load(filled, i) for i in range(n)], holds
+    given = [inputs[0], place, emit.pointer(place, equations.system.n_q), *_numbers(emit), filled]
+    return emit.builder.call(_function(emit, equations, way, numbers), emit.bit, given)
 
 
 def _accelerations(
@@ -76,14 +76,14 @@ def _accelerations(
     a, holds = _outputs(emit, equations, written, outputs)
     if not others:
         return a, holds
-    builder, (there,) = emit.builder, others
+    builder = emit.builder
     everywhere = holds
     if (width := width_of(holds.type)) > 1:
         everywhere = builder.call(f"llvm.vector.reduce.and.v{width}i1", BIT, [holds])
     before, otherwise, after = builder.block, builder.append_block(), builder.append_block()
     builder.branch(everywhere, after, otherwise)
     builder.position_at_end(otherwise)
-    name, place = _function(emit, equations, there, written.numbers), _room(emit, len(a))
+    name, place = _function(emit, equations, -1, written.numbers), _room(emit, len(a))
     found = builder.call(name, emit.bit, [*state(), *_numbers(emit), place])
     b = [builder.select(holds, value, emit.load(place, i)) for i, value in enumerate(a)]
     found, last = builder.operation("or", holds, found), builder.block
@@ -104,9 +104,10 @@ def _outputs(emit: Emitter, equations: StraightLine, written: Written, outputs: 
     return a, conditions_hold(emit, written, outputs, a)
 
 
-def _function(emit: Emitter, equations: StraightLine, outputs: Outputs, numbers: Coefficients) -> str:
-    """The name of the function of the module that eliminates M first; `numbers` are those that it reads."""
-    module, name = emit.builder.module, f"mass_first_{emit.suffix}"
+def _function(emit: Emitter, equations: StraightLine, way: int, numbers: Coefficients) -> str:
+    """The name of the function of the module for a way to find accelerations; `numbers` are those that it reads."""
+    outputs, mass_first = equations.accelerations[way], way in (-1, len(equations.accelerations) - 1)
+    module, name = emit.builder.module, f"{'mass_first' if mass_first else 'quick'}_{emit.suffix}"
     if not module.defines(name):
         n, given = equations.system.n_q, _numbers(emit)
         kinds = [emit.double, ARRAY, ARRAY, *[ARRAY] * len(given), ARRAY]
@@ -115,7 +116,7 @@ def _function(emit: Emitter, equations: StraightLine, outputs: Outputs, numbers:
         t, q, v, *places, filled = builder.arguments
         for attribute, place in zip(("numbers", "constants"), places, strict=False):
             setattr(inner, attribute, place)
-        if equations.parts is not None:
+        if mass_first and equations.parts is not None:
             builder.ret(equations.parts.there(inner, t, q, v, places[0], filled))
             return name
         written = Written(inner, numbers)

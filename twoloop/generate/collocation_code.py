@@ -18,14 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.generate import lane_emitter, llvm_code, lobatto_tables
-from twoloop.generate.accelerations import write_accelerations, write_mass_first
+from twoloop.generate.accelerations import call_accelerations
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.llvm_code import Emitter
 from twoloop.generate.llvm_text import BIT, DOUBLE, INTEGER, NOTHING, Module, Value, constant, constants, integer
 from twoloop.generate.lobatto_tables import tables
 from twoloop.generate.straight_code import OwnCode, SharedCode
 from twoloop.generate.straight_line import Outputs
-from twoloop.generate.written import conditions_hold, results_of
+from twoloop.generate.written import Written, conditions_hold, results_of
 from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.own_functions import LaterFunctions, own_functions
 from twoloop.kernels.data import collocation as at
@@ -33,7 +33,7 @@ from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL
 
 Array = NDArray[np.float64]
-LONGEST = 5000  # operations of the equations: code of as many takes 2 s to compile
+LONGEST = 8000  # operations of a projection
 SMALLEST = 1e-300  # in place of a coefficient of zero
 FAILED = -1.0  # what an audit gives in place of a defect where accelerations cannot be had
 INFINITE = float("inf")
@@ -57,7 +57,7 @@ ALLOWED = 16.0  # the defect between nodes, over the tolerances: most of it does
 
 def suits(own: SharedCode) -> bool:
     """Whether the code of a mechanism takes no longer than some seconds to compile."""
-    return own.equations.n_operations <= LONGEST
+    return len(own.equations.nearer.quantities(own.equations.graph)) <= LONGEST
 
 
 class CollocationCode:
@@ -118,10 +118,25 @@ class CollocationCode:
             name = self._careful(emit, [each.type for each in (room, state, tolerances, numbers)])
             return builder.call(name, DOUBLE, [room, state, tolerances, numbers])
 
-        def quick(inputs: list[Value]) -> tuple[list[Value], Callable[[], Value]]:
-            outputs = self.equations.accelerations[0]
-            written, (a,) = results_of(emit, self.equations.graph, outputs, inputs, self.numbers)
-            return a, lambda: conditions_hold(emit, written, outputs, self._accelerations(emit, room))
+        def quick(inputs: list[Value]) -> Callable[[], Value]:
+            if self.parts is not None:
+                return self._called(emit, room, 0)(inputs)
+            outputs, written = self.equations.accelerations[0], Written(emit, self.numbers)
+            (forms,), graph = outputs.arrays.values(), self.equations.graph
+            for quantity, value in enumerate(inputs):
+                written.define(quantity, value)
+
+            def put(coordinates: list[int]) -> None:
+                for i, value in zip(coordinates, written.forms(graph, [forms[i] for i in coordinates]), strict=True):
+                    _put(emit, value, room, self.a + LANES * i)
+
+            def finish() -> Value:
+                put(self.others)
+                written.forms(graph, [form for pair in outputs.conditions for form in pair])
+                return conditions_hold(emit, written, outputs, self._accelerations(emit, room))
+
+            put(self.iterated)
+            return finish
 
         def otherwise() -> Value:
             if not self.has_others:
@@ -144,16 +159,20 @@ class CollocationCode:
             builder = module.function(name, DOUBLE, kinds, internal=True)
             inner, (room, state, tolerances, numbers) = emit.like(builder), builder.arguments
             inner.numbers = inner.constants = numbers
-
-            def evaluate(inputs: list[Value]) -> tuple[list[Value], Callable[[], Value]]:
-                a, holds = write_mass_first(inner, self.equations, inputs, self.numbers)
-                return a, lambda: holds
-
             self._prepare(inner, room, state, tolerances)
-            builder.ret(
-                self._iterate(inner, room, state, tolerances, evaluate, lambda: constant(DOUBLE, float(at.LEFT)))
-            )
+            mass_first, given_up = self._called(inner, room, -1), constant(DOUBLE, float(at.LEFT))
+            builder.ret(self._iterate(inner, room, state, tolerances, mass_first, lambda: given_up))
         return name
+
+    def _called(self, emit: LaneEmitter, room: Value, way: int) -> Callable[[list[Value]], Callable[[], Value]]:
+        """What evaluates accelerations by a function of the module, see `call_accelerations`."""
+        filled = Emitter(emit.builder).pointer(room, self.a)
+
+        def evaluate(inputs: list[Value]) -> Callable[[], Value]:
+            holds = call_accelerations(emit, self.equations, way, inputs, self.numbers, filled)
+            return lambda: holds
+
+        return evaluate
 
     def _accelerations(self, emit: LaneEmitter, room: Value) -> list[Value]:
         """What is in memory: what else is done with a number after a loop has to wait on the stack in each turn."""
@@ -254,13 +273,13 @@ class CollocationCode:
         room: Value,
         state: Value,
         tolerances: Value,
-        evaluate: Callable[[list[Value]], tuple[list[Value], Callable[[], Value]]],
+        evaluate: Callable[[list[Value]], Callable[[], Value]],
         otherwise: Callable[[], Value],
     ) -> Value:
         """Sweeps over the stages until they are right, or the step is given up; and what is to be known of it.
 
-        `evaluate` gives accelerations of [t, q, v] and what says whether they may be used; where they may not,
-        `otherwise` does the step.
+        `evaluate` puts accelerations at [t, q, v] into memory, those of coordinates that are not iterated when what it
+        gives is called, which says whether all may be used. Where they may not, `otherwise` does the step.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
 
@@ -294,9 +313,7 @@ class CollocationCode:
         q, v = [emit.constant(0.0)] * n, [emit.constant(0.0)] * n
         for k, i in enumerate(self.iterated):
             q[i], v[i] = _get(emit, room, self.q + LANES * k), _get(emit, room, self.v + LANES * k)
-        a, holds = evaluate([times, *q, *v])
-        for i, value in enumerate(a):
-            _put(emit, value, room, self.a + LANES * i)
+        finish = evaluate([times, *q, *v])
         change = one.multiply(stricter, self._integrate(emit, room, state))
         m = one.add(sweeps, llvm_code.ONE)
 
@@ -329,7 +346,7 @@ class CollocationCode:
             phi.add_incoming(value, builder.block)
         builder.branch(goes_on, after, loop)
         builder.position_at_end(after)
-        all_hold = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [holds()])
+        all_hold = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [finish()])
         with self._leaving(emit, builder.operation("xor", all_hold, Value(BIT, "true"))):
             builder.ret(otherwise())
         for value, place in ((m, at.SWEEPS), (change, at.CHANGE), (target, at.TARGETED), (rho_now, at.RHO)):
@@ -349,18 +366,24 @@ class CollocationCode:
         are smaller by decades, which costs few steps, as the estimate is of order 12.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
-        size = (self.ends - self.spectra) // 3
+        m, change, target, rho = (one.load(room, place) for place in (at.SWEEPS, at.CHANGE, at.TARGETED, at.RHO))
+        two = LaneEmitter(builder, 2)
+        more = one.divide(one.multiply(rho, change), constant(DOUBLE, KAPPA))
+        more = one.add(more, constant(DOUBLE, LEAST_CHANGE))
+        by_rho = two.logarithm(two.vector([more, rho]))
+        left = one.fused(one.subtract(target, m), builder.extract(by_rho, 1), builder.extract(by_rho, 0))
+        further = one.divide(one.add(left, llvm_code.ONE), one.add(target, constant(DOUBLE, 2.0)))
         with one.loop(integer(0), integer(n), []) as (i, _, _):
             a0 = one.load(one.pointer(state, i), 2 * n)
             values = emit.function("fabs", self._combined(emit, tables().spectrum, a0, room, i))
             pairs = emit.larger(values, builder.shuffle(values, values, [1, 0, 3, 2, 5, 4, 7, 6]))
-            for row, lane in enumerate((2, 4, 6)):
-                one.store(builder.extract(pairs, lane), one.pointer(room, i), self.spectra + row * size)
+            _put(emit, pairs, one.pointer(room, _lanes(emit, i)), self.spectra)
         several, starts = self._several(emit)
         error = curved = several.constant(0.0)
         least = several.constant(SMALLEST)
         for start in starts:
-            first, before, top = (several.load(one.pointer(room, self.spectra + m * size + start)) for m in range(3))
+            vectors = [_get(emit, room, self.spectra + LANES * (start + k)) for k in range(several.lanes)]
+            first, before, top = (_column(emit, vectors, lane) for lane in (2, 4, 6))
             weight = several.load(one.pointer(room, at.WEIGHTS + start))
             of_last = several.larger(several.larger(before, top), least)
             falls = several.divide(top, of_last)
@@ -372,13 +395,6 @@ class CollocationCode:
         error = one.multiply(one.multiply(several.largest_lane(error), h), constant(DOUBLE, SHARE))
         one.store(error, room, at.ERROR)
         one.store(one.multiply(several.largest_lane(curved), h), room, at.CURVED)
-        m, change, target, rho = (one.load(room, place) for place in (at.SWEEPS, at.CHANGE, at.TARGETED, at.RHO))
-        two = LaneEmitter(builder, 2)
-        more = one.divide(one.multiply(rho, change), constant(DOUBLE, KAPPA))
-        more = one.add(more, constant(DOUBLE, LEAST_CHANGE))
-        by_rho = two.logarithm(two.vector([more, rho]))
-        left = one.fused(one.subtract(target, m), builder.extract(by_rho, 1), builder.extract(by_rho, 0))
-        further = one.divide(one.add(left, llvm_code.ONE), one.add(target, constant(DOUBLE, 2.0)))
         by_error = one.multiply(builder.extract(two.logarithm(two.splat(error)), 0), constant(DOUBLE, 1.0 / at.ORDER))
         factors = two.exponential(two.negative(two.vector([further, by_error])))
         one.store(builder.extract(factors, 0), room, at.FACTOR)
@@ -401,8 +417,7 @@ class CollocationCode:
             of_q = self._combined(emit, tables().positions_between, a0, room, integer(i))
             v[i] = emit.fused(h, of_v, emit.splat(v0))
             q[i] = emit.fused(emit.multiply(h, h), of_q, emit.fused(length, emit.splat(v0), emit.splat(q0)))
-        write = write_mass_first if self.has_others else write_accelerations
-        a, holds = write(emit, self.equations, [emit.add(t, length), *q, *v], self.numbers)
+        a, all_hold = self._called_whole(emit, [emit.add(t, length), *q, *v])
         worst = largest = zero
         for i, value in enumerate(a):
             a0 = one.load(state, 2 * n + i)
@@ -418,8 +433,29 @@ class CollocationCode:
             two.logarithm(two.splat(one.larger(defect, constant(DOUBLE, 1e-9)))), two.constant(-1.0 / 9)
         )
         one.store(builder.extract(two.exponential(power), 0), room, at.FACTOR_OF_DEFECT)
-        all_hold = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [holds])
         return builder.select(all_hold, defect, constant(DOUBLE, FAILED))
+
+    def _called_whole(self, emit: LaneEmitter, inputs: list[Value]) -> tuple[list[Value], Value]:
+        """Accelerations by the fewest operations or else by the elimination of M, and whether these may be used."""
+        builder, filled = emit.builder, emit.builder.room(DOUBLE, LANES * self.n)
+
+        def holds(way: int) -> Value:
+            each = call_accelerations(emit, self.equations, way, inputs, self.numbers, filled)
+            return builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [each])
+
+        all_hold = holds(0)
+        if self.has_others:
+            before, otherwise, after = builder.block, builder.append_block(), builder.append_block()
+            builder.branch(all_hold, after, otherwise)
+            builder.position_at_end(otherwise)
+            found, last = holds(-1), builder.block
+            builder.go_to(after)
+            builder.position_at_end(after)
+            phi = builder.phi(BIT)
+            phi.add_incoming(all_hold, before)
+            phi.add_incoming(found, last)
+            all_hold = phi
+        return [emit.load(filled, i) for i in range(self.n)], all_hold
 
     def retry(self, emit: LaneEmitter, room: Value, state: Value) -> None:
         """Let the polynomial of a step that was refused predict the shorter one in its place."""
@@ -603,6 +639,18 @@ def _two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
     for distance in (2, 1):
         total = emit.add(total, builder.shuffle(total, total, [k ^ distance for k in range(LANES)]))
     return [builder.extract(total, k) for k in (0, half)]
+
+
+def _column(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value:
+    """One lane of each of some vectors, side by side."""
+    builder, places = emit.builder, [lane, LANES + lane]
+    if len(vectors) == 1:
+        return builder.extract(vectors[0], lane)
+    while len(vectors) > 1:
+        pairs = zip(vectors[::2], vectors[1::2], strict=True)
+        vectors = [builder.shuffle(*pair, places) for pair in pairs]
+        places = list(range(2 * len(places)))
+    return vectors[0]
 
 
 @contextmanager

@@ -53,6 +53,10 @@ class Emitter:
         """A number that stands in the code."""
         return constant(self.double, value)
 
+    def far(self, value: float) -> Value:
+        """A number that is loaded where it is used."""
+        return self.builder.far(value)
+
     def whole(self, value: int) -> Value:
         """An integer that stands in the code, of those that go with numbers."""
         return constant(self.whole_number, value)
@@ -86,6 +90,16 @@ class Emitter:
     def fused(self, a: Value, b: Value, c: Value) -> Value:
         """a b + c, rounded once."""
         return self.builder.call(f"llvm.fma.{self.suffix}", a.type, [a, b, c])
+
+    def polynomial(self, coefficients: Sequence[float], x: Value) -> Value:
+        """A polynomial, its constant first; pairs of terms do not wait for one another."""
+        square, terms = self.builder.operation("fmul", x, x), [self.far(each) for each in coefficients]
+        pairs = [self.fused(second, x, first) for first, second in zip(terms[::2], terms[1::2], strict=False)]
+        pairs += terms[2 * len(pairs) :]
+        total = pairs.pop()
+        while pairs:
+            total = self.fused(total, square, pairs.pop())
+        return total
 
     def negative(self, a: Value) -> Value:
         """-a."""

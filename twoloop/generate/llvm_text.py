@@ -107,6 +107,7 @@ class Module:
         self.divided = divided
         self.kept_apart: list[str] = []  # addresses of blocks
         self._tables: list[str] = []
+        self._numbers: list[float] = []  # see `Builder.far`
         self._declared: dict[str, str] = {}
         self._functions: list[Builder] = []
 
@@ -127,6 +128,11 @@ class Module:
         self._tables.append(f"{name} = internal constant {kind} [{entries}]")
         return Value(f"{WORD}*", f"getelementptr inbounds ({kind}, {kind}* {name}, {INTEGER} 0, {INTEGER} 0)")
 
+    def far_number(self, number: float) -> int:
+        """A place of its own for a number, see `Builder.far`."""
+        self._numbers.append(number)
+        return len(self._numbers) - 1
+
     def declare(self, name: str, result: str, arguments: Iterable[str]) -> None:
         """Say of which type a function of LLVM, or of libm, is."""
         self._declared[name] = f"declare {result} @{name}({', '.join(arguments)})"
@@ -134,7 +140,14 @@ class Module:
     def __str__(self) -> str:
         defined = {function.name for function in self._functions}
         declared = [text for name, text in self._declared.items() if name not in defined]
-        parts = [*declared, *self._tables, *(function.text() for function in self._functions), "!0 = !{}"]
+        numbers = [constant(DOUBLE, number) for number in self._numbers]
+        tables = list(self._tables)
+        if numbers:
+            kind = f"[{len(numbers)} x {DOUBLE}]"
+            tables.append(f"@numbers = internal constant {kind} [{', '.join(map(str, numbers))}]")
+            place = f"getelementptr inbounds ({kind}, {kind}* @numbers, {INTEGER} 0, {INTEGER} 0)"
+            tables.append(f"@far = internal global {DOUBLE}* {place}")
+        parts = [*declared, *tables, *(function.text() for function in self._functions), "!0 = !{}"]
         if self.kept_apart:
             kind = f"[{len(self.kept_apart)} x i8*]"
             parts.append(f"@kept_apart = internal constant {kind} [{', '.join(self.kept_apart)}]")
@@ -148,6 +161,7 @@ class Builder:
         self.module, self.name, self.result, self.internal = module, name, result, internal
         self.arguments = [Value(kind, f"%a{k}") for k, kind in enumerate(arguments)]
         self._n = self._n_rooms = 0
+        self._far: Value | None = None
         self.part = 0  # of a divided function, in which operations are put now
         self._blocks: list[Block] = []
         self._n_blocks = 0
@@ -243,6 +257,14 @@ class Builder:
         self._blocks[0].lines.insert(self._n_rooms, f"{made.text} = alloca {kind}, {integer(max(size, 1))}, align 64")
         self._n_rooms += 1
         return made
+
+    def far(self, number: float) -> Value:
+        """A number that is loaded where it is used; a constant would wait in a register, or on the stack, before it."""
+        if self._far is None:
+            self._far = Value(f"{DOUBLE}*", "%far")
+            self._blocks[0].lines.insert(0, f"%far = load {DOUBLE}*, {DOUBLE}** @far")
+            self._n_rooms += 1
+        return self.load(self.gep(self._far, integer(self.module.far_number(number))))
 
     def leave_unless(self, condition: Value) -> None:
         """End the function where a condition does not hold, which is its result."""

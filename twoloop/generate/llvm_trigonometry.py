@@ -28,15 +28,15 @@ COSINES = (
 def sine_and_cosine(emit: Emitter, x: Value) -> tuple[Value, Value]:
     """Both, right to rounding for angles up to LARGEST_ANGLE."""
     builder, whole = emit.builder, emit.whole
-    turns = emit.function("rint", builder.operation("fmul", x, emit.constant(1.0 / HALF_PI[0])))
+    turns = emit.function("rint", builder.operation("fmul", x, emit.far(1.0 / HALF_PI[0])))
     rest = x
     for part in HALF_PI:
-        rest = emit.fused(turns, emit.constant(-part), rest)
+        rest = emit.fused(turns, emit.far(-part), rest)
     square = builder.operation("fmul", rest, rest)
     fourth = builder.operation("fmul", square, square)
-    sine = emit.fused(builder.operation("fmul", square, rest), _polynomial(emit, square, fourth, SINES), rest)
-    cosine = emit.fused(square, emit.constant(-0.5), emit.constant(1.0))
-    cosine = emit.fused(fourth, _polynomial(emit, square, fourth, COSINES), cosine)
+    sine = emit.fused(builder.operation("fmul", square, rest), emit.polynomial(SINES, square), rest)
+    cosine = emit.fused(square, emit.far(-0.5), emit.constant(1.0))
+    cosine = emit.fused(fourth, emit.polynomial(COSINES, square), cosine)
     quarter = builder.convert("fptosi", turns, emit.whole_number)
     odd, following = builder.convert("trunc", quarter, emit.bit), builder.add(quarter, whole(1))
     made = []
@@ -45,15 +45,3 @@ def sine_and_cosine(emit: Emitter, x: Value) -> tuple[Value, Value]:
         bits = builder.convert("bitcast", builder.select(odd, one, other), emit.whole_number)
         made.append(builder.convert("bitcast", builder.operation("xor", bits, sign), emit.double))
     return made[0], made[1]
-
-
-def _polynomial(emit: Emitter, x: Value, square: Value, coefficients: tuple[float, ...]) -> Value:
-    """A polynomial of x, whose square is given; pairs of terms do not wait for one another."""
-    pairs = [
-        emit.fused(emit.constant(second), x, emit.constant(first))
-        for first, second in zip(coefficients[::2], coefficients[1::2], strict=True)
-    ]
-    total: Value = pairs.pop()
-    while pairs:
-        total = emit.fused(total, square, pairs.pop())
-    return total

@@ -113,15 +113,16 @@ class Written:
         if not self.emit.builder.module.divided:
             self.write(graph, outputs.quantities(graph, self._made))
             return [[self.form(form) for form in forms] for forms in outputs.arrays.values()]
-        results = [[self._result(graph, form) for form in forms] for forms in outputs.arrays.values()]
+        results = [[self.forms(graph, [form])[0] for form in forms] for forms in outputs.arrays.values()]
         self.write(graph, graph.in_order_of_use(outputs.forms, self._made))
         return results
 
-    def _result(self, graph: Graph, form: Form) -> Value:
-        quantities = graph.in_order_of_use([form], self._made)
+    def forms(self, graph: Graph, forms: Sequence[Form]) -> list[Value]:
+        """Compute forms; what was computed for others before is not computed again."""
+        quantities = graph.in_order_of_use(forms, self._made)
         self.write(graph, quantities)
         self._made.update(quantities)
-        return self.form(form)
+        return [self.form(form) for form in forms]
 
 
 def results_of(

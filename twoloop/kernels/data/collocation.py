@@ -51,16 +51,15 @@ def places(n, n_iterated, n_rows):
     """Where what has no fixed place begins, and the length of the whole.
 
     Accelerations at the nodes (n lanes), positions and velocities there and two polynomials (n_iterated lanes each),
-    what is known of the spectrum of accelerations (three times n, in whole vectors); and for the projection t, q and v
-    (1 + 2 n lanes), a (n lanes) and lam (n_rows lanes).
+    the spectrum of accelerations (n lanes); and for the projection t, q and v (1 + 2 n lanes), a (n lanes) and lam
+    (n_rows lanes).
     """
-    whole = LANES * (-(-n // LANES))
-    a = WEIGHTS + whole
+    a = WEIGHTS + LANES * (-(-n // LANES))
     q = a + LANES * n
     v = q + LANES * n_iterated
     polynomials = v + LANES * n_iterated
     spectra = polynomials + 2 * LANES * n_iterated
-    ends = spectra + 3 * whole
+    ends = spectra + LANES * n
     end_a = ends + LANES * (1 + 2 * n)
     lam = end_a + LANES * n
     return a, q, v, polynomials, spectra, ends, end_a, lam, lam + LANES * n_rows
