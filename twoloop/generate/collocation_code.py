@@ -417,7 +417,9 @@ class CollocationCode:
             of_q = self._combined(emit, tables().positions_between, a0, room, integer(i))
             v[i] = emit.fused(h, of_v, emit.splat(v0))
             q[i] = emit.fused(emit.multiply(h, h), of_q, emit.fused(length, emit.splat(v0), emit.splat(q0)))
-        a, all_hold = self._called_whole(emit, [emit.add(t, length), *q, *v])
+        inputs, filled = [emit.add(t, length), *q, *v], builder.room(DOUBLE, LANES * n)
+        holds = call_accelerations(emit, self.equations, -1, inputs, self.numbers, filled)
+        a = [emit.load(filled, i) for i in range(n)]
         worst = largest = zero
         for i, value in enumerate(a):
             a0 = one.load(state, 2 * n + i)
@@ -433,29 +435,8 @@ class CollocationCode:
             two.logarithm(two.splat(one.larger(defect, constant(DOUBLE, 1e-9)))), two.constant(-1.0 / 9)
         )
         one.store(builder.extract(two.exponential(power), 0), room, at.FACTOR_OF_DEFECT)
+        all_hold = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [holds])
         return builder.select(all_hold, defect, constant(DOUBLE, FAILED))
-
-    def _called_whole(self, emit: LaneEmitter, inputs: list[Value]) -> tuple[list[Value], Value]:
-        """Accelerations by the fewest operations or else by the elimination of M, and whether these may be used."""
-        builder, filled = emit.builder, emit.builder.room(DOUBLE, LANES * self.n)
-
-        def holds(way: int) -> Value:
-            each = call_accelerations(emit, self.equations, way, inputs, self.numbers, filled)
-            return builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [each])
-
-        all_hold = holds(0)
-        if self.has_others:
-            before, otherwise, after = builder.block, builder.append_block(), builder.append_block()
-            builder.branch(all_hold, after, otherwise)
-            builder.position_at_end(otherwise)
-            found, last = holds(-1), builder.block
-            builder.go_to(after)
-            builder.position_at_end(after)
-            phi = builder.phi(BIT)
-            phi.add_incoming(all_hold, before)
-            phi.add_incoming(found, last)
-            all_hold = phi
-        return [emit.load(filled, i) for i in range(self.n)], all_hold
 
     def retry(self, emit: LaneEmitter, room: Value, state: Value) -> None:
         """Let the polynomial of a step that was refused predict the shorter one in its place."""
