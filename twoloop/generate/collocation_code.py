@@ -119,7 +119,7 @@ class CollocationCode:
             return builder.call(name, DOUBLE, [room, state, tolerances, numbers])
 
         def quick(inputs: list[Value]) -> Callable[[], Value]:
-            if self.parts is not None:
+            if self.parts is not None and not self.has_others:
                 return self._called(emit, room, 0)(inputs)
             outputs, written = self.equations.accelerations[0], Written(emit, self.numbers)
             (forms,), graph = outputs.arrays.values(), self.equations.graph
