@@ -156,3 +156,23 @@ def test_without_code_it_says_so():
     )
     with pytest.raises(ValueError, match=r"cannot be had; .* Take method='auto'"):
         solve_dae(branches, (0.0, 1.0), np.ones(1), np.zeros(1), method="Lobatto16")
+
+
+def test_a_coordinate_at_rest_whose_tolerance_is_relative_does_not_end_the_run():
+    """Tolerances of a coordinate that stays zero are none at all: another method goes on."""
+    problem = four_bar()
+    run = problem.system, (0.0, 1.0), problem.q0, problem.v0
+    result, exact = solve_dae(*run, rtol=1e-6, atol=1e-30), solve_dae(*run, rtol=1e-11, atol=1e-11)
+    assert result.success, result.message
+    assert np.abs(result.q[:, -1] - exact.q[:, -1]).max() < 1e-4
+
+
+def test_between_long_steps_over_a_soft_stop():
+    """The force has rounding errors of its own there, above those to which parts of a step are iterated."""
+    A, w, c = 20.52135, 0.00212, 0.29102
+    system = free(lambda t, q, v: -A / w * (q - c + np.sqrt((q - c) ** 2 + w * w)) - 0.1 * q - 0.057 * v)
+    t, start = np.linspace(0.0, 20.0, 801), ([0.108], [-0.179])
+    exact = end(system, 20.0, *start, method="DOP853", rtol=1e-12, atol=1e-12, t_eval=t)
+    for tolerance in (1e-6, 1e-9):
+        found = end(system, 20.0, *start, rtol=tolerance, atol=tolerance, t_eval=t)
+        assert np.abs(found.q - exact.q).max() < 100.0 * tolerance

@@ -1,0 +1,40 @@
+"""Test steps across singular positions: their coefficients, and that runs find across by them."""
+
+import numpy as np
+import pytest
+
+from tests.general.mechanisms import error, mechanism
+from twoloop import solve_dae
+from twoloop.kernels.steps import bridge
+from twoloop.methods.tableaux import gauss
+
+S = bridge.S
+
+
+def test_the_tables_are_exact_for_polynomials():
+    tableau = gauss(S)
+    options = bridge.options_array(tableau.A, tableau.b, tableau.c, 0.0, 0.0)[bridge.N_SCALARS :]
+    _, twice, legendre, without = options[: 4 * S * S].reshape(4, S, S)
+    _, end_twice, c = options[4 * S * S :].reshape(3, S)
+    for degree in range(S - 1):
+        values, product = c**degree, (degree + 1) * (degree + 2)
+        np.testing.assert_allclose(without @ values, values, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(twice @ values, c ** (degree + 2) / product, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(end_twice @ values, 1.0 / product, rtol=0, atol=1e-13)
+    for degree in range(S):
+        expected = np.zeros(S)
+        expected[degree] = 1.0
+        series = np.polynomial.legendre.legval(2.0 * c - 1.0, expected)
+        np.testing.assert_allclose(legendre @ series, expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_runs_find_across_at_tight_tolerances(n):
+    """Three passages in 5 s: stages beside the constraints let one run in four end at one of them."""
+    m = mechanism(f"A02, N = {n}")
+    ended = 0
+    for tolerance in (1e-8, 3e-9, 1e-9, 3e-10):
+        result = solve_dae(m.system(), (0.0, 5.0), *m.start, rtol=tolerance, atol=tolerance)
+        ended += result.success
+        assert not result.success or error(m, result) < 1e3 * tolerance
+    assert ended >= 3
