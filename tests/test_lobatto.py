@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 
 from twoloop import ConstrainedSystem, solve_dae
-from twoloop.generate.lobatto_tables import tables
+from twoloop.generate import lobatto_tables
 from twoloop.mechanisms import four_bar, spatial_four_bar
-
-TABLES = tables()
 
 
 def free(force, n=1):
@@ -24,19 +22,20 @@ def end(system, t_end, q0, v0=None, **options):
 
 @pytest.mark.parametrize("degree", range(9))
 def test_the_coefficients_are_exact_for_polynomials(degree):
-    nodes = np.concatenate([[0.0], TABLES.nodes])
+    tables = lobatto_tables.tables()
+    nodes = np.concatenate([[0.0], tables.nodes])
     values = nodes**degree
     once, twice = degree + 1, (degree + 1) * (degree + 2)
-    places = {"": TABLES.nodes, "_between": TABLES.between}
+    places = {"": tables.nodes, "_between": tables.between}
     for name, x in places.items():
         np.testing.assert_allclose(
-            values @ getattr(TABLES, f"velocities{name}"), x ** (degree + 1) / once, rtol=0, atol=1e-14
+            values @ getattr(tables, f"velocities{name}"), x ** (degree + 1) / once, rtol=0, atol=1e-14
         )
         np.testing.assert_allclose(
-            values @ getattr(TABLES, f"positions{name}"), x ** (degree + 2) / twice, rtol=0, atol=1e-14
+            values @ getattr(tables, f"positions{name}"), x ** (degree + 2) / twice, rtol=0, atol=1e-14
         )
-    np.testing.assert_allclose(values @ TABLES.values_between, TABLES.between**degree, rtol=0, atol=1e-13)
-    expansion = values @ TABLES.end  # about the end: (1 + x)^degree
+    np.testing.assert_allclose(values @ tables.values_between, tables.between**degree, rtol=0, atol=1e-13)
+    expansion = values @ tables.end  # about the end: (1 + x)^degree
     x = np.linspace(-1.0, 1.0, 7)
     np.testing.assert_allclose(
         1.0 + sum(c * x ** (k + 1) for k, c in enumerate(expansion)), (1.0 + x) ** degree, rtol=0, atol=1e-9
@@ -44,9 +43,10 @@ def test_the_coefficients_are_exact_for_polynomials(degree):
 
 
 def test_at_the_end_of_the_step_integrals_are_exact_to_degree_15():
-    nodes = np.concatenate([[0.0], TABLES.nodes])
+    tables = lobatto_tables.tables()
+    nodes = np.concatenate([[0.0], tables.nodes])
     for degree in range(16):
-        assert abs(nodes**degree @ TABLES.velocities[:, -1] - 1.0 / (degree + 1)) < 1e-14
+        assert abs(nodes**degree @ tables.velocities[:, -1] - 1.0 / (degree + 1)) < 1e-14
 
 
 SHARP = {  # forces whose corners and peaks the first estimate of the error did not see

@@ -13,6 +13,7 @@ import numpy as np
 from studies.bench import metrics, render, solvers, tables
 from studies.bench.store import Array
 from twoloop import ConstrainedSystem, Result, callback, mechanisms
+from twoloop.generate import lobatto_tables
 from twoloop.mechanisms import Problem
 from twoloop.methods import dop853_tableau, tableaux
 from twoloop.methods import presets as methods
@@ -20,6 +21,7 @@ from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import Plan
 
 TABLEAUX = "tests/test_tableaux.py"
+LOBATTO = "tests/test_lobatto.py::test_the_coefficients_are_exact_for_polynomials"
 EXPLICIT = "tests/test_tableaux.py::test_dop853_is_that_of_scipy"
 TABLES, METRICS, RENDER = (f"tests/studies/test_{name}.py" for name in ("tables", "metrics", "render"))
 
@@ -212,6 +214,8 @@ def in_tableau() -> Iterator[Fault]:
         array[np.unravel_index(np.flatnonzero(array)[1], array.shape)] += 1e-6
         plant = partial(patch.object, dop853_tableau, name, array)
         yield Fault(f"a number of DOP853's {name} off by 1e-6", "tableau", plant, (EXPLICIT,))
+    off_twice = _changed(lobatto_tables, "tables", lambda all_: all_._replace(positions=all_.positions + 1e-9))
+    yield Fault("double integrals of Lobatto16 off by 1e-9", "tableau", off_twice, (LOBATTO,))
 
 
 def in_options() -> Iterator[Fault]:
