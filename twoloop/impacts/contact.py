@@ -79,6 +79,7 @@ class Gaps:
 
     def _compare(self, stops: Sequence[Stop], t0: float, q0: Array) -> None:
         """Raise unless the traced programs return the values of the functions, at q0 and near it."""
+        # a fixed seed: the same model is accepted or refused at every call
         displacements = np.random.default_rng(4).uniform(-0.3, 0.3, (STATES, len(q0)))
         displacements[0] = 0.0
         for k, displacement in enumerate(displacements):
@@ -180,6 +181,7 @@ class ContactSystem:
         right_sides = [system.gamma(t, q, v)] if system.n_c else []
         right_sides += [system.nonholonomic_gamma(t, q, v)] if system.n_a else []
         n, first_stop = system.n_q, system.n_q + system.n_c + system.n_a
+        # the friction of sliding stops is proportional to their unknown forces, so it belongs in the matrix
         K = np.block([[self._call("mass", t, q), rows.T], [rows, np.zeros((len(rows),) * 2)]])
         for place, k, coefficient in self._slipping:
             K[:n, first_stop + place] -= coefficient * slides[k]
@@ -213,6 +215,7 @@ class Accelerations:
 
     def __init__(self, system: ConstrainedSystem, t: float, q: Array, v: Array, atol: Array):
         derived, _ = standing_for(system, unchecked)
+        # any explicit method would do: only the accelerations at the start of its steps are used
         plan = DOP853().plan(system.n_q, 1e-8, 1e-8, False)
         self._run = Run(derived, plan, t, q, v, 1e-8, atol, None)
         self._run.work.notes[noted.GENERATION] = 1.0  # the run has determined the ranks

@@ -60,6 +60,7 @@ def solve_complementarity(D: Array, b: Array) -> Array:
     if not len(b):
         return np.zeros(0)
     x = nnls(*_squares(D, b))[0]
+    # nnls finds the active set; the forces follow again from D itself, without the rounding of its square root
     active = x > 0.0
     x[active] = np.linalg.lstsq(D[np.ix_(active, active)], -b[active], rcond=NEGLIGIBLE)[0]
     return np.maximum(x, 0.0)
@@ -269,6 +270,7 @@ class FrictionModes(Modes):
         if not {STICKS, IDLE} & set(signs):
             return self.sliding_system(signs, t, q), {}
         names = [name for name, sign in zip(self._names, signs, strict=True) if sign == STICKS]
+        # rows of the gauge hold each displacement at t: their residuals at t = 0 measure where the joints are
         gauge, rows = self._build("gauge", signs, dict.fromkeys(names, np.nan), t, q)
         values, quarter = (gauge.constraint(t, q) for t in (0.0, 0.5 * np.pi)) if names else ((), ())
         positions = {}

@@ -274,6 +274,7 @@ class Motion:
     def _run_arc(self, mode: Mode, t1: float) -> None:
         """Integrate until a gap closes or opens, or a joint or a stop that rubs comes to rest or is released."""
         signs, resting = mode.signs, mode.resting
+        # rows of the extended system: C, then the gaps of the resting stops, then what sticks
         free, rows = self.modes.system_of(signs, self.t, self.q)
         # the rows of what sticks depend on where it sticks
         cacheable = not {STICKS, IDLE} & set(signs) and not mode.sticks
@@ -310,7 +311,7 @@ class Motion:
         if self.arcs and self.options.get("first_step") is None and self.arcs[-1].h.size:
             least_step = LEAST_STEP * max(1.0, abs(self.t))  # coordinates near zero have no scale for an initial step
             options["first_step"] = min(max(0.1 * float(self.arcs[-1].h.max()), least_step), t1 - self.t)
-        if resting:
+        if resting:  # the callbacks of an extended system call others, which cannot be traced
             options |= untraced(options)
         arc = solve_dae(system, (self.t, t1), self.q, self.v, events=events, dense_output=True, **options)
         self.arcs.append(arc)

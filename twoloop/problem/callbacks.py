@@ -316,6 +316,7 @@ def compile_returning(kind: str, function: Callable[..., Any], takes_p: bool) ->
     in_place = wrappers[len(KINDS[kind].state) > 1][takes_p]
     watched = watch(in_place)
     code = user.py_func.__code__
+    # numba caches machine code beside the file that the code claims to come from: that of the user's function
     in_place.__code__ = in_place.__code__.replace(co_filename=code.co_filename, co_firstlineno=code.co_firstlineno)
     in_place.__qualname__ = f"{user.py_func.__qualname__}.{kind}"
     return compile_callback(kind, in_place, watched, named=user.py_func)

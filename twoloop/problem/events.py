@@ -138,6 +138,7 @@ class EventSearch:
         """Search the steps that end at ends[1:], the first of which begins at ends[0]; stop at a terminal event."""
         if len(ends) < 2 or self.ended is not None:
             return
+        # all samples of many steps in one evaluation of the dense solution, which is several times faster
         steps = np.diff(ends)
         counts = np.maximum(SAMPLES, np.ceil(WHOLE * steps / self._every)).astype(int)
         first = np.append(0, np.cumsum(counts))

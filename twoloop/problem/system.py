@@ -252,6 +252,7 @@ class ConstrainedSystem:
     @property
     def parameters(self) -> Array:
         """Return the vector `p` that every callback gets, read-only: `with_parameters` makes a system of others."""
+        # the handle of Python functions comes first, and is no parameter of the user
         p = self.functions.p[self.called_in_python :].copy()  # kernels want an array that may be written
         p.setflags(write=False)
         return p.view()  # which cannot be made writable again

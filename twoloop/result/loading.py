@@ -182,7 +182,7 @@ class SavedFields:
         for name in ("v", "a"):
             self._array(name, (n_q, n_t))
         n_rows = len(self._array("lam", (None, n_t)))
-        self.sizes = n_q, n_rows
+        self.sizes = n_q, n_rows  # taken from q and lam; every other array must agree with them
         h = self._array("h", (None,))
         self._check("h", bool((h >= 0.0).all()), "sizes of steps")
         for name in COUNTS:

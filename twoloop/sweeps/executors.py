@@ -57,6 +57,7 @@ def _in_processes(work: Work, runs: dict[int, Row], n_workers: int) -> Iterator[
         while remaining or workers:
             while remaining and len(workers) < n_workers:
                 workers.append(_Worker(work, *remaining.pop()))
+            # returns as soon as a worker has sent something or has died
             wait([worker.connection for worker in workers], POLL_INTERVAL)
             for worker in list(workers):
                 yield from worker.rows()
