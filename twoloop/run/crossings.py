@@ -1,4 +1,4 @@
-"""What a run says of places where explicit steps went across in the place of its own, which became short there."""
+"""What a run says of places where steps by collocation went across in the place of its own, which became short."""
 
 from collections.abc import Callable, Iterator
 
@@ -33,7 +33,9 @@ def said_of_crossings(system: ConstrainedSystem, crossings: list[list[Place]], n
             f"({_measured(lost)}): beyond these, errors may exceed the tolerances."
         )
     if others:
-        words += f" Near t = {_times(others)} explicit steps took the place of shorter ones ({_measured(others)})."
+        words += (
+            f" Near t = {_times(others)} steps by collocation took the place of shorter ones ({_measured(others)})."
+        )
     more = len(crossings) - len(found)
     return words + (f" There were {more} more such places." if more > 0 else "")
 
