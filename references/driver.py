@@ -40,8 +40,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from references.equations.least_norm import accelerations
-from references.equations.rows import IndependentRows, with_all_rows
+from references.equations.rows import IndependentRows, accelerations, with_all_rows
 from twoloop.checks.arguments import check_positive, check_span, check_times, check_vector
 from twoloop.checks.consistency import check_start
 from twoloop.problem.problem import Array, Problem

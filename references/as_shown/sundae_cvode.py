@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from references.as_shown import rate_of, start_of
 from references.driver import imported
-from references.plain_equations import rate_of, start_of
 from twoloop.testing.problem import Array, KnownProblem
 
 NAME, PACKAGE, DRIFTS = "CVODE, scikit-sundae", "scikit-sundae", True

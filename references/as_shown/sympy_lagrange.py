@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from references.as_shown import NoModel, start_of
 from references.driver import imported
-from references.plain_equations import NoModel, start_of
 from twoloop.testing.problem import Array, KnownProblem
 
 NAME, PACKAGE, DRIFTS = "LagrangesMethod, SymPy", "sympy", True

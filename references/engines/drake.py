@@ -7,8 +7,19 @@ import numpy as np
 
 from references.driver import imported
 from references.engines import rigid as parts
-from references.engines.engine import Configured, Engine
-from references.engines.rigid import BALL, HINGE, SLIDE, UNTOLD, Array, Motion, Prepared, Rigid, State
+from references.engines.rigid import (
+    BALL,
+    HINGE,
+    SLIDE,
+    UNTOLD,
+    Array,
+    Configured,
+    Engine,
+    Motion,
+    Prepared,
+    Rigid,
+    State,
+)
 
 
 class Settings(NamedTuple):

@@ -7,14 +7,13 @@ import numpy as np
 
 from references.driver import imported
 from references.engines import rigid as parts
-from references.engines.engine import Configured, Engine
-from references.engines.rigid import UNTOLD, Motion, Prepared, Rigid
+from references.engines.rigid import UNTOLD, Configured, Engine, Motion, Prepared, Rigid
 
 PLANAR_CUT = [1, 1, 0, 0, 0, 0]
 
 
 class Settings(NamedTuple):
-    """A solver of `references.exudyn.run`; spectral radius of generalized-alpha, None: Exudyn's 0.9."""
+    """A solver of `references.exudyn.model`; spectral radius of generalized-alpha, None: Exudyn's 0.9."""
 
     solver: str = "GeneralizedAlpha"
     radius: float | None = None
@@ -26,8 +25,8 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
     Raises RuntimeError if Exudyn is not installed. Raises ValueError if it has no counterpart of a joint.
     """
     imported("exudyn", extra="references")
-    from references.exudyn.run import check_steps
-    from references.exudyn.run import run as run_exudyn
+    from references.exudyn.model import check_steps
+    from references.exudyn.model import run as run_exudyn
 
     planar = rigid.planar and all(joint.kind != "prismatic" for joint in rigid.model.joints)
     problem = rigid.given if planar else rigid.model.problem((0.0, 1.0))

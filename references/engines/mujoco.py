@@ -10,8 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from references.driver import imported
-from references.engines.engine import Configured, Engine
-from references.engines.rigid import BALL, Motion, Prepared, Rigid, State, freedoms, march
+from references.engines.rigid import BALL, Configured, Engine, Motion, Prepared, Rigid, State, freedoms, march
 from twoloop.bodies.mjcf_geometry import IgnoredWarning
 
 

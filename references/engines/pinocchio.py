@@ -8,8 +8,7 @@ import numpy as np
 
 from references.driver import imported
 from references.engines import rigid as parts
-from references.engines.engine import Configured, Engine
-from references.engines.rigid import BALL, SLIDE, UNTOLD, Motion, Prepared, Rigid, State
+from references.engines.rigid import BALL, SLIDE, UNTOLD, Configured, Engine, Motion, Prepared, Rigid, State
 from twoloop.bodies.parts import Body
 from twoloop.problem.problem import Array
 

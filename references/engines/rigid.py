@@ -2,13 +2,18 @@
 
 Every engine gets the same data: each body's mass and inertia about its centre of mass, a tree of joints whose
 coordinates are zero at the start, and the loop-closing joints. A planar mechanism is placed in the plane z = 0; its
-loop-closing hinges become ball joints, because the hinges of the tree keep it in the plane.
+loop-closing hinges become ball joints, because the hinges of the tree keep it in the plane. Each file of this folder
+says in `ENGINE` what the studies need to know of its engine.
 """
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from pkgutil import iter_modules
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -279,3 +284,30 @@ def coordinates(motion: Motion, planar: bool) -> tuple[Array, Array]:
             q[i, k, 3:] = euler_parameters(motion.R[i, k])
             v[i, k, 3:] = euler_rates(q[i, k, 3:], motion.w[i, k])
     return q.reshape(n_t, -1).T, v.reshape(n_t, -1).T
+
+
+class Configured(NamedTuple):
+    """Settings with a label; `how` says in the engine's own words what is set."""
+
+    label: str
+    settings: Any
+    how: str = "nothing"
+    everywhere: bool = False  # run on every mechanism, also with motors, lighter bodies and turned
+
+
+class Engine(NamedTuple):
+    """An engine: its name, its package, its function prepare(rigid, settings), and with which settings it is run."""
+
+    name: str
+    package: str  # name of the package, which provides the version
+    prepare: Callable[..., Prepared]
+    most_rigid: Any  # settings with which its models are compared with the mechanism
+    configured: tuple[Configured, ...]
+
+
+@cache
+def engines() -> dict[str, Engine]:
+    """Return the engines of all modules in this folder, by the names of these."""
+    names = sorted(each.name for each in iter_modules([str(Path(__file__).parent)]))
+    modules = {name: import_module(f"references.engines.{name}") for name in names}
+    return {name: module.ENGINE for name, module in modules.items() if hasattr(module, "ENGINE")}

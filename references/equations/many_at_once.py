@@ -11,15 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from references.cyrk.library import FINISHED
-from references.cyrk.ode import Solver, rate_of
+from references.cyrk.ode import FINISHED, Solver, rate_of
 from references.diffrax.dopri8 import derivative_of, packages, solved
 from references.driver import Task, TimeLimit, imported, user_call
 from references.equations.expressions import Expressions
 from references.equations.rows import with_all_rows
 from references.heyoka.taylor import rates_of
 from references.sundials.cvode_c import adams_memory
-from references.sundials.loop import Memory
+from references.sundials.library import Memory
 from twoloop.problem.problem import Array, Problem
 
 Solve = Callable[[float], Array]  # tolerance -> final q (n_runs, n_q), NaN for failed runs

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from references.driver import check_problem
-from references.exudyn.run import add_sensors, check_steps, exu, items, run
+from references.exudyn.model import add_sensors, check_steps, exu, items, run
 from twoloop.checks.arguments import check_choice
 from twoloop.problem.problem import Array, Problem
 from twoloop.result.result import Result

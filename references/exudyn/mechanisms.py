@@ -11,13 +11,24 @@ from typing import Any
 import numpy as np
 
 from references.driver import STORED
-from references.exudyn.model import GROUND, PRISMATIC, REVOLUTE, SPHERICAL, UNIVERSAL, Model, frame
-from references.exudyn.run import SOLVERS, check_steps, run
+from references.exudyn.model import (
+    GROUND,
+    PRISMATIC,
+    REVOLUTE,
+    SOLVERS,
+    SPHERICAL,
+    UNIVERSAL,
+    Model,
+    check_steps,
+    frame,
+    run,
+)
 from references.lines import CannotRun, Line
 from twoloop.bodies.rotation import euler_parameters, rotated_rate, rotation_matrix
 from twoloop.mechanisms import bricard, n_four_bar
 from twoloop.mechanisms.natural import BRICARD_AXES, BRICARD_CORNERS, BRICARD_FRAMES
 from twoloop.mechanisms.spatial import BALL, CUBE, DAMPING, DENSITY, HEIGHT, LENGTH, SLACK, STIFFNESS, WIDTH, box
+from twoloop.mechanisms.planar import PlanarBodies
 from twoloop.problem.problem import Array, Problem
 from twoloop.result.result import Result
 
@@ -259,3 +270,24 @@ LINES = (
         if solver != "GeneralizedAlpha"
     ),
 )
+
+
+def solve_pinned(
+    problem: Problem,
+    bodies: PlanarBodies,
+    n_steps: int,
+    solver: str = "GeneralizedAlpha",
+    time_limit: float | None = None,
+) -> Result:
+    """Run planar bodies with pins by one of Exudyn's implicit solvers with a fixed step, and store the final state.
+
+    The initial state and time span of the problem are used, not its system; and masses, inertias, gravity and pins of
+    the bodies. Otherwise as in `references.exudyn.mechanisms.solve_exudyn`.
+    """
+    steps = check_steps(problem, problem.t_span[1], n_steps, solver, n_steps, time_limit)
+    model = Model((0.0, -bodies.gravity, 0.0))
+    model.planar_bodies(bodies.masses, bodies.inertias, problem)
+    for pin in bodies.pins:
+        model.pin(*pin)
+    model.mbs.Assemble()
+    return run(model.mbs, model.sensors, np.concatenate(model.reference), steps, None)

@@ -1,10 +1,14 @@
-"""heyoka, CyRK and CVODE on a mechanism in minimal coordinates (`minimal.equations`), where no constraints can drift.
+"""heyoka, CyRK and CVODE on a mechanism in minimal coordinates, where no constraints can drift.
 
-Each is used as for redundant coordinates (`heyoka.taylor`, `cyrk.ode`, `sundials.cvode_c`), with the options that are
-best there, and the same timing of a second use of the integrator.
+One or two angles with Lagrange's equations derived by hand, from the parameters of a problem only, for mechanisms whose
+loops close in closed form. Each equation is written once, for floats (`math`), compiled code (numba supports `math`),
+and expressions (heyoka has functions of the same names). The solvers have the options that are best in redundant
+coordinates (`heyoka.taylor`, `cyrk.ode`, `sundials.cvode_c`), and the same timing of a second use of the integrator.
 """
 
+import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
@@ -14,16 +18,274 @@ from numpy.typing import ArrayLike
 
 from references.cyrk import ode
 from references.driver import Task, check_task, imported
-from references.equations.machine_code import machine_code
-from references.equations.straight_line import Program, Value
+from references.equations.straight_line import Program, Value, machine_code
 from references.heyoka import taylor
-from references.lines import Line
-from references.minimal.equations import Minimal, minimal
+from references.lines import CannotRun, Line
+from references.paper.four_bar_minimal import MinimalFourBar, absolute, tangent_of
 from references.sundials import cvode_c
 from twoloop.checks.arguments import check_positive
 from twoloop.mechanisms import Problem
 from twoloop.problem.problem import Array
 from twoloop.result.result import Result
+
+Equations = Callable[[Any], tuple[Any, ...]]  # [angles, rates] -> their rates
+
+INSTANTS = 1000  # per half period, at which the distance from dead centres of a four-bar is determined
+NEAREST = 1e-2  # sine of the angle between the two other bars that counts as a dead centre
+
+
+class NoMinimalCoordinates(CannotRun, ValueError):
+    """Raised for a problem without equations in minimal coordinates."""
+
+
+@dataclass(frozen=True)
+class Minimal:
+    """A mechanism in minimal coordinates."""
+
+    # equations(functions) -> rates, with rates(y) -> y', y = [angles, their rates]; functions: `math` or another module
+    # with sin, cos and sqrt
+    equations: Callable[[Any], Equations]
+    start: tuple[float, ...]  # initial y
+    # states(y (2 n, n_t)) -> q, v (n_q, n_t) in the problem's coordinates
+    states: Callable[[Array], tuple[Array, Array]]
+
+
+def minimal(problem: Problem) -> Minimal:
+    """Return the equations of a problem in minimal coordinates.
+
+    Raises NoMinimalCoordinates if there are none, or a four-bar has no angle that stays away from its dead centres.
+    """
+    if not has_minimal(problem):
+        given = problem.system.name
+        raise NoMinimalCoordinates(f"equations in minimal coordinates exist for {', '.join(MAKE)}; given {given!r}")
+    return MAKE[_kind(problem)](problem)
+
+
+def has_minimal(problem: Problem) -> bool:
+    """Return whether there are equations for the mechanism; a four-bar may still be refused by `minimal`."""
+    return _kind(problem) in MAKE
+
+
+def _kind(problem: Problem) -> str:
+    """Return the name of the mechanism without its size, which follows a comma."""
+    return problem.system.name.partition(",")[0]
+
+
+def _pendulum(problem: Problem) -> Minimal:
+    """One angle from the downward vertical: th'' = -g / L sin th."""
+    pull = problem.parameters["gravity"] / problem.parameters["length"]
+
+    def equations(functions: Any) -> Equations:
+        sin = functions.sin
+
+        def rates(y):  # type: ignore[no-untyped-def]
+            return y[1], -pull * sin(y[0])
+
+        return rates
+
+    return _chain(problem, equations)
+
+
+def _double_pendulum(problem: Problem) -> Minimal:
+    """Two angles from the downward vertical; equal masses and lengths.
+
+    Lagrange: 2 th1'' + c th2'' = -s th2'^2 - 2 g/L sin th1 and c th1'' + th2'' = s th1'^2 - g/L sin th2, with c and s
+    of th1 - th2.
+    """
+    pull = problem.parameters["gravity"] / problem.parameters["length"]
+
+    def equations(functions: Any) -> Equations:
+        sin, cos = functions.sin, functions.cos
+
+        def rates(y):  # type: ignore[no-untyped-def]
+            s, c = sin(y[0] - y[1]), cos(y[0] - y[1])
+            first = -s * (y[3] * y[3]) - 2.0 * pull * sin(y[0])
+            second = s * (y[2] * y[2]) - pull * sin(y[1])
+            determinant = 2.0 - c * c
+            return y[2], y[3], (first - c * second) / determinant, (2.0 * second - c * first) / determinant
+
+        return rates
+
+    return _chain(problem, equations)
+
+
+def _chain(problem: Problem, equations: Callable[[Any], Equations]) -> Minimal:
+    """Return links of equal length in a chain from the origin, by their angles from the downward vertical."""
+    length = problem.parameters["length"]
+
+    def states(y: Array) -> tuple[Array, Array]:
+        angles, rates = np.split(y, 2)
+        s, c = length * np.sin(angles), length * np.cos(angles)
+        q, v = (np.cumsum(each, axis=1).swapaxes(0, 1) for each in ([s, -c], [c * rates, s * rates]))
+        return q.reshape(y.shape), v.reshape(y.shape)
+
+    links, speeds = (np.diff(x.reshape(-1, 2), axis=0, prepend=0.0) for x in (problem.q0, problem.v0))
+    turns = (-links[:, 1] * speeds[:, 0] + links[:, 0] * speeds[:, 1]) / (links**2).sum(axis=1)
+    start = (*np.arctan2(links[:, 0], -links[:, 1]).tolist(), *turns.tolist())
+    return Minimal(equations, start, states)
+
+
+def _slider_crank(problem: Problem) -> Minimal:
+    """One angle, that of the crank; the rod's is asin(-a sin th), as a < 1.
+
+    Both ends of the spring are at half the height of the pin, so its length is half the distance of the slider.
+    """
+    a, J1, m2, J2, k, c, l0, F = (problem.parameters[name] for name in ("a", "J1", "m2", "J2", "k", "c", "l0", "F"))
+
+    def equations(functions: Any) -> Equations:
+        sin, cos, sqrt = functions.sin, functions.cos, functions.sqrt
+
+        def rates(y):  # type: ignore[no-untyped-def]
+            s, w = sin(y[0]), y[1]
+            cc, s2 = cos(y[0]), -a * s
+            c2 = sqrt(1.0 - s2 * s2)
+            rod = -a * cc / c2  # first derivatives by the angle, of the rod angle and slider position; then second ones
+            slide = -s2 * rod - a * s
+            rod_2 = (s2 * (rod * rod) + a * s) / c2
+            slide_2 = -c2 * (rod * rod) - s2 * rod_2 - a * cc
+            length = 0.5 * (c2 + a * cc)
+            inertia = J1 + m2 * (slide * slide) + J2 * (rod * rod)
+            coupling = m2 * slide * slide_2 + J2 * rod * rod_2
+            spring = -0.5 * slide * (k * (length - l0) + 0.5 * c * slide * w)
+            push = F * (slide - s2 * rod)
+            return w, (spring + push - coupling * (w * w)) / inertia
+
+        return rates
+
+    def states(y: Array) -> tuple[Array, Array]:
+        s, cc = np.sin(y[0]), np.cos(y[0])
+        tilt = np.arcsin(-a * s)
+        rod = -a * cc / np.cos(tilt)
+        slide = -np.sin(tilt) * rod - a * s
+        return np.array([y[0], np.cos(tilt) + a * cc, tilt]), y[1] * np.array([np.ones_like(s), slide, rod])
+
+    return Minimal(equations, (float(problem.q0[0]), float(problem.v0[0])), states)
+
+
+def _four_bar(problem: Problem) -> Minimal:
+    """One angle, that of a bar such that the two others are never collinear on the motion.
+
+    The others, of lengths La and Lb, follow from R = La e_a + Lb e_b = (L, 0) - Lk e_k: the component of La e_a along R
+    is (R^2 + La^2 - Lb^2) / (2 R^2) times R, and the perpendicular one is a root of constant sign.
+    """
+    p = problem.parameters
+    lengths, ground, density, gravity = (p["L1"], p["L2"], p["L3"]), p["L"], p["density"], p["gravity"]
+    known = MinimalFourBar.from_parameters(p)
+    angles = known.states(np.linspace(0.0, 0.5 * known.period, INSTANTS))[0][2::3]
+    between = [np.sin(angles[b] - angles[a]) for _, a, b in OTHERS]
+    best = max(range(3), key=lambda k: np.abs(between[k]).min())
+    own, a, b = OTHERS[best]
+    if np.ptp(np.sign(between[best])) or np.abs(between[best]).min() < NEAREST:
+        raise NoMinimalCoordinates(f"every angle of {problem.name!r} reaches its dead centre on this motion")
+    side = -math.copysign(1.0, between[best][0])  # e_a is to the left of R if e_b is to the right
+    Lk, La, Lb = lengths[own], lengths[a], lengths[b]
+    masses = [density * length for length in lengths]
+    # centre of bar i = sum of HALVES[i] L e; factors of the three bars in the order k, a, b
+    arms = [[masses[i], *(HALVES[i][j] * lengths[j] for j in (own, a, b))] for i in range(3)]
+    (m1, k1, a1, b1), (m2, k2, a2, b2), (m3, k3, a3, b3) = arms
+    Jk, Ja, Jb = (masses[i] * lengths[i] ** 2 / 12.0 for i in (own, a, b))
+
+    def equations(functions: Any) -> Equations:
+        sin, cos, sqrt = functions.sin, functions.cos, functions.sqrt
+
+        def rates(y):  # type: ignore[no-untyped-def]
+            ck, sk, w = cos(y[0]), sin(y[0]), y[1]
+            x, z = ground - Lk * ck, -Lk * sk
+            square = x * x + z * z
+            along = 0.5 * (square + (La * La - Lb * Lb)) / square
+            across = side * sqrt(La * La / square - along * along)
+            ax, az = along * x - across * z, along * z + across * x
+            ca, sa, cb, sb = ax / La, az / La, (x - ax) / Lb, (z - az) / Lb
+            sine = sb * ca - cb * sa
+            # derivatives of the two angles by the independent one: first and second, from the loop closure
+            na = -Lk * (sb * ck - cb * sk) / (La * sine)
+            nb = Lk * (sa * ck - ca * sk) / (Lb * sine)
+            ra, rb = na * na, nb * nb
+            wx, wz = Lk * ck + La * ra * ca + Lb * rb * cb, Lk * sk + La * ra * sa + Lb * rb * sb
+            da, db = (wx * cb + wz * sb) / (La * sine), -(wx * ca + wz * sa) / (Lb * sine)
+            # first and second derivatives of the bars' vectors e
+            kx, kz, ax, az, bx, bz = -sk, ck, -sa * na, ca * na, -sb * nb, cb * nb
+            kxx, kzz = -ck, -sk
+            axx, azz = -ca * ra - sa * da, -sa * ra + ca * da
+            bxx, bzz = -cb * rb - sb * db, -sb * rb + cb * db
+            # and of the centres
+            x1, z1 = k1 * kx + a1 * ax + b1 * bx, k1 * kz + a1 * az + b1 * bz
+            x2, z2 = k2 * kx + a2 * ax + b2 * bx, k2 * kz + a2 * az + b2 * bz
+            x3, z3 = k3 * kx + a3 * ax + b3 * bx, k3 * kz + a3 * az + b3 * bz
+            inertia = Jk + Ja * ra + Jb * rb
+            inertia = inertia + m1 * (x1 * x1 + z1 * z1) + m2 * (x2 * x2 + z2 * z2) + m3 * (x3 * x3 + z3 * z3)
+            coupling = Ja * na * da + Jb * nb * db
+            coupling = coupling + m1 * (x1 * (k1 * kxx + a1 * axx + b1 * bxx) + z1 * (k1 * kzz + a1 * azz + b1 * bzz))
+            coupling = coupling + m2 * (x2 * (k2 * kxx + a2 * axx + b2 * bxx) + z2 * (k2 * kzz + a2 * azz + b2 * bzz))
+            coupling = coupling + m3 * (x3 * (k3 * kxx + a3 * axx + b3 * bxx) + z3 * (k3 * kzz + a3 * azz + b3 * bzz))
+            weight = gravity * (m1 * z1 + m2 * z2 + m3 * z3)
+            return w, -(weight + coupling * (w * w)) / inertia
+
+        return rates
+
+    def turns(angle: Array) -> dict[int, Array]:
+        """Return the three angles, continuous in the independent one: R rotates only if its bar exceeds the ground."""
+        bar = np.exp(1j * angle)
+        chord = ground - Lk * bar
+        along = 0.5 * (np.abs(chord) ** 2 + La**2 - Lb**2) / np.abs(chord) ** 2
+        of_a = chord * (along + 1j * side * np.sqrt(La**2 / np.abs(chord) ** 2 - along**2))
+        across = np.angle(chord) if Lk < ground else angle + np.angle(-chord / bar) + math.pi
+        first = across + np.angle(of_a / chord)
+        return {own: angle, a: first, b: first + np.angle((chord - of_a) / of_a)}
+
+    at_start = turns(np.array(problem.q0[3 * own + 2]))
+    whole = [2.0 * math.pi * round((problem.q0[3 * i + 2] - float(at_start[i])) / (2.0 * math.pi)) for i in range(3)]
+
+    def states(y: Array) -> tuple[Array, Array]:
+        turned = turns(y[0])
+        angles = np.array([turned[i] + whole[i] for i in range(3)])
+        tangent = tangent_of(np.array(lengths), angles)
+        return absolute(np.array(lengths), angles, tangent / tangent[own] * y[1])
+
+    return Minimal(equations, (float(problem.q0[3 * own + 2]), float(problem.v0[3 * own + 2])), states)
+
+
+def _n_four_bar(problem: Problem) -> Minimal:
+    """One angle, that of all cranks from the ground line: th'' = -w^2 cos th, on the branch with level couplers.
+
+    n + 1 uniform bars turn about their ends and n do not turn; at positions where C_q loses rank nothing happens here.
+    """
+    n, length, gravity = (problem.parameters[name] for name in ("n", "length", "gravity"))
+    inertia, weight = (n + 1) / 3.0 + n, 0.5 * (n + 1) + n  # of bars of equal mass, over mass times length (squared)
+    pull = weight * gravity / (inertia * length)
+    by_tips = len(problem.q0) == 2 * (n + 1)
+    crank = 1.0 if by_tips else 0.5  # of its length, to the point whose coordinates are q
+
+    def equations(functions: Any) -> Equations:
+        cos = functions.cos
+
+        def rates(y):  # type: ignore[no-untyped-def]
+            return y[1], -pull * cos(y[0])
+
+        return rates
+
+    def states(y: Array) -> tuple[Array, Array]:
+        arm, turned = length * np.exp(1j * y[0]), y[1] * 1j * length * np.exp(1j * y[0])
+        bars = [(crank * arm + length * i, crank * turned, y[0], y[1]) for i in range(n + 1)]
+        if not by_tips:
+            level = np.zeros_like(y[0])
+            bars += [(arm + length * (i + 0.5), turned, level, level) for i in range(n)]
+        size = 2 if by_tips else 3  # coordinates of each
+        q = [part for x, _, angle, _ in bars for part in (x.real, x.imag, angle)[:size]]
+        v = [part for _, u, _, rate in bars for part in (u.real, u.imag, rate)[:size]]
+        return np.array(q), np.array(v)
+
+    tip, speed = problem.q0[:2] / (crank * length), problem.v0[:2] / (crank * length)
+    angle = math.atan2(tip[1], tip[0]) if by_tips else float(problem.q0[2])  # with whole turns
+    return Minimal(equations, (angle, float(tip[0] * speed[1] - tip[1] * speed[0])), states)
+
+
+OTHERS = ((0, 1, 2), (1, 0, 2), (2, 0, 1))  # a bar and the two others
+HALVES = ((0.5, 0.0, 0.0), (1.0, 0.5, 0.0), (1.0, 1.0, 0.5))  # path to the centre of a bar, in lengths of the bars
+MAKE: dict[str, Callable[[Problem], Minimal]] = {"four-bar": _four_bar, "A01 pendulum": _pendulum}
+MAKE |= {"projection pendulum": _pendulum, "double pendulum": _double_pendulum, "SUNDIALS slider-crank": _slider_crank}
+MAKE |= {"A02": _n_four_bar}
+
 
 FUNCTIONS = ("sin", "cos", "sqrt")  # that equations in minimal coordinates have
 _KNOWN: dict[int, tuple[Problem, Minimal]] = {}

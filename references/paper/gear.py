@@ -16,7 +16,7 @@ from numba import njit
 
 from references.driver import STORED as STEPS_STORED
 from references.driver import Task, TimeLimit, adapter, user_call
-from references.equations.linear import lu_factor, lu_solve
+from references.equations.accelerations import lu_factor, lu_solve
 from references.lines import Line
 from references.scipy.index1 import solve_index1
 from twoloop.checks.arguments import check_choice, check_size, check_times

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
 from references.driver import check_problem
-from references.equations.linear import kept
+from references.equations.accelerations import kept
 from twoloop.checks.arguments import check_positive, check_times
 from twoloop.mechanisms import Problem
 from twoloop.problem.problem import Array

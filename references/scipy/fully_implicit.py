@@ -12,7 +12,7 @@ import numpy as np
 
 from references.driver import CAUSES, Task, TimeLimit, adapter, imported, user_call
 from references.lines import Line
-from references.scipy.steps import Steps
+from references.scipy.index1 import Steps
 from references.sundials.residual import Implicit
 from twoloop.checks.arguments import check_choice
 from twoloop.problem.problem import Array

@@ -12,7 +12,7 @@ import numpy as np
 from references.driver import ADVICE, OutOfTimeError, Task, TimeLimit, adapter, imported, user_call
 from references.lines import Line
 from references.scipy.index1 import RightHandSide
-from references.sundials.loop import SMALLEST_STEP
+from references.sundials.library import SMALLEST_STEP
 from twoloop.problem.problem import Array
 from twoloop.result.result import Result
 

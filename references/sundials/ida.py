@@ -14,7 +14,7 @@ import numpy as np
 
 from references.driver import CAUSES, Deferred, Task, TimeLimit, adapter, user_call
 from references.lines import Line
-from references.sundials.loop import SMALLEST_STEP
+from references.sundials.library import SMALLEST_STEP
 from references.sundials.residual import FORMS, NOT_TESTED, Implicit
 from twoloop.checks.arguments import check_choice
 from twoloop.problem.problem import Array

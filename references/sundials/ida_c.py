@@ -13,12 +13,10 @@ import numpy as np
 from numba import carray, cfunc, njit, types
 
 from references.driver import Task, adapter
-from references.equations.linear import OPTIONS
+from references.equations.accelerations import OPTIONS
 from references.lines import Line
-from references.sundials.band import band_of
-from references.sundials.library import library
-from references.sundials.loop import RAISED, Memory, run
-from references.sundials.residual import NOT_TESTED, Implicit, Parts, iteration_matrix_at, residual_at
+from references.sundials.library import RAISED, Memory, library, run
+from references.sundials.residual import NOT_TESTED, Implicit, Parts, band_of, iteration_matrix_at, residual_at
 from twoloop.checks.arguments import check_choice, check_size
 from twoloop.result.result import Result
 

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from scipy.sparse import bmat, coo_array, csc_array, eye_array
 
 from references.driver import CAUSES, Deferred, Task, TimeLimit, adapter, user_call
-from references.equations.least_norm import accelerations
-from references.equations.linear import kept
-from references.sundials.loop import SMALLEST_STEP
+from references.equations.accelerations import kept
+from references.equations.rows import accelerations
+from references.sundials.library import SMALLEST_STEP
 from references.sundials.residual import DIFFERENCE
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result

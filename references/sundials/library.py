@@ -1,12 +1,18 @@
-"""IDA's and CVODE's functions by ctypes, from the SUNDIALS library inside scikit-sundae, private to the wheel."""
+"""IDA and CVODE by ctypes, from the SUNDIALS library inside scikit-sundae: functions, memory and time-stepping loop."""
 
 import ctypes
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, files
 from types import SimpleNamespace
 from typing import Any
+
+import numpy as np
+
+from references.driver import Task, TimeLimit, user_call
+from twoloop.problem.problem import Array
 
 WRITTEN_FOR = "scikit-sundae 1.2.0 for Linux, with SUNDIALS 7.9.0 (any 7.x), sunindextype int and sunrealtype double"
 
@@ -108,3 +114,150 @@ def _version(sundials: SimpleNamespace) -> tuple[int, int, int]:
     places = [ctypes.byref(numbers, i * ctypes.sizeof(INT)) for i in range(3)]
     sundials.SUNDIALSGetVersionNumber(*places, label, len(label))
     return numbers[0], numbers[1], numbers[2]
+
+
+SMALLEST_STEP = 1e-12  # relative to the length of t_span; without a limit the step is reduced forever at a NaN
+MOST_STEPS = 10**9  # the time limit takes effect earlier
+STEPS_A_CALL = 1000  # between two checks of the clock: each costs as much as a step of a small system
+NORMAL, ONE_STEP, TSTOP_RETURN, TOO_MUCH_WORK = 1, 2, 1, -1
+RAISED = -1  # return value of a callback for an unrecoverable error
+COUNTERS = {"n_accepted": ("Steps",), "n_rejected_error": ("ErrTestFails",)}
+COUNTERS |= {"n_rejected_convergence": ("StepSolveFails",), "n_outer": ("NonlinSolvIters",)}
+
+
+class Memory:
+    """The memory of IDA (`kind` "IDA") or CVODE ("CVode"), whose vectors are the rows of `state`."""
+
+    def __init__(self, stack: ExitStack, kind: str, start: Array, task: Task, *given: int):
+        self.kind, self.state, self.start, self.task = kind, start.copy(), start, task
+        self.stack, self.own, self.sundials = stack, context(stack), library()
+        self.vectors = [self.vector(values) for values in self.state]
+        free = getattr(self.sundials, f"{kind}Free")
+        self.memory = made(stack, f"{kind}Create", lambda pointer: free(ctypes.byref(pointer)), *given, self.own)
+        self.reached = REAL(task.t0)
+
+    def vector(self, values: Array) -> Any:
+        """Return a SUNDIALS vector that wraps an array."""
+        free = self.sundials.N_VDestroy
+        return made(self.stack, "N_VMake_Serial", free, values.size, values.ctypes.data, self.own)
+
+    def call(self, name: str, *arguments: Any) -> None:
+        """Call a function, which must return 0."""
+        check(f"{self.kind}{name}", getattr(self.sundials, f"{self.kind}{name}")(self.memory, *arguments))
+
+    def solve_directly(self, jacobian: Any, band: tuple[int, int] | None = None) -> None:
+        """Use Newton's method with a dense matrix, or one of so many lower and upper diagonals.
+
+        `jacobian` None: by differences.
+        """
+        kind, size, destroy = "Dense" if band is None else "Band", self.state.shape[1], self.sundials.SUNMatDestroy
+        widths = (size,) if band is None else band[::-1]
+        matrix = made(self.stack, f"SUN{kind}Matrix", destroy, size, *widths, self.own)
+        linear = made(self.stack, f"SUNLinSol_{kind}", self.sundials.SUNLinSolFree, self.vectors[0], matrix, self.own)
+        self.call("SetLinearSolver", linear, matrix)
+        if jacobian is not None:
+            self.call("SetJacFn", jacobian.address)
+
+    def bound_steps(self, longest: float) -> None:
+        """Set the limits of the step size, and the stop time."""
+        self.call("SetMaxNumSteps", STEPS_A_CALL)
+        self.call("SetMaxStep", longest)
+        self.call("SetMinStep", SMALLEST_STEP * (self.task.t1 - self.task.t0))
+        self.call("SetStopTime", self.task.t1)
+
+    def restart(self) -> None:
+        """Reinitialise at the start, like a user who keeps the memory."""
+        self.state[:] = self.start
+        self.call("ReInit", self.task.t0, *self.vectors)
+        self.reached.value = self.task.t0
+
+    def solve(self, stop: float, mode: int) -> int:
+        """Return the flag after steps to `stop`, or after one step."""
+        place = ctypes.byref(self.reached)
+        if self.kind == "IDA":
+            return int(self.sundials.IDASolve(self.memory, stop, place, *self.vectors, mode))
+        return int(self.sundials.CVode(self.memory, stop, *self.vectors, place, mode))
+
+    def go_to_the_end(self, limit: TimeLimit) -> int:
+        """Return the last flag; after the time limit that of a run stopped by the number of steps."""
+        flag = TOO_MUCH_WORK
+        for calls in itertools.count(1):
+            flag = TOO_MUCH_WORK if limit.passed() else self.solve(self.task.t1, NORMAL)
+            if flag != TOO_MUCH_WORK or limit.exceeded or calls * STEPS_A_CALL >= MOST_STEPS:
+                break
+        return flag
+
+    def rows_at(self, times: Array) -> Array:
+        """Return the states (n_t, k n) at times reached before with the same steps, or those before a failure."""
+        flag, rows = 0, np.empty((times.size, self.state.size))
+        for k, stop in enumerate(times.tolist()):
+            if stop > self.task.t0:
+                if k == 0 or times[k - 1] <= self.task.t0:  # the first step size depends on the end time
+                    self.solve(self.task.t1, ONE_STEP)
+                while flag != TSTOP_RETURN:
+                    flag = self.solve(stop, NORMAL)
+                    if flag != TOO_MUCH_WORK:
+                        break
+                if flag < 0:
+                    return rows[:k]
+            rows[k] = self.state.ravel()
+        return rows
+
+    def counted(self, what: str) -> int:
+        """Return a counter."""
+        number = LONG()
+        self.call(f"GetNum{what}", ctypes.byref(number))
+        return number.value
+
+    def failure(self, flag: int, limit: TimeLimit, advice: str) -> str:
+        """Return the message of a run that ended with this flag."""
+        name, t = self.kind.upper(), self.reached.value
+        if limit.exceeded:
+            return limit.message(name, t, "take looser tolerances")
+        if flag >= 0:
+            return ""
+        return f"{name} failed after t = {t:.10g} with {self.flag_name(flag)} ({flag}). {advice}"
+
+    def flag_name(self, flag: int) -> str:
+        """Return SUNDIALS' name of a flag; the caller must free the text."""
+        text = getattr(self.sundials, f"{self.kind}GetReturnFlagName")(flag)
+        name = ctypes.string_at(text).decode()
+        free = ctypes.CDLL(None).free
+        free.argtypes, free.restype = [POINTER], None
+        free(text)
+        return name
+
+
+def run(
+    kind: str,
+    start: Array,
+    task: Task,
+    given: tuple[int, ...],
+    set_up: Callable[[Memory], None],
+    max_step: float | None,
+    counters: Mapping[str, tuple[str, ...]],
+    advice: str,
+) -> tuple[Array, Array, str, dict[str, int]]:
+    """Return the times reached, states there as rows, error message or "", and counters.
+
+    A second use of the memory is timed, as in SUNDIALS' guides: ReInit, and steps to the end without output. The output
+    run has a memory of its own, because CVODE's ReInit does not reset the time of the last projection.
+    """
+    longest = task.longest(max_step)
+
+    def ready(stack: ExitStack) -> Memory:
+        solver = Memory(stack, kind, start, task, *given)
+        set_up(solver)
+        solver.bound_steps(longest)
+        return solver
+
+    with ExitStack() as stack:
+        solver, limit = ready(stack), TimeLimit(task.time_limit)
+        with user_call:
+            solver.restart()
+            flag = solver.go_to_the_end(limit)
+        counts = {name: sum(map(solver.counted, parts)) for name, parts in (COUNTERS | dict(counters)).items()}
+        failure, kept = solver.failure(flag, limit, advice), task.instants[task.instants <= solver.reached.value]
+    with ExitStack() as stack:
+        rows = ready(stack).rows_at(kept)
+    return kept[: len(rows)], rows, failure, counts

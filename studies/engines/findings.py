@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from references.engines.engine import engines
+from references.engines.rigid import engines
 from studies.bench import tables
 from studies.bench.closed_loops import LIGHTER
 from studies.bench.end_states import EXACT

@@ -10,8 +10,7 @@ import matplotlib.pyplot as plt
 import pandas as pd
 from matplotlib.figure import Figure
 
-from references.engines.engine import engines
-from references.engines.rigid import Motion, Prepared
+from references.engines.rigid import Motion, Prepared, engines
 from studies.bench import figures
 from studies.bench.cli import version_of
 from studies.bench.closed_loops import LIGHTENED, MECHANISMS, four_bar, rssr

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from references.engines.trees import end_by_pinocchio
-from references.exudyn.pinned import solve_pinned
+from references.exudyn.mechanisms import solve_pinned
 from references.sundials.ida_sparse import solve_ida_sparse
 from studies.bench.collector import Case, Run, Solver, called_from, timed
 from studies.bench.large import PLANAR, SPATIAL, Assembly, open_chain

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from references.minimal.equations import has_minimal
+from references.minimal.solvers import has_minimal
 from studies.bench import adaptive, headline
 from studies.bench.cli import Call
 from studies.bench.collector import REPEATS, Run

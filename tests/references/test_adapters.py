@@ -8,7 +8,7 @@ import pytest
 
 from references.exudyn.beam import solve_exudyn_beam
 from references.exudyn.mechanisms import solve_exudyn
-from references.exudyn.run import SOLVERS
+from references.exudyn.model import SOLVERS
 from tests.marks import slow
 from tests.problems import pendulum
 from tests.references.adapters import ADAPTERS, ANY_CALLBACK, each, start

@@ -6,10 +6,9 @@ from functools import partial
 import numpy as np
 import pytest
 
-from references.equations.accelerations import Equations, compiled_gamma, saddle_solve
+from references.equations.accelerations import SINGULAR, Equations, cholesky, compiled_gamma, saddle_solve
 from references.equations.expressions import Expressions, functions_of
-from references.equations.least_norm import accelerations as least_norm
-from references.equations.linear import SINGULAR, cholesky
+from references.equations.rows import accelerations as least_norm
 from references.equations.straight_line import straight_line
 from references.scipy.index1 import solve_index1
 from references.sundials.cvode_c import solve_cvode_c

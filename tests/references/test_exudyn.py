@@ -12,7 +12,7 @@ pytest.importorskip("exudyn")
 from references.exudyn.beam import MODELS as BEAMS
 from references.exudyn.beam import solve_exudyn_beam
 from references.exudyn.mechanisms import MODELS, has_model, solve_exudyn
-from references.exudyn.run import SOLVERS
+from references.exudyn.model import SOLVERS
 from references.paper.four_bar_minimal import trajectory
 from studies.validation import study as validation
 from tests.marks import slow, slow_but

@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from references.minimal import solvers as minimal_solvers
-from references.minimal.equations import NoMinimalCoordinates, minimal
+from references.minimal.solvers import NoMinimalCoordinates, minimal
 from references.paper.four_bar_minimal import MinimalFourBar
 from references.scipy.beam_reduced import reduced_motion
 from studies.bench.cases.four_bar import SECOND

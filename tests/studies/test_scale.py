@@ -102,7 +102,7 @@ def test_assemblies_start_on_their_constraints(build):
 
 def test_exudyns_bodies_move_as_those_of_twoloop():
     pytest.importorskip("exudyn")
-    from references.exudyn.pinned import solve_pinned
+    from references.exudyn.mechanisms import solve_pinned
     from twoloop import solve_dae
 
     made = open_chain(5)

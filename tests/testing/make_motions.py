@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from references.plain_equations import rate_of
+from references.as_shown import rate_of
 from tests.mechanisms.motions import planar, spatial
 from tests.mechanisms.motions.integrate import by_scipy
 from tests.testing.systems import system_of

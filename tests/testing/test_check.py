@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from references.plain_equations import rate_of, start_of
+from references.as_shown import rate_of, start_of
 from tests.marks import slow_but
 from tests.testing.planted import ALPHA, FAULTS, ORDERS, OTHERS, RATTLE, RK, module_of
 from tests.testing.systems import system_of
