@@ -2,22 +2,16 @@
 
 `adapter` turns solve(task, options ...) into solve(system, t_span, q0, v0, options ...). Common parameters:
 
-system : ConstrainedSystem
-    The problem. Its callbacks are compiled into the solver's functions at the first run (a few seconds). Solvers that
-    take expressions require compiled callbacks with Q_d that do not branch on t, q or v.
-t_span : (float, float)
-    Start and end, s, in increasing order.
-q0, v0 : array_like (n_q,)
-    Consistent initial coordinates and velocities.
+system, t_span, q0, v0
+    As of `solve_dae`. The callbacks are compiled into the solver's functions at the first run (a few seconds). Solvers
+    that take expressions require compiled callbacks with Q_d that do not branch on t, q or v.
 rtol, atol : float
     The solver's tolerances for q and v; `tol` for a solver with a single tolerance.
 t_eval : array_like, optional
     Increasing output times in t_span, by the solver's own interpolation, in a second run with the same steps that is
     not timed. None: `OUTPUTS` equidistant times, unless the adapter stores the steps.
-time_limit : float, optional
-    Wall-clock limit of the integration, s. A run that exceeds it fails. None: no limit.
-max_step : float, optional
-    Some adapters: the largest step, s. None: the length of t_span.
+time_limit, max_step : float, optional
+    Wall-clock limit of the integration, s, beyond which a run fails; and for some adapters the largest step, s.
 
 They return a `Result`, with the sign of M a + C_q^T lam = Q, and `a` and `lam` from eq. (6) at the stored states
 unless stated otherwise. `h` is empty if steps are not stored; `cpu_time` is that of the call that a user writes
@@ -43,7 +37,7 @@ from numpy.typing import ArrayLike
 from references.equations.rows import IndependentRows, accelerations, with_all_rows
 from twoloop.checks.arguments import check_positive, check_span, check_times, check_vector
 from twoloop.checks.consistency import check_start
-from twoloop.problem.problem import Array, Problem
+from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.run.record import Statistics, Status
@@ -64,17 +58,10 @@ def cpu_time() -> float:
 class UserCall:
     """CPU time of the call that a user of a solver writes.
 
-    An adapter does more than that: checks, construction of objects that a user would keep, a second run for the output,
-    accelerations and multipliers. It wraps the code that the solver's documentation shows for a repeated run in
-    `with user_call:`. Adapters that do not use it are timed as a whole.
-
-    Attributes
-    ----------
-    seconds : float or None
-        CPU time of the last call measured.
-    ended : float or None
-        `cpu_time` at the end of the first call since this was None: it includes construction, but no second run for
-        the output.
+    An adapter does more: checks, construction of objects that a user would keep, a second run for the output,
+    accelerations and multipliers. It wraps the code that the solver's documentation shows for a repeated run in `with
+    user_call:`. Adapters that do not use it are timed as a whole. `seconds` is the time of the last call measured;
+    `ended` is `cpu_time` at the end of the first call since this was None: it includes construction, but no second run.
     """
 
     def __init__(self) -> None:
@@ -133,20 +120,14 @@ class TimeLimit:
         return f"{name} was stopped at t = {t:.10g} by time_limit = {self.seconds:g} s. Raise time_limit, or {advice}."
 
 
-def check_time_limit(time_limit: float | None) -> None:
-    """Raise an error if a time limit is invalid."""
-    if time_limit is not None:
-        check_positive("time_limit", time_limit)
-
-
 def imported(module: str, name: str = "", extra: str = "peers") -> Any:
     """Return an optional package, or a module of it."""
     try:
         return import_module(module)
     except ImportError as error:
         name = name or module.partition(".")[0]
-        how = f"make {extra}, or pip" if extra in ("peers", "engines") else "pip"
-        raise RuntimeError(f"{name} is not installed: {how} install 'twoloop[{extra}]'") from error
+        command = f"make {extra}, or pip" if extra in ("peers", "engines") else "pip"
+        raise RuntimeError(f"{name} is not installed: {command} install 'twoloop[{extra}]'") from error
 
 
 class Deferred:
@@ -157,14 +138,6 @@ class Deferred:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(imported(self._module, self._name, "references"), name)
-
-
-def check_problem(problem: Any, parameter: str, expected: str) -> Problem:
-    """Return `problem` if it is a `Problem` with this parameter, which identifies its mechanism."""
-    if not isinstance(problem, Problem) or parameter not in problem.parameters:
-        given = f"the Problem {problem.name!r}" if isinstance(problem, Problem) else repr(problem)
-        raise TypeError(f"problem must be {expected}; given {given}")
-    return problem
 
 
 @dataclass(frozen=True)
@@ -203,17 +176,9 @@ class Task:
     def result(self, name: str, t: Array, rows: Array, failure: str = "", *, h: Any = None, **counts: Any) -> Result:
         """Return the Result of a run.
 
-        Parameters
-        ----------
-        t : ndarray (n_t,)
-        rows : ndarray (3 n_q + n_c, n_t) or (2 n_q, n_t)
-            [q v a lam], or [q v], which is completed by `a` and `lam` from eq. (6).
-        failure : str
-            Message of a failed run; "": it reached the end.
-        h : ndarray, optional
-            Step sizes.
-        counts
-            Fields of `Statistics` known to the solver, and cpu_time, if it is not that of the last `user_call`.
+        `rows` are [q v a lam] (3 n_q + n_c, n_t), or [q v], completed by `a` and `lam` from eq. (6). `failure` is the
+        message of a failed run, `h` the step sizes. `counts` are fields of `Statistics` known to the solver, and
+        cpu_time, if it is not that of the last `user_call`.
         """
         n = self.system.n_q
         if len(rows) == 2 * n:
@@ -248,12 +213,13 @@ def check_task(
     check_system(system)
     t0, t1 = check_span(t_span)
     q0, v0 = check_vector("q0", q0, system.n_q), check_vector("v0", v0, system.n_q)
-    check_time_limit(time_limit)
+    if time_limit is not None:
+        check_positive("time_limit", time_limit)
     times = None if t_eval is None else check_times(t_eval, t0, t1, None)
     rows = IndependentRows(system, t0, q0) if independent_rows else None
-    some = system if rows is None else rows.system
-    check_start(some, t0, q0, v0, derivatives=derivatives)
-    return Task(with_all_rows(some), some.n_c, t0, t1, q0, v0, times, time_limit, rows)
+    checked = system if rows is None else rows.system
+    check_start(checked, t0, q0, v0, derivatives=derivatives)
+    return Task(with_all_rows(checked), checked.n_c, t0, t1, q0, v0, times, time_limit, rows)
 
 
 def adapter(*, velocity_rows: bool = True, **checks: bool) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -263,23 +229,23 @@ def adapter(*, velocity_rows: bool = True, **checks: bool) -> Callable[[Callable
     """
 
     def decorate(solve: Callable[..., Any]) -> Callable[..., Any]:
-        known = signature(solve)
+        parameters = signature(solve)
 
         @wraps(solve)
         def checked(system: Any, t_span: Any, q0: Any, v0: Any, *rest: Any, **options: Any) -> Any:
             shared = {name: options.pop(name, None) for name in ("t_eval", "time_limit")}
-            given = known.bind(None, *rest, **options).arguments
-            for name in [name for name in POSITIVE & given.keys() if given[name] is not None]:
-                check_positive(name, given[name])
-                given[name] = float(given[name])
-            given["task"] = check_task(system, t_span, q0, v0, **shared, **checks)
+            arguments = parameters.bind(None, *rest, **options).arguments
+            for name in [name for name in POSITIVE & arguments.keys() if arguments[name] is not None]:
+                check_positive(name, arguments[name])
+                arguments[name] = float(arguments[name])
+            arguments["task"] = check_task(system, t_span, q0, v0, **shared, **checks)
             if system.n_a > 0 and not velocity_rows:
                 raise ValueError(
                     f"system must have constraints on positions only: this adapter has no rows A v + b = 0; given "
                     f"{system.name!r} with n_a = {system.n_a}. Use one based on accelerations, or solve_dae"
                 )
             user_call.seconds = None
-            return solve(**given)
+            return solve(**arguments)
 
         return checked
 

@@ -21,8 +21,7 @@ class Line:
     solve: Callable[..., Result]
     options: Mapping[str, Any] = field(default_factory=dict)
     called_from: str = "compiled"  # caller of the mechanism's functions; "Python" costs microseconds per call
-    # whether the positions stay on the constraints to the solver's tolerance
-    keeps: bool = True
+    keeps: bool = True  # keeps the positions on the constraints to the solver's tolerance
     compared: bool = True  # runs in all comparisons of studies
     checked: bool = False  # checked by `conformance`; one setting per solver
     setting: str = "tol"  # the number that varies; "h": a fixed step, which `solve` takes as `step`
@@ -36,8 +35,7 @@ class Line:
     compiled_callbacks: bool = False  # requires compiled functions
     one_tolerance: bool = False  # takes `tol` instead of `rtol` and `atol`
     scatters: bool = False  # error scatters with rounding: repetitions use slightly different tolerances
-    # as a row tells them
-    fixed: Mapping[str, float | str] = field(default_factory=dict)
+    fixed: Mapping[str, float | str] = field(default_factory=dict)  # as rows contain them
 
 
 class CannotRun(Exception):
@@ -47,7 +45,9 @@ class CannotRun(Exception):
 @cache
 def lines() -> tuple[Line, ...]:
     """Return the lines of all modules in this folder: solvers called from compiled code, from Python, of problems."""
-    here = Path(__file__).parent
-    names = sorted(each.name for each in walk_packages([str(here)], "references.") if not each.ispkg)
-    found = [line for name in names for line in getattr(import_module(name), "LINES", ())]
-    return tuple(sorted(found, key=lambda line: (line.of_problem, line.called_from == "Python", line.setting == "h")))
+    folder = Path(__file__).parent
+    names = sorted(module.name for module in walk_packages([str(folder)], "references.") if not module.ispkg)
+    solver_lines = [line for name in names for line in getattr(import_module(name), "LINES", ())]
+    return tuple(
+        sorted(solver_lines, key=lambda line: (line.of_problem, line.called_from == "Python", line.setting == "h"))
+    )

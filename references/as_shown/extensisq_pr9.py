@@ -14,7 +14,7 @@ def simulate(problem: KnownProblem, times: Array, tolerance: float) -> tuple[Arr
     from scipy.integrate import solve_ivp
 
     options = {"method": imported("extensisq").Pr9, "t_eval": times, "rtol": tolerance, "atol": tolerance}
-    found = solve_ivp(lambda t, y: rate_of(problem, t, y), (times[0], times[-1]), start_of(problem), **options)
-    if not found.success:
-        raise RuntimeError(found.message)
-    return tuple(part.T for part in np.split(found.y, 2))
+    solution = solve_ivp(lambda t, y: rate_of(problem, t, y), (times[0], times[-1]), start_of(problem), **options)
+    if not solution.success:
+        raise RuntimeError(solution.message)
+    return tuple(part.T for part in np.split(solution.y, 2))

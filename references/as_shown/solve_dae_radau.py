@@ -12,11 +12,11 @@ def simulate(problem: KnownProblem, times: Array, tolerance: float) -> tuple[Arr
     """Radau of solve_dae on the stabilised equations."""
     solve, (y0, yp0) = imported("solve_dae.integrate").solve_dae, _consistent(problem)
     options = {"method": "Radau", "t_eval": times, "rtol": tolerance, "atol": tolerance}
-    found = solve(lambda t, y, yp: _residual(problem, t, y, yp), (times[0], times[-1]), y0, yp0, **options)
-    if not found.success:
-        raise RuntimeError(found.message)
+    solution = solve(lambda t, y, yp: _residual(problem, t, y, yp), (times[0], times[-1]), y0, yp0, **options)
+    if not solution.success:
+        raise RuntimeError(solution.message)
     n, m = problem.n_q, problem.n_c
-    return found.y[:n].T, found.y[n : 2 * n].T, found.yp[2 * n + m :].T
+    return solution.y[:n].T, solution.y[n : 2 * n].T, solution.yp[2 * n + m :].T
 
 
 def _residual(problem: KnownProblem, t: float, y: Array, yp: Array) -> Array:
@@ -27,12 +27,14 @@ def _residual(problem: KnownProblem, t: float, y: Array, yp: Array) -> Array:
     n, m = problem.n_q, problem.n_c
     q, v, J = y[:n], y[n : 2 * n], problem.jacobian(t, y[:n])
     qp, vp, mu, lam = np.split(yp, [n, 2 * n, 2 * n + m])
-    moves = problem.mass(t, q) @ vp - problem.force(t, q, v) + J.T @ lam
-    return np.concatenate([qp - v + J.T @ mu, moves, problem.constraint(t, q), J @ v + problem.constraint_rate(t, q)])
+    momentum_balance = problem.mass(t, q) @ vp - problem.force(t, q, v) + J.T @ lam
+    return np.concatenate(
+        [qp - v + J.T @ mu, momentum_balance, problem.constraint(t, q), J @ v + problem.constraint_rate(t, q)]
+    )
 
 
 def _consistent(problem: KnownProblem) -> tuple[Array, Array]:
     """Return consistent initial y and y'."""
     a, lam = problem.acceleration(problem.t_span[0], problem.q0, problem.v0)
-    none = np.zeros(problem.n_c)
-    return np.concatenate([problem.q0, problem.v0, none, none]), np.concatenate([problem.v0, a, none, lam])
+    zeros = np.zeros(problem.n_c)
+    return np.concatenate([problem.q0, problem.v0, zeros, zeros]), np.concatenate([problem.v0, a, zeros, lam])

@@ -17,7 +17,7 @@ def simulate(problem: KnownProblem, times: Array, tolerance: float) -> tuple[Arr
         yp[:] = rate_of(problem, t, y)
 
     options = {"method": "Adams", "rtol": tolerance, "atol": tolerance, "max_num_steps": 100_000}
-    found = imported("sksundae.cvode").CVODE(rate, **options).solve(times, start_of(problem))
-    if not found.success:
-        raise RuntimeError(found.message)
-    return tuple(np.split(found.y, 2, axis=1))
+    solution = imported("sksundae.cvode").CVODE(rate, **options).solve(times, start_of(problem))
+    if not solution.success:
+        raise RuntimeError(solution.message)
+    return tuple(np.split(solution.y, 2, axis=1))

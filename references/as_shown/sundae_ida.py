@@ -16,14 +16,14 @@ def simulate(problem: KnownProblem, times: Array, tolerance: float) -> tuple[Arr
     a, lam = problem.acceleration(times[0], problem.q0, problem.v0)
     y0, yp0 = np.concatenate([start_of(problem), lam]), np.concatenate([problem.v0, a, np.zeros(m)])
 
-    def residual(t: float, y: Array, yp: Array, found: NDArray[np.float64]) -> None:
+    def residual(t: float, y: Array, yp: Array, solution: NDArray[np.float64]) -> None:
         q, v, J = y[:n], y[n : 2 * n], problem.jacobian(t, y[:n])
-        found[:n] = yp[:n] - v
-        found[n : 2 * n] = problem.mass(t, q) @ yp[n : 2 * n] + J.T @ y[2 * n :] - problem.force(t, q, v)
-        found[2 * n :] = J @ yp[n : 2 * n] - problem.gamma(t, q, v)
+        solution[:n] = yp[:n] - v
+        solution[n : 2 * n] = problem.mass(t, q) @ yp[n : 2 * n] + J.T @ y[2 * n :] - problem.force(t, q, v)
+        solution[2 * n :] = J @ yp[n : 2 * n] - problem.gamma(t, q, v)
 
     options = {"algebraic_idx": list(range(2 * n, 2 * n + m)), "max_num_steps": 100_000}
-    found = imported("sksundae.ida").IDA(residual, rtol=tolerance, atol=tolerance, **options).solve(times, y0, yp0)
-    if not found.success:
-        raise RuntimeError(found.message)
-    return tuple(np.split(found.y, [n, 2 * n], axis=1))
+    solution = imported("sksundae.ida").IDA(residual, rtol=tolerance, atol=tolerance, **options).solve(times, y0, yp0)
+    if not solution.success:
+        raise RuntimeError(solution.message)
+    return tuple(np.split(solution.y, [n, 2 * n], axis=1))

@@ -15,19 +15,19 @@ def simulate(problem: KnownProblem, times: Array, tolerance: float) -> tuple[Arr
     """Integrate SymPy's LagrangesMethod for point masses on rods, its mass matrix and forcing, by SciPy's solve_ivp."""
     from scipy.integrate import solve_ivp
 
-    full = _lagrange(problem)
+    equations = _lagrange(problem)
     n = problem.n_q
 
     def rate(t: float, y: Array) -> Array:
-        matrix, forcing = full(*y)
+        matrix, forcing = equations(*y)
         rates = np.linalg.solve(matrix, np.ravel(forcing))  # rates of q and v, then multipliers
         return np.asarray(rates[: 2 * n], np.float64)
 
     options = {"method": "DOP853", "t_eval": times, "rtol": tolerance, "atol": tolerance}
-    found = solve_ivp(rate, (times[0], times[-1]), start_of(problem), **options)
-    if not found.success:
-        raise RuntimeError(found.message)
-    return tuple(part.T for part in np.split(found.y, 2))
+    solution = solve_ivp(rate, (times[0], times[-1]), start_of(problem), **options)
+    if not solution.success:
+        raise RuntimeError(solution.message)
+    return tuple(part.T for part in np.split(solution.y, 2))
 
 
 def _lagrange(problem: KnownProblem) -> Callable[..., tuple[Array, Array]]:
@@ -42,15 +42,19 @@ def _lagrange(problem: KnownProblem) -> Callable[..., tuple[Array, Array]]:
     masses = np.diag(problem.mass(0.0, problem.q0))[::2]
     t, g = mechanics.dynamicsymbols._t, -problem.force(0.0, problem.q0, problem.v0)[1] / masses[0]
     q = mechanics.dynamicsymbols(f"q:{problem.n_q}")
-    points, placed = list(zip(q[::2], q[1::2], strict=True)), np.reshape(problem.q0, (-1, 2))
+    points, positions = list(zip(q[::2], q[1::2], strict=True)), np.reshape(problem.q0, (-1, 2))
     kinetic = sum(m * (x.diff(t) ** 2 + y.diff(t) ** 2) / 2 for m, (x, y) in zip(masses, points, strict=True))
     potential = sum(m * g * y for m, (_, y) in zip(masses, points, strict=True))
-    before = [(0, 0), *points[:-1]]
-    squares = (np.diff(placed, axis=0, prepend=0.0) ** 2).sum(axis=1)
-    rods = [(x - a) ** 2 + (y - b) ** 2 - s for (x, y), (a, b), s in zip(points, before, squares, strict=True)]
+    previous = [(0, 0), *points[:-1]]
+    squares = (np.diff(positions, axis=0, prepend=0.0) ** 2).sum(axis=1)
+    rods = [(x - a) ** 2 + (y - b) ** 2 - s for (x, y), (a, b), s in zip(points, previous, squares, strict=True)]
     method = mechanics.LagrangesMethod(kinetic - potential, q, hol_coneqs=rods)
     method.form_lagranges_equations()
     plain = sympy.symbols(f"p:{2 * problem.n_q}")
-    names = dict(zip([*(each.diff(t) for each in q), *q], [*plain[problem.n_q :], *plain[: problem.n_q]], strict=True))
+    names = dict(
+        zip(
+            [*(coordinate.diff(t) for coordinate in q), *q], [*plain[problem.n_q :], *plain[: problem.n_q]], strict=True
+        )
+    )
     parts = [part.subs(names) for part in (method.mass_matrix_full, method.forcing_full)]
     return sympy.lambdify(plain, parts)  # type: ignore[no-any-return]

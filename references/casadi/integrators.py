@@ -1,17 +1,14 @@
 """CasADi's IDAS, CVODES and collocation (J. Andersson et al.) on the expressions of a ConstrainedSystem.
 
-The equations are the index-1 ODE from `equations.expressions`: on the four-bar, IDAS needs a quarter to a half less
-time for a given error than with the multipliers as algebraic unknowns, and the stabilised index-2 form fails at
-tolerances below 1e-6. Constraints drift. The package is optional: `make peers`, or the extra `peers`.
-
-All use exact Jacobians by CasADi's derivatives, and accelerations eliminated symbolically. With a C compiler `cc`, the
-expressions are compiled with `FLAGS`, which halves the time (up to `LARGEST_COMPILED` coordinates); otherwise CasADi
-interprets them. A failed run has no output, and the last line of CasADi's message. CasADi does not check the clock; a
-run that took longer than the time limit counts as failed.
+The equations are the index-1 ODE from `equations.expressions`, with exact Jacobians by CasADi's derivatives: on the
+four-bar, IDAS needs a quarter to a half less time for a given error than with the multipliers as algebraic unknowns,
+and the stabilised index-2 form fails at tolerances below 1e-6. Constraints drift. With a C compiler `cc`, the
+expressions are compiled, which halves the time (up to `LARGEST_COMPILED` coordinates); otherwise CasADi interprets
+them. A failed run has no output, and the last line of CasADi's message. CasADi does not check the clock: a run that
+took longer than the time limit counts as failed.
 """
 
 import shutil
-import subprocess
 import tempfile
 from contextlib import chdir
 from functools import lru_cache, partial
@@ -27,13 +24,13 @@ from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
 
-METHODS: dict[str, dict[str, str]] = {  # settings of CVODES for each method
+METHODS: dict[str, dict[str, str]] = {  # settings for each method
+    "IDAS": {},
     "BDF": {},
     "Adams": {"linear_multistep_method": "adams", "nonlinear_solver_iteration": "functional"},
 }
 STEPS_A_RUN = 10**7  # limit for IDAS and CVODES, as for SUNDIALS driven from C
-FLAGS = ("-O3", "-march=native", "-ffast-math")  # compiler flags, if all are supported
-PLAIN = FLAGS[:1]
+FLAGS = ("-O3", "-march=native", "-ffast-math")  # compiler flags
 LARGEST_COMPILED = 9  # coordinates; the compiler takes minutes for larger exact Jacobians
 OUTPUTS = 1000  # limit for collocation, because CasADi splits its elements at every output
 DEGREE = 5  # degree of the Gauss collocation, i.e. order 10
@@ -41,27 +38,23 @@ ROOT = {"abstol": 1e-12, "max_iter": 60}  # root finder without step control: lo
 
 
 @adapter(derivatives=False)
-def solve_idas(task: Task, rtol: float = 1e-8, atol: float = 1e-8, *, most_steps: int = STEPS_A_RUN) -> Result:
-    """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with IDAS of CasADi.
-
-    Parameters, errors and result as in `references.driver`; a run ends after `most_steps` steps. Statistics:
-    n_accepted and n_evaluations (residuals).
-    """
-    return _by_sundials("idas", "IDAS of CasADi", task, rtol, atol, most_steps)
-
-
-@adapter(derivatives=False)
-def solve_cvodes(
-    task: Task, rtol: float = 1e-8, atol: float = 1e-8, *, method: str = "BDF", most_steps: int = STEPS_A_RUN
+def solve_sundials(
+    task: Task, method: str = "IDAS", rtol: float = 1e-8, atol: float = 1e-8, *, most_steps: int = STEPS_A_RUN
 ) -> Result:
-    """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with CVODES of CasADi.
+    """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with IDAS or CVODES of CasADi.
 
-    The method is "BDF" of orders up to 5 with Newton's iteration, CasADi's default, or "Adams" of orders up to 12 with
-    fixed-point iteration, which SUNDIALS recommends for non-stiff problems. Otherwise as `solve_idas`; n_evaluations
-    counts the accelerations.
+    `method` is "IDAS", or for CVODES "BDF" with Newton's iteration, CasADi's default, or "Adams" with fixed-point
+    iteration, which SUNDIALS recommends for non-stiff problems. Other parameters, errors and result as in
+    `references.driver`; a run ends after `most_steps` steps. Statistics: n_accepted and n_evaluations, of residuals or
+    accelerations.
     """
     check_choice("method", method, tuple(METHODS))
-    return _by_sundials("cvodes", "CVODES of CasADi", task, rtol, atol, most_steps, **METHODS[method])
+    plugin = "IDAS" if method == "IDAS" else "CVODES"
+    most_steps = check_size("most_steps", most_steps, 1)
+    options: dict[str, Any] = {"reltol": rtol, "abstol": atol, "max_num_steps": most_steps, **METHODS[method]}
+    options["show_eval_warnings"] = False  # thousands of lines; failures are reported anyway
+    name = f"{plugin} of CasADi"
+    return _run(task, plugin.lower(), name, np.array([task.t1]), task.instants, options)
 
 
 @adapter(derivatives=False)
@@ -78,40 +71,33 @@ def solve_collocation(task: Task, n_steps: int = 500) -> Result:
     parts = np.unique(np.linspace(0, n_steps, min(OUTPUTS, n_steps) + 1).astype(int))
     ends = task.t0 + (task.t1 - task.t0) * parts / n_steps
     options = {"interpolation_order": DEGREE, "number_of_finite_elements": n_steps, "collocation_scheme": "legendre"}
-    return _solved(task, "collocation", "CasADi's collocation", ends[1:], ends, options)
+    return _run(task, "collocation", "CasADi's collocation", ends[1:], ends, options)
 
 
-def _by_sundials(plugin: str, name: str, task: Task, rtol: float, atol: float, most_steps: int, **more: str) -> Result:
-    most_steps = check_size("most_steps", most_steps, 1)
-    options: dict[str, Any] = {"reltol": rtol, "abstol": atol, "max_num_steps": most_steps, **more}
-    options["show_eval_warnings"] = False  # thousands of lines; failures are reported anyway
-    return _solved(task, plugin, name, np.array([task.t1]), task.instants, options)
-
-
-def _solved(task: Task, plugin: str, name: str, timed: Array, times: Array, options: dict[str, Any]) -> Result:
+def _run(task: Task, plugin: str, name: str, timed_times: Array, times: Array, options: dict[str, Any]) -> Result:
     """Return the Result at `times`, with the CPU time of a run that stores at `timed`."""
-    made = partial(_integrator, plugin, *task.key, tuple(options.items()))
+    integrator_at = partial(_integrator, plugin, *task.key, tuple(options.items()))
     start, failure, states = task.y0, "", np.empty((2 * task.system.n_q, 0))
-    counts = {"n_accepted": timed.size} if plugin == "collocation" else {}
-    after = times[times > task.t0]
+    counts = {"n_accepted": timed_times.size} if plugin == "collocation" else {}
+    output_times = times[times > task.t0]
     try:
-        integrator = made(timed.tobytes())
+        integrator = integrator_at(timed_times.tobytes())
         limit = TimeLimit(task.time_limit)
         with user_call:
             states = np.array(integrator(x0=start)["xf"])
         if plugin != "collocation":
-            told = integrator.stats()
-            counts = {"n_accepted": told.get("nsteps"), "n_evaluations": told.get("nfevals")}
+            stats = integrator.stats()
+            counts = {"n_accepted": stats.get("nsteps"), "n_evaluations": stats.get("nfevals")}
         if limit.passed():
             failure = limit.message(name, task.t1, "take looser tolerances, or fewer steps")
-        elif not np.array_equal(after, timed):
-            states = np.array(made(after.tobytes())(x0=start)["xf"])
+        elif not np.array_equal(output_times, timed_times):
+            states = np.array(integrator_at(output_times.tobytes())(x0=start)["xf"])
     except RuntimeError as error:  # the only indication of a failure
-        said = [line for line in str(error).splitlines() if line.strip()]
-        failure = f"{name} failed: {said[-1]}. {ADVICE}"
+        lines = [line for line in str(error).splitlines() if line.strip()]
+        failure = f"{name} failed: {lines[-1]}. {ADVICE}"
     if failure:
         times, states = times[:0], states[:, :0]
-    elif after.size < times.size:
+    elif output_times.size < times.size:
         states = np.column_stack([start, states])
     return task.result(name, times, states, failure, **counts)
 
@@ -119,10 +105,10 @@ def _solved(task: Task, plugin: str, name: str, timed: Array, times: Array, opti
 @lru_cache(maxsize=256)
 def _equations(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> dict[str, Any]:
     casadi, n = imported("casadi"), system.n_q
-    made = expressions_at(system, t0, q0, v0)
+    expressions = expressions_at(system, t0, q0, v0)
     t, x = casadi.SX.sym("t"), casadi.SX.sym("x", 2 * n)
     q, v = ([x[first + i] for i in range(n)] for first in (0, n))
-    return {"t": t, "x": x, "ode": casadi.vertcat(*v, *made.accelerations(functions_of(casadi), t, q, v))}
+    return {"t": t, "x": x, "ode": casadi.vertcat(*v, *expressions.accelerations(functions_of(casadi), t, q, v))}
 
 
 @lru_cache(maxsize=256)
@@ -138,16 +124,8 @@ def _integrator(
     # CasADi always writes the generated code to the working folder; it is loaded on return
     with tempfile.TemporaryDirectory() as folder, chdir(folder):
         jit: dict[str, Any] = {"jit": True, "compiler": "shell", "jit_cleanup": False}
-        jit["jit_options"] = {"flags": list(_flags(compiler)), "cleanup": False}
+        jit["jit_options"] = {"flags": list(FLAGS), "cleanup": False}
         return casadi.integrator(*arguments, given | jit)
-
-
-@lru_cache(maxsize=1)
-def _flags(compiler: str) -> tuple[str, ...]:
-    """Return FLAGS if the compiler supports them, otherwise the plain ones."""
-    command = [compiler, *FLAGS, "-x", "c", "-fsyntax-only", "-"]
-    taken = subprocess.run(command, input=b"int x;\n", capture_output=True).returncode == 0
-    return FLAGS if taken else PLAIN
 
 
 def _by_step(
@@ -158,8 +136,8 @@ def _by_step(
 
 HOW: dict[str, Any] = {"keeps": False, "traces": True, "builds_each": True, "builds_span": True}
 LINES = (
-    Line("IDAS, CasADi", "casadi", "CasADi", solve_idas, checked=True, **HOW),
-    Line("CVODES, CasADi", "casadi", "CasADi", solve_cvodes, checked=True, **HOW),
+    Line("IDAS, CasADi", "casadi", "CasADi", solve_sundials, checked=True, **HOW),
+    Line("CVODES, CasADi", "casadi", "CasADi", solve_sundials, {"method": "BDF"}, checked=True, **HOW),
     Line("collocation, CasADi", "casadi", "CasADi", _by_step, setting="h", stores_steps=True, **HOW),
-    Line("CVODES, CasADi, Adams", "casadi", "CasADi", solve_cvodes, {"method": "Adams"}, **HOW),
+    Line("CVODES, CasADi, Adams", "casadi", "CasADi", solve_sundials, {"method": "Adams"}, **HOW),
 )

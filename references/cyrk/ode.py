@@ -1,7 +1,7 @@
 """CyRK's methods on the ODE y' = f(t, y), y = [q, v], from compiled code; the constraints drift.
 
-CyRK documents `cysolve_ivp` for Cython, whose callers pass a compiled right-hand side. It calls a C++ function, which is
-called here by ctypes from the library inside the wheel. Its arguments are C++ objects: vectors, which are three
+CyRK documents `cysolve_ivp` for Cython, whose callers pass a compiled right-hand side. It calls a C++ function, which
+is called here by ctypes from the library inside the wheel. Its arguments are C++ objects: vectors, which are three
 pointers, and a result, whose fields are read at the places that they have in `CyRK/cy/cysolution.hpp`.
 """
 
@@ -28,7 +28,7 @@ from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
 
 WRITTEN_FOR = "0.20.0"
-MADE_BY, SOLVED_BY = r"_Z\d+baseline_cysolve_ivpP\w+", r"_Z\d+baseline_cysolve_ivp_noreturnP\w+"
+CREATE_PATTERN, SOLVE_PATTERN = r"_Z\d+baseline_cysolve_ivpP\w+", r"_Z\d+baseline_cysolve_ivp_noreturnP\w+"
 NUMBERS = {"DOP853": 5, "BDF": 6, "LSODA": 7, "Radau": 8, "Vern8": 11}  # ODEMethod
 FINISHED, TOO_MANY_STEPS = 1, -52  # CyrkErrorCodes
 MEMORY = 8192  # MB that stored steps may take, the only limit of their number
@@ -41,7 +41,7 @@ class Vector(ctypes.Structure):
     _fields_ = (("begin", POINTER), ("end", POINTER), ("end_of_memory", POINTER))
 
     @classmethod
-    def of(cls, values: Array) -> "Vector":
+    def from_array(cls, values: Array) -> "Vector":
         """Return a vector of the data of a contiguous array, which must outlive it."""
         first = values.ctypes.data
         return cls(first, first + values.nbytes, first + values.nbytes)
@@ -59,12 +59,8 @@ class Configuration(ctypes.Structure):
     """The fields of ProblemConfig up to what a right-hand side is given."""
 
     _fields_ = (
-        ("methods", POINTER),
-        ("rate", POINTER),
-        ("t0", REAL),
-        ("t1", REAL),
-        ("start", Vector),
-        ("given", Vector),
+        *(("methods", POINTER), ("rate", POINTER), ("t0", REAL), ("t1", REAL)),
+        *(("start", Vector), ("given", Vector)),
     )
 
 
@@ -91,12 +87,12 @@ def library() -> tuple[Any, Any]:
     Raises RuntimeError if CyRK is missing, or has another version than `WRITTEN_FOR`.
     """
     imported("CyRK")
-    if (found := version("CyRK")) != WRITTEN_FOR:
-        raise RuntimeError(f"references/cyrk reads C++ objects of CyRK {WRITTEN_FOR}; installed is {found}")
+    if (installed := version("CyRK")) != WRITTEN_FOR:
+        raise RuntimeError(f"references/cyrk reads C++ objects of CyRK {WRITTEN_FOR}; installed is {installed}")
     path = imported("CyRK.cy.cysolver_api", "CyRK").__file__
     text, dll = Path(path).read_bytes().decode("latin-1"), ctypes.CDLL(path)
     functions = []
-    for pattern in (MADE_BY, SOLVED_BY):
+    for pattern in (CREATE_PATTERN, SOLVE_PATTERN):
         names = set(re.findall(pattern, text))
         if len(names) != 1:
             raise RuntimeError(f"{path} has {len(names)} functions {pattern}, not 1")
@@ -104,15 +100,15 @@ def library() -> tuple[Any, Any]:
         functions[-1].restype = None
     vectors = POINTER
     options = (SIZE, SIZE, vectors, SIZE, SIZE, ctypes.c_bool, *(POINTER,) * 5, REAL, REAL, ctypes.c_bool, POINTER)
-    made, solved = functions
-    made.argtypes = (POINTER, POINTER, REAL, REAL, vectors, ctypes.c_int, *options)
-    solved.argtypes = (POINTER, POINTER, REAL, REAL, vectors, *options)
-    return made, solved
+    create, solve = functions
+    create.argtypes = (POINTER, POINTER, REAL, REAL, vectors, ctypes.c_int, *options)
+    solve.argtypes = (POINTER, POINTER, REAL, REAL, vectors, *options)
+    return create, solve
 
 
 IMPLICIT = ("BDF", "LSODA", "Radau")
 NO_TIMES = np.empty(0)
-TRIED = 2000  # steps by which the time of a step is known, where there is a time limit
+TRIAL_STEPS = 2000  # steps by which the time of a step is known, where there is a time limit
 REALS, COUNTER = types.CPointer(types.float64), types.CPointer(types.int64)
 FUNCTION = types.void(REALS, types.float64, REALS, COUNTER, types.voidptr)
 
@@ -123,21 +119,13 @@ def solve_cyrk(
 ) -> Result:
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with a method of CyRK.
 
-    Settings: accelerations as straight-line code of the mechanism (`equations.straight_line`); for implicit methods the
-    analytic Jacobian from there, too. A second use of the solver is timed, with its steps stored, as CyRK does unless
-    it is given output times. A time limit is a limit of the number of steps, by the time of the first `TRIED`.
+    Accelerations are straight-line code (`equations.straight_line`); implicit methods get the analytic Jacobian from
+    there, too. A second use of the solver is timed, with its steps stored, as CyRK does unless it is given output
+    times. A time limit becomes a limit of the number of steps, by the time of the first `TRIAL_STEPS`.
 
-    Parameters
-    ----------
-    method : {"DOP853", "BDF", "LSODA", "Radau", "Vern8"}
-    others : see `references.driver`
-
-    Returns
-    -------
-    Result
-        The statistics are CyRK's number of steps, and the evaluations counted by the right-hand side itself.
-
-    Raises RuntimeError if the version of CyRK is not supported.
+    Parameters, errors and result as in `references.driver`; `method` is a key of `NUMBERS`. Statistics: CyRK's number
+    of steps, and the evaluations counted by the right-hand side. Raises RuntimeError if the version of CyRK is not
+    supported.
     """
     check_choice("method", method, tuple(NUMBERS))
     jacobian = _jacobian(*task.key) if method in IMPLICIT else None
@@ -169,7 +157,7 @@ def integrate(
         failure, reached, end, counts = solver.failure(limit), solver.reached, solver.end, solver.counts
         times = task.instants[task.instants <= reached]
         solver.prepared(most, times)()
-        rows = solver.found.states.values.reshape(-1, end.size)
+        rows = solver.solution.states.values.reshape(-1, end.size)
     if times.size and times[-1] == reached:
         rows[-1] = end  # without the error of the interpolation
     return times[: len(rows)], rows, failure, counts
@@ -189,18 +177,21 @@ class Solver:
         longest: float,
     ):
         self.task, self.start, self.longest = task, np.array(start, dtype=float), longest
-        self.rate, self.jacobian = (None if each is None else each.address for each in functions)
-        self.tolerances, self.given = [np.array([each]) for each in tolerances], np.zeros(1, dtype=np.int64)
-        made, self._solve = library()
+        self.rate, self.jacobian = (None if tolerance is None else tolerance.address for tolerance in functions)
+        self.tolerances, self.arguments = (
+            [np.array([tolerance]) for tolerance in tolerances],
+            np.zeros(1, dtype=np.int64),
+        )
+        create, self._solve = library()
         self.pointer = POINTER()
         soon = task.t0 + 1e-9 * (task.t1 - task.t0)  # is made, and initialised, by a run
-        made(ctypes.byref(self.pointer), *self._arguments(1, NO_TIMES, soon, NUMBERS[method]))
+        create(ctypes.byref(self.pointer), *self._arguments(1, NO_TIMES, soon, NUMBERS[method]))
         stack.callback(self._delete)
-        self.found = ctypes.cast(self.pointer, ctypes.POINTER(Solution)).contents
+        self.solution = ctypes.cast(self.pointer, ctypes.POINTER(Solution)).contents
 
     def _arguments(self, most_steps: int, times: Array, end: float, *method: int) -> tuple[Any, ...]:
         y0, args, t_eval, events, *tolerances = map(
-            Vector.of, (self.start, self.given, times, NO_TIMES, *self.tolerances)
+            Vector.from_array, (self.start, self.arguments, times, NO_TIMES, *self.tolerances)
         )
         return (
             *(self.rate, self.task.t0, end, ctypes.byref(y0), *method),
@@ -221,42 +212,42 @@ class Solver:
         if limit.seconds is None:
             return 0
         began = time.monotonic()
-        self.prepared(TRIED)()
+        self.prepared(TRIAL_STEPS)()
         if limit.passed():
             return 1
-        if self.found.status != TOO_MANY_STEPS:
+        if self.solution.status != TOO_MANY_STEPS:
             return 0
-        return TRIED * math.ceil(limit.seconds / (time.monotonic() - began))
+        return TRIAL_STEPS * math.ceil(limit.seconds / (time.monotonic() - began))
 
     @property
     def reached(self) -> float:
         """Return the time that the last run without output times reached."""
-        times = self.found.times.values
+        times = self.solution.times.values
         return float(times[-1]) if times.size else self.task.t0
 
     @property
     def end(self) -> Array:
         """Return the state there."""
-        states = self.found.states.values
+        states = self.solution.states.values
         return states[-self.start.size :] if states.size else self.start.copy()
 
     @property
     def counts(self) -> dict[str, int]:
         """Return the counters of the last run."""
-        counted = ctypes.c_int64.from_address(self.found.configuration.contents.given.begin).value
-        return {"n_accepted": int(self.found.n_steps), "n_evaluations": counted}
+        counted = ctypes.c_int64.from_address(self.solution.configuration.contents.given.begin).value
+        return {"n_accepted": int(self.solution.n_steps), "n_evaluations": counted}
 
     def failure(self, limit: TimeLimit) -> str:
         """Return the message of a run that did not reach the end, or ""."""
-        if self.found.status == FINISHED:
+        if self.solution.status == FINISHED:
             return ""
-        if self.found.status == TOO_MANY_STEPS:
+        if self.solution.status == TOO_MANY_STEPS:
             return limit.message("CyRK", self.reached, "take looser tolerances")
-        return f"CyRK failed after t = {self.reached:.10g}: {self.found.message.decode()} {ADVICE}"
+        return f"CyRK failed after t = {self.reached:.10g}: {self.solution.message.decode()} {ADVICE}"
 
     def _delete(self) -> None:
         """Call the destructor that frees the memory, the second of its virtual functions."""
-        functions = ctypes.cast(self.found.methods, ctypes.POINTER(POINTER))
+        functions = ctypes.cast(self.solution.methods, ctypes.POINTER(POINTER))
         ctypes.CFUNCTYPE(None, POINTER)(functions[1])(self.pointer)
 
 
@@ -264,9 +255,9 @@ def right_hand_side(derivative: Callable[..., Any], size: int) -> Any:
     """Return CyRK's right-hand side function, which counts its calls, for a compiled (t, y, rate) -> None."""
 
     @cfunc(FUNCTION, error_model="numpy")
-    def rate(found, t, y, count, before):  # type: ignore[no-untyped-def]
+    def rate(derivatives, t, y, count, unused):  # type: ignore[no-untyped-def]
         carray(count, (1,))[0] += 1
-        derivative(t, carray(y, (size,)), carray(found, (size,)))
+        derivative(t, carray(y, (size,)), carray(derivatives, (size,)))
 
     return rate
 
@@ -283,7 +274,7 @@ def _jacobian(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any
     derivatives, size = exact_jacobian(system, t0, q0, v0), 2 * system.n_q
 
     @cfunc(FUNCTION, error_model="numpy")
-    def jacobian(J, t, y, count, before):  # type: ignore[no-untyped-def]
+    def jacobian(J, t, y, count, unused):  # type: ignore[no-untyped-def]
         columns = carray(J, (size, size))
         columns[:] = 0.0
         derivatives(t, carray(y, (size,)), columns)
@@ -291,9 +282,9 @@ def _jacobian(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any
     return jacobian
 
 
-def _line(method: str, **more: Any) -> Line:
+def _line(method: str, **fields: Any) -> Line:
     options = {"method": method}
-    return Line(f"CyRK, {method}", "cyrk", "CyRK", solve_cyrk, options, keeps=False, traces=True, **more)
+    return Line(f"CyRK, {method}", "cyrk", "CyRK", solve_cyrk, options, keeps=False, traces=True, **fields)
 
 
 LINES = (_line("DOP853", checked=True), *map(_line, ("Vern8", "Radau", "BDF", "LSODA")))

@@ -1,7 +1,6 @@
 """Dopri8 of diffrax (P. Kidger) on a ConstrainedSystem: the right-hand side traced by JAX and compiled with the loop.
 
-The equations come from `equations.expressions`. Constraints drift. The package is optional: `make peers`, or the extra
-`peers`.
+The equations come from `equations.expressions`. Constraints drift.
 """
 
 from collections.abc import Callable
@@ -18,11 +17,11 @@ from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
 
 LARGEST = 9  # coordinates; larger systems take too long to compile
-MOST_STEPS = 10**6  # some seconds, because compiled code cannot check the clock
+MAX_STEPS = 10**6  # some seconds, because compiled code cannot check the clock
 
 
 @adapter(derivatives=False)
-def solve_diffrax(task: Task, rtol: float = 1e-8, atol: float = 1e-8, *, most_steps: int = MOST_STEPS) -> Result:
+def solve_diffrax(task: Task, rtol: float = 1e-8, atol: float = 1e-8, *, most_steps: int = MAX_STEPS) -> Result:
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with diffrax's Dopri8.
 
     Settings: 64-bit numbers; the whole integration compiled once per system, with the tolerances as arguments; the
@@ -39,8 +38,8 @@ def solve_diffrax(task: Task, rtol: float = 1e-8, atol: float = 1e-8, *, most_st
         raise NotSymbolic(
             f"system must have at most {LARGEST} coordinates for diffrax; {system.name!r} has {system.n_q}"
         )
-    solve, soon = _compiled(*task.key, most_steps), t0 + 1e-6 * (t1 - t0)
-    solve(t0, soon, start, rtol, atol, np.array([soon]))  # compiles
+    solve, warm_up_end = _compiled(*task.key, most_steps), t0 + 1e-6 * (t1 - t0)
+    solve(t0, warm_up_end, start, rtol, atol, np.array([warm_up_end]))  # compiles
     limit, end = TimeLimit(task.time_limit), np.array([t1])
     with user_call:
         _, status, steps, rejected = solve(t0, t1, start, rtol, atol, end)
@@ -52,8 +51,8 @@ def solve_diffrax(task: Task, rtol: float = 1e-8, atol: float = 1e-8, *, most_st
         if status:
             too_many = steps + rejected >= most_steps
             reason = f"{most_steps} steps were not enough" if too_many else f"diffrax says: {status}"
-            failure, kept = f"diffrax failed: {reason}. {ADVICE}", np.isfinite(states).all(axis=0)
-            times, states = times[kept], states[:, kept]
+            failure, finite = f"diffrax failed: {reason}. {ADVICE}", np.isfinite(states).all(axis=0)
+            times, states = times[finite], states[:, finite]
     counts = {"n_accepted": steps, "n_rejected_error": rejected, "n_evaluations": 13 * (steps + rejected)}
     return task.result("diffrax", times, states, failure, **counts)
 
@@ -66,13 +65,13 @@ def _compiled(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes, most_s
 
     @jax.jit
     def run(t0: Any, t1: Any, y0: Any, rtol: Any, atol: Any, times: Any) -> Any:
-        return solved(derivative, t0, t1, y0, (rtol, atol), diffrax.SaveAt(ts=times), most_steps)
+        return solve_by_dopri8(derivative, t0, t1, y0, (rtol, atol), diffrax.SaveAt(ts=times), most_steps)
 
-    def solve(*given: Any) -> Any:
-        found = jax.block_until_ready(run(*given))
-        good = bool(found.result == diffrax.RESULTS.successful)
-        counts = (int(found.stats[f"num_{kind}_steps"]) for kind in ("accepted", "rejected"))
-        return np.array(found.ys), "" if good else str(found.result), *counts
+    def solve(*arguments: Any) -> Any:
+        solution = jax.block_until_ready(run(*arguments))
+        good = bool(solution.result == diffrax.RESULTS.successful)
+        counts = (int(solution.stats[f"num_{kind}_steps"]) for kind in ("accepted", "rejected"))
+        return np.array(solution.ys), "" if good else str(solution.result), *counts
 
     return solve
 
@@ -92,12 +91,12 @@ def derivative_of(equations: Expressions) -> Callable[[Any, Any, Any], Any]:
     def derivative(t: Any, y: Any, p: Any) -> Any:
         q, v, parameters = ([x[i] for i in range(len(x))] for x in (y[:n], y[n:], () if p is None else p))
         a = equations.accelerations(functions, t, q, v, parameters)
-        return jax.numpy.concatenate([y[n:], jax.numpy.stack([jax.numpy.asarray(each) for each in a])])
+        return jax.numpy.concatenate([y[n:], jax.numpy.stack([jax.numpy.asarray(component) for component in a])])
 
     return derivative
 
 
-def solved(
+def solve_by_dopri8(
     derivative: Any, t0: Any, t1: Any, y0: Any, tolerances: tuple[Any, Any], saveat: Any, most_steps: int, p: Any = None
 ) -> Any:
     """Return diffrax's solution by Dopri8 with its default controller."""

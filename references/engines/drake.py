@@ -10,8 +10,8 @@ from references.engines import rigid as parts
 from references.engines.rigid import (
     BALL,
     HINGE,
+    NOT_REPORTED,
     SLIDE,
-    UNTOLD,
     Array,
     Configured,
     Engine,
@@ -23,7 +23,7 @@ from references.engines.rigid import (
 
 
 class Settings(NamedTuple):
-    """The discrete contact approximation of the plant; "continuous": a plant integrated by Drake's simulator."""
+    """Name the discrete contact approximation of the plant; "continuous": a plant integrated by Drake's simulator."""
 
     approximation: str = "kSap"
 
@@ -58,9 +58,11 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
         def see() -> State:
             poses = [plant.EvalBodyPoseInWorld(context, body) for body in bodies]
             twists = [plant.EvalBodySpatialVelocityInWorld(context, body) for body in bodies]
-            x = np.array([each.translation() for each in poses])
-            R = np.array([each.rotation().matrix() for each in poses])
-            v, w = (np.array([getattr(each, part)() for each in twists]) for part in ("translational", "rotational"))
+            x = np.array([inertia.translation() for inertia in poses])
+            R = np.array([inertia.rotation().matrix() for inertia in poses])
+            v, w = (
+                np.array([getattr(inertia, part)() for inertia in twists]) for part in ("translational", "rotational")
+            )
             return done * h, x, R, v, w, _force(rigid, plant, context, bodies)
 
         return parts.march(began, n_steps, n_stored, see, step)
@@ -68,9 +70,9 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
     _, bodies = _plant(rigid, settings, 1e-3)
     if refused := run(1e-6, 1, 1).message:
         raise RuntimeError(refused.split(": ", 1)[1])
-    own = [body.default_spatial_inertia() for body in bodies]
-    moments = [float(each.CalcRotationalInertia().CalcPrincipalMomentsOfInertia().max()) for each in own]
-    return Prepared(np.array([each.get_mass() for each in own]), np.array(moments), run)
+    inertias = [body.default_spatial_inertia() for body in bodies]
+    moments = [float(inertia.CalcRotationalInertia().CalcPrincipalMomentsOfInertia().max()) for inertia in inertias]
+    return Prepared(np.array([inertia.get_mass() for inertia in inertias]), np.array(moments), run)
 
 
 def _module(name: str) -> Any:
@@ -84,73 +86,70 @@ def _plant(rigid: Rigid, settings: Settings, h: float) -> tuple[Any, list[Any]]:
         approximations = multibody.DiscreteContactApproximation
         plant.set_discrete_contact_approximation(getattr(approximations, settings.approximation))
     plant.mutable_gravity_field().set_gravity_vector(rigid.model.gravity)
-    made = {rigid.model.ground.number: plant.world_body()}
+    drake_bodies = {rigid.model.ground.number: plant.world_body()}
     for body in rigid.model.bodies:
         mass, *moments = body.inertia.tolist()
         unit = tree.UnitInertia().SetFromRotationalInertia(tree.RotationalInertia(*moments), mass)
-        made[body.number] = plant.AddRigidBody(body.name, tree.SpatialInertia(mass, np.zeros(3), unit))
+        drake_bodies[body.number] = plant.AddRigidBody(body.name, tree.SpatialInertia(mass, np.zeros(3), unit))
     for body in rigid.model.bodies:
         parent, joint = rigid.parents[body.number]
-        point, found = parts.point_of(body, joint), parts.freedoms(body, joint)
+        joint_point, freedoms = parts.point_of(body, joint), parts.freedoms(body, joint)
         turned = np.eye(3)
-        if len(found) == 2:  # the axes of a universal joint
-            turned = np.column_stack([found[0][1], found[1][1], np.cross(found[0][1], found[1][1])])
+        if len(freedoms) == 2:  # the axes of a universal joint
+            turned = np.column_stack([freedoms[0][1], freedoms[1][1], np.cross(freedoms[0][1], freedoms[1][1])])
         frames = []
-        for end, R, at in (
-            (parent, parent.rotation.T @ body.rotation @ turned, parent.local_point(body.in_space(point))),
-            (body, turned, point),
+        for end, R, point in (
+            (parent, parent.rotation.T @ body.rotation @ turned, parent.local_point(body.in_space(joint_point))),
+            (body, turned, joint_point),
         ):
-            pose = mathematics.RigidTransform(mathematics.RotationMatrix.ProjectToRotationMatrix(R), at)
+            pose = mathematics.RigidTransform(mathematics.RotationMatrix.ProjectToRotationMatrix(R), point)
             name = f"{joint.name} on {end.name}"
-            frames.append(plant.AddFrame(tree.FixedOffsetFrame(name, made[end.number].body_frame(), pose)))
-        stiffness, damping, angle = parts.hinge_springs(rigid.model).get(joint.name, (0.0, 0.0, 0.0))
-        made_joint = plant.AddJoint(_joint(joint.name, found, frames, damping))
-        if stiffness:
-            plant.AddForceElement(tree.RevoluteSpring(made_joint, angle, stiffness))
+            frames.append(plant.AddFrame(tree.FixedOffsetFrame(name, drake_bodies[end.number].body_frame(), pose)))
+        plant.AddJoint(_joint(joint.name, freedoms, frames))
     for a, on_a, b, on_b in rigid.cut_points():
-        plant.AddBallConstraint(made[a.number], on_a, made[b.number], on_b)
+        plant.AddBallConstraint(drake_bodies[a.number], on_a, drake_bodies[b.number], on_b)
     for a, on_a, b, on_b, (stiffness, damping, length) in parts.springs(rigid.model):
-        ends = made[a.number], on_a, made[b.number], on_b
+        ends = drake_bodies[a.number], on_a, drake_bodies[b.number], on_b
         plant.AddForceElement(tree.LinearSpringDamper(*ends, length, stiffness, damping))
     plant.Finalize()
-    return plant, [made[body.number] for body in rigid.model.bodies]
+    return plant, [drake_bodies[body.number] for body in rigid.model.bodies]
 
 
-def _joint(name: str, found: list[tuple[str, Any]], frames: list[Any], damping: float) -> Any:
+def _joint(name: str, freedoms: list[tuple[str, Any]], frames: list[Any]) -> Any:
     tree = _module("multibody.tree")
-    kinds = tuple(kind for kind, _ in found)
+    kinds = tuple(kind for kind, _ in freedoms)
     if kinds == (BALL,):
         return tree.BallRpyJoint(name, *frames)
     if kinds == (HINGE, HINGE):
         return tree.UniversalJoint(name, *frames)
     if kinds in ((HINGE,), (SLIDE,)):
-        made = tree.RevoluteJoint if kinds == (HINGE,) else tree.PrismaticJoint
-        return made(name, *frames, found[0][1], damping=damping)
+        joint_type = tree.RevoluteJoint if kinds == (HINGE,) else tree.PrismaticJoint
+        return joint_type(name, *frames, freedoms[0][1])
     raise ValueError(f"Drake is given hinges, slides, balls and universal joints; {name!r} is of {' and '.join(kinds)}")
 
 
 def _force(rigid: Rigid, plant: Any, context: Any, bodies: list[Any]) -> Array:
     """Return the force of the first loop-closing joint, from the balance of accelerations; Drake does not report it."""
     if not rigid.loops:
-        return UNTOLD
+        return NOT_REPORTED
     try:
         rates = plant.get_generalized_acceleration_output_port().Eval(context)
     except RuntimeError:  # reported by an adjacent step
-        return UNTOLD
+        return NOT_REPORTED
     forces = _module("multibody.tree").MultibodyForces(plant)
     plant.CalcForceElementsContribution(context, forces)
     by_v, world = _module("multibody.tree").JacobianWrtVariable.kV, [plant.world_frame()] * 2
 
-    def moved(body: Any, at: Array) -> Array:
-        return plant.CalcJacobianTranslationalVelocity(context, by_v, bodies[body.number].body_frame(), at, *world)
+    def moved(body: Any, point: Array) -> Array:
+        return plant.CalcJacobianTranslationalVelocity(context, by_v, bodies[body.number].body_frame(), point, *world)
 
     rows = [moved(a, on_a) - moved(b, on_b) for a, on_a, b, on_b in rigid.cut_points()]
     missing = plant.CalcInverseDynamics(context, rates, forces)
     for k in np.flatnonzero(rigid.torques.any(axis=1)):
         J = plant.CalcJacobianAngularVelocity(context, by_v, bodies[k].body_frame(), *world)
         missing -= J.T @ rigid.torques[k]
-    made = np.linalg.lstsq(np.vstack(rows).T, missing, rcond=1e-9)[0].reshape(-1, 3)
-    return made[: {"spherical": 1, "revolute": 2}[rigid.loops[0].kind]].sum(axis=0)
+    forces_ = np.linalg.lstsq(np.vstack(rows).T, missing, rcond=1e-9)[0].reshape(-1, 3)
+    return forces_[: {"spherical": 1, "revolute": 2}[rigid.loops[0].kind]].sum(axis=0)
 
 
 def _start(rigid: Rigid, plant: Any, context: Any, bodies: list[Any]) -> None:

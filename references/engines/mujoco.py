@@ -61,8 +61,8 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
             poses = data.xpos[bodies].copy(), data.xmat[bodies].reshape(-1, 3, 3).copy()
             state = data.time, *poses, twists[:, 3:], twists[:, :3]
             mujoco.mj_forward(model, data)  # without this, forces are those of the previous step
-            own = (data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY) & np.isin(data.efc_id, connects)
-            return *state, data.efc_force[own].reshape(-1, 3).sum(axis=0)
+            connected = (data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY) & np.isin(data.efc_id, connects)
+            return *state, data.efc_force[connected].reshape(-1, 3).sum(axis=0)
 
         return march(began, n_steps, n_stored, see, step)
 

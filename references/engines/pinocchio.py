@@ -8,7 +8,7 @@ import numpy as np
 
 from references.driver import imported
 from references.engines import rigid as parts
-from references.engines.rigid import BALL, SLIDE, UNTOLD, Configured, Engine, Motion, Prepared, Rigid, State
+from references.engines.rigid import BALL, NOT_REPORTED, SLIDE, Configured, Engine, Motion, Prepared, Rigid, State
 from twoloop.bodies.parts import Body
 from twoloop.problem.problem import Array
 
@@ -34,15 +34,17 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
     constraints = pin.StdVec_RigidConstraintModel()
     for a, on_a, b, on_b in rigid.cut_points():
         ends = [
-            (joint, origin * pin.SE3(np.eye(3), at))
-            for (joint, origin), at in ((frames[a.number], on_a), (frames[b.number], on_b))
+            (joint, origin * pin.SE3(np.eye(3), point))
+            for (joint, origin), point in ((frames[a.number], on_a), (frames[b.number], on_b))
         ]
-        made = pin.RigidConstraintModel(pin.ContactType.CONTACT_3D, model, *ends[0], *ends[1], pin.ReferenceFrame.LOCAL)
+        constraint = pin.RigidConstraintModel(
+            pin.ContactType.CONTACT_3D, model, *ends[0], *ends[1], pin.ReferenceFrame.LOCAL
+        )
         if settings.baumgarte is not None:
-            gains = made.m_baumgarte_parameters
+            gains = constraint.m_baumgarte_parameters
             gains.Kp, gains.Kd = settings.baumgarte**2, 2.0 * settings.baumgarte
-            made.setBaumgarteCorrectorParameters(gains)
-        constraints.append(made)
+            constraint.setBaumgarteCorrectorParameters(gains)
+        constraints.append(constraint)
     n_points = {"spherical": 1, "revolute": 2}[rigid.loops[0].kind] if rigid.loops else 0
     proximal = pin.ProximalSettings()
     if settings.mu is not None:
@@ -61,11 +63,11 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
             return np.asarray(pin.constraintDynamics(model, data, q, v, force(q, v), constraints, datas, proximal))
 
         q, v = pin.neutral(model), _start(rigid, frames, model)
-        taken = 0
+        done = 0
         rate = _rates(model)
 
         def step(n: int) -> str:
-            nonlocal q, v, taken
+            nonlocal q, v, done
             for _ in range(n):
                 if settings.integrator == "Euler":
                     v = v + h * acceleration(q, v)
@@ -75,7 +77,7 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
                     q = pin.normalize(model, q)
                 if not np.isfinite(v).all():
                     return "the accelerations are not finite"
-            taken += n
+            done += n
             return ""
 
         def see() -> State:
@@ -90,18 +92,18 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
                 np.array([pose.rotation @ getattr(twist, part) for pose, twist in zip(poses, twists, strict=True)])
                 for part in ("linear", "angular")
             )
-            f = UNTOLD
+            f = NOT_REPORTED
             if n_points:
                 acceleration(q, v)
                 turned = data.oMi[constraints[0].joint1_id].rotation @ constraints[0].joint1_placement.rotation
                 f = turned @ np.sum([each.contact_force.linear for each in list(datas)[:n_points]], axis=0)
-            return taken * h, x, R, speeds, spins, f
+            return done * h, x, R, speeds, spins, f
 
         return parts.march(began, n_steps, n_stored, see, step)
 
-    own = [model.inertias[frames[k][0]] for k in range(len(rigid.x))]
-    moments = [float(np.linalg.eigvalsh(each.inertia)[-1]) for each in own]
-    return Prepared(np.array([each.mass for each in own]), np.array(moments), run)
+    inertias = [model.inertias[frames[k][0]] for k in range(len(rigid.x))]
+    moments = [float(np.linalg.eigvalsh(each.inertia)[-1]) for each in inertias]
+    return Prepared(np.array([each.mass for each in inertias]), np.array(moments), run)
 
 
 def _tree(pin: Any, rigid: Rigid) -> tuple[Any, dict[int, tuple[int, Any]]]:
@@ -120,8 +122,10 @@ def _tree(pin: Any, rigid: Rigid) -> tuple[Any, dict[int, tuple[int, Any]]]:
         place = origin * pin.SE3(parent.rotation.T @ body.rotation, parent.local_point(body.in_space(point)))
         for k, (kind, axis) in enumerate(parts.freedoms(body, joint)):
             kinds = {BALL: pin.JointModelSpherical, SLIDE: pin.JointModelPrismaticUnaligned}
-            made = kinds[kind]() if kind == BALL else kinds.get(kind, pin.JointModelRevoluteUnaligned)(axis)
-            number = model.addJoint(number, made, place if k == 0 else pin.SE3.Identity(), f"{joint.name} {k + 1}")
+            joint_model = kinds[kind]() if kind == BALL else kinds.get(kind, pin.JointModelRevoluteUnaligned)(axis)
+            number = model.addJoint(
+                number, joint_model, place if k == 0 else pin.SE3.Identity(), f"{joint.name} {k + 1}"
+            )
         origin = pin.SE3(np.eye(3), -point)
         model.appendBodyToJoint(
             number, pin.Inertia(float(body.inertia[0]), np.zeros(3), parts.tensor(body.inertia)), origin
@@ -147,13 +151,8 @@ def _force(
     pin: Any, rigid: Rigid, model: Any, data: Any, frames: dict[int, tuple[int, Any]]
 ) -> Callable[[Array, Array], Array]:
     """Return the generalised forces of springs and constant torques as a function of q and v."""
-    known, turning = parts.springs(rigid.model), np.flatnonzero(rigid.torques.any(axis=1))
-    hinges = [
-        (model.joints[frames[body][0]], values)
-        for body, (_, joint) in rigid.parents.items()
-        if (values := parts.hinge_springs(rigid.model).get(joint.name))
-    ]
-    if not known and not hinges and not turning.size:
+    springs, turning = parts.springs(rigid.model), np.flatnonzero(rigid.torques.any(axis=1))
+    if not springs and not turning.size:
         zero = np.zeros(model.nv)
         return lambda q, v: zero
 
@@ -177,19 +176,17 @@ def _force(
             return np.asarray(twist[:3] + np.cross(twist[3:], point - data.oMi[joint].translation))
 
         zero = np.zeros(3)
-        for joint, (stiffness, damping, angle) in hinges:
-            tau[joint.idx_v] -= stiffness * (q[joint.idx_q] - angle) + damping * v[joint.idx_v]
         for k in turning:
             pull(int(k), zero, zero, rigid.torques[k])
-        for a, on_a, b, on_b, (stiffness, damping, length) in known:
+        for a, on_a, b, on_b, (stiffness, damping, length) in springs:
             ends = [
-                (data.oMi[joint] * origin).act(at)
-                for (joint, origin), at in ((frames[a.number], on_a), (frames[b.number], on_b))
+                (data.oMi[joint] * origin).act(point)
+                for (joint, origin), point in ((frames[a.number], on_a), (frames[b.number], on_b))
             ]
-            along = ends[1] - ends[0]
-            long = float(np.linalg.norm(along))
-            rate = damping and along @ (speed(b.number, ends[1], v) - speed(a.number, ends[0], v)) / long
-            f = (stiffness * (long - length) + damping * rate) / long * along
+            direction = ends[1] - ends[0]
+            long = float(np.linalg.norm(direction))
+            rate = damping and direction @ (speed(b.number, ends[1], v) - speed(a.number, ends[0], v)) / long
+            f = (stiffness * (long - length) + damping * rate) / long * direction
             pull(a.number, ends[0], f, zero)
             pull(b.number, ends[1], -f, zero)
         return tau
@@ -205,12 +202,12 @@ def _rates(model: Any) -> Callable[[Array, Array], Array]:
     places = np.array([(each.idx_q, each.idx_v) for each in model.joints if each.nq == 1 and each.nv == 1], dtype=int)
 
     def rate(q: Array, v: Array) -> Array:
-        made = np.zeros_like(q)
-        made[places[:, 0]] = v[places[:, 1]]
+        q_rate = np.zeros_like(q)
+        q_rate[places[:, 0]] = v[places[:, 1]]
         for i, j in balls:
             f, e, w = q[i : i + 3], q[i + 3], v[j : j + 3]
-            made[i : i + 3], made[i + 3] = 0.5 * (e * w + np.cross(f, w)), -0.5 * f @ w
-        return made
+            q_rate[i : i + 3], q_rate[i + 3] = 0.5 * (e * w + np.cross(f, w)), -0.5 * f @ w
+        return q_rate
 
     return rate
 

@@ -19,14 +19,14 @@ import numpy as np
 
 from twoloop.bodies import SpatialModel
 from twoloop.bodies.model_problem import ModelProblem
-from twoloop.bodies.parameter_layout import SPRING, TORQUE, TORSION
+from twoloop.bodies.parameter_layout import SPRING, TORQUE
 from twoloop.bodies.parts import Body, ModelJoint
 from twoloop.bodies.rotation import G, euler_parameters, euler_rates, rotation_matrix
 from twoloop.bodies.spanning_tree import spanning_tree
 from twoloop.problem.problem import Array
 
 SLIDE, HINGE, BALL = "slide", "hinge", "ball"
-FREEDOMS = ("revolute", "prismatic", "cylindrical", "universal", "spherical")  # kinds of joints supported in the tree
+FREEDOMS = ("revolute", "prismatic", "universal", "spherical")  # kinds of joints supported in the tree
 HALF = 0.5  # m: distance of the two points that represent a loop-closing hinge
 Z = (0.0, 0.0, 1.0)
 
@@ -35,18 +35,14 @@ Z = (0.0, 0.0, 1.0)
 class Motion:
     """Poses and velocities of the bodies at some times, and the cost of the run."""
 
-    t: Array  # (n_t,); s; the first is 0
-    # x, v, w: (n_t, n_bodies, 3); centres of mass (m), their velocities (m/s), angular velocities along the axes of
-    # space (rad/s)
-    x: Array
+    t: Array  # (n_t,), s; the first is 0
+    x: Array  # (n_t, n_bodies, 3), m: centres of mass
     R: Array  # (n_t, n_bodies, 3, 3); the columns are the body axes
-    v: Array
-    w: Array
-    # (n_t, 3); force of the first joint that closes a loop on its `body`, along the axes of space, N; NaN: not reported
-    f: Array
-    # call_s, stepping_s: CPU time of the call on an existing model, and of its steps only, s
-    call_s: float
-    stepping_s: float
+    v: Array  # (n_t, n_bodies, 3), m/s: velocities of the centres
+    w: Array  # (n_t, n_bodies, 3), rad/s: angular velocities along the axes of space
+    f: Array  # (n_t, 3), N: force of the first loop-closing joint on its `body`, in space; NaN: not reported
+    call_s: float  # CPU time of the call on an existing model ...
+    stepping_s: float  # ... and of its steps only
     message: str = ""  # why the run ended early; empty if it did not
 
 
@@ -54,14 +50,13 @@ class Motion:
 class Prepared:
     """A model in an engine."""
 
-    # masses, moments: (n_bodies,); as the engine has them: kg, and the largest principal moment of inertia, kg m^2
-    masses: Array
-    moments: Array
+    masses: Array  # (n_bodies,), kg, as the engine has them
+    moments: Array  # (n_bodies,), kg m^2: the largest principal moments of inertia
     run: Callable[[float, int, int], Motion]  # run(t_end, n_steps, n_stored) -> Motion, from the start
 
 
 State = tuple[float, Array, Array, Array, Array, Array]  # t, x, R, v, w, f of `Motion` at one instant
-UNTOLD = np.full(3, np.nan)
+NOT_REPORTED = np.full(3, np.nan)
 
 
 def march(began: float, n_steps: int, n_stored: int, see: Callable[[], State], step: Callable[[int], str]) -> Motion:
@@ -76,13 +71,13 @@ def march(began: float, n_steps: int, n_stored: int, see: Callable[[], State], s
         message = step(int(n))
         spent += time.process_time() - start
         state = see()
-        if not message and not all(np.isfinite(each).all() for each in state[:-1]):
+        if not message and not all(np.isfinite(values).all() for values in state[:-1]):
             message = "the state is not finite"
         if message:
             message = f"at {state[0]:.3g} s or before: {message}"
             break
         stored.append(state)
-    t, x, R, v, w, f = (np.array(each) for each in zip(*stored, strict=True))
+    t, x, R, v, w, f = (np.array(values) for values in zip(*stored, strict=True))
     return Motion(t, x, R, v, w, f, time.process_time() - began, spent, message)
 
 
@@ -123,8 +118,8 @@ class Rigid:
     def rates(self, body: Body) -> Array:
         """Return initial velocities of the joint above a body, in the order of `freedoms`; of a ball in body axes."""
         parent, joint = self.parents[body.number]
-        here = body.position + body.rotation @ point_of(body, joint)
-        speed, spin = self._twist(body, here) - self._twist(parent, here)
+        point = body.position + body.rotation @ point_of(body, joint)
+        speed, spin = self._twist(body, point) - self._twist(parent, point)
         columns = []
         for kind, axis in freedoms(body, joint):
             turned, zero = body.rotation @ axis, np.zeros((3, 3))
@@ -133,11 +128,11 @@ class Rigid:
                 columns[-1] = np.vstack([zero, body.rotation])
         return np.linalg.lstsq(np.hstack(columns), np.concatenate([speed, spin]))[0]
 
-    def _twist(self, body: Body, at: Array) -> Array:
+    def _twist(self, body: Body, point: Array) -> Array:
         if body is self.model.ground:
             return np.zeros((2, 3))
         w = self.w[body.number]
-        return np.array([self.v[body.number] + np.cross(w, at - self.x[body.number]), w])
+        return np.array([self.v[body.number] + np.cross(w, point - self.x[body.number]), w])
 
 
 def largest_moment(inertia: Array) -> float:
@@ -169,12 +164,12 @@ def freedoms(body: Body, joint: ModelJoint) -> list[tuple[str, Array]]:
         return [(BALL, np.array(Z))]
     if joint.kind == "universal":
         axes = [
-            body.local_direction(end.rotation @ own) for end, own in zip((joint.a, joint.b), joint.axes, strict=True)
+            body.local_direction(end.rotation @ axis_in_end)
+            for end, axis_in_end in zip((joint.a, joint.b), joint.axes, strict=True)
         ]
         return [(HINGE, axis) for axis in (axes if joint.b is body else axes[::-1])]
     axis = joint.axes[1] if joint.b is body else -joint.axes[0]
-    kinds = {"revolute": (HINGE,), "prismatic": (SLIDE,), "cylindrical": (SLIDE, HINGE)}[joint.kind]
-    return [(kind, axis) for kind in kinds]
+    return [(HINGE if joint.kind == "revolute" else SLIDE, axis)]
 
 
 def springs(model: Any) -> list[tuple[Body, Array, Body, Array, tuple[float, ...]]]:
@@ -186,33 +181,18 @@ def springs(model: Any) -> list[tuple[Body, Array, Body, Array, tuple[float, ...
     ]
 
 
-def hinge_springs(model: Any) -> dict[str, tuple[float, float, float]]:
-    """Return by name of a hinge its spring: stiffness, damping, and the unstressed angle from the start."""
-    found = {}
-    for each in model.forces:
-        if each.kind == TORSION and not each.function:
-            stiffness, damping, angle = each.more.values
-            if model.dimension == 2:  # the unstressed angle is between the body axes
-                angle -= each.second.rotation - each.first.rotation
-            found[each.joint.name] = stiffness, damping, angle
-    return found
-
-
 def rigid_of(problem: ModelProblem) -> Rigid:
     """Return the data for the engines of a planar or spatial model.
 
-    Raises ValueError if it contains a drive, a force other than a spring or a constant torque, or a spring in a
-    loop-closing joint.
+    Raises ValueError if it contains a drive, or a force other than a spring or a constant torque.
     """
     given: Any = problem.model
-    wrong = [each.name for each in given.joints if each.kind == "drive"]
-    wrong += [f.name for f in given.forces if f.kind not in (SPRING, TORQUE, TORSION) or f.function]
-    cuts = {joint.name for joint in spanning_tree(given)[1]}
-    wrong += [name for name in hinge_springs(given) if name in cuts]
-    if wrong:
-        raise ValueError(f"engines support bodies, joints, springs and constant torques only; not {wrong[0]!r}")
+    unsupported = [item.name for item in given.joints if item.kind == "drive"]
+    unsupported += [f.name for f in given.forces if f.kind not in (SPRING, TORQUE) or f.function]
+    if unsupported:
+        raise ValueError(f"engines support bodies, joints, springs and constant torques only; not {unsupported[0]!r}")
     planar = given.dimension == 2
-    x, R, v, w = (each[0] for each in states(planar, problem.q0[:, None], problem.v0[:, None]))
+    x, R, v, w = (item[0] for item in states(planar, problem.q0[:, None], problem.v0[:, None]))
     model = _in_space(given, x, R, v, w) if planar else given
     if max(np.abs(np.array([body.position for body in model.bodies]) - x).max(), 0.0) > 1e-9:
         raise ValueError(f"the bodies of {problem.name!r} are not given where they start; give them closed")
@@ -233,26 +213,24 @@ def _in_space(given: Any, x: Array, R: Array, v: Array, w: Array) -> SpatialMode
     cuts = {joint.name for joint in spanning_tree(given)[1]}
     for joint in given.joints:
         a, b, name = joint.a.name, joint.b.name, joint.name
-        at = np.append(joint.a.in_space(np.array(joint.point_a.values)), 0.0)
+        point = np.append(joint.a.in_space(np.array(joint.point_a.values)), 0.0)
         if joint.kind == "prismatic":
-            turned = joint.rows[0].more.values[0] + joint.a.rotation
-            model.prismatic(a, b, at=at, axis=(np.cos(turned), np.sin(turned), 0.0), name=name)
+            angle = joint.rows[0].more.values[0] + joint.a.rotation
+            model.prismatic(a, b, at=point, axis=(np.cos(angle), np.sin(angle), 0.0), name=name)
         elif name in cuts:
-            model.spherical(a, b, at=at, name=name)
+            model.spherical(a, b, at=point, name=name)
         else:
-            model.revolute(a, b, at=at, axis=Z, name=name)
-    for one, at, other, there, (stiffness, damping, length) in springs(given):
-        ends = [np.append(body.in_space(place), 0.0) for body, place in ((one, at), (other, there))]
-        model.spring(one.name, ends[0], other.name, ends[1], stiffness=stiffness, damping=damping, length=length)
-    for name, (stiffness, damping, angle) in hinge_springs(given).items():
-        model.torsion_spring(name, stiffness=stiffness, damping=damping, angle=angle)
+            model.revolute(a, b, at=point, axis=Z, name=name)
+    for a, point, b, on_b, (stiffness, damping, length) in springs(given):
+        ends = [np.append(body.in_space(place), 0.0) for body, place in ((a, point), (b, on_b))]
+        model.spring(a.name, ends[0], b.name, ends[1], stiffness=stiffness, damping=damping, length=length)
     return model
 
 
 def states(planar: bool, q: Array, v: Array) -> tuple[Array, Array, Array, Array]:
     """Return x, R, v, w of `Motion` for coordinates (n_q, n_t) of a planar or spatial model."""
     n_t = q.shape[1]
-    shaped, rates = (each.T.reshape(n_t, -1, 3 if planar else 7) for each in (q, v))
+    shaped, rates = (array.T.reshape(n_t, -1, 3 if planar else 7) for array in (q, v))
     n = shaped.shape[1]
     x, speed, R, w = (np.zeros((n_t, n, 3)), np.zeros((n_t, n, 3)), np.zeros((n_t, n, 3, 3)), np.zeros((n_t, n, 3)))
     if planar:
@@ -274,8 +252,8 @@ def coordinates(motion: Motion, planar: bool) -> tuple[Array, Array]:
     if planar:
         angles = np.unwrap(np.arctan2(motion.R[..., 1, 0], motion.R[..., 0, 0]), axis=0)
         q, v = (
-            np.concatenate(each, axis=2)
-            for each in ((motion.x[..., :2], angles[..., None]), (motion.v[..., :2], motion.w[..., 2:]))
+            np.concatenate(parts, axis=2)
+            for parts in ((motion.x[..., :2], angles[..., None]), (motion.v[..., :2], motion.w[..., 2:]))
         )
     else:
         q, v = np.empty((n_t, n, 7)), np.empty((n_t, n, 7))
@@ -308,6 +286,6 @@ class Engine(NamedTuple):
 @cache
 def engines() -> dict[str, Engine]:
     """Return the engines of all modules in this folder, by the names of these."""
-    names = sorted(each.name for each in iter_modules([str(Path(__file__).parent)]))
+    names = sorted(module.name for module in iter_modules([str(Path(__file__).parent)]))
     modules = {name: import_module(f"references.engines.{name}") for name in names}
     return {name: module.ENGINE for name, module in modules.items() if hasattr(module, "ENGINE")}

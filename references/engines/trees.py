@@ -11,6 +11,7 @@ from twoloop.mechanisms.planar import GROUND, PlanarBodies
 from twoloop.problem.problem import Array
 
 Z = (0.0, 0.0, 1.0)
+MOMENTS = np.array([0.6, 0.6, 1.0])  # of a body in space that only rotates about z, relative to the last
 
 
 class TreeDynamics(NamedTuple):
@@ -28,25 +29,20 @@ def _outwards(bodies: PlanarBodies) -> Iterator[tuple[int, Array, int, Array]]:
     hanging: dict[int, list[tuple[int, Array, Array]]] = {}
     for i, (x, y), j, (u, w) in bodies.pins:
         hanging.setdefault(j, []).append((i, np.array([x, y, 0.0]), np.array([u, w, 0.0])))
-    ahead: list[tuple[int, Array, tuple[int, Array, Array]]]
-    ahead = [(GROUND, np.zeros(3), each) for each in hanging[GROUND]]
-    while ahead:
-        on, pin, (body, here, there) = ahead.pop()
-        yield body, -here, on, there - pin
-        ahead += [(body, here, each) for each in hanging.get(body, ())]
-
-
-def _moments(J: float) -> list[float]:
-    """Return the inertia of a body in space that only rotates about z."""
-    return [0.6 * J, 0.6 * J, J]
+    stack: list[tuple[int, Array, tuple[int, Array, Array]]]
+    stack = [(GROUND, np.zeros(3), child) for child in hanging[GROUND]]
+    while stack:
+        on, pin, (body, pin_in_child, pin_in_body) = stack.pop()
+        yield body, -pin_in_child, on, pin_in_body - pin
+        stack += [(body, pin_in_child, child) for child in hanging.get(body, ())]
 
 
 def _in_space(parents: list[tuple[int, int]], relative: Array) -> Array:
     """Return sums of joint quantities from the ground to each body."""
-    made = np.zeros(len(relative))
+    sums = np.zeros(len(relative))
     for body, on in parents:
-        made[body] = relative[body] + (0.0 if on == GROUND else made[on])
-    return made
+        sums[body] = relative[body] + (0.0 if on == GROUND else sums[on])
+    return sums
 
 
 def _relative(values: Array, body: int, on: int) -> float:
@@ -61,13 +57,13 @@ def mujoco_tree(bodies: PlanarBodies, angles: Array, rates: Array) -> TreeDynami
     mujoco = imported("mujoco", extra="engines")
     spec = mujoco.MjSpec()
     spec.option.gravity = [0.0, -bodies.gravity, 0.0]
-    made, parents, speeds = {GROUND: spec.worldbody}, [], []
-    for body, centre, on, there in _outwards(bodies):
+    elements, parents, speeds = {GROUND: spec.worldbody}, [], []
+    for body, centre, on, pin in _outwards(bodies):
         half = 0.5 * _relative(angles, body, on)
-        mass = {"mass": bodies.masses[body], "inertia": _moments(bodies.inertias[body]), "explicitinertial": True}
+        mass = {"mass": bodies.masses[body], "inertia": bodies.inertias[body] * MOMENTS, "explicitinertial": True}
         turned = [np.cos(half), 0.0, 0.0, np.sin(half)]
-        made[body] = made[on].add_body(name=str(body), pos=there, quat=turned, ipos=centre, **mass)
-        made[body].add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=Z)
+        elements[body] = elements[on].add_body(name=str(body), pos=pin, quat=turned, ipos=centre, **mass)
+        elements[body].add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=Z)
         parents.append((body, on))
         speeds.append(_relative(rates, body, on))
     model = spec.compile()
@@ -85,17 +81,17 @@ class _Pinocchio(NamedTuple):
 
 
 def _in_pinocchio(bodies: PlanarBodies) -> _Pinocchio:
-    pin = imported("pinocchio", "pin", extra="engines")
-    model = pin.Model()
-    model.gravity = pin.Motion(np.array([0.0, -bodies.gravity, 0.0]), np.zeros(3))
+    package = imported("pinocchio", "pin", extra="engines")
+    model = package.Model()
+    model.gravity = package.Motion(np.array([0.0, -bodies.gravity, 0.0]), np.zeros(3))
     joints, parents = {GROUND: 0}, []
-    for body, centre, on, there in _outwards(bodies):
-        place = pin.SE3(np.eye(3), there)
-        joints[body] = model.addJoint(joints[on], pin.JointModelRZ(), place, str(body))
-        inertia = pin.Inertia(float(bodies.masses[body]), centre, np.diag(_moments(bodies.inertias[body])))
-        model.appendBodyToJoint(joints[body], inertia, pin.SE3.Identity())
+    for body, centre, on, pin in _outwards(bodies):
+        place = package.SE3(np.eye(3), pin)
+        joints[body] = model.addJoint(joints[on], package.JointModelRZ(), place, str(body))
+        inertia = package.Inertia(float(bodies.masses[body]), centre, np.diag(bodies.inertias[body] * MOMENTS))
+        model.appendBodyToJoint(joints[body], inertia, package.SE3.Identity())
         parents.append((body, on))
-    return _Pinocchio(pin, model, [model.joints[joints[body]].idx_v for body in range(len(bodies.masses))], parents)
+    return _Pinocchio(package, model, [model.joints[joints[body]].idx_v for body in range(len(bodies.masses))], parents)
 
 
 def pinocchio_tree(bodies: PlanarBodies, angles: Array, rates: Array) -> TreeDynamics:
@@ -126,11 +122,11 @@ def end_by_pinocchio(bodies: PlanarBodies, angles: Array, t_end: float, toleranc
 
     options = {"rtol": tolerance, "atol": tolerance, "method": "DOP853"}
     ends = _in_space(parents, solve_ivp(rate, (0.0, t_end), y0, t_eval=(t_end,), **options).y[first, 0])
-    pins, made = {GROUND: np.zeros(2)}, np.zeros((len(angles), 3))
-    for body, centre, on, there in _outwards(bodies):
-        pins[body] = pins[on] + _turned(0.0 if on == GROUND else ends[on], there)
-        made[body] = *(pins[body] + _turned(ends[body], centre)), ends[body]
-    return made.ravel()
+    pins, coordinates = {GROUND: np.zeros(2)}, np.zeros((len(angles), 3))
+    for body, centre, on, pin_ in _outwards(bodies):
+        pins[body] = pins[on] + _turned(0.0 if on == GROUND else ends[on], pin_)
+        coordinates[body] = *(pins[body] + _turned(ends[body], centre)), ends[body]
+    return coordinates.ravel()
 
 
 def _turned(angle: float, place: Array) -> Array:

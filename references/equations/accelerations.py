@@ -19,6 +19,8 @@ from twoloop.kernels.data.flags import GAMMA_GIVEN
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
 
+GAMMA_DIFFERENCE = 1e-3  # displacement over which C_q v + C_t is differenced, divided by max(1, |v|)
+CONSTANT, DIAGONAL, SADDLE = 1, 2, 4  # flags of the mass matrix; SADDLE: not definite
 SINGULAR = 1e-13  # relative to the original entry, or to its row: smaller pivots count as zero
 
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
@@ -26,23 +28,23 @@ OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "rea
 
 # a closure over callbacks: compiled when it is called, for its argument types, and read from the disk in later
 # processes if callbacks and code are the same
-kept = kept_when_called(**OPTIONS)
+cached = kept_when_called(**OPTIONS)
 
 
-@kept  # called from Python, too
-def cholesky(A, lost=0.0):  # type: ignore[no-untyped-def]
+@cached  # called from Python, too
+def cholesky(A, threshold=0.0):  # type: ignore[no-untyped-def]
     """Overwrite the lower half of A with its Cholesky factor, with reciprocal pivots; return whether A is definite.
 
-    A pivot of at most `lost` times its original value is set to zero with its column, so that `cholesky_solve` omits
-    that unknown.
+    A pivot of at most `threshold` times its original value is set to zero with its column, so that `cholesky_solve`
+    omits that unknown.
     """
     n, definite = A.shape[0], True
     for k in range(n):
-        before = A[k, k]
+        original = A[k, k]
         for j in range(k):
             A[k, k] -= A[k, j] * A[k, j]
-        definite = definite and A[k, k] > lost * abs(before)
-        if A[k, k] <= lost * abs(before):  # False for NaN, which is kept
+        definite = definite and A[k, k] > threshold * abs(original)
+        if A[k, k] <= threshold * abs(original):  # False for NaN, which is kept
             for i in range(k, n):
                 A[i, k] = 0.0
             continue
@@ -88,9 +90,9 @@ def lu_factor(A, pivots):  # type: ignore[no-untyped-def]
         pivots[k], scale[pivot] = pivot, scale[k]
         if pivot != k:
             for j in range(n):
-                moved = A[k, j]
+                swapped = A[k, j]
                 A[k, j] = A[pivot, j]
-                A[pivot, j] = moved
+                A[pivot, j] = swapped
         for i in range(k + 1, n):
             if A[i, k] != 0.0:
                 A[i, k] /= A[k, k]
@@ -112,11 +114,6 @@ def lu_solve(A, pivots, x):  # type: ignore[no-untyped-def]
         for j in range(k + 1, n):
             x[k] -= A[k, j] * x[j]
         x[k] /= A[k, k]
-
-
-GAMMA_DIFFERENCE = 1e-3  # displacement over which C_q v + C_t is differenced, divided by max(1, |v|)
-
-CONSTANT, DIAGONAL, SADDLE = 1, 2, 4  # flags of the mass matrix; SADDLE: not definite
 
 
 class Equations:
@@ -164,22 +161,22 @@ def compiled_gamma(system: ConstrainedSystem) -> Callable[..., None]:
 def _gamma_by_differences(jacobian: Dispatcher, constraint_rate: Dispatcher) -> Callable[..., None]:
     """Q_d = -d/de [C_q v + C_t](t + e, q + e v), by central differences of order 4."""
 
-    @kept
+    @cached
     def gamma(t, q, v, p, Qd):  # type: ignore[no-untyped-def]
         speed = 1.0
         for i in range(v.size):
             speed = max(speed, abs(v[i]))
         e = GAMMA_DIFFERENCE / speed
-        Cq, Ct, moved = np.zeros((Qd.size, q.size)), np.zeros(Qd.size), np.zeros(q.size)
+        Cq, Ct, displaced = np.zeros((Qd.size, q.size)), np.zeros(Qd.size), np.zeros(q.size)
         for j in range(4):
             shift = (-2.0, -1.0, 1.0, 2.0)[j] * e
             weight = (-1.0, 8.0, -8.0, 1.0)[j] / (12.0 * e)
             for i in range(q.size):
-                moved[i] = q[i] + shift * v[i]
+                displaced[i] = q[i] + shift * v[i]
             Cq[:, :] = 0.0
             Ct[:] = 0.0
-            jacobian(t + shift, moved, p, Cq)
-            constraint_rate(t + shift, moved, p, Ct)
+            jacobian(t + shift, displaced, p, Cq)
+            constraint_rate(t + shift, displaced, p, Ct)
             for k in range(Qd.size):
                 Qd[k] += weight * Ct[k]
                 for i in range(v.size):
@@ -189,22 +186,16 @@ def _gamma_by_differences(jacobian: Dispatcher, constraint_rate: Dispatcher) -> 
 
 
 @lru_cache(maxsize=64)
-def _accelerations(
-    mass: Dispatcher,
-    force: Dispatcher,
-    constraint: Dispatcher,
-    jacobian: Dispatcher,
-    constraint_rate: Dispatcher,
-    gamma: Callable[..., None],
-) -> Callable[..., Any]:
-    """Return (t, q, v, alpha, p, factors, known, a, lam) -> success: eqs. (6)-(8), Baumgarte's terms if alpha > 0."""
+def _accelerations(*callbacks: Callable[..., Any]) -> Callable[..., Any]:
+    """Return (t, q, v, alpha, p, factors, mass_flags, a, lam) -> success: eq. (6), Baumgarte's terms if alpha > 0."""
+    mass, force, constraint, jacobian, constraint_rate, gamma = callbacks
     mass_at = matrix_of(mass)
 
-    @kept
-    def accelerate(t, q, v, alpha, p, factors, known, a, lam):  # type: ignore[no-untyped-def]
+    @cached
+    def accelerate(t, q, v, alpha, p, factors, mass_flags, a, lam):  # type: ignore[no-untyped-def]
         n, m = q.size, lam.size
         Cq = np.zeros((m, n))
-        L, definite = mass_at(t, q, p, factors, known)
+        L, definite = mass_at(t, q, p, factors, mass_flags)
         jacobian(t, q, p, Cq)
         lam[:] = 0.0
         gamma(t, q, v, p, lam)
@@ -218,19 +209,19 @@ def _accelerations(
                 lam[i] -= 2.0 * alpha * Ct[i] + alpha * alpha * C[i]
         a[:] = 0.0
         force(t, q, v, p, a)
-        return solve_for(L, definite, known, Cq, a, lam)
+        return solve_for(L, definite, mass_flags, Cq, a, lam)
 
     return accelerate  # type: ignore[no-any-return]
 
 
 @lru_cache(maxsize=64)
 def matrix_of(mass: Dispatcher) -> Callable[..., Any]:
-    """Return (t, q, p, factors, known) -> the factors of M and True, or M and False if it is not positive definite."""
+    """Return (t, q, p, factors, mass_flags) -> the factors of M and True; M and False if it is not definite."""
 
-    @kept
-    def mass_at(t, q, p, factors, known):  # type: ignore[no-untyped-def]
-        definite = not known & SADDLE
-        if known & CONSTANT:
+    @cached
+    def mass_at(t, q, p, factors, mass_flags):  # type: ignore[no-untyped-def]
+        definite = not mass_flags & SADDLE
+        if mass_flags & CONSTANT:
             return factors, definite
         M = np.zeros((q.size, q.size))
         mass(t, q, p, M)
@@ -243,7 +234,7 @@ def matrix_of(mass: Dispatcher) -> Callable[..., Any]:
     return mass_at  # type: ignore[no-any-return]
 
 
-@kept  # called from Python, too
+@cached  # called from Python, too
 def saddle_solve(M, Cq, a, lam):  # type: ignore[no-untyped-def]
     """Solve eq. (6) as a whole; Q in a is overwritten by the accelerations, Q_d in lam by the multipliers.
 
@@ -270,9 +261,9 @@ def saddle_solve(M, Cq, a, lam):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def times_inverse(L, known, x):  # type: ignore[no-untyped-def]
+def times_inverse(L, mass_flags, x):  # type: ignore[no-untyped-def]
     """Overwrite x with M^-1 x."""
-    if known & DIAGONAL:
+    if mass_flags & DIAGONAL:
         for j in range(x.size):
             x[j] *= L[j, j] * L[j, j]
     else:
@@ -280,7 +271,7 @@ def times_inverse(L, known, x):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def solve_for(L, definite, known, Cq, a, lam):  # type: ignore[no-untyped-def]
+def solve_for(L, definite, mass_flags, Cq, a, lam):  # type: ignore[no-untyped-def]
     """Solve eq. (6) by eqs. (7) and (8); Q in a is overwritten by the accelerations, Q_d in lam by the multipliers.
 
     `L`: the factors of M, or M itself if it is not definite. Return False if the matrix is singular.
@@ -295,7 +286,7 @@ def solve_for(L, definite, known, Cq, a, lam):  # type: ignore[no-untyped-def]
     for i in range(m):
         for j in range(n):
             x[j] = Cq[i, j]
-        times_inverse(L, known, x)
+        times_inverse(L, mass_flags, x)
         for j in range(n):
             if x[j] != 0.0:
                 for k in range(i, m):
@@ -304,7 +295,7 @@ def solve_for(L, definite, known, Cq, a, lam):  # type: ignore[no-untyped-def]
         return False
     for j in range(n):
         x[j] = a[j]
-    times_inverse(L, known, x)
+    times_inverse(L, mass_flags, x)
     for i in range(m):
         lam[i] = -lam[i]
         for j in range(n):
@@ -313,5 +304,5 @@ def solve_for(L, definite, known, Cq, a, lam):  # type: ignore[no-untyped-def]
     for i in range(m):
         for j in range(n):
             a[j] -= Cq[i, j] * lam[i]
-    times_inverse(L, known, a)
+    times_inverse(L, mass_flags, a)
     return True

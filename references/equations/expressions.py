@@ -1,8 +1,8 @@
 """The accelerations of a compiled mechanism as expressions of another package.
 
-`twoloop.generate` traces the callbacks into a graph of operations and differentiates it. Here eq. (6),
-M a + C_q^T lam = Q and C_q a = Q_d, is factorised on that graph, exploiting structural zeros, in an elimination order
-with little fill-in; then the graph is translated to expressions of a package, operation by operation.
+`twoloop.generate` traces the callbacks into a graph of operations and differentiates it. Here eq. (6) is factorised on
+that graph, exploiting structural zeros, in an elimination order with little fill-in; then the graph is translated to
+expressions of a package, operation by operation.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -46,15 +46,8 @@ class NotSymbolic(CannotRun, ValueError):
 class Expressions:
     """The equations of one system as functions of symbols.
 
-    Parameters
-    ----------
-    system : ConstrainedSystem
-        A system with compiled callbacks that do not branch on q or v.
-    t0 : float
-    q0, v0 : ndarray (n_q,)
-        A consistent state, at which redundant rows are determined.
-    of_parameters : bool
-        True: the parameters are symbols; False: the numbers of the system.
+    The callbacks must be compiled, and not branch on t, q or v. Redundant rows are determined at (t0, q0, v0). With
+    `of_parameters` the parameters are symbols, otherwise the numbers of the system.
 
     Raises NotSymbolic if the callbacks are Python functions, Q_d is not given, they branch on t, q or v or give near
     the start what their operations do not give, or the mass stays singular with rows of C_q added.
@@ -98,24 +91,24 @@ class Expressions:
         for k, i in _nonzero(self.jacobian):
             matrix[n + k, i] = matrix[i, n + k] = self.jacobian[k, i]
         size = n + len(self.rows)
-        orders = [_order(matrix, n, size, *how) for how in product((True, False), repeat=2)]
-        return min((_factored(matrix, order) for order in orders), key=self._price)
+        orders = [_order(matrix, n, size, *options) for options in product((True, False), repeat=2)]
+        return min((_factored(matrix, order) for order in orders), key=self._cost)
 
-    def _price(self, factors: Sequence[Block]) -> float:
+    def _cost(self, factors: Sequence[Block]) -> float:
         """Return about how many operations the accelerations take by these factors; a division counts for several."""
         graph = self.traced.graph
-        made = _substituted(factors, self._right_hand_side(self.force, self.gamma))[: self.system.n_q]
-        kinds = [graph.operations[i] for i in graph.needed_by(made)]
+        accelerations = _substituted(factors, self._right_hand_side(self.force, self.gamma))[: self.system.n_q]
+        kinds = [graph.operations[i] for i in graph.needed_by(accelerations)]
         terms = sum(len(form.terms) for _, *forms in kinds for form in forms if form is not None)  # type: ignore[misc]
         return terms + DIVISION * sum(kind == operations.RECIPROCAL for kind, *_ in kinds)  # type: ignore[misc]
 
     def _right_hand_side(self, force: Any, gamma: Any) -> list[Form]:
         """Return that of eq. (6), with the rows that were added to the mass."""
-        right = [*force]
+        result = [*force]
         for k in self.added:
             for i, entry in enumerate(self.jacobian[k]):
-                right[i] = right[i] + entry * gamma[k]
-        return [*right, *gamma]
+                result[i] = result[i] + entry * gamma[k]
+        return [*result, *gamma]
 
     @cached_property
     def solution(self) -> list[Form]:
@@ -136,7 +129,7 @@ class Expressions:
         masses, jacobians = _nonzero(self.mass), _nonzero(self.jacobian)
         for unknown in (*self.traced.q, *self.traced.v):
             by = Derivative(graph, {only(unknown): Form(graph, 1.0, {})})
-            Q, gamma = (list(map(by.of, of)) for of in (self.force, self.gamma))
+            Q, gamma = (list(map(by.of, forms)) for forms in (self.force, self.gamma))
             for i, j in masses:
                 Q[i] = Q[i] - by.of(self.mass[i, j]) * self.solution[j]
             for k, j in jacobians:
@@ -150,7 +143,7 @@ class Expressions:
     ) -> list[Any]:
         """Return the accelerations (n_q,) of eq. (6) as expressions; `parameters`: symbols, if they are symbolic."""
         written = Printed(self.traced.graph, functions, [t, *q, *v, *parameters])
-        return written.each(self.solution[: self.system.n_q])
+        return written.translate(self.solution[: self.system.n_q])
 
 
 @lru_cache(maxsize=64)
@@ -170,7 +163,7 @@ class Printed:
         self.known: dict[int, Any] = dict(enumerate(inputs))
         self.forms: dict[Any, Any] = {}
 
-    def each(self, forms: Iterable[Form]) -> list[Any]:
+    def translate(self, forms: Iterable[Form]) -> list[Any]:
         """Return the expressions of forms; a constant is a float."""
         forms = list(forms)
         for i in self.graph.needed_by(forms):
@@ -223,19 +216,19 @@ def _nonzero(forms: Any) -> list[tuple[int, ...]]:
 
 def _rows_for_mass(mass: Array, jacobian: Array) -> list[int]:
     """Return rows k for which M + sum C_k^T C_k is positive definite; none if M is."""
-    chosen: list[int] = []
+    rows: list[int] = []
     rank = np.linalg.matrix_rank(mass)
     order = np.argsort([np.count_nonzero(row) for row in jacobian], kind="stable")
     for k in order.tolist():
         if rank == mass.shape[0]:
             break
-        more = mass + np.outer(jacobian[k], jacobian[k])
-        if np.linalg.matrix_rank(more) > rank:
-            mass, rank = more, rank + 1
-            chosen.append(k)
+        extended = mass + np.outer(jacobian[k], jacobian[k])
+        if np.linalg.matrix_rank(extended) > rank:
+            mass, rank = extended, rank + 1
+            rows.append(k)
     if rank < mass.shape[0]:
         raise NotSymbolic("the mass matrix stays singular with the constraints added")
-    return chosen
+    return rows
 
 
 def _order(
@@ -243,34 +236,37 @@ def _order(
 ) -> list[tuple[int, ...]]:
     """Return an elimination order by minimum degree, with each row of C_q after all its coordinates.
 
-    The pivots are then those of the definite matrices M and -C_q M^-1 C_q^T. If `together`, unknowns with the same
-    neighbours, such as the two rows of a joint, are eliminated at once. If `early`, of equal degrees those come first
-    that wait for the fewest divisions. A coordinate that stands in one row of C_q alone, by a number, goes before all
-    others, with this row: without any division.
+    The pivots are then those of the definite matrices M and -C_q M^-1 C_q^T. `together`: unknowns with the same
+    neighbours, such as the two rows of a joint, are eliminated at once. `early`: of equal degrees those come first that
+    wait for the fewest divisions. A coordinate in one row of C_q alone, by a number, goes first, with this row.
     """
     neighbours: list[set[int]] = [set() for _ in range(size)]
     for i, j in matrix:
         neighbours[i] |= {j} - {i}
     waits = [{j for j in neighbours[i] if j < n} if i >= n else set() for i in range(size)]
-    left, depth = set(range(size)), [0] * size
+    remaining, depth = set(range(size)), [0] * size
     order: list[tuple[int, ...]] = []
     given = _given_by_rows(matrix, neighbours, n)
-    while left:
+    while remaining:
         if given:
             i, row = places = given.pop()
-            around = neighbours[i] | neighbours[row]
+            neighbourhood = neighbours[i] | neighbours[row]
         else:
-            i = min((j for j in left if not waits[j]), key=lambda j: (len(neighbours[j]), early * depth[j], j))
-            around = neighbours[i] | {i}
-            alike = [j for j in around - {i} if not waits[j] and (j < n) == (i < n) and neighbours[j] | {j} == around]
-            places = (i, *(sorted(alike)[:1] if together else ()))
+            i = min((j for j in remaining if not waits[j]), key=lambda j: (len(neighbours[j]), early * depth[j], j))
+            neighbourhood = neighbours[i] | {i}
+            equal = [
+                j
+                for j in neighbourhood - {i}
+                if not waits[j] and (j < n) == (i < n) and neighbours[j] | {j} == neighbourhood
+            ]
+            places = (i, *(sorted(equal)[:1] if together else ()))
         order.append(places)
-        left -= set(places)
-        around -= set(places)
-        for j in around:
-            neighbours[j] = (neighbours[j] | around) - {*places, j}
+        remaining -= set(places)
+        neighbourhood -= set(places)
+        for j in neighbourhood:
+            neighbours[j] = (neighbours[j] | neighbourhood) - {*places, j}
             depth[j] = max(depth[j], depth[i] + 1)
-        for j in left:
+        for j in remaining:
             waits[j] -= set(places)
     return order
 
@@ -296,8 +292,8 @@ def _factored(matrix: dict[tuple[int, int], Form], order: list[tuple[int, ...]])
     for places in order:
         zero = Form(next(iter(matrix.values())).graph, 0.0, {})
         inverse = _inverse([[rows[i].pop(j, zero).value() for j in places] for i in places])
-        others = dict.fromkeys(j for i in places for j in rows[i])
-        entries = [(j, [rows[i].get(j, zero).value() for i in places]) for j in others]
+        columns = dict.fromkeys(j for i in places for j in rows[i])
+        entries = [(j, [rows[i].get(j, zero).value() for i in places]) for j in columns]
         below = [(j, [_dot(row, values).value() for row in inverse]) for j, values in entries]
         for j, multiples in below:
             for k, values in entries:
@@ -319,39 +315,41 @@ def _inverse(pivots: list[list[Form]]) -> list[list[Form]]:
     return [[(c * inverse).value(), (-b * inverse).value()], [(-b * inverse).value(), (a * inverse).value()]]
 
 
-def _dot(one: Sequence[Form], other: Sequence[Form]) -> Form:
-    total = one[0] * other[0]
-    for x, y in zip(one[1:], other[1:], strict=True):
+def _dot(first: Sequence[Form], second: Sequence[Form]) -> Form:
+    total = first[0] * second[0]
+    for x, y in zip(first[1:], second[1:], strict=True):
         total = total + x * y
     return total
 
 
-def _substituted(factors: Sequence[Block], right: list[Form]) -> list[Form]:
+def _substituted(factors: Sequence[Block], right_side: list[Form]) -> list[Form]:
     """Return the solution of the factorised system."""
-    solution = list(right)
-    owed: list[list[tuple[Form, Form]]] = [[] for _ in right]
+    solution = list(right_side)
+    owed: list[list[tuple[Form, Form]]] = [[] for _ in right_side]
     for places, _, below in factors:
         for i in places:
-            solution[i] = (solution[i] - _total(owed[i])).value()
+            solution[i] = (solution[i] - _sum_of_products(owed[i])).value()
         for j, multiples in below:
             owed[j] += zip(multiples, [solution[i] for i in places], strict=True)
     for places, inverse, below in reversed(factors):
-        known = [solution[i] for i in places]
+        pivots = [solution[i] for i in places]
         for k, (i, row) in enumerate(zip(places, inverse, strict=True)):
-            solution[i] = (_dot(row, known) - _total([(each[k], solution[j]) for j, each in below])).value()
+            solution[i] = (
+                _dot(row, pivots) - _sum_of_products([(multiples[k], solution[j]) for j, multiples in below])
+            ).value()
     return solution
 
 
-def _total(products: Sequence[tuple[Form, Form]]) -> Any:
+def _sum_of_products(products: Sequence[tuple[Form, Form]]) -> Any:
     """Return the sum of products, in which multiples of one factor are summed up before they are multiplied by it."""
     total: Any = 0.0
     by_factor: dict[Any, list[Any]] = {}
-    for one, other in products:
-        if not one.terms:
-            total = total + one.constant * other
+    for first, second in products:
+        if not first.terms:
+            total = total + first.constant * second
             continue
-        scale, factor = one.normalised()
-        by_factor.setdefault(factor.key, [factor, 0.0])[1] += scale * other
-    for factor, other in by_factor.values():
-        total = total + factor * other.value()
+        scale, factor = first.normalised()
+        by_factor.setdefault(factor.key, [factor, 0.0])[1] += scale * second
+    for factor, second in by_factor.values():
+        total = total + factor * second.value()
     return total

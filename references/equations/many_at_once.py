@@ -1,8 +1,7 @@
 """Many motions of one mechanism with different parameters and starts, by other packages.
 
 diffrax, by vmap, and heyoka, in batches, are built once and take parameters as arguments; CyRK and CVODE make one run
-after another. All packages are optional: `make peers`, or the
-extra `peers`.
+after another.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from references.cyrk.ode import FINISHED, Solver, rate_of
-from references.diffrax.dopri8 import derivative_of, packages, solved
+from references.diffrax.dopri8 import derivative_of, packages, solve_by_dopri8
 from references.driver import Task, TimeLimit, imported, user_call
 from references.equations.expressions import Expressions
 from references.equations.rows import with_all_rows
@@ -23,7 +22,7 @@ from twoloop.problem.problem import Array, Problem
 
 Solve = Callable[[float], Array]  # tolerance -> final q (n_runs, n_q), NaN for failed runs
 
-MOST_STEPS = 100_000  # of diffrax
+MAX_STEPS = 100_000  # of diffrax
 CALLBACKS = ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")
 
 
@@ -33,11 +32,11 @@ def by_diffrax(problems: Sequence[Problem], t_end: float) -> Solve:
     equations, states, parameters = _gathered(problems)
     derivative, n = derivative_of(equations), equations.system.n_q
 
-    def one(y0: Any, p: Any, tol: Any) -> Any:
-        found = solved(derivative, 0.0, t_end, y0, (tol, tol), diffrax.SaveAt(t1=True), MOST_STEPS, p)
-        return jax.numpy.where(found.result == diffrax.RESULTS.successful, found.ys[-1][:n], jax.numpy.nan)
+    def run_one(y0: Any, p: Any, tol: Any) -> Any:
+        solution = solve_by_dopri8(derivative, 0.0, t_end, y0, (tol, tol), diffrax.SaveAt(t1=True), MAX_STEPS, p)
+        return jax.numpy.where(solution.result == diffrax.RESULTS.successful, solution.ys[-1][:n], jax.numpy.nan)
 
-    run = jax.jit(jax.vmap(one, in_axes=(0, 0, None)))
+    run = jax.jit(jax.vmap(run_one, in_axes=(0, 0, None)))
     return lambda tol: np.array(run(states, parameters, tol))
 
 
@@ -47,17 +46,17 @@ class Batches:
     def __init__(self, problems: Sequence[Problem]):
         self.package = imported("heyoka")
         equations, self.states, self.parameters = _gathered(problems)
-        self.n, self._made = equations.system.n_q, dict[float, Any]()
+        self.n, self._integrators = equations.system.n_q, dict[float, Any]()
         self.motion = rates_of(equations, [self.package.par[i] for i in range(self.parameters.shape[1])])
         n_runs, width = len(self.states), self.package.recommended_simd_size()
         self.groups = np.minimum(np.arange(-(-n_runs // width) * width), n_runs - 1).reshape(-1, width)
 
     def integrator(self, tol: float) -> Any:
         """The integrator of a tolerance."""
-        if tol not in self._made:
+        if tol not in self._integrators:
             start = self.states[self.groups[0]].T.copy()
-            self._made[tol] = self.package.taylor_adaptive_batch(self.motion, start, tol=tol, fast_math=True)
-        return self._made[tol]
+            self._integrators[tol] = self.package.taylor_adaptive_batch(self.motion, start, tol=tol, fast_math=True)
+        return self._integrators[tol]
 
     def put(self, integrator: Any, k: int) -> Any:
         """Put a batch at its start."""
@@ -94,8 +93,8 @@ def by_heyoka_ensemble(problems: Sequence[Problem], t_end: float) -> Solve:
     def solve(tol: float) -> Array:
         ends, n = np.full((len(problems), batches.n), np.nan), len(batches.groups)
         propagate = batches.package.ensemble_propagate_until_batch
-        for k, made in enumerate(propagate(batches.integrator(tol), t_end, n, batches.put, max_workers=1)):
-            batches.take(made[0], k, ends)
+        for k, result in enumerate(propagate(batches.integrator(tol), t_end, n, batches.put, max_workers=1)):
+            batches.take(result[0], k, ends)
         return ends
 
     return solve
@@ -108,21 +107,21 @@ def by_cyrk(problems: Sequence[Problem], t_end: float) -> Solve:
     """
     tasks, keys = _tasks(problems, t_end)
     rates = [rate_of(*key) for key in keys]
-    made: dict[float, list[Solver]] = {}
+    solvers: dict[float, list[Solver]] = {}
     stack, n = ExitStack(), problems[0].system.n_q  # the solvers last as long as the process
 
     def solve(tol: float) -> Array:
-        if tol not in made:
-            made[tol] = [
+        if tol not in solvers:
+            solvers[tol] = [
                 Solver(stack, task, task.y0, "DOP853", (rate, None), (tol, tol), t_end)
                 for task, rate in zip(tasks, rates, strict=True)
             ]
-        runs = [solver.prepared(0) for solver in made[tol]]
+        runs = [solver.prepared(0) for solver in solvers[tol]]
         with user_call:
             for run in runs:
                 run()
         return np.array(
-            [solver.end[:n] if solver.found.status == FINISHED else np.full(n, np.nan) for solver in made[tol]]
+            [solver.end[:n] if solver.solution.status == FINISHED else np.full(n, np.nan) for solver in solvers[tol]]
         )
 
     return solve
@@ -130,18 +129,18 @@ def by_cyrk(problems: Sequence[Problem], t_end: float) -> Solve:
 
 def by_cvode(problems: Sequence[Problem], t_end: float) -> Solve:
     """Return CVODE's Adams methods driven from C, one run after another, with equations as `by_cyrk` has them."""
-    (tasks, keys), made = _tasks(problems, t_end), dict[float, list[Memory]]()
+    (tasks, keys), memories = _tasks(problems, t_end), dict[float, list[Memory]]()
     stack, n = ExitStack(), problems[0].system.n_q
 
     def solve(tol: float) -> Array:
-        if tol not in made:
-            made[tol] = [adams_memory(stack, task, key, tol) for task, key in zip(tasks, keys, strict=True)]
+        if tol not in memories:
+            memories[tol] = [adams_memory(stack, task, key, tol) for task, key in zip(tasks, keys, strict=True)]
         flags, limit = [], TimeLimit(None)
         with user_call:
-            for solver in made[tol]:
+            for solver in memories[tol]:
                 solver.restart()
                 flags.append(solver.go_to_the_end(limit))
-        ends = [solver.state[0, :n].copy() for solver in made[tol]]
+        ends = [solver.state[0, :n].copy() for solver in memories[tol]]
         return np.array([end if flag >= 0 else np.full(n, np.nan) for end, flag in zip(ends, flags, strict=True)])
 
     return solve
@@ -149,8 +148,11 @@ def by_cvode(problems: Sequence[Problem], t_end: float) -> Solve:
 
 def _tasks(problems: Sequence[Problem], t_end: float) -> tuple[list[Task], list[tuple[Any, ...]]]:
     """Return the tasks of runs that are made singly, and the key of the equations of each: one, if parameters agree."""
-    tasks = [Task(with_all_rows(each.system), each.system.n_c, 0.0, t_end, each.q0, each.v0) for each in problems]
-    alike = all((each.system.parameters == problems[0].system.parameters).all() for each in problems)
+    tasks = [
+        Task(with_all_rows(problem.system), problem.system.n_c, 0.0, t_end, problem.q0, problem.v0)
+        for problem in problems
+    ]
+    alike = all((problem.system.parameters == problems[0].system.parameters).all() for problem in problems)
     return tasks, [tasks[0].key if alike else task.key for task in tasks]
 
 
@@ -161,8 +163,8 @@ def _gathered(problems: Sequence[Problem]) -> tuple[Expressions, Array, Array]:
     """
     first = problems[0]
     for problem in problems:
-        f, own = first.system.functions, problem.system.functions
-        if any(getattr(f, name) is not getattr(own, name) for name in CALLBACKS):
+        f, functions = first.system.functions, problem.system.functions
+        if any(getattr(f, name) is not getattr(functions, name) for name in CALLBACKS):
             raise ValueError(f"problems must have the callbacks of the first, {first.name!r}; given {problem.name!r}")
     states = np.array([np.concatenate([problem.q0, problem.v0]) for problem in problems])
     parameters = np.array([problem.system.functions.p for problem in problems])

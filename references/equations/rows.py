@@ -17,6 +17,7 @@ from twoloop import callback
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
 
+SAMPLES = 5  # states at which the rank is determined, because it may be lower at singular positions
 RANK = 1e-9  # relative: a row closer than this to the span of the previous rows counts as dependent
 HOLDS = 1e-6  # relative to max(1, |q|): allowed violation of a removed row ...
 BEYOND = 1e3  # ... plus this multiple of the violation of the rows kept
@@ -48,12 +49,8 @@ def with_all_rows(system: ConstrainedSystem) -> ConstrainedSystem:
 class IndependentRows:
     """The rows of C_q that are independent at the start, for a solver that does not support others.
 
-    Attributes
-    ----------
-    system : ConstrainedSystem
-        The system with these rows only; the one given if all are independent.
-
-    Raises ValueError if the start violates a removed row.
+    `system` is the system with these rows only; the one given if all are independent. Raises ValueError if the start
+    violates a removed row.
     """
 
     def __init__(self, system: ConstrainedSystem, t0: float, q0: Array):
@@ -88,8 +85,8 @@ class IndependentRows:
         """Return the multipliers of all rows (n_c + n_a, n_t): minimum-norm lam with T^T lam = lam_r, C_q = T C_r."""
         forces, n_c = np.full((self.all.n_c, t.size), np.nan), len(self.kept)
         for k in np.flatnonzero(np.isfinite(q).all(axis=0)):
-            at = float(t[k]), np.ascontiguousarray(q[:, k])
-            T = np.linalg.lstsq(self.system.jacobian(*at).T, self.all.jacobian(*at).T, rcond=None)[0].T
+            position = float(t[k]), np.ascontiguousarray(q[:, k])
+            T = np.linalg.lstsq(self.system.jacobian(*position).T, self.all.jacobian(*position).T, rcond=None)[0].T
             forces[:, k] = np.linalg.lstsq(T.T, lam[:n_c, k], rcond=None)[0]
         return np.concatenate([forces, lam[n_c:]])
 
@@ -99,110 +96,107 @@ def independent_rows(jacobian: Array) -> tuple[int, ...]:
     rows: list[int] = []
     basis = np.zeros((0, jacobian.shape[1]))
     for k, row in enumerate(jacobian):
-        left = row - basis.T @ (basis @ row)
-        left -= basis.T @ (basis @ left)
-        if np.linalg.norm(left) > RANK * np.linalg.norm(row):
+        remainder = row - basis.T @ (basis @ row)
+        remainder -= basis.T @ (basis @ remainder)
+        if np.linalg.norm(remainder) > RANK * np.linalg.norm(row):
             rows.append(k)
-            basis = np.vstack([basis, left / np.linalg.norm(left)])
+            basis = np.vstack([basis, remainder / np.linalg.norm(remainder)])
     return tuple(rows)
 
 
 @lru_cache(maxsize=64)
-def _with_rows(system: ConstrainedSystem, kept: tuple[int, ...], n_a: int) -> ConstrainedSystem:
+def _with_rows(system: ConstrainedSystem, rows: tuple[int, ...], n_a: int) -> ConstrainedSystem:
     """Return the system with some rows of C, and of A below them, as rows of C; plus n_a unchanged rows of A."""
-    f, more = system.functions, n_a < system.n_a
-    left_out = NOT_WITH_MORE_ROWS if more else ("kinematics", "reaction_by_q")
-    given = {kind: function for kind, function in system.given.items() if kind not in left_out}
-    below = (f.nonholonomic, f.nonholonomic_rate, f.nonholonomic_gamma) if more else ()
-    made = _rows(kept, system.n_c, system.n_a - n_a, tuple(getattr(f, kind) for kind in ROWS), below)
-    given |= {kind: made[kind] for kind in ROWS if kind in given or more}
-    sizes: dict[str, Any] = {"n_q": system.n_q, "n_c": len(kept), "n_a": n_a, "constant_mass": system.constant_mass}
+    f, with_a = system.functions, n_a < system.n_a
+    omitted = NOT_WITH_MORE_ROWS if with_a else ("kinematics", "reaction_by_q")
+    given = {kind: function for kind, function in system.given.items() if kind not in omitted}
+    below = (f.nonholonomic, f.nonholonomic_rate, f.nonholonomic_gamma) if with_a else ()
+    callbacks = _rows(rows, system.n_c, system.n_a - n_a, tuple(getattr(f, kind) for kind in ROWS), below)
+    given |= {kind: callbacks[kind] for kind in ROWS if kind in given or with_a}
+    sizes: dict[str, Any] = {"n_q": system.n_q, "n_c": len(rows), "n_a": n_a, "constant_mass": system.constant_mass}
     return ConstrainedSystem(**sizes, parameters=f.p, name=system.name, **given)
 
 
 @lru_cache(maxsize=64)
 def _rows(
-    kept: tuple[int, ...], m: int, n_a: int, of_c: tuple[Dispatcher, ...], of_a: tuple[Dispatcher, ...]
+    rows: tuple[int, ...], m: int, n_a: int, c_callbacks: tuple[Dispatcher, ...], a_callbacks: tuple[Dispatcher, ...]
 ) -> dict[str, Dispatcher]:
     """Return the callbacks of the rows kept, of m rows of C and n_a rows of A below them."""
-    constraint, jacobian, constraint_rate, gamma = of_c
-    nonholonomic, nonholonomic_rate, nonholonomic_gamma = of_a or of_c[1:]
+    constraint, jacobian, constraint_rate, gamma = c_callbacks
+    nonholonomic, nonholonomic_rate, nonholonomic_gamma = a_callbacks or c_callbacks[1:]
 
     @callback("constraint")
     def some_constraints(t, q, p, C):  # type: ignore[no-untyped-def]
-        of_all = np.zeros(m + n_a)
-        constraint(t, q, p, of_all[:m])
+        values = np.zeros(m + n_a)
+        constraint(t, q, p, values[:m])
         for i in range(C.size):
-            C[i] = of_all[kept[i]]
+            C[i] = values[rows[i]]
 
     @callback("jacobian")
     def some_rows(t, q, p, Cq):  # type: ignore[no-untyped-def]
-        of_all = np.zeros((m + n_a, q.size))
-        jacobian(t, q, p, of_all[:m])
+        values = np.zeros((m + n_a, q.size))
+        jacobian(t, q, p, values[:m])
         if n_a > 0:
-            nonholonomic(t, q, p, of_all[m:])
+            nonholonomic(t, q, p, values[m:])
         for i in range(Cq.shape[0]):
             for j in range(q.size):  # numba compiles `Cq[i] = ...` two seconds longer
-                Cq[i, j] = of_all[kept[i], j]
+                Cq[i, j] = values[rows[i], j]
 
     @callback("constraint_rate")
     def some_rates(t, q, p, Ct):  # type: ignore[no-untyped-def]
-        of_all = np.zeros(m + n_a)
-        constraint_rate(t, q, p, of_all[:m])
+        values = np.zeros(m + n_a)
+        constraint_rate(t, q, p, values[:m])
         if n_a > 0:
-            nonholonomic_rate(t, q, p, of_all[m:])
+            nonholonomic_rate(t, q, p, values[m:])
         for i in range(Ct.size):
-            Ct[i] = of_all[kept[i]]
+            Ct[i] = values[rows[i]]
 
     @callback("gamma")
     def some_gammas(t, q, v, p, Qd):  # type: ignore[no-untyped-def]
-        of_all = np.zeros(m + n_a)
-        gamma(t, q, v, p, of_all[:m])
+        values = np.zeros(m + n_a)
+        gamma(t, q, v, p, values[:m])
         if n_a > 0:
-            nonholonomic_gamma(t, q, v, p, of_all[m:])
+            nonholonomic_gamma(t, q, v, p, values[m:])
         for i in range(Qd.size):
-            Qd[i] = of_all[kept[i]]
+            Qd[i] = values[rows[i]]
 
     return dict(zip(ROWS, (some_constraints, some_rows, some_rates, some_gammas), strict=True))
-
-
-SAMPLES = 5  # states at which the rank is determined, because it may be lower at singular positions
 
 
 def accelerations(system: ConstrainedSystem, t: Array, states: Array) -> tuple[Array, Array]:
     """Return accelerations and multipliers of eq. (6) at states (2 n_q, n_t); NaN if a state is not finite."""
     n, m, f, gamma = system.n_q, system.n_c, system.functions, compiled_gamma(system)
     rows, finite = np.ascontiguousarray(states.T), np.isfinite(states).all(axis=0)
-    matrices, right = np.zeros((t.size, n + m, n + m)), np.zeros((t.size, n + m))
+    matrices, right_sides = np.zeros((t.size, n + m, n + m)), np.zeros((t.size, n + m))
     M, Cq = np.zeros((n, n)), np.zeros((m, n))
     for k in np.flatnonzero(finite):
         time, q, v = float(t[k]), rows[k, :n], rows[k, n:]
         M[:], Cq[:] = 0.0, 0.0
         f.mass(time, q, f.p, M)
-        f.force(time, q, v, f.p, right[k, :n])
+        f.force(time, q, v, f.p, right_sides[k, :n])
         if m:
             f.jacobian(time, q, f.p, Cq)
-            gamma(time, q, v, f.p, right[k, n:])
+            gamma(time, q, v, f.p, right_sides[k, n:])
         matrices[k, :n, :n], matrices[k, n:, :n], matrices[k, :n, n:] = M, Cq, Cq.T
-    found = np.full((t.size, n + m), np.nan)
+    solution = np.full((t.size, n + m), np.nan)
     if finite.any():
-        found[finite] = _solved(matrices[finite], right[finite], n)
-    return found[:, :n].T, found[:, n:].T
+        solution[finite] = _solved(matrices[finite], right_sides[finite], n)
+    return solution[:, :n].T, solution[:, n:].T
 
 
-def _solved(matrices: Array, right: Array, n: int) -> Array:
+def _solved(matrices: Array, right_sides: Array, n: int) -> Array:
     """Return minimum-norm solutions (n_t, n + n_c) of equations with the matrices [M C_q^T; C_q 0]."""
     Cq = matrices[:, n:, :n]
-    some = np.unique(np.linspace(0, len(Cq) - 1, SAMPLES).astype(int))
-    chosen = np.array(max((independent_rows(each) for each in Cq[some]), key=len), dtype=int)
-    kept = np.concatenate([np.arange(n), n + chosen])
+    samples = np.unique(np.linspace(0, len(Cq) - 1, SAMPLES).astype(int))
+    rows = np.array(max((independent_rows(jacobian) for jacobian in Cq[samples]), key=len), dtype=int)
+    unknowns = np.concatenate([np.arange(n), n + rows])
     try:
-        solution = np.linalg.solve(matrices[:, kept[:, None], kept], right[:, kept, None])
+        solution = np.linalg.solve(matrices[:, unknowns[:, None], unknowns], right_sides[:, unknowns, None])
     except np.linalg.LinAlgError:
-        return np.asarray(np.linalg.pinv(matrices, hermitian=True) @ right[:, :, None])[:, :, 0]
+        return np.asarray(np.linalg.pinv(matrices, hermitian=True) @ right_sides[:, :, None])[:, :, 0]
     lam = solution[:, n:]
-    if chosen.size < Cq.shape[1]:  # C_q = T C_r: minimum-norm lam with T^T lam = lam_r
-        Cr = Cq[:, chosen]
+    if rows.size < Cq.shape[1]:  # C_q = T C_r: minimum-norm lam with T^T lam = lam_r
+        Cr = Cq[:, rows]
         T = np.linalg.solve(Cr @ Cr.mT, Cr @ Cq.mT).mT
         lam = T @ np.linalg.solve(T.mT @ T, lam)
     return np.concatenate([solution[:, :n], lam], axis=1)[:, :, 0]

@@ -15,7 +15,6 @@ from references.exudyn.model import (
     GROUND,
     PRISMATIC,
     REVOLUTE,
-    SOLVERS,
     SPHERICAL,
     UNIVERSAL,
     Model,
@@ -27,8 +26,8 @@ from references.lines import CannotRun, Line
 from twoloop.bodies.rotation import euler_parameters, rotated_rate, rotation_matrix
 from twoloop.mechanisms import bricard, n_four_bar
 from twoloop.mechanisms.natural import BRICARD_AXES, BRICARD_CORNERS, BRICARD_FRAMES
-from twoloop.mechanisms.spatial import BALL, CUBE, DAMPING, DENSITY, HEIGHT, LENGTH, SLACK, STIFFNESS, WIDTH, box
 from twoloop.mechanisms.planar import PlanarBodies
+from twoloop.mechanisms.spatial import BALL, CUBE, DAMPING, DENSITY, HEIGHT, LENGTH, SLACK, STIFFNESS, WIDTH, box
 from twoloop.problem.problem import Array, Problem
 from twoloop.result.result import Result
 
@@ -53,51 +52,43 @@ def solve_exudyn(
     problem : Problem
         One of those named in `MODELS`, A02, or of `twoloop.mechanisms.four_bar`. Its parameters and initial state are
         used, not its system.
-    t_end : float
-        End, s; the run starts at 0.
-    n_steps : int
-        Number of steps.
+    t_end, n_steps : float, int
+        End, s, of a run that starts at 0, and its number of steps.
     solver : {"GeneralizedAlpha", "TrapezoidalIndex2", "HHT"}
         `SOLVERS` has a description of each for tables.
 
         "GeneralizedAlpha": J. Chung and G. M. Hulbert, J. Appl. Mech. 60 (1993) 371-375, on index 3 by M. Arnold and
-        O. Bruels, Multibody Syst. Dyn. 18 (2007) 185-202. From the spectral radius r at infinite frequency
-        alpha_m = (2 r - 1)/(r + 1), alpha_f = r/(r + 1), gamma = 1/2 - alpha_m + alpha_f, beta = (gamma + 1/2)^2/4.
+        O. Bruels, Multibody Syst. Dyn. 18 (2007) 185-202.
 
-        "HHT": alpha_m = 0, alpha_f = -alpha, gamma = (1 - 2 alpha)/2, beta = (1 - alpha)^2/4 (Hilber, Hughes and
-        Taylor, Earthq. Eng. Struct. Dyn. 5 (1977) 283-292). Exudyn has no option for it: alpha_m and alpha_f depend on
-        r only, and r = 1/2, where alpha_m vanishes, is HHT with alpha = -1/3. Therefore the four coefficients of the
-        solver are overwritten before the first step, with MSC Adams' alpha of -0.3. This is the formula of HHT-I3
-        without its step-size control.
+        "HHT": H. M. Hilber, T. J. R. Hughes and R. L. Taylor, Earthq. Eng. Struct. Dyn. 5 (1977) 283-292, with MSC
+        Adams' alpha of -0.3. Exudyn has no option for it, so the coefficients of its solver are overwritten.
     spectral_radius : float, optional
         For "GeneralizedAlpha" only, from 0 (most damping) to 1 (none). None: 0.9, Exudyn's default. With 1 the index-3
         form is weakly unstable: on the four-bar linkage the run fails within seconds for any step.
     store_every : int
         Number of steps between stored states; `n_steps` must be a multiple of it.
     time_limit : float, optional
-        Wall-clock limit of the run, s, checked after every step. A run that exceeds it fails. None: no limit.
+        Wall-clock limit of the run, s, checked after every step.
 
     Returns
     -------
     Result
-        In our coordinates; `a` as Exudyn's solver has it, but NaN of A02 by its tips and of A04, whose coordinates
-        Exudyn does not have; `lam` NaN, for Exudyn's joint forces are not our multipliers. Times are Exudyn's own,
-        which carry the rounding of an accumulated sum. `h` is empty unless every step is stored. A step that does not
-        converge gives what was stored before it, `Status.SOLVER_FAILED` and Exudyn's text. Of the statistics Exudyn
-        tells steps (n_accepted), Newton iterations (n_outer) and Jacobians, each with its factorisation
-        (n_factorizations); cpu_time is that of the solver, its initialisation included.
+        In our coordinates. `a` is Exudyn's, but NaN of A02 by its tips and of A04, whose coordinates Exudyn does not
+        have. `lam` is NaN: Exudyn's joint forces are not our multipliers. `h` is empty unless every step is stored.
+        Statistics: steps (n_accepted), Newton iterations (n_outer) and Jacobians (n_factorizations); cpu_time is that
+        of the solver, its initialisation included.
     """
     if not isinstance(problem, Problem) or not has_model(problem):
         error, given = (ValueError, problem.name) if isinstance(problem, Problem) else (TypeError, problem)
         raise error(f"problem must be a four-bar linkage, of A02 or one of {', '.join(MODELS)}; given {given!r}")
     steps = check_steps(problem, t_end, n_steps, solver, store_every, time_limit, spectral_radius)
-    model, ours = model_of(problem), None
+    model, convert = model_of(problem), None
     reference = np.concatenate(model.reference)
     if problem.name == bricard().name:
-        ours = _with_matrices
+        convert = _with_matrices
     elif problem.name.startswith("A02") and problem.q0.size != reference.size:
-        ours = _with_tips
-    return run(model.mbs, model.sensors, reference, steps, ours, problem.name.startswith(REDUNDANT))
+        convert = _with_tips
+    return run(model.mbs, model.sensors, reference, steps, convert, problem.name.startswith(REDUNDANT))
 
 
 def model_of(problem: Problem) -> Model:
@@ -145,8 +136,8 @@ def _spatial_slider_crank(problem: Problem) -> Model:
     (centre, rod), (slider, _) = model.places[1:]
     model.joint(GROUND, 0, p["A"], frame(X), REVOLUTE)
     model.joint(0, 1, centre - 0.5 * p["rod"] * rod[:, 0], np.eye(3), SPHERICAL)
-    across = rod[:, 1]
-    model.joint(1, 2, slider, np.column_stack([across, X, np.cross(across, X)]), UNIVERSAL)
+    second_axis = rod[:, 1]
+    model.joint(1, 2, slider, np.column_stack([second_axis, X, np.cross(second_axis, X)]), UNIVERSAL)
     model.joint(GROUND, 2, slider, np.eye(3), PRISMATIC)
     return model
 
@@ -155,9 +146,9 @@ def _governor(problem: Problem) -> Model:
     model = Model((0.0, 0.0, -problem.parameters["gravity"]))
     bar, cube = DENSITY * LENGTH * WIDTH**2, DENSITY * CUBE**3
     centre = (0.5 * bar + BALL) * LENGTH / (bar + BALL)  # centre of mass of rod and ball, from the hinge
-    axial, across, _ = box(bar, LENGTH, WIDTH, WIDTH)
-    across += bar * (centre - 0.5 * LENGTH) ** 2 + BALL * (LENGTH - centre) ** 2
-    rod = (bar + BALL, (axial, across, across))
+    axial, transverse, _ = box(bar, LENGTH, WIDTH, WIDTH)
+    transverse += bar * (centre - 0.5 * LENGTH) ** 2 + BALL * (LENGTH - centre) ** 2
+    rod = (bar + BALL, (axial, transverse, transverse))
     bodies = [(bar, box(bar, WIDTH, WIDTH, LENGTH)), (cube, box(cube, CUBE, CUBE, CUBE)), rod, rod]
     for (mass, inertia), (q, v) in zip(bodies, _states(problem), strict=True):
         model.body(mass, inertia, q, v)
@@ -178,8 +169,8 @@ def _bricard(problem: Problem) -> Model:
         q = np.concatenate([0.5 * (begin + end), euler_parameters(R)])
         model.body(1.0, (2.0 * width, 1.0 / 12.0 + width, 1.0 / 12.0 + width), q, np.zeros(7))
     for hinge, (corner, axis) in enumerate(zip(BRICARD_CORNERS, BRICARD_AXES, strict=True)):
-        after = hinge if hinge < 5 else GROUND
-        model.joint(hinge - 1 if hinge else GROUND, after, corner, frame(axis), REVOLUTE)
+        next_ = hinge if hinge < 5 else GROUND
+        model.joint(hinge - 1 if hinge else GROUND, next_, corner, frame(axis), REVOLUTE)
     return model
 
 
@@ -195,7 +186,7 @@ def _with_matrices(q: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
 def _with_tips(q: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
     """Return the tips of the n + 1 cranks instead of the 2 n + 1 bars."""
     n, n_t = len(q) // 6, q.shape[1]
-    x, u = (each.reshape(-1, 3, n_t)[: n + 1, :2] for each in (q, v))
+    x, u = (array.reshape(-1, 3, n_t)[: n + 1, :2] for array in (q, v))
     ground = np.column_stack([np.arange(n + 1.0), np.zeros(n + 1)])
     tips, rates = ((2.0 * x - ground[:, :, None]).reshape(-1, n_t), (2.0 * u).reshape(-1, n_t))
     return tips, rates, np.full_like(tips, np.nan)
@@ -244,34 +235,6 @@ def solve_by_step(problem: Problem, t_end: float, *, step: float, **options: Any
     return solve_exudyn(problem, t_end, n_steps, store_every=store_every, **options)
 
 
-RADII = (1.0, 0.6)  # spectral radii besides Exudyn's default of 0.9; 1 fails on index 3
-MODEL: dict[str, Any] = {"own_accelerations": True, "traces": True, "setting": "h", "of_problem": True}
-MODEL |= {"stores_steps": True}
-ALPHA = "Exudyn, GeneralizedAlpha"
-LINES = (
-    Line(ALPHA, "exudyn", "Exudyn", solve_by_step, **MODEL),
-    *(
-        Line(
-            *(f"{ALPHA} {radius:g}", "exudyn", "Exudyn", solve_by_step, {"spectral_radius": radius}),
-            compared=radius < 1.0,
-            fixed={"spectral_radius": radius},
-            **MODEL,
-        )
-        for radius in RADII
-    ),
-    *(
-        Line(
-            *(f"Exudyn, {solver}", "exudyn", "Exudyn", solve_by_step, {"solver": solver}),
-            keeps=solver != "TrapezoidalIndex2",  # its positions are off by its errors
-            compared=solver == "TrapezoidalIndex2",
-            **MODEL,
-        )
-        for solver in SOLVERS
-        if solver != "GeneralizedAlpha"
-    ),
-)
-
-
 def solve_pinned(
     problem: Problem,
     bodies: PlanarBodies,
@@ -291,3 +254,18 @@ def solve_pinned(
         model.pin(*pin)
     model.mbs.Assemble()
     return run(model.mbs, model.sensors, np.concatenate(model.reference), steps, None)
+
+
+def _line(name: str, options: dict[str, Any], **fields: Any) -> Line:
+    fields.update(own_accelerations=True, traces=True, setting="h", of_problem=True, stores_steps=True)
+    return Line(name, "exudyn", "Exudyn", solve_by_step, options, **fields)
+
+
+RADII = (1.0, 0.6)  # spectral radii besides Exudyn's default of 0.9; 1 fails on index 3
+ALPHA = "Exudyn, GeneralizedAlpha"
+LINES = (
+    _line(ALPHA, {}),
+    *(_line(f"{ALPHA} {r:g}", {"spectral_radius": r}, compared=r < 1.0, fixed={"spectral_radius": r}) for r in RADII),
+    _line("Exudyn, TrapezoidalIndex2", {"solver": "TrapezoidalIndex2"}, keeps=False),  # positions are off by its errors
+    _line("Exudyn, HHT", {"solver": "HHT"}, compared=False),
+)

@@ -1,9 +1,7 @@
 """Building blocks of Exudyn models, and their runs: bodies, joints, springs, fixed steps, statistics.
 
-There is no variant with error control. For `adaptiveStep` of the implicit solvers Exudyn's documentation states "the
-step size may be reduced if step fails; no automatic stepsize control"; the solvers with error control
-(`automaticStepSize`: DOPRI5, ODE23) are explicit and reject joints: "explicit integrator detected object 2 which
-contains constraints that cannot be solved" (1.13.6).
+There is no variant with error control. `adaptiveStep` of the implicit solvers only reduces steps that fail. The solvers
+with error control (`automaticStepSize`: DOPRI5, ODE23) are explicit and reject joints (1.13.6).
 """
 
 import contextlib
@@ -13,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from references.driver import Deferred, Task, TimeLimit, check_time_limit, user_call
+from references.driver import Deferred, Task, TimeLimit, user_call
 from twoloop.bodies.rotation import rotation_matrix
 from twoloop.checks.arguments import check_choice, check_number, check_positive, check_size
 from twoloop.problem.problem import Array, Problem
@@ -21,7 +19,7 @@ from twoloop.result.result import Result
 
 exu, items = Deferred("exudyn"), Deferred("exudyn.itemInterface", "exudyn")
 
-Ours = Callable[[Array, Array, Array], tuple[Array, Array, Array]]
+Convert = Callable[[Array, Array, Array], tuple[Array, Array, Array]]
 
 SPECTRAL_RADIUS = 0.9  # Exudyn's default
 SPARSE = 90  # coordinates above which its sparse solver is faster
@@ -57,7 +55,8 @@ def check_steps(
 ) -> Steps:
     """Return the checked arguments, with Exudyn's default radius; raise an error if one is invalid."""
     check_positive("t_end", t_end)
-    check_time_limit(time_limit)
+    if time_limit is not None:
+        check_positive("time_limit", time_limit)
     n_steps, store_every = check_size("n_steps", n_steps, 1), check_size("store_every", store_every, 1)
     if n_steps % store_every != 0:
         raise ValueError(f"n_steps must be a multiple of store_every = {store_every}; given {n_steps}")
@@ -84,7 +83,7 @@ def run(
     sensors: Sequence[list[int]],
     reference: Array,
     steps: Steps,
-    ours: Ours | None,
+    convert: Convert | None,
     dependent_rows: bool = False,
 ) -> Result:
     """Solve an assembled system whose nodes have these sensors and reference coordinates.
@@ -106,30 +105,34 @@ def run(
     tables = [[mbs.GetSensorStoredData(sensor) for sensor in node] for node in sensors]  # (n_t, 1 + n), time first
     t = tables[0][0][:, 0]
     q, v, a = (np.concatenate([node[k][:, 1:] for node in tables], axis=1).T for k in range(len(_OUTPUTS)))
-    did = mbs.sys["dynamicSolver"].it
-    made = did.currentStepIndex - (2 if failure else 1)  # the index starts at 1 and includes the failed step
+    iteration = mbs.sys["dynamicSolver"].it
+    n_done = iteration.currentStepIndex - (2 if failure else 1)  # the index starts at 1 and includes the failed step
     message = ""
-    if not failure and made < n_steps:
-        message = limit.message("Exudyn", did.currentTime, "take fewer steps")
+    if not failure and n_done < n_steps:
+        message = limit.message("Exudyn", iteration.currentTime, "take fewer steps")
     elif failure:
-        message = f"Exudyn failed in the step to t = {did.currentTime:.10g}: {failure}. Take more steps."
-    counts = {"n_accepted": made, "n_outer": did.newtonStepsCount, "n_factorizations": did.newtonJacobiCount}
+        message = f"Exudyn failed in the step to t = {iteration.currentTime:.10g}: {failure}. Take more steps."
+    counts = {
+        "n_accepted": n_done,
+        "n_outer": iteration.newtonStepsCount,
+        "n_factorizations": iteration.newtonJacobiCount,
+    }
     q += reference[:, None]
-    rows = np.concatenate([*((q, v, a) if ours is None else ours(q, v, a)), np.full((task.n_c, t.size), np.nan)])
-    h = np.full(t.size - 1, did.currentStepSize) if store_every == 1 else None
+    rows = np.concatenate([*((q, v, a) if convert is None else convert(q, v, a)), np.full((task.n_c, t.size), np.nan)])
+    h = np.full(t.size - 1, iteration.currentStepSize) if store_every == 1 else None
     return task.result("Exudyn", t, rows, message, h=h, **counts)
 
 
 def _solve(mbs: Any, settings: Any, solver: str, limit: TimeLimit) -> str:
     """Run one of Exudyn's own solvers; return an error message, or "" for success or at the time limit."""
-    before = exu.special.solver.timeout
+    previous = exu.special.solver.timeout
     exu.special.solver.timeout = -1 if limit.seconds is None else limit.seconds
     try:
         mbs.SolveDynamic(settings, solverType=getattr(exu.DynamicSolverType, solver))
     except exu.SolverError as error:
         return f"{error}: {mbs.sys['dynamicSolver'].GetErrorString()}"
     finally:
-        exu.special.solver.timeout = before
+        exu.special.solver.timeout = previous
     return ""
 
 
@@ -166,12 +169,12 @@ def _settings(t_end: float, n_steps: int, store_every: int) -> Any:
 @contextlib.contextmanager
 def _silence() -> Iterator[None]:
     """Suppress the output of Exudyn, whose console switch is global."""
-    before = exu.config.printToConsole
+    previous = exu.config.printToConsole
     exu.config.printToConsole = False
     try:
         yield
     finally:
-        exu.config.printToConsole = before
+        exu.config.printToConsole = previous
 
 
 GROUND = -1
@@ -262,19 +265,6 @@ class Model:
         self.mbs.AddLoad(
             items.LoadTorqueVector(markerNumber=marker, loadVector=np.asarray(torque, dtype=float).tolist())
         )
-
-    def turn(self, body: int, stiffness: float, damping: float, angle: float) -> None:
-        """Add a torsional spring between the ground and a planar body, unstressed at the rotation `angle`."""
-        properties: dict[str, Any] = {"stiffness": stiffness, "damping": damping, "offset": angle}
-        self.mbs.AddObject(
-            items.ObjectConnectorCoordinateSpringDamper(markerNumbers=self._coordinate(body, 2), **properties)
-        )
-
-    def twist(self, joint: int, stiffness: float, damping: float, angle: float) -> None:
-        """Add a torsional spring about z of the markers of a joint, unstressed at the rotation `angle`."""
-        markers = self.mbs.GetObject(joint)["markerNumbers"]
-        properties: dict[str, Any] = {"stiffness": stiffness, "damping": damping, "offset": angle}
-        self.mbs.AddObject(items.TorsionalSpringDamper(markerNumbers=markers, **properties))
 
     def _coordinate(self, body: int, coordinate: int) -> list[int]:
         fixed = self.mbs.AddNode(items.NodePointGround())

@@ -1,8 +1,7 @@
 """The Taylor integrator of heyoka.py (F. Biscani and D. Izzo, MNRAS 504 (2021) 2614-2628) on a ConstrainedSystem.
 
-It takes the right-hand side as expressions, here from `equations.expressions`, and compiles a Taylor integrator for
-each mechanism and each tolerance, which determines the order. The step size follows from the radius of convergence. The
-constraints drift. The package is optional: `make peers`, or the extra `peers`.
+It takes the right-hand side as expressions, from `equations.expressions`, and compiles an integrator for each mechanism
+and tolerance, which determines the order; the step size follows from the radius of convergence. Constraints drift.
 """
 
 from functools import lru_cache
@@ -25,11 +24,11 @@ STEPS = 20_000  # between two checks of the clock, over the number of coordinate
 def solve_heyoka(task: Task, tol: float = 1e-8, *, max_step: float | None = None) -> Result:
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with heyoka's Taylor integrator.
 
-    Settings: accelerations eliminated symbolically, exploiting structural zeros, in a minimum-degree order;
-    the default, unrolled form (`compact_mode=False`, faster than the compact one) with `fast_math` up to
-    `LARGEST_UNROLLED` coordinates, then the compact one without, whose steps then take a fifth less time. The timed
-    call is a second use of the integrator, as in its tutorials: time and state are set, and `propagate_until` is called
-    without output. The clock is checked every `STEPS` / n_q steps.
+    Accelerations are eliminated symbolically, exploiting structural zeros, in a minimum-degree order. Up to
+    `LARGEST_UNROLLED` coordinates the form is the default, unrolled one (`compact_mode=False`) with `fast_math`, beyond
+    it the compact one without, whose steps then take a fifth less time. A second use of the integrator is timed, as in
+    its tutorials: time and state are set, and `propagate_until` is called without output. The clock is checked every
+    `STEPS` / n_q steps.
 
     Parameters, errors and result as in `references.driver`; statistics: n_accepted. The integrator is cached for the
     next run of the same system, start and tolerance, and its machine code in heyoka's own cache on disk.
@@ -42,12 +41,14 @@ def solve_heyoka(task: Task, tol: float = 1e-8, *, max_step: float | None = None
 def integrate(integrator: Any, start: Array, task: Task, longest: float) -> tuple[str, Array, Array, str, int]:
     """Return the integrator's name, times reached, rows y there, error message or "", and number of steps."""
     outcomes, limit, steps = imported("heyoka").taylor_outcome, TimeLimit(task.time_limit), 0
-    at_once = STEPS // task.system.n_q
+    steps_per_call = STEPS // task.system.n_q
     with user_call:
         integrator.time, integrator.state[:] = task.t0, start
         while True:
-            outcome, _, _, taken, *_ = integrator.propagate_until(task.t1, max_steps=at_once, max_delta_t=longest)
-            steps += taken
+            outcome, _, _, n_taken, *_ = integrator.propagate_until(
+                task.t1, max_steps=steps_per_call, max_delta_t=longest
+            )
+            steps += n_taken
             if outcome != outcomes.step_limit or limit.passed():
                 break
     reached, failure = float(integrator.time), ""
@@ -55,12 +56,12 @@ def integrate(integrator: Any, start: Array, task: Task, longest: float) -> tupl
         failure = limit.message("heyoka", reached, "take looser tolerances")
     elif outcome != outcomes.time_limit:  # heyoka's status at the end time
         failure = f"heyoka failed after t = {reached:.10g} with {outcome.name}. {ADVICE}"
-    kept = task.instants[task.instants <= (reached if failure else task.t1)]
+    times = task.instants[task.instants <= (reached if failure else task.t1)]
     integrator.time, integrator.state[:] = task.t0, start
-    grid = kept if kept.size and kept[0] == task.t0 else np.append(task.t0, kept)  # must start at the current time
-    rows = integrator.propagate_grid(grid, max_delta_t=longest)[-1][grid.size - kept.size :]
-    kept = kept[: len(rows)]  # a failure may come earlier this time
-    return f"heyoka, order {integrator.order},", kept, rows, failure, steps
+    grid = times if times.size and times[0] == task.t0 else np.append(task.t0, times)  # must start at the current time
+    rows = integrator.propagate_grid(grid, max_delta_t=longest)[-1][grid.size - times.size :]
+    times = times[: len(rows)]  # a failure may come earlier this time
+    return f"heyoka, order {integrator.order},", times, rows, failure, steps
 
 
 def rates_of(equations: Expressions, parameters: list[Any] | None = None) -> list[tuple[Any, Any]]:
@@ -73,7 +74,7 @@ def rates_of(equations: Expressions, parameters: list[Any] | None = None) -> lis
     return list(zip(symbols, rates, strict=True))
 
 
-def built(motion: list[tuple[Any, Any]], start: Any, t0: float, tol: float, unrolled: bool) -> Any:
+def build_integrator(motion: list[tuple[Any, Any]], start: Any, t0: float, tol: float, unrolled: bool) -> Any:
     """Return the integrator of variables and their rates."""
     options = {"time": t0, "tol": tol, "fast_math": unrolled, "compact_mode": not unrolled}
     return imported("heyoka").taylor_adaptive(motion, start, **options)
@@ -82,7 +83,9 @@ def built(motion: list[tuple[Any, Any]], start: Any, t0: float, tol: float, unro
 @lru_cache(maxsize=256)
 def _integrator(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes, tol: float) -> Any:
     start = [*np.frombuffer(q0), *np.frombuffer(v0)]
-    return built(rates_of(expressions_at(system, t0, q0, v0)), start, t0, tol, system.n_q <= LARGEST_UNROLLED)
+    return build_integrator(
+        rates_of(expressions_at(system, t0, q0, v0)), start, t0, tol, system.n_q <= LARGEST_UNROLLED
+    )
 
 
 HOW: dict[str, Any] = {"keeps": False, "traces": True, "builds_each": True, "one_tolerance": True}

@@ -9,15 +9,15 @@ coordinates (`heyoka.taylor`, `cyrk.ode`, `sundials.cvode_c`), and the same timi
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, wraps
+from inspect import signature
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from references.cyrk import ode
-from references.driver import Task, check_task, imported
+from references.driver import POSITIVE, Task, check_task, imported
 from references.equations.straight_line import Program, Value, machine_code
 from references.heyoka import taylor
 from references.lines import CannotRun, Line
@@ -42,12 +42,10 @@ class NoMinimalCoordinates(CannotRun, ValueError):
 class Minimal:
     """A mechanism in minimal coordinates."""
 
-    # equations(functions) -> rates, with rates(y) -> y', y = [angles, their rates]; functions: `math` or another module
-    # with sin, cos and sqrt
+    # functions (`math` or another module with sin, cos, sqrt) -> rates, with rates(y) -> y', y = [angles, their rates]
     equations: Callable[[Any], Equations]
     start: tuple[float, ...]  # initial y
-    # states(y (2 n, n_t)) -> q, v (n_q, n_t) in the problem's coordinates
-    states: Callable[[Array], tuple[Array, Array]]
+    states: Callable[[Array], tuple[Array, Array]]  # y (2 n, n_t) -> q, v (n_q, n_t) in the problem's coordinates
 
 
 def minimal(problem: Problem) -> Minimal:
@@ -116,7 +114,7 @@ def _chain(problem: Problem, equations: Callable[[Any], Equations]) -> Minimal:
     def states(y: Array) -> tuple[Array, Array]:
         angles, rates = np.split(y, 2)
         s, c = length * np.sin(angles), length * np.cos(angles)
-        q, v = (np.cumsum(each, axis=1).swapaxes(0, 1) for each in ([s, -c], [c * rates, s * rates]))
+        q, v = (np.cumsum(components, axis=1).swapaxes(0, 1) for components in ([s, -c], [c * rates, s * rates]))
         return q.reshape(y.shape), v.reshape(y.shape)
 
     links, speeds = (np.diff(x.reshape(-1, 2), axis=0, prepend=0.0) for x in (problem.q0, problem.v0))
@@ -170,20 +168,20 @@ def _four_bar(problem: Problem) -> Minimal:
     """
     p = problem.parameters
     lengths, ground, density, gravity = (p["L1"], p["L2"], p["L3"]), p["L"], p["density"], p["gravity"]
-    known = MinimalFourBar.from_parameters(p)
-    angles = known.states(np.linspace(0.0, 0.5 * known.period, INSTANTS))[0][2::3]
+    reference = MinimalFourBar.from_parameters(p)
+    angles = reference.states(np.linspace(0.0, 0.5 * reference.period, INSTANTS))[0][2::3]
     between = [np.sin(angles[b] - angles[a]) for _, a, b in OTHERS]
     best = max(range(3), key=lambda k: np.abs(between[k]).min())
-    own, a, b = OTHERS[best]
+    bar, a, b = OTHERS[best]
     if np.ptp(np.sign(between[best])) or np.abs(between[best]).min() < NEAREST:
         raise NoMinimalCoordinates(f"every angle of {problem.name!r} reaches its dead centre on this motion")
     side = -math.copysign(1.0, between[best][0])  # e_a is to the left of R if e_b is to the right
-    Lk, La, Lb = lengths[own], lengths[a], lengths[b]
+    Lk, La, Lb = lengths[bar], lengths[a], lengths[b]
     masses = [density * length for length in lengths]
     # centre of bar i = sum of HALVES[i] L e; factors of the three bars in the order k, a, b
-    arms = [[masses[i], *(HALVES[i][j] * lengths[j] for j in (own, a, b))] for i in range(3)]
+    arms = [[masses[i], *(HALVES[i][j] * lengths[j] for j in (bar, a, b))] for i in range(3)]
     (m1, k1, a1, b1), (m2, k2, a2, b2), (m3, k3, a3, b3) = arms
-    Jk, Ja, Jb = (masses[i] * lengths[i] ** 2 / 12.0 for i in (own, a, b))
+    Jk, Ja, Jb = (masses[i] * lengths[i] ** 2 / 12.0 for i in (bar, a, b))
 
     def equations(functions: Any) -> Equations:
         sin, cos, sqrt = functions.sin, functions.cos, functions.sqrt
@@ -192,9 +190,9 @@ def _four_bar(problem: Problem) -> Minimal:
             ck, sk, w = cos(y[0]), sin(y[0]), y[1]
             x, z = ground - Lk * ck, -Lk * sk
             square = x * x + z * z
-            along = 0.5 * (square + (La * La - Lb * Lb)) / square
-            across = side * sqrt(La * La / square - along * along)
-            ax, az = along * x - across * z, along * z + across * x
+            parallel = 0.5 * (square + (La * La - Lb * Lb)) / square
+            normal = side * sqrt(La * La / square - parallel * parallel)
+            ax, az = parallel * x - normal * z, parallel * z + normal * x
             ca, sa, cb, sb = ax / La, az / La, (x - ax) / Lb, (z - az) / Lb
             sine = sb * ca - cb * sa
             # derivatives of the two angles by the independent one: first and second, from the loop closure
@@ -225,24 +223,24 @@ def _four_bar(problem: Problem) -> Minimal:
 
     def turns(angle: Array) -> dict[int, Array]:
         """Return the three angles, continuous in the independent one: R rotates only if its bar exceeds the ground."""
-        bar = np.exp(1j * angle)
-        chord = ground - Lk * bar
-        along = 0.5 * (np.abs(chord) ** 2 + La**2 - Lb**2) / np.abs(chord) ** 2
-        of_a = chord * (along + 1j * side * np.sqrt(La**2 / np.abs(chord) ** 2 - along**2))
-        across = np.angle(chord) if Lk < ground else angle + np.angle(-chord / bar) + math.pi
-        first = across + np.angle(of_a / chord)
-        return {own: angle, a: first, b: first + np.angle((chord - of_a) / of_a)}
+        direction = np.exp(1j * angle)
+        chord = ground - Lk * direction
+        parallel = 0.5 * (np.abs(chord) ** 2 + La**2 - Lb**2) / np.abs(chord) ** 2
+        of_a = chord * (parallel + 1j * side * np.sqrt(La**2 / np.abs(chord) ** 2 - parallel**2))
+        chord_angle = np.angle(chord) if Lk < ground else angle + np.angle(-chord / direction) + math.pi
+        first = chord_angle + np.angle(of_a / chord)
+        return {bar: angle, a: first, b: first + np.angle((chord - of_a) / of_a)}
 
-    at_start = turns(np.array(problem.q0[3 * own + 2]))
+    at_start = turns(np.array(problem.q0[3 * bar + 2]))
     whole = [2.0 * math.pi * round((problem.q0[3 * i + 2] - float(at_start[i])) / (2.0 * math.pi)) for i in range(3)]
 
     def states(y: Array) -> tuple[Array, Array]:
         turned = turns(y[0])
         angles = np.array([turned[i] + whole[i] for i in range(3)])
         tangent = tangent_of(np.array(lengths), angles)
-        return absolute(np.array(lengths), angles, tangent / tangent[own] * y[1])
+        return absolute(np.array(lengths), angles, tangent / tangent[bar] * y[1])
 
-    return Minimal(equations, (float(problem.q0[3 * own + 2]), float(problem.v0[3 * own + 2])), states)
+    return Minimal(equations, (float(problem.q0[3 * bar + 2]), float(problem.v0[3 * bar + 2])), states)
 
 
 def _n_four_bar(problem: Problem) -> Minimal:
@@ -291,136 +289,86 @@ FUNCTIONS = ("sin", "cos", "sqrt")  # that equations in minimal coordinates have
 _KNOWN: dict[int, tuple[Problem, Minimal]] = {}
 
 
-def solve_heyoka_minimal(
-    problem: Problem,
-    t_end: float,
-    tol: float = 1e-8,
-    *,
-    t_eval: ArrayLike | None = None,
-    time_limit: float | None = None,
-) -> Result:
+def _adapter(integrate: Callable[..., Any]) -> Callable[..., Result]:
+    """Turn integrate(equations, task, ...) into solve(problem, t_end, ..., t_eval, time_limit) -> `Result`.
+
+    The run starts at 0 with the problem's initial state. The result is in the problem's coordinates, `a` and `lam` from
+    eq. (6). Raises NoMinimalCoordinates, a ValueError, if there are no equations for the problem.
+    """
+
+    @wraps(integrate)
+    def solve(
+        problem: Problem, t_end: float, *tolerances: float, t_eval: Any = None, time_limit: Any = None, **options: Any
+    ) -> Result:
+        if not isinstance(problem, Problem):
+            raise TypeError(f"problem must be a Problem of twoloop.mechanisms; given {problem!r}")
+        given = signature(integrate).bind(None, None, *tolerances, **options).arguments
+        for name in POSITIVE & given.keys():
+            check_positive(name, given[name])
+        start = problem.system, (0.0, t_end), problem.q0, problem.v0
+        task = check_task(*start, t_eval, time_limit, derivatives=False)
+        if id(problem) not in _KNOWN:  # integrators are cached with the equations
+            _KNOWN[id(problem)] = problem, minimal(problem)
+        equations = _KNOWN[id(problem)][1]
+        name, times, rows, failure, counts = integrate(equations, task, *tolerances, **options)
+        states = np.concatenate(equations.states(rows.T)) if len(rows) else np.empty((2 * task.system.n_q, 0))
+        return task.result(name, times, states, failure, **counts)
+
+    return solve
+
+
+@_adapter
+def solve_heyoka_minimal(equations: Minimal, task: Task, tol: float = 1e-8) -> tuple[Any, ...]:
     """Integrate a mechanism in minimal coordinates by heyoka's Taylor integrator.
 
     From rest with level links, three of four terms of a pendulum's series vanish. At some orders these include the two
     from which heyoka determines its step: the first step is then much too long, and the run succeeds with a wrong
     state. Another tolerance avoids this; it is not handled here.
-
-    Parameters
-    ----------
-    problem : Problem
-        A problem supported by `minimal`.
-    t_end : float
-        End time, s; the run starts at 0 with the problem's initial state.
-    tol : float
-        heyoka's tolerance.
-    t_eval, time_limit : see `references.driver`
-
-    Returns
-    -------
-    Result
-        In the problem's coordinates, `a` and `lam` from eq. (6); statistics: n_accepted.
-
-    Raises
-    ------
-    NoMinimalCoordinates
-        A ValueError, if there are no equations for the problem.
     """
-    check_positive("tol", tol)
-    own, task = _checked(problem, t_end, t_eval, time_limit)
-    integrator = _integrator(own, float(tol))
-    name, times, rows, failure, steps = taylor.integrate(integrator, np.array(own.start), task, task.t1)
-    return task.result(name, times, _states(own, task, rows), failure, n_accepted=steps)
+    integrator = _integrator(equations, float(tol))
+    *run, steps = taylor.integrate(integrator, np.array(equations.start), task, task.t1)
+    return *run, {"n_accepted": steps}
 
 
-def solve_cvode_minimal(
-    problem: Problem,
-    t_end: float,
-    rtol: float = 1e-8,
-    atol: float = 1e-8,
-    *,
-    t_eval: ArrayLike | None = None,
-    time_limit: float | None = None,
-) -> Result:
-    """Integrate a mechanism in minimal coordinates by CVODE's Adams methods, driven from C.
-
-    Parameters, errors and result as for `solve_heyoka_minimal`, except for CVODE's two tolerances and its counters.
-    """
-    check_positive("rtol", rtol)
-    check_positive("atol", atol)
-    own, task = _checked(problem, t_end, t_eval, time_limit)
-    functions, start = cvode_c.Functions(_right_hand_side(own, cvode_c.right_hand_side)), np.array(own.start)
-    times, rows, failure, counts = cvode_c.integrate(functions, start, task, "Adams", rtol, atol)
-    return task.result("CVODE, Adams,", times, _states(own, task, rows), failure, **counts)
+@_adapter
+def solve_cvode_minimal(equations: Minimal, task: Task, rtol: float = 1e-8, atol: float = 1e-8) -> tuple[Any, ...]:
+    """Integrate a mechanism in minimal coordinates by CVODE's Adams methods, driven from C."""
+    functions = cvode_c.Functions(_right_hand_side(equations, cvode_c.right_hand_side))
+    return "CVODE, Adams,", *cvode_c.integrate(functions, np.array(equations.start), task, "Adams", rtol, atol)
 
 
+@_adapter
 def solve_cyrk_minimal(
-    problem: Problem,
-    t_end: float,
-    rtol: float = 1e-8,
-    atol: float = 1e-8,
-    *,
-    method: str = "DOP853",
-    t_eval: ArrayLike | None = None,
-    time_limit: float | None = None,
-) -> Result:
-    """Integrate a mechanism in minimal coordinates by one of CyRK's explicit methods, "DOP853" or "Vern8".
-
-    Other parameters, errors and result as for `solve_cvode_minimal`.
-    """
-    check_positive("rtol", rtol)
-    check_positive("atol", atol)
-    own, task = _checked(problem, t_end, t_eval, time_limit)
-    rate = _right_hand_side(own, ode.right_hand_side)
-    times, rows, failure, counts = ode.integrate((rate, None), np.array(own.start), task, method, rtol, atol)
-    return task.result(f"CyRK, {method},", times, _states(own, task, rows), failure, **counts)
-
-
-def _checked(
-    problem: Problem, t_end: float, t_eval: ArrayLike | None, time_limit: float | None
-) -> tuple[Minimal, Task]:
-    """Return the equations of a problem, cached per object because integrators are cached with them, and the task."""
-    if not isinstance(problem, Problem):
-        raise TypeError(f"problem must be a Problem of twoloop.mechanisms; given {problem!r}")
-    start = problem.system, (0.0, t_end), problem.q0, problem.v0
-    task = check_task(*start, t_eval, time_limit, derivatives=False)
-    if id(problem) not in _KNOWN:
-        _KNOWN[id(problem)] = problem, minimal(problem)
-    return _KNOWN[id(problem)][1], task
+    equations: Minimal, task: Task, rtol: float = 1e-8, atol: float = 1e-8, *, method: str = "DOP853"
+) -> tuple[Any, ...]:
+    """Integrate a mechanism in minimal coordinates by one of CyRK's explicit methods, "DOP853" or "Vern8"."""
+    rate = _right_hand_side(equations, ode.right_hand_side)
+    return f"CyRK, {method},", *ode.integrate((rate, None), np.array(equations.start), task, method, rtol, atol)
 
 
 @lru_cache(maxsize=256)
-def _integrator(own: Minimal, tol: float) -> Any:
+def _integrator(equations: Minimal, tol: float) -> Any:
     package = imported("heyoka")
-    symbols = package.make_vars(*(f"y{i}" for i in range(len(own.start))))
-    motion = list(zip(symbols, own.equations(package)(symbols), strict=True))
-    return taylor.built(motion, list(own.start), 0.0, tol, unrolled=True)
+    symbols = package.make_vars(*(f"y{i}" for i in range(len(equations.start))))
+    motion = list(zip(symbols, equations.equations(package)(symbols), strict=True))
+    return taylor.build_integrator(motion, list(equations.start), 0.0, tol, unrolled=True)
 
 
 @lru_cache(maxsize=64)
-def _right_hand_side(own: Minimal, made: Callable[[Any, int], Any]) -> Any:
-    """Return the right-hand side as `made` makes it for a solver of a compiled (t, y, rate) -> None."""
-    program, n = Program(), len(own.start) // 2
+def _right_hand_side(equations: Minimal, make: Callable[[Any, int], Any]) -> Any:
+    """Return the right-hand side as `make` returns it for a solver of a compiled (t, y, rate) -> None."""
+    program, n = Program(), len(equations.start) // 2
     names = [f"{letter}{i}" for letter in "qv" for i in range(n)]
     functions = SimpleNamespace(**program.functions(FUNCTIONS))
-    rates = own.equations(functions)([Value(program, name) for name in names])
-    return made(machine_code(n, program.names, enumerate(each.name for each in rates)), 2 * n)
-
-
-def _states(own: Minimal, task: Task, rows: Array) -> Array:
-    """Return [q, v] (2 n_q, n_t) for [angles, rates] given as rows."""
-    return np.concatenate(own.states(rows.T)) if len(rows) else np.empty((2 * task.system.n_q, 0))
+    rates = equations.equations(functions)([Value(program, name) for name in names])
+    return make(machine_code(n, program.names, enumerate(rate.name for rate in rates)), 2 * n)
 
 
 # in minimal coordinates, where these have a closed form: no solvers of a DAE, and in no ranking
 FAMILY = "minimal coordinates"
 OWN: dict[str, Any] = {"compared": False, "of_problem": True, "traces": True}
 LINES = (
-    Line(
-        *(f"heyoka, {FAMILY}", "heyoka", FAMILY, solve_heyoka_minimal),
-        one_tolerance=True,
-        builds_each=True,
-        **OWN,
-    ),
+    Line(*(f"heyoka, {FAMILY}", "heyoka", FAMILY, solve_heyoka_minimal), one_tolerance=True, builds_each=True, **OWN),
     *(
         Line(f"CyRK, {method}, {FAMILY}", "cyrk", FAMILY, solve_cyrk_minimal, {"method": method}, **OWN)
         for method in ("DOP853", "Vern8")

@@ -304,12 +304,12 @@ def _step(  # type: ignore[no-untyped-def]
     q1, v1 = end[:n], end[n : 2 * n]
     _combine(q, h, b, w.Kq, q1)
     _combine(v, h, b, w.Kv, v1)
-    kept = True
+    projected = True
     if variant <= FROZEN:
-        kept = _satisfy(f, w, t + h, q1, v1, KEPT, counters)
+        projected = _satisfy(f, w, t + h, q1, v1, KEPT, counters)
     elif variant == PROJECTED or (variant == STABILISED and np.abs(A[-1] - b).max() >= ROUNDING):
-        kept = _project(f, w, t + h, q1, v1, counters)
-    if not kept:
+        projected = _project(f, w, t + h, q1, v1, counters)
+    if not projected:
         return SINGULAR
     where[MU] = max(where[MU], np.abs(w.mu).max() if w.mu.size else 0.0)
     if not _accelerate(f, w, t + h, q1, v1, end[2 * n : 3 * n], end[3 * n :], w.W[0], counters):
@@ -338,8 +338,8 @@ def run(  # type: ignore[no-untyped-def]
     M, Cq, W, S, D = np.zeros((n, n)), np.zeros((m, n)), np.zeros((s, m, n)), np.zeros((m, m)), np.zeros((m, m))
     pivots, C, lam, mu = np.zeros(m, dtype=np.int64), np.zeros(m), np.zeros((s, m)), np.zeros((s, m))
     q, v, a, Kq, Kv = np.zeros((s, n)), np.zeros((s, n)), np.zeros((s, n)), np.zeros((s, n)), np.zeros((s, n))
-    off, places = np.zeros((2, s, m)), np.zeros(n, dtype=np.int64)
-    w = _Space(M, Cq, W, S, D, pivots, C, q, v, a, lam, mu, off, Kq, Kv, places)
+    corrections, places = np.zeros((2, s, m)), np.zeros(n, dtype=np.int64)
+    w = _Space(M, Cq, W, S, D, pivots, C, q, v, a, lam, mu, corrections, Kq, Kv, places)
     if rows.shape[0] == 1:
         parts = state[:n], state[n : 2 * n], state[2 * n : 3 * n], state[3 * n :]
         good = _accelerate(f, w, t0, *parts, w.W[0], counters)
@@ -350,8 +350,8 @@ def run(  # type: ignore[no-untyped-def]
     f.mass(where[T], state[:n], f.p, w.M)
     cholesky(w.M)
     states = np.zeros((4, state.size))  # start, end by one step, middle, end by two half steps
-    made = 0
-    while made < rows.shape[0] and where[T] < t1:
+    n_stored = 0
+    while n_stored < rows.shape[0] and where[T] < t1:
         t, h = where[T], where[H]
         last = counters[STEPS] + 1 == n_steps if n_steps > 0 else t + 1.01 * h >= t1
         if n_steps == 0 and h < LEAST_STEP * (t1 - t0):
@@ -384,9 +384,9 @@ def run(  # type: ignore[no-untyped-def]
         counters[STEPS] += 1
         where[T] = t1 if last else t0 + counters[STEPS] * h if n_steps > 0 else t + h
         state[:] = states[part]
-        rows[made, 0] = where[T]
-        rows[made, 1:] = state
-        made += 1
+        rows[n_stored, 0] = where[T]
+        rows[n_stored, 1:] = state
+        n_stored += 1
     return DONE
 
 
@@ -434,43 +434,43 @@ def solve_variant(
     Returns
     -------
     result : Result
-        States at the ends of steps, with `a` and `lam` from eq. (6). Statistics: n_evaluations of forces with solution
-        of the equations of motion; n_factorizations, of C_qd, C_q M^-1 C_q^T, a varying M, and partitions; n_outer,
-        sweeps over all stages; n_inner, Newton iterations for positions.
+        States at the ends of steps. Statistics: n_evaluations, of eq. (6); n_factorizations, of all matrices, and
+        partitions; n_outer, sweeps over all stages; n_inner, Newton iterations.
     mu : float
         Largest |mu| of the stabilised form, M q' = M v - C_q^T mu; 0 for the others.
 
-    Notes ----- All stages of a sweep are computed from those of the previous sweep; the first uses the accelerations at
-    the start of the step. The multipliers of the stabilised form follow from the residuals of the stages by a Newton
-    step with the matrices of each stage. Unless the last stage is the end of the step, the end is projected onto the
-    constraints (U. Ascher and L. Petzold, SIAM J. Numer. Anal. 28 (1991) 1097-1120); otherwise the method loses its
-    order.
+    Notes
+    -----
+    All stages of a sweep are computed from those of the previous sweep. The multipliers of the stabilised form follow
+    from the residuals of the stages by a Newton step with the matrices of each stage. Unless the last stage is the end
+    of the step, the end is projected onto the constraints (U. Ascher and L. Petzold, SIAM J. Numer. Anal. 28 (1991)
+    1097-1120); otherwise the method loses its order.
     """
     check_choice("variant", variant, tuple(VARIANTS))
     if (step is None) == (tol is None):
         raise ValueError(f"give either step, for fixed steps, or tol; given step={step!r}, tol={tol!r}")
-    system, span, which = task.system, task.t1 - task.t0, list(VARIANTS).index(variant)
+    system, span, variant_index = task.system, task.t1 - task.t0, list(VARIANTS).index(variant)
     if not system.functions.flags[GAMMA_GIVEN]:
         raise ValueError(f"system must have gamma; given {system.name!r} without it")
     if np.linalg.matrix_rank(tableau.A) < tableau.stages:
         raise ValueError(f"tableau must have an invertible A; that of {tableau.name} is singular")
 
     n, m, s = system.n_q, system.n_c, tableau.stages
-    order = FROZEN_ORDER if which == FROZEN else tableau.order
+    order = FROZEN_ORDER if variant_index == FROZEN else tableau.order
     coefficients = [np.ascontiguousarray(x) for x in (tableau.A, tableau.b, tableau.c, np.linalg.inv(tableau.A))]
     counters, where = np.zeros(N_COUNTERS, dtype=np.int64), np.zeros(N_PLACES)
     n_steps, tol = 0 if step is None else max(1, round(span / step)), tol or 0.0
     where[T], where[H] = task.t0, span / n_steps if n_steps else FIRST * span
     where[LONGEST], loop_tol = span, max(LOOP_SHARE * tol, LEAST_LOOP)
     state, chunks = np.concatenate([task.y0, np.zeros(n + m)]), [np.empty((1, 1 + 3 * n + m))]
-    given = n, m, s, which, order, *coefficients, task.t0, task.t1, n_steps, tol, loop_tol, state, where
+    given = n, m, s, variant_index, order, *coefficients, task.t0, task.t1, n_steps, tol, loop_tol, state, where
     limit, began = TimeLimit(task.time_limit), time.process_time()
     code = run(Kit(system.functions), *given, chunks[0], counters)  # initial a and lam
     while code == DONE and where[T] < task.t1 and not limit.passed():
         chunks.append(np.empty((CHUNK, 1 + 3 * n + m)))
-        before = counters[STEPS]
+        n_before = counters[STEPS]
         code = run(Kit(system.functions), *given, chunks[-1], counters)
-        chunks[-1] = chunks[-1][: counters[STEPS] - before]
+        chunks[-1] = chunks[-1][: counters[STEPS] - n_before]
     counts: dict[str, Any] = dict(zip(COUNTERS, counters.tolist(), strict=True))
     counts["cpu_time"] = time.process_time() - began
     rows, name = np.concatenate(chunks).T, f"{tableau.name}, {variant}"

@@ -1,9 +1,8 @@
-"""BDF with a fixed step and order on the index-3 form, as a substitute for ADAMS GSTIFF.
+"""BDF with a fixed step and order on the index-3 form, as a substitute for ADAMS GSTIFF, which is not available.
 
-ADAMS is not available. Its GSTIFF is Gear's method on the index-3 equations with variable order and step, fixed
-coefficients, and its own error test and starting procedure. This is a substitute, not a copy: the same formulas and
-equations with a fixed step and order, as intended by HMAX = HINIT. Its numbers show the behaviour of such formulas;
-they are not numbers of ADAMS.
+GSTIFF is Gear's method on the index-3 equations with variable order and step, fixed coefficients, and its own error
+test and starting procedure. This has the same formulas and equations with a fixed step and order, as intended by HMAX =
+HINIT. Its numbers show the behaviour of such formulas; they are not numbers of ADAMS.
 """
 
 import math
@@ -59,39 +58,32 @@ def solve_gear(task: Task, step: float, order: int = 2, *, start: str = "ramp") 
 
     Parameters
     ----------
-    step : float
-        Step size, s.
-    order : int
-        1 to 6.
+    step, order : float, int
+        Step size, s, of which t_span must be a multiple; 1 to 6.
     start : {"ramp", "accurate"}
         Computation of the first `order` states.
 
         "ramp": the order increases from 1 by one per step, as in Gear's codes (C. W. Gear, Commun. ACM 14 (1971)
-        176-179) including GSTIFF. These choose a small first step; here all steps are equal, so the start causes an
-        error of order 2 in the step for any order. Unless the start is at rest, the first few multipliers and
-        accelerations have errors that do not vanish with the step: after the first step their centripetal part is half
-        of the correct value.
+        176-179) including GSTIFF. Here all steps are equal, so the start causes an error of order 2 in the step for any
+        order; unless it is at rest, the first multipliers and accelerations have errors that do not vanish.
 
-        "accurate": by `solve_index1` with projection and tolerances of 1e-12, like a start with tight error control, to
-        show the error of the formula alone. Not included in cpu_time.
+        "accurate": by `solve_index1` with projection and tolerances of 1e-12, to show the error of the formula alone.
+        Not included in cpu_time.
     others : see `references.driver`
-        t_span must be a multiple of the step; t_eval (None: every step) contains multiples of the step after
-        t_span[0]. The clock is checked about every `CALL` seconds.
+        t_eval (None: every step) contains multiples of the step after t_span[0].
 
     Returns
     -------
     Result
-        `a` is the BDF derivative of v, `lam` (with the sign of M a + C_q^T lam = Q) the solution of Newton's method; at
-        starting states not computed by a formula, both are from eq. (6). `h` contains all steps. Statistics:
-        n_accepted, n_outer (Newton iterations) and n_factorizations (Newton matrices, by finite differences). If
-        Newton's method fails, the message contains the time. A completed run may be wrong, because the error is not
-        controlled. At small steps an undamped motion loses energy with orders 1, 2, 5 and 6, and gains it with 3 and 4.
+        `a` is the BDF derivative of v, `lam` the solution of Newton's method. Statistics: n_accepted, n_outer (Newton
+        iterations) and n_factorizations (Newton matrices). A completed run may be wrong, because the error is not
+        controlled. At small steps an undamped motion loses energy with orders 1, 2, 5, 6, and gains it with 3 and 4.
 
     Notes
     -----
     With q = q* + h b v and v = v* + h b a, where q* and v* are combinations of past values and b is the coefficient of
-    the formula, v and a follow from q; the equation of motion is multiplied by (h b)^2, and (h b)^2 lam is the unknown.
-    The condition number of Newton's matrix [[M + O(h), C_q^T], [C_q, 0]] is then bounded as h tends to zero.
+    the formula, v and a follow from q. The equation of motion is multiplied by (h b)^2, and (h b)^2 lam is the unknown:
+    the condition number of [[M + O(h), C_q^T], [C_q, 0]] is then bounded as h tends to zero.
     """
     system, n, t0, length = task.system, task.system.n_q, task.t0, task.t1 - task.t0
     n_steps = round(length / step)
@@ -112,24 +104,24 @@ def solve_gear(task: Task, step: float, order: int = 2, *, start: str = "ramp") 
     given = np.ascontiguousarray(np.vstack([first.q, first.v, first.a, first.lam]).T)
     rows, past = np.empty((keep.size, given.shape[1])), np.zeros((HIGHEST, given.shape[1]))
     counters, limit = np.zeros(N_COUNTERS, dtype=np.int64), TimeLimit(task.time_limit)
-    code, made, stride, fixed = DONE, -1, FIRST_STEPS, (t0, h, order, _formulas(), keep, rows, counters)
+    code, n_done, stride, fixed = DONE, -1, FIRST_STEPS, (t0, h, order, _formulas(), keep, rows, counters)
     with user_call:
-        while code == DONE and made < n_steps and not limit.passed():
-            called, last = time.monotonic(), min(made + stride, n_steps)
-            code = _integrate(Kit(system.functions), n, given, past, made + 1, last, *fixed)
-            made, stride = last, stride * (2 if time.monotonic() - called < CALL else 1)
+        while code == DONE and n_done < n_steps and not limit.passed():
+            called, last = time.monotonic(), min(n_done + stride, n_steps)
+            code = _integrate(Kit(system.functions), n, given, past, n_done + 1, last, *fixed)
+            n_done, stride = last, stride * (2 if time.monotonic() - called < CALL else 1)
 
-    made, stored = int(counters[STEPS]), int(counters[STORED])
+    n_done, stored = int(counters[STEPS]), int(counters[STORED])
     name, failure = f"BDF of order {order}", ""
     if limit.exceeded:
-        failure = limit.message(name, t0 + made * h, "take a larger step")
+        failure = limit.message(name, t0 + n_done * h, "take a larger step")
     elif code != DONE:
         lower = " or a lower order" if order > 1 else ""
-        failure = f"{name} failed in the step to t = {t0 + (made + 1) * h:.10g}: {_REASONS[code]}. "
+        failure = f"{name} failed in the step to t = {t0 + (n_done + 1) * h:.10g}: {_REASONS[code]}. "
         failure += f"Take a smaller step{lower}."
-    counts = {"n_accepted": made, "n_outer": int(counters[NEWTON]), "n_factorizations": int(counters[MATRICES])}
+    counts = {"n_accepted": n_done, "n_outer": int(counters[NEWTON]), "n_factorizations": int(counters[MATRICES])}
     return task.result(
-        name, np.asarray(t0 + h * keep[:stored], float), rows[:stored].T, failure, h=np.full(made, h), **counts
+        name, np.asarray(t0 + h * keep[:stored], float), rows[:stored].T, failure, h=np.full(n_done, h), **counts
     )
 
 
@@ -192,7 +184,7 @@ def _residual(f, w, t, q, forces, q_past, v_past, hb, r):  # type: ignore[no-unt
 
 
 @njit(error_model="numpy")
-def _matrix(f, w, t, q, forces, q_past, v_past, hb, r, there, J):  # type: ignore[no-untyped-def]
+def _matrix(f, w, t, q, forces, q_past, v_past, hb, r, displaced, J):  # type: ignore[no-untyped-def]
     """Compute the derivative of the residual r with respect to [q, forces], partly by differences."""
     n, m = q.size, forces.size
     J[:, :] = 0.0
@@ -201,25 +193,25 @@ def _matrix(f, w, t, q, forces, q_past, v_past, hb, r, there, J):  # type: ignor
             J[i, n + k] = w.Cq[k, i]
             J[n + k, i] = w.Cq[k, i]
     for j in range(n):
-        before = q[j]
-        q[j] += DIFFERENCE * max(1.0, abs(before))
-        displacement = q[j] - before
-        _residual(f, w, t, q, forces, q_past, v_past, hb, there)
-        q[j] = before
+        original = q[j]
+        q[j] += DIFFERENCE * max(1.0, abs(original))
+        displacement = q[j] - original
+        _residual(f, w, t, q, forces, q_past, v_past, hb, displaced)
+        q[j] = original
         for i in range(n):
-            J[i, j] = (there[i] - r[i]) / displacement
+            J[i, j] = (displaced[i] - r[i]) / displacement
 
 
 @njit(error_model="numpy")
-def _newton(f, w, t, q, forces, q_past, v_past, hb, r, there, J, pivots, counters):  # type: ignore[no-untyped-def]
+def _newton(f, w, t, q, forces, q_past, v_past, hb, r, displaced, J, pivots, counters):  # type: ignore[no-untyped-def]
     """Solve for q and forces = (h b)^2 lam from their initial values; return DONE or an error code."""
     n = q.size
-    before, renew = np.inf, True
+    previous, renew = np.inf, True
     for _ in range(MAX_NEWTON):
         _residual(f, w, t, q, forces, q_past, v_past, hb, r)
         counters[NEWTON] += 1
         if renew:
-            _matrix(f, w, t, q, forces, q_past, v_past, hb, r, there, J)
+            _matrix(f, w, t, q, forces, q_past, v_past, hb, r, displaced, J)
             counters[MATRICES] += 1
             if not lu_factor(J, pivots):
                 return SINGULAR if np.isfinite(r).all() else NOT_FINITE
@@ -235,8 +227,8 @@ def _newton(f, w, t, q, forces, q_past, v_past, hb, r, there, J, pivots, counter
             return NOT_FINITE
         if correction <= NEWTON_TOL * size:
             return DONE
-        renew = correction > SLOW * before
-        before = correction
+        renew = correction > SLOW * previous
+        previous = correction
     return NOT_CONVERGED
 
 
@@ -250,7 +242,12 @@ def _integrate(  # type: ignore[no-untyped-def]
     """
     m = given.shape[1] - 3 * n
     w = _Space(np.zeros((n, n)), np.zeros((m, n)), np.zeros(n), np.zeros(m), np.zeros(n))
-    r, there, J, pivots = np.zeros(n + m), np.zeros(n + m), np.zeros((n + m, n + m)), np.zeros(n + m, dtype=np.int64)
+    r, displaced, J, pivots = (
+        np.zeros(n + m),
+        np.zeros(n + m),
+        np.zeros((n + m, n + m)),
+        np.zeros(n + m, dtype=np.int64),
+    )
     combined, new = np.zeros(2 * n), past[(first - 1) % HIGHEST].copy()
     for step in range(first, last + 1):
         if step < given.shape[0]:
@@ -270,7 +267,7 @@ def _integrate(  # type: ignore[no-untyped-def]
                 new[j] = combined[j] + hb * new[n + j]
             forces = new[3 * n :] * (hb * hb)
             q_past, v_past, t = combined[:n], combined[n:], t0 + step * h
-            code = _newton(f, w, t, new[:n], forces, q_past, v_past, hb, r, there, J, pivots, counters)
+            code = _newton(f, w, t, new[:n], forces, q_past, v_past, hb, r, displaced, J, pivots, counters)
             if code != DONE:
                 return code
             for j in range(n):
@@ -291,8 +288,8 @@ def solve_gear_stored(
 ) -> Result:
     """As `solve_gear`; about `STEPS_STORED` steps are stored."""
     n_steps = round((t_span[1] - t_span[0]) / step)
-    kept = t_span[0] + np.arange(0, n_steps, max(1, n_steps // STEPS_STORED)) * step
-    return solve_gear(system, t_span, *start, step, order, t_eval=np.append(kept, t_span[1]), **options)  # type: ignore[no-any-return]
+    stored_times = t_span[0] + np.arange(0, n_steps, max(1, n_steps // STEPS_STORED)) * step
+    return solve_gear(system, t_span, *start, step, order, t_eval=np.append(stored_times, t_span[1]), **options)  # type: ignore[no-any-return]
 
 
 def name_of(order: int, start: str = "accurate") -> str:
@@ -300,14 +297,11 @@ def name_of(order: int, start: str = "accurate") -> str:
     return f"GSTIFF stand-in, order {order}" + (", ramp" if start == "ramp" else "")
 
 
+HOW: dict[str, Any] = {"compared": False, "setting": "h", "stores_steps": True, "own_accelerations": True}
 LINES = tuple(
     Line(
         *(name_of(order, start), "twoloop", "stand-in", solve_gear_stored, {"order": order, "start": start}),
-        compared=False,
-        setting="h",
-        stores_steps=True,
-        own_accelerations=True,
-        fixed={"order": order},
+        **HOW | {"fixed": {"order": order}},
     )
     for order in range(1, HIGHEST + 1)
     for start in ("accurate", "ramp")

@@ -36,11 +36,6 @@ def independents(jacobian: Array) -> list[int]:
     return sorted(columns[len(matrix) :])
 
 
-def choice(n_q: int, independent: list[int]) -> Array:
-    """Return I_in of (14), (15)."""
-    return np.eye(n_q)[independent]
-
-
 def kkt(system: ConstrainedSystem, t: float, q: Array, v: Array) -> tuple[Array, Array]:
     """Return accelerations and multipliers from (6), solved as a whole."""
     jacobian = system.jacobian(t, q)
@@ -54,12 +49,8 @@ def kkt(system: ConstrainedSystem, t: float, q: Array, v: Array) -> tuple[Array,
 class Step:
     """The outer loop of one step, iteration by iteration, from an explicit Euler prediction.
 
-    Attributes
-    ----------
-    A_stage, V_stage : ndarray (s, n_q)
-        Stage derivatives K = [a, v].
-    q1, v1 : ndarray (n_q,)
-        End of the step after the last iteration, satisfying the constraints.
+    `A_stage`, `V_stage` (s, n_q) are the stage derivatives K = [a, v]; `q1`, `v1` (n_q,) are the end of the step after
+    the last iteration, satisfying the constraints.
     """
 
     system: ConstrainedSystem
@@ -71,18 +62,18 @@ class Step:
 
     def __post_init__(self) -> None:
         self.independent = independents(self.system.jacobian(self.t, self.q))
-        self.I_in = choice(self.system.n_q, self.independent)
+        self.I_in = np.eye(self.system.n_q)[self.independent]  # of (14), (15)
         a, _ = kkt(self.system, self.t, self.q, self.v)
         self.q1, self.v1 = self.dependents(self.t + self.h, self.q + self.h * self.v, self.v + self.h * a)
         a1, _ = kkt(self.system, self.t + self.h, self.q1, self.v1)
         stages = self.tableau.stages
         self.A_stage, self.V_stage = np.tile(a1, (stages, 1)), np.tile(self.v1, (stages, 1))
 
-    def continue_from(self, before: "Step") -> None:
+    def continue_from(self, previous: "Step") -> None:
         """Predict the stages by extrapolating the collocation polynomial of the previous step, instead of by Euler."""
-        x, c = (before.h + self.h * self.tableau.c) / before.h, self.tableau.c
+        x, c = (previous.h + self.h * self.tableau.c) / previous.h, self.tableau.c
         weights = np.linalg.solve(np.vander(c).T, np.vander(x, len(c)).T).T
-        self.A_stage, self.V_stage = weights @ before.A_stage, weights @ before.V_stage
+        self.A_stage, self.V_stage = weights @ previous.A_stage, weights @ previous.V_stage
 
     def dependents(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
         """Return dependent positions by (15) and dependent velocities by (14)."""
@@ -103,15 +94,15 @@ class Step:
         old = np.concatenate([self.q1, self.v1])
         A, b, c = self.tableau.A, self.tableau.b, self.tableau.c
         for j in range(self.tableau.stages):
-            q, v = self._moved(A[j])
+            q, v = self._combine_stages(A[j])
             q, v = self.dependents(self.t + c[j] * self.h, q, v)
             self.A_stage[j], _ = kkt(self.system, self.t + c[j] * self.h, q, v)
             self.V_stage[j] = v
-        self.q1, self.v1 = self.dependents(self.t + self.h, *self._moved(b))
+        self.q1, self.v1 = self.dependents(self.t + self.h, *self._combine_stages(b))
         new = np.concatenate([self.q1, self.v1])
         return float(np.max(np.abs(new - old) / np.maximum(np.abs(new), 1.0))), float(np.linalg.norm(new - old))
 
-    def _moved(self, weights: Array) -> tuple[Array, Array]:
+    def _combine_stages(self, weights: Array) -> tuple[Array, Array]:
         """Return y_n + h sum(weights K) for the independents; the others keep their values at the start of the step."""
         q, v, i = self.q.copy(), self.v.copy(), self.independent
         q[i] += self.h * weights @ self.V_stage[:, i]

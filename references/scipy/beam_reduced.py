@@ -1,7 +1,6 @@
 """The beam on its moving base without constraints: the motion of the base is substituted, the rest solved by DOP853.
 
-Only the forces and the mass of the beam are shared with `twoloop`: there are no constraints, multipliers or
-partitions, and the integrator is a different one.
+Only the forces and the mass of the beam are shared with `twoloop`; the integrator is a different one.
 """
 
 import math
@@ -13,41 +12,26 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
-from references.driver import check_problem
-from references.equations.accelerations import kept
-from twoloop.checks.arguments import check_positive, check_times
+from references.equations.accelerations import cached
+from twoloop.checks.arguments import check_times
 from twoloop.mechanisms import Problem
 from twoloop.problem.problem import Array
 
 
 def reduced_motion(problem: Problem, t_eval: ArrayLike, tol: float) -> tuple[Array, Array]:
-    """Return coordinates and velocities of an `ancf_beam`, integrated without its constraints.
+    """Return coordinates and velocities (n_q, n_t) of an `ancf_beam`, integrated without its constraints.
 
-    Parameters
-    ----------
-    problem : Problem
-        Problem of `twoloop.mechanisms.ancf_beam`.
-    t_eval : array_like (n_t,)
-        Increasing times from 0, s; output by interpolation.
-    tol : float
-        rtol = atol, for coordinates and velocities.
-
-    Returns
-    -------
-    q, v : ndarray (n_q, n_t)
-
-    Raises TypeError or ValueError if an argument is invalid. Raises RuntimeError if DOP853 fails or cannot start.
+    `t_eval` are increasing times from 0, s, with output by interpolation; `tol` is rtol = atol. Raises RuntimeError if
+    DOP853 fails or cannot start.
     """
-    check_problem(problem, "angular_frequency", "a beam of ancf_beam, on a moving base")
-    check_positive("tol", tol)
     times = check_times(t_eval, 0.0, float(np.max(t_eval, initial=0.0)), None)
     amplitude, frequency = (float(problem.parameters[name]) for name in ("amplitude", "angular_frequency"))
     system, n = problem.system, problem.system.n_q
-    own, p, M = _rate_of(system.functions.force), system.functions.p, system.mass(0.0, problem.q0)
+    compiled_rate, p, M = _rate_of(system.functions.force), system.functions.p, system.mass(0.0, problem.q0)
     fixed = np.linalg.inv(M[2:, 2:]), M[2:, 0].copy(), amplitude, frequency
 
     def rate(t: float, y: Array) -> Array:
-        return own(t, y, p, fixed)
+        return compiled_rate(t, y, p, fixed)
 
     y0, run = np.concatenate([problem.q0[2:], problem.v0[2:]]), f"DOP853 with rtol = atol = {tol:g} on {problem.name}"
     if not np.isfinite(rate(0.0, y0)).all():  # SciPy would try a first step of NaN forever
@@ -64,7 +48,7 @@ def reduced_motion(problem: Problem, t_eval: ArrayLike, tol: float) -> tuple[Arr
 def _rate_of(force: Dispatcher) -> Callable[..., Array]:
     """Return (t, y, p, fixed) -> y' of y = [q, v] without the coordinates of the base."""
 
-    @kept
+    @cached
     def rate(t, y, p, fixed):  # type: ignore[no-untyped-def]
         inverse, coupling, amplitude, frequency = fixed
         n = coupling.size + 2

@@ -1,7 +1,7 @@
 """Radau IIA and BDF for F(t, y, y') = 0 of the package solve_dae (J. Breuling), on any ConstrainedSystem.
 
 The equations are those of `sundials.residual` in the form "stabilised", with compiled residual and Jacobian; the
-methods are in Python. The package is optional: `pip install solve_dae`, or the extra `peers` of this project.
+methods are in Python.
 """
 
 import time
@@ -28,21 +28,11 @@ METHODS: dict[str, dict[str, int]] = {"Radau": {"stages": 3}, "Radau9": {"stages
 def solve_fully_implicit(task: Task, method: str = "Radau", rtol: float = 1e-8, atol: float = 1e-8) -> Result:
     """Integrate a constrained mechanical system by a method of the package solve_dae.
 
-    Parameters
-    ----------
-    method : {"Radau", "Radau9", "BDF"}
-        Radau IIA with 3 stages (order 5) or 5 stages (order 9), or BDF of orders 1 to 5 with NDF coefficients.
-    rtol, atol : float
-        Tolerances of all unknowns: q, v and the integrals Lam, Mu of the multipliers.
-    others : see `references.driver`
-        t_eval None: every step.
-
-    Returns
-    -------
-    Result
-        `a` and `lam` are derivatives of unknowns, between steps those of the interpolant. `h` contains all accepted
-        steps. Statistics: n_accepted, n_evaluations (residuals, without those of the difference Jacobian) and
-        n_factorizations.
+    "Radau" and "Radau9" are Radau IIA with 3 stages (order 5) and 5 stages (order 9); "BDF" has orders 1 to 5 with NDF
+    coefficients. The tolerances are those of all unknowns: q, v and the integrals Lam, Mu of the multipliers. t_eval
+    None: every step. `a` and `lam` are derivatives of unknowns, between steps those of the interpolant. Otherwise as in
+    `references.driver`. Statistics: n_accepted, n_evaluations (residuals, without those of the difference Jacobian) and
+    n_factorizations.
     """
     check_choice("method", method, tuple(METHODS))
     package, functions = imported("solve_dae.integrate"), Functions(task)
@@ -50,19 +40,19 @@ def solve_fully_implicit(task: Task, method: str = "Radau", rtol: float = 1e-8, 
     first = FIRST_STEP * abs(task.t1 - task.t0)
     options = {"rtol": rtol, "atol": atol, "jac": functions.jacobians, "first_step": first, **METHODS[method]}
 
-    def made(limit: TimeLimit) -> Any:
+    def make_solver(limit: TimeLimit) -> Any:
         y0, yp0 = functions.form.start
         return solver_type(functions.residual(limit), task.t0, y0, yp0, task.t1, **options)
 
-    run = Steps.timed(task, made, functions.form.start.ravel(), functions)
+    run = Steps.timed(task, make_solver, functions.form.start.ravel(), functions)
     with user_call:
         run.go()
-    shown, counts = run.again(task.times), {}
+    output, counts = run.repeat_at(task.times), {}
     if run.solver is not None:
         counts = {"n_evaluations": run.solver.nfev, "n_factorizations": run.solver.nlu}
-    name, rows = f"{method} of solve_dae", functions.form.columns(*np.split(shown.states, 2))
+    name, rows = f"{method} of solve_dae", functions.form.columns(*np.split(output.states, 2))
     failure = run.message(name, f"{CAUSES} other tolerances.")
-    return task.result(name, shown.t, rows, failure, h=np.diff(run.ends), n_accepted=len(run.ends) - 1, **counts)
+    return task.result(name, output.t, rows, failure, h=np.diff(run.ends), n_accepted=len(run.ends) - 1, **counts)
 
 
 class Functions:
@@ -106,15 +96,11 @@ class Functions:
         return by_y, by_yp
 
 
+HOW: dict[str, Any] = {"called_from": "Python", "own_accelerations": True, "stores_steps": True}
 LINES = tuple(
     Line(
-        *(f"{method}, solve_dae", "solve-dae", "solve_dae", solve_fully_implicit),
-        {"method": method},
-        called_from="Python",
-        compared=method != "BDF",
-        checked=method == "Radau",
-        own_accelerations=True,
-        stores_steps=True,
+        *(f"{method}, solve_dae", "solve-dae", "solve_dae", solve_fully_implicit, {"method": method}),
+        **HOW | {"compared": method != "BDF", "checked": method == "Radau"},
     )
-    for method in ("Radau", "Radau9", "BDF")
+    for method in METHODS
 )

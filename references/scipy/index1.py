@@ -16,7 +16,7 @@ from numba.core.dispatcher import Dispatcher
 from scipy.integrate import BDF, DOP853, LSODA, RK45, OdeSolver, Radau
 
 from references.driver import ADVICE, OutOfTimeError, Task, TimeLimit, adapter, imported, user_call
-from references.equations.accelerations import OPTIONS, Equations, kept, matrix_of, solve_for
+from references.equations.accelerations import OPTIONS, Equations, cached, matrix_of, solve_for
 from references.equations.expressions import NotSymbolic
 from references.equations.straight_line import exact_jacobian
 from references.lines import Line
@@ -33,13 +33,10 @@ class Steps:
     """Steps of one run."""
 
     make: Callable[[TimeLimit], Any]  # limit -> the solver at its start; the limit is checked in every evaluation
-    # t0, start: that start: y, or [y, y']
     t0: float
-    start: Array
-    # `raised` says whether a callback of the system raised: such an exception comes through, the solver's do not
-    callbacks: Any
-    # (t, y) -> whether y, which it moves onto the constraints, is on them
-    project: Callable[[float, Array], bool] | None
+    start: Array  # y, or [y, y']
+    callbacks: Any  # `raised`: a callback of the system raised; such an exception comes through, the solver's do not
+    project: Callable[[float, Array], bool] | None  # (t, y) -> whether y, moved onto the constraints, is on them
     times: Array | None  # output times, by the solver's interpolant; None: the end of every step
     limit: TimeLimit
     ends: list[float] = field(default_factory=list)  # start and ends of the accepted steps, s
@@ -70,8 +67,10 @@ class Steps:
             self.stored.append((self.t0, self.start))
         try:
             self.solver = self.make(self.limit)
-            wanted = self.times.size if self.times is not None and self.times.size else np.inf  # number of output times
-            while self.solver.status == "running" and not self.failure and len(self.stored) < wanted:
+            n_wanted = (
+                self.times.size if self.times is not None and self.times.size else np.inf
+            )  # number of output times
+            while self.solver.status == "running" and not self.failure and len(self.stored) < n_wanted:
                 self.failure = self._attempt()
                 if not self.failure:
                     self._accept()
@@ -82,16 +81,16 @@ class Steps:
                 raise
             self.failure = str(error)
 
-    def again(self, times: Array | None) -> "Steps":
+    def repeat_at(self, times: Array | None) -> "Steps":
         """Return the same steps, untimed, with the states at the given times that were reached; itself for None."""
         if times is None:
             return self
-        given = self.make, self.t0, self.start, self.callbacks, self.project
-        shown = Steps(*given, times[times <= self.ends[-1]], TimeLimit(None))
+        arguments = self.make, self.t0, self.start, self.callbacks, self.project
+        steps = Steps(*arguments, times[times <= self.ends[-1]], TimeLimit(None))
         if times[0] <= self.ends[-1]:
-            shown.go()
-        self.failure = self.failure or shown.failure
-        return shown
+            steps.go()
+        self.failure = self.failure or steps.failure
+        return steps
 
     def message(self, name: str, advice: str) -> str:
         """Return the message of a failure; "" if there was none."""
@@ -184,36 +183,30 @@ def solve_index1(
     method : {"DOP853", "RK45", "LSODA", "Radau", "BDF", "Pr9"}
         The solver of `scipy.integrate`, or of extensisq (`PAIR`: on the four-bar the best of its pairs at tight
         tolerances). The implicit ones get the analytic Jacobian of `equations.straight_line`, if the equations can be
-        had as expressions, without Baumgarte's terms; otherwise forward differences with constant increments, compiled.
-        SciPy's own adapts its increments: of a coordinate without influence it multiplies them by ten at each Jacobian,
-        without a bound.
+        had as expressions, without Baumgarte's terms; otherwise compiled forward differences with constant increments,
+        because SciPy multiplies those of a coordinate without influence by ten at each Jacobian, without a bound.
     stabilisation : {"none", "baumgarte", "projection"}
         `STABILISATIONS` has a description of each for tables.
 
-        "baumgarte": J. Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972) 1-16. In
-        C'' + 2 alpha C' + beta^2 C = 0 we set beta = alpha, so that a violation decays as (1 + alpha t) exp(-alpha t),
-        without oscillation. Every step adds to the violation, which is therefore bounded but does not vanish.
+        "baumgarte": J. Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972) 1-16, with beta = alpha, so that a
+        violation decays as (1 + alpha t) exp(-alpha t). Every step adds to it: it is bounded and does not vanish.
 
         "projection": E. Eich, SIAM J. Numer. Anal. 30 (1993) 1467-1482. After every accepted step the positions are
         projected onto C = 0 by Newton's method, then the velocities onto C_q v + C_t = 0, both orthogonally in the norm
-        of the mass matrix; the next step starts with a right-hand side evaluated there (one more evaluation per step).
-        States interpolated to `t_eval` are projected too. Only for "DOP853" and "RK45": the others keep a history that
-        would have to be projected as well.
+        of the mass matrix. So are states interpolated to `t_eval`. Only for "DOP853" and "RK45": the others keep a
+        history that would have to be projected.
     alpha : float, optional
-        Baumgarte's parameter, 1/s; only with stabilisation="baumgarte". None: 10. The right value is problem-dependent;
-        1 to 10 is typical according to MapleSim's manual of its exports. On the four-bar linkage (period 2.25 s,
-        DOP853, tolerances 1e-6 and 1e-9, 100 s) 10 costs 21 and 13 % more evaluations than no stabilisation, and the
-        error is 1/300 and 1/35; above 20 the cost grows with alpha, because the ODE becomes stiff.
+        Baumgarte's parameter, 1/s; only with stabilisation="baumgarte". None: 10. The right value depends on the
+        problem. On the four-bar linkage 10 costs 13 to 21 % more evaluations than no stabilisation; above 20 the ODE
+        becomes stiff.
     others : see `references.driver`
         t_eval None: every step.
 
     Returns
     -------
     Result
-        `a` and `lam` are computed from the stored q and v as in the right-hand side, with Baumgarte's terms if used.
-        `h` contains all accepted steps. Statistics: n_accepted; n_evaluations of the right-hand side, including those
-        for difference Jacobians and after projections, excluding those for the interpolant; n_factorizations, SciPy's
-        LU count, for "Radau" and "BDF".
+        `a` and `lam` are computed as in the right-hand side, with Baumgarte's terms if used. Statistics: n_accepted;
+        n_evaluations of the right-hand side, excluding those for the interpolant; n_factorizations, SciPy's LU count.
     """
     check_choice("method", method, (*METHODS, PAIR))
     check_choice("stabilisation", stabilisation, tuple(STABILISATIONS))
@@ -238,18 +231,18 @@ def solve_index1(
     if method in IMPLICIT:
         options["jac"] = equations.jacobian(t0, y0) or equations.differences(t0, y0)
 
-    def made(limit: TimeLimit) -> OdeSolver:
+    def make_solver(limit: TimeLimit) -> OdeSolver:
         return solver_type(equations.function(limit), t0, y0, task.t1, **options)
 
-    run = Steps.timed(task, made, y0, equations, equations.project if projected else None)
+    run = Steps.timed(task, make_solver, y0, equations, equations.project if projected else None)
     with user_call:
         run.go()
     counts = {"n_accepted": len(run.ends) - 1, "n_evaluations": int(equations.counters[0])}
     if isinstance(run.solver, Radau | BDF):
         counts["n_factorizations"] = run.solver.nlu
-    shown = run.again(task.times)
-    rows = np.concatenate([shown.states, *equations.at_points(shown.t, shown.states, equations.alpha)])
-    return task.result(method, shown.t, rows, run.message(method, ADVICE), h=np.diff(run.ends), **counts)
+    output = run.repeat_at(task.times)
+    rows = np.concatenate([output.states, *equations.at_points(output.t, output.states, equations.alpha)])
+    return task.result(method, output.t, rows, run.message(method, ADVICE), h=np.diff(run.ends), **counts)
 
 
 class RightHandSide(Equations):
@@ -267,7 +260,7 @@ class RightHandSide(Equations):
     def function(self, limit: TimeLimit) -> Callable[[float, Array], Array]:
         """Return y' = f(t, y) in SciPy's signature."""
         derivative, n_c, alpha = self.derivative, self.system.n_c, self.alpha
-        p, factors, known, counters = self.system.functions.p, self.factors, self.known, self.counters
+        p, factors, mass_flags, counters = self.system.functions.p, self.factors, self.known, self.counters
 
         monotonic, deadline = time.monotonic, limit.deadline  # inlined: calling `limit` would cost 3 % of an evaluation
 
@@ -275,7 +268,7 @@ class RightHandSide(Equations):
             if monotonic() > deadline:
                 limit.check()
             try:
-                return derivative(t, y, n_c, alpha, p, factors, known, counters)
+                return derivative(t, y, n_c, alpha, p, factors, mass_flags, counters)
             except BaseException:
                 self.raised = True
                 raise
@@ -302,11 +295,11 @@ class RightHandSide(Equations):
     def differences(self, t: float, y: Array) -> Callable[[float, Array], Array]:
         """Return df/dy in SciPy's signature, by forward differences, compiled; their evaluations are counted."""
         columns, n_c, alpha = _differences(self.accelerate), self.system.n_c, self.alpha
-        p, factors, known, counters = self.system.functions.p, self.factors, self.known, self.counters
+        p, factors, mass_flags, counters = self.system.functions.p, self.factors, self.known, self.counters
 
         def jac(t: float, y: Array) -> Array:
             try:
-                return columns(t, y, n_c, alpha, p, factors, known, counters).T  # type: ignore[no-any-return]
+                return columns(t, y, n_c, alpha, p, factors, mass_flags, counters).T  # type: ignore[no-any-return]
             except BaseException:
                 self.raised = True
                 raise
@@ -329,14 +322,14 @@ class RightHandSide(Equations):
 
 @lru_cache(maxsize=64)
 def _derivative(accelerate: Callable[..., Any]) -> Callable[..., Any]:
-    """Return (t, y, n_c, alpha, p, factors, known, counters) -> y'."""
+    """Return (t, y, n_c, alpha, p, factors, mass_flags, counters) -> y'."""
 
-    @kept
-    def derivative(t, y, m, alpha, p, factors, known, counters):  # type: ignore[no-untyped-def]
+    @cached
+    def derivative(t, y, m, alpha, p, factors, mass_flags, counters):  # type: ignore[no-untyped-def]
         n = y.size // 2
         rate = np.empty(2 * n)
         counters[0] += 1
-        good = accelerate(t, y[:n].copy(), y[n:].copy(), alpha, p, factors, known, rate[n:], np.empty(m))
+        good = accelerate(t, y[:n].copy(), y[n:].copy(), alpha, p, factors, mass_flags, rate[n:], np.empty(m))
         for i in range(n):
             rate[i] = y[n + i]
             if not good:
@@ -348,18 +341,18 @@ def _derivative(accelerate: Callable[..., Any]) -> Callable[..., Any]:
 
 @lru_cache(maxsize=64)
 def _differences(accelerate: Callable[..., Any]) -> Callable[..., Any]:
-    """Return (t, y, n_c, alpha, p, factors, known, counters) -> (dy'/dy)^T."""
+    """Return (t, y, n_c, alpha, p, factors, mass_flags, counters) -> (dy'/dy)^T."""
     derivative = _derivative(accelerate)
 
-    @kept
-    def differences(t, y, m, alpha, p, factors, known, counters):  # type: ignore[no-untyped-def]
+    @cached
+    def differences(t, y, m, alpha, p, factors, mass_flags, counters):  # type: ignore[no-untyped-def]
         columns = np.empty((y.size, y.size))
-        here, moved = derivative(t, y, m, alpha, p, factors, known, counters), y.copy()
+        rate, displaced = derivative(t, y, m, alpha, p, factors, mass_flags, counters), y.copy()
         for j in range(y.size):
-            moved[j] += INCREMENT * max(1.0, abs(y[j]))
-            there = derivative(t, moved, m, alpha, p, factors, known, counters)
-            columns[j] = (there - here) / (moved[j] - y[j])
-            moved[j] = y[j]
+            displaced[j] += INCREMENT * max(1.0, abs(y[j]))
+            displaced_rate = derivative(t, displaced, m, alpha, p, factors, mass_flags, counters)
+            columns[j] = (displaced_rate - rate) / (displaced[j] - y[j])
+            displaced[j] = y[j]
         return columns
 
     return differences  # type: ignore[no-any-return]
@@ -369,15 +362,15 @@ def _differences(accelerate: Callable[..., Any]) -> Callable[..., Any]:
 def _projection(
     mass: Dispatcher, constraint: Dispatcher, jacobian: Dispatcher, constraint_rate: Dispatcher
 ) -> Callable[..., Any]:
-    """Return (t, y, n_c, p, factors, known) -> success, which projects y in place: positions, then velocities."""
+    """Return (t, y, n_c, p, factors, mass_flags) -> success, which projects y in place: positions, then velocities."""
     mass_at = matrix_of(mass)
 
-    @kept
-    def project(t, y, m, p, factors, known):  # type: ignore[no-untyped-def]
+    @cached
+    def project(t, y, m, p, factors, mass_flags):  # type: ignore[no-untyped-def]
         n = y.size // 2
         q, v = y[:n].copy(), y[n:].copy()
         Cq, C = np.zeros((m, n)), np.zeros(m)
-        L, definite = mass_at(t, q, p, factors, known)
+        L, definite = mass_at(t, q, p, factors, mass_flags)
         size = 1.0
         for j in range(n):
             size = max(size, abs(q[j]))
@@ -390,7 +383,7 @@ def _projection(
             C[:] = 0.0
             jacobian(t, q, p, Cq)
             constraint(t, q, p, C)
-            change = _least_change(L, definite, known, Cq, C, q)
+            change = _least_change(L, definite, mass_flags, Cq, C, q)
             if change == np.inf:
                 return False
         Cq[:, :] = 0.0
@@ -400,7 +393,7 @@ def _projection(
         for i in range(m):
             for j in range(n):
                 C[i] += Cq[i, j] * v[j]
-        if _least_change(L, definite, known, Cq, C, v) == np.inf:
+        if _least_change(L, definite, mass_flags, Cq, C, v) == np.inf:
             return False
         for j in range(n):
             y[j] = q[j]
@@ -411,10 +404,10 @@ def _projection(
 
 
 @njit(**OPTIONS)
-def _least_change(L, definite, known, Cq, C, x):  # type: ignore[no-untyped-def]
+def _least_change(L, definite, mass_flags, Cq, C, x):  # type: ignore[no-untyped-def]
     """Subtract d from x, with M d + C_q^T mu = 0, C_q d = C; return the largest change, inf if singular. Destroys C."""
     change, largest = np.zeros(x.size), 0.0
-    if not solve_for(L, definite, known, Cq, change, C):
+    if not solve_for(L, definite, mass_flags, Cq, change, C):
         return np.inf
     for j in range(x.size):
         x[j] -= change[j]
@@ -429,11 +422,11 @@ def baumgarte(method: str, alpha: float) -> str:
     return f"{method}, Baumgarte {alpha:g}"
 
 
-def _line(name: str, method: str, stabilisation: str = "none", **more: Any) -> Line:
+def _line(name: str, method: str, stabilisation: str = "none", **fields: Any) -> Line:
     package = "extensisq" if method == "Pr9" else "scipy"
-    more = {"called_from": "Python", "keeps": False, "stores_steps": True, **more}
-    options = {"method": method, "stabilisation": stabilisation, **more.get("fixed", {})}
-    return Line(name, package, "extensisq" if method == "Pr9" else "SciPy", solve_index1, options, **more)
+    fields = {"called_from": "Python", "keeps": False, "stores_steps": True, **fields}
+    options = {"method": method, "stabilisation": stabilisation, **fields.get("fixed", {})}
+    return Line(name, package, "extensisq" if method == "Pr9" else "SciPy", solve_index1, options, **fields)
 
 
 LINES = (

@@ -1,12 +1,14 @@
-"""SUNDIALS CVODE without Python overhead: the library of scikit-sundae, by ctypes, with a compiled right-hand side.
+"""SUNDIALS CVODE on y' = f(t, y), y = [q, v]: through scikit-sundae, as its users call it, and from compiled code.
 
-The equations are y' = f(t, y), y = [q, v], with the accelerations as straight-line machine code. The constraints drift
-unless CVODE projects onto C = 0 and C_q v + C_t = 0. See `references.sundials.ida_c` for the library.
+Through Python the equations are those of `scipy.index1` without stabilisation. From C, by ctypes, the accelerations are
+straight-line machine code. The constraints drift unless CVODE projects onto C = 0 and C_q v + C_t = 0. See
+`references.sundials.library` for the library.
 """
 
 import ctypes
+import io
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, redirect_stdout, suppress
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -14,15 +16,62 @@ import numpy as np
 from numba import carray, cfunc, njit, types
 from numba.core.dispatcher import Dispatcher
 
-from references.driver import ADVICE, Task, adapter
+from references.driver import ADVICE, OutOfTimeError, Task, TimeLimit, adapter, imported, user_call
 from references.equations.accelerations import SINGULAR, cholesky, cholesky_solve
 from references.equations.straight_line import exact_jacobian, straight_line
 from references.lines import Line
-from references.sundials.library import RAISED, REALS, Memory, library, made, run
+from references.scipy.index1 import RightHandSide
+from references.sundials.ida import states_at
+from references.sundials.library import RAISED, REALS, SMALLEST_STEP, Memory, create_object, library, run
 from twoloop.checks.arguments import check_choice
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
+
+MAX_STEPS_PER_OUTPUT = 10**7  # between two output times; the default of 500 is too small
+
+
+@adapter(derivatives=False, independent_rows=True)
+def solve_cvode(task: Task, rtol: float = 1e-8, atol: float = 1e-8) -> Result:
+    """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with Adams' methods in CVODE.
+
+    The right-hand side is compiled, with its analytic Jacobian where `equations.straight_line` has it. scikit-sundae
+    has Newton's iteration only. The integration to the end without output is timed. Parameters, errors and result as in
+    `references.driver`; statistics: n_evaluations, all calls of the right-hand side.
+    """
+    CVODE = imported("sksundae.cvode", "scikit-sundae", "references").CVODE
+    t0, t1, times, y0 = task.t0, task.t1, task.instants, task.y0
+    equations = RightHandSide(task.system, t0, task.q0, 0.0)
+    y0.setflags(write=False)  # read-only as in CVODE, so that the same signature is compiled
+    equations.warm(t0, y0, False)
+    options: dict[str, Any] = {"method": "Adams", "rtol": rtol, "atol": atol, "max_num_steps": MAX_STEPS_PER_OUTPUT}
+    options |= {"min_step": SMALLEST_STEP * (t1 - t0), "max_step": t1 - t0}
+    jacobian = equations.jacobian(t0, y0)
+
+    def integrator(limit: TimeLimit) -> Any:
+        derivative = equations.function(limit)
+
+        def right_hand_side(t: float, y: Array, rate: Array) -> None:
+            rate[:] = derivative(t, y)
+
+        def jacfn(t: float, y: Array, rate: Array, JJ: Array) -> None:
+            JJ[:] = jacobian(t, y)  # type: ignore[misc]
+
+        return CVODE(right_hand_side, jacfn=None if jacobian is None else jacfn, **options)
+
+    limit = TimeLimit(task.time_limit)
+    timed, outcome = integrator(limit), None
+    with redirect_stdout(io.StringIO()), user_call, suppress(OutOfTimeError):  # CVODE prints its failures
+        timed.init_step(t0, y0)
+        outcome = timed.step(t1, tstop=t1)
+    name, counts = "CVODE, Adams,", {"n_evaluations": int(equations.counters[0])}
+    if outcome is None:
+        failure = limit.message("CVODE", t0, "take looser tolerances")
+        return task.result(name, times[:0], np.empty((y0.size, 0)), failure, **counts)
+    failure = "" if outcome.success else f"CVODE failed after t = {outcome.t:.10g}: {outcome.message}. {ADVICE}"
+    states = states_at(integrator(TimeLimit(None)), (t0, t1), times[times <= outcome.t], y0)
+    return task.result(name, states.t, states.y.T, failure, **counts)
+
 
 MOST_ITERATIONS = 10  # Newton's method usually needs one or two
 AGAIN = 1  # return value of a failed projection, which makes CVODE reduce the step
@@ -121,7 +170,7 @@ def projection_for_cvode(
 
 METHODS = {"Adams": 1, "BDF": 2}  # CV_ADAMS and CV_BDF
 COUNTERS: dict[str, dict[str, tuple[str, ...]]] = {
-    "Adams": {"n_evaluations": ("RhsEvals",), "n_factorizations": (), "n_jacobians": ()},
+    "Adams": {"n_evaluations": ("RhsEvals",), "n_factorizations": (), "n_jacobians": ()}
 }
 COUNTERS["BDF"] = {"n_evaluations": ("RhsEvals", "LinRhsEvals"), "n_factorizations": ("LinSolvSetups",)}
 COUNTERS["BDF"] |= {"n_jacobians": ("JacEvals",)}
@@ -149,26 +198,15 @@ def solve_cvode_c(
 ) -> Result:
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with CVODE driven from C.
 
-    Settings: accelerations as straight-line code of the mechanism (`equations.straight_line`); Adams with fixed-point
-    iteration, as SUNDIALS recommends for non-stiff problems; BDF with Newton's iteration, dense with the analytic
-    Jacobian from there, too. A second use of CVODE's memory is timed. The clock is checked every `STEPS_A_CALL` steps.
+    Accelerations are straight-line code (`equations.straight_line`). "Adams" (orders up to 12) has fixed-point
+    iteration, as SUNDIALS recommends for non-stiff problems; "BDF" (up to 5) has Newton's iteration, dense with the
+    analytic Jacobian from there, too. A second use of CVODE's memory is timed. The clock is checked every
+    `STEPS_A_CALL` steps.
 
-    Parameters
-    ----------
-    method : {"Adams", "BDF"}
-        Orders up to 12 or 5, respectively.
-    projected : bool
-        True: CVODE projects each step, and its error estimate, onto C = 0 and C_q v + C_t = 0
-        (`sundials.cvode_projection`); BDF only. States interpolated for t_eval are not projected.
-    others : see `references.driver`
-
-    Returns
-    -------
-    Result
-        The statistics are CVODE's counters of the timed run, including evaluations for the Jacobian. The message of a
-        failure contains the name of CVODE's flag.
-
-    Raises RuntimeError if the version of scikit-sundae is not supported.
+    With `projected`, for BDF only, CVODE projects each step, and its error estimate, onto C = 0 and C_q v + C_t = 0;
+    states interpolated for t_eval are not projected. Otherwise as in `references.driver`. The statistics are CVODE's
+    counters of the timed run, including evaluations for the Jacobian; a failure names CVODE's flag. Raises RuntimeError
+    if the version of scikit-sundae is not supported.
     """
     check_choice("method", method, tuple(METHODS))
     if projected and method != "BDF":
@@ -242,7 +280,7 @@ def _set_up(functions: Functions, task: Task, method: str, rtol: float, atol: fl
     solver.call("SStolerances", float(rtol), float(atol))
     if method == "Adams":
         free = solver.sundials.SUNNonlinSolFree_FixedPoint
-        iteration = made(solver.stack, "SUNNonlinSol_FixedPoint", free, *solver.vectors, 0, solver.own)
+        iteration = create_object(solver.stack, "SUNNonlinSol_FixedPoint", free, *solver.vectors, 0, solver.own)
         solver.call("SetNonlinearSolver", iteration)
     else:
         solver.solve_directly(functions.jacobian)
@@ -252,6 +290,7 @@ def _set_up(functions: Functions, task: Task, method: str, rtol: float, atol: fl
 
 
 LINES = (
+    Line("CVODE, Adams", "scikit-sundae", "SUNDIALS", solve_cvode, called_from="Python", keeps=False, checked=True),
     Line("CVODE from C, Adams", "scikit-sundae", "SUNDIALS", solve_cvode_c, keeps=False, checked=True, traces=True),
     Line("CVODE from C, BDF", "scikit-sundae", "SUNDIALS", solve_cvode_c, {"method": "BDF"}, keeps=False, traces=True),
     Line(

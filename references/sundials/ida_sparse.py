@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse import bmat, coo_array, csc_array, eye_array
 
 from references.driver import CAUSES, Deferred, Task, TimeLimit, adapter, user_call
-from references.equations.accelerations import kept
+from references.equations.accelerations import cached
 from references.equations.rows import accelerations
 from references.sundials.library import SMALLEST_STEP
 from references.sundials.residual import DIFFERENCE
@@ -30,21 +30,15 @@ ida = Deferred("sksundae.ida", "scikit-sundae")
 def solve_ida_sparse(task: Task, rtol: float = 1e-8, atol: float = 1e-8) -> Result:
     """Integrate a constrained mechanical system whose forces do not depend on the state, with IDA.
 
-    Parameters
-    ----------
-    rtol, atol : float
-        IDA's tolerances for q, v, Lam and Mu.
-    others : see `references.driver`
-        The result contains the initial and final states only.
-
-    Raises ValueError if the system has no `jacobian_values` and `mass_values`.
+    Parameters and errors as in `references.driver`; the result contains the initial and final states only. Raises
+    ValueError if the system has no `jacobian_values` and `mass_values`.
     """
     system, (t0, t1), limit = task.system, (task.t0, task.t1), TimeLimit(task.time_limit)
     if not {"jacobian", "mass"} <= system.entries.keys():
         raise ValueError(f"system must have jacobian_values and mass_values; {system.name!r} does not")
     f, n, m = system.functions, system.n_q, system.n_c
     residual = _residual_of(f.mass_values, f.force, f.constraint, f.constraint_rate, f.jacobian_values)
-    entries = tuple(np.asarray(each) for name in ("mass", "jacobian") for each in system.entries[name])
+    entries = tuple(np.asarray(indices) for name in ("mass", "jacobian") for indices in system.entries[name])
     space = *entries, np.zeros(entries[0].size), np.zeros(entries[2].size)
 
     pattern = pattern_of_residual(system)
@@ -58,7 +52,7 @@ def solve_ida_sparse(task: Task, rtol: float = 1e-8, atol: float = 1e-8) -> Resu
     def jacfn(t, y, yp, res, cj, JJ):  # type: ignore[no-untyped-def]
         matrix(n, t, cj, np.array(y), np.array(yp), f.p, *space, groups, pattern.indptr, pattern.indices, JJ)
 
-    a, lam = (each[:, 0] for each in accelerations(system, np.array([t0]), task.y0[:, None]))
+    a, lam = (indices[:, 0] for indices in accelerations(system, np.array([t0]), task.y0[:, None]))
     y, yp = np.concatenate([task.y0, np.zeros(2 * m)]), np.concatenate([task.v0, a, lam, np.zeros(m)])
     steps = {"min_step": SMALLEST_STEP * (t1 - t0), "max_step": t1 - t0, "max_num_steps": 10**9}
     sparse = {"linsolver": "sparse", "sparsity": pattern, "jacfn": jacfn}
@@ -87,11 +81,18 @@ def pattern_of_residual(system: ConstrainedSystem) -> csc_array:
         coo_array((np.ones(len(rows)), (rows, columns)), shape=(size, n))
         for size, (rows, columns) in ((n, system.entries["mass"]), (m, system.entries["jacobian"]))
     )
-    both, one = G.T @ G, eye_array(n)  # C_q^T lam couples coordinates that share a row
-    blocks = [[one + both, one, None, G.T], [both, M, G.T, None], [G, None, None, None], [G, G, None, None]]
-    made = csc_array(bmat(blocks) != 0.0)
+    products, identity = G.T @ G, eye_array(n)  # C_q^T lam couples coordinates that share a row
+    blocks = [
+        [identity + products, identity, None, G.T],
+        [products, M, G.T, None],
+        [G, None, None, None],
+        [G, G, None, None],
+    ]
+    pattern = csc_array(bmat(blocks) != 0.0)
     # 64-bit indices make scikit-sundae corrupt the heap
-    return csc_array((made.data, made.indices.astype(np.int32), made.indptr.astype(np.int32)), shape=made.shape)
+    return csc_array(
+        (pattern.data, pattern.indices.astype(np.int32), pattern.indptr.astype(np.int32)), shape=pattern.shape
+    )
 
 
 def groups_of(pattern: csc_array) -> NDArray[np.int64]:
@@ -99,8 +100,8 @@ def groups_of(pattern: csc_array) -> NDArray[np.int64]:
     near = csc_array(pattern.T @ pattern)
     groups = np.full(near.shape[1], -1)
     for j in range(groups.size):
-        taken = set(groups[near.indices[near.indptr[j] : near.indptr[j + 1]]].tolist())
-        groups[j] = next(g for g in range(len(taken) + 1) if g not in taken)
+        used = set(groups[near.indices[near.indptr[j] : near.indptr[j + 1]]].tolist())
+        groups[j] = next(g for g in range(len(used) + 1) if g not in used)
     return groups
 
 
@@ -110,7 +111,7 @@ def _residual_of(
 ) -> Callable[..., None]:
     """Return (n_q, t, y, y', p, rows and columns of M and C_q, workspaces for their values, res) -> None."""
 
-    @kept
+    @cached
     def residual(n, t, y, yp, p, rows, columns, row_of, column_of, M, G, res):  # type: ignore[no-untyped-def]
         m = y.size // 2 - n
         q, v, Lam, Mu = y[:n], y[n : 2 * n], yp[2 * n : 2 * n + m], yp[2 * n + m :]
@@ -137,20 +138,20 @@ def _residual_of(
 def _matrix_of(residual: Callable[..., None]) -> Callable[..., None]:
     """Return the same with cj after t, and groups, pointers, rows and values of the columns: dF/dy + cj dF/dy'."""
 
-    @kept
+    @cached
     def matrix(n, t, cj, y, yp, p, r, c, r_of, c_of, M, G, groups, begin, rows, values):  # type: ignore[no-untyped-def]
-        there, moved = np.zeros_like(y), np.zeros_like(y)
-        residual(n, t, y, yp, p, r, c, r_of, c_of, M, G, there)
+        here, displaced = np.zeros_like(y), np.zeros_like(y)
+        residual(n, t, y, yp, p, r, c, r_of, c_of, M, G, here)
         for group in range(groups.max() + 1):
             x, rate = y.copy(), yp.copy()
             for j in range(y.size):
                 if groups[j] == group:
                     x[j] += DIFFERENCE * max(1.0, abs(y[j]))
                     rate[j] += cj * (x[j] - y[j])
-            residual(n, t, x, rate, p, r, c, r_of, c_of, M, G, moved)
+            residual(n, t, x, rate, p, r, c, r_of, c_of, M, G, displaced)
             for j in range(y.size):
                 if groups[j] == group:
                     for k in range(begin[j], begin[j + 1]):
-                        values[k] = (moved[rows[k]] - there[rows[k]]) / (x[j] - y[j])
+                        values[k] = (displaced[rows[k]] - here[rows[k]]) / (x[j] - y[j])
 
     return matrix

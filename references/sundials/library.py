@@ -14,6 +14,13 @@ import numpy as np
 from references.driver import Task, TimeLimit, user_call
 from twoloop.problem.problem import Array
 
+SMALLEST_STEP = 1e-12  # relative to the length of t_span; without a limit the step is reduced forever at a NaN
+MOST_STEPS = 10**9  # the time limit takes effect earlier
+STEPS_A_CALL = 1000  # between two checks of the clock: each costs as much as a step of a small system
+NORMAL, ONE_STEP, TSTOP_RETURN, TOO_MUCH_WORK = 1, 2, 1, -1
+RAISED = -1  # return value of a callback for an unrecoverable error
+COUNTERS = {"n_accepted": ("Steps",), "n_rejected_error": ("ErrTestFails",)}
+COUNTERS |= {"n_rejected_convergence": ("StepSolveFails",), "n_outer": ("NonlinSolvIters",)}
 WRITTEN_FOR = "scikit-sundae 1.2.0 for Linux, with SUNDIALS 7.9.0 (any 7.x), sunindextype int and sunrealtype double"
 
 POINTER, INT, LONG, REAL, INDEX = ctypes.c_void_p, ctypes.c_int, ctypes.c_long, ctypes.c_double, ctypes.c_int32
@@ -57,24 +64,24 @@ def library() -> SimpleNamespace:
         sizes = config["SUNDIALS_INT_TYPE"], config["SUNDIALS_FLOAT_TYPE"]
         paths = [str(path.locate()) for path in files("scikit-sundae") or ()]
     except (ImportError, KeyError, PackageNotFoundError) as error:
-        raise _another_wheel(f"{type(error).__name__}: {error}") from error
+        raise _unsupported_wheel(f"{type(error).__name__}: {error}") from error
     if sizes != ("int", "double"):
-        raise _another_wheel(f"sunindextype and sunrealtype are {' and '.join(sizes)}")
+        raise _unsupported_wheel(f"sunindextype and sunrealtype are {' and '.join(sizes)}")
     functions: dict[str, Any] = {}
-    for name, wanted in FUNCTIONS.items():
-        found = [path for path in paths if f"scikit_sundae.libs/libsundials_{name}-" in path]
-        if len(found) != 1:
-            raise _another_wheel(f"there are {len(found)} files scikit_sundae.libs/libsundials_{name}-*, not 1")
+    for name, declarations in FUNCTIONS.items():
+        matches = [path for path in paths if f"scikit_sundae.libs/libsundials_{name}-" in path]
+        if len(matches) != 1:
+            raise _unsupported_wheel(f"there are {len(matches)} files scikit_sundae.libs/libsundials_{name}-*, not 1")
         try:
-            dll = ctypes.CDLL(found[0])
-            for function, types in (each.split(":") for each in wanted.split()):
+            dll = ctypes.CDLL(matches[0])
+            for function, types in (declaration.split(":") for declaration in declarations.split()):
                 functions[function] = declared = getattr(dll, function)
                 declared.restype, *declared.argtypes = (_TYPES[letter] for letter in types)
         except (OSError, AttributeError) as error:
-            raise _another_wheel(str(error)) from error
+            raise _unsupported_wheel(str(error)) from error
     sundials = SimpleNamespace(**functions)
     if (version := _version(sundials))[0] != 7:
-        raise _another_wheel(f"SUNDIALS has the version {'.'.join(map(str, version))}")
+        raise _unsupported_wheel(f"SUNDIALS has the version {'.'.join(map(str, version))}")
     return sundials
 
 
@@ -84,7 +91,7 @@ def check(name: str, flag: int) -> None:
         raise RuntimeError(f"{name} of SUNDIALS failed with {flag}")
 
 
-def made(stack: ExitStack, name: str, free: Callable[[Any], Any], *arguments: Any) -> Any:
+def create_object(stack: ExitStack, name: str, free: Callable[[Any], Any], *arguments: Any) -> Any:
     """Return an object created by the function of this name; it is freed when the stack is closed."""
     pointer = POINTER(getattr(library(), name)(*arguments))
     if not pointer:
@@ -102,9 +109,9 @@ def context(stack: ExitStack) -> Any:
     return pointer
 
 
-def _another_wheel(found: str) -> RuntimeError:
+def _unsupported_wheel(reason: str) -> RuntimeError:
     return RuntimeError(
-        f"the SUNDIALS of the installed scikit-sundae cannot be driven: {found}. references/sundials/library.py was "
+        f"the SUNDIALS of the installed scikit-sundae cannot be driven: {reason}. references/sundials/library.py was "
         f"written for {WRITTEN_FOR}. references.sundials.ida.solve_ida does the same through Python"
     )
 
@@ -116,15 +123,6 @@ def _version(sundials: SimpleNamespace) -> tuple[int, int, int]:
     return numbers[0], numbers[1], numbers[2]
 
 
-SMALLEST_STEP = 1e-12  # relative to the length of t_span; without a limit the step is reduced forever at a NaN
-MOST_STEPS = 10**9  # the time limit takes effect earlier
-STEPS_A_CALL = 1000  # between two checks of the clock: each costs as much as a step of a small system
-NORMAL, ONE_STEP, TSTOP_RETURN, TOO_MUCH_WORK = 1, 2, 1, -1
-RAISED = -1  # return value of a callback for an unrecoverable error
-COUNTERS = {"n_accepted": ("Steps",), "n_rejected_error": ("ErrTestFails",)}
-COUNTERS |= {"n_rejected_convergence": ("StepSolveFails",), "n_outer": ("NonlinSolvIters",)}
-
-
 class Memory:
     """The memory of IDA (`kind` "IDA") or CVODE ("CVode"), whose vectors are the rows of `state`."""
 
@@ -133,13 +131,14 @@ class Memory:
         self.stack, self.own, self.sundials = stack, context(stack), library()
         self.vectors = [self.vector(values) for values in self.state]
         free = getattr(self.sundials, f"{kind}Free")
-        self.memory = made(stack, f"{kind}Create", lambda pointer: free(ctypes.byref(pointer)), *given, self.own)
+        release = lambda pointer: free(ctypes.byref(pointer))  # noqa: E731
+        self.memory = create_object(stack, f"{kind}Create", release, *given, self.own)
         self.reached = REAL(task.t0)
 
     def vector(self, values: Array) -> Any:
         """Return a SUNDIALS vector that wraps an array."""
         free = self.sundials.N_VDestroy
-        return made(self.stack, "N_VMake_Serial", free, values.size, values.ctypes.data, self.own)
+        return create_object(self.stack, "N_VMake_Serial", free, values.size, values.ctypes.data, self.own)
 
     def call(self, name: str, *arguments: Any) -> None:
         """Call a function, which must return 0."""
@@ -152,8 +151,10 @@ class Memory:
         """
         kind, size, destroy = "Dense" if band is None else "Band", self.state.shape[1], self.sundials.SUNMatDestroy
         widths = (size,) if band is None else band[::-1]
-        matrix = made(self.stack, f"SUN{kind}Matrix", destroy, size, *widths, self.own)
-        linear = made(self.stack, f"SUNLinSol_{kind}", self.sundials.SUNLinSolFree, self.vectors[0], matrix, self.own)
+        matrix = create_object(self.stack, f"SUN{kind}Matrix", destroy, size, *widths, self.own)
+        linear = create_object(
+            self.stack, f"SUNLinSol_{kind}", self.sundials.SUNLinSolFree, self.vectors[0], matrix, self.own
+        )
         self.call("SetLinearSolver", linear, matrix)
         if jacobian is not None:
             self.call("SetJacFn", jacobian.address)
@@ -203,10 +204,10 @@ class Memory:
             rows[k] = self.state.ravel()
         return rows
 
-    def counted(self, what: str) -> int:
+    def counter(self, counter: str) -> int:
         """Return a counter."""
         number = LONG()
-        self.call(f"GetNum{what}", ctypes.byref(number))
+        self.call(f"GetNum{counter}", ctypes.byref(number))
         return number.value
 
     def failure(self, flag: int, limit: TimeLimit, advice: str) -> str:
@@ -232,7 +233,7 @@ def run(
     kind: str,
     start: Array,
     task: Task,
-    given: tuple[int, ...],
+    arguments: tuple[int, ...],
     set_up: Callable[[Memory], None],
     max_step: float | None,
     counters: Mapping[str, tuple[str, ...]],
@@ -246,7 +247,7 @@ def run(
     longest = task.longest(max_step)
 
     def ready(stack: ExitStack) -> Memory:
-        solver = Memory(stack, kind, start, task, *given)
+        solver = Memory(stack, kind, start, task, *arguments)
         set_up(solver)
         solver.bound_steps(longest)
         return solver
@@ -256,8 +257,8 @@ def run(
         with user_call:
             solver.restart()
             flag = solver.go_to_the_end(limit)
-        counts = {name: sum(map(solver.counted, parts)) for name, parts in (COUNTERS | dict(counters)).items()}
-        failure, kept = solver.failure(flag, limit, advice), task.instants[task.instants <= solver.reached.value]
+        counts = {name: sum(map(solver.counter, parts)) for name, parts in (COUNTERS | dict(counters)).items()}
+        failure, times = solver.failure(flag, limit, advice), task.instants[task.instants <= solver.reached.value]
     with ExitStack() as stack:
-        rows = ready(stack).rows_at(kept)
-    return kept[: len(rows)], rows, failure, counts
+        rows = ready(stack).rows_at(times)
+    return times[: len(rows)], rows, failure, counts

@@ -1,13 +1,9 @@
 """IDA's residual and its derivatives as machine code, from the callbacks of a ConstrainedSystem.
 
-IDA solves F(t, y, y') = 0. The index-3 equations are reduced to index 1 in one of two ways, described for tables in
-`FORMS`:
-
-"index1": unknowns q, v, lam; q' = v, M v' + C_q^T lam = Q, C_q v' = Q_d. Drifts off the constraints.
-
-"stabilised": Gear, Gupta and Leimkuhler (1985) with the multipliers as time derivatives of further unknowns Lam, Mu;
-q' = v - C_q^T Mu', M v' + C_q^T Lam' = Q, C = 0, C_q v + C_t = 0. Rows A v + b = 0 follow C_q v + C_t = 0; their
-Mu is zero.
+IDA solves F(t, y, y') = 0. The index-3 equations are reduced to index 1 in one of two ways (`FORMS`). "index1" has the
+unknowns q, v, lam with q' = v, M v' + C_q^T lam = Q, C_q v' = Q_d, and drifts off the constraints. "stabilised", by
+Gear, Gupta and Leimkuhler (1985), has the multipliers as time derivatives of further unknowns Lam, Mu: q' = v - C_q^T
+Mu', M v' + C_q^T Lam' = Q, C = 0, C_q v + C_t = 0. Rows A v + b = 0 follow C_q v + C_t = 0; their Mu is zero.
 """
 
 from collections.abc import Callable
@@ -20,7 +16,7 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from references.driver import Task
-from references.equations.accelerations import compiled_gamma, kept
+from references.equations.accelerations import cached, compiled_gamma
 from references.equations.rows import accelerations
 from twoloop.kernels.compile.callbacks import stand_in
 from twoloop.kernels.data.flags import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN
@@ -56,16 +52,9 @@ class Parts(NamedTuple):
 class Implicit:
     """F(t, y, y') = 0 of a task in one of the `FORMS`.
 
-    Attributes
-    ----------
-    start : ndarray (2, size)
-        Initial unknowns and derivatives; accelerations and multipliers from eq. (6).
-    space : tuple of ndarray
-        Arguments of the compiled functions: p, M, which is kept if it is constant, C_q, dQ/dq, and workspace.
-    parts : Parts
-        Functions from which they are compiled.
-    residual, matrix : callable
-        See `residual_at` and `iteration_matrix_at`.
+    `start` (2, size) are the initial unknowns and derivatives, with accelerations and multipliers from eq. (6).
+    `residual` and `matrix` are compiled from `parts`, see `residual_at` and `iteration_matrix_at`; their arguments
+    `space` are p, M, which is kept if it is constant, C_q, dQ/dq, and workspace.
     """
 
     def __init__(self, task: Task, form: str):
@@ -77,7 +66,7 @@ class Implicit:
         self.parts = Parts(self.index1, *functions, task.n_c if m > task.n_c else ALL, system.constant_mass)
         self.residual, self.matrix = residual_at(self.parts), iteration_matrix_at(self.parts)
         self.sizes = n, m
-        a, lam = (each[:, 0] for each in accelerations(system, np.array([task.t0]), task.y0[:, None]))
+        a, lam = (array[:, 0] for array in accelerations(system, np.array([task.t0]), task.y0[:, None]))
         zeros = np.zeros(m)
         y, yp = ([lam], [zeros]) if self.index1 else ([zeros, zeros], [lam, zeros])
         self.start = np.array([np.concatenate([task.y0, *y]), np.concatenate([task.v0, a, *yp])])
@@ -95,7 +84,7 @@ def residual_at(parts: Parts) -> Callable[..., None]:
     """Return (t, y, y', p, M, Cq, res) -> None: the residual; M and C_q are evaluated at q on return."""
     index1, mass, force, constraint, jacobian, constraint_rate, gamma, _, positions, constant_mass = parts
 
-    @kept
+    @cached
     def residual(t, y, yp, p, M, Cq, res):  # type: ignore[no-untyped-def]
         m, n = Cq.shape
         q, v, a = y[:n], y[n : 2 * n], yp[n : 2 * n]
@@ -153,7 +142,7 @@ def iteration_matrix_at(parts: Parts) -> Callable[..., None]:
     differenced = residual_at(parts._replace(force=_no_force if exact else force, tangent=None))
     by_velocities = index1 or not exact
 
-    @kept
+    @cached
     def of_velocities(t, q, v, p, m, out):  # type: ignore[no-untyped-def]
         n = q.size
         out[: n + m] = 0.0
@@ -162,12 +151,12 @@ def iteration_matrix_at(parts: Parts) -> Callable[..., None]:
         if index1:
             gamma(t, q, v, p, out[n : n + m])
 
-    @kept
-    def iteration_matrix(t, cj, y, yp, p, M, Cq, K, moved, here, there, J):  # type: ignore[no-untyped-def]
+    @cached
+    def iteration_matrix(t, cj, y, yp, p, M, Cq, K, displaced, residual_here, residual_displaced, J):  # type: ignore[no-untyped-def]
         m, n = Cq.shape
         for k in range(y.size):  # numba compiles `moved[:] = y` for two seconds
-            moved[k] = y[k]
-        q, v = moved[:n], moved[n : 2 * n]
+            displaced[k] = y[k]
+        q, v = displaced[:n], displaced[n : 2 * n]
         if not constant_mass:
             M[:, :] = 0.0
             mass(t, q, p, M)
@@ -189,24 +178,24 @@ def iteration_matrix_at(parts: Parts) -> Callable[..., None]:
             for k in range(positions, m):
                 J[2 * n + m + k, 2 * n + k] = 1.0
         if by_velocities:
-            of_velocities(t, q, v, p, m, here)
+            of_velocities(t, q, v, p, m, residual_here)
             for j in range(n):
                 step = DIFFERENCE * max(1.0, abs(y[n + j]))
                 v[j] = y[n + j] + step
-                of_velocities(t, q, v, p, m, there)
+                of_velocities(t, q, v, p, m, residual_displaced)
                 v[j] = y[n + j]
                 for i in range(n + m if index1 else n):
-                    J[n + j, n + i] -= (there[i] - here[i]) / step
-        differenced(t, moved, yp, p, M, Cq, here)
+                    J[n + j, n + i] -= (residual_displaced[i] - residual_here[i]) / step
+        differenced(t, displaced, yp, p, M, Cq, residual_here)
         for j in range(n):  # columns of q
             step = DIFFERENCE * max(1.0, abs(y[j]))
             q[j] = y[j] + step
-            differenced(t, moved, yp, p, M, Cq, there)
+            differenced(t, displaced, yp, p, M, Cq, residual_displaced)
             q[j] = y[j]
             for i in range(2 * n):
-                J[j, i] = (there[i] - here[i]) / step
+                J[j, i] = (residual_displaced[i] - residual_here[i]) / step
             for i in range(2 * n if index1 else 2 * n + m, y.size):  # C_q is above
-                J[j, i] = (there[i] - here[i]) / step
+                J[j, i] = (residual_displaced[i] - residual_here[i]) / step
             J[j, j] += cj
         if exact:
             K[:, :] = 0.0
@@ -245,6 +234,6 @@ def _entries(form: Implicit) -> Array:
     """Return where dF/dy + cj dF/dy' has entries, beside the start."""
     y, yp = form.start + SHIFT * np.random.default_rng(0).uniform(0.5, 1.0, form.start.shape)
     J = np.zeros((y.size, y.size))
-    p, *space = (each.copy() for each in form.space)
+    p, *space = (array.copy() for array in form.space)
     form.matrix(0.0, 1.0, y, yp, p, *space, J)
     return np.asarray(J.T != 0.0)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from references.casadi.integrators import solve_cvodes
+from references.casadi.integrators import solve_sundials
 from references.diffrax.dopri8 import solve_diffrax
 from references.paper.four_bar_minimal import MinimalFourBar
 from references.scipy.index1 import solve_index1
@@ -133,7 +133,7 @@ OTHERS: dict[str, tuple[tuple[float, ...], Callable[[Case, float, int], Result]]
     solvers.CYRK: (FINER, solvers.CATALOGUE[solvers.CYRK].run),
     solvers.CVODE_C_PROJECTED: (FINE, solvers.CATALOGUE[solvers.CVODE_C_PROJECTED].run),
     solvers.DIFFRAX: (FINE, partial(_long, solve_diffrax)),
-    solvers.CVODES: (FINE, partial(_long, solve_cvodes)),
+    solvers.CVODES: (FINE, partial(_long, partial(solve_sundials, method="BDF"))),
     solvers.HEYOKA: ((*FINER, 1e-14), solvers.CATALOGUE[solvers.HEYOKA].run),
     LSODA: ((1e-8, 1e-10, 1e-12), partial(_index1, "LSODA", "none")),
     PROJECTED: ((1e-7, 1e-9, 1e-11), partial(_index1, "DOP853", "projection")),

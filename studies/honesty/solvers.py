@@ -9,8 +9,7 @@ from references.cyrk.ode import solve_cyrk
 from references.heyoka.taylor import solve_heyoka
 from references.scipy.index1 import solve_index1
 from references.sundials.cvode_c import solve_cvode_c
-from references.sundials.ida import solve_ida
-from references.sundials.ida_c import solve_ida_c
+from references.sundials.ida import solve_ida, solve_ida_c
 from studies.bench.solvers import GIVEN
 from studies.honesty.traps import FORCE, INPUT, LINKAGE, MISTAKE, SHORT, SINGULAR, Trap
 from twoloop import Result, solve_dae

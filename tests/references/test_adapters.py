@@ -6,13 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from references.exudyn.beam import solve_exudyn_beam
 from references.exudyn.mechanisms import solve_exudyn
 from references.exudyn.model import SOLVERS
 from tests.marks import slow
 from tests.problems import pendulum
 from tests.references.adapters import ADAPTERS, ANY_CALLBACK, each, start
-from twoloop.mechanisms import double_pendulum, four_bar, knife_edge, rolling_disc, very_flexible_beam
+from twoloop.mechanisms import double_pendulum, four_bar, knife_edge, rolling_disc
 from twoloop.run.record import Status
 from twoloop.testing.mechanisms import MAKERS
 
@@ -102,7 +101,6 @@ def test_output_takes_no_step_and_no_evaluation_of_the_run_that_is_timed(name):
 # --- time limits
 OWN_MODEL = {
     **{f"Exudyn {s}": lambda s=s, **options: solve_exudyn(PROBLEM, 1e4, 10**7, s, **options) for s in SOLVERS},
-    "Exudyn beam": lambda **options: solve_exudyn_beam(very_flexible_beam(), 1e4, 10**7, **options),
 }
 STOPPED = {
     **OWN_MODEL,
@@ -215,10 +213,9 @@ def test_an_exception_of_a_callback_comes_through(name):
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_exudyn_ends_where_its_model_is_not_finite(solver):
     # its models call no function of ours: a value of theirs is the way in
-    for solve, problem in ((solve_exudyn, PROBLEM), (solve_exudyn_beam, very_flexible_beam())):
-        broken = replace(problem, parameters={**problem.parameters, "gravity": np.nan})
-        result = solve(broken, 1.0, 100, solver=solver, time_limit=60.0)
-        assert result.status is Status.SOLVER_FAILED and "Exudyn failed in the step to t = 0.01" in result.message
+    broken = replace(PROBLEM, parameters={**PROBLEM.parameters, "gravity": np.nan})
+    result = solve_exudyn(broken, 1.0, 100, solver=solver, time_limit=60.0)
+    assert result.status is Status.SOLVER_FAILED and "Exudyn failed in the step to t = 0.01" in result.message
 
 
 # --- rows A v + b = 0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from references.engines import engine as catalogue
+from references.engines import rigid as catalogue
 from references.engines.rigid import rigid_of
 from studies.bench import closed_loops
 from studies.bench.closed_loops import ASKEW, LIGHTENED, SPATIAL
@@ -15,7 +15,6 @@ from studies.bench.engine_runs import Loop, errors, gate
 from twoloop import audit
 from twoloop.audit.simulator import gaps
 from twoloop.bodies import PlanarModel, SpatialModel
-from twoloop.bodies.parameter_layout import TORSION
 
 ENGINES = catalogue.engines()
 engines = pytest.mark.parametrize("engine", ENGINES)
@@ -84,19 +83,6 @@ def test_gates_catch_a_loop_an_inertia_a_mass_and_a_torque(loops, engine):
     assert "the mass of 'K3' is 0." in gate(loop, prepared(engine, model(lose_mass)))
     assert "accelerations" in gate(loop, prepared(engine, model(lose_joint)))
     assert "accelerations" in gate(loop, prepared(engine, replace(rigid, torques=1.1 * rigid.torques)))
-
-
-@engines
-@pytest.mark.parametrize("make", [closed_loops.four_bar, closed_loops.crank_rocker])
-def test_motors_do_what_they_should(engine, make):
-    model = make().model
-    model.torsion_spring(model.joints[0], stiffness=200.0, damping=5.0, angle=0.5)  # a PD motor
-    loop = Loop(model.problem((0.0, 1.0)))
-    off = errors(loop, prepared(engine, loop.rigid).run(1.0, 2000, 50))
-    assert off["error_q"] < 0.02 and off["error_v"] < 0.02
-    idle = [force for force in loop.problem.model.forces if force.kind != TORSION]
-    loop.problem.model.forces[:] = idle
-    assert errors(loop, prepared(engine, rigid_of(loop.problem)).run(1.0, 2000, 50))["error_q"] > 0.1
 
 
 def leaning():

@@ -9,14 +9,14 @@ import pytest
 pytest.importorskip("exudyn")
 
 
-from references.exudyn.beam import MODELS as BEAMS
-from references.exudyn.beam import solve_exudyn_beam
 from references.exudyn.mechanisms import MODELS, has_model, solve_exudyn
 from references.exudyn.model import SOLVERS
 from references.paper.four_bar_minimal import trajectory
 from studies.validation import study as validation
 from tests.marks import slow, slow_but
 from tests.problems import LINKAGES
+from tests.references.exudyn_beam import MODELS as BEAMS
+from tests.references.exudyn_beam import solve_exudyn_beam
 from twoloop import solve_dae
 from twoloop.mechanisms import ancf_beam, moderately_stiff_beam
 from twoloop.mechanisms.ancf_beam import midpoint_deflection, tip_height

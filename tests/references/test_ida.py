@@ -10,8 +10,7 @@ import pytest
 from numba import njit
 
 from references.driver import Task
-from references.sundials.ida import solve_ida
-from references.sundials.ida_c import solve_ida_c
+from references.sundials.ida import solve_ida, solve_ida_c
 from references.sundials.residual import FORMS, Implicit, iteration_matrix_at, residual_at
 from tests.marks import slow
 from tests.problems import PLAIN, without_tangent

@@ -14,9 +14,8 @@ from references.lines import Line, lines
 from references.scipy import fully_implicit, index1
 from references.scipy.index1 import solve_index1
 from references.sundials import cvode_c
-from references.sundials.cvode import solve_cvode
-from references.sundials.cvode_c import solve_cvode_c
-from references.sundials.ida_c import solve_ida_c
+from references.sundials.cvode_c import solve_cvode, solve_cvode_c
+from references.sundials.ida import solve_ida_c
 from studies.bench.collector import Case, Run, attempt
 from studies.bench.solvers import CATALOGUE
 from studies.validation.study import MAKE

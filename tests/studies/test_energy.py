@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from references.casadi.integrators import solve_cvodes
+from references.casadi.integrators import solve_sundials
 from studies.bench.cli import Call
 from studies.bench.collector import REPEATS, attempt
 from studies.bench.figures import STYLES
@@ -312,9 +312,9 @@ def test_a_long_run_may_take_as_many_steps_as_it_needs():
     case = case_of(SWITCHING, QUICK)
     assert OTHERS[CVODES][1](case, 1e-8, 0).stats.n_accepted > 1000
     span = (0.0, case.t_end)
-    few = solve_cvodes(case.problem.system, span, *start(case), 1e-4, 1e-4, most_steps=100)
+    few = solve_sundials(case.problem.system, span, *start(case), "BDF", 1e-4, 1e-4, most_steps=100)
     assert not few.success and few.t.size == 0
     run = next(run for run in runs(False) if run.solver.name == CVODES)
     assert measure(type(run)(case, run.solver, 1e-4, "other", 1), few)["t_reached"] == 0.0  # a row, all the same
     with pytest.raises(ValueError, match="most_steps"):
-        solve_cvodes(case.problem.system, span, *start(case), most_steps=0)
+        solve_sundials(case.problem.system, span, *start(case), most_steps=0)

@@ -13,14 +13,7 @@ from twoloop.testing.mechanisms import N_TIMES, as_list, select_problems
 from twoloop.testing.problem import KnownProblem, Motion
 from twoloop.testing.properties import Observation, Settings, measure_properties, transformed_finding
 from twoloop.testing.report import Finding, Report
-from twoloop.testing.runs import (
-    Simulate,
-    SimulatorRun,
-    TimeLimitedSimulator,
-    change_frame,
-    change_units,
-    run_simulator,
-)
+from twoloop.testing.runs import Simulate, SimulatorRun, TimeLimitedSimulator, change_frame, change_units, run_simulator
 
 Skipped = tuple[str, str, str]
 TIME_LIMIT = 120.0  # s

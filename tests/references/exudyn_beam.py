@@ -8,16 +8,10 @@ measures how closely.
 """
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
-from references.driver import check_problem
 from references.exudyn.model import add_sensors, check_steps, exu, items, run
-from twoloop.checks.arguments import check_choice
-from twoloop.problem.problem import Array, Problem
-from twoloop.result.result import Result
 
 MODELS = {
     "cable": "ANCFCable2D: cubic, the section stays normal to the centre line and has no rotary inertia",
@@ -26,49 +20,28 @@ MODELS = {
 
 
 def solve_exudyn_beam(
-    problem: Problem,
-    t_end: float,
-    n_steps: int,
-    model: str = "cable",
-    *,
-    solver: str = "GeneralizedAlpha",
-    store_every: int = 1,
-    time_limit: float | None = None,
-) -> Result:
+    problem, t_end, n_steps, model="cable", *, solver="GeneralizedAlpha", store_every=1, time_limit=None
+):
     """Run the beam on its moving base with one of Exudyn's implicit solvers, with a fixed step.
 
-    Parameters
-    ----------
-    problem : Problem
-        Problem of `twoloop.mechanisms.ancf_beam`; only its `parameters` are used.
-    t_end, n_steps, solver, store_every, time_limit : see `references.exudyn.mechanisms.solve_exudyn`
-    model : {"cable", "shear"}
-        `MODELS` has a description of each for tables. The first converges much faster with mesh refinement.
-
-    Returns
-    -------
-    Result
-        q, v, a (6 (n_elements + 1), n_t) in the order of `ancf_beam`, as required by its `tip_height` and
-        `midpoint_deflection`. Quantities missing in the model are NaN: the directors, with "shear" also the slopes.
-        `lam` (2, n_t) is NaN too. Otherwise as in `references.exudyn.mechanisms.solve_exudyn`.
+    Only the `parameters` of the problem are used. q, v, a (6 (n_elements + 1), n_t) of the `Result` are in the order of
+    `ancf_beam`; NaN where the model has no such quantity: the directors, with "shear" also the slopes. So is `lam`.
     """
-    check_problem(problem, "youngs_modulus", "a beam of twoloop.mechanisms.ancf_beam")
     steps = check_steps(problem, t_end, n_steps, solver, store_every, time_limit)
-    check_choice("model", model, tuple(MODELS))
     _container, mbs, sensors, reference = _model(problem.parameters, model)
     n_nodes = len(reference)
     kept = 4 if model == "cable" else 2  # of x, y, slopes the first model has all, the second x, y and an angle
 
-    def among_six(coordinates: Array) -> Array:
+    def among_six(coordinates):
         """Insert Exudyn's coordinates into six coordinates per node."""
-        ours = np.full((n_nodes, 6, coordinates.shape[1]), np.nan)
-        ours[:, :kept] = coordinates.reshape(n_nodes, -1, coordinates.shape[1])[:, :kept]
-        return ours.reshape(-1, coordinates.shape[1])
+        inserted = np.full((n_nodes, 6, coordinates.shape[1]), np.nan)
+        inserted[:, :kept] = coordinates.reshape(n_nodes, -1, coordinates.shape[1])[:, :kept]
+        return inserted.reshape(-1, coordinates.shape[1])
 
     return run(mbs, sensors, reference.ravel(), steps, lambda q, v, a: (among_six(q), among_six(v), among_six(a)))
 
 
-def _model(p: dict[str, Any], model: str) -> tuple[Any, Any, list[list[int]], Array]:
+def _model(p, model):
     """Return Exudyn's container, its system, the sensors [node][output], and the reference coordinates [node]."""
     container = exu.SystemContainer()
     mbs = container.AddSystem()
@@ -92,7 +65,7 @@ def _model(p: dict[str, Any], model: str) -> tuple[Any, Any, list[list[int]], Ar
     return container, mbs, sensors, reference
 
 
-def _element(p: dict[str, Any], model: str, length: float) -> Callable[[list[int]], Any]:
+def _element(p, model, length):
     """Return an element of the beam between two nodes."""
     area, second_moment = p["height"] * p["width"], p["width"] * p["height"] ** 3 / 12.0
     section = {"length": length, "massPerLength": p["density"] * area}
@@ -105,14 +78,14 @@ def _element(p: dict[str, Any], model: str, length: float) -> Callable[[list[int
     return lambda ends: items.ObjectBeamGeometricallyExact2D(nodeNumbers=ends, **section)
 
 
-def _hold(mbs: Any, p: dict[str, Any], node: int) -> None:
+def _hold(mbs, p, node):
     """Prescribe a node's motion, amplitude sin(angular_frequency t) along x and zero along y."""
     amplitude, frequency = p["amplitude"], p["angular_frequency"]
 
-    def place(mbs: Any, t: float, itemNumber: int, lOffset: float) -> float:
+    def place(mbs, t, itemNumber, lOffset):
         return float(amplitude * math.sin(frequency * t))
 
-    def speed(mbs: Any, t: float, itemNumber: int, lOffset: float) -> float:
+    def speed(mbs, t, itemNumber, lOffset):
         return float(amplitude * frequency * math.cos(frequency * t))
 
     ground = mbs.AddMarker(items.MarkerNodeCoordinate(nodeNumber=mbs.AddNode(items.NodePointGround()), coordinate=0))
