@@ -144,12 +144,12 @@ AGAIN.add_function("choose", i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS
 AGAIN.add_function("dependents", i8(MATRIX, INTEGERS, INTEGERS, i8, VECTOR, INTEGERS, INTEGERS))
 AGAIN.add_function("start", i8(KIT, WORK, f8, VECTOR))
 AGAIN.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS))
-# in `constants`: of starts, what `choose` takes, the flag of an M that varies, else 0, the smallest pivot with which
-# one is taken and the form of the equations; of steps, a first one, or 0, and what set_sizes takes; of ends, the pivot
-# below which speeds are looked at, how many times what accelerations give these may change by, and how many looks at
-# sudden changes two of these must be apart
-ACCURACY, REUSE, NEARLY_SINGULAR, RANK, WEAK, SCALE, CONTRADICTS, OF_MASS, LEAST_PIVOT, IN_FORM = range(10)
-FIRST, LEAST, LONGEST, LOOKS_WITHIN, NEAR, MOST_TURNED, LOOKS = range(10, 17)
+# in `constants`: of starts, whether rows have entries wherever `kinds` says so, what `choose` takes, the flag of an M
+# that varies, else 0, the smallest pivot with which one is taken and the form of the equations; of steps, a first one,
+# or 0, and what set_sizes takes; of ends, the pivot below which speeds are looked at, how many times what accelerations
+# give these may change by, and how many looks at sudden changes two of these must be apart
+ACCURACY, REUSE, NEARLY_SINGULAR, IN_ALL_PLACES, RANK, WEAK, SCALE, CONTRADICTS = range(8)
+OF_MASS, LEAST_PIVOT, IN_FORM, FIRST, LEAST, LONGEST, LOOKS_WITHIN, NEAR, MOST_TURNED, LOOKS = range(8, 18)
 PLACE, N_KEPT, N_ADDED, KEPT = range(4)  # in `expected`, which is empty without code; those that help follow those kept
 
 
@@ -200,6 +200,22 @@ def _agree(w, b, n):
 
 
 @merged
+def _look(given, b, t, q, v, sizes, ways):
+    for k in range(b.looked.size):
+        b.looked[k] = 0.0
+    return b.look(given, t, q, v, sizes, b.lam, b.room, b.mass, b.rows, ways, b.pattern, b.least)
+
+
+@merged
+def _has_all_entries(b):
+    """Whether rows have an entry wherever they may have one: then they need not be looked at nearby."""
+    n, same = b.rows.shape[1], True
+    for k in range(b.kinds.size):
+        same = same and (b.kinds[k] != 0) == (b.rows[k // n, k % n] != 0.0)
+    return same
+
+
+@merged
 def _begin(f, given, w, b, t, t1, q, v, sizes, sure):
     """Begin a run to t1 at a state, with the same choices as the run before it; 0, or why it cannot.
 
@@ -208,9 +224,9 @@ def _begin(f, given, w, b, t, t1, q, v, sizes, sure):
     n = q.size
     if not (finite_vector(q) and finite_vector(v)):
         return REFUSED
-    for k in range(b.looked.size):
-        b.looked[k] = 0.0
-    found = b.look(given, t, q, v, sizes, b.lam, b.room, b.mass, b.rows, b.ways, b.pattern, b.least)
+    found = _look(given, b, t, q, v, sizes, b.ways[: 0 if b.constants[IN_ALL_PLACES] > 0.0 else len(b.ways)])
+    if b.constants[IN_ALL_PLACES] > 0.0 and not _has_all_entries(b):
+        found = _look(given, b, t, q, v, sizes, b.ways)
     if found & IN_ORDER == 0 or found & (DEFINITE | INDEFINITE) != int(b.constants[OF_MASS]):
         return REFUSED
     if found & CONSISTENT == 0 and not sure:

@@ -103,7 +103,7 @@ class Again:
         run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, run.chunk
         looked, room = system if self.movable is None else self.movable.system, LARGEST // len(run.state)
         self.look, self.loops, self.rest = Look(looked), short_loops(), 0
-        self.known, self.given = arrays_of(run, self.look, code, definite, asked, room), looked.kit
+        self.known, self.given = arrays_of(run, self.look, code, definite, asked, room), looked.kit.address
         self._go, self._tell, self._advance = map(direct, (self.loops.go, self.loops.tell, run.kernels.advance))
         # in the block of all that is kept: where states begin, and what is told of one that is the only one
         self.states_from, self.width = self.known.told.size, len(run.state)
@@ -157,7 +157,18 @@ class Again:
         if self.looks is not None:
             self._forget_chunks()
         run.t0, told, at_times, words = t0, None, None, ""
-        arrays = run.kit, self.given, run.work, known, t0, t1, q0, v0, self.look.sizes(), territory.known
+        arrays = (
+            run.kit.address,
+            self.given,
+            run.work.address,
+            known.address,
+            t0,
+            t1,
+            q0,
+            v0,
+            self.look.sizes(),
+            territory.known,
+        )
         clock = time.perf_counter if self.spent < SHORT else time.process_time
         began = clock()
         try:

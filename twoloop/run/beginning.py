@@ -47,8 +47,9 @@ def arrays_of(run: Run, look: Look, code: OwnCode | None, definite: bool, asked:
     places = np.flatnonzero(memory.view(np.int64))  # -0 is not what is cleared
     weak = 0.0 if system.constant_mass and system.made.get("no weak mass", False) else SINGULAR_MASS
     of_start: tuple[float, ...]
-    of_start = max(run.rtol, GAMMA_ACCURACY), run.reuse, 0.0 if run.plan.watchful else 1.0, RANK, weak, scale
-    of_start += CONTRADICTS, of_mass, NEARER * run.work.notes[noted.PIVOT], run.kit.flags[FORM]
+    of_start = max(run.rtol, GAMMA_ACCURACY), run.reuse, 0.0 if run.plan.watchful else 1.0
+    of_start += np.array_equal(search[0] != 0, run.work.pattern.ravel() != 0.0), RANK, weak, scale, CONTRADICTS
+    of_start += of_mass, NEARER * run.work.notes[noted.PIVOT], run.kit.flags[FORM]
     of_steps = asked.first_step or 0.0, run.least_atol, asked.max_step, run.plan.looks_within
     columns, width = run.a.N_STEP_COLUMNS, len(run.state)
     block = np.empty(loops.FRONT + 1 + (1 + columns) * room + width * (1 + room))

@@ -148,10 +148,10 @@ def _first_bound_kept(mass, G, kept, n_rows, bounds, factors, solved_room, S_roo
             if G[kept[i], j] != 0.0:
                 for k in range(n_rows):
                     S[i, k] += G[kept[i], j] * solved[j, k]
-        sizes[i] = math.sqrt(S[i, i])
+        sizes[i] = 1.0 / math.sqrt(S[i, i])
     for i in range(n_rows):
         for k in range(i, n_rows):
-            S[i, k] /= sizes[i] * sizes[k]
+            S[i, k] *= sizes[i] * sizes[k]
     less = S[n_rows:]
     for place in range(bounds.size):
         for i in range(n_rows):
