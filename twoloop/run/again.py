@@ -103,7 +103,7 @@ class Again:
         run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, run.chunk
         looked, room = system if self.movable is None else self.movable.system, LARGEST // len(run.state)
         self.look, self.loops, self.rest = Look(looked), short_loops(), 0
-        self.known, self.given = arrays_of(run, self.look, code, definite, asked, room), looked.kit.address
+        self.known, self.given = arrays_of(run, self.look, code, definite, asked, room), looked.kit
         self._go, self._tell, self._advance = map(direct, (self.loops.go, self.loops.tell, run.kernels.advance))
         # in the block of all that is kept: where states begin, and what is told of one that is the only one
         self.states_from, self.width = self.known.told.size, len(run.state)
@@ -157,29 +157,19 @@ class Again:
         if self.looks is not None:
             self._forget_chunks()
         run.t0, told, at_times, words = t0, None, None, ""
-        arrays = (
-            run.kit.address,
-            self.given,
-            run.work.address,
-            known.address,
-            t0,
-            t1,
-            q0,
-            v0,
-            self.look.sizes(),
-            territory.known,
-        )
+        kit, work, sizes, box = run.kit.address, run.work.address, self.look.sizes(), territory.known
+        arrays = kit, self.given.address, work, known.address, t0, t1, q0, v0, sizes, box
         clock = time.perf_counter if self.spent < SHORT else time.process_time
         began = clock()
         try:
             n = self._go(*arrays, False)
-            if n == loops.IN_DOUBT:
-                interrupts.listen()
-                n = self._go(*arrays, True) if self.look.is_surely(0, t0, q0, v0) else loops.REFUSED
-            if n == loops.REFUSED:
-                return None
             if n < 0 or self.unusual or output is not STEPS:
-                told = self._go_on(t1, output, interrupts)
+                interrupts.listen()
+                if n == loops.IN_DOUBT and self.look.is_surely(0, t0, q0, v0):
+                    n = self._go(*arrays, True)
+                if n in (loops.IN_DOUBT, loops.REFUSED):
+                    return None
+                told = self._go_on(t1, output)
         except Exception:  # of a callback; the long way knows what to do
             self.rest, known.begun[loops.HOW_OFTEN] = IN_VAIN, loops.NEVER
             return None
@@ -188,7 +178,7 @@ class Again:
         n_rows = n
         if told is not None:
             n_rows, n = known.filled.tolist()
-            found = self._looked_at(told, t1, q0, v0, output, interrupts, fields)
+            found = self._looked_at(told, t1, q0, v0, output, fields)
             if found is None:
                 known.begun[loops.HOW_OFTEN] = loops.NEVER
                 return None
@@ -201,14 +191,14 @@ class Again:
         territory.count()  # a run that goes the long way is counted there
         return fields
 
-    def _go_on(self, t1: float, output: Output, interrupts: Interrupts) -> list[float]:
+    def _go_on(self, t1: float, output: Output) -> list[float]:
         """Take the steps beyond the first chunk, and find states between steps; what is told of the run."""
         run, known, loops, done = self.run, self.known, self.loops, self.run.a.ALL_OUTPUT_DONE
         told = self._told()
         if told[loops.IS_NEW]:
             run.compared_to[0] = -np.inf
         if told[loops.CODE] != done:
-            self._steps_beyond(int(told[loops.CODE]), t1, interrupts)
+            self._steps_beyond(int(told[loops.CODE]), t1)
             told = [*self._told()[: loops.IS_NEW], told[loops.IS_NEW]]
         elif output is not STEPS:
             self.kinds[: known.filled[1]] = kinds_of(run, known.steps[: known.filled[1]])
@@ -225,14 +215,7 @@ class Again:
         return told
 
     def _looked_at(
-        self,
-        told: list[float],
-        t1: float,
-        q0: Array,
-        v0: Array,
-        output: Output,
-        interrupts: Interrupts,
-        fields: dict[str, Any],
+        self, told: list[float], t1: float, q0: Array, v0: Array, output: Output, fields: dict[str, Any]
     ) -> tuple[tuple[Array, Array] | None, str] | None:
         """Output times and rows there, None: all steps, and the words of a message; None where it is not to be trusted.
 
@@ -246,10 +229,9 @@ class Again:
         if code != run.a.ALL_OUTPUT_DONE or not trusted:
             self.rest = max(self.rest, IN_VAIN)
             return None
-        if told[loops.IS_NEW] and not self._agrees(t1, q0, v0, interrupts):
+        if told[loops.IS_NEW] and not self._agrees(t1, q0, v0):
             return None
         if not inside or movable is not None:
-            interrupts.listen()
             if (run.compared_to[0] < t1 or self.territory.is_due()) and not self._compared(t, rows, inside):
                 return None
             run.compared_to[0] = t1
@@ -269,11 +251,10 @@ class Again:
                 words += said_of_stiffness(self.looks, run.kit, run.work)
         return at_times, words
 
-    def _agrees(self, t1: float, q0: Array, v0: Array, interrupts: Interrupts) -> bool:
+    def _agrees(self, t1: float, q0: Array, v0: Array) -> bool:
         """Whether a system of other parameters is as it should be at a new start, where other rows may be redundant."""
         run = self.run
         if run.said_of_rows:  # rounding may decide which row is left out
-            interrupts.listen()
             counted = self.known.start_rows.tobytes()
             if counted not in self.dependent:
                 there = run.at(run.t0, q0, v0)
@@ -292,9 +273,8 @@ class Again:
             run.plan, run.kit, run.functions, run.substituted = self.plan, self.kit, self.kit.functions, False
             run.memory = self.memory
 
-    def _steps_beyond(self, code: int, t1: float, interrupts: Interrupts) -> None:
+    def _steps_beyond(self, code: int, t1: float) -> None:
         """Take the steps after the first chunk, which ended so, and tell of all."""
-        interrupts.listen()
         run, known, a = self.run, self.known, self.run.a
         self.looks = looks = Looks(run.plan)
         plan, control, kit = run.plan, run.control, run.kit  # at the moment: not always the run's own

@@ -69,8 +69,6 @@ def record_again(
     for kept in alike:
         if kept.waiting is None or not (output is STEPS or Again.gives(kept.run, output, kept.kin)):
             continue
-        if kept.kin is not None or output is not STEPS:
-            interrupts.listen()
         try:
             again = kept.waiting.pop()
         except IndexError:
