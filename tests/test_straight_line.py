@@ -23,6 +23,7 @@ from twoloop.kernels.compile.own_functions import OwnFunctions, object_code
 from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.noted import BY_GENERAL
 from twoloop.kernels.evaluation import tasks
+from twoloop.kernels.evaluation.own_inner import own_inner_loop
 from twoloop.methods.presets import PRESETS
 from twoloop.run.run import Run
 from twoloop.solve import solve_dae
@@ -52,7 +53,7 @@ def run_from(system, q0, v0, compiled):
     plan = PRESETS["DOP853"].plan(system.n_q, 1e-8, 1e-8, False)
     if compiled:
         own = own_code(system, 0.0, q0)
-        plan = replace(plan, inner=own.shared.inner, own=(own.shared.functions,), numbers=own.numbers)
+        plan = replace(plan, inner=own_inner_loop, own=(own.shared.functions,), numbers=own.numbers)
     return Run(system, plan, 0.0, q0, v0, 1e-8, np.full(system.n_q, 1e-8), None)
 
 

@@ -673,16 +673,17 @@ def _compiled(own: SharedCode) -> Collocation:
         "closer_ends": code.closer,
         "nearer_ends": code.nearer,
     }
-    long = own.parts is not None
+    long, numbers = own.parts is not None, code.numbers.formulas
 
     def write() -> tuple[list[str], str]:
         module = Module(divided=long)
         for name, emit in parts.items():
             llvm_code.write(module, name, KIT.own_type(name), emit, partial(LaneEmitter, lanes=LANES))
+        assert len(code.numbers.values) == len(numbers)  # what is read beyond would be anything
         return list(parts), str(module)
 
     functions = LaterFunctions(lambda: own_functions("collocation", _stamp(), code.structure, write, passes=not long))
-    return Collocation(functions, code, code.numbers.formulas)
+    return Collocation(functions, code, numbers)
 
 
 @cache

@@ -9,6 +9,7 @@ states in lanes.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from twoloop.generate import llvm_code
@@ -16,7 +17,8 @@ from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.llvm_code import Emitter
 from twoloop.generate.llvm_text import BIT, DOUBLE, Module, Value, integer, width_of
 from twoloop.generate.straight_line import Outputs, Solution, StraightLine
-from twoloop.generate.written import NOWHERE, Place, Written, conditions_hold
+from twoloop.generate.tracing import Graph
+from twoloop.generate.written import Place, Written, conditions_hold
 
 # operations from which on equations are written in parts, which takes half as long to build: where these are for
 # projections alone, and where accelerations, too, would take half as long again by them
@@ -55,8 +57,10 @@ class PartsCode:
         if self.redundant:
             self.with_factors["least"] = self.solution.least
         self._parts: dict[str, Callable[..., Value]] = {"factors": self._factors}
-        self._parts |= {name: self._at_position(outputs) for name, outputs in self.at_position.items()}
-        self._parts |= {name: self._with_factors(outputs) for name, outputs in self.with_factors.items()}
+        for name, outputs in self.at_position.items():
+            self._parts[name] = partial(self._part, equations.graph, outputs, self.solution.known)
+        for name, outputs in self.with_factors.items():
+            self._parts[name] = partial(self._part, self.solution.graph, outputs, None)
 
     def described(self) -> Iterable[Any]:
         """What the functions depend on, the values of numbers apart."""
@@ -78,25 +82,32 @@ class PartsCode:
 
     # the parts
 
-    def _call(self, emit: Emitter, name: str, arguments: Sequence[Value]) -> Value:
-        """Whether what a part computes holds; it is written when it is first called."""
-        module, full_name = emit.builder.module, f"{name}_{emit.suffix}"
-        if not module.defines(full_name):
-            builder = module.function(full_name, emit.bit, [value.type for value in arguments], internal=True)
-            builder.ret(self._parts[name](emit.like(builder), *builder.arguments))
-        return emit.builder.call(full_name, emit.bit, arguments)
+    def _call(self, emit: Emitter, *calls: tuple[str, Sequence[Value]]) -> Value:
+        """Whether what parts compute holds; they are written when they are first called."""
+        module, holds = emit.builder.module, None
+        for part, arguments in calls:
+            name = f"{part}_{emit.suffix}"
+            if not module.defines(name):
+                builder = module.function(name, emit.bit, [value.type for value in arguments], internal=True)
+                builder.ret(self._parts[part](emit.like(builder), *builder.arguments))
+            found = emit.builder.call(name, emit.bit, arguments)
+            holds = found if holds is None else emit.builder.both(holds, found)
+        assert holds is not None
+        return holds
 
-    def _written(self, emit: Emitter, arguments: Sequence[Value], places: Mapping[int, Place] = NOWHERE) -> Written:
-        """For code at t, q, v, of which numbers are the next argument."""
+    def _written(self, emit: Emitter, graph: Graph, arguments: Sequence[Value], places: Mapping[int, Place]) -> Written:
+        """For code of three inputs of a graph, which are given first, and then the numbers that it reads."""
+        *given, emit.numbers = arguments[:4]
+        if width_of(emit.double) > 1:
+            emit.constants = emit.numbers  # type: ignore[attr-defined]
         written = Written(emit, self.numbers, places)
-        _read(emit, arguments[3])
-        written.take(self.equations.graph, arguments[:3])
+        written.take(graph, given)
         return written
 
     def _factors(self, emit: Emitter, *arguments: Value) -> Value:
         """Whether the conditions hold; what is kept is stored when it is found."""
         graph, solution, kept = self.equations.graph, self.solution, arguments[4]
-        written = self._written(emit, arguments)
+        written = self._written(emit, graph, arguments, {})
         places = {i: (kept, place) for i, place in solution.known.items()}
         for i, place in places.items():
             if graph.operations[i] is None:  # an entry is t or a coordinate
@@ -104,26 +115,17 @@ class PartsCode:
         written.write(graph, graph.in_order_of_use(solution.kept.forms), places)
         return conditions_hold(emit, written, solution.kept, [])
 
-    def _at_position(self, outputs: Outputs) -> Callable[..., Value]:
-        def emit_part(emit: Emitter, *arguments: Value) -> Value:
-            known, kept = self.solution.known, arguments[4]
-            written = self._written(emit, arguments, {i: (kept, place) for i, place in known.items()})
-            results = written.results(self.equations.graph, outputs)
-            _store(emit, results, arguments[5:])
-            return conditions_hold(emit, written, outputs, results[0])
-
-        return emit_part
-
-    def _with_factors(self, outputs: Outputs) -> Callable[..., Value]:
-        def emit_part(emit: Emitter, r: Value, c: Value, kept: Value, numbers: Value, *out: Value) -> Value:
-            _read(emit, numbers)
-            written = Written(emit, self.numbers)
-            written.take(self.solution.graph, [r, c, kept])
-            results = written.results(self.solution.graph, outputs)
-            _store(emit, results, out)
-            return conditions_hold(emit, written, outputs, results[0])
-
-        return emit_part
+    def _part(
+        self, graph: Graph, outputs: Outputs, known: Mapping[int, int] | None, emit: Emitter, *arguments: Value
+    ) -> Value:
+        """Whether outputs hold; they are stored. `known`: what is kept, and where, which is then the fifth argument."""
+        places = {} if known is None else {i: (arguments[4], place) for i, place in known.items()}
+        written = self._written(emit, graph, arguments, places)
+        results = written.results(graph, outputs)
+        for array, values in zip(arguments[-len(results) :], results, strict=True):
+            for j, value in enumerate(values):
+                emit.store(value, array, j)
+        return conditions_hold(emit, written, outputs, results[0])
 
     # what kernels call, and code in lanes
 
@@ -131,16 +133,14 @@ class PartsCode:
         """Accelerations."""
         kept, r, c, lam = self._rooms(emit)
         at = [t, q, v, numbers, kept]
-        holds = self._call(emit, "factors", at)
-        holds = _both(emit, holds, self._call(emit, "right", [*at, r, c]))
-        return _both(emit, holds, self._call(emit, "solution", [r, c, kept, numbers, a, lam]))
+        return self._call(emit, ("factors", at), ("right", [*at, r, c]), ("solution", [r, c, kept, numbers, a, lam]))
 
     def closer(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, moved: Value, out: Value) -> Value:
         """Positions moved towards the constraints."""
         kept, r, c, lam = self._rooms(emit)
         at = [t, q, v, numbers, kept]
         _clear(emit, self.n, r)
-        holds = self._correct(emit, self._call(emit, "factors", at), "off", at, r, c, moved, lam)
+        holds = self._call(emit, ("factors", at), ("off", [*at, c]), ("solution", [r, c, kept, numbers, moved, lam]))
         _leave_unless(emit, holds)
         _sum(emit, self.n, q, moved, out)
         return holds
@@ -158,19 +158,25 @@ class PartsCode:
         new_v: Value,
         lam: Value,
     ) -> Value:
-        """The same, and velocities, accelerations and multipliers."""
+        """The same, and velocities, accelerations and multipliers; moves are in the metric of M."""
         kept, r, c, change = self._rooms(emit)
-        (u,) = _rooms(emit, self.n)
-        at = [t, q, v, numbers, kept]
+        u, at = self._room(emit, self.n), [t, q, v, numbers, kept]
         _clear(emit, self.n, r)
-        holds = self._correct(emit, self._call(emit, "factors", at), "off", at, r, c, moved, lam)
-        holds = self._correct(emit, holds, "faster", at, r, c, change, lam)
+        moves = self._call(
+            emit,
+            ("factors", at),
+            *(("off", [*at, c]), ("solution", [r, c, kept, numbers, moved, lam])),
+            *(("faster", [*at, c]), ("solution", [r, c, kept, numbers, change, lam])),
+        )
         _sum(emit, self.n, v, change, u)
-        holds = _both(emit, holds, self._call(emit, "right", [t, q, u, numbers, kept, r, c]))
-        solution = [r, c, kept, numbers, a, c if self.redundant else lam]
-        holds = _both(emit, holds, self._call(emit, "solution", solution))
-        if self.redundant:
-            holds = _both(emit, holds, self._call(emit, "least", [c, c, kept, numbers, lam]))
+        of_rows = c if self.redundant else lam
+        holds = self._call(
+            emit,
+            ("right", [t, q, u, numbers, kept, r, c]),
+            ("solution", [r, c, kept, numbers, a, of_rows]),
+            *([("least", [c, c, kept, numbers, lam])] if self.redundant else []),
+        )
+        holds = emit.builder.both(moves, holds)
         _leave_unless(emit, holds)
         _sum(emit, self.n, q, moved, new_q)
         _sum(emit, self.n, v, change, new_v)
@@ -178,41 +184,17 @@ class PartsCode:
 
     def _rooms(self, emit: Emitter) -> list[Value]:
         """For what is kept, r, c, and a solution."""
-        return _rooms(emit, self.solution.n_kept, self.n, self.n_rows, max(self.n, self.n_rows))
+        sizes = self.solution.n_kept, self.n, self.n_rows, max(self.n, self.n_rows)
+        return [self._room(emit, size) for size in sizes]
 
-    def _correct(
-        self, emit: Emitter, holds: Value, what: str, at: list[Value], r: Value, c: Value, out: Value, lam: Value
-    ) -> Value:
-        """The solution where r is zero, in the metric of M; the multipliers do not matter."""
-        holds = _both(emit, holds, self._call(emit, what, [*at, c]))
-        return _both(emit, holds, self._call(emit, "solution", [r, c, at[-1], at[-2], out, lam]))
-
-
-def _read(emit: Emitter, numbers: Value) -> None:
-    """Say where numbers stand, which lanes have in common."""
-    emit.numbers = numbers
-    if width_of(emit.double) > 1:
-        emit.constants = numbers  # type: ignore[attr-defined]
-
-
-def _rooms(emit: Emitter, *sizes: int) -> list[Value]:
-    return [emit.builder.room(DOUBLE, size * width_of(emit.double)) for size in sizes]
-
-
-def _both(emit: Emitter, one: Value, other: Value) -> Value:
-    return emit.builder.both(one, other)
+    def _room(self, emit: Emitter, size: int) -> Value:
+        return emit.builder.room(DOUBLE, size * width_of(emit.double))
 
 
 def _leave_unless(emit: Emitter, holds: Value) -> None:
     """Change nothing that is given where it does not hold; in lanes, others may hold."""
     if holds.type == BIT:
         emit.builder.leave_unless(holds)
-
-
-def _store(emit: Emitter, arrays: Sequence[Sequence[Value]], out: Sequence[Value]) -> None:
-    for place, values in zip(out, arrays, strict=True):
-        for j, value in enumerate(values):
-            emit.store(value, place, j)
 
 
 def _clear(emit: Emitter, n: int, out: Value) -> None:

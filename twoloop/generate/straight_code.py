@@ -37,7 +37,6 @@ from twoloop.generate.tracing import Graph, Untraceable
 from twoloop.generate.written import Written, conditions_hold
 from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.own_functions import own_functions
-from twoloop.kernels.compile.private import Dispatcher
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -105,13 +104,6 @@ class SharedCode:
         """The code, and what it reads for one of the systems."""
         return OwnCode(self, evaluate(self.numbers.formulas), self.equations.traced.of(system, evaluate), evaluate)
 
-    @property
-    def inner(self) -> Dispatcher:
-        """The inner loop that calls them."""
-        from twoloop.kernels.evaluation import own_inner
-
-        return own_inner.own_inner_loop
-
     def _outputs(self) -> dict[str, Outputs]:
         """What functions compute that are no parts of others."""
         equations = self.equations
@@ -120,17 +112,10 @@ class SharedCode:
             outputs |= {"own_closer": equations.closer, "own_nearer": equations.nearer}
         return outputs
 
-    @property
-    def _accelerations(self) -> list[Outputs]:
-        """What `own_there` computes."""
-        if self.parts is None:
-            return self.equations.accelerations
-        return [] if self.equations.quick is None else [self.equations.quick]
-
     def _described(self) -> Iterable[Any]:
         equations, parts, numbers = self.equations, self.parts, self.numbers
         yield equations.system.n_q, equations.choice.rows, equations.choice.added
-        for outputs in (*self.outputs.values(), *self._accelerations):
+        for outputs in (*self.outputs.values(), *equations.accelerations[: None if parts is None else -1]):
             yield outputs.sizes, list(numbers.structure(equations.graph, outputs.forms))
         if parts is not None:
             yield from parts.described()

@@ -16,7 +16,10 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 Compiled = bool | Literal["auto"]
 
-SMALL = 300  # operations of the series of its motion: the code takes at most 0.6 s to build
+# operations of the series of its motion, which no position decides: code of mechanisms with 230 to 280 takes 0.6 s to
+# build, two thirds of it by LLVM; with 370 to 690 it takes 0.7 to 1.9 s (Bricard 1.6, governor 1.9, by whose stiff
+# motion code loses a tenth)
+SMALL = 300
 
 
 def check_compiled(value: Compiled) -> Compiled:
@@ -87,13 +90,11 @@ def _refuse(method: Method, fixed: bool) -> None:
 
 def is_small(system: ConstrainedSystem) -> bool:
     """Whether its callbacks are compiled, can be traced, and make few operations."""
-    return not system.called_in_python and bool(system.remembered("small", lambda: _is_small(system)))
 
+    def look() -> bool:
+        try:
+            return is_quick(system) and series_for(system).n_operations <= SMALL
+        except Untraceable:
+            return False
 
-def _is_small(system: ConstrainedSystem) -> bool:
-    if not is_quick(system):
-        return False
-    try:
-        return series_for(system).n_operations <= SMALL
-    except Untraceable:
-        return False
+    return not system.called_in_python and bool(system.remembered("small", look))

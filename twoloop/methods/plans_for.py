@@ -56,6 +56,8 @@ def _made(
 
 
 def _with_code(plan: Plan, code: OwnCode) -> Plan:
+    from twoloop.kernels.evaluation.own_inner import own_inner_loop
+
     substitute = None if plan.substitute is None else _with_code(plan.substitute, code)
     own = code.shared.functions, *plan.own
-    return plan.changed(inner=code.shared.inner, own=own, numbers=code.numbers, substitute=substitute)
+    return plan.changed(inner=own_inner_loop, own=own, numbers=code.numbers, substitute=substitute)
