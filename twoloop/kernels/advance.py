@@ -7,7 +7,7 @@ import numpy as np
 
 from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control import clock as at
-from twoloop.kernels.control.controller import EXPONENT, FACTOR_MIN, SAFETY, UNFORESEEN, factor_of, remember
+from twoloop.kernels.control.controller import EXPONENT, FACTOR_MIN, SAFETY, factor_of, remember
 from twoloop.kernels.control.landing import NEAR, off_grid, on_grid
 from twoloop.kernels.control.progress import count_step
 from twoloop.kernels.control.singular import (
@@ -50,6 +50,7 @@ from twoloop.kernels.evaluation.calls import (
 from twoloop.kernels.evaluation.kinks import JUMP, RAMP, SMOOTH, find_kink, unexplained
 from twoloop.kernels.evaluation.partition import CHANGED
 
+UNFORESEEN = 10.0  # an error that is so large was not foreseen: the force jumps, or bends, within the step
 REFUSED = 0.95  # of a refused step is what the next one is at most
 FIRST_JUDGED = 2  # accepted step after which a provisional method may give way: the first one may be a guess
 

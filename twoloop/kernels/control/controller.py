@@ -6,7 +6,6 @@ accepted step.
 
 from twoloop.kernels.data.common import SETTLE, compiled, kernel, merged
 
-UNFORESEEN = 10.0  # an error that is so large was not foreseen: the force jumps, or bends, within the step
 KEPT = 1.2  # with the trend, a factor from 1 to this leaves the step as it is: new factors of Newton's matrix cost
 
 # places in a rule: the factor is SAFETY error**-EXPONENT within FACTOR_MIN and FACTOR_MAX; LEAST_ERROR is what a

@@ -13,7 +13,6 @@ import math
 
 from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control import clock as at
-from twoloop.kernels.control.controller import UNFORESEEN
 from twoloop.kernels.control.landing import off_grid
 from twoloop.kernels.control.predictor import departure, keep_predicted
 from twoloop.kernels.control.progress import count_step
@@ -40,13 +39,13 @@ THETA, N_ITERATED, N_ROWS, FREE, N_OPTIONS = range(5)
 
 WANTED_START = 0.12  # contraction of the first step, see collocation_code.py
 MOST_STARTS = 4
-SHORTER, SAFETY = 0.6, 0.65
+SHORTER, SAFETY = 0.6, 0.75
 LIMITED, STRAIGHT = 24.0, 0.1  # such steps, after which another method goes on; what the iteration leaves of CURVED
 REFUSALS = 12.0  # of UNMADE, which each accepted step lessens by 1 and each that did not converge raises by 2
 BETWEEN = 0.0908  # of a step, the longest part that an audit leaves unseen: half that between two nodes
 EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
 GROWTH_AT_ONCE = 30.0  # after a step at the beginning that needed a single sweep
-LEAST_TREND, FAR = 0.5, 3.0
+LEAST_TREND, FAR = 0.4, 3.0
 _places = merged(places)
 
 
@@ -110,7 +109,7 @@ def _collocate(f, w, options, room, tolerances, t, h, state):
         of_defect = 0.9 * room[room_at.FACTOR_OF_DEFECT]
         if defect > 1.0:
             _keep_refused(f, room, state)
-            return REFUSED, min(defect, UNFORESEEN), max(0.3, of_defect)
+            return REFUSED, defect, max(0.3, of_defect)
         room[room_at.DEFECT] = defect
         most = min(most, of_defect)
     most = min(most, longest / h)
@@ -257,19 +256,12 @@ def _make(f, w, options, room, tolerances, control, clock, goal, state, n_most, 
         h, reaches = off_grid(control, t, wanted, goal - t, False)
         if reaches:
             h = goal - t
-        ended, error, factor = _collocate(f, w, options, room, tolerances, t, h, state)
+        ended, _, factor = _collocate(f, w, options, room, tolerances, t, h, state)
         if ended == LEFT:
             break
-        if ended == MADE and t < clock[at.ROUGH_TO] and control[at.ROUGH] > 1.0:
-            rooted = room[room_at.FACTOR_OF_ERROR] * control[at.ROUGH] ** (-1.0 / room_at.ORDER)
-            factor = min(factor, SAFETY * rooted)
-            if error * control[at.ROUGH] > 1.0:
-                ended, factor = REFUSED, min(max(0.9 * rooted, 0.3), 0.9)
         if ended != MADE:
             clock[at.H_NEXT] = h * factor
             w.counters[N_REJECTED_ERROR] += 1 if ended == REFUSED else 0
-            if ended == REFUSED and error > UNFORESEEN:
-                clock[at.ROUGH_TO] = t + h
             continue
         f.end_nodes(room, state, state)
         _accept(room)
