@@ -17,9 +17,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.generate import lane_emitter, llvm_code, lobatto_tables
+from twoloop.generate import lane_emitter, lane_memory, llvm_code, lobatto_tables
 from twoloop.generate.accelerations import call_accelerations
 from twoloop.generate.lane_emitter import LaneEmitter
+from twoloop.generate.lane_memory import column, load_lanes, over, place_of, store_lanes, two_sums
 from twoloop.generate.llvm_code import Emitter
 from twoloop.generate.llvm_text import BIT, DOUBLE, INTEGER, NOTHING, Module, Value, constant, constants, integer
 from twoloop.generate.lobatto_tables import tables
@@ -33,7 +34,7 @@ from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL
 
 Array = NDArray[np.float64]
-LONGEST = 8000  # operations of a projection
+LONGEST = 5000  # operations of the equations: code of as many takes 2 s to compile
 SMALLEST = 1e-300  # in place of a coefficient of zero
 FAILED = -1.0  # what an audit gives in place of a defect where accelerations cannot be had
 INFINITE = float("inf")
@@ -57,7 +58,7 @@ ALLOWED = 16.0  # the defect between nodes, over the tolerances: most of it does
 
 def suits(own: SharedCode) -> bool:
     """Whether the code of a mechanism takes no longer than some seconds to compile."""
-    return len(own.equations.nearer.quantities(own.equations.graph)) <= LONGEST
+    return own.equations.n_operations <= LONGEST
 
 
 class CollocationCode:
@@ -128,7 +129,7 @@ class CollocationCode:
 
             def put(coordinates: list[int]) -> None:
                 for i, value in zip(coordinates, written.forms(graph, [forms[i] for i in coordinates]), strict=True):
-                    _put(emit, value, room, self.a + LANES * i)
+                    store_lanes(emit, value, room, self.a + LANES * i)
 
             def finish() -> Value:
                 put(self.others)
@@ -149,7 +150,7 @@ class CollocationCode:
             with self._leaving(emit, builder.compare("fcmp ogt", left, llvm_code.ZERO)):
                 one.store(one.subtract(left, llvm_code.ONE), room, at.CAREFUL)
                 builder.ret(careful())
-        self._prepare(emit, room, state, tolerances)
+        self._call(emit, "begin_nodes", self._begin, [room, state, tolerances])
         return self._iterate(emit, room, state, tolerances, quick, otherwise)
 
     def _careful(self, emit: LaneEmitter, kinds: list[str]) -> str:
@@ -159,7 +160,7 @@ class CollocationCode:
             builder = module.function(name, DOUBLE, kinds, internal=True)
             inner, (room, state, tolerances, numbers) = emit.like(builder), builder.arguments
             inner.numbers = inner.constants = numbers
-            self._prepare(inner, room, state, tolerances)
+            self._call(inner, "begin_nodes", self._begin, [room, state, tolerances])
             mass_first, given_up = self._called(inner, room, -1), constant(DOUBLE, float(at.LEFT))
             builder.ret(self._iterate(inner, room, state, tolerances, mass_first, lambda: given_up))
         return name
@@ -176,7 +177,7 @@ class CollocationCode:
 
     def _accelerations(self, emit: LaneEmitter, room: Value) -> list[Value]:
         """What is in memory: what else is done with a number after a loop has to wait on the stack in each turn."""
-        return [_get(emit, room, self.a + LANES * i) for i in range(self.n)]
+        return [load_lanes(emit, room, self.a + LANES * i) for i in range(self.n)]
 
     @contextmanager
     def _leaving(self, emit: LaneEmitter, condition: Value) -> Iterator[None]:
@@ -187,10 +188,6 @@ class CollocationCode:
         builder.position_at_end(leave)
         yield
         builder.position_at_end(go_on)
-
-    def _prepare(self, emit: LaneEmitter, *arguments: Value) -> None:
-        """Call the function that begins a step."""
-        self._call(emit, "begin_nodes", self._begin, arguments)
 
     def _call(self, emit: LaneEmitter, name: str, write: Callable[..., None], arguments: Sequence[Value]) -> None:
         """Call a function of the module, which `write` writes, for those that share it."""
@@ -235,7 +232,7 @@ class CollocationCode:
             one.store(one.divide(of_all, of_iterated), room, at.STRICTER)
             one.store(size, room, at.SIZE)
         powers = self._powers(emit, one.divide(h, one.load(room, at.H_BEFORE)))
-        _put(emit, powers, room, at.POWERS)
+        store_lanes(emit, powers, room, at.POWERS)
         degree = emit.splat(one.load(room, at.DEGREE))
         known = constants([float(k) for k in range(LANES)])
         kept = builder.select(builder.compare("fcmp olt", known, degree), powers, emit.constant(0.0))
@@ -244,9 +241,9 @@ class CollocationCode:
         # integrals of the polynomial from the beginning to the nodes: rows belong to its powers, from 0 on
         velocities = np.array([nodes ** (k + 1) / (k + 1) for k in range(LANES + 1)])
         positions = np.array([nodes ** (k + 2) / ((k + 1) * (k + 2)) for k in range(LANES + 1)])
-        with _over(emit, self.iterated) as (k, i, _, _):
-            scaled = emit.multiply(_get(emit, one.pointer(old, _lanes(emit, k))), kept)
-            _put(emit, scaled, room, at.SCALED)
+        with over(emit, self.iterated) as (k, i, _, _):
+            scaled = emit.multiply(load_lanes(emit, one.pointer(old, place_of(emit, k))), kept)
+            store_lanes(emit, scaled, room, at.SCALED)
             terms = [one.load(one.pointer(state, i), 2 * n), *(one.load(room, at.SCALED + j) for j in range(LANES))]
             self._put_stages(
                 emit, room, state, k, i, [self._sums(emit, each, terms) for each in (velocities, positions)]
@@ -312,7 +309,7 @@ class CollocationCode:
             phi.add_incoming(value, before)
         q, v = [emit.constant(0.0)] * n, [emit.constant(0.0)] * n
         for k, i in enumerate(self.iterated):
-            q[i], v[i] = _get(emit, room, self.q + LANES * k), _get(emit, room, self.v + LANES * k)
+            q[i], v[i] = load_lanes(emit, room, self.q + LANES * k), load_lanes(emit, room, self.v + LANES * k)
         finish = evaluate([times, *q, *v])
         change = one.multiply(stricter, self._integrate(emit, room, state))
         m = one.add(sweeps, llvm_code.ONE)
@@ -377,13 +374,13 @@ class CollocationCode:
             a0 = one.load(one.pointer(state, i), 2 * n)
             values = emit.function("fabs", self._combined(emit, tables().spectrum, a0, room, i))
             pairs = emit.larger(values, builder.shuffle(values, values, [1, 0, 3, 2, 5, 4, 7, 6]))
-            _put(emit, pairs, one.pointer(room, _lanes(emit, i)), self.spectra)
+            store_lanes(emit, pairs, one.pointer(room, place_of(emit, i)), self.spectra)
         several, starts = self._several(emit)
         error = curved = several.constant(0.0)
         least = several.constant(SMALLEST)
         for start in starts:
-            vectors = [_get(emit, room, self.spectra + LANES * (start + k)) for k in range(several.lanes)]
-            first, before, top = (_column(emit, vectors, lane) for lane in (2, 4, 6))
+            vectors = [load_lanes(emit, room, self.spectra + LANES * (start + k)) for k in range(several.lanes)]
+            first, before, top = (column(emit, vectors, lane) for lane in (2, 4, 6))
             weight = several.load(one.pointer(room, at.WEIGHTS + start))
             of_last = several.larger(several.larger(before, top), least)
             falls = several.divide(top, of_last)
@@ -441,9 +438,9 @@ class CollocationCode:
     def retry(self, emit: LaneEmitter, room: Value, state: Value) -> None:
         """Let the polynomial of a step that was refused predict the shorter one in its place."""
         one, old = Emitter(emit.builder), self._polynomial(emit, room, other=False)
-        with _over(emit, self.iterated) as (k, i, _, _):
+        with over(emit, self.iterated) as (k, i, _, _):
             a0 = one.load(one.pointer(state, i), 2 * self.n)
-            _put(emit, self._combined(emit, tables().begin, a0, room, i), one.pointer(old, _lanes(emit, k)))
+            store_lanes(emit, self._combined(emit, tables().begin, a0, room, i), one.pointer(old, place_of(emit, k)))
 
     def end(self, emit: LaneEmitter, room: Value, state: Value, new_state: Value) -> None:
         """[q, v, a] at the end of the step, and the polynomial that predicts the next, with the degree it is to have.
@@ -452,31 +449,34 @@ class CollocationCode:
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
         last, h = LANES - 1, one.load(room, at.H)
-        powers, new = _get(emit, room, at.POWERS), self._polynomial(emit, room, other=True)
+        powers, new = load_lanes(emit, room, at.POWERS), self._polynomial(emit, room, other=True)
         old, zero = self._polynomial(emit, room, other=False), emit.constant(0.0)
-        with _over(emit, self.iterated, [zero]) as (k, i, (worst,), carried):
-            place = one.pointer(room, _lanes(emit, k))
+        with over(emit, self.iterated, [zero]) as (k, i, (worst,), carried):
+            place = one.pointer(room, place_of(emit, k))
             here = one.pointer(new_state, i)
-            a0, a1 = one.load(one.pointer(state, i), 2 * n), one.load(one.pointer(room, _lanes(emit, i)), self.a + last)
+            a0, a1 = (
+                one.load(one.pointer(state, i), 2 * n),
+                one.load(one.pointer(room, place_of(emit, i)), self.a + last),
+            )
             for value, begin in ((one.load(place, self.q + last), 0), (one.load(place, self.v + last), n), (a1, 2 * n)):
                 one.store(value, here, begin)
-            sums = emit.multiply(_get(emit, one.pointer(old, _lanes(emit, k))), powers)
+            sums = emit.multiply(load_lanes(emit, one.pointer(old, place_of(emit, k))), powers)
             for distance in (1, 2, 4):  # of all terms up to each degree
                 shifted = [LANES + k if k < distance else k - distance for k in range(LANES)]
                 sums = emit.add(sums, builder.shuffle(sums, zero, shifted))
             off = emit.add(sums, emit.splat(one.subtract(a0, a1)))
             weight = emit.splat(one.load(one.pointer(room, i), at.WEIGHTS))
             carried.append(emit.larger(emit.multiply(emit.function("fabs", off), weight), worst))
-            _put(emit, self._combined(emit, tables().end, a0, room, i), one.pointer(new, _lanes(emit, k)))
+            store_lanes(emit, self._combined(emit, tables().end, a0, room, i), one.pointer(new, place_of(emit, k)))
         self._choose_degree(emit, room, carried[0])
         if self.others:
             ends = [constants(table[1:, last]) for table in (tables().velocities, tables().positions)]
             of_first = [constant(DOUBLE, table[0, last]) for table in (tables().velocities, tables().positions)]
-            with _over(emit, self.others) as (_, i, _, _):
+            with over(emit, self.others) as (_, i, _, _):
                 first, here = one.pointer(state, i), one.pointer(new_state, i)
-                a = _get(emit, one.pointer(room, _lanes(emit, i)), self.a)
+                a = load_lanes(emit, one.pointer(room, place_of(emit, i)), self.a)
                 q, v, a0 = (one.load(first, m * n) for m in range(3))
-                of_v, of_q = _two_sums(emit, *(emit.multiply(a, end) for end in ends))
+                of_v, of_q = two_sums(emit, *(emit.multiply(a, end) for end in ends))
                 of_v, of_q = (one.fused(factor, a0, each) for factor, each in zip(of_first, (of_v, of_q), strict=True))
                 further = one.multiply(h, one.fused(h, of_q, v))
                 one.store(one.add(q, further), here, 0)
@@ -515,13 +515,13 @@ class CollocationCode:
 
     def _project(self, emit: LaneEmitter, room: Value, numbers: Value, outputs: Outputs) -> None:
         emit.numbers = emit.constants = numbers
-        inputs = [_get(emit, room, self.ends + LANES * k) for k in range(1 + 2 * self.n)]
+        inputs = [load_lanes(emit, room, self.ends + LANES * k) for k in range(1 + 2 * self.n)]
         written, arrays = results_of(emit, self.equations.graph, outputs, inputs, self.numbers)
         values = dict(zip(outputs.arrays, arrays, strict=True))
         holds = conditions_hold(emit, written, outputs, [value for array in arrays for value in array])
         for name, place in self._places_of_ends().items():
             for k, value in enumerate(values.get(name, [])):
-                _put(emit, value, room, place + LANES * k)
+                store_lanes(emit, value, room, place + LANES * k)
         self._keep_moved(emit, room, values["moved"], holds)
 
     def _project_in_parts(
@@ -530,9 +530,9 @@ class CollocationCode:
         """The same by a function of parts_code.py, which fills arrays of these names."""
         one, moved = Emitter(emit.builder), emit.builder.room(DOUBLE, LANES * self.n)
         places = {name: one.pointer(room, place) for name, place in self._places_of_ends().items()} | {"moved": moved}
-        state = _get(emit, room, self.ends), places["q"], places["v"]
+        state = load_lanes(emit, room, self.ends), places["q"], places["v"]
         holds = write(emit, *state, numbers, *(places[name] for name in names))
-        self._keep_moved(emit, room, [_get(emit, moved, LANES * k) for k in range(self.n)], holds)
+        self._keep_moved(emit, room, [load_lanes(emit, moved, LANES * k) for k in range(self.n)], holds)
 
     def _places_of_ends(self) -> dict[str, int]:
         return {"q": self.ends + LANES, "v": self.ends + LANES * (1 + self.n), "a": self.end_a, "lam": self.lam}
@@ -541,15 +541,15 @@ class CollocationCode:
         moved = emit.constant(0.0)
         for value in values:
             moved = emit.larger(emit.function("fabs", value), moved)
-        _put(emit, moved, room, at.MOVED)
-        before = _get(emit, room, at.FINE)
-        _put(emit, emit.builder.select(holds, before, emit.constant(0.0)), room, at.FINE)
+        store_lanes(emit, moved, room, at.MOVED)
+        before = load_lanes(emit, room, at.FINE)
+        store_lanes(emit, emit.builder.select(holds, before, emit.constant(0.0)), room, at.FINE)
 
     def _integrate(self, emit: LaneEmitter, room: Value, state: Value) -> Value:
         """Positions and velocities at the nodes from accelerations there; the largest change of a velocity."""
         one = Emitter(emit.builder)
-        with _over(emit, self.iterated, [emit.constant(0.0)]) as (k, i, (largest,), new):
-            before = _get(emit, one.pointer(room, _lanes(emit, k)), self.v)
+        with over(emit, self.iterated, [emit.constant(0.0)]) as (k, i, (largest,), new):
+            before = load_lanes(emit, one.pointer(room, place_of(emit, k)), self.v)
             terms = self._values(emit, one.load(one.pointer(state, i), 2 * self.n), room, i)
             sums = [self._sums(emit, table, terms) for table in (tables().velocities, tables().positions)]
             v = self._put_stages(emit, room, state, k, i, sums)
@@ -564,18 +564,18 @@ class CollocationCode:
         """Velocities and positions of coordinate i, the k-th that is iterated, at the nodes; and these velocities."""
         one = Emitter(emit.builder)
         h = emit.splat(one.load(room, at.H))
-        place, begin = one.pointer(room, _lanes(emit, k)), one.pointer(state, i)
+        place, begin = one.pointer(room, place_of(emit, k)), one.pointer(state, i)
         q0, v0 = (emit.splat(one.load(begin, m * self.n)) for m in range(2))
         v = emit.fused(h, sums[0], v0)
         inner = emit.fused(h, sums[1], emit.multiply(constants(tables().nodes), v0))
-        _put(emit, v, place, self.v)
-        _put(emit, emit.fused(h, inner, q0), place, self.q)
+        store_lanes(emit, v, place, self.v)
+        store_lanes(emit, emit.fused(h, inner, q0), place, self.q)
         return v
 
     def _values(self, emit: LaneEmitter, first: Value, room: Value, i: Value) -> list[Value]:
         """Values of coordinate i at all nodes; `first` is that at the beginning."""
         one = Emitter(emit.builder)
-        place = one.pointer(room, _lanes(emit, i))
+        place = one.pointer(room, place_of(emit, i))
         return [first, *(one.load(place, self.a + node) for node in range(LANES))]
 
     def _combined(self, emit: LaneEmitter, table: Array, first: Value, room: Value, i: Value) -> Value:
@@ -596,54 +596,6 @@ class CollocationCode:
         size = LANES * len(self.iterated)
         place = builder.select(second, integer(self.polynomials + size), integer(self.polynomials))
         return one.pointer(room, place)
-
-
-def _lanes(emit: LaneEmitter, k: Value) -> Value:
-    """The place of vector k."""
-    return emit.builder.mul(k, integer(LANES))
-
-
-def _get(emit: LaneEmitter, base: Value, place: int = 0) -> Value:
-    """A vector at a place, which is counted in numbers."""
-    return Emitter(emit.builder).load_vector(base, place, LANES)
-
-
-def _put(emit: LaneEmitter, value: Value, base: Value, place: int = 0) -> None:
-    Emitter(emit.builder).store_vector(value, base, place)
-
-
-def _two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
-    """The sums of the numbers of two vectors, which are added side by side."""
-    builder, half = emit.builder, LANES // 2
-    lower, upper = ([*range(k, k + half), *range(LANES + k, LANES + k + half)] for k in (0, half))
-    total = emit.add(builder.shuffle(a, b, lower), builder.shuffle(a, b, upper))
-    for distance in (2, 1):
-        total = emit.add(total, builder.shuffle(total, total, [k ^ distance for k in range(LANES)]))
-    return [builder.extract(total, k) for k in (0, half)]
-
-
-def _column(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value:
-    """One lane of each of some vectors, side by side."""
-    builder, places = emit.builder, [lane, LANES + lane]
-    if len(vectors) == 1:
-        return builder.extract(vectors[0], lane)
-    while len(vectors) > 1:
-        pairs = zip(vectors[::2], vectors[1::2], strict=True)
-        vectors = [builder.shuffle(*pair, places) for pair in pairs]
-        places = list(range(2 * len(places)))
-    return vectors[0]
-
-
-@contextmanager
-def _over(
-    emit: LaneEmitter, coordinates: Sequence[int], carried: Sequence[Value] = ()
-) -> Iterator[tuple[Value, Value, list[Any], list[Any]]]:
-    """A loop over some coordinates: how many there were before, which it is, and as of `Emitter.loop`."""
-    builder = emit.builder
-    table = None if list(coordinates) == list(range(len(coordinates))) else builder.module.table(coordinates)
-    with emit.loop(integer(0), integer(len(coordinates)), carried) as (k, values, new):
-        i = k if table is None else builder.convert("sext", builder.load(builder.gep(table, k), 4), INTEGER)
-        yield k, i, values, new
 
 
 class Collocation(NamedTuple):
@@ -689,4 +641,4 @@ def _compiled(own: SharedCode) -> Collocation:
 @cache
 def _stamp() -> str:
     """A digest of what writes the functions; what they share with those of the equations is in the key."""
-    return digest_of("", __file__, lane_emitter, lobatto_tables, at)
+    return digest_of("", __file__, lane_emitter, lane_memory, lobatto_tables, at)
