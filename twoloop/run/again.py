@@ -113,8 +113,8 @@ class Again:
         self.loading, self.spent = 0.0, np.inf  # CPU time of a step that a run came to, and of the last run, s
         self.kinds, self.between = np.empty(room, dtype=np.int64), Between(run)
         self.of_run = run.rank, run.redundant, bool(run.plan.own)
-        self.unusual = kin is not None or run.said_of_rows != ""  # what is not known at its start alone
-        self.dependent = {self.known.start_rows.tobytes(): (run.redundant, run.said_of_rows)}  # by the rows that count
+        self.counted = self.known.start_rows.tobytes()  # the rows that count, to which `of_run` belongs
+        self.dependent = {self.counted: (run.redundant, run.said_of_rows)}
 
     @staticmethod
     def suits(run: Run) -> bool:
@@ -163,7 +163,8 @@ class Again:
         began = clock()
         try:
             n = self._go(*arrays, False)
-            if n < 0 or self.unusual or output is not STEPS:
+            others = run.said_of_rows != "" and known.start_rows.tobytes() != self.counted
+            if n < 0 or others or output is not STEPS or self.movable is not None:
                 interrupts.listen()
                 if n == loops.IN_DOUBT and self.look.is_surely(0, t0, q0, v0):
                     n = self._go(*arrays, True)
@@ -262,7 +263,7 @@ class Again:
                     return False
                 self.dependent[counted] = there.redundant, there.said_of_rows
             redundant, run.said_of_rows = self.dependent[counted]
-            self.of_run = run.rank, redundant, bool(self.plan.own)
+            self.of_run, self.counted = (run.rank, redundant, bool(self.plan.own)), counted
         return self.movable is None or self.movable.agrees(run.t0, q0, v0, t1, self.look.mass, self.check_derivatives)
 
     def _forget_chunks(self) -> None:
