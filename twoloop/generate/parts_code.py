@@ -25,11 +25,6 @@ from twoloop.generate.written import Place, Written, conditions_hold
 LONG, LONG_OF_ALL = 200, 500
 
 
-def is_long(equations: StraightLine) -> bool:
-    """Whether equations are worth their calls."""
-    return equations.n_operations > (LONG_OF_ALL if equations.quick is None else LONG)
-
-
 class PartsCode:
     """Writes the parts, and the functions of which they are parts.
 

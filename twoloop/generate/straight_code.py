@@ -30,7 +30,7 @@ from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.families import Evaluator, Family, of_family
 from twoloop.generate.llvm_code import Emitter
 from twoloop.generate.llvm_text import Module, Value
-from twoloop.generate.parts_code import PartsCode
+from twoloop.generate.parts_code import LONG, LONG_OF_ALL, PartsCode
 from twoloop.generate.straight_line import Outputs, StraightLine
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.generate.tracing import Graph, Untraceable
@@ -92,7 +92,7 @@ class SharedCode:
 
     def __init__(self, equations: StraightLine, family: Family):
         self.equations, self.family, self.numbers, self.parts = equations, family, Coefficients(), None
-        if parts_code.is_long(equations):
+        if equations.n_operations > (LONG_OF_ALL if equations.quick is None else LONG):
             self.parts = PartsCode(equations, self.numbers)
         self.outputs = self._outputs()
         structure = repr(list(self._described()))
