@@ -135,7 +135,7 @@ def solve_dae(
     Notes
     -----
     *Method.* "auto" is explicit, with Newton's method while the problem is found to be stiff, see `Auto`. Near a
-    position where the constraints lose rank, any method may take explicit steps across it.
+    position where the constraints lose rank, any method may take steps by collocation across it.
 
     *Constraints.* Rows that depend on others at the start are left out and checked at every step; a
     `ConstraintWarning` names them.

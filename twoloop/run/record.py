@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from twoloop.problem.description import Description
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.dense_solution import DenseSolution
-from twoloop.run.kept import OF_STEPS
 
 Array = NDArray[np.float64]
 AnyRecord = TypeVar("AnyRecord", bound="Record")
@@ -241,7 +240,5 @@ class _Deferred:
 
 
 DEFAULTS = {each.name: each.default for each in fields(Record) if each.default is not MISSING}
-
-NOT_OF_STATES = ("stats", *OF_STEPS, "rank", "redundant", "defect", "widest_gap", "compiled")  # but of the run
 for _field in fields(Record):  # behind the decorator, which would take it for a default
     setattr(Record, _field.name, _Deferred(_field.name))
