@@ -140,7 +140,7 @@ def test_the_rows_that_are_shipped(tmp_path):
     assert all(each["version"] not in ("", "unknown") for each in rows)
     ready = {name for name in mechanisms.__all__ if inspect.isfunction(getattr(mechanisms, name))}
     assert len(ready & {each["mechanism"] for each in rows}) >= 18
-    assert all(each["t_end"] == 100 for each in select_rows(rows, "four_bar", 100.0))
+    assert all(each["t_end"] == 10 for each in select_rows(rows, "four_bar", 10.0))
     here, *others = boards(select_rows(rows, "four_bar", 10.0), 1e-6)
     assert not others and len(here.entries) > 20 and here.measure == "error_end"
 
