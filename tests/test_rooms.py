@@ -1,4 +1,4 @@
-"""The rooms of twoloop: imports go one way, no module has the name of another, nothing is flat but the calls."""
+"""The rooms of twoloop: imports go one way."""
 
 import importlib.util
 import sys

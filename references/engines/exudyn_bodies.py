@@ -30,11 +30,11 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
     planar = rigid.planar and all(joint.kind != "prismatic" for joint in rigid.model.joints)
     problem = rigid.given if planar else rigid.model.problem((0.0, 1.0))
     dependent = bool(rigid.given.freedom.redundant)
-    x, R, v, w = (each[None] for each in (rigid.x, rigid.R, rigid.v, rigid.w))
+    x, R, v, w = (array[None] for array in (rigid.x, rigid.R, rigid.v, rigid.w))
     start = parts.coordinates(Motion(np.zeros(1), x, R, v, w, NOT_REPORTED[None], 0.0, 0.0), planar)
 
     def build() -> Any:
-        return _model(rigid, planar, *(each[:, 0].reshape(len(rigid.x), -1) for each in start))
+        return _model(rigid, planar, *(array[:, 0].reshape(len(rigid.x), -1) for array in start))
 
     def run(t_end: float, n_steps: int, n_stored: int) -> Motion:
         began = time.process_time()

@@ -54,8 +54,8 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
         began = time.process_time()
         h, data = t_end / n_steps, model.createData()
         datas = pin.StdVec_RigidConstraintData()
-        for each in constraints:
-            datas.append(each.createData())
+        for item in constraints:
+            datas.append(item.createData())
         pin.initConstraintDynamics(model, data, constraints, datas)
         force = _force(pin, rigid, model, data, frames)
 
@@ -87,7 +87,7 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
                 joint, origin = frames[k]
                 poses.append(data.oMi[joint] * origin)
                 twists.append(origin.actInv(data.v[joint]))
-            x, R = np.array([each.translation for each in poses]), np.array([each.rotation for each in poses])
+            x, R = np.array([item.translation for item in poses]), np.array([item.rotation for item in poses])
             speeds, spins = (
                 np.array([pose.rotation @ getattr(twist, part) for pose, twist in zip(poses, twists, strict=True)])
                 for part in ("linear", "angular")
@@ -96,14 +96,14 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
             if n_points:
                 acceleration(q, v)
                 turned = data.oMi[constraints[0].joint1_id].rotation @ constraints[0].joint1_placement.rotation
-                f = turned @ np.sum([each.contact_force.linear for each in list(datas)[:n_points]], axis=0)
+                f = turned @ np.sum([item.contact_force.linear for item in list(datas)[:n_points]], axis=0)
             return done * h, x, R, speeds, spins, f
 
         return parts.march(began, n_steps, n_stored, see, step)
 
     inertias = [model.inertias[frames[k][0]] for k in range(len(rigid.x))]
-    moments = [float(np.linalg.eigvalsh(each.inertia)[-1]) for each in inertias]
-    return Prepared(np.array([each.mass for each in inertias]), np.array(moments), run)
+    moments = [float(np.linalg.eigvalsh(item.inertia)[-1]) for item in inertias]
+    return Prepared(np.array([item.mass for item in inertias]), np.array(moments), run)
 
 
 def _tree(pin: Any, rigid: Rigid) -> tuple[Any, dict[int, tuple[int, Any]]]:
@@ -196,10 +196,10 @@ def _force(
 
 def _rates(model: Any) -> Callable[[Array, Array], Array]:
     """Return dq/dt as a function of q and v; quaternions (x, y, z, w) of ball joints rotate in body axes."""
-    balls = [(each.idx_q, each.idx_v) for each in model.joints if each.nq == 4]
+    balls = [(joint.idx_q, joint.idx_v) for joint in model.joints if joint.nq == 4]
     if not balls:
         return lambda q, v: v
-    places = np.array([(each.idx_q, each.idx_v) for each in model.joints if each.nq == 1 and each.nv == 1], dtype=int)
+    places = np.array([(joint.idx_q, joint.idx_v) for joint in model.joints if joint.nq == joint.nv == 1], dtype=int)
 
     def rate(q: Array, v: Array) -> Array:
         q_rate = np.zeros_like(q)

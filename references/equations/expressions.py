@@ -117,8 +117,8 @@ class Expressions:
 
     def derivatives(self) -> Iterator[list[Form]]:
         """Yield the derivatives of the accelerations with respect to each of [q, v], as 2 n_q lists (n_q,) of forms."""
-        for right in self.right_hand_sides():
-            yield _substituted(self.factors, right)[: self.system.n_q]
+        for right_side in self.right_hand_sides():
+            yield _substituted(self.factors, right_side)[: self.system.n_q]
 
     def right_hand_sides(self) -> Iterator[list[Form]]:
         """Yield the right-hand sides for these derivatives, whose matrix is that of eq. (6), factorised once.
