@@ -41,7 +41,7 @@ def found_of(study, folder, rows, quick=False):
 
 def said(study, rows, quick=False):
     """The findings of a module's study from rows, and the text of its report."""
-    found = study.findings_of(rows)
+    found = study.STUDY.findings(rows)
     return found, render(study.STUDY.name, found, {}, stamp="stamp", quick=quick, rows=rows)
 
 
