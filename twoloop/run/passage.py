@@ -1,5 +1,7 @@
 """What goes on where a run's own steps cannot: another plan, a step to load, one across what is singular, a jump."""
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -70,9 +72,16 @@ def _plan_across(n_q: int) -> Plan:
     """The plan of steps across a singular position."""
     from twoloop.kernels.steps import bridge
 
+    return Plan(bridge.BRIDGING, _options_across(), np.zeros(bridge.memory_size(n_q)), exponent=1.0 / bridge.ORDER)
+
+
+@cache
+def _options_across() -> Array:
+    """Compute the options of such steps once: the tableau takes longer than most steps across."""
+    from twoloop.kernels.steps import bridge
+
     tableau = gauss(bridge.S)
-    options = bridge.options_array(tableau.A, tableau.b, tableau.c, INNER_TOL, LARGEST_MOVE)
-    return Plan(bridge.BRIDGING, options, np.zeros(bridge.memory_size(n_q)), exponent=1.0 / bridge.ORDER)
+    return bridge.options_array(tableau.A, tableau.b, tableau.c, INNER_TOL, LARGEST_MOVE)
 
 
 def bridging_kit(kit: Kit) -> Kit:
