@@ -74,8 +74,10 @@ def renewed(old: pd.DataFrame, line: str, make: Callable[[], pd.DataFrame], call
         raise StudyError(f"no rows of {', '.join(sorted(missing))} were made; nothing is changed")
     rows = pd.concat([old[~replaced], new], ignore_index=True)
     keys = [name for name in (*NAMED, "trap", "mechanism") if name in old]
-    places = {key: k for k, key in reversed(list(enumerate(map(tuple, old[keys].astype(str).to_numpy()))))}
-    order = [places.get(key, len(old)) for key in map(tuple, rows[keys].astype(str).to_numpy())]
+    # a name that is missing is NaN in rows that were read, and may be None in new ones
+    named, all_named = (list(map(tuple, each[keys].fillna("").astype(str).to_numpy())) for each in (old, rows))
+    places = {key: k for k, key in reversed(list(enumerate(named)))}
+    order = [places.get(key, len(old)) for key in all_named]
     rows = rows.iloc[np.argsort(order, kind="stable")].reset_index(drop=True)
     now, before = cli.stamp(command_of(call.study)), line.split("; ")[1][:10]
     if not replaced.all() and before not in now:
