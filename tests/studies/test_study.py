@@ -2,6 +2,7 @@
 
 from datetime import date
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -63,6 +64,13 @@ def test_rows_measured_again_take_the_place_of_those_of_their_solver():
     call = Call("x", False, None, False, "", ("y",))
     with pytest.raises(StudyError, match="no rows of y were made; nothing is changed"):
         shared.renewed(OLD, STAMP, lambda: OLD[:1], call)
+
+
+def test_rows_without_a_group_stay_in_their_place():
+    old = OLD.assign(group=np.nan)
+    new = old[old["solver"] == "x"].assign(group=None)
+    rows, _ = shared.renewed(old, STAMP, lambda: new, Call("x", False, None, False, "", ("x",)))
+    assert rows["solver"].tolist() == ["x", "y"] * 2
 
 
 def test_groups_of_other_commits_stand_beside_that_of_the_newest_rows():
