@@ -75,7 +75,9 @@ def renewed(old: pd.DataFrame, line: str, make: Callable[[], pd.DataFrame], call
     rows = pd.concat([old[~replaced], new], ignore_index=True)
     keys = [name for name in (*NAMED, "trap", "mechanism") if name in old]
     # a name that is missing is NaN in rows that were read, and may be None in new ones
-    named, all_named = (list(map(tuple, each[keys].fillna("").astype(str).to_numpy())) for each in (old, rows))
+    named, all_named = (
+        list(map(tuple, each[keys].astype(object).fillna("").astype(str).to_numpy())) for each in (old, rows)
+    )
     places = {key: k for k, key in reversed(list(enumerate(named)))}
     order = [places.get(key, len(old)) for key in all_named]
     rows = rows.iloc[np.argsort(order, kind="stable")].reset_index(drop=True)
