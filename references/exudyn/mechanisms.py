@@ -1,7 +1,7 @@
 """The four-bar linkage and published mechanisms as Exudyn models with Exudyn's bodies, joints, springs and gravity.
 
 Only masses, inertias, geometry and the initial state are shared with twoloop. Spatial bodies have Euler parameters,
-like ours, except for the bars of A04, whose rotation matrices are computed from them.
+like those of this project, except for the bars of A04, whose rotation matrices are computed from them.
 """
 
 from collections.abc import Callable
