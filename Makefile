@@ -80,13 +80,13 @@ bench: compile-all ## two commits side by side: make bench BASE=main [HEAD=branc
 # does: what Newton's matrices and large systems have in common, and bodies in space, are in one of them
 compile: install ## compile the kernels, and the callbacks of bodies, mechanisms and studies, on two cores
 	@echo "Compiling (once, on both cores) the kernels, and the callbacks of bodies, mechanisms and studies"
-	@$(RUN) -c "from twoloop.kernels.evaluation import calls, own_inner; from twoloop.kernels.control import controller"
+	@$(RUN) -c "from twoloop.kernels.evaluation import inner_loop; from twoloop.kernels.control import controller"
 	@$(RUN) -c "from twoloop.kernels.steps import diagonal_step, newton_step; \
-	from twoloop.kernels.evaluation import static_inner; from twoloop.bodies import spatial_callbacks, spatial_programs; \
+	from twoloop.kernels.evaluation import sparse_inner_loop; from twoloop.bodies import spatial_callbacks, spatial_programs; \
 	from studies.bench import sharp_callbacks; $(CALLBACKS_OF_TESTS)" & \
-	$(RUN) -c "from twoloop.kernels import advance, agreement, interpolation, short_loops; \
-	from twoloop.kernels.algebra import dependents, independent, pivots, scaling; from twoloop.kernels.control import switching; \
-	from twoloop.kernels.evaluation import first_look, traced; \
+	$(RUN) -c "from twoloop.kernels import advance, interpolation, short_loops; \
+	from twoloop.kernels.linalg import dependent_columns, rank; from twoloop.kernels.control import switching; \
+	from twoloop.kernels.evaluation import checks, residuals, traced; \
 	from twoloop.kernels.lanes import lane_dop853, lane_runs, lane_starts, lane_taylor; \
 	from twoloop.kernels.steps import adams_step, asking_step, bdf_step, bridge, explicit_step, lobatto_step, \
 	fixed_point_step, newmark_step, paper_step, taylor_step; from twoloop.bodies import planar_callbacks, planar_programs; \

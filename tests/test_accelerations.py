@@ -21,9 +21,9 @@ from twoloop.generate.llvm_text import BIT, Module
 from twoloop.generate.null_space import LEAST
 from twoloop.generate.straight_code import own_code, write_function
 from twoloop.generate.straight_line import StraightLine
-from twoloop.kernels.algebra.dependents import NONE, NUMBER, VARIES, dependents, room_size
-from twoloop.kernels.compile.own_functions import OwnFunctions, object_code
+from twoloop.kernels.compile.generated_functions import OwnFunctions, object_code
 from twoloop.kernels.lanes.lane_room import LANES
+from twoloop.kernels.linalg.dependent_columns import NONE, NUMBER, VARIES, dependents, room_size
 
 pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 

@@ -14,11 +14,10 @@ from numba import njit
 from numba.core.caching import _CacheLocator
 
 from tests.processes import ROOT, run_python
-from twoloop.kernels.compile import callbacks, ownership
-from twoloop.kernels.compile.caches import UNWRITABLE, folder_of, watch
-from twoloop.kernels.compile.kept_files import Files
-from twoloop.kernels.compile.ownership import doubt_of, make_own, own_folder
-from twoloop.kernels.evaluation import calls
+from twoloop.kernels.compile import caches as ownership
+from twoloop.kernels.compile import callbacks
+from twoloop.kernels.compile.caches import UNWRITABLE, Files, doubt_of, folder_of, make_own, own_folder, watch
+from twoloop.kernels.evaluation import inner_loop as calls
 
 
 def with_kernels(cache):

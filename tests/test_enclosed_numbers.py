@@ -13,7 +13,7 @@ from numba.extending import register_jitable
 from tests.compiled import unit_mass
 from tests.problems import pendulum, quick
 from twoloop import ConstrainedSystem, Integrator, callback, consistent_state, consistent_states, ensemble, solve_dae
-from twoloop.kernels.compile.frozen import places
+from twoloop.kernels.compile.dependencies import places
 
 GRAVITY = 9.81
 START = [1.0, 0.0], [0.0, 0.0]

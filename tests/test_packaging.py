@@ -10,7 +10,7 @@ from hatchling.build import build_wheel
 from numba.core.types.functions import BaseFunction, Function
 from numba.np import arrayobj
 
-from twoloop.kernels.compile.versions import check_version
+from twoloop.kernels.compile import check_version
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

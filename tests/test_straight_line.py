@@ -19,11 +19,11 @@ from twoloop.generate.straight_code import own_code, write_function
 from twoloop.generate.straight_line import Outputs
 from twoloop.generate.symbolic_factors import Factors
 from twoloop.generate.tracing import Graph
-from twoloop.kernels.compile.own_functions import OwnFunctions, object_code
+from twoloop.kernels.compile.generated_functions import OwnFunctions, object_code
 from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.noted import BY_GENERAL
 from twoloop.kernels.evaluation import tasks
-from twoloop.kernels.evaluation.own_inner import own_inner_loop
+from twoloop.kernels.evaluation.inner_loop import own_inner_loop
 from twoloop.methods.presets import PRESETS
 from twoloop.run.run import Run
 from twoloop.solve import solve_dae

@@ -8,10 +8,12 @@ from hypothesis import strategies as st
 from tests.problems import called, entry
 from twoloop.checks.rank import least_solution
 from twoloop.generate.choices import BOUNDS, LEAST, RANK, SINGULAR_MASS
-from twoloop.kernels.algebra import elimination, factors, linalg
-from twoloop.kernels.algebra.pivots import STAYS_SINGULAR, choose, room_size
 from twoloop.kernels.lanes import lane_algebra
 from twoloop.kernels.lanes.lane_room import FINE, LANES, N_FIELDS
+from twoloop.kernels.linalg import dense as linalg
+from twoloop.kernels.linalg import markowitz_lu as elimination
+from twoloop.kernels.linalg import markowitz_lu as factors
+from twoloop.kernels.linalg.rank import STAYS_SINGULAR, choose, room_size
 
 # not positive definite, and singular or not finite
 UNFIT = [[[1.0, 2.0], [2.0, 4.0]], [[0.0, 0.0], [0.0, 1.0]], [[np.nan, 1.0], [1.0, 1.0]]]

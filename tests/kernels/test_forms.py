@@ -7,7 +7,7 @@ import twoloop.run.workspace as workspace_module
 from tests.general.mechanisms import error, mechanism
 from tests.problems import pendulum, some_of, violations, without_tangent, worst
 from twoloop import ConstrainedSystem, consistent_state, solve_dae
-from twoloop.kernels.algebra import lapack
+from twoloop.kernels.linalg import band as lapack
 from twoloop.mechanisms.ancf_beam import very_flexible_beam
 from twoloop.methods.newmark import Newmark
 from twoloop.methods.runge_kutta import RungeKutta

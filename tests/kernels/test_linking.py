@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numba import types
 
-from twoloop.kernels.compile import own_rules
+from twoloop.kernels.compile import linking as own_rules
 from twoloop.kernels.compile.linking import KernelCompiler
 from twoloop.kernels.data.common import OPTIONS, compiled, inlined, merged
 

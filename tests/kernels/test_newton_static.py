@@ -11,7 +11,7 @@ from tests.large_systems import spatial_chain
 from tests.marks import slow
 from tests.problems import worst
 from twoloop import ConstrainedSystem, solve_dae
-from twoloop.kernels.algebra.static_program import N_UPDATES
+from twoloop.kernels.linalg.symbolic_factorization import N_UPDATES
 from twoloop.mechanisms import planar
 from twoloop.run.run import Run
 

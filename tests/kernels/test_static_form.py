@@ -14,8 +14,8 @@ from tests.problems import worst
 from twoloop import ConstrainedSystem, solve_dae
 from twoloop.checks.values import MOST
 from twoloop.kernels import advance
-from twoloop.kernels.algebra import static_program
 from twoloop.kernels.data import codes, noted
+from twoloop.kernels.linalg import symbolic_factorization as static_program
 from twoloop.run.static_form import static_form
 from twoloop.run.workspace import kit_of, workspace
 

@@ -15,9 +15,8 @@ from numba import njit
 from twoloop.checks.arguments import Array
 from twoloop.checks.values import MOST
 from twoloop.kernels.compile.callbacks import KINDS
-from twoloop.kernels.compile.dependencies import of_library
+from twoloop.kernels.compile.dependencies import Rewritten, of_library
 from twoloop.kernels.compile.private import Dispatcher
-from twoloop.kernels.compile.rewritten import Rewritten
 
 if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem

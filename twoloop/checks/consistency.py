@@ -108,8 +108,8 @@ class Look:
     """
 
     def __init__(self, system: ConstrainedSystem):
-        from twoloop.kernels.evaluation import first_look
-        from twoloop.kernels.evaluation.first_look import look, room_size
+        from twoloop.kernels.evaluation import checks as first_look
+        from twoloop.kernels.evaluation.checks import look, room_size
 
         self.flags, self._look = first_look, direct(look)
         n, n_rows, size = system.n_q, system.n_c + system.n_a, room_size(system.n_q, system.n_c, system.n_a)

@@ -26,7 +26,7 @@ def orthogonalised(rows: Array, least: float) -> tuple[Array, Array, list[int]]:
 
     A row counts if more of it than the share `least` is no combination of those before.
     """
-    from twoloop.kernels.algebra.independent import independent_rows
+    from twoloop.kernels.linalg.rank import independent_rows
 
     most, kept = min(rows.shape), np.zeros(len(rows), dtype=np.int64)
     basis, factors = np.zeros((most + 1, rows.shape[1])), np.zeros((most + 1, most + 1))
@@ -39,7 +39,7 @@ def least_solution(rows: Array, values: Array) -> tuple[Array, Array] | None:
 
     None where a direction is so weak that it may count or not.
     """
-    from twoloop.kernels.algebra import independent
+    from twoloop.kernels.linalg import rank as independent
 
     n_rows, n_q = rows.shape
     most, kept, x, left = min(n_rows, n_q) + 1, np.zeros(n_rows, dtype=np.int64), np.zeros(n_q), values.copy()
@@ -53,7 +53,7 @@ def least_solution(rows: Array, values: Array) -> tuple[Array, Array] | None:
 
 def surely_above(ratio: float, rows: Array, rank: int) -> bool:
     """Whether so many singular values are above this share of the largest, by bounds that cost less than these."""
-    from twoloop.kernels.algebra.independent import above, size_of_inverse
+    from twoloop.kernels.linalg.rank import above, size_of_inverse
 
     if rank == len(rows) > 0 and direct(above)(np.ascontiguousarray(rows), ratio, np.empty((rank, rank))):
         return True
@@ -76,7 +76,7 @@ def redundant_rows(scaled: Array) -> list[int]:
 
 def in_words(jacobian: Array, redundant: list[int]) -> str:
     """Which rows depend on which others, with the coefficients where these are few: many differ from start to start."""
-    from twoloop.kernels.algebra.independent import shares_of_others
+    from twoloop.kernels.linalg.rank import shares_of_others
 
     (n_rows, n_q), shown = jacobian.shape, redundant[:SHOWN]
     others = [i for i in range(n_rows) if i not in redundant]

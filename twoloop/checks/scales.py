@@ -56,8 +56,7 @@ class Scales:
         Elsewhere the mechanism may be smaller by far. The latest of such positions are kept: the sizes of each, where
         it is, and which entries count there.
         """
-        from twoloop.kernels.algebra.scaling import NO_ENTRY
-        from twoloop.kernels.evaluation.first_look import NEAR
+        from twoloop.kernels.evaluation.checks import NEAR, NO_ENTRY
 
         n, size = len(q), np.abs(jacobian)
         entries = (size > NO_ENTRY * size.max(axis=1, initial=0.0)[:, None]).ravel()
@@ -79,7 +78,7 @@ def sizes(q: Array) -> Array:
 
 def typical_sizes(q: Array) -> Array:
     """Sizes of the coordinates, (n_q,): none below the median of those that are no zeros by chance, 1 if all are."""
-    from twoloop.kernels.algebra.scaling import NEGLIGIBLE
+    from twoloop.kernels.evaluation.checks import NEGLIGIBLE
 
     size = np.abs(q)
     return np.maximum(size, median(size[size > NEGLIGIBLE * size.max()]) if size.any() else 1.0)
@@ -104,7 +103,7 @@ def _middle(ordered: Array) -> float:
 
 def column_scales(jacobian: Rows, typical: Array) -> Array:
     """Units of the coordinates in which the entries of C_q are of like size; of zero columns, the typical ones."""
-    from twoloop.kernels.algebra.scaling import like_sizes
+    from twoloop.kernels.evaluation.checks import like_sizes
 
     if isinstance(jacobian, SparseRows):
         return _sparse_column_scales(jacobian, typical)
@@ -135,7 +134,7 @@ def _sparse_column_scales(jacobian: SparseRows, typical: Array) -> Array:
 
 def scales_of(system: ConstrainedSystem, t: float, q: Array, jacobian: Array) -> Scales:
     """Scales at a position, from C_q there and nearby; or from C_q and A, if `jacobian` has the rows of both."""
-    from twoloop.kernels.algebra.scaling import NEGLIGIBLE, reaches
+    from twoloop.kernels.evaluation.checks import NEGLIGIBLE, reaches
 
     size, columns = np.abs(q), units(system, t, q, jacobian, typical_sizes(q))
     in_units = np.abs(jacobian) * columns
@@ -180,7 +179,7 @@ def _largest(system: ConstrainedSystem, t: float, places: Array, here: Rows) -> 
 
 def rows_at(system: ConstrainedSystem, t: float, places: Array) -> tuple[Array, NDArray[np.bool_]]:
     """C_q and A at positions, (n, n_c + n_a, n_q), and at which of these no callback raised an exception, (n,)."""
-    from twoloop.kernels.evaluation import first_look
+    from twoloop.kernels.evaluation import checks as first_look
 
     check_callback(system, "jacobian", t, [places[0]])
     n, kit, defined = len(places), system.kit, np.ones(len(places), dtype=bool)

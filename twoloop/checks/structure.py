@@ -80,7 +80,7 @@ def wrong_kinematics(system: ConstrainedSystem, t: float, q: Array) -> str | Non
 
 def _compared(system: ConstrainedSystem, t: float, q: Array, v: Array) -> tuple[bool, Array, Array]:
     """Whether kinematics give what the separate callbacks give, and C_t and C_q of these."""
-    from twoloop.kernels.evaluation.first_look import kinematics_agree
+    from twoloop.kernels.evaluation.checks import kinematics_agree
 
     n, n_c = system.n_q, system.n_c
     fused, given = np.zeros((2, 3 + n, n_c))

@@ -136,7 +136,7 @@ class LaneRuns:
 
         q, v : (n_runs, n, n_t), the last at the end; ends : a and lam there.
         """
-        from twoloop.kernels.agreement import disagreement
+        from twoloop.kernels.evaluation.residuals import disagreement
 
         n, n_c = self.system.n_q, self.system.n_c
         room, worst = np.zeros(n * (n + 3) + n_c * (n + 3)), np.full(len(which), np.inf)

@@ -87,7 +87,7 @@ def kit_to_write(system: ConstrainedSystem) -> tuple[Any, NDArray[np.int64]]:
 
 def far_off(kit: tuple[Any, NDArray[np.int64]], starts: Starts) -> NDArray[np.bool_]:
     """Of which starts callbacks say that C or C_q v + C_t is more than what rounding of their terms may leave."""
-    from twoloop.kernels.agreement import violation
+    from twoloop.kernels.evaluation.residuals import violation
 
     functions, sizes = kit
     room, worst = np.zeros(int(sizes[1] * (sizes[0] + 2))), np.zeros(len(starts.q))

@@ -16,9 +16,8 @@ import numpy as np
 from twoloop.checks.bounds import place_of
 from twoloop.generate.known_numbers import OPERATORS, Known, Refusal, Untraceable, applied, elementwise, number
 from twoloop.generate.tracing import FUNCTIONS, Form, Graph
-from twoloop.kernels.compile.dependencies import of_library
+from twoloop.kernels.compile.dependencies import Rewritten, of_library
 from twoloop.kernels.compile.private import Dispatcher
-from twoloop.kernels.compile.rewritten import Rewritten
 
 # functions of NumPy that do with arrays of forms what they do with numbers
 AS_WITH_NUMBERS = {

@@ -82,8 +82,8 @@ class Dependents:
     Attributes
     ----------
     find : callable or None
-        Of G and `arguments`: how many blocks there are, see `dependents` of kernels/algebra/dependents.py. None: there
-        are none at any position.
+        Of G and `arguments`: how many blocks there are, see kernels/linalg/dependent_columns.py. None: there are
+        none at any position.
     """
 
     find: Any = None
@@ -91,7 +91,7 @@ class Dependents:
     def __init__(self, system: ConstrainedSystem, rows: tuple[int, ...]):
         kinds = _kinds(system) if len(rows) >= MOSTLY_ROWS * system.n_q > 0 else None
         if kinds is not None:
-            from twoloop.kernels.algebra.dependents import dependents, room_size
+            from twoloop.kernels.linalg.dependent_columns import dependents, room_size
 
             numbers, integers = room_size(len(rows), system.n_q)
             blocks, room, work = np.zeros(4 * len(rows), np.int64), np.zeros(numbers), np.zeros(integers, np.int64)
@@ -130,7 +130,7 @@ class Chooser:
     """The choice for one M and G of a system after another; it is mostly the last one."""
 
     def __init__(self, system: ConstrainedSystem):
-        from twoloop.kernels.algebra.pivots import choose, room_size
+        from twoloop.kernels.linalg.rank import choose, room_size
 
         n_rows = system.n_c + system.n_a
         self.system, self._choose = system, direct(choose)
@@ -149,7 +149,7 @@ class Chooser:
         return self._last
 
     def _made(self, place: int) -> Choice:
-        from twoloop.kernels.algebra.pivots import STAYS_SINGULAR
+        from twoloop.kernels.linalg.rank import STAYS_SINGULAR
 
         system, n_rows = self.system, self.system.n_c + self.system.n_a
         n_kept, n_added, *places = self._chosen.tolist()

@@ -28,7 +28,7 @@ from twoloop.generate.straight_code import OwnCode, SharedCode
 from twoloop.generate.straight_line import Outputs
 from twoloop.generate.written import Written, conditions_hold, results_of
 from twoloop.kernels.compile.dependencies import digest_of
-from twoloop.kernels.compile.own_functions import LaterFunctions, own_functions
+from twoloop.kernels.compile.generated_functions import LaterFunctions, own_functions
 from twoloop.kernels.data import collocation as at
 from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL

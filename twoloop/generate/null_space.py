@@ -17,7 +17,7 @@ Blocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # rows and columns o
 Terms = dict[int, Form]  # entries of a row that are not zero, by their columns
 
 # Squares of the least pivot over what it is divided into, or its column, and of the sine between two columns. The
-# accelerations lose up to three times as many digits. At a start more is asked for, see kernels/algebra/dependents.py.
+# accelerations lose up to three times as many digits. At a start more is asked for, see linalg/dependent_columns.py.
 LEAST = 0.03**2
 
 

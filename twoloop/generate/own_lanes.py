@@ -31,7 +31,7 @@ from twoloop.generate.lane_constraints import LaneConstraints
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.llvm_text import Module
 from twoloop.kernels.compile.dependencies import digest_of
-from twoloop.kernels.compile.own_functions import OwnFunctions, are_kept, own_functions
+from twoloop.kernels.compile.generated_functions import OwnFunctions, are_kept, own_functions
 from twoloop.kernels.lanes.lane_room import CODE
 
 Array = NDArray[np.float64]

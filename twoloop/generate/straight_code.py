@@ -36,7 +36,7 @@ from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.generate.tracing import Graph, Untraceable
 from twoloop.generate.written import Written, conditions_hold
 from twoloop.kernels.compile.dependencies import digest_of
-from twoloop.kernels.compile.own_functions import own_functions
+from twoloop.kernels.compile.generated_functions import own_functions
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]

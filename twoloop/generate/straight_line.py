@@ -26,8 +26,8 @@ from twoloop.generate.symbolic_factors import Block, Factors, solve
 from twoloop.generate.traced_equations import Equations, only
 from twoloop.generate.traced_values import Traced
 from twoloop.generate.tracing import Form, Graph, Untraceable, is_zero
-from twoloop.kernels.evaluation.inner import CONTRADICTS
 from twoloop.kernels.evaluation.operations import PRODUCT, RECIPROCAL
+from twoloop.kernels.evaluation.partition import CONTRADICTS
 from twoloop.problem.system import ConstrainedSystem
 
 MOST_ELIMINATED = 60_000  # operations with their elimination: those of more than 40 bodies on hinges in space

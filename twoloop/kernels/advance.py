@@ -5,7 +5,6 @@
 
 import numpy as np
 
-from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control import clock as at
 from twoloop.kernels.control.controller import EXPONENT, FACTOR_MIN, SAFETY, factor_of, remember
 from twoloop.kernels.control.landing import NEAR, off_grid, on_grid
@@ -39,7 +38,8 @@ from twoloop.kernels.data.noted import (
     PIVOT,
 )
 from twoloop.kernels.data.tolerances import GAP
-from twoloop.kernels.evaluation.calls import (
+from twoloop.kernels.evaluation.drive_discontinuities import JUMP, RAMP, SMOOTH, find_kink, unexplained
+from twoloop.kernels.evaluation.inner_loop import (
     accelerations,
     check_redundant,
     find_tangents,
@@ -47,8 +47,8 @@ from twoloop.kernels.evaluation.calls import (
     renew_partition,
     take_midpoint,
 )
-from twoloop.kernels.evaluation.kinks import JUMP, RAMP, SMOOTH, find_kink, unexplained
 from twoloop.kernels.evaluation.partition import CHANGED
+from twoloop.kernels.linalg.dense import copy
 
 UNFORESEEN = 10.0  # an error that is so large was not foreseen: the force jumps, or bends, within the step
 REFUSED = 0.95  # of a refused step is what the next one is at most

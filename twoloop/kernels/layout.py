@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.kernels.algebra.elimination import N_COUNTS, N_LISTS, WIDEST, index_size, values_size
-from twoloop.kernels.algebra.lapack import N_ROUTINES
 from twoloop.kernels.control.sudden import N_CHANGES
 from twoloop.kernels.data.common import WORK, Work
 from twoloop.kernels.data.counters import N_COUNTERS
 from twoloop.kernels.data.noted import N_NOTES
-from twoloop.kernels.evaluation.kinks import PARTS
+from twoloop.kernels.evaluation.drive_discontinuities import PARTS
+from twoloop.kernels.linalg.band import N_ROUTINES
+from twoloop.kernels.linalg.markowitz_lu import N_COUNTS, N_LISTS, WIDEST, index_size, values_size
 
 MOST_FREE, LARGEST_FREE = 32, 100_000  # workspaces that wait for their next run, and numbers of each of them
 WORD, LINE = 8, 8  # bytes of a number, and numbers in a line of the cache, at which arrays begin

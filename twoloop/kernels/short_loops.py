@@ -14,7 +14,7 @@ from twoloop.kernels.data.counters import N_ACCEPTED, N_COUNTERS
 from twoloop.kernels.data.finite import finite_vector
 from twoloop.kernels.data.flags import FORM
 from twoloop.kernels.data.tolerances import GAP, LONGEST_UNSEEN, LOOK
-from twoloop.kernels.evaluation.first_look import CONSISTENT, DEFINITE, IN_ORDER, INDEFINITE
+from twoloop.kernels.evaluation.checks import CONSISTENT, DEFINITE, IN_ORDER, INDEFINITE
 
 ROUNDING = 1e-15  # of the largest coordinate: corrections of this size are rounding
 

@@ -56,7 +56,7 @@ def _made(
 
 
 def _with_code(plan: Plan, code: OwnCode) -> Plan:
-    from twoloop.kernels.evaluation.own_inner import own_inner_loop
+    from twoloop.kernels.evaluation.inner_loop import own_inner_loop
 
     substitute = None if plan.substitute is None else _with_code(plan.substitute, code)
     own = code.shared.functions, *plan.own

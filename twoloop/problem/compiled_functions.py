@@ -22,11 +22,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from twoloop.checks.arguments import Array, shown
-from twoloop.kernels.compile.caches import UNWRITABLE, say_once, sources_folder, watch
+from twoloop.kernels.compile.caches import UNWRITABLE, make_own, read_own, say_once, sources_folder, watch, write_own
 from twoloop.kernels.compile.callbacks import KINDS, compile_callback
-from twoloop.kernels.compile.dependencies import CannotBeWatched, Digest
-from twoloop.kernels.compile.frozen import found_by, python_function
-from twoloop.kernels.compile.ownership import make_own, read_own, write_own
+from twoloop.kernels.compile.dependencies import CannotBeWatched, Digest, found_by, python_function
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.problem.callbacks import ConstantMatrix
 

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from twoloop.checks.consistency import Look
 from twoloop.generate.choices import BOUNDS, LEAST, RANK, SINGULAR_MASS, Choice, Dependents
 from twoloop.generate.straight_code import OwnCode
-from twoloop.kernels.algebra.lapack import addresses
 from twoloop.kernels.data import noted
 from twoloop.kernels.data.flags import BANDWIDTH, FORM
 from twoloop.kernels.layout import lasting, short_loops
+from twoloop.kernels.linalg.band import addresses
 from twoloop.run.asked import Asked
 from twoloop.run.crossings import TURNED
 from twoloop.run.run import CONTRADICTS, Run
@@ -29,9 +29,9 @@ def arrays_of(run: Run, look: Look, code: OwnCode | None, definite: bool, asked:
     The run is at its start; its clock, control and tolerances become parts of one array. `look` is of its system, or of
     the one that it stands for; `code` is the machine code that its plan calls; `definite`: whether M has an inverse.
     """
-    from twoloop.kernels.algebra import pivots
-    from twoloop.kernels.algebra.dependents import dependents as find
-    from twoloop.kernels.evaluation import first_look
+    from twoloop.kernels.evaluation import checks as first_look
+    from twoloop.kernels.linalg import rank as pivots
+    from twoloop.kernels.linalg.dependent_columns import dependents as find
 
     loops, system = short_loops(), look.system
     of_mass = 0 if system.constant_mass else first_look.DEFINITE if definite else first_look.INDEFINITE

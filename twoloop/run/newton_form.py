@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.at_position import NEARBY
-from twoloop.kernels.algebra.static_lu import groups_of, in_groups, newton_program
-from twoloop.kernels.algebra.static_program import N_UPDATES, Entries
+from twoloop.kernels.linalg.sparse_lu import groups_of, in_groups, newton_program
+from twoloop.kernels.linalg.symbolic_factorization import N_UPDATES, Entries
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -23,7 +23,7 @@ def newton_form(
     together: list[tuple[int, ...]],
     stiff: list[int],
 ) -> tuple[NDArray[np.int32], int] | None:
-    """The program of Newton's matrix, see static_lu.py, and the number of groups of columns that are differenced.
+    """The program of Newton's matrix, see sparse_lu.py, and the number of groups of columns that are differenced.
 
     None where it is not sparse, or cannot be found.
     """

@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.at_position import NEARBY, pattern_of
-from twoloop.kernels.algebra.static_order import bodies_of
-from twoloop.kernels.algebra.static_program import N_OFF, N_PIVOTS, N_UPDATES, Entries, static_program
 from twoloop.kernels.layout import Static
+from twoloop.kernels.linalg.symbolic_factorization import N_OFF, N_PIVOTS, N_UPDATES, Entries, bodies_of, static_program
 from twoloop.methods.plan import Plan
 from twoloop.problem.callbacks import LARGE
 from twoloop.problem.system import ConstrainedSystem
@@ -114,7 +113,7 @@ def _together(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]
 def _stiff_rows(
     system: ConstrainedSystem, t0: float, q0: Array, mass: Entries, jacobian: Entries, together: list[tuple[int, ...]]
 ) -> list[int]:
-    """Rows of single bodies that M is singular along, with no entry but where M has some: see static_factors.py.
+    """Rows of single bodies that M is singular along, with no entry but where M has some: see sparse_ldl.py.
 
     No more than make it definite: others, as of a hinge on the ground, hold the body as joints do.
     """

@@ -6,9 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.at_position import has_definite_mass, least_inertia
-from twoloop.kernels.algebra.banded import banded_pays
-from twoloop.kernels.algebra.lapack import addresses
-from twoloop.kernels.algebra.sparse import sparse_pays
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import common
 from twoloop.kernels.data.flags import (
@@ -25,6 +22,8 @@ from twoloop.kernels.data.flags import (
 from twoloop.kernels.data.kit import Kit
 from twoloop.kernels.evaluation.operations import N_NODES
 from twoloop.kernels.layout import lasting, make_work, short_loops
+from twoloop.kernels.linalg.band import addresses, banded_pays
+from twoloop.kernels.linalg.saddle_point import sparse_pays
 from twoloop.kernels.steps.named_step import LOADED, at_hand, loaded
 from twoloop.methods.plan import Plan
 from twoloop.problem.system import ConstrainedSystem
@@ -40,7 +39,7 @@ def kit_of(
     system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = None, static: StaticForm | None = None
 ) -> Kit:
     """The callbacks of a system, with flags that say which linear algebra suits it, and what a plan calls."""
-    from twoloop.kernels.evaluation.calls import inner_loop
+    from twoloop.kernels.evaluation.inner_loop import inner_loop
 
     if static is not None:
         return _static_kit(system, plan, static)
@@ -60,7 +59,7 @@ def kit_of(
 
 def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) -> Kit:
     """The same for the static form."""
-    from twoloop.kernels.evaluation.static_inner import static_inner_loop
+    from twoloop.kernels.evaluation.sparse_inner_loop import static_inner_loop
 
     flags = system.functions.flags.copy()
     flags[FORM] = STATIC
@@ -112,7 +111,7 @@ def is_diagonal(mass: Array) -> bool:
 
 def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
     """The callbacks with these flags, and what a plan calls; kept with the system for the next run."""
-    from twoloop.kernels.evaluation.calls import inner_loop
+    from twoloop.kernels.evaluation.inner_loop import inner_loop
 
     read = (plan.numbers, plan.own_numbers)
     kept: dict[Any, tuple[Kit, Any]] = system.remembered("kits", dict)

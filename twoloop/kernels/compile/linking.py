@@ -3,22 +3,194 @@
 Numba optimises each function together with all that it calls and makes machine code of it, so that a helper at depth
 five is optimised six times, and its machine code is made without ever being called. Here helpers are handed on as
 LLVM's intermediate code, and the kernel at the top is optimised once. Numba's front end, half of the time, leaves out
-what finds nothing to do. Loops are neither unrolled nor vectorised: those
-of a mechanism are short, and the code that tests whether they are costs more than it gains.
+what finds nothing to do. Loops are neither unrolled nor vectorised: those of a mechanism are short, and the code that
+tests whether they are costs more than it gains.
+
+While a kernel is compiled, `kernel_rules` replaces some of numba's functions; what others compile meanwhile is theirs.
+An index of a kernel does not count from the end where it is negative, as none is: the code that asks for it would hide
+from LLVM that elements lie side by side. The other rules give the same machine code in less time: half of a compilation
+is Python, and numba finds the same things again and again.
 """
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from copy import copy
 from functools import cache
 from typing import Any
 from weakref import WeakKeyDictionary
 
 from llvmlite import binding
+from numba import types
+from numba.core import cgutils, event, ir
+from numba.core.base import BaseContext
+from numba.core.bytecode import FunctionIdentity
 from numba.core.codegen import CPUCodeLibrary, JITCodeLibrary
 from numba.core.compiler import Compiler
+from numba.core.cpu import CPUContext
 from numba.core.dispatcher import Dispatcher
+from numba.core.inline_closurecall import InlineWorker
+from numba.core.targetconfig import ConfigStack
 from numba.core.typed_passes import InlineOverloads, IRLegalization, NopythonRewrites
+from numba.core.types.functions import BaseFunction, Function
 from numba.core.untyped_passes import InlineClosureLikes
+from numba.np import arrayobj
 
-from twoloop.kernels.compile.own_rules import of_kernels, own_rules
+_index_from_either_end = arrayobj.fix_integer_index
+_OF_KERNELS: list[type] = []  # classes of libraries
+
+
+def of_kernels(library: Any) -> Any:
+    """A decorator of classes of libraries of code: in these, no index counts from the end."""
+    _OF_KERNELS.append(library)
+    return library
+
+
+def _index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
+    if kind.signed and isinstance(context.active_code_library, tuple(_OF_KERNELS)):
+        return context.cast(builder, index, kind, types.intp)
+    return _index_from_either_end(context, builder, kind, index, size)
+
+
+_any_indexing: Any = arrayobj.basic_indexing
+
+
+def _indexing(context: Any, builder: Any, kind: Any, array: Any, index_types: Any, indices: Any, **options: Any) -> Any:
+    """The address of one element of a contiguous array, without what only views need."""
+    of_element = len(indices) == kind.ndim and all(isinstance(each, types.Integer) for each in index_types)
+    if kind.layout != "C" or not of_element or options.get("boundscheck"):
+        return _any_indexing(context, builder, kind, array, index_types, indices, **options)
+    sizes = cgutils.unpack_tuple(builder, array.shape, kind.ndim)
+    given = zip(index_types, indices, sizes, strict=True)
+    places = [arrayobj.fix_integer_index(context, builder, *each) for each in given]
+    return cgutils.get_item_pointer2(context, builder, array.data, sizes, None, "C", places), [], []
+
+
+_plain_call_type: Any = BaseFunction.get_call_type
+_call_types: dict[Any, tuple[Any, Any]] = {}
+_options: dict[int, tuple[Any, str]] = {}  # of functions, and what they say; kept, so that no other gets their place
+
+
+def _text_of(options: Any) -> str:
+    if id(options) not in _options:
+        _options[id(options)] = options, repr(options and options._values)
+    return _options[id(options)][1]
+
+
+def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
+    """The signature of a call of one of numba's functions, found once for the same types and options.
+
+    Numba tries all implementations of an operator at each call, which is a tenth of a compilation.
+    """
+    key = self, args, tuple(kws.items()), _text_of(ConfigStack.top_or_none())
+    if key not in _call_types:
+        signature = _plain_call_type(self, context, args, kws)
+        _call_types[key] = signature, self._impl_keys[signature.args]
+    signature, self._impl_keys[signature.args] = _call_types[key]
+    return signature
+
+
+_found_size: Any = BaseContext.get_abi_sizeof
+_sizes: dict[str, int] = {}
+
+
+def _size_of(self: Any, kind: Any) -> Any:
+    """The size of a type, for which numba has LLVM read a module at each variable."""
+    name = str(kind)
+    if name not in _sizes:
+        _sizes[name] = _found_size(self, kind)
+    return _sizes[name]
+
+
+_inlined_passes: Any = InlineWorker.run_untyped_passes
+_inlined: dict[Any, Any] = {}
+
+
+def _inlined_code(self: Any, function: Any, enable_ssa: bool = False) -> Any:
+    """The code of a function that is inlined, which numba copies, and reads anew at each call."""
+    if (function, enable_ssa) not in _inlined:
+        _inlined[function, enable_ssa] = _inlined_passes(self, function, enable_ssa)
+    self.flags.enable_ssa = enable_ssa
+    code = copy(_inlined[function, enable_ssa])
+    code.func_id = FunctionIdentity.from_function(function)  # variables are named after it
+    return code
+
+
+_LEAVES = {ir.Loc, str, int, bool, type(None)}  # of what a statement holds
+
+
+def _variables(self: Any, held: Any) -> list[Any]:
+    """The variables that a statement names; numba calls a function for each thing that it holds."""
+    if isinstance(held, ir.Var):
+        return [held]
+    if isinstance(held, ir.Inst):
+        return held.list_vars()  # type: ignore[no-any-return]
+    found: list[Any] = []
+    if isinstance(held, (dict, list, tuple)):
+        for each in held.values() if isinstance(held, dict) else held:
+            if type(each) is ir.Var:
+                found.append(each)
+            elif type(each) not in _LEAVES:
+                found += _variables(self, each)
+    return found
+
+
+_load_registries: Any = CPUContext.load_additional_registries
+
+
+def _load_once(self: Any) -> None:
+    """What numba implements of Python's and NumPy's functions, all of which it imports anew at each function.
+
+    An intrinsic that is first met is put into one of the registries that are there; copies of a context share them.
+    """
+    if self._registries:
+        for registry in list(self._registries):
+            self.install_registry(registry)
+    else:
+        _load_registries(self)
+
+
+_LOCKS = ("numba:llvm_lock", "numba:compiler_lock")
+
+
+def _but_of_locks(tell: Any) -> Any:
+    """Events are told, but not of locks: some thousand for each kernel, of which each measures all before it."""
+    return lambda kind, *args, **named: None if kind in _LOCKS else tell(kind, *args, **named)
+
+
+# in the place of what; Function inherits what it gets here
+_RULES: list[tuple[Any, str, Callable[..., Any]]] = [
+    (Function, "get_call_type", _call_type),
+    (arrayobj, "fix_integer_index", _index),
+    (arrayobj, "basic_indexing", _indexing),
+    (BaseContext, "get_abi_sizeof", _size_of),
+    (InlineWorker, "run_untyped_passes", _inlined_code),
+    (ir.Inst, "_rec_list_vars", _variables),
+    (CPUContext, "load_additional_registries", _load_once),
+    (event, "start_event", _but_of_locks(event.start_event)),
+    (event, "end_event", _but_of_locks(event.end_event)),
+]
+_NONE = object()
+_open = [0]  # compilations of kernels, one within another
+
+
+@contextmanager
+def own_rules() -> Iterator[None]:
+    """These in the place of numba's while a kernel is compiled."""
+    if _open[0] == 0:
+        before = [vars(owner).get(name, _NONE) for owner, name, _ in _RULES]
+        for owner, name, rule in _RULES:
+            setattr(owner, name, rule)
+    _open[0] += 1
+    try:
+        yield
+    finally:
+        _open[0] -= 1
+        if _open[0] == 0:
+            for (owner, name, _), numbas in zip(_RULES, before, strict=True):
+                if numbas is _NONE:
+                    delattr(owner, name)
+                else:
+                    setattr(owner, name, numbas)
 
 
 class _WithoutEnvironment:

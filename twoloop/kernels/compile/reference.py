@@ -32,7 +32,8 @@ def _known(name: str) -> Any:
 class Reference(types.Type):
     """A pointer to a table: of each array its address and its shape, of each function its address.
 
-    Functions are of numba, or of LLVM (see own_functions.py): these get addresses of arrays, and report no errors.
+    Functions are of numba, or of LLVM (see generated_functions.py): these get addresses of arrays,
+    and report no errors.
 
     Parameters
     ----------

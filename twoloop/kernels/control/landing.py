@@ -4,7 +4,7 @@ import numpy as np
 
 from twoloop.kernels.control import clock as at
 from twoloop.kernels.data.common import merged
-from twoloop.kernels.evaluation.gamma import representable
+from twoloop.kernels.evaluation.constraints import representable
 
 NEAR = 4.0  # times that differ by less than so many spacings of floating-point numbers are one
 

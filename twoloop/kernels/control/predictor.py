@@ -7,12 +7,12 @@ difference; it has then passed a zero of det C_qd, which a motion does only thro
 this sign needs a prediction that is nearly exact, as short steps through a singular position have it.
 """
 
-from twoloop.kernels.algebra.factors import sign_of
 from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.common import merged
 from twoloop.kernels.data.noted import ORIENTATION, ORIENTATION_NEW
 from twoloop.kernels.data.tolerances import ESTIMATE, allowed
-from twoloop.kernels.evaluation.calls import restore
+from twoloop.kernels.evaluation.inner_loop import restore
+from twoloop.kernels.linalg.markowitz_lu import sign_of
 
 SHARE_OF_MOTION = 0.1  # of the way that the coordinates go in the step: what a prediction may be off at any tolerance
 SHARE_THROUGH_ZERO = 1e-6  # ... and where the sign of det C_qd changes

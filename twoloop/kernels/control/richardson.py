@@ -5,7 +5,7 @@ import numpy as np
 from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.common import compiled
 from twoloop.kernels.data.tolerances import ATOL, RTOL
-from twoloop.kernels.evaluation.calls import restore
+from twoloop.kernels.evaluation.inner_loop import restore
 
 
 @compiled

@@ -6,9 +6,9 @@ from twoloop.kernels.data.common import merged
 from twoloop.kernels.data.counters import N_ACCEPTED
 from twoloop.kernels.data.flags import AUGMENTED, FORM, NULL_SPACE, STATIC, STRAIGHT
 from twoloop.kernels.data.noted import BY_GENERAL, NEAR_NOW, NEARLY_SINGULAR, PIVOT, SENSITIVITY
-from twoloop.kernels.evaluation.calls import find_tangents, renew_partition
+from twoloop.kernels.evaluation.inner_loop import find_tangents, renew_partition
 from twoloop.kernels.evaluation.partition import least_pivot, partition_is_poor
-from twoloop.kernels.evaluation.static_factors_at import CAREFUL
+from twoloop.kernels.evaluation.sparse_inner_loop import CAREFUL
 
 SHORT = 0.5  # of the longest of the last steps: a step below it may be near a singular position ...
 COLLAPSED = 0.2  # of it: steps for which the pivots of C_q are looked at anew

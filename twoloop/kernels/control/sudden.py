@@ -17,8 +17,7 @@ import numpy as np
 from twoloop.kernels.control import clock as at
 from twoloop.kernels.data.common import compiled
 from twoloop.kernels.data.tolerances import GAP, RTOL
-from twoloop.kernels.evaluation.constraints import constraint_rates
-from twoloop.kernels.evaluation.gamma import representable
+from twoloop.kernels.evaluation.constraints import constraint_rates, representable
 
 PLACES = 20  # times ahead that are compared
 LONG = 12.0  # spacings of these times: the shortest way along which it is looked

@@ -20,7 +20,6 @@ Both methods are called by their addresses, and are compiled once, where they ar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.controller import ERROR_BEFORE, H_BEFORE, LEAST_ERROR, N_PAST, N_RULE, factor_of
 from twoloop.kernels.control.directions import DISPLACEMENT, INNER_TOL, first_direction
 from twoloop.kernels.data.codes import DONE, NOT_LOADED, OUTER_DIVERGED
@@ -29,8 +28,9 @@ from twoloop.kernels.data.counters import N_EVALUATIONS, N_JACOBIANS
 from twoloop.kernels.data.flags import FORCE_BY_Q_GIVEN, FORM, STATIC, STRAIGHT
 from twoloop.kernels.data.noted import EXPLICIT_STEP, REUSE, ROUNDED
 from twoloop.kernels.data.tolerances import ESTIMATE, GAP, LONGEST_UNSEEN, allowed, times_gap
-from twoloop.kernels.evaluation.calls import evaluate, renew_partition
+from twoloop.kernels.evaluation.inner_loop import evaluate, renew_partition
 from twoloop.kernels.evaluation.tasks import PROJECT
+from twoloop.kernels.linalg.dense import copy
 
 # evaluations before the first look at the rate, and between two; of code made for the mechanism DEARER times as many
 EARLY, INTERVAL = 100.0, 600.0  # a look takes some eight, by the general code

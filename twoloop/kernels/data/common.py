@@ -28,7 +28,7 @@ INTEGERS = types.int64[::1]
 PLACES = types.int32[::1]  # of long programs, which are to stay in the cache
 
 # programs in the place of callbacks that are not given, see evaluation/program.py, and that of the elimination of large
-# systems and of their Newton matrices, see algebra/static_program.py and static_lu.py; of size 0 where there is none
+# systems and of their Newton matrices, see linalg/symbolic_factorization.py; of size 0 where there is none
 PROGRAMS = (
     "jacobian_program",
     "jacobian_numbers",
@@ -64,7 +64,7 @@ class Work(NamedTuple):
     mass_pattern: Any  # (n_q, n_q) the same of M; empty without the augmented form
     places: Any  # where the entries of each row of G begin (n_c + n_a + 1), counted in what follows: their columns
     Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences over a double length, and with the length tried before
-    rates: Any  # (13, n_c + n_a) C_t and b at times within a step, see kinks.py
+    rates: Any  # (13, n_c + n_a) C_t and b at times within a step, see drive_discontinuities.py
     changes: Any  # (8, n_q + n_c + n_a) of forces, C_t and b with time, see sudden.py
     Q: Any  # (n_q) force
     x: Any  # (n_q) scratch
@@ -79,7 +79,7 @@ class Work(NamedTuple):
     rows: Any  # (r) rows of C that count
     dependent: Any  # (r) columns of the coordinates that they determine
     independent: Any  # (n_q - r) columns of the others
-    index: Any  # program of the factors of C_qd, see factors.py
+    index: Any  # program of the factors of C_qd, see markowitz_lu.py
     values: Any  # the factors
     rows_v: Any  # (r_v) rows of G that count
     dependent_v: Any  # (r_v)
@@ -98,13 +98,13 @@ class Work(NamedTuple):
     nodes: Any  # what the operations of a program make
     matrices: Any  # of Newton's method, see steps/newton_memory.py and steps/newton_static.py
     # of the static form alone; there N is n_q + n_c, and what is of no use to it is empty
-    mass_values: Any  # entries of M, see algebra/static_program.py
+    mass_values: Any  # entries of M, see linalg/symbolic_factorization.py
     jacobian_values: Any  # entries of G
     counts: Any  # (n_c) 1 for rows that count, else 0
     factors: Any
     pivot_sizes: Any  # (N)
     unknowns: Any  # (N) right-hand side and solution
-    solutions: Any  # (3 N) scratch, and (n_c) what M is stiffened by along rows, see algebra/static_factors.py
+    solutions: Any  # (3 N) scratch, and (n_c) what M is stiffened by along rows, see linalg/sparse_ldl.py
 
     sizes: Any = None  # by which it was made
     address: Any = 0  # of the table by which kernels find these arrays
@@ -165,7 +165,7 @@ KIT = Reference(
 )
 for _name, _kind in KINDS.items():
     KIT.add_function(_name, _kind.signature)
-# (kit, work, task, t, q, v, tolerance, a, lam) -> code, see calls.py
+# (kit, work, task, t, q, v, tolerance, a, lam) -> code, see inner_loop.py
 INNER = i8(KIT, WORK, i8, f8, VECTOR, VECTOR, f8, VECTOR, VECTOR)
 for _name in ("inner", "general"):
     KIT.add_function(_name, INNER)

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numba.extending import typeof_impl
 
-from twoloop.kernels.compile.own_functions import LaterFunctions, OwnFunctions
+from twoloop.kernels.compile.generated_functions import LaterFunctions, OwnFunctions
 from twoloop.kernels.data.common import KIT, OWN_FUNCTIONS, Step
 
 NONE = np.zeros(0)

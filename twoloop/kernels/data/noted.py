@@ -6,7 +6,7 @@
     ORIENTATION_NEW,  # ... and at the end of this attempt
     FAULT_KIND,  # place in Functions of the callback that gave a value that is not finite; -1: none known
     FAULT_TIME,  # ... and when
-    GAMMA_REQUIRED,  # relative accuracy that Q_d by differences must have, see differences.py
+    GAMMA_REQUIRED,  # relative accuracy that Q_d by differences must have, see constraints.py
     GAMMA_SHARE,  # of the longest length over which to difference
     GAMMA_ACCURACY,  # reached when that share was chosen
     GAMMA_SCALE,  # largest entry of Q_d so far
@@ -19,7 +19,7 @@
     PIVOT,  # smallest of the last full pivoting, rows scaled to 1: small near a singular position
     NEARLY_SINGULAR,  # 1: the run has come near a singular position, or is not to look for one
     NEAR_NOW,  # 1: a singular position was near at the last look; 2: a step that could look within did not for it
-    MASS_SCALE,  # s of the augmented matrix, see algebra/sparse.py
+    MASS_SCALE,  # s of the augmented matrix, see linalg/saddle_point.py
     FACTORED,  # 1: the factors of the linear problem belong to w.M and w.G
     KNOWN,  # 1: w.Rate and w.Gamma[:n_c] belong to the state, from the fused callback
     BY_GENERAL,  # 1: code made for the mechanism left the last state to the general inner loop

@@ -1,18 +1,40 @@
-"""Accelerations and multipliers, eqs. (6)-(8) of the paper, at a state on the constraints."""
+"""Accelerations and multipliers, eqs. (6)-(8) of the paper, and the projection of a state to the constraints.
+
+Where a step integrates all coordinates, a state is off the constraints by the error of the formula. One pass finds the
+accelerations there and moves positions and velocities to the nearest that the constraints allow, nearest in the metric
+of M, which does not depend on the partition. Positions are then good to the square of their correction, velocities and
+accelerations to the correction itself: one that is not near rounding is followed by another pass.
+"""
 
 import numpy as np
 
-from twoloop.kernels.algebra.banded import banded_mass
-from twoloop.kernels.algebra.saddle_point import factor, least_norm, multipliers, solve
-from twoloop.kernels.algebra.schur import factor_mass
-from twoloop.kernels.data.codes import DONE
+from twoloop.kernels.data.codes import DONE, INNER_DIVERGED
 from twoloop.kernels.data.common import compiled, merged
-from twoloop.kernels.data.counters import N_EVALUATIONS
-from twoloop.kernels.data.finite import MASS, finite, not_finite, source_of_acceleration
-from twoloop.kernels.data.flags import CONSTANT_MASS, FORM, GAMMA_GIVEN, MULTIPLIERS, NONHOLONOMIC_GAMMA_GIVEN
-from twoloop.kernels.data.noted import FACTORED, GAMMA_SCALE, KNOWN
-from twoloop.kernels.evaluation.gamma import gamma_by_differences
+from twoloop.kernels.data.counters import N_EVALUATIONS, N_INNER
+from twoloop.kernels.data.finite import CONSTRAINT, MASS, finite, not_finite, source_of_acceleration
+from twoloop.kernels.data.flags import (
+    CONSTANT_MASS,
+    FORM,
+    GAMMA_GIVEN,
+    KINEMATICS_GIVEN,
+    MULTIPLIERS,
+    NONHOLONOMIC_GAMMA_GIVEN,
+    NULL_SPACE,
+)
+from twoloop.kernels.data.noted import FACTORED, GAMMA_SCALE, KNOWN, PIVOT, ROUNDED
+from twoloop.kernels.evaluation.constraints import constraint_rates, gamma_by_differences, kinematics, row_residual
+from twoloop.kernels.evaluation.partition import (
+    CONTRACTION,
+    MAX_INNER,
+    ROUNDING,
+    factor_dependent,
+    factor_rows,
+    tangents,
+)
 from twoloop.kernels.evaluation.program import gamma_by_program
+from twoloop.kernels.linalg.band import banded_mass
+from twoloop.kernels.linalg.dense import largest_of
+from twoloop.kernels.linalg.saddle_point import factor, factor_mass, least_norm, multipliers, solve
 
 
 @merged
@@ -104,3 +126,96 @@ def equilibrate(f, w, a, lam):
     multipliers(f, w, w.Q, a, lam)
     if w.rows_v.size < lam.size:
         least_norm(w, lam)
+
+
+ABOVE_ROUNDING = 10.0  # of positions: no correction is asked to be smaller
+
+
+@merged
+def _look(f, w, t, q, v):
+    """Rows, factors and tangents at (q, v), which need not be on the constraints."""
+    if f.flags[KINEMATICS_GIVEN] == 1:
+        kinematics(f, w, t, q, v)
+        w.notes[KNOWN] = 1.0
+        code = factor_rows(w, t, q)
+    else:
+        code = factor_dependent(f, w, t, q)
+    if code == DONE and f.flags[FORM] == NULL_SPACE:
+        tangents(f, w, t, q)
+    return code
+
+
+@merged
+def accelerate_there(f, w, t, q, v, a):
+    """Accelerations at (q, v)."""
+    code = _look(f, w, t, q, v)
+    return accelerate(f, w, t, q, v, a) if code == DONE else code
+
+
+@merged
+def _move(f, w, x):
+    """Move x by the least correction in the metric of M that takes -w.g away from G x; the largest entry of it."""
+    w.Q[:] = 0.0
+    solve(f, w, w.Q, w.g, w.y)
+    largest = 0.0
+    for j in range(x.size):
+        if not np.isfinite(w.y[j]):
+            return np.inf
+        x[j] += w.y[j]
+        largest = max(largest, abs(w.y[j]))
+    return largest
+
+
+@merged
+def _move_both(f, w, q, v):
+    """Correct q and v by the factors at q; the largest correction of a position, and of a velocity."""
+    rows, n_c = w.rows_v, w.C.size
+    for i in range(rows.size):
+        w.g[rows[i]] = -w.C[rows[i]] if rows[i] < n_c else 0.0
+    moved = _move(f, w, q)
+    row_residual(w, v, rows)
+    for i in range(rows.size):
+        w.g[rows[i]] = -w.z[i]
+    return moved, _move(f, w, v)
+
+
+@merged
+def to_constraints(f, w, t, q, v, theta, a, lam):
+    """(q, v) put on the constraints, then accelerations and multipliers there.
+
+    Rows of A hold for velocities alone; positions are moved in directions that they allow.
+
+    Positions are corrected until a correction is at most theta, velocities alike, relative to the largest. Where it is
+    at most theta times the smallest pivot, by whose inverse tangents turn, velocities are right after the same pass.
+    """
+    before = np.inf
+    theta = max(theta, ABOVE_ROUNDING * w.notes[ROUNDED])
+    for _ in range(MAX_INNER):
+        code = _look(f, w, t, q, v)
+        if code == DONE:
+            code = factor_there(f, w, t, q)
+        if code != DONE:
+            return code
+        if f.flags[KINEMATICS_GIVEN] == 0:
+            w.C[:] = 0.0
+            f.constraint(t, q, f.p, w.C)
+        w.counters[N_INNER] += 1
+        if f.flags[KINEMATICS_GIVEN] == 0 and f.flags[FORM] != NULL_SPACE:  # whose tangents needed them
+            constraint_rates(f, w, t, q, w.Rate)
+        moved, faster = _move_both(f, w, q, v)
+        if not np.isfinite(moved):
+            return not_finite(w.notes, CONSTRAINT, t, q)
+        if moved <= theta and faster <= theta * max(1.0, largest_of(v)):
+            break
+        if moved <= w.notes[PIVOT] * theta:
+            w.notes[KNOWN] = 0.0  # the tangents are those of the end, but Gamma belongs to the velocities before
+            break
+        if moved > CONTRACTION * before:
+            if not moved <= ROUNDING * largest_of(q):
+                return INNER_DIVERGED
+            break
+        before = max(moved, theta)
+    code = accelerate(f, w, t, q, v, a)
+    if code == DONE:
+        equilibrate(f, w, a, lam)
+    return code

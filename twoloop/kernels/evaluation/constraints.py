@@ -1,8 +1,19 @@
-"""Rows of the constraints on velocities: C_q of C(t, q) = 0, then A of A(t, q) v + b(t, q) = 0."""
+"""Rows of the constraints on velocities, their rates, and the right-hand side Gamma of their derivative by differences.
 
-from twoloop.kernels.data.common import compiled, merged
+Rows are C_q of C(t, q) = 0, then A of A(t, q) v + b(t, q) = 0.
+
+Q_d, and its like for non-holonomic rows, is differenced along the motion over a length that is checked: two central
+differences, over a length e and over 2 e, give the derivative to order 4, and their disagreement its error.
+"""
+
+import numpy as np
+
+from twoloop.kernels.data.codes import DONE, GAMMA_INACCURATE
+from twoloop.kernels.data.common import compiled, exact, merged
 from twoloop.kernels.data.flags import AUGMENTED, CONSTRAINT_RATE_GIVEN, FORM, NONHOLONOMIC_RATE_GIVEN
+from twoloop.kernels.data.noted import GAMMA_ACCURACY, GAMMA_REQUIRED, GAMMA_SCALE, GAMMA_SHARE, KINK_AFTER, KINK_BEFORE
 from twoloop.kernels.evaluation.program import jacobian_by_program
+from twoloop.kernels.linalg.dense import copy
 
 
 @merged
@@ -80,3 +91,147 @@ def gather_independent_columns(G, rate, rows, independent, D):
             D[j, k] = -G[rows[k], column]
     for k in range(rows.size):
         D[independent.size, k] = -rate[rows[k]]
+
+
+LENGTH, SHORTEST = 2e-4, 1e-4  # see longest_difference
+LEVELS = 12  # lengths tried by _choose_length, each a quarter of the one before
+CERTAIN = 1e-9  # relative disagreement below which nothing but rounding is left
+LENGTHEN = 1e-11  # relative disagreement below which a longer length loses nothing and has less rounding
+# of values at 0, e, 2 e and 4 e: derivatives of order 2 over e and over 2 e
+ONE_SIDED, ONE_SIDED_TWICE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
+ONE_SIDED_LENGTH = 1.0 / 16.0  # their error is of lower order: a shorter length, so that none has to be looked for
+ROUNDING = 1e-14  # of the terms of G v over the longest length: where they cancel, Gamma cannot be had better
+ENOUGH = 0.01  # of the required accuracy: a change by less ends the search for a length
+
+
+@exact
+def representable(t, h):
+    """The difference of t + h and t as floating-point numbers: times near 1e9 s have spacings of 2e-7 s."""
+    return (t + h) - t
+
+
+@merged
+def longest_difference(q, v):
+    """Seconds over which to difference along the motion: LENGTH, or until q moves by LENGTH max|q|.
+
+    But at least LENGTH SHORTEST.
+    """
+    size = 0.0
+    speed = 0.0
+    for j in range(v.size):
+        size = max(size, abs(q[j]))
+        speed = max(speed, abs(v[j]))
+    if speed <= size:
+        return LENGTH
+    return LENGTH * max(size / speed, SHORTEST)  # where all coordinates pass through zero
+
+
+@merged
+def _side(notes, t, e):
+    """On which side of t differences may be taken for the sake of a known jump of C_t or b; 0: on both."""
+    before, after = t - notes[KINK_BEFORE], notes[KINK_AFTER] - t
+    if min(before, after) >= 2.0 * e:
+        return 0.0
+    return 1.0 if after >= before else -1.0
+
+
+@compiled
+def _differences(f, w, t, q, v, e, first, last):
+    """Gamma by differences over e and 2 e; its largest entry, the largest disagreement and the largest G v."""
+    twice = w.Gamma_tried[0]
+    side = _side(w.notes, t, e)
+    shorter = representable(t, ONE_SIDED_LENGTH * e)
+    if side != 0.0 and shorter > 0.0:
+        e = shorter
+    terms = 0.0
+    for i in range(first, last):
+        w.Gamma[i] = 0.0
+        twice[i] = 0.0
+    for k in range(4):
+        shift = (-2.0, -1.0, 1.0, 2.0)[k] * e if side == 0.0 else (0.0, 1.0, 2.0, 4.0)[k] * side * e
+        for j in range(q.size):
+            w.x[j] = q[j] + shift * v[j]
+        w.Gx[:, :] = 0.0
+        constraint_rows(f, w, t + shift, w.x, w.Gx)
+        constraint_rates(f, w, t + shift, w.x, w.g)
+        for i in range(first, last):
+            for j in range(v.size):
+                w.g[i] += w.Gx[i, j] * v[j]
+                terms = max(terms, abs(w.Gx[i, j] * v[j]))
+            if side != 0.0:
+                w.Gamma[i] -= ONE_SIDED[k] * w.g[i] / (side * e)
+                twice[i] -= ONE_SIDED_TWICE[k] * w.g[i] / (side * e)
+            elif k == 0 or k == 3:
+                twice[i] -= w.g[i] / (2.0 * shift)
+            else:
+                w.Gamma[i] -= w.g[i] / (2.0 * shift)
+    largest = 0.0
+    disagreement = 0.0
+    for i in range(first, last):
+        disagreement = max(disagreement, abs(w.Gamma[i] - twice[i]))
+        w.Gamma[i] = (4.0 * w.Gamma[i] - twice[i]) / 3.0
+        largest = max(largest, abs(w.Gamma[i]))
+        if not np.isfinite(w.Gamma[i]):
+            return np.nan, np.nan, terms
+    return largest, disagreement, terms
+
+
+@merged
+def _limit(notes):
+    """Largest disagreement that needs no other length: the result is better by far, were it not for rounding."""
+    return max(notes[GAMMA_REQUIRED], CERTAIN) * notes[GAMMA_SCALE]
+
+
+@compiled
+def _choose_length(f, w, t, q, v, longest, first, last):
+    """Difference over ever shorter lengths until the result no longer changes, else keep the one that changed it least.
+
+    DONE, or GAMMA_INACCURATE where it changed by more than is allowed.
+    """
+    best = np.inf
+    share = 1.0
+    for level in range(LEVELS):
+        e = representable(t, share * longest)
+        if e <= 0.0:
+            break
+        copy(w.Gamma, w.Gamma_tried[1])
+        largest, disagreement, _ = _differences(f, w, t, q, v, e, first, last)
+        if np.isnan(largest):
+            return DONE
+        w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], largest)
+        change = 0.0
+        for i in range(first, last):
+            change = max(change, abs(w.Gamma[i] - w.Gamma_tried[1, i]))
+        if level > 0 and change < best and disagreement <= _limit(w.notes):
+            best = change
+            w.notes[GAMMA_SHARE] = share
+            if change <= ENOUGH * w.notes[GAMMA_REQUIRED] * w.notes[GAMMA_SCALE]:
+                break
+        share *= 0.25
+    w.notes[GAMMA_ACCURACY] = best / w.notes[GAMMA_SCALE]
+    _differences(f, w, t, q, v, representable(t, w.notes[GAMMA_SHARE] * longest), first, last)
+    return DONE if w.notes[GAMMA_ACCURACY] <= w.notes[GAMMA_REQUIRED] else GAMMA_INACCURATE
+
+
+@compiled
+def gamma_by_differences(f, w, t, q, v, first, last):
+    """Rows first to last of Gamma by differences, into w.Gamma, or GAMMA_INACCURATE where no length will do.
+
+    Gamma = -d/de [G v + (C_t, b)](t + e, q + e v) at e = 0.
+
+    Errors are judged relative to the largest entry that Gamma has had in this run. The length is a share of
+    longest_difference, found by trial where the two differences disagree: a drive of kilohertz needs a short one.
+    """
+    longest = longest_difference(q, v)
+    e = representable(t, w.notes[GAMMA_SHARE] * longest)
+    if e > 0.0:
+        largest, disagreement, terms = _differences(f, w, t, q, v, e, first, last)
+        if np.isnan(largest) or disagreement == 0.0 or w.notes[GAMMA_SCALE] == 0.0:
+            return DONE  # what is not finite is found where it is used; without a scale nothing can be judged
+        rounding = ROUNDING * terms / longest
+        w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], largest, rounding / w.notes[GAMMA_REQUIRED])
+        if disagreement < LENGTHEN * w.notes[GAMMA_SCALE]:
+            w.notes[GAMMA_SHARE] = min(1.0, 2.0 * w.notes[GAMMA_SHARE])
+        if disagreement <= _limit(w.notes):
+            return DONE
+    return _choose_length(f, w, t, q, v, longest, first, last)

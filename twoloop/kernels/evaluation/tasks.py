@@ -1,4 +1,4 @@
-"""What the steps may ask an inner loop for; calls.py has a function for each."""
+"""What the steps may ask an inner loop for; inner_loop.py has a function for each."""
 
 (
     EVALUATE,
@@ -14,5 +14,5 @@
     MIDPOINT,
     PATTERN,
     REDUNDANT,
-    SOLVE,  # of large systems alone, see static_inner.py
+    SOLVE,  # of large systems alone, see sparse_inner_loop.py
 ) = range(14)

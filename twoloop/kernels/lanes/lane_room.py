@@ -6,7 +6,7 @@ from numba import types
 from numba.extending import typeof_impl
 
 from twoloop.kernels.compile.callbacks import VECTOR
-from twoloop.kernels.compile.own_functions import OwnFunctions, has_wide_vectors
+from twoloop.kernels.compile.generated_functions import OwnFunctions, has_wide_vectors
 from twoloop.kernels.compile.reference import Reference
 from twoloop.kernels.data.common import INTEGERS, merged
 

@@ -18,7 +18,7 @@ from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, inlined, kernel, merged
 from twoloop.kernels.data.counters import N_OUTER
 from twoloop.kernels.data.tolerances import ATOL, RTOL
-from twoloop.kernels.evaluation.calls import evaluate_there, project
+from twoloop.kernels.evaluation.inner_loop import evaluate_there, project
 
 HIGHEST = 12  # order; with orders above 13 the nodes below would not do
 N_TERMS = HIGHEST + 2  # differences that a step makes, and coefficients g and G

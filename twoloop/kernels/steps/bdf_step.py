@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.predictor import departure
 from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, inlined, kernel, merged
 from twoloop.kernels.data.counters import N_OUTER
 from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL
-from twoloop.kernels.evaluation.calls import accelerations, evaluate_state, rounding_floor
+from twoloop.kernels.evaluation.inner_loop import accelerations, evaluate_state, rounding_floor
+from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps.fixed_point_loops import iterate_accelerations
 from twoloop.kernels.steps.stages import options_array as gauss_options
 

@@ -9,7 +9,6 @@ enters by q and v alone. Its end is put on the constraints with a partition of i
 
 import numpy as np
 
-from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.controller import nothing_to_settle
 from twoloop.kernels.control.predictor import keep_predicted
 from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED, SINGULAR
@@ -17,7 +16,8 @@ from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, kernel
 from twoloop.kernels.data.counters import N_OUTER
 from twoloop.kernels.data.noted import ORIENTATION, ORIENTATION_NEW, PIVOT
 from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL, allowed
-from twoloop.kernels.evaluation.calls import evaluate_state, project, renew_partition
+from twoloop.kernels.evaluation.inner_loop import evaluate_state, project, renew_partition
+from twoloop.kernels.linalg.dense import copy
 
 # places in `options`, then A, A A, Legendre coefficients and interpolation from the other nodes (S, S each); b, b A, c
 INNER_TOL, THETA, N_SCALARS = range(3)

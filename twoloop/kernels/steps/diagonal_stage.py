@@ -17,7 +17,7 @@ from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED
 from twoloop.kernels.data.common import compiled, inlined, merged
 from twoloop.kernels.data.counters import N_OUTER
 from twoloop.kernels.data.flags import BANDWIDTH, FORCE_BY_Q_GIVEN, FORM, STATIC
-from twoloop.kernels.evaluation.calls import evaluate, multipliers
+from twoloop.kernels.evaluation.inner_loop import evaluate, multipliers
 from twoloop.kernels.steps import newton_memory as at
 from twoloop.kernels.steps.iteration_matrix import factor_iteration, solve_iteration
 from twoloop.kernels.steps.newton_memory import block, memory_size, vector

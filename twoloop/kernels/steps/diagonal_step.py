@@ -10,14 +10,14 @@ times it.
 
 import numpy as np
 
-from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.predictor import departure, keep_predicted
 from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, kernel
 from twoloop.kernels.data.flags import FORCE_BY_Q_GIVEN
 from twoloop.kernels.data.noted import GENERATION
 from twoloop.kernels.data.tolerances import ESTIMATE, allowed
-from twoloop.kernels.evaluation.calls import evaluate, evaluate_state, multipliers
+from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, multipliers
+from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps import newton_memory as at
 from twoloop.kernels.steps.diagonal_stage import (
     KEPT_WHILE,

@@ -9,7 +9,6 @@ constraints by its error, and the end of the step alone is put back on them.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.controller import nothing_to_settle
 from twoloop.kernels.control.predictor import departure, keep_predicted
 from twoloop.kernels.data.codes import DONE
@@ -17,7 +16,8 @@ from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, inline
 from twoloop.kernels.data.counters import N_OUTER
 from twoloop.kernels.data.noted import NEARLY_SINGULAR
 from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL, times_gap
-from twoloop.kernels.evaluation.calls import evaluate, evaluate_state, evaluate_there, project
+from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, evaluate_there, project
+from twoloop.kernels.linalg.dense import copy
 
 # places in `options`: scalars, then A (s, s), b (s), c (s) and the weights of the two estimates (s each)
 STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)  # FREE: stages are left where they are

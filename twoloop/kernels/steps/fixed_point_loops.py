@@ -6,12 +6,12 @@
 
 import numpy as np
 
-from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.predictor import restore_predicted
 from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED
 from twoloop.kernels.data.common import compiled, exact, merged
 from twoloop.kernels.data.counters import N_OUTER
-from twoloop.kernels.evaluation.calls import evaluate, restore, rounding_floor
+from twoloop.kernels.evaluation.inner_loop import evaluate, restore, rounding_floor
+from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps.fixed_point_memory import N_RESTS
 from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TEST, OUTER_TOL, tableau_of
 

@@ -1,8 +1,8 @@
 """Where the parts of the `memory` of fixed_point_step.py and paper_step.py are."""
 
-from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.data.common import inlined, merged
 from twoloop.kernels.data.tolerances import ESTIMATE
+from twoloop.kernels.linalg.dense import copy
 
 # rows of REST, for the compensated sums of fixed steps: what rounding took from q and from v, at the last accepted step
 # and in this attempt. Without them the energy of a symmetric method wanders with the number of steps

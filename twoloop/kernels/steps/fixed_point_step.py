@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.richardson import conclude
 from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, kernel
 from twoloop.kernels.data.tolerances import ESTIMATE
-from twoloop.kernels.evaluation.calls import accelerations
+from twoloop.kernels.evaluation.inner_loop import accelerations
+from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps import fixed_point_memory as at
 from twoloop.kernels.steps.fixed_point_loops import iterate_accelerations
 from twoloop.kernels.steps.fixed_point_memory import block, keep_rest, rests_of, vector

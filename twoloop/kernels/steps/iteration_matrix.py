@@ -9,12 +9,12 @@ many systems of a Runge-Kutta method: half the work where a matrix serves one it
 same: how T and M change with the position, in which there is no stiffness.
 """
 
-from twoloop.kernels.algebra.linalg import copy, ldl_factor, ldl_solve, lu_factor, lu_solve
 from twoloop.kernels.data.codes import DONE, SINGULAR
 from twoloop.kernels.data.common import compiled
 from twoloop.kernels.data.counters import N_FACTORIZATIONS, N_JACOBIANS
 from twoloop.kernels.data.flags import FORCE_BY_V_GIVEN
-from twoloop.kernels.evaluation.calls import find_tangents
+from twoloop.kernels.evaluation.inner_loop import find_tangents
+from twoloop.kernels.linalg.dense import copy, ldl_factor, ldl_solve, lu_factor, lu_solve
 from twoloop.kernels.steps import newton_memory as at
 from twoloop.kernels.steps.newton_dense import reduce
 from twoloop.kernels.steps.newton_memory import pivots_of, space, square, vector

@@ -12,11 +12,11 @@ J that was differenced before a contact began or ended says another rate, while 
 
 import numpy as np
 
-from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.common import compiled
 from twoloop.kernels.data.tolerances import GAP, allowed
-from twoloop.kernels.evaluation.calls import evaluate
+from twoloop.kernels.evaluation.inner_loop import evaluate
+from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps import newton_memory as at
 from twoloop.kernels.steps.newton_memory import block, vector
 from twoloop.kernels.steps.newton_tangents import DIFFERENCE

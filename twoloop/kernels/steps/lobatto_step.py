@@ -11,7 +11,6 @@ are made in a row, while nothing else has to be looked at, and put on the constr
 
 import math
 
-from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control import clock as at
 from twoloop.kernels.control.landing import off_grid
 from twoloop.kernels.control.predictor import departure, keep_predicted
@@ -31,8 +30,9 @@ from twoloop.kernels.data.counters import (
 )
 from twoloop.kernels.data.noted import BY_GENERAL, DEFECT, NEARLY_SINGULAR, ORIENTATION_NEW, PIVOT, ROUNDED
 from twoloop.kernels.data.tolerances import ESTIMATE, LOOK, ROUNDING, allowed
-from twoloop.kernels.evaluation.calls import check_redundant, project
-from twoloop.kernels.evaluation.onto_constraints import ABOVE_ROUNDING
+from twoloop.kernels.evaluation.accelerations import ABOVE_ROUNDING
+from twoloop.kernels.evaluation.inner_loop import check_redundant, project
+from twoloop.kernels.linalg.dense import copy
 
 # FREE: how many times LOOK a step may be long that nothing is looked at within, beside the nodes
 THETA, N_ITERATED, N_ROWS, FREE, N_OPTIONS = range(5)
@@ -210,7 +210,7 @@ def _take(f, w, options, room, tolerances, driven, n, k, t, row, state):
     """Make `row`, a state beside the constraints, that of lane k, on them; whether it was near enough.
 
     Where constraints depend on time (`driven`), a velocity that they change is one that the accelerations at the nodes
-    do not explain: see kinks.py.
+    do not explain: see drive_discontinuities.py.
     """
     _, _, _, _, _, ends, end_a, lam, _ = _places(n, int(options[N_ITERATED]), int(options[N_ROWS]))
     if room[room_at.FINE + k] == 0.0:

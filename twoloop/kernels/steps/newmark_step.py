@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.controller import nothing_to_settle
 from twoloop.kernels.control.predictor import departure
 from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, kernel, merged
 from twoloop.kernels.data.counters import N_OUTER
 from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, GAP, RTOL
-from twoloop.kernels.evaluation.calls import evaluate_state, rounding_floor
+from twoloop.kernels.evaluation.inner_loop import evaluate_state, rounding_floor
+from twoloop.kernels.linalg.dense import copy
 
 MAX_ITERATIONS = 60
 GROWN = 2.0  # times the size before a step

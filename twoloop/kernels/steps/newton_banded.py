@@ -18,16 +18,24 @@ every n_q (Curtis, Powell & Reid 1974, doi 10.1093/imamat/13.1.117).
 
 import numpy as np
 
-from twoloop.kernels.algebra.banded import add_banded_mass_times, factor_bordered, lu_band, solve_bordered
-from twoloop.kernels.algebra.factors import columns_of
-from twoloop.kernels.algebra.lapack import DGBTRF, DGBTRS, ZGBTRF, ZGBTRS
-from twoloop.kernels.algebra.linalg import copy, copy_matrix
 from twoloop.kernels.data.codes import DONE, NOT_FINITE
 from twoloop.kernels.data.common import compiled, inlined
 from twoloop.kernels.data.counters import N_EVALUATIONS, N_FACTORIZATIONS, N_JACOBIANS
 from twoloop.kernels.data.flags import BANDWIDTH, FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN
-from twoloop.kernels.evaluation.calls import find_tangents
 from twoloop.kernels.evaluation.constraints import constraint_rows
+from twoloop.kernels.evaluation.inner_loop import find_tangents
+from twoloop.kernels.linalg.band import (
+    DGBTRF,
+    DGBTRS,
+    ZGBTRF,
+    ZGBTRS,
+    add_banded_mass_times,
+    factor_bordered,
+    lu_band,
+    solve_bordered,
+)
+from twoloop.kernels.linalg.dense import copy, copy_matrix
+from twoloop.kernels.linalg.markowitz_lu import columns_of
 from twoloop.kernels.steps import newton_memory as at
 from twoloop.kernels.steps.newton_memory import (
     complex_vector,

@@ -7,13 +7,13 @@ in which a body turns by some 0.4 rad on its constraints may then fail where dif
 converge.
 """
 
-from twoloop.kernels.algebra.factors import columns_of
-from twoloop.kernels.algebra.linalg import copy, ldl_factor, ldl_solve_rows, lu_factor, lu_solve
 from twoloop.kernels.data.codes import DONE, SINGULAR
 from twoloop.kernels.data.common import compiled
 from twoloop.kernels.data.counters import N_FACTORIZATIONS, N_JACOBIANS
 from twoloop.kernels.data.flags import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN
-from twoloop.kernels.evaluation.calls import evaluate, find_tangents
+from twoloop.kernels.evaluation.inner_loop import evaluate, find_tangents
+from twoloop.kernels.linalg.dense import copy, ldl_factor, ldl_solve_rows, lu_factor, lu_solve
+from twoloop.kernels.linalg.markowitz_lu import columns_of
 from twoloop.kernels.steps import newton_memory as at
 from twoloop.kernels.steps.newton_memory import (
     count_eigenvalues,

@@ -12,16 +12,16 @@ which no position showed when the pattern was looked for, other forms have to go
 
 import numpy as np
 
-from twoloop.kernels.algebra.linalg import copy
-from twoloop.kernels.algebra.static_lu import factor as factor_lu
-from twoloop.kernels.algebra.static_lu import load, tangents_of
-from twoloop.kernels.algebra.static_lu import solve as solve_lu
-from twoloop.kernels.algebra.static_program import N_OF_MASS, N_OFF, N_PIVOTS, jacobian_of, mass_of
 from twoloop.kernels.data.codes import DONE, NEEDS_DENSE, NOT_FINITE, SINGULAR
 from twoloop.kernels.data.common import compiled, inlined
 from twoloop.kernels.data.counters import N_EVALUATIONS, N_FACTORIZATIONS, N_JACOBIANS
 from twoloop.kernels.data.finite import finite_vector
-from twoloop.kernels.evaluation.static_factors_at import jacobian_values_there
+from twoloop.kernels.evaluation.sparse_inner_loop import jacobian_values_there
+from twoloop.kernels.linalg.dense import copy
+from twoloop.kernels.linalg.sparse_lu import factor as factor_lu
+from twoloop.kernels.linalg.sparse_lu import load, tangents_of
+from twoloop.kernels.linalg.sparse_lu import solve as solve_lu
+from twoloop.kernels.linalg.symbolic_factorization import N_OF_MASS, N_OFF, N_PIVOTS, jacobian_of, mass_of
 from twoloop.kernels.steps import newton_memory as at
 from twoloop.kernels.steps.newton_memory import count_eigenvalues, eigen_place
 from twoloop.kernels.steps.newton_tangents import DIFFERENCE, displaced_with_all

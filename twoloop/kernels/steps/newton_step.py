@@ -13,7 +13,6 @@ need tiny steps there.
 
 import numpy as np
 
-from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.predictor import restore_predicted
 from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, kernel
@@ -21,7 +20,8 @@ from twoloop.kernels.data.counters import N_OUTER
 from twoloop.kernels.data.flags import FORM, STATIC
 from twoloop.kernels.data.noted import GENERATION
 from twoloop.kernels.data.tolerances import ESTIMATE, LEAST, allowed
-from twoloop.kernels.evaluation.calls import accelerations, evaluate, multipliers
+from twoloop.kernels.evaluation.inner_loop import accelerations, evaluate, multipliers
+from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps import newton_memory as at
 from twoloop.kernels.steps.lasting import STEPS, lasting_error, over_velocities, own_time
 from twoloop.kernels.steps.newton_memory import block, eigen_place, vector

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.data.codes import DONE, NOT_FINITE
 from twoloop.kernels.data.common import compiled, inlined
 from twoloop.kernels.data.flags import FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN
 from twoloop.kernels.evaluation.constraints import constraint_rows
+from twoloop.kernels.linalg.dense import copy
 
 DIFFERENCE = 1e-7  # displacement for derivatives, relative to max(1, |value|)
 STEP, KINDS = 0.37, 7  # by which displacements that are made at a time differ, and how many kinds of them there are

@@ -5,13 +5,13 @@ See the head of taylor.py.
 
 import numpy as np
 
-from twoloop.kernels.algebra.saddle_point import solve_both
 from twoloop.kernels.data.codes import DONE, NOT_FINITE
 from twoloop.kernels.data.common import compiled, inlined, merged
 from twoloop.kernels.data.counters import N_EVALUATIONS
 from twoloop.kernels.data.flags import FORM, STATIC
 from twoloop.kernels.evaluation import operations as op
 from twoloop.kernels.evaluation.tasks import SOLVE
+from twoloop.kernels.linalg.saddle_point import solve_both
 
 # places in `options`: scalars, ORDER being that of the series of q; where each array of the program begins, and where
 # the last ends; then the arrays, integers by their bits

@@ -17,7 +17,6 @@ before, so that no power of a short time underflows. The end of the step is move
 
 import numpy as np
 
-from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.defect import excess
 from twoloop.kernels.control.predictor import departure, keep_predicted
 from twoloop.kernels.data.codes import DONE
@@ -26,8 +25,9 @@ from twoloop.kernels.data.counters import N_OUTER
 from twoloop.kernels.data.flags import STRAIGHT
 from twoloop.kernels.data.noted import BY_GENERAL, DEFECT, NEAR_NOW, NEARLY_SINGULAR
 from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, LOOK, ROUNDING, RTOL, times_gap
-from twoloop.kernels.evaluation.calls import evaluate_there, project
+from twoloop.kernels.evaluation.inner_loop import evaluate_there, project
 from twoloop.kernels.evaluation.tasks import EVALUATE_THERE
+from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps import recurrences as at
 from twoloop.kernels.steps.recurrences import accelerations_found, expand, series_of
 

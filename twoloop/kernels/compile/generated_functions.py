@@ -13,8 +13,7 @@ from typing import Any
 from llvmlite import binding
 from numba.core.registry import cpu_target
 
-from twoloop.kernels.compile.caches import UNWRITABLE, Newest, say_once, sources_folder
-from twoloop.kernels.compile.kept_files import Files
+from twoloop.kernels.compile.caches import UNWRITABLE, Files, Newest, say_once, sources_folder
 
 SINGLE_PASSES = hasattr(binding.ModulePassManager, "add_reassociate_pass")
 

@@ -1,4 +1,4 @@
-"""Factors of the matrix of a large system by its program, see static_program.py, and solutions with them.
+"""Factors of the matrix of a large system by its program, see symbolic_factorization.py, and solutions with them.
 
 A row of G that counts has a negative pivot, the square of what is left of it beside the rows before. Over what the
 bodies put into it, that is the sine squared of the angle between the row and those before, in the metric of M^-1:
@@ -11,7 +11,8 @@ M + s g g^T accelerations are the same, as g a is given, and the multiplier of g
 positive definite but on what such rows allow.
 """
 
-from twoloop.kernels.algebra.static_program import (
+from twoloop.kernels.data.common import compiled, merged
+from twoloop.kernels.linalg.symbolic_factorization import (
     N_COORDINATES,
     N_PIVOTS,
     columns_of,
@@ -21,7 +22,6 @@ from twoloop.kernels.algebra.static_program import (
     stiffened_of,
     targets_of,
 )
-from twoloop.kernels.data.common import compiled, merged
 
 NOT_DEFINITE = -1.0  # what stands for the smallest pivot where one of M is not positive
 

@@ -3,9 +3,9 @@
     [M - z^2 K - z D  G^T]
     [G                 0 ]  = L U
 
-in the order of static_order.py with couplings, with pivots of one row and no look at the numbers. The numbers of M come
-first among the entries, then those of K and D. Behind the program stand groups of these, each of columns of which no
-two have an entry in the same row, so that one displacement serves all (Curtis, Powell & Reid 1974, doi
+in the order of symbolic_factorization.py with couplings, with pivots of one row and no look at the numbers. The numbers
+of M come first among the entries, then those of K and D. Behind the program stand groups of these, each of columns of
+which no two have an entry in the same row, so that one displacement serves all (Curtis, Powell & Reid 1974, doi
 10.1093/imamat/13.1.117).
 """
 
@@ -14,8 +14,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.kernels.algebra.static_order import elimination_order
-from twoloop.kernels.algebra.static_program import (
+from twoloop.kernels.data.common import compiled, inlined
+from twoloop.kernels.linalg.symbolic_factorization import (
     N_COORDINATES,
     N_OFF,
     N_PIVOTS,
@@ -23,6 +23,7 @@ from twoloop.kernels.algebra.static_program import (
     Integers,
     behind,
     columns_of,
+    elimination_order,
     jacobian_of,
     mass_of,
     order_of,
@@ -30,7 +31,6 @@ from twoloop.kernels.algebra.static_program import (
     stiffened_of,
     targets_of,
 )
-from twoloop.kernels.data.common import compiled, inlined
 
 LEAST = 1e-11  # of what it is the difference of: a smaller pivot is rounding
 

@@ -1,0 +1,510 @@
+"""The inner loop of large systems, by sparse factors whose order of elimination is chosen once.
+
+There is no partition: all coordinates are integrated, and evaluated as they stand. Wherever others restore dependent
+coordinates, all are moved to the nearest state on the constraints, nearest in the metric of M. What these factors
+cannot decide is NEEDS_DENSE: a run then goes on with the forms of saddle_point.py, as it does for methods that need a
+partition. Nothing here has the size of n_c times n_q where callbacks give values of entries. Dense callbacks fill dense
+arrays, from which the entries are taken.
+
+Multipliers of least norm, where rows are redundant: of all lam with the same G^T lam = b, the least is G x for some x.
+It solves
+
+    [0  G^T] [ x ]   [b]
+    [G  -1 ] [lam] = [0]
+
+which is singular in x, as not all motion is held. With W in the place of 0, a small diagonal positive matrix, it is
+quasi-definite, and has factors in any order (Vanderbei 1995, doi 10.1137/0805005): those of the same program. As b is a
+sum of rows of G, refined solutions come to the lam that is looked for: a part of b along a direction in which G is
+small by s, over the columns' own size, loses the factor 1 + s^2 / SHARE each time.
+"""
+
+import numpy as np
+
+from twoloop.kernels.data.codes import DONE, INNER_DIVERGED, NEEDS_DENSE, RANK_DIFFERS, ROWS_CONTRADICT, SINGULAR
+from twoloop.kernels.data.common import INNER, compiled, kernel
+from twoloop.kernels.data.counters import N_EVALUATIONS, N_FACTORIZATIONS, N_INNER, N_PARTITIONS
+from twoloop.kernels.data.finite import CONSTRAINT, FORCE, GAMMA, JACOBIAN, MASS, RATE, finite_vector, not_finite
+from twoloop.kernels.data.flags import CONSTANT_MASS, GAMMA_GIVEN, JACOBIAN_VALUES_GIVEN, MASS_VALUES_GIVEN
+from twoloop.kernels.data.noted import (
+    CONTRADICTION,
+    GENERATION,
+    NEARLY_SINGULAR,
+    PIVOT,
+    RANK,
+    RANK_V,
+    ROUNDED,
+    SMALLEST,
+)
+from twoloop.kernels.evaluation import tasks
+from twoloop.kernels.evaluation.accelerations import ABOVE_ROUNDING
+from twoloop.kernels.evaluation.constraints import constraint_rates
+from twoloop.kernels.evaluation.partition import CONTRACTION, CONTRADICTS, MAX_INNER, ROUNDING
+from twoloop.kernels.evaluation.program import gamma_by_program, jacobian_by_program
+from twoloop.kernels.linalg.dense import copy, has_new_entries, largest_of
+from twoloop.kernels.linalg.sparse_ldl import factor, load, refined, solve
+from twoloop.kernels.linalg.symbolic_factorization import N_OFF, N_PIVOTS, jacobian_of, mass_of, order_of
+
+SUSPECT = 1e-6  # a pivot below this share of its size is looked at: that of a redundant row is rounding
+LEAST = 1e-10  # ... and one below this share no factors with pivots of one row can do with
+DEPENDENT = 1e-11  # sine of the angle to the other rows, found without cancellation, up to which a row is redundant
+CAREFUL = 2.0  # of NEARLY_SINGULAR: stages are put on the constraints, as it matters how well they keep to these
+ONCE, TWICE = 1e-3, 1e-7  # the smallest share, below which solutions are refined, and refined again
+
+
+@compiled
+def mass_values_there(f, w, t, q):
+    """The entries of M into w.mass_values; of a constant dense M they stand there from the beginning."""
+    if f.flags[MASS_VALUES_GIVEN] == 1:
+        w.mass_values[:] = 0.0
+        f.mass_values(t, q, f.p, w.mass_values)
+    elif w.M.size > 0:
+        rows, columns, _ = mass_of(f.static_program)
+        for k in range(rows.size):
+            w.M[rows[k], columns[k]] = 0.0
+        f.mass(t, q, f.p, w.M)
+        for k in range(rows.size):
+            w.mass_values[k] = w.M[rows[k], columns[k]]
+
+
+@compiled
+def jacobian_values_there(f, w, t, q):
+    """The entries of C_q into w.jacobian_values."""
+    if f.flags[JACOBIAN_VALUES_GIVEN] == 1:
+        w.jacobian_values[:] = 0.0
+        f.jacobian_values(t, q, f.p, w.jacobian_values)
+        return
+    rows, columns, _ = jacobian_of(f.static_program)
+    for k in range(rows.size):
+        w.G[rows[k], columns[k]] = 0.0
+    if not jacobian_by_program(f, w, t, q, w.G):
+        f.jacobian(t, q, f.p, w.G[: w.C.size])
+    for k in range(rows.size):
+        w.jacobian_values[k] = w.G[rows[k], columns[k]]
+
+
+@compiled
+def _factor(f, w, least):
+    """The factors for the values there are; the smallest pivot over its size, see sparse_ldl.py."""
+    w.counters[N_FACTORIZATIONS] += 1
+    stiffness = w.solutions[3 * f.static_program[N_PIVOTS] :]
+    load(f.static_program, w.mass_values, w.jacobian_values, w.counts, w.factors, stiffness, w.pivot_sizes)
+    smallest = factor(f.static_program, w.counts, w.factors, w.pivot_sizes, least)
+    w.notes[SMALLEST] = smallest
+    w.notes[PIVOT] = np.sqrt(max(smallest, 0.0))
+    return smallest
+
+
+@compiled
+def _factor_fault(w, t, q):
+    """Which values are not finite; where all are, whether M is singular, as dense forms may accept, or the rows are."""
+    if not finite_vector(w.mass_values):
+        return not_finite(w.notes, MASS, t, q)
+    if not finite_vector(w.jacobian_values):
+        return not_finite(w.notes, JACOBIAN, t, q)
+    return NEEDS_DENSE if w.notes[SMALLEST] < 0.0 else SINGULAR
+
+
+@compiled
+def factors_there(f, w, t, q):
+    """The factors at (t, q), of the rows that count."""
+    if f.flags[CONSTANT_MASS] == 0:
+        mass_values_there(f, w, t, q)
+    jacobian_values_there(f, w, t, q)
+    smallest = _factor(f, w, LEAST)
+    if not smallest > 0.0:
+        return _factor_fault(w, t, q)
+    return DONE if _number(w.counts) == w.rows_v.size else _choose_again(f, w, t, q)
+
+
+@compiled
+def _choose_again(f, w, t, q):
+    """Rows that count have come to depend on one another: others may do in their place."""
+    w.counters[N_PARTITIONS] += 1
+    code = _choose(f, w, t, q)
+    return _take(w) if code == DONE else code
+
+
+@compiled
+def solve_values(f, w, times):
+    """Solve for the right-hand side in w.unknowns, in its place, refined so many times."""
+    n = f.static_program[N_PIVOTS]
+    scratch = w.solutions
+    return refined(
+        f.static_program,
+        w.mass_values,
+        w.jacobian_values,
+        w.counts,
+        w.factors,
+        scratch[3 * n :],
+        w.unknowns,
+        times,
+        scratch[:n],
+        scratch[n : 2 * n],
+        scratch[2 * n : 3 * n],
+    )
+
+
+@compiled
+def refinements(w):
+    """How often solutions with these factors are to be refined."""
+    smallest = w.notes[SMALLEST]
+    return 0 if smallest > ONCE else 1 if smallest > TWICE else 2
+
+
+@compiled
+def _row_as_force(f, w, row):
+    """[g, 0] into w.unknowns for a row g of G."""
+    w.unknowns[:] = 0.0
+    rows, columns, _ = jacobian_of(f.static_program)
+    for k in range(rows.size):
+        if rows[k] == row:
+            w.unknowns[columns[k]] += w.jacobian_values[k]
+
+
+@compiled
+def _squared_in_mass(f, w, x):
+    """x^T M x."""
+    rows, columns, _ = mass_of(f.static_program)
+    total = 0.0
+    for k in range(rows.size):
+        total += x[rows[k]] * w.mass_values[k] * x[columns[k]]
+    return total
+
+
+@compiled
+def _sine(f, w, row, size):
+    """The sine of the angle of a row that does not count to those that do; `size` is g M^-1 g^T."""
+    _row_as_force(f, w, row)
+    solve_values(f, w, 2)
+    part = _squared_in_mass(f, w, w.unknowns[: w.Q.size])
+    return np.sqrt(part / size) if size > 0.0 else 0.0
+
+
+@compiled
+def _number(counts):
+    number = 0
+    for i in range(counts.size):
+        number += int(counts[i])
+    return number
+
+
+@compiled
+def _choose(f, w, t, q):
+    """Which rows count, into w.counts, and the factors of these; DONE, or why that cannot be said.
+
+    Rows with small pivots are left out at first, and taken one after another if they are independent of those that
+    count by then.
+    """
+    w.counts[:] = 1.0
+    if not _factor(f, w, SUSPECT) > 0.0:
+        return _factor_fault(w, t, q)
+    order, n_q = order_of(f.static_program), w.Q.size
+    copy(w.counts, w.z)  # 0 for rows to look at
+    for k in range(order.size):
+        row = order[k] - n_q
+        if row < 0 or w.z[row] != 0.0:
+            continue
+        sine = _sine(f, w, row, w.pivot_sizes[k])
+        if sine <= DEPENDENT:
+            continue
+        number = _number(w.counts)
+        w.counts[row] = 1.0
+        smallest = _factor(f, w, LEAST) if sine * sine > LEAST else 0.0
+        if not smallest > 0.0 or _number(w.counts) != number + 1:
+            return _factor_fault(w, t, q)
+    return DONE
+
+
+@compiled
+def _take(w):
+    """Make the rows that count those of the workspace, which has room for so many."""
+    if _number(w.counts) != w.rows_v.size:
+        return SINGULAR
+    place = 0
+    for i in range(w.counts.size):
+        if w.counts[i] != 0.0:
+            w.rows_v[place] = i
+            place += 1
+    return DONE
+
+
+@compiled
+def choose_rows(f, w, t, q):
+    """Choose the rows that count at (t, q); RANK_DIFFERS where the workspace is made for another number of them."""
+    w.counters[N_PARTITIONS] += 1
+    mass_values_there(f, w, t, q)
+    jacobian_values_there(f, w, t, q)
+    code = _choose(f, w, t, q)
+    if code != DONE:
+        return code
+    number = _number(w.counts)
+    if w.notes[GENERATION] == 0.0 and number != w.rows_v.size:
+        w.notes[RANK] = w.notes[RANK_V] = number
+        return RANK_DIFFERS
+    w.notes[GENERATION] += 1.0
+    return _take(w)
+
+
+SHARE = 1e-11  # of the squares of a column of G: W
+ENOUGH = 1e-14  # of the largest force: what may be left of b
+ALLOWED = 1e-9  # ... and what may be left where it no longer shrinks
+MOST = 30  # solutions
+
+
+@compiled
+def _load(program, jacobian, n_q, weights, values):
+    """The numbers of the matrix into their slots; `weights` is room for n_q numbers."""
+    rows, columns, slots = jacobian_of(program)
+    for j in range(n_q):
+        weights[j] = 0.0
+    largest = 0.0
+    for k in range(rows.size):
+        weights[columns[k]] += jacobian[k] * jacobian[k]
+        largest = max(largest, weights[columns[k]])
+    order, n = order_of(program), program[N_PIVOTS]
+    for s in range(n + program[N_OFF]):
+        values[s] = 0.0
+    for k in range(n):
+        values[k] = SHARE * (weights[order[k]] if weights[order[k]] > 0.0 else largest) if order[k] < n_q else -1.0
+    for k in range(rows.size):
+        values[slots[k]] += jacobian[k]
+
+
+@compiled
+def _residual(program, jacobian, force, x, r):
+    """[b - G^T lam, lam - G x] for x = [x, lam]; the largest of its forces over the largest of b."""
+    n_q, largest, left = force.size, 0.0, 0.0
+    copy(force, r[:n_q])
+    for i in range(n_q, x.size):
+        r[i] = x[i]
+    rows, columns, _ = jacobian_of(program)
+    for k in range(rows.size):
+        i, j = n_q + rows[k], columns[k]
+        r[j] -= jacobian[k] * x[i]
+        r[i] -= jacobian[k] * x[j]
+    for j in range(n_q):
+        largest, left = max(largest, abs(force[j])), max(left, abs(r[j]))
+    return left / largest if largest > 0.0 else 0.0
+
+
+@compiled
+def least_norm(f, w, lam):
+    """The multipliers of least norm with the same G^T lam, in the place of lam; NEEDS_DENSE if they are not found."""
+    program, n_q = f.static_program, w.Q.size
+    n = program[N_PIVOTS]
+    n_factors = n + program[N_OFF] + 1
+    values, counts, without = w.minimum[:n_factors], w.z, w.g
+    force, x = w.minimum[n_factors : n_factors + n_q], w.minimum[n_factors + n_q :]
+    change, y, weights = w.solutions[:n], w.solutions[n : 2 * n], w.solutions[2 * n : 3 * n]
+    rows, columns, _ = jacobian_of(program)
+    for j in range(n_q):
+        force[j] = 0.0
+    for k in range(rows.size):
+        force[columns[k]] += w.jacobian_values[k] * lam[rows[k]]
+    _load(program, w.jacobian_values, n_q, weights, values)
+    for i in range(lam.size):
+        counts[i], without[i] = 1.0, 0.0
+    if not factor(program, counts, values, w.pivot_sizes, 0.0) > 0.0:
+        return NEEDS_DENSE
+    for i in range(n):
+        x[i] = 0.0
+    before = _residual(program, w.jacobian_values, force, x, change)
+    for _ in range(MOST):
+        if before <= ENOUGH:
+            break
+        solve(program, values, without, change, y)
+        for i in range(n):
+            x[i] += change[i]
+        left = _residual(program, w.jacobian_values, force, x, change)
+        if not left < before:
+            before = left
+            break
+        before = left
+    if not before <= ALLOWED:
+        return NEEDS_DENSE
+    copy(x[n_q:], lam)
+    return DONE
+
+
+@compiled
+def _rows_times(f, w, x, out):
+    """Add G x to out."""
+    rows, columns, _ = jacobian_of(f.static_program)
+    for k in range(rows.size):
+        out[rows[k]] += w.jacobian_values[k] * x[columns[k]]
+
+
+@compiled
+def _gamma(f, w, t, q, v):
+    """The right-hand side of the acceleration constraints, into w.Gamma."""
+    w.Gamma[:] = 0.0
+    if f.flags[GAMMA_GIVEN] == 1:
+        f.gamma(t, q, v, f.p, w.Gamma)
+        return DONE
+    return DONE if gamma_by_program(f, w, t, q, v) else NEEDS_DENSE
+
+
+@compiled
+def _acceleration_fault(w, t, q):
+    """Which callback gave an acceleration that is not finite."""
+    if not finite_vector(w.Gamma):
+        return not_finite(w.notes, GAMMA, t, q)
+    if not finite_vector(w.Q):
+        return not_finite(w.notes, FORCE, t, q)
+    return not_finite(w.notes, MASS if not finite_vector(w.mass_values) else -1, t, q)
+
+
+@compiled
+def _accelerate(f, w, t, q, v, a):
+    """The accelerations by the factors there are; multipliers go into w.z."""
+    w.counters[N_EVALUATIONS] += 1
+    code = _gamma(f, w, t, q, v)
+    if code != DONE:
+        return code
+    w.Q[:] = 0.0
+    f.force(t, q, v, f.p, w.Q)
+    n = a.size
+    copy(w.Q, w.unknowns[:n])
+    copy(w.Gamma, w.unknowns[n:])
+    solve_values(f, w, refinements(w))
+    copy(w.unknowns[:n], a)
+    copy(w.unknowns[n:], w.z)
+    return DONE if finite_vector(a) else _acceleration_fault(w, t, q)
+
+
+@compiled
+def _equilibrate(f, w, lam):
+    """Multipliers of all rows, of least norm where rows are redundant."""
+    copy(w.z, lam)
+    return least_norm(f, w, lam) if w.rows_v.size < lam.size else DONE
+
+
+@compiled
+def _move(f, w, x):
+    """Move x by the least correction in the metric of M that takes -w.g away from G x; the largest entry of it."""
+    n = x.size
+    w.unknowns[:n] = 0.0
+    copy(w.g, w.unknowns[n:])
+    solve_values(f, w, 0)
+    largest = 0.0
+    for j in range(n):
+        if not np.isfinite(w.unknowns[j]):
+            return np.inf
+        x[j] += w.unknowns[j]
+        largest = max(largest, abs(w.unknowns[j]))
+    return largest
+
+
+@compiled
+def _to_constraints(f, w, t, q, v, theta):
+    """(q, v) put on the constraints, as accelerations.py says; the factors are those before the last correction."""
+    before = np.inf
+    theta = max(theta, ABOVE_ROUNDING * w.notes[ROUNDED])
+    for _ in range(MAX_INNER):
+        code = factors_there(f, w, t, q)
+        if code != DONE:
+            return code
+        w.C[:] = 0.0
+        f.constraint(t, q, f.p, w.C)
+        w.counters[N_INNER] += 1
+        for i in range(w.g.size):
+            w.g[i] = -w.C[i]
+        moved = _move(f, w, q)
+        if not np.isfinite(moved):
+            return not_finite(w.notes, CONSTRAINT, t, q)
+        constraint_rates(f, w, t, q, w.Rate)
+        copy(w.Rate, w.g)
+        _rows_times(f, w, v, w.g)
+        for i in range(w.g.size):
+            w.g[i] = -w.g[i]
+        faster = _move(f, w, v)
+        if not np.isfinite(faster):
+            return not_finite(w.notes, RATE, t, q)
+        if moved <= theta and faster <= theta * max(1.0, largest_of(v)):
+            return DONE
+        if moved <= w.notes[PIVOT] * theta:
+            return DONE
+        if moved > CONTRACTION * before:
+            return DONE if moved <= ROUNDING * largest_of(q) else INNER_DIVERGED
+        before = max(moved, theta)
+    return INNER_DIVERGED
+
+
+@compiled
+def _is_as_planned(w):
+    """Whether a dense mass matrix has its entries where the program expects them; the Jacobian's are seen to."""
+    return w.M.size == 0 or not has_new_entries(w.M, w.mass_pattern)
+
+
+@compiled
+def _redundant_rows_hold(f, w, t, q, v):
+    """Whether the rows that were left out hold at an accepted state, whose entries stand in w."""
+    w.C[:] = 0.0
+    f.constraint(t, q, f.p, w.C)
+    size, speed = max(1.0, largest_of(q)), max(1.0, largest_of(v))
+    copy(w.Rate, w.g)
+    _rows_times(f, w, v, w.g)
+    rows, _, _ = jacobian_of(f.static_program)
+    largest = w.solutions[: w.g.size]
+    largest[:] = 0.0
+    for k in range(rows.size):
+        largest[rows[k]] = max(largest[rows[k]], abs(w.jacobian_values[k]))
+    for i in range(w.g.size):
+        if abs(w.C[i]) > CONTRADICTS * size * largest[i] or abs(w.g[i]) > CONTRADICTS * speed * largest[i]:
+            w.notes[CONTRADICTION] = i
+            return ROWS_CONTRADICT
+    return DONE
+
+
+@compiled
+def _solve(f, w, r, c, a, lam):
+    """The solution for any right-hand side, by the factors there are."""
+    n = r.size
+    copy(r, w.unknowns[:n])
+    copy(c, w.unknowns[n:])
+    solve_values(f, w, refinements(w))
+    copy(w.unknowns[:n], a)
+    copy(w.unknowns[n:], lam)
+    return DONE
+
+
+@compiled
+def _other_task(f, w, task, t, q, v, a, lam):
+    if task == tasks.TANGENTS:
+        return factors_there(f, w, t, q)
+    if task == tasks.RENEW:
+        return choose_rows(f, w, t, q)
+    if task == tasks.MASS_TASK:
+        mass_values_there(f, w, t, q)
+        return DONE if finite_vector(w.mass_values) else not_finite(w.notes, MASS, t, q)
+    if task == tasks.REDUNDANT:
+        return _redundant_rows_hold(f, w, t, q, v)
+    if task == tasks.SOLVE:
+        return _solve(f, w, q, v, a, lam)
+    return NEEDS_DENSE
+
+
+@kernel(INNER)
+def static_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
+    """What the names of the tasks say, at (t, q, v), see inner_loop.py; of SOLVE, q and v are the right-hand side."""
+    if task in (tasks.EVALUATE, tasks.EVALUATE_THERE):
+        code = DONE
+        if task == tasks.EVALUATE and w.notes[NEARLY_SINGULAR] == CAREFUL:
+            code = _to_constraints(f, w, t, q, v, tolerance)
+        if code == DONE:
+            code = factors_there(f, w, t, q)
+        return _accelerate(f, w, t, q, v, a) if code == DONE else code
+    if task == tasks.MULTIPLIERS:
+        return _equilibrate(f, w, lam)
+    if task >= tasks.TANGENTS:
+        return _other_task(f, w, task, t, q, v, a, lam)
+    code = DONE
+    if task != tasks.ACCELERATIONS:
+        code = _to_constraints(f, w, t, q, v, tolerance if task == tasks.PROJECT else 0.0)
+        if code != DONE or task == tasks.RESTORE:
+            return code
+    code = _accelerate(f, w, t, q, v, a)
+    if code != DONE:
+        return code
+    code = _equilibrate(f, w, lam)
+    return code if _is_as_planned(w) else NEEDS_DENSE

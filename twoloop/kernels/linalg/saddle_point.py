@@ -1,0 +1,429 @@
+"""The linear problem on the velocities that the constraints allow: for few degrees of freedom.
+
+With T = [I; D^T], D^T = -G_d^-1 G_i, whose columns are these velocities, a = g + T x, where g, with G g = c, has no
+independent entries, and (T^T M T) x = T^T (r - M g): M need only be positive definite on these velocities.
+"""
+
+import numpy as np
+
+from twoloop.kernels.data.codes import DONE, MASS_NOT_DEFINITE, NOT_FINITE, SINGULAR
+from twoloop.kernels.data.common import compiled, merged
+from twoloop.kernels.data.counters import N_FACTORIZATIONS
+from twoloop.kernels.data.finite import finite
+from twoloop.kernels.data.flags import (
+    AUGMENTED,
+    CONSTANT_MASS,
+    DENSE_FORM,
+    DIAGONAL_MASS,
+    FORM,
+    MULTIPLIERS,
+    NULL_SPACE,
+)
+from twoloop.kernels.data.noted import FACTORED, MASS_SCALE
+from twoloop.kernels.linalg import markowitz_lu as at
+from twoloop.kernels.linalg.band import banded_mass, factor_banded_mass, solve_banded_mass
+from twoloop.kernels.linalg.dense import copy, copy_matrix, invert_definite, ldl_factor, ldl_solve, note_pattern
+from twoloop.kernels.linalg.markowitz_lu import (
+    begin,
+    columns_of,
+    lists_of,
+    order,
+    put,
+    rows_of,
+    run,
+    sign_of,
+    slots,
+    solve_rows,
+    solve_transposed,
+)
+from twoloop.kernels.linalg.markowitz_lu import solve as solve_dependent
+
+
+@compiled
+def directions(w):
+    """D from the rows and factors in w."""
+    rows, independent = rows_of(w.index_v), w.independent_v
+    for j in range(independent.size):
+        for k in range(rows.size):
+            w.D[j, k] = -w.G[rows[k], independent[j]]
+    solve_rows(w.index_v, w.values_v, w.D, independent.size)
+
+
+@merged
+def _reduce_diagonal(columns, independent, M, D, A, m):
+    """T^T M T of a diagonal M, upper triangle into A; m is scratch."""
+    for k in range(columns.size):
+        m[k] = M[columns[k], columns[k]]
+    for i in range(independent.size):
+        for j in range(i, independent.size):
+            total = 0.0
+            for k in range(columns.size):
+                total += D[i, k] * m[k] * D[j, k]
+            A[i, j] = total
+        A[i, i] += M[independent[i], independent[i]]
+
+
+@merged
+def _reduce_dense(columns, independent, M, D, A, MT):
+    """T^T M T of any M, upper triangle into A; MT is scratch."""
+    n, n_dof = M.shape[0], independent.size
+    for i in range(n):
+        for j in range(n_dof):
+            MT[i, j] = M[i, independent[j]]
+        for k in range(columns.size):
+            m = M[i, columns[k]]
+            if m != 0.0:
+                for j in range(n_dof):
+                    MT[i, j] += m * D[j, k]
+    for i in range(n_dof):
+        for j in range(i, n_dof):
+            A[i, j] = MT[independent[i], j]
+        for k in range(columns.size):
+            factor = D[i, k]
+            if factor != 0.0:
+                for j in range(i, n_dof):
+                    A[i, j] += factor * MT[columns[k], j]
+
+
+@merged
+def factor_reduced(f, w):
+    """The factors of T^T M T, into w.A; needs w.D."""
+    columns = columns_of(w.index_v)
+    if f.flags[DIAGONAL_MASS] == 1:
+        _reduce_diagonal(columns, w.independent_v, w.M, w.D, w.A, w.x)
+    else:
+        _reduce_dense(columns, w.independent_v, w.M, w.D, w.A, w.MT)
+    w.counters[N_FACTORIZATIONS] += 1
+    if ldl_factor(w.A):
+        return DONE
+    return MASS_NOT_DEFINITE if finite(w.M) and finite(w.D) else NOT_FINITE
+
+
+@merged
+def solve_reduced(f, w, r, c, a):
+    """a of M a + G^T lam = r and G a = c."""
+    rows, columns, independent = rows_of(w.index_v), columns_of(w.index_v), w.independent_v
+    n_dof, z, x, D, M = independent.size, w.z, w.x, w.D, w.M
+    for k in range(rows.size):
+        z[k] = c[rows[k]]
+    solve_dependent(w.index_v, w.values_v, z)
+    copy(r, a)  # for a while: r - M g
+    for k in range(columns.size):
+        m = columns[k]
+        if f.flags[DIAGONAL_MASS] == 1:
+            a[m] -= M[m, m] * z[k]
+        else:
+            for j in range(a.size):
+                a[j] -= M[m, j] * z[k]
+    for j in range(n_dof):
+        total = a[independent[j]]
+        for k in range(columns.size):
+            total += D[j, k] * a[columns[k]]
+        x[j] = total
+    ldl_solve(w.A, x)
+    for j in range(n_dof):
+        a[independent[j]] = x[j]
+    for k in range(columns.size):
+        total = z[k]
+        for j in range(n_dof):
+            total += D[j, k] * x[j]
+        a[columns[k]] = total
+
+
+@merged
+def reduced_multipliers(f, w, r, a, lam):
+    """The multipliers of the rows that count: G^T lam = r - M a in the dependent columns."""
+    rows, columns, z = rows_of(w.index_v), columns_of(w.index_v), w.z
+    for k in range(columns.size):
+        m = columns[k]
+        total = r[m]
+        if f.flags[DIAGONAL_MASS] == 1:
+            total -= w.M[m, m] * a[m]
+        else:
+            for j in range(a.size):
+                total -= w.M[m, j] * a[j]
+        z[k] = total
+    solve_transposed(w.index_v, w.values_v, z)
+    for k in range(rows.size):
+        lam[rows[k]] = z[k]
+
+
+@merged
+def factor_mass(f, w):
+    """What is needed of w.M: of a constant M its inverse, quicker to apply, else its factors."""
+    if banded_mass(f):
+        definite = factor_banded_mass(f, w) == DONE
+    else:
+        copy_matrix(w.M, w.L)
+        definite = invert_definite(w.L) if f.flags[CONSTANT_MASS] == 1 else ldl_factor(w.L)
+    if definite:
+        return DONE
+    return MASS_NOT_DEFINITE if finite(w.M) else NOT_FINITE
+
+
+@merged
+def _times_inverse_mass(f, w, x, y):
+    """y = M^-1 x; they may be one array unless M is constant, dense and not diagonal."""
+    n = x.size
+    if f.flags[DIAGONAL_MASS] == 1:
+        for i in range(n):
+            y[i] = x[i] * w.L[i, i]
+    elif f.flags[CONSTANT_MASS] == 1 and not banded_mass(f):
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += w.L[i, j] * x[j]
+            y[i] = total
+    else:
+        copy(x, y)
+        if banded_mass(f):
+            solve_banded_mass(f, w, y)
+        else:
+            ldl_solve(w.L, y)
+
+
+@merged
+def _equal(A, B):
+    for i in range(B.shape[0]):
+        for j in range(B.shape[1]):
+            if A[i, j] != B[i, j]:  # also true for NaN
+                return False
+    return True
+
+
+@merged
+def factor_schur(f, w):
+    """S = G M^-1 G^T of the rows that count, and its factors; with a constant M only if G has changed."""
+    keep = f.flags[CONSTANT_MASS] == 1
+    if keep and _equal(w.G, w.G_of_S):
+        return DONE
+    rows = w.rows_v
+    S, solved = w.S, w.W
+    for i in range(rows.size):
+        _times_inverse_mass(f, w, w.G[rows[i]], solved[i])
+    for i in range(rows.size):
+        for k in range(i, rows.size):
+            total = 0.0
+            for j in range(w.Q.size):
+                total += w.G[rows[i], j] * solved[k, j]
+            S[i, k] = total
+    w.counters[N_FACTORIZATIONS] += 1
+    if rows.size > 0:
+        w.G_of_S[0, 0] = np.nan
+    if not ldl_factor(S):
+        return SINGULAR if finite(S) else NOT_FINITE
+    if keep:
+        copy_matrix(w.G, w.G_of_S)
+    return DONE
+
+
+@merged
+def solve_schur(f, w, r, c, a):
+    """a of M a + G^T lam = r and G a = c; the multipliers of the rows that count go into w.z."""
+    rows, solved = w.rows_v, w.W
+    _times_inverse_mass(f, w, r, a)
+    for i in range(rows.size):
+        total = -c[rows[i]]
+        for j in range(a.size):
+            total += w.G[rows[i], j] * a[j]
+        w.z[i] = total
+    ldl_solve(w.S, w.z)
+    for i in range(rows.size):
+        for j in range(a.size):
+            a[j] -= solved[i, j] * w.z[i]
+
+
+MANY = 8  # rows, and degrees of freedom, from which on this is the fastest form of a chain: measured, about 7
+LARGE = 32  # coordinates, from which on it is with few degrees of freedom, too, unless M is diagonal: about 30
+
+
+def sparse_pays(n_q: int, n_rows: int, diagonal: bool) -> bool:
+    """Whether this form is faster than the dense ones, for a sparse pattern; `diagonal`: M is constant and diagonal."""
+    return n_rows >= MANY and (n_q - n_rows >= MANY or (n_q >= LARGE and not diagonal))
+
+
+@compiled
+def _largest(A):
+    largest = 0.0
+    for i in range(A.shape[0]):
+        for j in range(A.shape[1]):
+            largest = max(largest, abs(A[i, j]))
+    return largest
+
+
+@compiled
+def _make_program(w):
+    """Choose the order of elimination for the numbers in w.M and w.G."""
+    n, rows, index, values = w.Q.size, w.rows_v, w.index_a, w.values_a
+    note_pattern(w.M, w.mass_pattern)
+    begin(index, n + rows.size)
+    matrix = lists_of(index, values)
+    scale = 2.0 ** np.round(np.log2(_largest(w.G) / _largest(w.M))) if rows.size > 0 else 1.0
+    w.notes[MASS_SCALE] = scale
+    for i in range(n):
+        for j in range(n):
+            source = w.entries.size + i * n + j
+            if w.mass_pattern[i, j] != 0.0 and not put(matrix, i, j, scale * w.M[i, j], source):
+                return at.TOO_MANY
+    for k in range(rows.size):
+        for j in range(n):
+            if w.pattern[rows[k], j] != 0.0:
+                number, source = w.G[rows[k], j], rows[k] * n + j
+                if not (put(matrix, n + k, j, number, source) and put(matrix, j, n + k, number, source)):
+                    return at.TOO_MANY
+    return order(index, matrix, w.pattern.size, 0.0)
+
+
+@compiled
+def _factor(w):
+    """Factors by the program that there is; False: it does not suit these numbers."""
+    index, values, scale, first_of_mass = w.index_a, w.values_a, w.notes[MASS_SCALE], w.entries.size
+    source = slots(index[at.SIZE]) + 2 * index[at.N_SLOTS]
+    for s in range(index[at.N_SLOTS]):
+        place = index[source + s]
+        values[s] = w.augmented[place] * (scale if place >= first_of_mass else 1.0)
+    return run(index, values) > 0.0
+
+
+@compiled
+def factor_sparse(f, w):
+    """Factors for the w.M and w.G that there are; f.flags[FORM] is another one on return where they are not sparse."""
+    w.counters[N_FACTORIZATIONS] += 1
+    new = f.flags[CONSTANT_MASS] == 0 and note_pattern(w.M, w.mass_pattern)
+    if w.index_a[at.SIZE] == 0 or new or not _factor(w):
+        if not finite(w.M):
+            return NOT_FINITE
+        code = _make_program(w)
+        if code == at.TOO_MANY:
+            f.flags[FORM] = f.flags[DENSE_FORM]
+            return DONE
+        if code != at.ORDERED or not _factor(w):
+            w.index_a[at.SIZE] = 0
+            return MASS_NOT_DEFINITE
+    if sign_of(w.index_a, w.values_a) != (1.0 if w.rows_v.size % 2 == 0 else -1.0):
+        return MASS_NOT_DEFINITE
+    return DONE
+
+
+@compiled
+def solve_sparse(w, r, c, a):
+    """a of M a + G^T lam = r and G a = c; the multipliers of the rows that count go into w.z."""
+    n, size, scale = r.size, w.index_a[at.SIZE], w.notes[MASS_SCALE]
+    x, y = w.right[:size], w.right[size:]
+    for j in range(n):
+        x[j] = scale * r[j]
+    for k in range(w.rows_v.size):
+        x[n + k] = c[w.rows_v[k]]
+    rows, columns = rows_of(w.index_a), columns_of(w.index_a)
+    for k in range(size):
+        y[k] = x[rows[k]]
+    solve_dependent(w.index_a, w.values_a, y)
+    for k in range(size):
+        x[columns[k]] = y[k]
+    for j in range(n):
+        a[j] = x[j]
+    for k in range(w.rows_v.size):
+        w.z[k] = x[n + k] / scale
+
+
+@compiled
+def _factor_sparse(f, w):
+    """The factors of the sparse matrix, or what the dense form needs where they are not sparse."""
+    code = factor_sparse(f, w)
+    if code == DONE and f.flags[FORM] == NULL_SPACE:
+        directions(w)
+    elif code == DONE and f.flags[FORM] == MULTIPLIERS and f.flags[CONSTANT_MASS] == 1:
+        code = factor_mass(f, w)
+    return code
+
+
+@merged
+def factor(f, w):
+    """Factor for the w.M that there is, and the rows, factors and tangents of G; DONE, or why it cannot be done."""
+    if w.notes[FACTORED] == 1.0:
+        return DONE
+    code = _factor_sparse(f, w) if f.flags[FORM] == AUGMENTED else DONE
+    if code == DONE and f.flags[FORM] == NULL_SPACE:
+        code = factor_reduced(f, w)
+    elif code == DONE and f.flags[FORM] == MULTIPLIERS:
+        if f.flags[CONSTANT_MASS] == 0:
+            w.counters[N_FACTORIZATIONS] += 1
+            code = factor_mass(f, w)
+        if code == DONE:
+            code = factor_schur(f, w)
+    if code == DONE:
+        w.notes[FACTORED] = 1.0
+    return code
+
+
+@merged
+def solve(f, w, r, c, a):
+    """a for any right-hand side, by the factors; r, c and a are three arrays."""
+    if f.flags[FORM] == NULL_SPACE:
+        solve_reduced(f, w, r, c, a)
+    elif f.flags[FORM] == MULTIPLIERS:
+        solve_schur(f, w, r, c, a)
+    else:
+        solve_sparse(w, r, c, a)
+
+
+@merged
+def multipliers(f, w, r, a, lam):
+    """Those that belong to the a found just before; entries of rows that do not count are left as they are."""
+    if f.flags[FORM] == NULL_SPACE:
+        reduced_multipliers(f, w, r, a, lam)
+    else:
+        for i in range(w.rows_v.size):
+            lam[w.rows_v[i]] = w.z[i]
+
+
+@merged
+def solve_both(f, w, r, c, a, lam):
+    """Solution and multipliers for any right-hand side."""
+    solve(f, w, r, c, a)
+    multipliers(f, w, r, a, lam)
+
+
+@compiled
+def least_norm(w, lam):
+    """Take away from lam what the null space of G^T has of it: redundant row i is sum_k Z[i, k] of the rows that count.
+
+    The null space is spanned by n_i = e_i - sum_k Z[i, k] e_k, and lam -= N (N^T N)^-1 N^T lam.
+    """
+    rows, columns = rows_of(w.index_v), columns_of(w.index_v)
+    r, n_red = rows.size, lam.size - rows.size
+    Z = w.minimum[: n_red * r].reshape((n_red, r))
+    gram = w.minimum[n_red * r : n_red * (r + n_red)].reshape((n_red, n_red))
+    part = w.minimum[n_red * (r + n_red) :]
+    i = 0
+    for row in range(lam.size):
+        counts = False
+        for k in w.rows_v:
+            counts = counts or k == row
+        if counts:
+            continue
+        for k in range(r):
+            Z[i, k] = w.G[row, columns[k]]
+        solve_transposed(w.index_v, w.values_v, Z[i])
+        part[i] = lam[row]
+        for k in range(r):
+            part[i] -= Z[i, k] * lam[rows[k]]
+        i += 1
+    for i in range(n_red):
+        for j in range(i, n_red):
+            total = 1.0 if i == j else 0.0
+            for k in range(r):
+                total += Z[i, k] * Z[j, k]
+            gram[i, j] = total
+    ldl_factor(gram)
+    ldl_solve(gram, part)
+    i = 0
+    for row in range(lam.size):
+        counts = False
+        for k in w.rows_v:
+            counts = counts or k == row
+        if not counts:
+            lam[row] -= part[i]
+            for k in range(r):
+                lam[rows[k]] += part[i] * Z[i, k]
+            i += 1
