@@ -13,14 +13,13 @@ from tests.bodies.random_models import Both
 from tests.marks import slow
 from tests.problems import assert_same, quick, worst
 from twoloop import mechanisms, solve_dae
-from twoloop.generate.accelerations import write_accelerations
 from twoloop.generate.choices import Choice
 from twoloop.generate.coefficients import Coefficients
+from twoloop.generate.compile_equations import generated_code, write_accelerations, write_function
+from twoloop.generate.elimination import Elimination
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.llvm_text import BIT, Module
 from twoloop.generate.null_space import LEAST
-from twoloop.generate.straight_code import own_code, write_function
-from twoloop.generate.straight_line import StraightLine
 from twoloop.kernels.compile.generated_functions import OwnFunctions, object_code
 from twoloop.kernels.lanes.lane_room import LANES
 from twoloop.kernels.linalg.dependent_columns import NONE, NUMBER, VARIES, dependents, room_size
@@ -57,7 +56,7 @@ class Code:
     """`own_there` of a system, and a function of the few operations alone."""
 
     def __init__(self, system, q0):
-        self.code, self.n = own_code(system, 0.0, q0), system.n_q
+        self.code, self.n = generated_code(system, 0.0, q0), system.n_q
         self.equations = self.code.shared.equations
         self.there = on_arrays(self.code.shared.functions.addresses["own_there"])
         self.quick = None
@@ -165,7 +164,7 @@ COUNTS |= {"spatial_slider_crank": (715, 1705), "spatial_four_bar": (850, 1622)}
 @pytest.mark.parametrize(("name", "most", "mass_first"), [(name, *counts) for name, counts in COUNTS.items()])
 def test_they_take_fewer_operations(name, most, mass_first):
     problem = getattr(mechanisms, name)()
-    equations = own_code(problem.system, 0.0, problem.q0).shared.equations
+    equations = generated_code(problem.system, 0.0, problem.q0).shared.equations
     quick_ones, all_of_them = (
         len(equations.graph.needed_by(outputs.arrays["a"])) for outputs in (equations.quick, equations.there)
     )
@@ -176,7 +175,7 @@ def test_they_take_fewer_operations(name, most, mass_first):
 @pytest.mark.parametrize("name", ["pendulum", "double_pendulum", "heavy_top", "closed_chain", "rolling_disc"])
 def test_where_few_coordinates_depend_mass_first_stays(name):
     problem = getattr(mechanisms, name)()
-    assert own_code(problem.system, 0.0, problem.q0).shared.equations.quick is None
+    assert generated_code(problem.system, 0.0, problem.q0).shared.equations.quick is None
 
 
 @settings(max_examples=50, deadline=None)
@@ -231,7 +230,7 @@ def test_in_lanes_no_run_depends_on_those_beside_it():
     problem = mechanisms.four_bar()
     system, n = problem.system, problem.system.n_q
     known = solve_dae(system, (0.0, 5.0), problem.q0, problem.v0, t_eval=np.linspace(0.0, 5.0, 801))
-    equations = StraightLine(system, Choice.at(system, 0.0, problem.q0))
+    equations = Elimination(system, Choice.at(system, 0.0, problem.q0))
     module, numbers = Module(), Coefficients()
     for outputs in equations.accelerations:
         list(numbers.structure(equations.graph, outputs.forms))

@@ -17,7 +17,7 @@ from tests.compiled import PENDULUM
 from tests.problems import assert_same, pendulum, quick, some_of
 from twoloop import ConstrainedSystem, ConstraintWarning, Integrator, callback, mechanisms, solve, solve_dae
 from twoloop.checks.consistency import Look, check_start
-from twoloop.generate.exact_derivatives import exact_derivatives, generic_states
+from twoloop.generate.derived_callbacks import exact_derivatives, generic_states
 from twoloop.kernels.layout import _free
 from twoloop.methods.tableaux import gauss, radau_iia
 from twoloop.run import again

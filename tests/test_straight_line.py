@@ -13,12 +13,12 @@ from numba import njit
 from tests.problems import pendulum, quick, unconstrained, worst
 from twoloop import ConstraintWarning, mechanisms
 from twoloop.generate.coefficients import Coefficients
+from twoloop.generate.compile_equations import generated_code, write_function
+from twoloop.generate.elimination import Outputs
+from twoloop.generate.graph import Graph
+from twoloop.generate.llvm_code import LARGEST_ANGLE
 from twoloop.generate.llvm_text import Module
-from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE
-from twoloop.generate.straight_code import own_code, write_function
-from twoloop.generate.straight_line import Outputs
 from twoloop.generate.symbolic_factors import Factors
-from twoloop.generate.tracing import Graph
 from twoloop.kernels.compile.generated_functions import OwnFunctions, object_code
 from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.noted import BY_GENERAL
@@ -52,7 +52,7 @@ def run_of(problem, compiled):
 def run_from(system, q0, v0, compiled):
     plan = PRESETS["DOP853"].plan(system.n_q, 1e-8, 1e-8, False)
     if compiled:
-        own = own_code(system, 0.0, q0)
+        own = generated_code(system, 0.0, q0)
         plan = replace(plan, inner=own_inner_loop, own=(own.shared.functions,), numbers=own.numbers)
     return Run(system, plan, 0.0, q0, v0, 1e-8, np.full(system.n_q, 1e-8), None)
 

@@ -14,10 +14,9 @@ import numpy as np
 
 from references.equations.rows import independent_rows
 from references.lines import CannotRun
-from twoloop.generate.derivative import Derivative
-from twoloop.generate.traced_equations import Equations, only
+from twoloop.generate.graph import Affine, Derivative, Graph, Untraceable, symbols
+from twoloop.generate.trace import Equations, only
 from twoloop.generate.traced_values import Traced
-from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
 from twoloop.kernels.data.flags import GAMMA_GIVEN
 from twoloop.kernels.evaluation import operations
 from twoloop.problem.problem import Array
@@ -35,8 +34,8 @@ class Block(NamedTuple):
     """One or two unknowns that are eliminated together, by one division."""
 
     places: tuple[int, ...]
-    inverse: list[list[Form]]  # of their part of D
-    below: list[tuple[int, list[Form]]]  # rows of L
+    inverse: list[list[Affine]]  # of their part of D
+    below: list[tuple[int, list[Affine]]]  # rows of L
 
 
 class NotSymbolic(CannotRun, ValueError):
@@ -102,7 +101,7 @@ class Expressions:
         terms = sum(len(form.terms) for _, *forms in kinds for form in forms if form is not None)  # type: ignore[misc]
         return terms + DIVISION * sum(kind == operations.RECIPROCAL for kind, *_ in kinds)  # type: ignore[misc]
 
-    def _right_hand_side(self, force: Any, gamma: Any) -> list[Form]:
+    def _right_hand_side(self, force: Any, gamma: Any) -> list[Affine]:
         """Return that of eq. (6), with the rows that were added to the mass."""
         result = [*force]
         for k in self.added:
@@ -111,16 +110,16 @@ class Expressions:
         return [*result, *gamma]
 
     @cached_property
-    def solution(self) -> list[Form]:
+    def solution(self) -> list[Affine]:
         """Return accelerations and multipliers of eq. (6)."""
         return _substituted(self.factors, self._right_hand_side(self.force, self.gamma))
 
-    def derivatives(self) -> Iterator[list[Form]]:
+    def derivatives(self) -> Iterator[list[Affine]]:
         """Yield the derivatives of the accelerations with respect to each of [q, v], as 2 n_q lists (n_q,) of forms."""
         for right_side in self.right_hand_sides():
             yield _substituted(self.factors, right_side)[: self.system.n_q]
 
-    def right_hand_sides(self) -> Iterator[list[Form]]:
+    def right_hand_sides(self) -> Iterator[list[Affine]]:
         """Yield the right-hand sides for these derivatives, whose matrix is that of eq. (6), factorised once.
 
         Its derivatives times the solution are in them.
@@ -128,7 +127,7 @@ class Expressions:
         n, graph = self.system.n_q, self.traced.graph
         masses, jacobians = _nonzero(self.mass), _nonzero(self.jacobian)
         for unknown in (*self.traced.q, *self.traced.v):
-            by = Derivative(graph, {only(unknown): Form(graph, 1.0, {})})
+            by = Derivative(graph, {only(unknown): Affine(graph, 1.0, {})})
             Q, gamma = (list(map(by.of, forms)) for forms in (self.force, self.gamma))
             for i, j in masses:
                 Q[i] = Q[i] - by.of(self.mass[i, j]) * self.solution[j]
@@ -163,7 +162,7 @@ class Printed:
         self.known: dict[int, Any] = dict(enumerate(inputs))
         self.forms: dict[Any, Any] = {}
 
-    def translate(self, forms: Iterable[Form]) -> list[Any]:
+    def translate(self, forms: Iterable[Affine]) -> list[Any]:
         """Return the expressions of forms; a constant is a float."""
         forms = list(forms)
         for i in self.graph.needed_by(forms):
@@ -172,7 +171,7 @@ class Printed:
                 self.known[i] = self._operation(kind, first, second)
         return [self._sum(form) for form in forms]
 
-    def _operation(self, kind: int, first: Form, second: Form | None) -> Any:
+    def _operation(self, kind: int, first: Affine, second: Affine | None) -> Any:
         x = self._sum(first)
         if kind == operations.PRODUCT:
             assert second is not None
@@ -186,7 +185,7 @@ class Printed:
         except Exception as error:  # packages raise different exceptions for unsupported functions
             raise NotSymbolic(f"{FUNCTIONS[kind]} cannot be had as an expression: {error!r}") from error
 
-    def _sum(self, form: Form) -> Any:
+    def _sum(self, form: Affine) -> Any:
         """Return c + sum_i c_i x_i, with negative terms last."""
         if form.key not in self.forms:
             total: Any = float(form.constant)
@@ -205,7 +204,7 @@ def functions_of(package: Any) -> dict[str, Callable[[Any], Any]]:
     return {name: getattr(package, name) for name in FUNCTIONS.values() if hasattr(package, name)}
 
 
-def _is_nonzero(form: Form) -> bool:
+def _is_nonzero(form: Affine) -> bool:
     return bool(form.terms) or form.constant != 0.0
 
 
@@ -232,7 +231,7 @@ def _rows_for_mass(mass: Array, jacobian: Array) -> list[int]:
 
 
 def _order(
-    matrix: Mapping[tuple[int, int], Form], n: int, size: int, together: bool, early: bool
+    matrix: Mapping[tuple[int, int], Affine], n: int, size: int, together: bool, early: bool
 ) -> list[tuple[int, ...]]:
     """Return an elimination order by minimum degree, with each row of C_q after all its coordinates.
 
@@ -272,7 +271,7 @@ def _order(
 
 
 def _given_by_rows(
-    matrix: Mapping[tuple[int, int], Form], neighbours: Sequence[set[int]], n: int
+    matrix: Mapping[tuple[int, int], Affine], neighbours: Sequence[set[int]], n: int
 ) -> list[tuple[int, ...]]:
     """Return coordinates that stand in one row of C_q alone, by a number, and whose mass is one; each with its row."""
     rows: dict[int, int] = {}
@@ -283,14 +282,14 @@ def _given_by_rows(
     return [(i, k) for k, i in rows.items()]
 
 
-def _factored(matrix: dict[tuple[int, int], Form], order: list[tuple[int, ...]]) -> list[Block]:
+def _factored(matrix: dict[tuple[int, int], Affine], order: list[tuple[int, ...]]) -> list[Block]:
     """Return the factors L D L^T, in this order, of a symmetric matrix; entries not in `matrix` are zero."""
-    rows: dict[int, dict[int, Form]] = {i: {} for places in order for i in places}
+    rows: dict[int, dict[int, Affine]] = {i: {} for places in order for i in places}
     for (i, j), entry in matrix.items():
         rows[i][j] = entry
     blocks: list[Block] = []
     for places in order:
-        zero = Form(next(iter(matrix.values())).graph, 0.0, {})
+        zero = Affine(next(iter(matrix.values())).graph, 0.0, {})
         inverse = _inverse([[rows[i].pop(j, zero).value() for j in places] for i in places])
         columns = dict.fromkeys(j for i in places for j in rows[i])
         entries = [(j, [rows[i].get(j, zero).value() for i in places]) for j in columns]
@@ -305,7 +304,7 @@ def _factored(matrix: dict[tuple[int, int], Form], order: list[tuple[int, ...]])
     return blocks
 
 
-def _inverse(pivots: list[list[Form]]) -> list[list[Form]]:
+def _inverse(pivots: list[list[Affine]]) -> list[list[Affine]]:
     """Return the inverse of a symmetric matrix of one or two rows."""
     a = pivots[0][0]
     if len(pivots) == 1:
@@ -315,17 +314,17 @@ def _inverse(pivots: list[list[Form]]) -> list[list[Form]]:
     return [[(c * inverse).value(), (-b * inverse).value()], [(-b * inverse).value(), (a * inverse).value()]]
 
 
-def _dot(first: Sequence[Form], second: Sequence[Form]) -> Form:
+def _dot(first: Sequence[Affine], second: Sequence[Affine]) -> Affine:
     total = first[0] * second[0]
     for x, y in zip(first[1:], second[1:], strict=True):
         total = total + x * y
     return total
 
 
-def _substituted(factors: Sequence[Block], right_side: list[Form]) -> list[Form]:
+def _substituted(factors: Sequence[Block], right_side: list[Affine]) -> list[Affine]:
     """Return the solution of the factorised system."""
     solution = list(right_side)
-    owed: list[list[tuple[Form, Form]]] = [[] for _ in right_side]
+    owed: list[list[tuple[Affine, Affine]]] = [[] for _ in right_side]
     for places, _, below in factors:
         for i in places:
             solution[i] = (solution[i] - _sum_of_products(owed[i])).value()
@@ -340,7 +339,7 @@ def _substituted(factors: Sequence[Block], right_side: list[Form]) -> list[Form]
     return solution
 
 
-def _sum_of_products(products: Sequence[tuple[Form, Form]]) -> Any:
+def _sum_of_products(products: Sequence[tuple[Affine, Affine]]) -> Any:
     """Return the sum of products, in which multiples of one factor are summed up before they are multiplied by it."""
     total: Any = 0.0
     by_factor: dict[Any, list[Any]] = {}

@@ -19,7 +19,7 @@ from numba.core.registry import cpu_target
 
 from references.equations.accelerations import OPTIONS
 from references.equations.expressions import FUNCTIONS, Expressions, Printed, expressions_at
-from twoloop.generate.llvm_trigonometry import COSINES, HALF_PI, LARGEST_ANGLE, SINES
+from twoloop.generate.llvm_code import COSINES, HALF_PI, LARGEST_ANGLE, SINES
 from twoloop.problem.system import ConstrainedSystem
 
 DOUBLE, POINTER, PLACE = ir.DoubleType(), ir.DoubleType().as_pointer(), ir.IntType(64)

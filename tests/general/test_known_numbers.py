@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from twoloop.generate.known_numbers import Known, Record
+from twoloop.generate.parameter_expressions import Parameter, ParameterTape
 
 EXPRESSIONS = (
     lambda p: p[0] * p[1] / p[0],
@@ -27,21 +27,21 @@ values = st.floats(0.3, 3.0) | st.floats(-3.0, -0.3)
 @pytest.mark.parametrize("expression", EXPRESSIONS)
 @given(st.tuples(values, values, st.floats(0.3, 3.0)))
 def test_for_other_parameters_they_are_what_plain_numbers_are(expression, other):
-    record = Record([0.7, 1.9, 1.3], range(3))
+    record = ParameterTape([0.7, 1.9, 1.3], range(3))
     made = expression(record.parameters)
-    assert isinstance(made, Known) and made == pytest.approx(expression(np.array([0.7, 1.9, 1.3])))
+    assert isinstance(made, Parameter) and made == pytest.approx(expression(np.array([0.7, 1.9, 1.3])))
     if expression is EXPRESSIONS[-2]:
         other = (abs(other[0]), *other[1:])  # the branch was taken for a positive one
     assert record.evaluate([made], np.array([other]))[0, 0] == pytest.approx(expression(np.array(other)), abs=1e-12)
 
 
 def test_what_cancels_is_gone():
-    p = Record([0.7, 1.9, 1.3], range(3)).parameters
+    p = ParameterTape([0.7, 1.9, 1.3], range(3)).parameters
     assert type(p[0] * p[1] / p[1] / p[0]) is float and type(p[0] - p[0]) is float
     assert (p[0] * p[1] / p[1]).powers == p[0].powers
 
 
 def test_parameters_that_do_not_vary_are_plain_numbers():
-    record = Record([0.7, 1.9], [1])
-    assert type(record.parameters[0]) is float and type(record.parameters[1]) is Known
+    record = ParameterTape([0.7, 1.9], [1])
+    assert type(record.parameters[0]) is float and type(record.parameters[1]) is Parameter
     assert record.evaluate([record.parameters[1]], np.array([[5.0, 6.0]])).tolist() == [[6.0]]

@@ -11,10 +11,9 @@ import numpy as np
 
 from twoloop.bodies.row_function import RowFunction
 from twoloop.checks.arguments import Array, check_finite, check_real, shown
-from twoloop.generate.calls_on_symbols import as_forms, trace
-from twoloop.generate.derivative import Derivative
-from twoloop.generate.programs import Program, numbers_of, program_of
-from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
+from twoloop.generate.graph import Affine, Derivative, Graph, Untraceable, symbols
+from twoloop.generate.program import Program, numbers_of, program_of
+from twoloop.generate.trace import as_forms, trace
 
 ARGUMENTS = {1: "(t)", 2: "(length, rate) or (angle, rate)", 3: "(t, q, v)"}
 
@@ -74,10 +73,10 @@ class Function:
             raise ValueError(f"{self.name} must return {expected}; it returned {shown(value)}")
         return array.reshape(self.size)
 
-    def forms(self, graph: Graph, t: Form, q: Sequence[Form], v: Sequence[Form]) -> list[Form]:
+    def forms(self, graph: Graph, t: Affine, q: Sequence[Affine], v: Sequence[Affine]) -> list[Affine]:
         """Return the results for symbolic arguments; raise Untraceable if that fails."""
         arguments = self._arguments(t, symbols(q), symbols(v))
-        made: list[Form] = []
+        made: list[Affine] = []
         for each in (self.function, *self.derivatives):
             array = np.array(trace(each, *arguments), dtype=object)
             if array.shape != (self.size,) and not (self.size == 1 and array.shape == ()):
@@ -170,13 +169,13 @@ def motion_function(name: str, motion: Any, rate: Any, acceleration: Any) -> Fun
     return function
 
 
-def motion_forms(function: Function, graph: Graph, t: Form) -> list[Form]:
+def motion_forms(function: Function, graph: Graph, t: Affine) -> list[Affine]:
     """Return a motion and its first two derivatives as symbols."""
     made = function.forms(graph, t, [], [])
     if not function.derivatives:
         (place,) = t.terms
         for _ in range(2):
-            made.append(Derivative(graph, {place: Form(graph, 1.0, {})}).of(made[-1]))
+            made.append(Derivative(graph, {place: Affine(graph, 1.0, {})}).of(made[-1]))
     return made
 
 
@@ -186,7 +185,7 @@ def program_for(functions: Sequence[Function | RowFunction], n_q: int, motions: 
     (t,) = graph.inputs(1, False)
     n = n_q + sum(isinstance(each, Law) for each in functions)
     q, v = graph.inputs(n, False), graph.inputs(n, True)
-    made: list[Form] = []
+    made: list[Affine] = []
     for each, one, other in with_arguments(functions, n_q, q, v):
         try:
             if motions and isinstance(each, Function):

@@ -17,8 +17,8 @@ from twoloop.bodies.places import placed
 from twoloop.bodies.row_function import RowFunction
 from twoloop.bodies.tables import Tables
 from twoloop.checks.arguments import Array, shown
-from twoloop.generate.programs import AGREES, BETWEEN, STATES
-from twoloop.generate.tracing import Untraceable
+from twoloop.generate.graph import Untraceable
+from twoloop.generate.program import AGREES, BETWEEN, STATES
 from twoloop.problem.callbacks import LARGE
 from twoloop.problem.description import Joint
 from twoloop.problem.system import ConstrainedSystem

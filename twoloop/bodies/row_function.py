@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from twoloop.checks.arguments import Array
-from twoloop.generate.calls_on_symbols import as_forms, trace
-from twoloop.generate.derivative import Derivative
-from twoloop.generate.programs import numbers_of, program_of
-from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
+from twoloop.generate.graph import Affine, Derivative, Graph, Untraceable, symbols
+from twoloop.generate.program import numbers_of, program_of
+from twoloop.generate.trace import as_forms, trace
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,17 +48,17 @@ class RowFunction:
         """Number of results: C, C_t, gamma, and the derivative with respect to each coordinate."""
         return 3 + len(self.columns)
 
-    def forms(self, graph: Graph, t: Form, q: Sequence[Form], v: Sequence[Form]) -> list[Form]:
+    def forms(self, graph: Graph, t: Affine, q: Sequence[Affine], v: Sequence[Affine]) -> list[Affine]:
         """Return the results as symbols."""
         value = np.array(trace(lambda _, coordinates: self.function(coordinates), t, symbols(q)), dtype=object)
         if value.shape not in ((), (1,)):
             raise Untraceable(f"on symbols it returns shape {value.shape}")
         row = as_forms(graph, value.reshape(1))[0]
-        one, places = Form(graph, 1.0, {}), [next(iter(each.terms)) for each in q]
+        one, places = Affine(graph, 1.0, {}), [next(iter(each.terms)) for each in q]
         along = dict(zip(places, v, strict=True))
         bend = Derivative(graph, along).of(Derivative(graph, along).of(row))
         gradient = [Derivative(graph, {places[j]: one}).of(row) for j in self.columns]
-        return [row, Form(graph, 0.0, {}), bend.times(-1.0), *gradient]
+        return [row, Affine(graph, 0.0, {}), bend.times(-1.0), *gradient]
 
     def at(self, t: float, q: Array, v: Array) -> Array:
         """Evaluate the results."""
@@ -78,11 +77,11 @@ class RateFunction(RowFunction):
         """Number of results: the right-hand side of A a = Q_a, and A for each coordinate."""
         return 1 + len(self.columns)
 
-    def forms(self, graph: Graph, t: Form, q: Sequence[Form], v: Sequence[Form]) -> list[Form]:
+    def forms(self, graph: Graph, t: Affine, q: Sequence[Affine], v: Sequence[Affine]) -> list[Affine]:
         """Return the results as symbols."""
         function: Callable[..., Any] = self.function
         value = trace(lambda _, one, other: function(one, other), t, symbols(q), symbols(v))
-        row, one = as_forms(graph, np.array(value, dtype=object).reshape(1))[0], Form(graph, 1.0, {})
+        row, one = as_forms(graph, np.array(value, dtype=object).reshape(1))[0], Affine(graph, 1.0, {})
         along = {next(iter(each.terms)): rate for each, rate in zip(q, v, strict=True)}
         gradient = [Derivative(graph, {next(iter(v[j].terms)): one}).of(row) for j in self.columns]
         return [Derivative(graph, along).of(row).times(-1.0), *gradient]

@@ -10,8 +10,8 @@ from twoloop.bodies.functions import is_constant, program_for
 from twoloop.bodies.parameter_layout import AXIAL, BRAKE, NONE, PULL, RAIL, RATE, RUB, SLIDE, SPRING, TORQUE, TORSION
 from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
 from twoloop.checks.arguments import Array, check_not_negative, check_positive
-from twoloop.generate.programs import numbers_of
-from twoloop.generate.tracing import Untraceable
+from twoloop.generate.graph import Untraceable
+from twoloop.generate.program import numbers_of
 
 GRAVITY = ("x", "y", "z")
 MOMENTS = {2: ("moment of inertia",), 3: tuple(f"J_{which}" for which in ("xx", "yy", "zz", "xy", "xz", "yz"))}

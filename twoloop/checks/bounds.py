@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 
 OWN = {
-    *("twoloop.checks.bounds", "twoloop.generate.tracing", "twoloop.generate.calls_on_symbols"),
-    *("twoloop.generate.known_numbers", "twoloop.bodies.model_system"),
+    *("twoloop.checks.bounds", "twoloop.generate.graph", "twoloop.generate.trace"),
+    *("twoloop.generate.parameter_expressions", "twoloop.bodies.model_system"),
 }
 MANY = 4096  # parameters that a callback may ask for beyond those that it has, for telling which array is too short
 

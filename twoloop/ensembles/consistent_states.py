@@ -12,14 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from twoloop.checks.arguments import Array, check_finite, check_indices
 from twoloop.ensembles.in_lanes import Integers, aligned, in_blocks, threads_of
 from twoloop.ensembles.starts import Starts, all_starts, far_off, generic_parameters, kit_to_write, system_of
-from twoloop.generate.known_numbers import Record
-from twoloop.generate.tracing import Untraceable
+from twoloop.generate.graph import Untraceable
+from twoloop.generate.parameter_expressions import ParameterTape
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.run.projection import ConsistentState, consistent_state
 
 if TYPE_CHECKING:
+    from twoloop.generate.generated_lanes import GeneratedLanes
     from twoloop.generate.lane_constraints import LaneConstraints
-    from twoloop.generate.own_lanes import OwnLanes
 
 MOST_ROWS = 200  # whose factors in lanes have no zeros
 SINGLY = 0.01  # about what `consistent_state` takes, s
@@ -122,12 +122,12 @@ class _InLanes:
             raise Untraceable("single calls have sparse matrices")
         generic, varying = generic_parameters(starts.parameters)
 
-        def make() -> OwnLanes[LaneConstraints]:
+        def make() -> GeneratedLanes[LaneConstraints]:
+            from twoloop.generate.generated_lanes import GeneratedLanes
             from twoloop.generate.lane_constraints import LaneConstraints
-            from twoloop.generate.own_lanes import OwnLanes
 
-            record = Record(generic.tolist(), varying)
-            return OwnLanes(record, LaneConstraints(system, record.parameters))
+            record = ParameterTape(generic.tolist(), varying)
+            return GeneratedLanes(record, LaneConstraints(system, record.parameters))
 
         self._own = system.remembered_at(("starts", tuple(varying)), generic.tobytes(), make)
         if self._own.seconds_to_build > SINGLY * len(starts.q):

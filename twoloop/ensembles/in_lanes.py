@@ -15,14 +15,14 @@ from twoloop.ensembles.lane_methods import LaneMethod
 from twoloop.ensembles.short_looks import ShortLooks
 from twoloop.ensembles.starts import Starts, generic_parameters, generic_system, kit_to_write, system_of
 from twoloop.generate.choices import Choice
-from twoloop.generate.known_numbers import Record
+from twoloop.generate.parameter_expressions import ParameterTape
 from twoloop.generate.time_dependence import may_be_narrow, may_be_sudden
 from twoloop.kernels.lanes import lane_ends
 from twoloop.problem.system import ConstrainedSystem
 
 if TYPE_CHECKING:
+    from twoloop.generate.generated_lanes import GeneratedLanes
     from twoloop.generate.lane_code import LaneCode
-    from twoloop.generate.own_lanes import OwnLanes
 
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
@@ -72,12 +72,12 @@ class LaneRuns:
         choice = Choice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
         kind = ("lanes", method.series, method.tableau is None, choice, tuple(varying))  # of which the latest is kept
 
-        def make() -> OwnLanes[LaneCode]:
+        def make() -> GeneratedLanes[LaneCode]:
+            from twoloop.generate.generated_lanes import GeneratedLanes
             from twoloop.generate.lane_code import LaneCode  # compiled, or read from the cache, at the first ensemble
-            from twoloop.generate.own_lanes import OwnLanes
 
-            record = Record(generic.tolist(), varying)
-            return OwnLanes(record, LaneCode(system, choice, record.parameters, method.series, method.tableau))
+            record = ParameterTape(generic.tolist(), varying)
+            return GeneratedLanes(record, LaneCode(system, choice, record.parameters, method.series, method.tableau))
 
         self.own = system.remembered_at(kind, generic.tobytes(), make)
 

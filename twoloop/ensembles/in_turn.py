@@ -11,7 +11,7 @@ from twoloop.checks.arguments import Array
 from twoloop.ensembles.in_lanes import LOOKS, SHORT, WHY, LaneRuns
 from twoloop.ensembles.lane_methods import is_involved, lane_methods
 from twoloop.ensembles.starts import Starts, far_off, generic_system, system_of
-from twoloop.generate.tracing import Untraceable
+from twoloop.generate.graph import Untraceable
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
 

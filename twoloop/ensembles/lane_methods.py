@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from twoloop.checks.arguments import Array
+from twoloop.generate.graph import Untraceable
 from twoloop.generate.series import series_for
 from twoloop.generate.time_dependence import may_be_narrow
-from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.layout import short_loops
 from twoloop.methods import dop853_tableau as tableau
 from twoloop.methods.auto import TIGHTEST

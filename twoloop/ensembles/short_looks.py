@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from twoloop.checks.arguments import Array
-from twoloop.generate.known_numbers import Record
-from twoloop.generate.on_arrays import OnArrays
+from twoloop.generate.parameter_expressions import ParameterTape
+from twoloop.generate.program import OnArrays
 from twoloop.generate.time_dependence import BY_TIME, TIME
-from twoloop.generate.traced_equations import Equations
+from twoloop.generate.trace import Equations
 from twoloop.kernels.control.sudden import FLOOR, LEAST, PLACES, SHARE, STEEPER  # what counts as sudden in single runs
 from twoloop.problem.system import ConstrainedSystem
 
@@ -28,11 +28,11 @@ class ShortLooks:
     system : ConstrainedSystem
         Whose callbacks run on symbols, and have no nonholonomic rows.
     values, varying
-        Of a `Record`: generic parameters, and which of them differ from run to run.
+        Of a `ParameterTape`: generic parameters, and which of them differ from run to run.
     """
 
     def __init__(self, system: ConstrainedSystem, values: Array, varying: Sequence[int]):
-        self._record = Record(values.tolist(), varying)
+        self._record = ParameterTape(values.tolist(), varying)
         equations = Equations(system, self._record.parameters)
         self._graph = graph = equations.graph
         forms = np.concatenate([equations.of(kind).ravel() for kind in BY_TIME if kind in system.given])

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.at_position import mass_and_rows
-from twoloop.generate.families import Family, family_of
-from twoloop.generate.traced_equations import Equations
-from twoloop.generate.tracing import Untraceable
+from twoloop.generate.graph import Untraceable
+from twoloop.generate.trace import Equations
+from twoloop.generate.trace_cache import TraceCache, trace_cache_of
 from twoloop.kernels.compile.linking import direct
 from twoloop.problem.system import ConstrainedSystem
 
@@ -119,7 +119,7 @@ def _kinds(system: ConstrainedSystem) -> Any:
             return None
         return np.array([2 if form.terms else int(form.constant != 0.0) for form in rows], dtype=np.int64)
 
-    family: Family = system.remembered(("family", family_of), partial(family_of, system))
+    family: TraceCache = system.remembered(("family", trace_cache_of), partial(trace_cache_of, system))
     kinds = family.remembered("kinds of entries", partial(make, partial(family.equations, system)))
     if kinds is None:  # it may be traced with numbers
         kinds = system.remembered("kinds of entries", partial(make, partial(Equations, system)))

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.generate.known_numbers import Known, Powers, Record, array_of
-from twoloop.generate.tracing import Form, Graph, rounded
+from twoloop.generate.graph import Affine, Graph, rounded
+from twoloop.generate.parameter_expressions import Parameter, ParameterTape, Powers, array_of
 
 Terms = tuple[tuple[int, float], ...]  # quantities and their coefficients
 
@@ -53,7 +53,7 @@ class Coefficients:
         self._apart = apart
         self._values: list[float] = []
         self._formulas: Any = np.zeros(0)
-        self._varying: dict[tuple[float, Powers], Known] = {}
+        self._varying: dict[tuple[float, Powers], Parameter] = {}
         self._known: dict[tuple[Terms, float], tuple[Terms, float]] = {}
         self._of_forms: dict[Any, tuple[Terms, float]] = {}
 
@@ -77,7 +77,7 @@ class Coefficients:
             known = self._known[key] = tuple((i, self._number(c)) for i, c in terms), self._number(constant)
         return known
 
-    def of_form(self, form: Form) -> tuple[Terms, float]:
+    def of_form(self, form: Affine) -> tuple[Terms, float]:
         """The same of a form."""
         known = self._of_forms.get(form.key)
         if known is None:
@@ -85,7 +85,7 @@ class Coefficients:
         return known
 
     def structure(
-        self, graph: Graph, forms: Iterable[Form], kept: Mapping[int, int] = MappingProxyType({})
+        self, graph: Graph, forms: Iterable[Affine], kept: Mapping[int, int] = MappingProxyType({})
     ) -> Iterable[Any]:
         """What code for these forms depends on, the values of its numbers apart; `kept`: at which places others are."""
         forms = list(forms)
@@ -94,26 +94,26 @@ class Coefficients:
         name |= {i: k for k, i in enumerate(needed)}
         name |= {i: f"kept {place}" for i, place in kept.items()}
 
-        def told(form: Form) -> Any:
+        def told(form: Affine) -> Any:
             terms, constant = self.of_form(form)
             return [(name[i], c) for i, c in terms], constant
 
         yield [told(form) for form in forms]
         for i in needed:
             kind, *arguments = graph.operations[i]  # type: ignore[misc]
-            yield kind, [told(each) for each in arguments if isinstance(each, Form)]
+            yield kind, [told(each) for each in arguments if isinstance(each, Affine)]
 
     @property
     def n_varying(self) -> int:
         """How many vary with parameters."""
         return len(self._varying)
 
-    def for_parameters(self, record: Record, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+    def for_parameters(self, record: ParameterTape, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
         """Those that vary, for parameters (n_runs, n_p), a row a run."""
         return record.evaluate(list(self._varying.values()), parameters)
 
     def _number(self, value: float) -> float:
-        if type(value) is Known:  # which is another number for other parameters, whatever it is now
+        if type(value) is Parameter:  # which is another number for other parameters, whatever it is now
             if self._apart:
                 made_of = value.scale, value.powers
                 self._varying.setdefault(made_of, value)
@@ -126,7 +126,7 @@ class Coefficients:
 
 def in_the_code(value: float) -> float | None:
     """A number as it may stand in the code, if it may."""
-    if type(value) is Known or not math.isfinite(value):
+    if type(value) is Parameter or not math.isfinite(value):
         return None
     near = float(round(value))
     return near if near in IN_THE_CODE and abs(value - near) <= ROUNDING * abs(near) else None

@@ -18,15 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.generate import lane_emitter, lane_memory, llvm_code, lobatto_tables
-from twoloop.generate.accelerations import call_accelerations
+from twoloop.generate.compile_equations import GeneratedCode, SharedCode, call_accelerations
+from twoloop.generate.elimination import Outputs
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.lane_memory import column, load_lanes, over, place_of, store_lanes, two_sums
 from twoloop.generate.llvm_code import Emitter
 from twoloop.generate.llvm_text import BIT, DOUBLE, INTEGER, NOTHING, Module, Value, constant, constants, integer
 from twoloop.generate.lobatto_tables import tables
-from twoloop.generate.straight_code import OwnCode, SharedCode
-from twoloop.generate.straight_line import Outputs
-from twoloop.generate.written import Written, conditions_hold, results_of
+from twoloop.generate.lowering import Lowering, conditions_hold, results_of
 from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.generated_functions import LaterFunctions, own_functions
 from twoloop.kernels.data import collocation as at
@@ -122,7 +121,7 @@ class CollocationCode:
         def quick(inputs: list[Value]) -> Callable[[], Value]:
             if self.parts is not None and not self.has_others:
                 return self._called(emit, room, 0)(inputs)
-            outputs, written = self.equations.accelerations[0], Written(emit, self.numbers)
+            outputs, written = self.equations.accelerations[0], Lowering(emit, self.numbers)
             (forms,), graph = outputs.arrays.values(), self.equations.graph
             for quantity, value in enumerate(inputs):
                 written.define(quantity, value)
@@ -527,7 +526,7 @@ class CollocationCode:
     def _project_in_parts(
         self, emit: LaneEmitter, room: Value, numbers: Value, write: Callable[..., Value], names: tuple[str, ...]
     ) -> None:
-        """The same by a function of parts_code.py, which fills arrays of these names."""
+        """The same by a function of compile_equations.py, which fills arrays of these names."""
         one, moved = Emitter(emit.builder), emit.builder.room(DOUBLE, LANES * self.n)
         places = {name: one.pointer(room, place) for name, place in self._places_of_ends().items()} | {"moved": moved}
         state = load_lanes(emit, room, self.ends), places["q"], places["v"]
@@ -606,7 +605,7 @@ class Collocation(NamedTuple):
     numbers: Any  # what they read, or formulas for it
 
 
-def compiled_collocation(of_one: OwnCode) -> Collocation:
+def compiled_collocation(of_one: GeneratedCode) -> Collocation:
     """The code for a mechanism; its machine code is kept on disk, and compiled when steps are to call it."""
     own = of_one.shared
     made: Collocation = own.family.remembered(("collocation", own.equations.choice), lambda: _compiled(own))

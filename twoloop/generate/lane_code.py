@@ -1,27 +1,27 @@
 """Code for many runs of one mechanism at once: every number is a vector, with one run in each of its lanes.
 
-The operations are those of `series`, `straight_line` and `straight_code`. Coefficients are read, a vector each, so that
-runs may have parameters of their own.
+The operations are those of `series`, `elimination` and `compile_equations`. Coefficients are read, a vector each, so
+that runs may have parameters of their own.
 """
 
 import hashlib
 import math
 from typing import Any
 
-from twoloop.generate.accelerations import write_accelerations
 from twoloop.generate.choices import Choice
 from twoloop.generate.coefficients import Coefficients
+from twoloop.generate.compile_equations import write_accelerations
+from twoloop.generate.elimination import Elimination, Outputs, Solution
+from twoloop.generate.graph import Untraceable, is_zero
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.lane_series import LaneSeries
 from twoloop.generate.lane_stages import LaneStages, Tableau
 from twoloop.generate.lane_steps import LaneSteps, Places, common, is_set, keep_fine, store_mask
 from twoloop.generate.lane_turns import turned
 from twoloop.generate.llvm_text import Value, integer
+from twoloop.generate.lowering import conditions_hold, results_of
 from twoloop.generate.series import series_program
-from twoloop.generate.straight_line import Outputs, Solution, StraightLine
-from twoloop.generate.traced_equations import Equations
-from twoloop.generate.tracing import Untraceable, is_zero
-from twoloop.generate.written import conditions_hold, results_of
+from twoloop.generate.trace import Equations
 from twoloop.kernels.lanes import lane_projection
 from twoloop.kernels.lanes import lane_room as lanes
 from twoloop.problem.system import ConstrainedSystem
@@ -38,7 +38,7 @@ class LaneCode(LaneSteps):
     ----------
     system : ConstrainedSystem
     choice : Choice
-    parameters : array of Known
+    parameters : array of Parameter
     series : bool
         Whether there is to be code for its Taylor series, too.
     tableau : Tableau, optional
@@ -56,7 +56,7 @@ class LaneCode(LaneSteps):
         if system.n_a > 0:
             raise Untraceable("it has nonholonomic rows")
         self.numbers = Coefficients(apart=True)
-        self.equations = equations = StraightLine(system, choice, Equations(system, parameters))
+        self.equations = equations = Elimination(system, choice, Equations(system, parameters))
         self.solution = Solution(self.equations)
         super().__init__(system.n_q, system.n_c + system.n_a)
         self.recurrences: LaneSeries | None = None

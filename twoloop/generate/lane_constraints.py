@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 from twoloop.generate.coefficients import Coefficients
+from twoloop.generate.elimination import Outputs
+from twoloop.generate.graph import is_zero
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.lane_steps import LaneSteps, keep_fine
 from twoloop.generate.llvm_text import Value
-from twoloop.generate.straight_line import Outputs
-from twoloop.generate.traced_equations import Equations
-from twoloop.generate.tracing import is_zero
-from twoloop.generate.written import conditions_hold, results_of
+from twoloop.generate.lowering import conditions_hold, results_of
+from twoloop.generate.trace import Equations
 from twoloop.kernels.lanes import lane_room as lanes
 from twoloop.problem.system import ConstrainedSystem
 
@@ -25,7 +25,7 @@ class LaneConstraints(LaneSteps):
     ----------
     system : ConstrainedSystem
         Without nonholonomic rows.
-    parameters : array of Known
+    parameters : array of Parameter
 
     Attributes
     ----------

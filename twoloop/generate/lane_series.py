@@ -6,14 +6,13 @@ Factors of products stand in rows, one for each order; a factor that several pro
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from twoloop.generate import llvm_trigonometry
 from twoloop.generate.coefficients import Coefficients, Terms
+from twoloop.generate.elimination import Solution
 from twoloop.generate.lane_emitter import LaneEmitter
-from twoloop.generate.llvm_code import Quantities
+from twoloop.generate.llvm_code import Quantities, sine_and_cosine
 from twoloop.generate.llvm_text import Value, integer
+from twoloop.generate.lowering import FUNCTIONS, results_of
 from twoloop.generate.series import SeriesProgram, Sums, Table
-from twoloop.generate.straight_line import Solution
-from twoloop.generate.written import FUNCTIONS, results_of
 from twoloop.kernels.evaluation.operations import (
     ARCTANGENT,
     EXPONENTIAL,
@@ -219,7 +218,7 @@ class LaneSeries:
                 row.store(second, z)
                 values = [emit.multiply(x, z)]
             elif kind == SINE:
-                values = list(llvm_trigonometry.sine_and_cosine(emit, x))
+                values = list(sine_and_cosine(emit, x))
             elif kind == RECIPROCAL:
                 values = [emit.divide(one, x)]
             else:

@@ -10,11 +10,11 @@ Pivots are fixed. Where one becomes small on the way, the conditions do not hold
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from twoloop.generate.graph import Affine, is_zero
 from twoloop.generate.symbolic_factors import Factors
-from twoloop.generate.tracing import Form, is_zero
 
 Blocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # rows and columns of pivots, one or two each
-Terms = dict[int, Form]  # entries of a row that are not zero, by their columns
+Terms = dict[int, Affine]  # entries of a row that are not zero, by their columns
 
 # Squares of the least pivot over what it is divided into, or its column, and of the sine between two columns. The
 # accelerations lose up to three times as many digits. At a start more is asked for, see linalg/dependent_columns.py.
@@ -30,9 +30,9 @@ class DependentCoordinates:
 
     Parameters
     ----------
-    rows : sequence of sequence of Form
+    rows : sequence of sequence of Affine
         G, of full rank.
-    gamma : sequence of Form
+    gamma : sequence of Affine
     blocks : sequence of (rows, columns)
         Of pivots, in their order.
     most : int
@@ -44,9 +44,9 @@ class DependentCoordinates:
         The coordinates that stay.
     T : list of dict
         The entries of T in each row, by the coordinate that they multiply.
-    g : list of Form
+    g : list of Affine
         0 for the coordinates that stay.
-    conditions : list of (Form, Form)
+    conditions : list of (Affine, Affine)
         The first is larger than the second where pivots are not too small.
 
     Raises
@@ -55,17 +55,17 @@ class DependentCoordinates:
         If a pivot is zero by its structure, or it takes more operations.
     """
 
-    def __init__(self, rows: Sequence[Sequence[Form]], gamma: Sequence[Form], blocks: Blocks, most: int):
+    def __init__(self, rows: Sequence[Sequence[Affine]], gamma: Sequence[Affine], blocks: Blocks, most: int):
         self._n, graph = len(rows[0]), rows[0][0].graph
         self._graph, self._most = graph, len(graph.operations) + most
-        self._zero, self._one = Form(graph, 0.0, {}), Form(graph, 1.0, {})
+        self._zero, self._one = Affine(graph, 0.0, {}), Affine(graph, 1.0, {})
         self._rows: list[Terms] = [
             {j: entry for j, entry in enumerate([*row, right]) if not is_zero(entry)}
             for row, right in zip(rows, gamma, strict=True)
         ]
         self._columns = list(zip(*rows, strict=True))
         self._left, self._free = set(range(len(rows))), set(range(self._n))
-        self.conditions: list[tuple[Form, Form]] = []
+        self.conditions: list[tuple[Affine, Affine]] = []
         for block in blocks:
             self._eliminate(*block)
         self.independent = sorted(self._free)
@@ -105,7 +105,7 @@ class DependentCoordinates:
         if len(self._graph.operations) + more > self._most:
             raise NotReduced
 
-    def _inverse(self, block: list[list[Form]]) -> tuple[Form, list[list[Form]]]:
+    def _inverse(self, block: list[list[Affine]]) -> tuple[Affine, list[list[Affine]]]:
         """The determinant of a block, and its inverse."""
         if len(block) == 1:
             ((determinant,),) = block
@@ -123,7 +123,7 @@ class DependentCoordinates:
         ]
 
     def _add_conditions(
-        self, block: list[list[Form]], columns: tuple[int, ...], pivot: Form, solved: list[Terms]
+        self, block: list[list[Affine]], columns: tuple[int, ...], pivot: Affine, solved: list[Terms]
     ) -> None:
         """What is solved is not divided by too small a pivot, nor are rows nearly dependent.
 
@@ -134,7 +134,7 @@ class DependentCoordinates:
         entries = [entry for row in solved for j, entry in row.items() if j < self._n]
         total = _dot(self._zero, [(entry, entry) for entry in entries])
         if total.terms:
-            self.conditions.append((Form(total.graph, 1.0 / LEAST, {}), total))
+            self.conditions.append((Affine(total.graph, 1.0 / LEAST, {}), total))
         if len(block) == 1:
             (column,) = (self._columns[j] for j in columns)
             squares = _dot(self._zero, [(entry, entry) for entry in column])
@@ -146,7 +146,7 @@ class DependentCoordinates:
     def _substitute(self, j: int, row: Terms) -> None:
         """Express a dependent coordinate by independent ones, and by later ones, which are expressed already."""
         self.check()
-        right, entries = row.get(self._n, self._zero), dict[int, Form]()
+        right, entries = row.get(self._n, self._zero), dict[int, Affine]()
         for k, entry in row.items():
             if k < self._n:
                 right = right - entry * self.g[k]
@@ -156,14 +156,14 @@ class DependentCoordinates:
 
 
 def reduced_accelerations(
-    mass: Any, force: Sequence[Form], coordinates: DependentCoordinates
-) -> tuple[list[Form], list[tuple[Form, Form]]]:
+    mass: Any, force: Sequence[Affine], coordinates: DependentCoordinates
+) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
     """Accelerations by those of the coordinates that stay, and conditions that these have inertia, as of the class."""
     n, T, g, independent = len(mass), coordinates.T, coordinates.g, coordinates.independent
-    zero = Form(mass[0, 0].graph, 0.0, {})
+    zero = Affine(mass[0, 0].graph, 0.0, {})
     rows = [[(mass[i, j], j) for j in range(n) if not is_zero(mass[i, j])] for i in range(n)]
     forces = [(force[i] - _dot(zero, ((x, g[j]) for x, j in rows[i]))).value() for i in range(n)]
-    matrix: dict[tuple[int, int], Form] = {}
+    matrix: dict[tuple[int, int], Affine] = {}
     coordinates.check(sum(len(row) ** 2 // 2 for row in T))  # of T^T M T, if M is diagonal
     for a, x in enumerate(independent):
         moved = [_dot(zero, ((entry, T[j][x]) for entry, j in row if x in T[j])).value() for row in rows]  # M T
@@ -178,11 +178,11 @@ def reduced_accelerations(
     return found, list(_definite(matrix, factors))
 
 
-def _definite(matrix: dict[tuple[int, int], Form], factors: Factors) -> Iterator[tuple[Form, Form]]:
+def _definite(matrix: dict[tuple[int, int], Affine], factors: Factors) -> Iterator[tuple[Affine, Affine]]:
     """What pivots of the small mass matrix are larger than: a share of what they are without those before."""
     pivots = iter(factors.positive)
     for places, _, _ in factors.blocks:
-        alone: Form | None = None
+        alone: Affine | None = None
         for place in places:
             pivot = next(pivots)
             scale = matrix[place, place] if alone is None else alone * matrix[place, place]
@@ -191,7 +191,7 @@ def _definite(matrix: dict[tuple[int, int], Form], factors: Factors) -> Iterator
                 yield pivot, scale.times(0.0 if pivot.key == scale.key else LEAST)
 
 
-def _dot(total: Form, pairs: Any) -> Form:
+def _dot(total: Affine, pairs: Any) -> Affine:
     for x, y in pairs:
         if not is_zero(x) and not is_zero(y):
             total = total + x * y

@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.generate.families import Evaluator, Family, of_family
-from twoloop.generate.known_numbers import array_of, elementwise
-from twoloop.generate.traced_equations import Equations, only
+from twoloop.generate.graph import MOST_OPERATIONS, Affine, Graph, Untraceable
+from twoloop.generate.parameter_expressions import array_of, elementwise
+from twoloop.generate.trace import Equations, only
+from twoloop.generate.trace_cache import Evaluator, TraceCache, derive_cached
 from twoloop.generate.traced_values import Check, Traced, unchecked
-from twoloop.generate.tracing import MOST_OPERATIONS, Form, Graph, Untraceable
 from twoloop.kernels.evaluation.operations import COSINE, PENDING, SINE, SUM
 from twoloop.problem.system import ConstrainedSystem
 
@@ -132,10 +132,10 @@ def series_for(system: ConstrainedSystem, check: Check = unchecked) -> SeriesPro
         As of `series_program`.
     """
 
-    def make(family: Family) -> SeriesProgram:
+    def make(family: TraceCache) -> SeriesProgram:
         return series_program(system, family.equations(system))
 
-    made: SeriesProgram = of_family(system, "series", make, lambda program: check(program.traced))
+    made: SeriesProgram = derive_cached(system, "series", make, lambda program: check(program.traced))
     return made
 
 
@@ -160,7 +160,7 @@ def series_program(
     arrays = np.vstack([jacobian, nonholonomic]), mass, np.append(rate, nonholonomic_rate), force
     G, mass, rates, force = (elementwise(partial(_without_sums, sums), [each]) for each in arrays)
     row_products: dict[Any, Any] = {}
-    nothing = Form(graph, 0.0, {})
+    nothing = Affine(graph, 0.0, {})
     kept = [i for i in range(n_rows) if counting is None or i in counting]
     rows = [nothing] * n_rows
     for i in kept:
@@ -177,16 +177,16 @@ def series_program(
     return replace(program, traced=Traced(system, graph))
 
 
-def _sums_of(graph: Graph) -> dict[int, Form]:
+def _sums_of(graph: Graph) -> dict[int, Affine]:
     """What the sums that are quantities are made of: series are linear, and have no recurrence for them."""
-    sums: dict[int, Form] = {}
+    sums: dict[int, Affine] = {}
     for i, operation in enumerate(graph.operations):
         if operation is not None and operation[0] == SUM:
             sums[i] = _without_sums(sums, operation[1])
     return sums
 
 
-def _without_sums(sums: dict[int, Form], form: Form) -> Form:
+def _without_sums(sums: dict[int, Affine], form: Affine) -> Affine:
     """A form in terms of other quantities than sums."""
     named = [i for i in form.terms if i in sums]
     if not named:
@@ -198,22 +198,27 @@ def _without_sums(sums: dict[int, Form], form: Form) -> Form:
 
 
 def _sum_of_products(
-    graph: Graph, factors: Sequence[Form], others: Sequence[Form], rest: Form, known: dict[Any, Any], of_rates: bool
-) -> Form:
+    graph: Graph,
+    factors: Sequence[Affine],
+    others: Sequence[Affine],
+    rest: Affine,
+    known: dict[Any, Any],
+    of_rates: bool,
+) -> Affine:
     """rest + sum_i factors[i] others[i] with few products, which go into `known`: by factor, or by what is in these.
 
     Where both take as few, those of rates go by what is in the factors: a sine's with the rate of its angle is a
     derivative.
     """
     total = rest
-    by_factor: dict[Any, tuple[Form, Form]] = {}
-    by_quantity: dict[Any, tuple[Form, Form]] = {}
+    by_factor: dict[Any, tuple[Affine, Affine]] = {}
+    by_quantity: dict[Any, tuple[Affine, Affine]] = {}
     for factor, other in zip(factors, others, strict=True):
         if factor.constant != 0.0:
             total = total + other.times(factor.constant)
         if not factor.terms:
             continue
-        varying = Form(graph, 0.0, factor.terms)
+        varying = Affine(graph, 0.0, factor.terms)
         scale, form = varying.normalised()
         _collect(by_factor, form, other.times(scale))
         for i, c in factor.terms.items():
@@ -227,25 +232,25 @@ def _sum_of_products(
     return total
 
 
-def _normalised(factor: Form, other: Form) -> tuple[Any, float, Form, Form]:
+def _normalised(factor: Affine, other: Affine) -> tuple[Any, float, Affine, Affine]:
     """A product with a scale of 1: its key, the scale, and both factors."""
     scale, other = other.normalised()
     return (factor.key, other.key), scale, factor, other
 
 
-def _collect(groups: dict[Any, tuple[Form, Form]], factor: Form, other: Form) -> None:
+def _collect(groups: dict[Any, tuple[Affine, Affine]], factor: Affine, other: Affine) -> None:
     before = groups.get(factor.key)
     groups[factor.key] = (factor, other if before is None else before[1] + other)
 
 
 def _assembled(
     graph: Graph,
-    sums: dict[int, Form],
+    sums: dict[int, Affine],
     inputs: list[int],
     n: int,
     n_rows: int,
-    rows: list[Form],
-    balance: list[Form],
+    rows: list[Affine],
+    balance: list[Affine],
     row_products: dict[Any, Any],
     reaction_products: dict[Any, Any],
 ) -> SeriesProgram:
@@ -282,7 +287,7 @@ def _assembled(
     )
 
 
-def _used(graph: Graph, forms: list[Form]) -> list[tuple[int, Any]]:
+def _used(graph: Graph, forms: list[Affine]) -> list[tuple[int, Any]]:
     """The operations that forms are made of, and those that are made with them: sines and cosines of an angle."""
     needed = set(graph.needed_by(forms))
     pairs = (SINE, COSINE)
@@ -294,7 +299,7 @@ def _used(graph: Graph, forms: list[Form]) -> list[tuple[int, Any]]:
     ]
 
 
-def _scattered(forms: list[Form], place: dict[int, int]) -> tuple[Sums, Integers]:
+def _scattered(forms: list[Affine], place: dict[int, int]) -> tuple[Sums, Integers]:
     """Those forms that are not zero, and which they are."""
     kept = [k for k, form in enumerate(forms) if form.terms or form.constant]
     sums = _sums([forms[k] for k in kept], place)
@@ -302,9 +307,9 @@ def _scattered(forms: list[Form], place: dict[int, int]) -> tuple[Sums, Integers
     return sums._replace(row=places[sums.row]), places
 
 
-def _without(form: Form, inputs: Container[int]) -> Form:
+def _without(form: Affine, inputs: Container[int]) -> Affine:
     """A form less its multiples of some quantities."""
-    return Form(form.graph, form.constant, {i: c for i, c in form.terms.items() if i not in inputs})
+    return Affine(form.graph, form.constant, {i: c for i, c in form.terms.items() if i not in inputs})
 
 
 def _ordered(operations: list[Any]) -> list[tuple[int, list[Any]]]:
@@ -316,7 +321,7 @@ def _ordered(operations: list[Any]) -> list[tuple[int, list[Any]]]:
         used = [i for form in (first, second) if form is not None for i in form.terms if i in own]
         level[node] = 1 + max((level[i] for i in used), default=0)
         if second is None:
-            second = Form(first.graph, 0.0, {})
+            second = Affine(first.graph, 0.0, {})
         groups.setdefault((level[node], kind), []).append((node, first, second))
     ordered = []
     for (number, kind), members in sorted(groups.items()):
@@ -330,7 +335,7 @@ def _ordered(operations: list[Any]) -> list[tuple[int, list[Any]]]:
     return ordered
 
 
-def _n_terms(operation: tuple[int, Form, Form]) -> tuple[int, int]:
+def _n_terms(operation: tuple[int, Affine, Affine]) -> tuple[int, int]:
     _, first, second = operation
     return len(first.terms), len(second.terms)
 
@@ -347,7 +352,7 @@ def _table(groups: list[tuple[int, list[Any]]], place: dict[int, int]) -> Table:
     return Table(np.array(rows, dtype=np.int64), *sums)
 
 
-def _sums(forms: list[Form], place: dict[int, int]) -> Sums:
+def _sums(forms: list[Affine], place: dict[int, int]) -> Sums:
     terms = [[(place[i], c) for i, c in form.terms.items()] or [(0, 0.0)] for form in forms]
     more = [(k, *term) for k, each in enumerate(terms) for term in each[1:]]
     return Sums(

@@ -3,15 +3,15 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from twoloop.generate.tracing import Form
+from twoloop.generate.graph import Affine
 
 
 class Block(NamedTuple):
     """One or two places that are eliminated together, which takes one division."""
 
     places: tuple[int, ...]
-    inverse: list[list[Form]]  # of the pivots
-    below: list[tuple[int, list[Form]]]  # rows of L
+    inverse: list[list[Affine]]  # of the pivots
+    below: list[tuple[int, list[Affine]]]  # rows of L
 
 
 class Factors:
@@ -21,23 +21,23 @@ class Factors:
     ----------
     blocks : list of Block
         In the order of elimination.
-    conditions : list of (Form, Form)
+    conditions : list of (Affine, Affine)
         Two numbers for each row from `n` on, the first over the second: its pivot over what it is without the others.
-    positive : list of Form
+    positive : list of Affine
         Coefficients that are positive where the matrix of the first `n` is definite.
     """
 
-    def __init__(self, matrix: dict[tuple[int, int], Form], size: int, n: int):
-        rows: list[dict[int, Form]] = [{} for _ in range(size)]
+    def __init__(self, matrix: dict[tuple[int, int], Affine], size: int, n: int):
+        rows: list[dict[int, Affine]] = [{} for _ in range(size)]
         for (i, j), value in matrix.items():
             rows[i][j] = value
         self.blocks: list[Block] = []
-        self.conditions: list[tuple[Form, Form]] = []
-        self.positive: list[Form] = []
+        self.conditions: list[tuple[Affine, Affine]] = []
+        self.positive: list[Affine] = []
         alone: dict[int, Any] = {}
         pairs = _pairs(rows, n)
         for places in [*pairs, *_order(rows, n, pairs)]:
-            nothing = Form(rows[places[0]][places[0]].graph, 0.0, {})
+            nothing = Affine(rows[places[0]][places[0]].graph, 0.0, {})
             pivots = [[rows[i].pop(j, nothing).value() for j in places] for i in places]
             inverse = self._inverse(pivots, [alone.get(i) for i in places])
             others = dict.fromkeys(j for i in places for j in rows[i])
@@ -53,7 +53,7 @@ class Factors:
                     rows[j].pop(i, None)
             self.blocks.append(Block(places, inverse, below))
 
-    def _inverse(self, pivots: list[list[Form]], alone: list[Any]) -> list[list[Form]]:
+    def _inverse(self, pivots: list[list[Affine]], alone: list[Any]) -> list[list[Affine]]:
         """The inverse of one or two pivots; of rows of G, conditions too."""
         own = [None if each is None else each.value() for each in alone]
         a = pivots[0][0]
@@ -72,22 +72,22 @@ class Factors:
         inverse = determinant.reciprocal()
         return [[(c * inverse).value(), (-b * inverse).value()], [(-b * inverse).value(), (a * inverse).value()]]
 
-    def solve(self, right: Sequence[Form]) -> list[Form]:
+    def solve(self, right: Sequence[Affine]) -> list[Affine]:
         """The solution for a right-hand side."""
         return solve(self.blocks, right)
 
 
-def _dot(one: Sequence[Form], other: Sequence[Form]) -> Form:
+def _dot(one: Sequence[Affine], other: Sequence[Affine]) -> Affine:
     total = one[0] * other[0]
     for x, y in zip(one[1:], other[1:], strict=True):
         total = total + x * y
     return total
 
 
-def solve(blocks: Sequence[Block], right: Sequence[Form]) -> list[Form]:
+def solve(blocks: Sequence[Block], right: Sequence[Affine]) -> list[Affine]:
     """The solution for a right-hand side; multiples of one quantity are summed up before they are multiplied by it."""
     solution = list(right)
-    owed: list[list[tuple[Form, Form]]] = [[] for _ in right]
+    owed: list[list[tuple[Affine, Affine]]] = [[] for _ in right]
     for places, _, below in blocks:
         for i in places:
             solution[i] = (solution[i] - _gathered(owed[i])).value()
@@ -101,10 +101,10 @@ def solve(blocks: Sequence[Block], right: Sequence[Form]) -> list[Form]:
     return solution
 
 
-def _gathered(products: Sequence[tuple[Form, Form]]) -> Any:
+def _gathered(products: Sequence[tuple[Affine, Affine]]) -> Any:
     """The sum of products, those of multiples of one factor as one."""
     total: Any = 0.0
-    groups: dict[Any, tuple[Form, Form]] = {}
+    groups: dict[Any, tuple[Affine, Affine]] = {}
     for one, other in products:
         if not one.terms:
             total = total + other.times(one.constant)
@@ -118,7 +118,7 @@ def _gathered(products: Sequence[tuple[Form, Form]]) -> Any:
     return total
 
 
-def _pairs(rows: list[dict[int, Form]], n: int) -> list[tuple[int, int]]:
+def _pairs(rows: list[dict[int, Affine]], n: int) -> list[tuple[int, int]]:
     """Coordinates and rows of G that give them: by a number, each in one row alone, of a mass that is a number.
 
     The rank of G is that of the rows without such pairs, and as many more: they take no condition, and no division.
@@ -130,7 +130,7 @@ def _pairs(rows: list[dict[int, Form]], n: int) -> list[tuple[int, int]]:
     return [(i, k) for k, i in pairs.items()]
 
 
-def _order(rows: list[dict[int, Form]], n: int, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, ...]]:
+def _order(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, ...]]:
     """Least degree first; a row from n on only after all that it has below n; in pairs where their neighbours agree.
 
     Among equals those first that wait for the fewest divisions: what does not depend on one another runs side by side.

@@ -3,10 +3,10 @@
 import math
 from typing import Any, NamedTuple
 
-from twoloop.generate.families import Evaluator, Family, of_family
-from twoloop.generate.known_numbers import Known
+from twoloop.generate.graph import Affine, Graph, Untraceable
+from twoloop.generate.parameter_expressions import Parameter
+from twoloop.generate.trace_cache import Evaluator, TraceCache, derive_cached
 from twoloop.generate.traced_values import unchecked
-from twoloop.generate.tracing import Form, Graph, Untraceable
 from twoloop.kernels.evaluation.operations import (
     ARCTANGENT,
     COSINE,
@@ -77,14 +77,14 @@ def _known(system: ConstrainedSystem, ran_on_symbols: bool) -> Dependence | None
     if system.called_in_python and not ran_on_symbols:
         return None
     try:
-        known: Dependence = of_family(system, "dependence", _traced(system), unchecked)
+        known: Dependence = derive_cached(system, "dependence", _traced(system), unchecked)
     except Untraceable:
         return None
     return known
 
 
 def _traced(system: ConstrainedSystem) -> Any:
-    def make(family: Family) -> Dependence:
+    def make(family: TraceCache) -> Dependence:
         equations = family.equations(system)
 
         def needed(kinds: tuple[str, ...]) -> list[int]:
@@ -152,7 +152,7 @@ def _is_narrow(graph: Graph, needed: list[int]) -> bool:
     return False
 
 
-def _degree(degrees: dict[int, float], kind: int, *factors: Form | None) -> float:
+def _degree(degrees: dict[int, float], kind: int, *factors: Affine | None) -> float:
     """The degree of a product is the sum of those of its factors, of a root half that of its argument, else that."""
     first, *others = (
         max((degrees.get(i, 0.0) for i in form.terms), default=0.0) for form in factors if form is not None
@@ -160,16 +160,19 @@ def _degree(degrees: dict[int, float], kind: int, *factors: Form | None) -> floa
     return first + sum(others) if kind == PRODUCT else 0.5 * first if kind == SQUARE_ROOT else first
 
 
-def _growth(powers: dict[int, float], kind: int, *factors: Form | None) -> float:
+def _growth(powers: dict[int, float], kind: int, *factors: Affine | None) -> float:
     """By which power it grows far away; it falls off with its reciprocal, and vibrations do neither."""
     power = _degree(powers, kind, *factors)
     return 0.0 if kind in (SINE, COSINE) else -power if kind == RECIPROCAL else power
 
 
-def _rate(rates: dict[int, float], *factors: Form | None) -> float:
+def _rate(rates: dict[int, float], *factors: Affine | None) -> float:
     """The rate of a product is the sum of those of its factors, of a sum the largest of those of its terms."""
     return sum(
-        max((math.inf if type(c) is Known else abs(c) * rates.get(i, 1.0) for i, c in form.terms.items()), default=0.0)
+        max(
+            (math.inf if type(c) is Parameter else abs(c) * rates.get(i, 1.0) for i, c in form.terms.items()),
+            default=0.0,
+        )
         for form in factors
         if form is not None
     )

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.scales import sizes
-from twoloop.generate.families import Evaluator
-from twoloop.generate.programs import program_of
-from twoloop.generate.tracing import Graph, Untraceable
+from twoloop.generate.graph import Graph, Untraceable
+from twoloop.generate.program import program_of
+from twoloop.generate.trace_cache import Evaluator
 from twoloop.kernels.compile.linking import direct
 from twoloop.problem.system import ConstrainedSystem
 

@@ -8,12 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from twoloop.checks.arguments import Array, shown
-from twoloop.generate.calls_on_symbols import as_forms, trace
-from twoloop.generate.derivative import Derivative
-from twoloop.generate.derived import standing_for
-from twoloop.generate.programs import AGREES, BETWEEN, STATES, numbers_of, program_of
+from twoloop.generate.derived_callbacks import with_derived_callbacks
+from twoloop.generate.graph import Affine, Derivative, Graph, Untraceable, symbols
+from twoloop.generate.program import AGREES, BETWEEN, STATES, numbers_of, program_of
+from twoloop.generate.trace import as_forms, trace
 from twoloop.generate.traced_values import unchecked
-from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import codes, noted
 from twoloop.methods.dop853 import DOP853
@@ -50,7 +49,7 @@ class Gaps:
         graph = Graph()
         (t,) = graph.inputs(1, False)
         q, v = graph.inputs(self._n_q, False), graph.inputs(self._n_q, True)
-        outputs: list[Form] = []
+        outputs: list[Affine] = []
         for stop in stops:
             try:
                 value = np.array(trace(getattr(stop, function), t, symbols(q)), dtype=object)
@@ -98,9 +97,9 @@ class Gaps:
                     )
 
 
-def _with_derivatives(graph: Graph, gap: Form, t: Form, q: Sequence[Form], v: Sequence[Form]) -> list[Form]:
+def _with_derivatives(graph: Graph, gap: Affine, t: Affine, q: Sequence[Affine], v: Sequence[Affine]) -> list[Affine]:
     """Return a gap, its rate, the part of its second derivative without v', and its gradient."""
-    unit = Form(graph, 1.0, {})
+    unit = Affine(graph, 1.0, {})
     (t_input,), q_inputs = t.terms, [next(iter(coordinate.terms)) for coordinate in q]
     direction = {t_input: unit, **dict(zip(q_inputs, v, strict=True))}
     rate = Derivative(graph, direction).of(gap)
@@ -137,7 +136,7 @@ class ContactSystem:
         self._slides, self._sticking, self._slipping = slides, list(sticking), slipping
         self._offsets = np.array(list(sticking.values()))
         self._zero_velocity = np.zeros(system.n_q)
-        self._derived = standing_for(system, unchecked)[0] if slipping else system
+        self._derived = with_derived_callbacks(system, unchecked)[0] if slipping else system
 
     def _rows(self, part: str, t: float, q: Array, v: Array) -> Array:
         """Return a part of a `Gap` for closed stops, followed by that for the displacements that do not change."""
@@ -214,7 +213,7 @@ class Accelerations:
     """Compute accelerations and multipliers of a system at any state, as in its runs."""
 
     def __init__(self, system: ConstrainedSystem, t: float, q: Array, v: Array, atol: Array):
-        derived, _ = standing_for(system, unchecked)
+        derived, _ = with_derived_callbacks(system, unchecked)
         # any explicit method would do: only the accelerations at the start of its steps are used
         plan = DOP853().plan(system.n_q, 1e-8, 1e-8, False)
         self._run = Run(derived, plan, t, q, v, 1e-8, atol, None)

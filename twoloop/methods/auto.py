@@ -3,11 +3,11 @@
 from dataclasses import dataclass, replace
 
 from twoloop.generate.collocation_code import suits
+from twoloop.generate.compile_equations import GeneratedCode
+from twoloop.generate.graph import Untraceable
 from twoloop.generate.series import is_quick, series_for
-from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.time_dependence import may_be_narrow
 from twoloop.generate.traced_values import Check, unchecked
-from twoloop.generate.tracing import Untraceable
 from twoloop.methods.lobatto import Lobatto16
 from twoloop.methods.plan import Method, Plan, kept_plan, least_tolerance
 from twoloop.methods.taylor import Taylor
@@ -151,7 +151,9 @@ class Auto:
         """What the error estimate of implicit steps is taken over."""
         return "positions"
 
-    def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked) -> "Auto":
+    def for_system(
+        self, system: ConstrainedSystem, code: GeneratedCode | None = None, check: Check = unchecked
+    ) -> "Auto":
         """The same for the operations of a system, without `series` where they cannot be seen, or not be relied on."""
         sparse = len(system.entries) == 2 and system.n_a == 0
         chosen = replace(self, n_rows=system.n_c + system.n_a, series=None, lanes=None, sparse=sparse)

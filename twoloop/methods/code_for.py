@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import shown
+from twoloop.generate.compile_equations import GeneratedCode, generated_code
+from twoloop.generate.graph import Untraceable
 from twoloop.generate.series import is_quick, series_for
-from twoloop.generate.straight_code import OwnCode, own_code
 from twoloop.generate.traced_values import Check
-from twoloop.generate.tracing import Untraceable
 from twoloop.methods.plan import Method, needs_code, takes_code
 from twoloop.problem.system import ConstrainedSystem
 
@@ -35,7 +35,7 @@ def check_compiled(value: Compiled) -> Compiled:
 
 def code_for(
     system: ConstrainedSystem, method: Method, fixed: bool, compiled: Compiled, t0: float, q0: Array, check: Check
-) -> OwnCode | None:
+) -> GeneratedCode | None:
     """The code for a run, if it gets any.
 
     What is left open depends on the arguments of the call alone, so that the same call gives the same numbers whatever
@@ -45,13 +45,13 @@ def code_for(
     """
     if compiled is True:
         _refuse(method, fixed)
-        return own_code(system, t0, q0, check)
+        return generated_code(system, t0, q0, check)
     if needs_code(method):
         return _needed(system, method, compiled, t0, q0, check)
     if not may_have_code(system, method, fixed, compiled):
         return None
     try:
-        return own_code(system, t0, q0, check)
+        return generated_code(system, t0, q0, check)
     except ValueError:
         return None
 
@@ -67,13 +67,13 @@ def may_have_code(system: ConstrainedSystem, method: Method, fixed: bool, compil
 
 def _needed(
     system: ConstrainedSystem, method: Method, compiled: Compiled, t0: float, q0: Array, check: Check
-) -> OwnCode:
+) -> GeneratedCode:
     """The code for a method that cannot do without."""
     what = f"method={method.name!r} needs code made for {system.name!r}"
     if not compiled:
         raise ValueError(f"{what}; given compiled=False. Leave it out, or take method='auto'")
     try:
-        return own_code(system, t0, q0, check)
+        return generated_code(system, t0, q0, check)
     except ValueError as error:
         raise ValueError(f"{what}, which cannot be had; {error.__cause__}. Take method='auto'") from error
 

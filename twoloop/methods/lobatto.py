@@ -6,8 +6,8 @@ from typing import ClassVar
 import numpy as np
 
 from twoloop.generate.collocation_code import compiled_collocation, suits
+from twoloop.generate.compile_equations import GeneratedCode
 from twoloop.generate.lobatto_tables import tables
-from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.time_dependence import may_be_narrow
 from twoloop.generate.traced_values import Check, unchecked
 from twoloop.kernels.data.collocation import ORDER
@@ -54,11 +54,11 @@ class Lobatto16:
 
     needs_code: ClassVar[bool] = True
     name: ClassVar[str] = "Lobatto16"
-    code: OwnCode | None = None  # made for one system; solve_dae puts it in
+    code: GeneratedCode | None = None  # made for one system; solve_dae puts it in
     narrow: bool = True  # whether forces may change much over a short way
 
     def for_system(
-        self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked
+        self, system: ConstrainedSystem, code: GeneratedCode | None = None, check: Check = unchecked
     ) -> "Lobatto16":
         """The method with what is compiled for this system.
 

@@ -1,6 +1,6 @@
 """The plans by which a method runs a system; those of our own methods are made once for a system and a tolerance."""
 
-from twoloop.generate.straight_code import OwnCode
+from twoloop.generate.compile_equations import GeneratedCode
 from twoloop.generate.traced_values import Check
 from twoloop.kernels.data.intervals import ACCELERATIONS, APART, VELOCITIES
 from twoloop.methods.plan import Method, Plan
@@ -14,7 +14,13 @@ Plans = tuple[Plan, dict[int, Plan]]
 
 
 def plans_for(
-    system: ConstrainedSystem, method: Method, rtol: float, atol: float, fixed: bool, code: OwnCode | None, check: Check
+    system: ConstrainedSystem,
+    method: Method,
+    rtol: float,
+    atol: float,
+    fixed: bool,
+    code: GeneratedCode | None,
+    check: Check,
 ) -> Plans:
     """The plans of a run.
 
@@ -42,7 +48,7 @@ def _series(method: Method) -> bool:
 
 
 def _made(
-    system: ConstrainedSystem, method: Method, rtol: float, atol: float, fixed: bool, code: OwnCode | None
+    system: ConstrainedSystem, method: Method, rtol: float, atol: float, fixed: bool, code: GeneratedCode | None
 ) -> Plans:
     plan = method.plan(system.n_q, rtol, atol, fixed)
     interiors = {} if plan.within_newton is None else {VELOCITIES: plan.within_newton}
@@ -55,7 +61,7 @@ def _made(
     return _with_code(plan, code).changed(traced=(*plan.traced, code.traced)), interiors
 
 
-def _with_code(plan: Plan, code: OwnCode) -> Plan:
+def _with_code(plan: Plan, code: GeneratedCode) -> Plan:
     from twoloop.kernels.evaluation.inner_loop import own_inner_loop
 
     substitute = None if plan.substitute is None else _with_code(plan.substitute, code)

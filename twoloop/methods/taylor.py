@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import check_size
+from twoloop.generate.compile_equations import GeneratedCode
+from twoloop.generate.graph import Untraceable
 from twoloop.generate.series import SeriesProgram, series_for
-from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Check, unchecked
-from twoloop.generate.tracing import Untraceable
 from twoloop.methods.plan import LARGEST_MOVE, Plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
 
@@ -89,7 +89,9 @@ class Taylor:
         """Shown in messages and tables."""
         return "Taylor" if self.order is None else f"Taylor(order={self.order})"
 
-    def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked) -> "Taylor":
+    def for_system(
+        self, system: ConstrainedSystem, code: GeneratedCode | None = None, check: Check = unchecked
+    ) -> "Taylor":
         """The method with the operations of this system, of which what is compiled for it makes no use.
 
         Raises

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.consistency import Look
-from twoloop.generate.exact_derivatives import farthest
-from twoloop.generate.straight_code import OwnCode
+from twoloop.generate.compile_equations import GeneratedCode
+from twoloop.generate.derived_callbacks import farthest
 from twoloop.generate.traced_values import Sample
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.control.clock import N_STEP_COLUMNS
@@ -78,7 +78,7 @@ class Again:
         A copy at its start, which this one keeps.
     system : ConstrainedSystem
         The one of the call: the run's own may be another, that stands for it.
-    code : OwnCode or None
+    code : GeneratedCode or None
         The machine code that its plan calls.
     definite : bool
         Whether M has an inverse at its start.
@@ -92,7 +92,7 @@ class Again:
         self,
         run: Run,
         system: ConstrainedSystem,
-        code: OwnCode | None,
+        code: GeneratedCode | None,
         definite: bool,
         asked: Asked,
         kin: Kin | None,

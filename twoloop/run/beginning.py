@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from twoloop.checks.consistency import Look
 from twoloop.generate.choices import BOUNDS, LEAST, RANK, SINGULAR_MASS, Choice, Dependents
-from twoloop.generate.straight_code import OwnCode
+from twoloop.generate.compile_equations import GeneratedCode
 from twoloop.kernels.data import noted
 from twoloop.kernels.data.flags import BANDWIDTH, FORM
 from twoloop.kernels.layout import lasting, short_loops
@@ -23,7 +23,9 @@ Array = NDArray[np.float64]
 NEARER = 0.1  # of the smallest pivot at the start of the first run: below it, a start is looked at anew
 
 
-def arrays_of(run: Run, look: Look, code: OwnCode | None, definite: bool, asked: Asked, room: int) -> SimpleNamespace:
+def arrays_of(
+    run: Run, look: Look, code: GeneratedCode | None, definite: bool, asked: Asked, room: int
+) -> SimpleNamespace:
     """The arrays that `go` of kernels/short_loops.py reads and writes, with room for so many steps.
 
     The run is at its start; its clock, control and tolerances become parts of one array. `look` is of its system, or of

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from twoloop.checks.derivatives import wrong_derivative
 from twoloop.checks.structure import unlike_itself
-from twoloop.generate.exact_derivatives import Territory, exact_derivatives, generic_states
+from twoloop.generate.derived_callbacks import CheckedRegion, exact_derivatives, generic_states
 from twoloop.generate.traced_values import CLEAR, FEW, Sample
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.record import Status
@@ -26,7 +26,7 @@ def compared(
 ) -> tuple[Status, str]:
     """Status and message, unless callbacks are not what they should be where the run went.
 
-    Compiled ones are not compared again where they were: see Territory.
+    Compiled ones are not compared again where they were: see CheckedRegion.
     """
     territory = territory_of(run, check_derivatives)
     everywhere = territory.is_due() or run.system.called_in_python
@@ -40,15 +40,15 @@ def compared(
     return status, message
 
 
-def territory_of(run: "Run", check_derivatives: bool) -> Territory:
+def territory_of(run: "Run", check_derivatives: bool) -> CheckedRegion:
     """Where runs of its system and kind were that callbacks were compared in."""
     what = (check_derivatives, *map(id, run.traced))  # the system keeps these
-    return run.system.remembered(("territory", what), Territory)  # type: ignore[no-any-return]
+    return run.system.remembered(("territory", what), CheckedRegion)  # type: ignore[no-any-return]
 
 
 def compared_at(
     run: "Run",
-    territory: Territory,
+    territory: CheckedRegion,
     states: Array,
     check_derivatives: bool,
     status: Status,

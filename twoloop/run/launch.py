@@ -8,10 +8,9 @@ from numpy.typing import NDArray
 
 from twoloop.checks.at_position import has_definite_mass
 from twoloop.checks.consistency import check_start
-from twoloop.generate.derived import standing_for
-from twoloop.generate.exact_derivatives import exact_near
-from twoloop.generate.families import Family, family_of, give_bounds, take_bounds
-from twoloop.generate.straight_code import OwnCode
+from twoloop.generate.compile_equations import GeneratedCode
+from twoloop.generate.derived_callbacks import exact_near, with_derived_callbacks
+from twoloop.generate.trace_cache import TraceCache, give_bounds, take_bounds, trace_cache_of
 from twoloop.generate.traced_values import Traced, states_around
 from twoloop.methods.code_for import code_for, may_have_code
 from twoloop.methods.plans_for import plans_for
@@ -37,7 +36,7 @@ class Kept(NamedTuple):
     run: Run
     start: tuple[float, bytes, bytes]
     t1: float
-    code: OwnCode | None
+    code: GeneratedCode | None
     definite: bool  # whether M was
     moves: bool  # whether what it takes depends on the start by that alone
     waiting: list[Again] | None  # arrays for further runs, one a thread; None: they are not made in this way
@@ -120,7 +119,7 @@ def run_from(system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Arr
     return run
 
 
-def _kept_of(run: Run, code: OwnCode | None, t1: float, asked: Asked) -> Kept | None:
+def _kept_of(run: Run, code: GeneratedCode | None, t1: float, asked: Asked) -> Kept | None:
     """What is kept of a run at its start, if it may be."""
     system, n = run.system, run.system.n_q
     trusted = identity(asked.method) is not None and all(traced.trusted for traced in run.traced)
@@ -134,12 +133,12 @@ def _kept_of(run: Run, code: OwnCode | None, t1: float, asked: Asked) -> Kept | 
     return Kept(run.again(), start, t1, code, definite, moves, [] if moves and Again.suits(run) else None)
 
 
-def _family_of(system: ConstrainedSystem) -> Family:
-    made: Family = system.remembered(("family", family_of), lambda: family_of(system))
+def _family_of(system: ConstrainedSystem) -> TraceCache:
+    made: TraceCache = system.remembered(("family", trace_cache_of), lambda: trace_cache_of(system))
     return made
 
 
-def _keep_for_kin(system: ConstrainedSystem, run: Run, code: OwnCode | None, t1: float, asked: Asked) -> None:
+def _keep_for_kin(system: ConstrainedSystem, run: Run, code: GeneratedCode | None, t1: float, asked: Asked) -> None:
     """Keep a run for systems of other parameters, from the second of these on."""
     call, seen, known = (asked.key, _family_of(system)), system.functions, system.shared.get("runs", {})
     if call not in known:
@@ -169,7 +168,7 @@ def _moved(
 
 def _made(
     system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, asked: Asked
-) -> tuple[Run, OwnCode | None]:
+) -> tuple[Run, GeneratedCode | None]:
     fixed, given, new = asked.step_size is not None, system, not system.checked
     if new:
         take_bounds(system)
@@ -178,7 +177,7 @@ def _made(
     def check(traced: Traced) -> None:
         traced.refuse(system, t0, t1, q0, v0)
 
-    system, derived = standing_for(system, check)
+    system, derived = with_derived_callbacks(system, check)
     code = code_for(system, asked.method, fixed, asked.compiled, t0, q0, check)
     plan, interiors = plans_for(system, asked.method, asked.rtol, float(asked.atol.min()), fixed, code, check)
     if derived:

@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 
 from twoloop.checks.at_position import has_definite_mass, is_definite
 from twoloop.checks.derivatives import check_derivatives
-from twoloop.generate.exact_derivatives import Territory, exact_derivatives, exact_near
-from twoloop.generate.families import family_of, give_bounds
-from twoloop.generate.formulas import Formulas
-from twoloop.generate.straight_code import OwnCode
-from twoloop.generate.traced_equations import runs_on_symbols
+from twoloop.generate.compile_equations import GeneratedCode
+from twoloop.generate.derived_callbacks import CheckedRegion, exact_derivatives, exact_near
+from twoloop.generate.trace import runs_on_symbols
+from twoloop.generate.trace_cache import ParameterArrays, give_bounds, trace_cache_of
 from twoloop.generate.traced_values import refuse_wrong, unchecked
 from twoloop.kernels.data.flags import AUGMENTED, BANDWIDTH, DIAGONAL_MASS, FORM
 from twoloop.kernels.data.kit import Kit
@@ -42,7 +41,7 @@ class Kin:
     ----------
     run : Run
         Of one of the systems, at its start, which stays there.
-    code : OwnCode or None
+    code : GeneratedCode or None
         The machine code that its plan calls.
     method, fixed, compiled
         How it was asked for.
@@ -53,14 +52,14 @@ class Kin:
         If not all is known that depends on the parameters.
     """
 
-    def __init__(self, run: Run, code: OwnCode | None, method: Method, fixed: bool, compiled: Compiled):
+    def __init__(self, run: Run, code: GeneratedCode | None, method: Method, fixed: bool, compiled: Compiled):
         system, t, q = run.system, run.t0, run.state[: run.system.n_q]
-        self.family, self._territories = family_of(system), dict[bool, Territory]()
+        self.family, self._territories = trace_cache_of(system), dict[bool, CheckedRegion]()
         form, banded = run.kit.flags[FORM], run.kit.flags[BANDWIDTH] >= 0
         if run.static is not None or form == AUGMENTED or banded or system.entries:
             raise ValueError("of large systems more is decided by numbers")
         of_formulas = copy.copy(system)
-        of_formulas.made = {("family", family_of): self.family, ("numbers", self.family): lambda array: array}
+        of_formulas.made = {("family", trace_cache_of): self.family, ("numbers", self.family): lambda array: array}
         own = code_for(of_formulas, method, fixed, compiled, t, q, unchecked)
         self.plan, self.interiors = plans_for(of_formulas, method, run.rtol, run.least_atol, fixed, own, unchecked)
         self.exact = exact_derivatives(of_formulas)
@@ -74,9 +73,9 @@ class Kin:
         if (code is None) is not (own is None) or _told(made) != _told(run):
             raise ValueError("its numbers are not those of the family")
 
-    def territory(self, with_derivatives: bool) -> Territory:
+    def territory(self, with_derivatives: bool) -> CheckedRegion:
         """Where callbacks were compared."""
-        return self._territories.setdefault(with_derivatives, Territory())
+        return self._territories.setdefault(with_derivatives, CheckedRegion())
 
 
 class Movable:
@@ -97,15 +96,15 @@ class Movable:
     """
 
     def __init__(self, kin: Kin, run: Run):
-        self.kin, self.run, self._formulas = kin, run, Formulas()
+        self.kin, self.run, self._formulas = kin, run, ParameterArrays()
         functions, array = run.system.functions, self._formulas.array
         self._functions = functions._replace(p=functions.p.copy(), flags=functions.flags.copy())
         run.plan = self._numbered(kin.plan).fresh()
         run.interiors = {kind: self._numbered(each) for kind, each in kin.interiors.items()}
         run.traced = run.plan.traced
         self._remembered: dict[Any, Any] = {
-            ("family", family_of): kin.family,
-            ("derivatives", family_of): None if kin.exact is None else kin.exact.with_numbers(array),
+            ("family", trace_cache_of): kin.family,
+            ("derivatives", trace_cache_of): None if kin.exact is None else kin.exact.with_numbers(array),
             ("kit", id(self._functions)): Kit(self._functions),
             "kits": {},
         }

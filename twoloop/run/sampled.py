@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from twoloop.checks.arguments import check_finite, check_real, shown
 from twoloop.checks.at_position import parts_of
 from twoloop.checks.consistency import check_start
-from twoloop.generate.derived import standing_for
-from twoloop.generate.exact_derivatives import exact_near
+from twoloop.generate.derived_callbacks import exact_near, with_derived_callbacks
 from twoloop.generate.traced_values import Traced
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.kernels.compile.linking import direct
@@ -107,7 +106,7 @@ class SampledRun:
         def check(traced: Traced) -> None:
             traced.refuse(system, t0, t0 + 1.0, q0, v0)
 
-        self._derived, _ = standing_for(system, check)  # by what inputs must not enter
+        self._derived, _ = with_derived_callbacks(system, check)  # by what inputs must not enter
         self._plan = method.plan(system.n_q, rtol, float(atol.min()), False)
         self.system, self.method, self.max_step, self.t0 = system, method, max_step, t0
         self._tolerances = rtol, atol

@@ -1,4 +1,4 @@
-"""Machine code of one mechanism for lanes, kept on disk by the structure of its equations, and the numbers it reads."""
+"""Machine code of one mechanism for SIMD lanes, kept on disk by the structure of its equations, and its numbers."""
 
 from functools import cache, cached_property
 from typing import Generic, TypeVar
@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.generate import (
-    accelerations,
     coefficients,
+    compile_equations,
+    elimination,
     lane_code,
     lane_constraints,
     lane_emitter,
@@ -18,18 +19,16 @@ from twoloop.generate import (
     lane_turns,
     llvm_code,
     llvm_text,
-    llvm_trigonometry,
+    lowering,
     null_space,
     series,
-    straight_line,
     symbolic_factors,
-    written,
 )
-from twoloop.generate.known_numbers import Record
 from twoloop.generate.lane_code import LaneCode
 from twoloop.generate.lane_constraints import LaneConstraints
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.llvm_text import Module
+from twoloop.generate.parameter_expressions import ParameterTape
 from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.generated_functions import OwnFunctions, are_kept, own_functions
 from twoloop.kernels.lanes.lane_room import CODE
@@ -38,24 +37,24 @@ Array = NDArray[np.float64]
 
 BUILD_SECONDS = 3e-4  # for a quantity, about
 LANE_WRITERS = (lane_code, lane_constraints, lane_steps, lane_series, lane_stages, lane_turns, lane_emitter)
-ELIMINATION = (straight_line, symbolic_factors, null_space, accelerations)
-WRITERS = (series, *ELIMINATION, written, coefficients, *LANE_WRITERS, llvm_code, llvm_text, llvm_trigonometry)
+ELIMINATION = (elimination, symbolic_factors, null_space, compile_equations)
+WRITERS = (series, *ELIMINATION, coefficients, lowering, *LANE_WRITERS, llvm_code, llvm_text)
 
 Code = TypeVar("Code", LaneCode, LaneConstraints)
 KIND = "lanes"  # of files on the disk
 
 
-class OwnLanes(Generic[Code]):
+class GeneratedLanes(Generic[Code]):
     """Machine code of a mechanism for lanes, and the numbers that it reads for any parameters.
 
     Parameters
     ----------
-    record : Record
+    record : ParameterTape
         Of the parameters that `code` was made for.
     code : LaneCode or LaneConstraints
     """
 
-    def __init__(self, record: Record, code: Code):
+    def __init__(self, record: ParameterTape, code: Code):
         self.record = record
         self.code: Code = code
 

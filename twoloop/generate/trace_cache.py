@@ -1,8 +1,8 @@
-"""What is traced of callbacks once, for all systems that share them: numbers in it are formulas in the parameters.
+"""Cache what is traced of callbacks, for all systems that share them: its numbers are expressions in the parameters.
 
-Parameters that are whole numbers stay what they are, as these may be counts, places or switches, and zeros and ones
-leave operations out; what is equal, but for its sign, stays equal. So systems of one family differ in other numbers.
-A callback that branches on its parameters, or rounds them, has no formulas: it is traced for each system alone.
+- Parameters that are whole numbers keep their values, as these may be counts, places or switches, and zeros and ones
+  leave operations out. What is equal, but for its sign, stays equal. So systems of one cache differ in other numbers.
+- A callback that branches on its parameters, or rounds them, has no such expressions. It is traced for each system.
 """
 
 from collections.abc import Callable
@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.generate.known_numbers import Known, Powers, Record
-from twoloop.generate.traced_equations import Equations
-from twoloop.generate.tracing import Untraceable
+from twoloop.generate.graph import Untraceable
+from twoloop.generate.parameter_expressions import Parameter, ParameterTape, Powers
+from twoloop.generate.trace import Equations
 from twoloop.kernels.compile.caches import Newest, uncollected
 from twoloop.problem.system import ConstrainedSystem
 
@@ -29,7 +29,7 @@ EXTREME = 1e-30  # what is smaller, or larger than its inverse, stays what it is
 _FAMILIES = Newest()
 
 
-class Family:
+class TraceCache:
     """What is made of the callbacks of some systems.
 
     Parameters
@@ -41,7 +41,7 @@ class Family:
 
     Attributes
     ----------
-    parameters : ndarray of float and Known (n_p,)
+    parameters : ndarray of float and Parameter (n_p,)
         With which callbacks are traced.
     traced : set of str
         Kinds of callbacks that were: they do the same in all systems, at the same places of their arrays.
@@ -52,7 +52,7 @@ class Family:
         n_numbers = int(np.abs(self._classes).max(initial=0))
         _, first = np.unique(np.abs(self._classes), return_index=True)
         self._first = first[self._classes[first] != 0]  # where each number stands first
-        self._record = Record(np.random.default_rng(7).uniform(*GENERIC, n_numbers).tolist(), range(n_numbers))
+        self._record = ParameterTape(np.random.default_rng(7).uniform(*GENERIC, n_numbers).tolist(), range(n_numbers))
         self.parameters = parameters.astype(object) if self._classes.any() else parameters.copy()
         for place in np.flatnonzero(self._classes).tolist():
             which = int(self._classes[place])
@@ -99,9 +99,11 @@ class Family:
         """Numbers of an array as multiples of products of atoms, the places of these, and the products."""
         known = self._arrays.get(id(array))
         if known is None:
-            powers = [each.powers if type(each) is Known else () for each in array.ravel()]
+            powers = [each.powers if type(each) is Parameter else () for each in array.ravel()]
             products = {each: place for place, each in enumerate(dict.fromkeys(powers))}
-            scales = np.array([each.scale if type(each) is Known else each for each in array.ravel()], dtype=np.float64)
+            scales = np.array(
+                [each.scale if type(each) is Parameter else each for each in array.ravel()], dtype=np.float64
+            )
             places = np.array([products[each] for each in powers], dtype=np.int64)
             gathered = scales.reshape(array.shape), places.reshape(array.shape), list(products)
             known = self._arrays[id(array)] = array, gathered  # what is named by its id is held
@@ -117,7 +119,9 @@ class Family:
         return self._made[what]
 
 
-def of_family(system: ConstrainedSystem, what: Any, make: Callable[[Family], Any], check: Callable[[Any], None]) -> Any:
+def derive_cached(
+    system: ConstrainedSystem, what: Any, make: Callable[[TraceCache], Any], check: Callable[[Any], None]
+) -> Any:
     """What `make` makes of the callbacks of a family, for one of its systems: what its method `of` gives.
 
     Where it cannot be traced with formulas, or `check` refuses it (a callback may do with these what it does not with
@@ -128,7 +132,7 @@ def of_family(system: ConstrainedSystem, what: Any, make: Callable[[Family], Any
     Untraceable
         If it cannot be made of the system, or is refused.
     """
-    for family_for in (_alone,) if system.called_in_python else (family_of, _alone):
+    for family_for in (_alone,) if system.called_in_python else (trace_cache_of, _alone):
         family = system.remembered(("family", family_for), partial(family_for, system))
         made = system.remembered((what, family_for), partial(_made_for, system, family, what, make))
         try:
@@ -142,7 +146,7 @@ def of_family(system: ConstrainedSystem, what: Any, make: Callable[[Family], Any
     raise reason
 
 
-def _made_for(system: ConstrainedSystem, family: Family, what: Any, make: Callable[[Family], Any]) -> Any:
+def _made_for(system: ConstrainedSystem, family: TraceCache, what: Any, make: Callable[[TraceCache], Any]) -> Any:
     """What a system gets of a family, or why it cannot be had."""
     try:
         shared = family.remembered(what, partial(make, family))
@@ -156,32 +160,32 @@ def _made_for(system: ConstrainedSystem, family: Family, what: Any, make: Callab
 def take_bounds(system: ConstrainedSystem) -> None:
     """Let a system have what `check_bounds` has found in others of its family, whose callbacks do the same."""
     if not system.called_in_python:
-        family: Family = system.remembered(("family", family_of), partial(family_of, system))
+        family: TraceCache = system.remembered(("family", trace_cache_of), partial(trace_cache_of, system))
         system.within_bounds |= family.within_bounds
 
 
 def give_bounds(system: ConstrainedSystem) -> None:
     """Let others of its family have what `check_bounds` has found in a system."""
     if not system.called_in_python:
-        family: Family = system.remembered(("family", family_of), partial(family_of, system))
+        family: TraceCache = system.remembered(("family", trace_cache_of), partial(trace_cache_of, system))
         family.within_bounds |= family.traced & system.within_bounds
 
 
-def family_of(system: ConstrainedSystem) -> Family:
+def trace_cache_of(system: ConstrainedSystem) -> TraceCache:
     """The family of a system of compiled callbacks, which depend on their arguments alone."""
     parameters = system.parameters
     classes = _classes(parameters)
     fixed = parameters[classes == 0] + 0.0  # without a sign of zero
     key = (*system.given.items(), system.n_q, system.n_c, system.n_a, classes.tobytes(), fixed.tobytes())
-    known: Family | None = _FAMILIES.get(key)
+    known: TraceCache | None = _FAMILIES.get(key)
     if known is None:
-        _FAMILIES[key] = known = Family(parameters, classes)
+        _FAMILIES[key] = known = TraceCache(parameters, classes)
     return known
 
 
-def _alone(system: ConstrainedSystem) -> Family:
+def _alone(system: ConstrainedSystem) -> TraceCache:
     """A family of a system with these parameters only, all of which are plain numbers."""
-    return Family(system.parameters, np.zeros(system.parameters.size, dtype=np.int64))
+    return TraceCache(system.parameters, np.zeros(system.parameters.size, dtype=np.int64))
 
 
 def _classes(parameters: Array) -> NDArray[np.int64]:
@@ -194,3 +198,48 @@ def _classes(parameters: Array) -> NDArray[np.int64]:
     classes = np.zeros(len(size), dtype=np.int64)
     classes[varies] = np.copysign(rank[which], parameters[varies])
     return classes
+
+
+class ParameterArrays:
+    """Arrays in the place of arrays of formulas, all of which `write` fills for some parameters.
+
+    One array stands for one of formulas, however often that is asked for; one that holds plain numbers stays itself.
+    """
+
+    def __init__(self) -> None:
+        self._arrays: dict[int, tuple[Any, Array]] = {}  # by the ids of those of formulas, which are held
+        self._places: list[tuple[Array, NDArray[np.int64], slice]] = []
+        self._products: dict[Powers, int] = {}
+        self._scales: list[float] = []
+        self._which: list[int] = []
+        self._gathered: tuple[list[Powers], Array, NDArray[np.int64]] | None = None
+
+    def array(self, formulas: Any) -> Array:
+        """What stands in the place of an array; its numbers are there after the next `write`."""
+        if formulas.dtype != object:
+            return formulas  # type: ignore[no-any-return]
+        if id(formulas) not in self._arrays:
+            self._arrays[id(formulas)] = formulas, self._made(formulas)
+        return self._arrays[id(formulas)][1]
+
+    def _made(self, formulas: Any) -> Array:
+        entries, begin = formulas.ravel().tolist(), len(self._scales)
+        where = [k for k, entry in enumerate(entries) if type(entry) is Parameter]
+        for k in where:
+            self._scales.append(entries[k].scale)
+            self._which.append(self._products.setdefault(entries[k].powers, len(self._products)))
+            entries[k] = 0.0
+        numbers = np.array(entries, dtype=np.float64)
+        self._places.append((numbers, np.array(where, dtype=np.int64), slice(begin, len(self._scales))))
+        self._gathered = list(self._products), np.array(self._scales), np.array(self._which, dtype=np.int64)
+        return numbers.reshape(formulas.shape)
+
+    def write(self, product: Callable[[Powers], Any]) -> None:
+        """Put in the numbers for parameters, of which `product` gives the products: see TraceCache."""
+        if self._gathered is None:
+            return
+        products, scales, which = self._gathered
+        with np.errstate(all="ignore"):
+            values = scales * np.array(list(map(product, products)), dtype=np.float64)[which]
+        for numbers, where, part in self._places:
+            numbers[where] = values[part]

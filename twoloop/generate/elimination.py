@@ -1,15 +1,18 @@
-"""The equations of one mechanism as straight-line code: what it would take to write them down, without loops.
+"""Eliminate the equations of one mechanism symbolically.
 
-The callbacks run once in Python on symbols (`twoloop.generate.tracing`). The matrix of
+The matrix of
 
     [M  G^T] [a  ]   [Q    ]
     [G  0  ] [lam] = [Gamma]
 
-with G = [C_q; A] is eliminated symbolically, without what is zero by its structure, in an order found once: a row of G
-after all its coordinates, so that the pivots are those of definite matrices, M and -G M^-1 G^T, and need no search. A
-row is nearly a combination of others where its pivot is small against the one that it has without them; there the code
-is not to be used. The same factors give the nearest position and velocity on the constraints, in the metric of M. Where
-M is singular, rows g of G are added, M + g^T g, which changes neither. Of redundant rows those that count are kept.
+with G = [C_q; A] is eliminated without what is zero by its structure, in an order that is chosen once: a row of G after
+all its coordinates, so that the pivots are those of definite matrices, M and -G M^-1 G^T, and need no search.
+
+- A row is nearly a combination of others where its pivot is small against the one that it has without them. There the
+  code is not to be used.
+- The same factors give the nearest position and velocity on the constraints, in the metric of M.
+- Where M is singular, rows g of G are added, M + g^T g, which changes neither.
+- Of redundant rows, a set of full rank is kept.
 """
 
 from collections.abc import Callable, Container, Sequence
@@ -20,12 +23,12 @@ from typing import Any
 import numpy as np
 
 from twoloop.generate.choices import Choice
-from twoloop.generate.known_numbers import elementwise
+from twoloop.generate.graph import Affine, Graph, Untraceable, is_zero
 from twoloop.generate.null_space import DependentCoordinates, NotReduced, reduced_accelerations
+from twoloop.generate.parameter_expressions import elementwise
 from twoloop.generate.symbolic_factors import Block, Factors, solve
-from twoloop.generate.traced_equations import Equations, only
+from twoloop.generate.trace import Equations, only
 from twoloop.generate.traced_values import Traced
-from twoloop.generate.tracing import Form, Graph, Untraceable, is_zero
 from twoloop.kernels.evaluation.operations import PRODUCT, RECIPROCAL
 from twoloop.kernels.evaluation.partition import CONTRADICTS
 from twoloop.problem.system import ConstrainedSystem
@@ -45,12 +48,12 @@ class Outputs:
     ----------
     arrays : dict
         Forms, for each array by its name.
-    conditions : list of (Form, Form)
+    conditions : list of (Affine, Affine)
         The first is to be larger than the second.
     """
 
-    arrays: dict[str, list[Form]]
-    conditions: list[tuple[Form, Form]]
+    arrays: dict[str, list[Affine]]
+    conditions: list[tuple[Affine, Affine]]
 
     def quantities(self, graph: Graph, known: Container[int] = ()) -> list[int]:
         """What all of this is made of, inputs and what is known apart, in an order in which it can be computed."""
@@ -62,7 +65,7 @@ class Outputs:
         for i in self.quantities(graph):
             kind, *arguments = graph.operations[i]  # type: ignore[misc]
             total += COSTS.get(kind, 0)
-            forms += [form for form in arguments if isinstance(form, Form)]
+            forms += [form for form in arguments if isinstance(form, Affine)]
         return total + sum(max(len(form.terms) - 1, 0) for form in forms)
 
     @property
@@ -71,13 +74,13 @@ class Outputs:
         return {name: len(forms) for name, forms in self.arrays.items()}, len(self.conditions)
 
     @property
-    def forms(self) -> list[Form]:
+    def forms(self) -> list[Affine]:
         """All of them."""
         forms = [form for array in self.arrays.values() for form in array]
         return [*forms, *(form for condition in self.conditions for form in condition)]
 
 
-class StraightLine:
+class Elimination:
     """The equations of a system, with rows G = [C_q; A].
 
     Parameters
@@ -107,8 +110,8 @@ class StraightLine:
         "c" (n_c + n_a,) of the moves to positions and to velocities on the rows.
     redundant : Outputs
         No arrays; its conditions are that the rows of C_q that do not count hold, too.
-    parts : PartsCode or None
-        Writes the elimination of M in parts, where equations are long: see parts_code.py, which sets it.
+    parts : SplitFunctions or None
+        Writes the elimination of M in parts, where equations are long: see compile_equations.py, which sets it.
     n_operations : int
         Of callbacks and elimination, without solutions.
     traced : Traced
@@ -125,7 +128,7 @@ class StraightLine:
     def __init__(self, system: ConstrainedSystem, choice: Choice, equations: Equations | None = None):
         self.equations = Equations(system) if equations is None else equations
         self.system, self.choice, self.graph = system, choice, self.equations.graph
-        self.nothing, self._beside = Form(self.graph, 0.0, {}), 0  # operations of `quick`
+        self.nothing, self._beside = Affine(self.graph, 0.0, {}), 0  # operations of `quick`
         n, (self.q, self.v) = system.n_q, (self.equations.q, self.equations.v)
         self.mass = self._made("mass")
         rows = [self._made("jacobian"), self._made("nonholonomic")]
@@ -146,13 +149,13 @@ class StraightLine:
         if len(self.graph.operations) - self._beside > MOST_ELIMINATED:
             raise Untraceable(f"its equations are more than {MOST_ELIMINATED} operations")
 
-    def _made(self, kind: str, v: Sequence[Form] | None = None) -> Any:
-        return elementwise(Form.value, [self.equations.of(kind, v)])
+    def _made(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
+        return elementwise(Affine.value, [self.equations.of(kind, v)])
 
     def _redundant(self, rates: Any) -> Outputs:
         left = [k for k in range(self.system.n_c) if k not in self.choice.rows]
         off = self._made("constraint")
-        one, conditions = Form(self.graph, 1.0, {}), []
+        one, conditions = Affine(self.graph, 1.0, {}), []
         size, speed = (sum((x * x for x in state), one) for state in (self.q, self.v))
         for k in left:
             row, rate = self.all_rows[k], rates[k]
@@ -162,7 +165,7 @@ class StraightLine:
                 conditions.append((allowed * scale, what * what))
         return Outputs({"": []}, conditions)
 
-    def _matrix(self) -> dict[tuple[int, int], Form]:
+    def _matrix(self) -> dict[tuple[int, int], Affine]:
         n = self.system.n_q
         matrix = {(i, j): self.mass[i, j] for i in range(n) for j in range(n) if not is_zero(self.mass[i, j])}
         for i, j in matrix:
@@ -183,7 +186,7 @@ class StraightLine:
                     matrix[n + k, i] = matrix[i, n + k] = row[i]
         return matrix
 
-    def _given(self, v: Sequence[Form]) -> tuple[list[Form], list[Form]]:
+    def _given(self, v: Sequence[Affine]) -> tuple[list[Affine], list[Affine]]:
         """Q, and the right-hand sides of all rows of G, at velocities v."""
         return list(self._made("force", v)), [*self._made("gamma", v), *self._made("nonholonomic_gamma", v)]
 
@@ -213,7 +216,7 @@ class StraightLine:
 
     @property
     def accelerations(self) -> list[Outputs]:
-        """What code for accelerations is made of, see `accelerations.write_accelerations`."""
+        """What code for accelerations is made of, see `compile_equations.write_accelerations`."""
         return [self.there] if self.quick is None else [self.quick, self.there]
 
     @cached_property
@@ -223,7 +226,7 @@ class StraightLine:
         used = {*self.choice.rows, *self.choice.added}
         return Outputs({"r": force, "c": [each if k in used else self.nothing for k, each in enumerate(gamma)]}, [])
 
-    def _accelerations(self, v: Sequence[Form]) -> list[Form]:
+    def _accelerations(self, v: Sequence[Affine]) -> list[Affine]:
         """a and the multipliers of the rows that count, at velocities v."""
         right, gamma = self._given(v)
         for k in self.choice.added:
@@ -231,7 +234,7 @@ class StraightLine:
                 right[i] = right[i] + (entry * gamma[k]).times(self.choice.scale)
         return self.factors.solve([*right, *(gamma[k] for k in self.choice.rows)])
 
-    def _spread(self, counting: Sequence[Form]) -> list[Form]:
+    def _spread(self, counting: Sequence[Affine]) -> list[Affine]:
         """Numbers for all rows from those for the rows that count, the others 0."""
         numbers = [self.nothing] * len(self.all_rows)
         for k, number in zip(self.choice.rows, counting, strict=True):
@@ -280,31 +283,31 @@ class StraightLine:
         self._bound()
         return Outputs({"a": solution[:n], **position, "v": v, "lam": self._spread(solution[n:])}, self.conditions)
 
-    def _correction(self, c: Outputs) -> list[Form]:
+    def _correction(self, c: Outputs) -> list[Affine]:
         n = self.system.n_q
         return self.factors.solve([*([self.nothing] * n), *(c.arrays["c"][k] for k in self.choice.rows)])[:n]
 
 
 def of_least_norm(
     graph: Graph,
-    known: Sequence[Form],
+    known: Sequence[Affine],
     all_rows: Any,
     rows: Sequence[int],
-    solve: Callable[[Sequence[Form]], list[Form]],
-) -> list[Form]:
+    solve: Callable[[Sequence[Affine]], list[Affine]],
+) -> list[Affine]:
     """Multipliers of all rows from those of the rows that count.
 
     A row that does not is a combination of these, by the numbers Z; less its part in the null space of G^T, spanned
     by e_i - sum_k Z_ik e_k, lam has least norm.
     """
-    nothing = Form(graph, 0.0, {})
+    nothing = Affine(graph, 0.0, {})
     lam = [nothing] * len(all_rows)
     for k, value in zip(rows, known, strict=True):
         lam[k] = value
     others = [k for k in range(len(lam)) if k not in rows]
     Z = [solve([*all_rows[k], *([nothing] * len(rows))])[len(all_rows[k]) :] for k in others]
     gram = {
-        (i, j): sum((x * y for x, y in zip(one, other, strict=True)), Form(graph, float(i == j), {}))
+        (i, j): sum((x * y for x, y in zip(one, other, strict=True)), Affine(graph, float(i == j), {}))
         for i, one in enumerate(Z)
         for j, other in enumerate(Z)
     }
@@ -321,7 +324,7 @@ class Solution:
 
     Parameters
     ----------
-    equations : StraightLine
+    equations : Elimination
     more : sequence of Outputs
         Of the equations: what these share with the factors is kept, too.
 
@@ -339,7 +342,7 @@ class Solution:
         "lam" (n_c,) of least norm, where c is "lam" of `solved`.
     """
 
-    def __init__(self, equations: StraightLine, more: Sequence[Outputs] = ()):
+    def __init__(self, equations: Elimination, more: Sequence[Outputs] = ()):
         factors, self._choice, self._n = equations.factors, equations.choice, equations.system.n_q
         n_rows, rows = len(equations.all_rows), self._choice.rows
         others = [k for k in range(n_rows) if k not in rows] if more else []
@@ -355,8 +358,8 @@ class Solution:
         self._r, self._c = self.graph.inputs(self._n, False), self.graph.inputs(n_rows, False)
         places = [only(form) for form in self.graph.inputs(len(factors_kept), False)]
 
-        def here(form: Form) -> Form:
-            return Form(self.graph, form.constant, {places[self.known[i]]: x for i, x in form.terms.items()})
+        def here(form: Affine) -> Affine:
+            return Affine(self.graph, form.constant, {places[self.known[i]]: x for i, x in form.terms.items()})
 
         self._blocks = [
             Block(
@@ -367,7 +370,7 @@ class Solution:
             for block in factors.blocks
         ]
         self._rows = {k: [here(x) for x in equations.all_rows[k]] for k in (*self._choice.added, *others)}
-        self._nothing = Form(self.graph, 0.0, {})
+        self._nothing = Affine(self.graph, 0.0, {})
         self.solved = self._solved()
 
     @property
@@ -375,10 +378,10 @@ class Solution:
         """How many numbers are kept."""
         return len(self.known)
 
-    def _solve(self, right: Sequence[Form]) -> list[Form]:
+    def _solve(self, right: Sequence[Affine]) -> list[Affine]:
         return solve(self._blocks, right)
 
-    def _counting(self) -> list[Form]:
+    def _counting(self) -> list[Affine]:
         return [self._c[k] for k in self._choice.rows]
 
     def _solved(self) -> Outputs:
@@ -405,5 +408,5 @@ def _shared(graph: Graph, kept: Sequence[int], more: Sequence[Outputs]) -> list[
         for j in outputs.quantities(graph, made):
             operation = graph.operations[j]
             assert operation is not None
-            found |= {i for form in operation[1:] if isinstance(form, Form) for i in form.terms}
+            found |= {i for form in operation[1:] if isinstance(form, Affine) for i in form.terms}
     return sorted(found & made - set(kept))

@@ -1,14 +1,16 @@
-"""Operations of a graph as they are written into a function of LLVM, and whether what they compute is to be used."""
+"""Write operations of a graph into a function of LLVM, with coefficients that are read from memory.
+
+One code serves all mechanisms of its structure: the numbers that it reads differ.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from twoloop.generate.coefficients import Coefficients
-from twoloop.generate.llvm_code import Emitter, Quantities
+from twoloop.generate.elimination import Outputs
+from twoloop.generate.graph import Affine, Graph
+from twoloop.generate.llvm_code import LARGEST_ANGLE, Emitter, Quantities, sine_and_cosine
 from twoloop.generate.llvm_text import BIT, Value
-from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE, sine_and_cosine
-from twoloop.generate.straight_line import Outputs
-from twoloop.generate.tracing import Form, Graph
 from twoloop.kernels.evaluation.operations import (
     ARCTANGENT,
     COSINE,
@@ -28,7 +30,7 @@ Place = tuple[Value, int]
 NOWHERE: Mapping[int, Place] = {}
 
 
-class Written:
+class Lowering:
     """Values of the quantities of a graph, as they are written into a function.
 
     Parameters
@@ -70,11 +72,11 @@ class Written:
         """The value of a quantity."""
         return self._known.value(quantity)
 
-    def form(self, form: Form) -> Value:
+    def form(self, form: Affine) -> Value:
         """The value of a form."""
         return self._known.sum(*self.numbers.of_form(form))
 
-    def operation(self, quantity: int, kind: int, first: Form, second: Form | None) -> None:
+    def operation(self, quantity: int, kind: int, first: Affine, second: Affine | None) -> None:
         """Compute a quantity."""
         emit, x = self.emit, self.form(first)
         if kind == PRODUCT:
@@ -117,7 +119,7 @@ class Written:
         self.write(graph, graph.in_order_of_use(outputs.forms, self._made))
         return results
 
-    def forms(self, graph: Graph, forms: Sequence[Form]) -> list[Value]:
+    def forms(self, graph: Graph, forms: Sequence[Affine]) -> list[Value]:
         """Compute forms; what was computed for others before is not computed again."""
         quantities = graph.in_order_of_use(forms, self._made)
         self.write(graph, quantities)
@@ -127,15 +129,15 @@ class Written:
 
 def results_of(
     emit: Emitter, graph: Graph, outputs: Outputs, inputs: Sequence[Value], numbers: Coefficients
-) -> tuple[Written, list[list[Value]]]:
+) -> tuple[Lowering, list[list[Value]]]:
     """Arrays that code computes from the inputs of a graph, in their order."""
-    written = Written(emit, numbers)
+    written = Lowering(emit, numbers)
     for quantity, value in enumerate(inputs):
         written.define(quantity, value)
     return written, written.results(graph, outputs)
 
 
-def conditions_hold(emit: Emitter, written: Written, outputs: Outputs, values: Sequence[Value]) -> Value:
+def conditions_hold(emit: Emitter, written: Lowering, outputs: Outputs, values: Sequence[Value]) -> Value:
     """Whether what was written holds: its conditions, angles that are not too large, and values that are finite."""
     builder, zero = emit.builder, emit.constant(0.0)
     total = zero

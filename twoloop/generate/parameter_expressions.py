@@ -1,7 +1,7 @@
-"""Numbers that remember how they were made of parameters, so that equations traced once hold for other values of these.
+"""Numbers that record how they were computed from parameters, so that one trace serves other values of these.
 
-A `Known` is a float with which callbacks compute as with any other; what they make of it is one again. What is traced
-decides by values (what cancels, which forms are equal), so these must be generic ones.
+A `Parameter` is a float with which callbacks compute as with any other; the result is a `Parameter` again. Tracing
+decides by values (what cancels, which expressions are equal), so these must be generic.
 """
 
 import math
@@ -80,7 +80,7 @@ class Symbolic:
             raise Untraceable(f"{self.refused}, and catches the exception that says so")
 
 
-class Record(Symbolic):
+class ParameterTape(Symbolic):
     """What numbers were made of: atoms, which are parameters, sums of products of atoms, or functions of these.
 
     Parameters
@@ -102,7 +102,7 @@ class Record(Symbolic):
         self.parameters = np.empty(len(values), dtype=object)
         self.parameters[:] = [float(value) for value in values]
         for place in varying:
-            self.parameters[place] = Known(float(values[place]), self, 1.0, ((place, 1.0),))
+            self.parameters[place] = Parameter(float(values[place]), self, 1.0, ((place, 1.0),))
 
     def atom(self, definition: Any) -> Powers:
         """The power of a sum or a function, the one known before if there is one."""
@@ -113,7 +113,7 @@ class Record(Symbolic):
 
     def terms(self, number: float) -> dict[Powers, float]:
         """A number as a sum of products."""
-        if type(number) is not Known:
+        if type(number) is not Parameter:
             return {(): number} if number else {}
         (place, exponent), *others = number.powers
         definition = self.atoms[place]
@@ -124,7 +124,7 @@ class Record(Symbolic):
     def on(self, parameters: Array) -> Callable[[float], Any]:
         """A function that gives what a number is for other parameters, as `products` does for one of its factors."""
         product = self.products(parameters)
-        return lambda number: number.scale * product(number.powers) if type(number) is Known else number
+        return lambda number: number.scale * product(number.powers) if type(number) is Parameter else number
 
     def products(self, parameters: Array) -> Callable[[Powers], Any]:
         """A function that gives what a product of atoms is for other parameters.
@@ -156,7 +156,7 @@ class Record(Symbolic):
 
         return product
 
-    def evaluate(self, numbers: Sequence["Known"], parameters: Array) -> Array:
+    def evaluate(self, numbers: Sequence["Parameter"], parameters: Array) -> Array:
         """What numbers are for other parameters (n_runs, n_p): (n_runs, len(numbers))."""
         product = self.products(parameters)
         places = {powers: k for k, powers in enumerate(dict.fromkeys(each.powers for each in numbers))}
@@ -169,15 +169,15 @@ class Record(Symbolic):
         return np.ascontiguousarray(made.T)
 
 
-class Known(float):
+class Parameter(float):
     """A float, and the product of atoms that it is a multiple of."""
 
     __slots__ = ("powers", "record", "scale")
-    record: Record
+    record: ParameterTape
     scale: float
     powers: Powers
 
-    def __new__(cls, value: float, record: Record, scale: float, powers: Powers) -> "Known":
+    def __new__(cls, value: float, record: ParameterTape, scale: float, powers: Powers) -> "Parameter":
         """A number of a record."""
         made = float.__new__(cls, value)
         made.record, made.scale, made.powers = record, scale, powers
@@ -187,7 +187,7 @@ class Known(float):
         name = NAMES.get(ufunc.__name__, ufunc.__name__)
         if method != "__call__" or name not in _OPERATIONS.keys() | FUNCTIONS.keys() or options:
             self._decides(f"it calls numpy.{ufunc.__name__} on its parameters")
-            plain = (float(each) if type(each) is Known else each for each in inputs)
+            plain = (float(each) if type(each) is Parameter else each for each in inputs)
             return getattr(ufunc, method)(*plain, **options)
         return elementwise(lambda *given: applied(name, *given), inputs, out)
 
@@ -197,15 +197,15 @@ class Known(float):
         if self.record.running and not caller.startswith(__name__.rpartition(".")[0]):
             self.record.refuse(reason)
 
-    def to(self, exponent: float) -> "Known":
+    def to(self, exponent: float) -> "Parameter":
         """The power with a whole exponent that is not 0."""
         powers = tuple([(place, exponent * own) for place, own in self.powers])
-        return Known(_plain(self) ** exponent, self.record, self.scale**exponent, powers)
+        return Parameter(_plain(self) ** exponent, self.record, self.scale**exponent, powers)
 
-    def __neg__(self) -> "Known":
-        return Known(-_plain(self), self.record, -self.scale, self.powers)
+    def __neg__(self) -> "Parameter":
+        return Parameter(-_plain(self), self.record, -self.scale, self.powers)
 
-    def __pos__(self) -> "Known":
+    def __pos__(self) -> "Parameter":
         return self
 
     def __abs__(self) -> Any:
@@ -214,10 +214,10 @@ class Known(float):
     def __reduce_ex__(self, protocol: Any) -> Any:
         return float, (float(self),)
 
-    def __copy__(self) -> "Known":
+    def __copy__(self) -> "Parameter":
         return self
 
-    def __deepcopy__(self, memo: Any) -> "Known":
+    def __deepcopy__(self, memo: Any) -> "Parameter":
         return self
 
 
@@ -234,20 +234,20 @@ def _sum(one: float, other: float) -> float:
         record.refuse(f"it adds up more than {MOST_TERMS} terms of its parameters")
     if len(terms) < 2:
         ((powers, c),) = terms.items() or (((), 0.0),)
-        return Known(value, record, c, powers) if powers else c
+        return Parameter(value, record, c, powers) if powers else c
     (_, scale), *_ = items = sorted(terms.items())
-    return Known(value, record, scale, record.atom(("sum", tuple((powers, c / scale) for powers, c in items))))
+    return Parameter(value, record, scale, record.atom(("sum", tuple((powers, c / scale) for powers, c in items))))
 
 
 def _product(one: float, other: float) -> float:
-    if type(one) is not Known:
+    if type(one) is not Parameter:
         one, other = other, one
-    assert isinstance(one, Known)
+    assert isinstance(one, Parameter)
     record = one.record
-    if type(other) is not Known:
+    if type(other) is not Parameter:
         if other == 1.0:
             return one
-        return Known(_plain(one) * other, record, one.scale * other, one.powers) if other else 0.0
+        return Parameter(_plain(one) * other, record, one.scale * other, one.powers) if other else 0.0
     scale, both = one.scale * other.scale, (one.powers, other.powers)
     left = record.merged.get(both)
     if left is None:
@@ -255,13 +255,13 @@ def _product(one: float, other: float) -> float:
         for place, exponent in other.powers:
             powers[place] = powers.get(place, 0.0) + exponent
         left = record.merged[both] = tuple(sorted(each for each in powers.items() if each[1]))
-    return Known(_plain(one) * _plain(other), record, scale, left) if left else scale
+    return Parameter(_plain(one) * _plain(other), record, scale, left) if left else scale
 
 
 def _power(one: float, exponent: float) -> float:
-    if type(exponent) is Known or not exponent.is_integer():  # the root of a square is no product: it has no sign
+    if type(exponent) is Parameter or not exponent.is_integer():  # the root of a square is no product: it has no sign
         return _function("power", one, exponent)
-    assert isinstance(one, Known)
+    assert isinstance(one, Parameter)
     return one.to(exponent) if exponent else 1.0
 
 
@@ -269,49 +269,49 @@ _OPERATIONS: dict[str, Callable[[float, float], float]] = {
     "add": _sum,
     "subtract": lambda one, other: _sum(one, -other),
     "multiply": _product,
-    "divide": lambda one, other: _product(one, other.to(-1.0) if type(other) is Known else 1.0 / other),
+    "divide": lambda one, other: _product(one, other.to(-1.0) if type(other) is Parameter else 1.0 / other),
     "power": _power,
 }
 
 
-def _record(*numbers: float) -> Record:
-    return next(each.record for each in numbers if type(each) is Known)
+def _record(*numbers: float) -> ParameterTape:
+    return next(each.record for each in numbers if type(each) is Parameter)
 
 
 def applied(name: str, *arguments: Any) -> Any:
-    """A function, by its name in NumPy or `math`, of numbers: a Known one if one of these is."""
+    """A function, by its name in NumPy or `math`, of numbers: a Parameter one if one of these is."""
     name = NAMES.get(name, name)
     if any(not issubclass(type(each), NUMBERS) for each in arguments):  # a symbol, which goes by its own rules
         one, other = arguments
         return OPERATORS[name](one, other)
-    numbers = [each if type(each) is Known else float(each) for each in arguments]
-    if not any(type(each) is Known for each in numbers):
+    numbers = [each if type(each) is Parameter else float(each) for each in arguments]
+    if not any(type(each) is Parameter for each in numbers):
         return float(getattr(np, name)(*numbers))
     if name in _OPERATIONS:
         return _OPERATIONS[name](*numbers)
     return _function(name, *numbers)
 
 
-def _function(name: str, *numbers: float) -> Known:
+def _function(name: str, *numbers: float) -> Parameter:
     record = _record(*numbers)
-    made = tuple((each.powers, each.scale) if isinstance(each, Known) else ((), each) for each in numbers)
+    made = tuple((each.powers, each.scale) if isinstance(each, Parameter) else ((), each) for each in numbers)
     with np.errstate(all="ignore"):  # a generic number may be where the function has no value
         value = float(FUNCTIONS[name](*map(float, numbers)))
-    return Known(value, record, 1.0, record.atom((name, made)))
+    return Parameter(value, record, 1.0, record.atom((name, made)))
 
 
-def _operator(name: str, swapped: bool) -> Callable[[Known, Any], Any]:
+def _operator(name: str, swapped: bool) -> Callable[[Parameter, Any], Any]:
     known = _OPERATIONS[name]
 
-    def operate(self: Known, other: Any) -> Any:
-        if type(other) is float or type(other) is Known:
+    def operate(self: Parameter, other: Any) -> Any:
+        if type(other) is float or type(other) is Parameter:
             return known(other, self) if swapped else known(self, other)
         pair = (other, self) if swapped else (self, other)
         if issubclass(type(other), np.ndarray):
             return self.__array_ufunc__(getattr(np, name), "__call__", *pair)
         if not issubclass(type(other), NUMBERS):  # by type(), as a symbol refuses isinstance
             return NotImplemented
-        return known(*(each if type(each) is Known else float(each) for each in pair))
+        return known(*(each if type(each) is Parameter else float(each) for each in pair))
 
     return operate
 
@@ -319,7 +319,7 @@ def _operator(name: str, swapped: bool) -> Callable[[Known, Any], Any]:
 def _deciding(name: str) -> Callable[..., Any]:
     plain = getattr(float, name)
 
-    def decide(self: Known, *others: Any) -> Any:
+    def decide(self: Parameter, *others: Any) -> Any:
         self._decides()
         return plain(self, *others)
 
@@ -328,13 +328,13 @@ def _deciding(name: str) -> Callable[..., Any]:
 
 _DECIDING = ("bool", "int", "float", "trunc", "floor", "ceil", "round", "lt", "le", "gt", "ge", "eq", "ne")
 for _name in (*_DECIDING, "mod", "rmod", "floordiv", "rfloordiv", "divmod", "rdivmod"):
-    setattr(Known, f"__{_name}__", _deciding(f"__{_name}__"))
-Known.__hash__ = float.__hash__  # type: ignore[method-assign]
+    setattr(Parameter, f"__{_name}__", _deciding(f"__{_name}__"))
+Parameter.__hash__ = float.__hash__  # type: ignore[method-assign]
 for _symbol, _name in {"add": "add", "sub": "subtract", "mul": "multiply", "truediv": "divide", "pow": "power"}.items():
-    setattr(Known, f"__{_symbol}__", _operator(_name, False))
-    setattr(Known, f"__r{_symbol}__", _operator(_name, True))
+    setattr(Parameter, f"__{_symbol}__", _operator(_name, False))
+    setattr(Parameter, f"__r{_symbol}__", _operator(_name, True))
 for _name in _OF_ONE:
-    setattr(Known, _name, lambda self, name=_name: applied(name, self))  # NumPy calls them on arrays of objects
+    setattr(Parameter, _name, lambda self, name=_name: applied(name, self))  # NumPy calls them on arrays of objects
 
 
 def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = None) -> Any:
@@ -359,15 +359,15 @@ def _operand(value: Any) -> Any:
 def array_of(values: Iterable[float]) -> Any:
     """An array of floats, or of objects where some know their parameters."""
     values = list(values)
-    return np.array(values, dtype=object if any(type(each) is Known for each in values) else float)
+    return np.array(values, dtype=object if any(type(each) is Parameter for each in values) else float)
 
 
 def number(value: Any) -> float:
-    """A coefficient of a form: a Known one as it is, any other as a float."""
-    return value if type(value) is Known else float(value)
+    """A coefficient of a form: a Parameter one as it is, any other as a float."""
+    return value if type(value) is Parameter else float(value)
 
 
 def function_of_number(name: str) -> Callable[[float], float]:
     """A function of `math` that keeps what a number is made of."""
     plain = getattr(math, name)
-    return lambda x: applied(name, x) if type(x) is Known else plain(x)
+    return lambda x: applied(name, x) if type(x) is Parameter else plain(x)

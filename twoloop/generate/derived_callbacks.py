@@ -1,24 +1,124 @@
-"""What C_q, C_t and Gamma must be, exactly: to be compared with what is given, by no differences."""
+"""Derive C_q, C_t and Gamma exactly from traced callbacks.
 
+Programs compute those that are not given. Those that are given are compared with what they must be, without
+differences.
+"""
+
+import copy
 from collections.abc import Sequence
 from functools import cache, partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.derivatives import TIME
 from twoloop.checks.scales import generic_factors, sizes
-from twoloop.generate.families import Family, of_family
-from twoloop.generate.traced_equations import OF_ROWS
+from twoloop.generate.graph import MOST_OPERATIONS, Affine, Untraceable
+from twoloop.generate.program import Program, program_of
+from twoloop.generate.trace import OF_ROWS, Equations
+from twoloop.generate.trace_cache import Evaluator, TraceCache, derive_cached
 from twoloop.generate.traced_values import Check, Traced, unchecked
-from twoloop.generate.tracing import Untraceable
+from twoloop.kernels.evaluation.operations import KIND, MADE, RESULT
 from twoloop.problem.system import ConstrainedSystem
+
+ROWS = {"jacobian": "n_c", "gamma": "n_c", "nonholonomic_gamma": "n_a"}  # what may be derived, and of how many rows
+
+
+class DerivedPrograms:
+    """Programs in the place of what no callback gives, made once for all systems of a family.
+
+    Parameters
+    ----------
+    programs : dict
+        By name, each with the places to which its results belong.
+    traced : Traced
+        What they were traced from.
+    """
+
+    def __init__(self, programs: dict[str, tuple[Program, list[int]]], traced: Traced):
+        self.programs, self.traced, self.kinds = programs, traced, traced.kinds
+
+    def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "DerivedSystem":
+        """What stands for one of the systems."""
+        functions: dict[str, Any] = {}
+        for name, (program, places) in self.programs.items():
+            constants, coefficients = evaluate(program.constants), evaluate(program.coefficients)
+            vectors = _packed(program._replace(constants=constants, coefficients=coefficients), places)
+            functions |= dict(zip((f"{name}_program", f"{name}_numbers"), vectors, strict=True))
+        other = copy.copy(system)
+        other.functions = system.functions._replace(**functions)
+        return DerivedSystem(other, self.traced.of(system, evaluate))
+
+
+class DerivedSystem(NamedTuple):
+    """A system with such programs, and what they were traced from."""
+
+    system: ConstrainedSystem
+    traced: Traced
+
+    @property
+    def kinds(self) -> frozenset[str]:
+        """Kinds of callbacks that were traced."""
+        return self.traced.kinds
+
+
+def with_derived_callbacks(system: ConstrainedSystem, check: Check) -> tuple[ConstrainedSystem, tuple[Traced, ...]]:
+    """The system with programs in the place of C_q and Gamma that no callback gives, and what they were traced from.
+
+    As it is, and nothing, where all is given, or cannot be traced: then differences stand for it.
+    """
+    absent = [kind for kind, size in ROWS.items() if getattr(system, size) and kind not in system.given]
+    if not absent:
+        return system, ()
+    try:
+        made: DerivedSystem = derive_cached(
+            system, "programs", partial(_made, system, absent), lambda made: check(made.traced)
+        )
+    except Untraceable:
+        return system, ()
+    return made.system, (made.traced,)
+
+
+def _made(system: ConstrainedSystem, absent: Sequence[str], family: TraceCache) -> DerivedPrograms:
+    equations = family.equations(system)
+    programs = {}
+    for name, forms in _results(equations, absent).items():
+        program = program_of(equations.graph, 1 + 2 * system.n_q, dict(enumerate(forms.values())))
+        if len(program.rows) > MOST_OPERATIONS:
+            raise Untraceable(f"{name} takes {len(program.rows)} operations")
+        programs[name] = program, list(forms)
+    return DerivedPrograms(programs, Traced(system, equations.graph))
+
+
+def _results(equations: Equations, absent: Sequence[str]) -> dict[str, dict[int, Affine]]:
+    """The forms that a program makes, each by its place."""
+    system = equations.system
+    gamma: dict[int, Affine] = {}
+    for kind, first in (("gamma", 0), ("nonholonomic_gamma", system.n_c)):
+        if kind in absent:
+            gamma |= dict(enumerate(equations.of(kind), first))
+    if "jacobian" not in absent:
+        return {"gamma": gamma} if gamma else {}
+    entries = enumerate(equations.of("jacobian").ravel())
+    return {"gamma": gamma, "jacobian": {k: form for k, form in entries if form.terms or form.constant}}
+
+
+def _packed(program: Program, places: Sequence[int]) -> tuple[Any, Any]:
+    """A program as kernels take one of a system; `places`: to what its results belong."""
+    rows, n = program.rows.copy(), len(places)
+    results = rows[:, KIND] == RESULT
+    rows[results, MADE] += program.n_nodes
+    head = [program.n_nodes + n, len(rows), len(program.columns), n]
+    integers = np.concatenate([head, rows.ravel(), program.columns, places])
+    return integers.astype(np.int64), np.concatenate([program.constants.ravel(), program.coefficients])
+
 
 Array = NDArray[np.float64]
 
 MOST = 50_000  # entries of C_q
 NEAR = (0.0, 1e-3, 0.03)  # of the coordinates, and of TIME
-BESIDE = 0.01  # of the box of a Territory, less than states of a run that are compared lie apart: no new place
+BESIDE = 0.01  # of the box of a CheckedRegion, less than states of a run that are compared lie apart: no new place
 ROUNDED = 1e-9  # of its longest side but that of the time: the same for coordinates that move by rounding alone
 
 
@@ -30,13 +130,13 @@ def exact_derivatives(system: ConstrainedSystem, check: Check = unchecked) -> Tr
     if system.n_q * (system.n_c + system.n_a) > MOST:
         return None
     try:
-        made: Traced = of_family(system, "derivatives", partial(_traced, system), check)
+        made: Traced = derive_cached(system, "derivatives", partial(_traced, system), check)
     except Untraceable:
         return None
     return made
 
 
-def _traced(system: ConstrainedSystem, family: Family) -> Traced:
+def _traced(system: ConstrainedSystem, family: TraceCache) -> Traced:
     equations = family.equations(system)
     given = [kind for kind in ("jacobian", *OF_ROWS) if kind in system.given]
     forms = {kind: equations.derived(kind) for kind in (*given, *(["constraint_rate"] if system.n_c else []))}
@@ -95,7 +195,7 @@ def farthest(t: Array, rows: Array) -> Array:
     return states[np.unique([states.argmin(axis=0), states.argmax(axis=0)])]
 
 
-class Territory:
+class CheckedRegion:
     """Where the states of runs were, at which callbacks were compared: a box of [t, q, v], and one of parameters.
 
     Attributes

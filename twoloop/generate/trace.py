@@ -1,0 +1,403 @@
+"""Trace callbacks: run them in Python on symbols, in whose place `math` and `numpy` take expressions.
+
+What a callback makes of symbols must be what it makes of numbers. So a function that is not known to do the same with
+both is refused by name when it is given symbols, even if the callback catches the refusal. What remains undetected,
+such as a global that has changed, `traced_values.py` finds by comparing numbers.
+
+`Equations` holds every callback of one system as an array of expressions, with exact derivatives in the place of
+callbacks that are not given. Series, eliminations, references and derived callbacks read them from there.
+"""
+
+import copy
+import functools
+import math
+import types
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext, suppress
+from typing import Any
+
+import numpy as np
+
+from twoloop.checks.bounds import place_of
+from twoloop.generate.graph import FUNCTIONS, Affine, Derivative, Graph, Untraceable, symbols
+from twoloop.generate.parameter_expressions import (
+    OPERATORS,
+    Parameter,
+    Refusal,
+    applied,
+    elementwise,
+    number,
+)
+from twoloop.kernels.compile.callbacks import KINDS
+from twoloop.kernels.compile.dependencies import Rewritten, of_library
+from twoloop.kernels.compile.private import Dispatcher
+from twoloop.problem.system import ConstrainedSystem
+
+# functions of NumPy that do with arrays of forms what they do with numbers
+AS_WITH_NUMBERS = {
+    *("add", "append", "atleast_1d", "atleast_2d", "block", "column_stack", "concatenate", "copy", "cross", "diag"),
+    *("diagonal", "divide", "dot", "einsum", "expand_dims", "flip", "hstack", "inner", "kron", "matmul", "mean"),
+    *("multiply", "ndim", "negative", "outer", "positive", "prod", "ravel", "repeat", "reshape", "roll", "shape"),
+    *("size", "square", "squeeze", "stack", "subtract", "sum", "tile", "trace", "transpose", "true_divide", "vdot"),
+    *("vstack", "zeros_like", "ones_like", "empty_like", "full_like"),
+}
+CONSTRUCTORS = ("zeros", "ones", "empty")
+CONVERSIONS = ("array", "asarray", "ascontiguousarray")
+
+
+def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
+    """Run a callback in Python on symbols: what it returns, None of a compiled one.
+
+    Raises
+    ------
+    Untraceable
+        If it does not run on them, or does with them what it would not do with numbers.
+    """
+    graph, value = t.graph, None
+    with graph.watched():
+        try:
+            value = _Traced(lambda copy, _: copy).callback(function)(t, *arguments)
+        except (Refusal, Untraceable) as refusal:
+            raise Untraceable(f"{graph.refused or refusal}{place_of(refusal)}") from None
+        except Exception as error:  # what a callback makes of symbols is its own
+            if not graph.refused:
+                said = str(error).partition("\n")[0].replace("twoloop.generate.graph.", "").replace("Affine", "symbol")
+                said = f"it does not run on symbols in the place of t, q and v: {type(error).__name__}: {said}"
+                raise Untraceable(f"{said}{place_of(error)}") from error
+    return value
+
+
+def as_forms(graph: Graph, made: Any) -> Any:
+    """What a callback filled or returned, as an array of forms."""
+    for place in np.ndindex(made.shape):
+        entry = made[place]
+        if type(entry) is not Affine:
+            try:
+                made[place] = Affine(graph, number(entry), {})
+            except Exception as error:
+                raise Untraceable(f"on symbols its entry {place} is {entry!r}, which is not a number") from error
+        elif entry.graph is not graph:
+            raise Untraceable("it returns t, q or v of another call, which it has kept")
+    return made
+
+
+class _Traced(Rewritten):
+    """Copies of callbacks with the mathematics of forms in the place of `math` and `numpy`."""
+
+    def copies(self, value: Any) -> bool:
+        return isinstance(value, Dispatcher | types.FunctionType)
+
+    def callback(self, function: Any) -> Any:
+        """A callback that may be an object with a method to call it."""
+        own = next((vars(each)["__call__"] for each in type(function).__mro__ if "__call__" in vars(each)), None)
+        if isinstance(own, types.FunctionType) and not isinstance(function, Dispatcher):
+            return types.MethodType(self.value(own), function)
+        return self.value(function)
+
+    def value(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
+        if isinstance(value, types.MethodType):
+            return types.MethodType(self.value(value.__func__), value.__self__)
+        if isinstance(value, functools.partial):
+            return functools.partial(self.value(value.func), *value.args, **value.keywords)
+        if isinstance(value, types.ModuleType) and value in (math, np):
+            return _Mathematics(value)
+        name = getattr(value, "__name__", "")
+        if not isinstance(value, type) and callable(value):
+            for module in (math, np):
+                if name and getattr(module, name, None) is value:
+                    return getattr(_Mathematics(module), name)
+            if of_library(getattr(value, "__module__", None) or ""):
+                return value
+        return super().value(value, names)
+
+    def _rewrite(self, helper: Any) -> None:
+        super()._rewrite(helper)
+        self.known[id(helper)].__globals__.setdefault("type", _type)
+
+
+def _type(value: Any, *more: Any) -> Any:
+    _refuse(value, "asks for the type of")
+    return type(value, *more)
+
+
+def _symbol_in(value: Any) -> Affine | None:
+    """A form in a number, an array, or a list of these."""
+    if type(value) is Affine:
+        return value
+    if isinstance(value, np.ndarray):
+        value = value.ravel().tolist() if value.dtype == object else ()
+    if isinstance(value, list | tuple):
+        return next((found for found in map(_symbol_in, value) if found is not None), None)
+    return None
+
+
+def _remembers(value: Any) -> bool:
+    """Whether a number, an array or a list of these holds a number that knows its parameters."""
+    if isinstance(value, np.ndarray):
+        value = value.ravel().tolist() if value.dtype == object else ()
+    return any(map(_remembers, value)) if isinstance(value, list | tuple) else type(value) is Parameter
+
+
+def _refuse(value: Any, does: str) -> None:
+    symbol = _symbol_in(value)
+    if symbol is not None:
+        symbol.graph.refuse(f"it {does} what depends on t, q or v")
+
+
+def _of_numbers(known: Any, name: str) -> Callable[..., Any]:
+    """A function that is not known to take forms."""
+
+    @functools.wraps(known)
+    def function(*arguments: Any, **options: Any) -> Any:
+        _refuse([*arguments, *options.values()], f"calls {name} on")
+        return known(*arguments, **options)
+
+    return function
+
+
+def _either(known: Any, own: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of numbers, and of forms."""
+
+    def function(*arguments: Any) -> Any:
+        if _symbol_in(arguments) is None:
+            remembers = any(type(x) is Parameter for x in arguments)
+            return applied(known.__name__, *arguments) if remembers else known(*arguments)
+        if any(isinstance(x, np.ndarray) for x in arguments if type(x) is not Affine):
+            return elementwise(function, arguments)
+        return own(*arguments)
+
+    return function
+
+
+def _is_real(dtype: Any) -> bool:
+    return dtype is None or np.dtype(dtype) == np.float64
+
+
+def _constructor(known: Any) -> Callable[..., Any]:
+    """`zeros` and its kin, which hold forms where they would hold real numbers."""
+
+    def function(shape: Any, dtype: Any = None, **options: Any) -> Any:
+        if not _is_real(dtype):
+            return known(shape, dtype, **options)
+        return np.full(shape, 1.0 if known is np.ones else 0.0, dtype=object)
+
+    return function
+
+
+def _conversion(known: Any) -> Callable[..., Any]:
+    """`array` and its kin."""
+
+    def function(value: Any, dtype: Any = None, **options: Any) -> Any:
+        if _symbol_in(value) is None and not _remembers(value):
+            return known(value, dtype, **options)
+        if not _is_real(dtype):
+            _refuse(value, f"makes {np.dtype(dtype).name} of")
+        return known(value, object, **options)
+
+    return function
+
+
+def _full(shape: Any, value: Any, dtype: Any = None) -> Any:
+    if (
+        _symbol_in(value) is None
+        and not _remembers(value)
+        and not (_is_real(dtype) and np.asarray(value).dtype == np.float64)
+    ):
+        return np.full(shape, value, dtype)
+    if not _is_real(dtype):
+        _refuse(value, f"makes {np.dtype(dtype).name} of")
+    return np.full(shape, value, object)
+
+
+def _norm(x: Any, *more: Any, **options: Any) -> Any:
+    if _symbol_in(x) is None:
+        return np.linalg.norm(x, *more, **options)
+    if more or options or np.ndim(x) != 1:
+        _refuse(x, "calls numpy.linalg.norm, but of a vector, on")
+    x = np.asarray(x, dtype=object)
+    return (x @ x) ** 0.5
+
+
+class _Mathematics:
+    """`math`, `numpy` or a part of it, with functions that take forms too, and arrays that hold them."""
+
+    def __init__(self, module: types.ModuleType):
+        self._module = module
+
+    def __getattr__(self, name: str) -> Any:
+        known = getattr(self._module, name)
+        if isinstance(known, types.ModuleType):
+            return _Mathematics(known)
+        if isinstance(known, type) or not callable(known):
+            return known
+        if name in FUNCTIONS or name == "hypot":
+            return _either(known, FUNCTIONS.get(name) or OPERATORS[name])
+        if name in ("pow", "power"):
+            return lambda x, y: x**y
+        if self._module is np and name in CONSTRUCTORS:
+            return _constructor(known)
+        if self._module is np and name in CONVERSIONS:
+            return _conversion(known)
+        if known is np.full:
+            return _full
+        if known is np.linalg.norm:
+            return _norm
+        if self._module is np and name in AS_WITH_NUMBERS:
+            return known
+        return _of_numbers(known, f"{self._module.__name__}.{name}")
+
+
+# in the order in which they are traced
+CALLBACKS = (
+    *("constraint", "constraint_rate", "jacobian", "nonholonomic", "nonholonomic_rate", "mass", "force"),
+    *("gamma", "nonholonomic_gamma"),
+)
+OF_ROWS = {"gamma": ("jacobian", "constraint_rate"), "nonholonomic_gamma": ("nonholonomic", "nonholonomic_rate")}
+
+
+class Equations:
+    """What the callbacks of a system make of symbols; each is traced when it is first asked for, once.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+    parameters : array of float or Parameter, optional
+        In the place of its own.
+
+    Attributes
+    ----------
+    graph : Graph
+        Its first quantities are t, q and v.
+    t : Affine
+    q, v : list of Affine (n_q,)
+    """
+
+    def __init__(self, system: ConstrainedSystem, parameters: Any = None):
+        self.system, self.graph = system, Graph()
+        self.parameters = system.parameters if parameters is None else parameters
+        self.watched: Any = next((x.record.watched for x in self.parameters if type(x) is Parameter), nullcontext)
+        (self.t,) = self.graph.inputs(1, False)
+        self.q, self.v = self.graph.inputs(system.n_q, False), self.graph.inputs(system.n_q, True)
+        self._made: dict[str, Any] = {}
+        self._before: dict[str, Any] = {}  # what was traced in the graph of which this one is a copy
+
+    def trace_all(self) -> "Equations":
+        """Trace all callbacks that can be traced, for copies."""
+        for kind in CALLBACKS:
+            if not self._is_derived(kind):
+                with suppress(Untraceable):  # which who needs it is told
+                    self.of(kind)
+        return self
+
+    def copy(self) -> "Equations":
+        """Equations with a graph of their own, in which what was traced here is not traced again."""
+        other = copy.copy(self)
+        other.graph = self.graph.copy()
+        other.t, other.q, other.v = (
+            self.t.on(other.graph),
+            *([x.on(other.graph) for x in each] for each in (self.q, self.v)),
+        )
+        other._made, other._before = {}, self.graph.traced
+        return other
+
+    def of(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
+        """What a kind of callback gives, as an array of forms: zeros, or derivatives, where there is none.
+
+        `v`: forms in the place of the velocities, if not these themselves.
+
+        Raises
+        ------
+        Untraceable
+            If a callback does not run on symbols; says which, and why.
+        """
+        if v is not None and "v" in KINDS[kind].state:
+            return self._make(kind, v)
+        if kind not in self._made:
+            self._made[kind] = self._make(kind, self.v)
+        return self._made[kind].copy()
+
+    def derived(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
+        """C_q, C_t or a right-hand side by the rules of differentiation, whether there is a callback or not."""
+        if kind == "jacobian":
+            return self._jacobian()
+        return self._rate() if kind == "constraint_rate" else self._gamma(*OF_ROWS[kind], self.v if v is None else v)
+
+    def _make(self, kind: str, v: Sequence[Affine]) -> Any:
+        if self._is_derived(kind):
+            return self.derived(kind, v)
+        if kind in self._before and v is self.v:
+            made = elementwise(lambda form: form.on(self.graph), [self._before[kind]])
+            self.graph.traced.setdefault(kind, made.copy())
+            return made
+        return self._traced(kind, v)
+
+    def _is_derived(self, kind: str) -> bool:
+        return kind not in self.system.given and kind in ("jacobian", *OF_ROWS)
+
+    def _traced(self, kind: str, v: Sequence[Affine]) -> Any:
+        system, graph, (out,) = self.system, self.graph, self.system.arrays_of(kind)
+        out, shape, p = out.astype(object), out.shape, self.parameters.copy()
+        arrays = [symbols({"q": self.q, "v": v}[name]) for name in KINDS[kind].state]
+        if out.size:
+            try:
+                with self.watched():
+                    if not system.called_in_python:
+                        trace(getattr(system.functions, kind), self.t, *arrays, p, out)
+                    elif kind in system.python_functions:
+                        function, more = system.python_functions[kind], (p,) if system.takes_parameters(kind) else ()
+                        out = np.array(trace(function, self.t, *arrays, *more), dtype=object)
+                    out = as_forms(graph, out)
+                    if out.shape != shape:
+                        raise Untraceable(f"on symbols it returns an array of shape {out.shape}, not {shape}")
+            except Untraceable as error:
+                raise Untraceable(f"{kind} of {system.name!r}: {error}") from error
+        graph.traced.setdefault(kind, out.copy())
+        return out
+
+    def _jacobian(self) -> Any:
+        """C_q from C."""
+        constraint, one = self.of("constraint"), Affine(self.graph, 1.0, {})
+        made = np.empty((self.system.n_c, self.system.n_q), dtype=object)
+        for j, coordinate in enumerate(self.q):
+            by = Derivative(self.graph, {only(coordinate): one})
+            made[:, j] = [by.of(form) for form in constraint]
+        return made
+
+    def _rate(self) -> Any:
+        """C_t from C."""
+        constraint, by_t = self.of("constraint"), Derivative(self.graph, {only(self.t): Affine(self.graph, 1.0, {})})
+        return symbols(by_t.of(form) for form in constraint)
+
+    def _gamma(self, rows: str, rates: str, v: Sequence[Affine]) -> Any:
+        """-(dG/dt v + dG_t/dt) at constant v, the right-hand side of G a = gamma, by the rules of differentiation."""
+        moving = {only(coordinate): u for coordinate, u in zip(self.q, v, strict=True)}
+        along = Derivative(self.graph, {only(self.t): Affine(self.graph, 1.0, {}), **moving})
+        made = self.of(rates)
+        for i, row in enumerate(self.of(rows)):
+            total = along.of(made[i])
+            for entry, u in zip(row, v, strict=True):
+                total = total + along.of(entry) * u if entry.terms else total
+            made[i] = -total
+        return made
+
+
+def runs_on_symbols(system: ConstrainedSystem, kind: str, parameters: Any) -> bool:
+    """Whether a compiled callback does the same whatever its arguments are, and these parameters where they vary."""
+    equations = Equations(system, parameters)
+    state = {"q": equations.q, "v": equations.v, "lam": equations.graph.inputs(system.n_c, True)}
+    arrays = [symbols(state[name]) for name in KINDS[kind].state]
+    filled = [array.astype(object) for array in system.arrays_of(kind)]
+    try:
+        with equations.watched():
+            trace(getattr(system.functions, kind), equations.t, *arrays, equations.parameters.copy(), *filled)
+            for array in filled:
+                as_forms(equations.graph, array)
+    except (Untraceable, ArithmeticError, RecursionError):
+        return False
+    return True
+
+
+def only(form: Affine) -> int:
+    """The one quantity that a form is."""
+    (place,) = form.terms
+    return place
