@@ -82,14 +82,14 @@ compile: install ## compile the kernels, and the callbacks of bodies, mechanisms
 	@echo "Compiling (once, on both cores) the kernels, and the callbacks of bodies, mechanisms and studies"
 	@$(RUN) -c "from twoloop.kernels.evaluation import inner_loop; from twoloop.kernels.control import controller"
 	@$(RUN) -c "from twoloop.kernels.steps import diagonal_step, newton_step; \
-	from twoloop.kernels.evaluation import sparse_inner_loop; from twoloop.bodies import spatial_callbacks, spatial_programs; \
+	from twoloop.kernels.evaluation import sparse_inner_loop; from twoloop.bodies.spatial import callbacks, programs; \
 	from studies.bench import sharp_callbacks; $(CALLBACKS_OF_TESTS)" & \
 	$(RUN) -c "from twoloop.kernels import advance, interpolation, short_loops; \
 	from twoloop.kernels.linalg import dependent_columns, rank; from twoloop.kernels.control import switching; \
 	from twoloop.kernels.evaluation import checks, residuals, traced; \
 	from twoloop.kernels.lanes import lane_dop853, lane_runs, lane_starts, lane_taylor; \
 	from twoloop.kernels.steps import adams_step, asking_step, bdf_step, bridge, explicit_step, lobatto_step, \
-	fixed_point_step, newmark_step, paper_step, taylor_step; from twoloop.bodies import planar_callbacks, planar_programs; \
+	fixed_point_step, newmark_step, paper_step, taylor_step; from twoloop.bodies.planar import callbacks, programs; \
 	from twoloop.mechanisms import *; from studies.honesty import traps; $(CALLBACKS_OF_MORE_TESTS)" && wait $$!
 
 # kernels that slow tests alone need

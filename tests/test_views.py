@@ -56,6 +56,7 @@ def test_a_result_from_a_file_knows_what_its_system_knows(result, default_four_b
 def test_panels_for_units_energy_and_violation(result, tmp_path):
     figure = result.plot(tmp_path / "run.png")
     assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
+    assert max(figure.get_size_inches()) < 12.0  # fits a page
     labels = [panel.get_ylabel() for panel in figure.axes]
     assert labels == ["q (m)", "q (rad)", "energy − start (J)", "largest violation"] and len(figure.axes[0].lines) == 6
     np.testing.assert_array_equal(figure.axes[1].lines[2].get_ydata(), result.q[8])

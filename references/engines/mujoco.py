@@ -11,7 +11,7 @@ import numpy as np
 
 from references.driver import imported
 from references.engines.rigid import BALL, Configured, Engine, Motion, Prepared, Rigid, State, freedoms, march
-from twoloop.bodies.mjcf_geometry import IgnoredWarning
+from twoloop.bodies.file_parts import IgnoredWarning
 
 
 class Settings(NamedTuple):

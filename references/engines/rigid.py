@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from twoloop.bodies import SpatialModel
+from twoloop.bodies.mjcf_writer import spanning_tree
 from twoloop.bodies.model_problem import ModelProblem
 from twoloop.bodies.parameter_layout import SPRING, TORQUE
 from twoloop.bodies.parts import Body, ModelJoint
 from twoloop.bodies.rotation import G, euler_parameters, euler_rates, rotation_matrix
-from twoloop.bodies.spanning_tree import spanning_tree
 from twoloop.problem.problem import Array
 
 SLIDE, HINGE, BALL = "slide", "hinge", "ball"

@@ -3,12 +3,11 @@
 from typing import Any
 
 from studies.bench.sharp_forces import drive, force_along
-from twoloop.bodies import spatial_callbacks
 from twoloop.bodies.parameter_layout import HEAD
+from twoloop.bodies.spatial.callbacks import force as spatial_force
 from twoloop.kernels.compile.callbacks import callback
 
 GRAVITY = 9.81  # m/s^2
-spatial_force = spatial_callbacks.force
 
 # --- callbacks of a chain of points, p = [n lengths, n masses, ...], that hangs from a pivot driven along x
 

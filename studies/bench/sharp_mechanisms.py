@@ -18,8 +18,8 @@ from studies.bench.sharp_callbacks import GRAVITY
 from studies.bench.sharp_forces import Sharp, drive, force_along
 from studies.bench.store import Array
 from twoloop import ConstrainedSystem
-from twoloop.bodies import spatial_callbacks
 from twoloop.bodies.parameter_layout import HEAD
+from twoloop.bodies.spatial import callbacks as spatial_callbacks
 from twoloop.mechanisms import four_bar, spatial_slider_crank
 
 TINY = 1e-30  # imaginary step: derivatives without differences

@@ -296,4 +296,4 @@ print(solve_dae(problem.system, (0.0, 0.5), problem.q0, problem.v0).success, *sy
     assert success == "True" and "twoloop.kernels.steps.explicit_step" in modules
     unused = ("newton_step", "diagonal_step", "fixed_point_step", "paper_step")
     assert not {*modules} & {f"twoloop.kernels.steps.{name}" for name in unused}
-    assert not {*modules} & {"twoloop.bodies.model", "twoloop.bodies.assembly", "scipy.optimize"}
+    assert not {*modules} & {"twoloop.bodies.model_problem", "twoloop.bodies.assembly", "scipy.optimize"}

@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from twoloop.audit.simulator import Audit, AuditedRun, audit_simulator
-from twoloop.bodies.mjcf_geometry import IgnoredWarning
+from twoloop.bodies.file_parts import IgnoredWarning
 from twoloop.bodies.mjcf_reader import from_mjcf
 from twoloop.bodies.model_problem import ModelProblem
 from twoloop.bodies.rotation import euler_parameters, euler_rates
-from twoloop.bodies.spatial_model import SpatialModel
+from twoloop.bodies.spatial.model import SpatialModel
 from twoloop.checks.arguments import Array, check_positive
 from twoloop.run.projection import consistent_state
 

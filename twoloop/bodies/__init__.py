@@ -1,4 +1,4 @@
-"""Mechanisms built from bodies, joints and forces; a model becomes a `Problem` with its equations of motion.
+"""Build mechanisms from bodies, joints and forces; a model becomes a `Problem` with its equations of motion.
 
 A name is imported when it is asked for: what ready mechanisms need of this package imports next to nothing.
 """
@@ -8,17 +8,17 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from twoloop.bodies.mjcf_geometry import IgnoredWarning
+    from twoloop.bodies.file_parts import IgnoredWarning
     from twoloop.bodies.mjcf_reader import from_mjcf
-    from twoloop.bodies.planar_model import PlanarModel
-    from twoloop.bodies.spatial_model import SpatialModel
+    from twoloop.bodies.planar.model import PlanarModel
+    from twoloop.bodies.spatial.model import SpatialModel
     from twoloop.bodies.urdf_reader import Loop, from_urdf
 
 _MODULES = {
-    "IgnoredWarning": "mjcf_geometry",
+    "IgnoredWarning": "file_parts",
     "Loop": "urdf_reader",
-    "PlanarModel": "planar_model",
-    "SpatialModel": "spatial_model",
+    "PlanarModel": "planar.model",
+    "SpatialModel": "spatial.model",
     "from_mjcf": "mjcf_reader",
     "from_urdf": "urdf_reader",
 }

@@ -1,15 +1,18 @@
-"""Assembly of a model: consistent positions and velocities, degrees of freedom and redundant joints."""
+"""Find consistent positions and velocities of a model, its degrees of freedom and redundant joints; remark on them."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack, null_space
 
+from twoloop.bodies.collection import Collection
+from twoloop.bodies.loads import TurnGap
+from twoloop.bodies.tables import TENSOR, Tables
 from twoloop.checks.arguments import Array
 from twoloop.checks.scales import TURNS, generic_factors, scales_of, typical_sizes, units
 from twoloop.checks.sparse_rows import SparseRows, norms
@@ -70,23 +73,9 @@ def positions(
 ) -> Array:
     """Return positions that close all joints, as near to the guess as possible.
 
-    Parameters
-    ----------
-    system : ConstrainedSystem
-        The system without drives.
-    guess : ndarray (n_q,)
-    turning : ndarray of bool (n_q,)
-        True for coordinates that are rotations.
-    keep : sequence of int
-        Coordinates that must not change.
-    rows : mapping
-        Row numbers of each joint, by its name.
-    coordinates : sequence of str (n_q,)
-
-    Raises
-    ------
-    ValueError
-        If a joint does not close (the message names it), or the poses are so far off that the assembly is ambiguous.
+    The system has no drives. `turning` marks the rotations, the coordinates in `keep` must not change, and `rows` has
+    the row numbers of each joint. Raises ValueError if a joint does not close (the message names it), or the poses are
+    so far off that the assembly is ambiguous.
     """
     if system.n_c == 0:
         return guess
@@ -113,10 +102,7 @@ def positions(
 def follow_drives(system: ConstrainedSystem, t: float, start: Array, keep: Sequence[int]) -> Array:
     """Move the bodies in small steps to the initial values of the drives, staying on the same assembly branch.
 
-    Raises
-    ------
-    ValueError
-        If the joints, or the bodies that must not move, prevent it.
+    Raises ValueError if the joints, or the bodies that must not move, prevent it.
     """
     free = np.setdiff1d(np.arange(system.n_q), keep)
     q, values = start.copy(), system.constraint(t, start)
@@ -175,28 +161,18 @@ def _least_squares_positions(system: ConstrainedSystem, t: float, guess: Array, 
 
 
 def velocities(
-    system: ConstrainedSystem, t: float, q: Array, given: Array, known: NDArray[np.bool_], coordinates: Sequence[str]
+    system: ConstrainedSystem, t: float, q: Array, given: Array, is_given: NDArray[np.bool_], coordinates: Sequence[str]
 ) -> Array:
     """Return velocities that satisfy the constraints: those given, and for the others the least kinetic energy.
 
-    Parameters
-    ----------
-    given : ndarray (n_q,)
-    known : ndarray of bool (n_q,)
-        True where a velocity is given.
-    coordinates : sequence of str (n_q,)
-
-    Raises
-    ------
-    ValueError
-        If the velocities given, or those of the drives, violate the constraints.
+    Raises ValueError if the velocities given, or those of the drives, violate the constraints.
     """
-    if system.n_c + system.n_a == 0 or not (known.any() or system.rates(t, q).any()):
-        return np.where(known, given, 0.0)
+    if system.n_c + system.n_a == 0 or not (is_given.any() or system.rates(t, q).any()):
+        return np.where(is_given, given, 0.0)
     rows = system.rows(t, q)
     scales = scales_of(system, t, q, rows)
     scaled = scales.scaled(rows)
-    v = np.where(known, given, 0.0) / scales.columns
+    v = np.where(is_given, given, 0.0) / scales.columns
     for _ in range(2):  # the second pass removes rounding errors
         v = v - np.linalg.lstsq(scaled, scaled @ v + system.rates(t, q) / scales.rows, rcond=SINGULAR)[0]
     left = float(np.abs(scaled @ v + system.rates(t, q) / scales.rows).max(initial=0.0))
@@ -207,17 +183,17 @@ def velocities(
             "motion is over-constrained. Remove a drive or a joint"
         )
     free = null_space(scaled, rcond=SINGULAR)
-    target = np.where(known, given, 0.0) / scales.columns
+    target = np.where(is_given, given, 0.0) / scales.columns
     mass = system.mass(t, q) * np.outer(scales.columns, scales.columns)
     size = float(np.abs(target).max(initial=0.0))
-    if free.shape[1] and known.any():
-        block = free[known]
-        v = v + free @ np.linalg.lstsq(block, (target - v)[known], rcond=SINGULAR)[0]
+    if free.shape[1] and is_given.any():
+        block = free[is_given]
+        v = v + free @ np.linalg.lstsq(block, (target - v)[is_given], rcond=SINGULAR)[0]
         free = free @ null_space(block, rcond=SINGULAR)
     if free.shape[1]:
         inert = free.T @ mass @ free
         v = v - free @ np.linalg.lstsq(inert, free.T @ (mass @ v), rcond=SINGULAR)[0]
-    off = np.where(known, np.abs(v - target), 0.0)
+    off = np.where(is_given, np.abs(v - target), 0.0)
     if off.max(initial=0.0) > max(VELOCITY_CHANGE * size, SINGULAR * speed):
         j = int(off.argmax())
         name, unit = name_and_unit(coordinates[j])
@@ -228,7 +204,7 @@ def velocities(
             f"{f' ({unit}/s)' if unit else ''}. Give fewer velocities (the others are computed), or fewer joints"
         )
     v = v - np.linalg.lstsq(scaled, scaled @ v + system.rates(t, q) / scales.rows, rcond=SINGULAR)[0]
-    near = np.where(known, target, 0.0)
+    near = np.where(is_given, target, 0.0)
     at_rest = np.where(np.abs(v - near) < ROUNDING * np.abs(v).max(), near, v)  # rounding errors removed
     rates = system.rates(t, q) / scales.rows
     terms = ROUNDING * (np.abs(scaled) @ np.abs(at_rest) + np.abs(rates))
@@ -269,28 +245,28 @@ def _freedom_of_large(
     system: ConstrainedSystem, t: float, q: Array, rows: Mapping[str, tuple[int, ...]]
 ) -> Freedom | None:
     """Return the freedom of a large sparse system by its factors; None if the dense test is needed."""
-    here = dependence(system, t, q)
-    if here is None:
+    rows_here = dependence(system, t, q)
+    if rows_here is None:
         return None
     singular = 0
-    if here.shares and np.abs(here.allowed).max() > 0.0:
-        away = q + PERTURBATION * here.allowed
+    if rows_here.shares and np.abs(rows_here.allowed).max() > 0.0:
+        away = q + PERTURBATION * rows_here.allowed
         moved = project_sparsely(system, t, away, np.zeros(system.n_q), check_assembly=False)
-        there = here.onto_constraints(away) if moved is None else moved[0]
-        beside = None if there is None else dependence(system, t, there)
+        nearby = rows_here.onto_constraints(away) if moved is None else moved[0]
+        beside = None if nearby is None else dependence(system, t, nearby)
         if beside is None:
             return None
-        if beside.rank > here.rank:
-            singular, here = beside.rank - here.rank, beside
+        if beside.rank > rows_here.rank:
+            singular, rows_here = beside.rank - rows_here.rank, beside
     of_row = {row: name for name, own in rows.items() for row in own}
     groups: list[set[str]] = []
-    for row, share in here.shares.items():
+    for row, share in rows_here.shares.items():
         involved = [row, *np.flatnonzero(np.abs(share) > 1e-6 * np.abs(share).max()).tolist()]
         joined = {of_row[k] for k in involved if k in of_row}  # rows of Euler parameters belong to no joint
         joined = joined.union(*(group for group in groups if group & joined))
         groups = [group for group in groups if not group & joined] + [joined]
     redundant = tuple(tuple(name for name in rows if name in group) for group in groups)
-    return Freedom(system.n_q - here.rank, singular, redundant)
+    return Freedom(system.n_q - rows_here.rank, singular, redundant)
 
 
 def _scaled(system: ConstrainedSystem, t: float, q: Array) -> Array:
@@ -348,9 +324,89 @@ def _redundant(
     idle = null_space(_scaled(system, t, q).T, rcond=SINGULAR)
     part = idle @ idle.T  # projector onto the null space of C_q^T
     groups: list[set[str]] = []
-    involved = {name: list(of) for name, of in rows.items() if np.abs(part[list(of)]).max(initial=0.0) > 1e-6}
-    for name, of in involved.items():
-        linked = {other for other, there in involved.items() if np.abs(part[np.ix_(of, there)]).max() > 1e-6}
+    involved = {name: list(own) for name, own in rows.items() if np.abs(part[list(own)]).max(initial=0.0) > 1e-6}
+    for name, own in involved.items():
+        linked = {other for other, theirs in involved.items() if np.abs(part[np.ix_(own, theirs)]).max() > 1e-6}
         joined = {name, *linked}.union(*(group for group in groups if group & {name, *linked}))
         groups = [group for group in groups if not group & joined] + [joined]
     return tuple(tuple(name for name in rows if name in group) for group in groups)
+
+
+MOVED = 1e-6  # relative to the largest coordinate: smaller displacements are not reported
+ROUNDED = 0.01  # relative tolerance of the triangle inequality, for moments of inertia rounded to a few digits
+TURN = 2.0 * np.pi
+
+
+def note_of(
+    model: Collection,
+    tables: Tables,
+    freedom: Freedom,
+    given: Array,
+    closed: Array,
+    start: Array,
+    coordinates: Sequence[str],
+) -> str:
+    """Return remarks on degrees of freedom, redundant rows and possible mistakes.
+
+    The coordinates are those given, those with all joints closed, and those with the drives at their initial values.
+    """
+    remarks = [*_freedom(freedom), *_moved(given, closed, coordinates), *_forgotten(model)]
+    remarks += (*_inertias(model, tables), *_turns(model, tables, start))
+    if tables.untraced:
+        remarks.append(f"Its functions are called in Python, which is slower: {tables.untraced}.")
+    return " ".join(remarks)
+
+
+def _freedom(freedom: Freedom) -> Iterator[str]:
+    yield f"{freedom.degrees} {'degree' if freedom.degrees == 1 else 'degrees'} of freedom."
+    if freedom.singular:
+        yield f"The start is singular: {freedom.singular} more degrees of freedom there."
+    for group in freedom.redundant:
+        yield f"The rows of {', '.join(map(repr, group))} are dependent."
+
+
+def _moved(given: Array, closed: Array, coordinates: Sequence[str]) -> Iterator[str]:
+    off = np.abs(closed - given)
+    if off.max(initial=0.0) > MOVED * np.abs(closed).max():
+        name, unit = name_and_unit(coordinates[int(off.argmax())])
+        yield f"Bodies were moved to close the joints, {name} by {f'{off.max():.3g} {unit}'.rstrip()}."
+
+
+def _forgotten(model: Collection) -> Iterator[str]:
+    drives = {id(each.point_b): each.name for each in model.joints if each.kind == "drive"}
+    joined = {id(body) for each in model.joints for body in (each.a, each.b)}
+    joined |= {id(body) for each in model.forces for body in (each.first, each.second)}
+    for body in model.bodies:
+        if model.joints and id(body) not in joined:
+            yield f"{body.name!r} has no joint, and no force acts on it."
+    for force in model.forces:
+        if force.joint is not None and id(force.joint.point_b) in drives:
+            name = drives[id(force.joint.point_b)]
+            yield f"{force.name!r} acts where {name!r} prescribes the motion: it only changes the drive reaction."
+    if model.dry:
+        yield "solve_with_friction handles its dry friction; solve_dae ignores it."
+    if model.stops:
+        yield "solve_with_stops handles its stops; solve_dae ignores them."
+
+
+def _inertias(model: Collection, tables: Tables) -> Iterator[str]:
+    """Yield bodies whose principal moments violate the triangle inequality; the equations are still well defined."""
+    for body in model.bodies if model.dimension == 3 else ():
+        first = tables.places[f"mass of {body.name} (kg)"] + 1
+        low, middle, high = np.linalg.eigvalsh(tables.p[first : first + 6][TENSOR].reshape(3, 3))
+        if high > (1.0 + ROUNDED) * (low + middle):
+            yield (
+                f"No body has the principal moments of inertia of {body.name!r}, {low:.6g}, {middle:.6g} and "
+                f"{high:.6g}: the largest exceeds the sum of the others."
+            )
+
+
+def _turns(model: Collection, tables: Tables, start: Array) -> Iterator[str]:
+    """Yield angles of more than one turn, which may be meant in degrees."""
+    angles = {name: value for name, value in tables.values.items() if name.endswith("(rad)")}
+    if model.dimension == 2:
+        angles |= {f"angle of {body.name} (rad)": start[body.coordinates[2]] for body in model.bodies}
+    angles |= {f"{each.name} (rad)": each.gap.limit for each in model.stops if isinstance(each.gap, TurnGap)}
+    for name, value in angles.items():
+        if abs(value) > TURN:
+            yield f"{name[:-6]} is {value:.6g} rad, more than a turn: angles are in rad, not in degrees."

@@ -1,13 +1,14 @@
-"""Bodies, joints and forces of a model with unique names, and the interpretation of arguments that refer to them."""
+"""Collect bodies, joints and forces under unique names, and interpret arguments that refer to them."""
 
 from __future__ import annotations
 
-from typing import Any
+import inspect
+import re
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from twoloop.bodies.documented import documented
 from twoloop.bodies.functions import Function, force_function
 from twoloop.bodies.parameter_layout import NONE
 from twoloop.bodies.parts import (
@@ -24,15 +25,61 @@ from twoloop.bodies.parts import (
 from twoloop.checks.arguments import Array, check_positive, check_text, check_vector, shown
 from twoloop.problem.description import Stop
 
+# sections that many methods share, by the parameter that they describe
+SHARED = {
+    "a": "a, b : Body or str\n    The bodies, or their names.\n",
+    "at": (
+        "at : array_like (2 or 3,) or (BodyPoint, BodyPoint)\n    A point of the joint, in space in the position "
+        "given, m; or a point of a and a point of b, which the\n    joint brings together.\n"
+    ),
+    "axis": (
+        "axis : array_like (2 or 3,) or (BodyDirection, BodyDirection)\n    Direction, of any length, in space in the "
+        "position given; or a direction of a and one of b.\n"
+    ),
+}
+NAME = "name : str, optional\n    Used in messages and results. None: made of the kind and the bodies.\n"
+PARAMETERS, RETURNS, RAISED = (f"{title}\n{'-' * len(title)}\n" for title in ("Parameters", "Returns", "Raises"))
+RAISES = f"{RAISED}TypeError, ValueError\n    If an argument is invalid, or the name is taken."
+
+
+def documented(cls: Any) -> Any:
+    """Complete the docstrings of methods that add to a model by the sections that they share."""
+    for method in vars(cls).values():
+        text = inspect.cleandoc(getattr(method, "__doc__", None) or "")  # python -OO removes docstrings
+        if not text or not inspect.isfunction(method) or method.__name__.startswith("_") or RETURNS in text:
+            continue
+        given, returned = inspect.signature(method).parameters, method.__annotations__["return"]
+        shared = "".join(
+            part for name, part in SHARED.items() if name in given and not re.search(rf"(?m)^{name}\b", text)
+        )
+        if returned == "None" or not (shared or PARAMETERS in text):
+            continue
+        text, raised, cause = text.partition(RAISED)
+        head, _, own = text.partition(PARAMETERS)
+        named = NAME if "name" in given and given["name"].default is None else ""
+        parameters = f"{PARAMETERS}{shared}{f'{own.rstrip()}{chr(10)}' if own else ''}{named}"
+        method.__doc__ = (
+            f"{head.rstrip()}\n\n{parameters}\n{RETURNS}{returned}\n\n{raised + cause if raised else RAISES}"
+        )
+    return cls
+
+
 Points = tuple[Numbers, Numbers]
+Part = TypeVar("Part")
 
 AXES = ("x", "y", "z")
 WITHOUT_POINT = ("fixed", "rolling")  # joints whose point may be left out
 
 
+def add(parts: list[Part], part: Part) -> Part:
+    """Append a part of a model to a list, and return it."""
+    parts.append(part)
+    return part
+
+
 @documented
 class Collection:
-    """Bodies, joints and forces, in the plane or in space."""
+    """Collect bodies, joints and forces, in the plane or in space."""
 
     dimension: int
     distance_kind: int  # kind of the row of a distance, see `parameter_layout`
@@ -59,33 +106,20 @@ class Collection:
         """Return the angle or the rotation matrix of the ground."""
         raise NotImplementedError
 
-    def _add_body(self, body: Body) -> Body:
-        self.bodies.append(body)
-        return body
-
-    def _add_joint(self, joint: ModelJoint) -> ModelJoint:
-        self.joints.append(joint)
-        return joint
-
-    def _add_force(self, force: Force) -> Force:
-        self.forces.append(force)
-        return force
-
     def _new_name(self, what: str, name: str | None, *bodies: Body) -> str:
         """Return a unique name: the one given, or one made of the kind and the bodies."""
-        known = {each.name for part in (self.bodies, self.joints, self.forces, self.stops) for each in part} | {
-            "ground"
-        }
+        parts: list[Any] = [self.ground, *self.bodies, *self.joints, *self.forces, *self.stops]
+        taken = {part.name for part in parts}
         if name is not None:
             if not check_text("name", name).strip():
                 raise ValueError(f"name must not be empty; given {name!r}")
-            if name in known:
+            if name in taken:
                 raise ValueError(f"name must be unique in the model: {name!r} is already taken")
             return name
         ordered = bodies[::-1] if bodies and bodies[0].number == NONE else bodies
-        made = f"{what} {'-'.join(body.name for body in ordered)}" if bodies else what
+        base = f"{what} {'-'.join(body.name for body in ordered)}" if bodies else what
         number = 2
-        while (new := made if number == 2 and made not in known else f"{made} {number}") in known:
+        while (new := base if number == 2 and base not in taken else f"{base} {number}") in taken:
             number += 1
         return new
 
@@ -100,8 +134,8 @@ class Collection:
         for body in (self.ground, *self.bodies):
             if body.name == given:
                 return body
-        known = ", ".join(repr(body.name) for body in (self.ground, *self.bodies))
-        raise ValueError(f"{argument} must be a body of this model, {known}; given {given!r}")
+        names = ", ".join(repr(body.name) for body in (self.ground, *self.bodies))
+        raise ValueError(f"{argument} must be a body of this model, {names}; given {given!r}")
 
     def _moving_body(self, argument: str, given: Any) -> Body:
         body = self._body(argument, given)
@@ -115,19 +149,21 @@ class Collection:
 
     def _joint(self, given: Any, kinds: tuple[str, ...], what: str) -> ModelJoint:
         """Return a joint of this model that is of one of the given kinds, given as an object or by its name."""
-        found = next((joint for joint in self.joints if given is joint or joint.name == given), None)
-        if found is None:
+        chosen = next((joint for joint in self.joints if given is joint or joint.name == given), None)
+        if chosen is None:
             if not isinstance(given, (ModelJoint, str)):
                 raise TypeError(
                     f"joint must be a joint, as returned by revolute(...) etc., or its name; given {shown(given)}"
                 )
             if isinstance(given, ModelJoint):
                 raise ValueError(f"joint must be one of this model; {given.name!r} belongs to another")
-            known = ", ".join(repr(joint.name) for joint in self.joints) or "none so far"
-            raise ValueError(f"joint must be one of this model, {known}; given {given!r}")
-        if found.kind not in kinds:
-            raise ValueError(f"{what} needs a {' or '.join(kinds)} joint; given {found.name!r}, which is {found.kind}")
-        return found
+            names = ", ".join(repr(joint.name) for joint in self.joints) or "none so far"
+            raise ValueError(f"joint must be one of this model, {names}; given {given!r}")
+        if chosen.kind not in kinds:
+            raise ValueError(
+                f"{what} needs a {' or '.join(kinds)} joint; given {chosen.name!r}, which is {chosen.kind}"
+            )
+        return chosen
 
     def _point(self, argument: str, given: Any, body: Body) -> Array:
         """Return a point in the axes of a body, given in these axes or in space."""
@@ -179,21 +215,21 @@ class Collection:
 
     def _function(self, name: str, given: Any, size: int, unit: str) -> tuple[Function | None, Numbers | None]:
         """Return the f of a force, torque or motor: a function, or named constants."""
-        found = force_function(f"f of {name!r}", given, size)
-        if isinstance(found, Function):
-            return found, None
+        value = force_function(f"f of {name!r}", given, size)
+        if isinstance(value, Function):
+            return value, None
         parts = ("value",) if size == 1 else AXES[:size]
-        return None, Numbers(tuple(found.tolist()), tuple(f"{part} of {name} ({unit})" for part in parts))
+        return None, Numbers(tuple(value.tolist()), tuple(f"{part} of {name} ({unit})" for part in parts))
 
     def _pair(self, kind: str, a: Any, b: Any, name: str | None, at: Any) -> tuple[Body, Body, str, Points]:
         """Return bodies, name and points of a joint; default point: the centre of mass of b, or of a on the ground."""
-        first, second = self._body("a", a), self._body("b", b)
-        self._different(f"{kind} joint", first, second)
-        name = self._new_name(kind, name, first, second)
+        body_a, body_b = self._body("a", a), self._body("b", b)
+        self._different(f"{kind} joint", body_a, body_b)
+        name = self._new_name(kind, name, body_a, body_b)
         if at is None and kind in WITHOUT_POINT:
-            at = first.position if second is self.ground else second.position
-        here, there = self._points(at, first, second)
-        return first, second, name, (self._numbers(name, first, here), self._numbers(name, second, there))
+            at = body_a.position if body_b is self.ground else body_b.position
+        point_a, point_b = self._points(at, body_a, body_b)
+        return body_a, body_b, name, (self._numbers(name, body_a, point_a), self._numbers(name, body_b, point_b))
 
     def _weld(self, name: str, a: Body, b: Body, points: Points) -> tuple[JointRow, ...]:
         """Return the rows that fix two bodies to each other."""
@@ -204,28 +240,27 @@ class Collection:
 
         Parameters
         ----------
-        a, b : Body or str
         at : array_like (2,) or (3,) or (BodyPoint, BodyPoint), optional
             Point of reference of the reaction, m. None: the centre of mass of b, or of a if b is the ground.
         """
-        first, second, name, points = self._pair("fixed", a, b, name, at)
-        return self._add_joint(
-            ModelJoint(name, "fixed", first, second, self._weld(name, first, second, points), *points)
-        )
+        body_a, body_b, name, points = self._pair("fixed", a, b, name, at)
+        rows = self._weld(name, body_a, body_b, points)
+        return add(self.joints, ModelJoint(name, "fixed", body_a, body_b, rows, *points))
 
     def _apart(
         self, kind: str, a: Any, at_a: Any, b: Any, at_b: Any, name: str | None
     ) -> tuple[Body, Body, str, Points, float]:
         """Return the bodies and name of a part between two points, the points, and their initial distance."""
-        first, second = self._body("a", a), self._body("b", b)
-        self._different(kind, first, second)
-        name = self._new_name(kind.removesuffix(" joint"), name, first, second)
-        here, there = self._point("at_a", at_a, first), self._point("at_b", at_b, second)
-        one, other = first.in_space(here), second.in_space(there)
-        distance = float(np.linalg.norm(one - other))
-        if distance <= COINCIDE * np.abs((one, other)).max():  # but for rounding
+        body_a, body_b = self._body("a", a), self._body("b", b)
+        self._different(kind, body_a, body_b)
+        name = self._new_name(kind.removesuffix(" joint"), name, body_a, body_b)
+        point_a, point_b = self._point("at_a", at_a, body_a), self._point("at_b", at_b, body_b)
+        end_a, end_b = body_a.in_space(point_a), body_b.in_space(point_b)
+        distance = float(np.linalg.norm(end_a - end_b))
+        if distance <= COINCIDE * np.abs((end_a, end_b)).max():  # but for rounding
             distance = 0.0
-        return first, second, name, (self._numbers(name, first, here), self._numbers(name, second, there)), distance
+        points = self._numbers(name, body_a, point_a), self._numbers(name, body_b, point_b)
+        return body_a, body_b, name, points, distance
 
     def distance(
         self,
@@ -241,21 +276,20 @@ class Collection:
 
         Parameters
         ----------
-        a, b : Body or str
         at_a, at_b : array_like (2,) or (3,), or BodyPoint
             The points, in space in the position given, m.
         length : float, optional
             m. None: their distance in the position given.
         """
-        first, second, name, points, apart = self._apart("distance joint", a, at_a, b, at_b, name)
+        body_a, body_b, name, points, apart = self._apart("distance joint", a, at_a, b, at_b, name)
         if length is None:
             length = apart
             if length == 0.0:
                 raise ValueError(f"the points of {name!r} coincide in the position given; give a length or use a joint")
         check_positive(f"length of {name!r}", length)
         long = Numbers((float(length),), (f"length of {name} (m)",))
-        row = JointRow(self.distance_kind, 1, first, second, *points, long)
-        return self._add_joint(ModelJoint(name, "distance", first, second, (row,), *points))
+        row = JointRow(self.distance_kind, 1, body_a, body_b, *points, long)
+        return add(self.joints, ModelJoint(name, "distance", body_a, body_b, (row,), *points))
 
     def _new_body(self, name: str, mass: float, position: ArrayLike, velocity: ArrayLike | None) -> tuple[Any, ...]:
         """Check what bodies in the plane and in space have in common; return name, position, mass and velocity."""

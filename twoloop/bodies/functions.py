@@ -1,26 +1,99 @@
-"""Functions given by the user: forces of t, q and v, motions of t. They are traced once to programs where possible."""
+"""Trace functions given by the user once: forces of t, q and v, motions of t, constraint rows of q and v."""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from twoloop.bodies.row_function import RowFunction
 from twoloop.checks.arguments import Array, check_finite, check_real, shown
 from twoloop.generate.graph import Affine, Derivative, Graph, Untraceable, symbols
 from twoloop.generate.program import Program, numbers_of, program_of
 from twoloop.generate.trace import as_forms, trace
+
+
+@dataclass(frozen=True, eq=False)
+class RowFunction:
+    """Evaluate a row C(q) = 0 that depends on the coordinates of some bodies.
+
+    Attributes
+    ----------
+    name : str
+        Used in messages.
+    function : callable
+        function(q) -> number, made of operations that can be traced.
+    columns : tuple of int
+        Coordinates on which the row depends.
+    """
+
+    name: str
+    function: Callable[..., Any]
+    columns: tuple[int, ...]
+    traced: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        n, graph = 1 + max(self.columns), Graph()
+        (t,) = graph.inputs(1, False)
+        q, v = graph.inputs(n, False), graph.inputs(n, True)
+        try:
+            results = self.forms(graph, t, q, v)
+        except Untraceable as error:
+            raise ValueError(f"{self.name} must be made of numpy's functions, without branches: {error}") from None
+        object.__setattr__(self, "traced", np.array(numbers_of(program_of(graph, 1 + 2 * n, dict(enumerate(results))))))
+
+    @property
+    def n_results(self) -> int:
+        """Return the number of results: C, C_t, gamma, and the derivative with respect to each coordinate."""
+        return 3 + len(self.columns)
+
+    def forms(self, graph: Graph, t: Affine, q: Sequence[Affine], v: Sequence[Affine]) -> list[Affine]:
+        """Return the results as symbols."""
+        value = np.array(trace(lambda _, coordinates: self.function(coordinates), t, symbols(q)), dtype=object)
+        if value.shape not in ((), (1,)):
+            raise Untraceable(f"on symbols it returns shape {value.shape}")
+        row = as_forms(graph, value.reshape(1))[0]
+        one, places = Affine(graph, 1.0, {}), [next(iter(each.terms)) for each in q]
+        along = dict(zip(places, v, strict=True))
+        bend = Derivative(graph, along).of(Derivative(graph, along).of(row))
+        gradient = [Derivative(graph, {places[j]: one}).of(row) for j in self.columns]
+        return [row, Affine(graph, 0.0, {}), bend.times(-1.0), *gradient]
+
+    def at(self, t: float, q: Array, v: Array) -> Array:
+        """Evaluate the results."""
+        from twoloop.bodies.program_results import results  # compiled on import
+
+        n = 1 + max(self.columns)
+        return np.asarray(results(0, t, q[:n].copy(), v[:n].copy(), self.traced)[: self.n_results])
+
+
+@dataclass(frozen=True, eq=False)
+class RateFunction(RowFunction):
+    """Evaluate a row A(q) v = 0 of the non-holonomic constraints: function(q, v) -> number, linear in v."""
+
+    @property
+    def n_results(self) -> int:
+        """Return the number of results: the right-hand side of A a = Q_a, and A for each coordinate."""
+        return 1 + len(self.columns)
+
+    def forms(self, graph: Graph, t: Affine, q: Sequence[Affine], v: Sequence[Affine]) -> list[Affine]:
+        """Return the results as symbols."""
+        function: Callable[..., Any] = self.function
+        value = trace(lambda _, one, other: function(one, other), t, symbols(q), symbols(v))
+        row, one = as_forms(graph, np.array(value, dtype=object).reshape(1))[0], Affine(graph, 1.0, {})
+        along = {next(iter(each.terms)): rate for each, rate in zip(q, v, strict=True)}
+        gradient = [Derivative(graph, {next(iter(v[j].terms)): one}).of(row) for j in self.columns]
+        return [Derivative(graph, along).of(row).times(-1.0), *gradient]
+
 
 ARGUMENTS = {1: "(t)", 2: "(length, rate) or (angle, rate)", 3: "(t, q, v)"}
 
 
 @dataclass(frozen=True, eq=False)
 class Function:
-    """A force, torque or motor torque given as a function, or a motion with its derivatives.
+    """Evaluate a force or torque given as a function, or a motion with its derivatives.
 
     Attributes
     ----------
@@ -28,7 +101,7 @@ class Function:
         Names the argument and its owner in messages.
     function : callable
     n_arguments : int
-        1: t; 2: length and rate, see `Law`; 3: t, q and v.
+        1: t; 2: length and rate, see `SpringFunction`; 3: t, q and v.
     size : int
         Number of values returned.
     derivatives : tuple of callable
@@ -46,22 +119,22 @@ class Function:
 
     @property
     def n_results(self) -> int:
-        """Number of results of its program; three for a motion."""
+        """Return the number of results of its program; three for a motion."""
         return 3 if self.derivatives or self.traced is not None else self.size
 
     def at(self, t: float, q: Array, v: Array) -> Array:
         """Evaluate the function and check the shape; for a motion, with its derivatives."""
         arguments = self._arguments(t, q.copy(), v.copy())
         try:
-            made = [self._checked(each(*arguments)) for each in (self.function, *self.derivatives)]
+            values = [self._checked(each(*arguments)) for each in (self.function, *self.derivatives)]
         except Exception as error:
             error.add_note(f"raised by {self.name} at t = {t!r}")
             raise
         if self.traced is not None:
             from twoloop.bodies.program_results import results  # compiled on import
 
-            made.append(results(0, t, np.zeros(0), np.zeros(0), self.traced)[1:3])
-        return np.concatenate(made)
+            values.append(results(0, t, np.zeros(0), np.zeros(0), self.traced)[1:3])
+        return np.concatenate(values)
 
     def _arguments(self, t: Any, q: Any, v: Any) -> tuple[Any, ...]:
         return (t, q, v)[: self.n_arguments]
@@ -76,57 +149,45 @@ class Function:
     def forms(self, graph: Graph, t: Affine, q: Sequence[Affine], v: Sequence[Affine]) -> list[Affine]:
         """Return the results for symbolic arguments; raise Untraceable if that fails."""
         arguments = self._arguments(t, symbols(q), symbols(v))
-        made: list[Affine] = []
+        results: list[Affine] = []
         for each in (self.function, *self.derivatives):
             array = np.array(trace(each, *arguments), dtype=object)
             if array.shape != (self.size,) and not (self.size == 1 and array.shape == ()):
                 raise Untraceable(f"on symbols it returns shape {array.shape}")
-            made += as_forms(graph, array.reshape(self.size)).tolist()
-        return made
+            results += as_forms(graph, array.reshape(self.size)).tolist()
+        return results
 
 
-class Law(Function):
-    """The force of a spring as a function of its length and rate, which are all that it is given as q and v."""
+class SpringFunction(Function):
+    """Evaluate the force of a spring as a function of its length and rate, which take the place of q and v."""
 
     def _arguments(self, t: Any, q: Any, v: Any) -> tuple[Any, ...]:
         return q[0], v[0]
 
 
-def law_function(name: str, given: Any) -> Law:
-    """Return the force of a spring as a function of its length, or angle, and rate.
-
-    Raises
-    ------
-    TypeError
-        If the argument is not such a function.
-    """
+def spring_function(name: str, given: Any) -> SpringFunction:
+    """Return the force of a spring as a function of its length, or angle, and rate."""
     if not callable(given):
         raise TypeError(
             f"{name} must be a function of (length, rate) or (angle, rate), such as lambda x, rate: 40.0 * x**3; "
             f"given {shown(given)}"
         )
-    return Law(name, given, _n_arguments(name, given, (2,)), 1)
+    return SpringFunction(name, given, _n_arguments(name, given, (2,)), 1)
 
 
 def with_arguments(functions: Sequence[Any], n_q: int, q: Any, v: Any) -> Iterator[tuple[Any, Any, Any]]:
     """Yield functions with their parts of q and v, where lengths and rates of laws follow the first n_q, in order."""
-    law = n_q
+    index = n_q
     for each in functions:
-        if isinstance(each, Law):
-            yield each, q[law : law + 1], v[law : law + 1]
-            law += 1
+        if isinstance(each, SpringFunction):
+            yield each, q[index : index + 1], v[index : index + 1]
+            index += 1
         else:
             yield each, q[:n_q], v[:n_q]
 
 
 def force_function(name: str, given: Any, size: int) -> Function | Array:
-    """Return a function of t or of t, q and v, or constants.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the argument is neither.
-    """
+    """Return a function of t or of t, q and v, or constants."""
     if callable(given):
         return Function(name, given, _n_arguments(name, given, (1, 3)), size)
     if size == 1:
@@ -141,13 +202,7 @@ def force_function(name: str, given: Any, size: int) -> Function | Array:
 
 
 def motion_function(name: str, motion: Any, rate: Any, acceleration: Any) -> Function:
-    """Return a motion with its derivatives, which are traced if they are not given.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is not a function of t, or the derivatives are neither given nor can be traced.
-    """
+    """Return a motion with its derivatives, which are traced if they are not given."""
     if not callable(motion):
         raise TypeError(f"{name} must be a function of t, such as lambda t: 0.5 * np.sin(2.0 * t); given {motion!r}")
     if (rate is None) != (acceleration is None):
@@ -171,30 +226,30 @@ def motion_function(name: str, motion: Any, rate: Any, acceleration: Any) -> Fun
 
 def motion_forms(function: Function, graph: Graph, t: Affine) -> list[Affine]:
     """Return a motion and its first two derivatives as symbols."""
-    made = function.forms(graph, t, [], [])
+    results = function.forms(graph, t, [], [])
     if not function.derivatives:
         (place,) = t.terms
         for _ in range(2):
-            made.append(Derivative(graph, {place: Affine(graph, 1.0, {})}).of(made[-1]))
-    return made
+            results.append(Derivative(graph, {place: Affine(graph, 1.0, {})}).of(results[-1]))
+    return results
 
 
 def program_for(functions: Sequence[Function | RowFunction], n_q: int, motions: bool) -> Program:
     """Return one program for all functions, in order; raise Untraceable if one cannot be traced."""
     graph = Graph()
     (t,) = graph.inputs(1, False)
-    n = n_q + sum(isinstance(each, Law) for each in functions)
+    n = n_q + sum(isinstance(each, SpringFunction) for each in functions)
     q, v = graph.inputs(n, False), graph.inputs(n, True)
-    made: list[Affine] = []
-    for each, one, other in with_arguments(functions, n_q, q, v):
+    results: list[Affine] = []
+    for each, q_part, v_part in with_arguments(functions, n_q, q, v):
         try:
             if motions and isinstance(each, Function):
-                made += motion_forms(each, graph, t)
+                results += motion_forms(each, graph, t)
             else:
-                made += each.forms(graph, t, one, other)
+                results += each.forms(graph, t, q_part, v_part)
         except Untraceable as error:
             raise Untraceable(f"{each.name}: {error}") from None
-    return program_of(graph, 1 + 2 * n, dict(enumerate(made)))
+    return program_of(graph, 1 + 2 * n, dict(enumerate(results)))
 
 
 def is_constant(function: Function | RowFunction) -> bool:

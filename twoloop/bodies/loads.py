@@ -1,16 +1,31 @@
-"""Forces and prescribed motions of a model."""
+"""Add forces, prescribed motions, stops, gears and racks to a model."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
-from twoloop.bodies.collection import Collection
-from twoloop.bodies.documented import documented
-from twoloop.bodies.functions import Function, Law, law_function, motion_function
-from twoloop.bodies.parameter_layout import BRAKE, FORCE, PULL, RAIL, RUB, SPRING, TORQUE
+import numpy as np
+
+from twoloop.bodies.collection import Collection, add, documented
+from twoloop.bodies.frames import angle_of, point_of, vector_of
+from twoloop.bodies.functions import Function, RowFunction, SpringFunction, motion_function, spring_function
+from twoloop.bodies.parameter_layout import (
+    AXIAL_FRICTION,
+    AXIAL_SPRING,
+    FORCE,
+    HINGE_FRICTION,
+    ROW_FUNCTION,
+    SPRING,
+    TORQUE,
+    ZERO_LENGTH_SPRING,
+)
 from twoloop.bodies.parts import Body, DryFriction, Force, JointRow, ModelJoint, Numbers
-from twoloop.checks.arguments import check_finite, check_not_negative, check_positive, shown
+from twoloop.checks.arguments import Array, check_finite, check_not_negative, check_positive, shown
+from twoloop.problem.description import Stop
+
+Row = Callable[[Any], Any]  # of the coordinates; zero where the constraint holds
 
 
 @documented
@@ -59,10 +74,10 @@ class Loads(Collection):
             In the place of stiffness, damping and length: force(length, rate), N, positive where it pulls the points
             together. A linear spring has stiffness * (length - unstressed length) + damping * rate.
         """
-        first, second, name, points, distance = self._apart("spring", a, at_a, b, at_b, name)
-        law = _law(f"force of {name!r}", force, stiffness, damping or length is not None)
-        if law is not None:
-            return self._add_force(Force(name, SPRING, first, second, *points, None, law))
+        body_a, body_b, name, points, distance = self._apart("spring", a, at_a, b, at_b, name)
+        function = _spring_function(f"force of {name!r}", force, stiffness, damping or length is not None)
+        if function is not None:
+            return add(self.forces, Force(name, SPRING, body_a, body_b, *points, None, function))
         stiffness, damping = check_not_negative("stiffness", stiffness), check_not_negative("damping", damping)
         length = distance if length is None else check_not_negative("length", length)
         if length == 0.0:
@@ -71,11 +86,11 @@ class Loads(Collection):
                     f"the spring {name!r} without a length has no direction where its points meet, so that it takes no "
                     "damping; give it a length, or take a force of t, q, v for the damper"
                 )
-            more, kind = Numbers((stiffness,), (f"stiffness of {name} (N/m)",)), PULL
+            more, kind = Numbers((stiffness,), (f"stiffness of {name} (N/m)",)), ZERO_LENGTH_SPRING
         else:
             names = f"stiffness of {name} (N/m)", f"damping of {name} (N s/m)", f"length of {name} (m)"
             more, kind = Numbers((stiffness, damping, length), names), SPRING
-        return self._add_force(Force(name, kind, first, second, *points, more))
+        return add(self.forces, Force(name, kind, body_a, body_b, *points, more))
 
     def torsion_spring(
         self,
@@ -104,12 +119,12 @@ class Loads(Collection):
         """
         hinge = self._joint(joint, ("revolute",), "torsion_spring")
         name = self._new_name(f"torsion spring of {hinge.name}", name)
-        law = _law(f"torque of {name!r}", torque, stiffness, damping or angle)
-        if law is not None:
+        function_of_length = _spring_function(f"torque of {name!r}", torque, stiffness, damping or angle)
+        if function_of_length is not None:
             zero = Numbers((0.0,), (f"angle of {name} (rad)",))
-            return self._add_force(replace(self._torsion(name, hinge, zero), function=law))
-        given = {"stiffness": (stiffness, "N m/rad"), "damping": (damping, "N m s/rad"), "angle": (angle, "rad")}
-        return self._add_force(self._torsion(name, hinge, _spring_numbers(name, given)))
+            return add(self.forces, replace(self._torsion(name, hinge, zero), function=function_of_length))
+        numbers = {"stiffness": (stiffness, "N m/rad"), "damping": (damping, "N m s/rad"), "angle": (angle, "rad")}
+        return add(self.forces, self._torsion(name, hinge, _spring_numbers(name, numbers)))
 
     def axial_spring(
         self,
@@ -137,11 +152,11 @@ class Loads(Collection):
         """
         slide = self._joint(joint, ("prismatic",), "axial_spring")
         name = self._new_name(f"spring of {slide.name}", name)
-        law = _law(f"force of {name!r}", force, stiffness, damping or length)
-        if law is not None:
-            return self._add_force(replace(self._along(name, RAIL, slide, None), function=law))
-        given = {"stiffness": (stiffness, "N/m"), "damping": (damping, "N s/m"), "length": (length, "m")}
-        return self._add_force(self._along(name, RAIL, slide, _spring_numbers(name, given)))
+        function_of_length = _spring_function(f"force of {name!r}", force, stiffness, damping or length)
+        if function_of_length is not None:
+            return add(self.forces, replace(self._along(name, AXIAL_SPRING, slide, None), function=function_of_length))
+        numbers = {"stiffness": (stiffness, "N/m"), "damping": (damping, "N s/m"), "length": (length, "m")}
+        return add(self.forces, self._along(name, AXIAL_SPRING, slide, _spring_numbers(name, numbers)))
 
     def friction(
         self,
@@ -197,7 +212,10 @@ class Loads(Collection):
             check_positive("radius", radius)
             names, values = [*names, f"radius of {name} (m)"], [*values, float(radius)]
         numbers = Numbers(tuple(values), tuple(names))
-        return self._add_force(replace(self._along(name, BRAKE if turns else RUB, rubbed, numbers), joint=rubbed))
+        return add(
+            self.forces,
+            replace(self._along(name, HINGE_FRICTION if turns else AXIAL_FRICTION, rubbed, numbers), joint=rubbed),
+        )
 
     def dry_friction(
         self, joint: ModelJoint | str, f: float, *, static: float | None = None, name: str | None = None
@@ -221,7 +239,7 @@ class Loads(Collection):
         if most < kinetic:
             raise ValueError(f"static must be at least f = {kinetic:g}; given {static!r}")
         force = replace(self._motor(name, rubbed, "", 0.0), more=Numbers((0.0,)), joint=None)
-        self.dry.append(DryFriction(name, rubbed, kinetic, most, self._add_force(force)))
+        self.dry.append(DryFriction(name, rubbed, kinetic, most, add(self.forces, force)))
         return self.dry[-1]
 
     def force(self, body: Body | str, at: Any, f: Any, *, name: str | None = None) -> Force:
@@ -240,7 +258,7 @@ class Loads(Collection):
         name = self._new_name(f"force on {on.name}", name)
         there = self._numbers(name, on, self._point("at", at, on))
         function, more = self._function(name, f, self.dimension, "N")
-        return self._add_force(Force(name, FORCE, self.ground, on, None, there, more, function))
+        return add(self.forces, Force(name, FORCE, self.ground, on, None, there, more, function))
 
     def torque(self, body: Body | str, f: Any, *, name: str | None = None) -> Force:
         """Add a torque on a body: in the plane a number, positive from x to y; in space (3,) along the axes of space.
@@ -254,7 +272,7 @@ class Loads(Collection):
         on = self._moving_body("body", body)
         name = self._new_name(f"torque on {on.name}", name)
         function, more = self._function(name, f, 1 if self.dimension == 2 else 3, "N m")
-        return self._add_force(Force(name, TORQUE, self.ground, on, None, None, more, function))
+        return add(self.forces, Force(name, TORQUE, self.ground, on, None, None, more, function))
 
     def motor(self, joint: ModelJoint | str, f: Any, *, name: str | None = None) -> Force:
         """Add a torque in a revolute joint, or a force along a prismatic joint, on b, with its reaction on a.
@@ -267,7 +285,7 @@ class Loads(Collection):
         """
         moved = self._joint(joint, ("revolute", "prismatic"), "motor")
         name = self._new_name(f"motor of {moved.name}", name)
-        return self._add_force(self._motor(name, moved, "N m" if moved.kind == "revolute" else "N", f))
+        return add(self.forces, self._motor(name, moved, "N m" if moved.kind == "revolute" else "N", f))
 
     def drive(
         self,
@@ -303,17 +321,17 @@ class Loads(Collection):
         moved = self._joint(joint, ("revolute", "prismatic"), "drive")
         name = self._new_name(f"drive of {moved.name}", name)
         row = self._drive_row(moved, motion_function(f"motion of {name!r}", motion, rate, acceleration))
-        return self._add_joint(ModelJoint(name, "drive", moved.a, moved.b, (row,), moved.point_a, moved.point_b))
+        return add(self.joints, ModelJoint(name, "drive", moved.a, moved.b, (row,), moved.point_a, moved.point_b))
 
 
-def _law(name: str, f: Any, stiffness: Any, more: Any) -> Law | None:
+def _spring_function(name: str, f: Any, stiffness: Any, more: Any) -> SpringFunction | None:
     """Return the force or torque of a spring as a function, or None if the spring has a stiffness."""
     if (f is None) == (stiffness is None) or (f is not None and more):
         raise TypeError(
             f"give either stiffness, with damping and what is unstressed, or a function in the place of all of them: "
             f"given {name} = {shown(f)}, stiffness={shown(stiffness)}"
         )
-    return None if f is None else law_function(name, f)
+    return None if f is None else spring_function(name, f)
 
 
 def _spring_numbers(name: str, given: dict[str, tuple[Any, str]]) -> Numbers:
@@ -321,3 +339,226 @@ def _spring_numbers(name: str, given: dict[str, tuple[Any, str]]) -> Numbers:
     checks = check_not_negative, check_not_negative, check_finite
     values = tuple(check(what, value) for check, (what, (value, _)) in zip(checks, given.items(), strict=True))
     return Numbers(values, tuple(f"{what} of {name} ({unit})" for what, (_, unit) in given.items()))
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneGap:
+    """Measure the distance of a point of one body from a plane of another, m."""
+
+    body: Body
+    place: Array
+    other: Body
+    foot: Array
+    normal: Array
+
+    def __call__(self, t: Any, q: Any) -> Any:
+        """Return the distance, for numbers or symbols."""
+        plane = self.other.number
+        point, foot = point_of(q, self.body.number, self.place), point_of(q, plane, self.foot)
+        return sum(n * (x - y) for n, x, y in zip(vector_of(q, plane, self.normal), point, foot, strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneSlide(PlaneGap):
+    """Measure the displacement of a point of one body along a line of another, m."""
+
+    def __call__(self, t: Any, q: Any) -> Any:
+        """Return the displacement, for numbers or symbols."""
+        x, y = self.normal
+        return PlaneGap(self.body, self.place, self.other, self.foot, np.array([y, -x]))(t, q)
+
+
+@dataclass(frozen=True, eq=False)
+class TurnGap:
+    """Measure the angle between a planar hinge and its limit, rad."""
+
+    joint: ModelJoint
+    limit: float
+    sign: float
+
+    def __call__(self, t: Any, q: Any) -> Any:
+        """Return the remaining angle, for numbers or symbols."""
+        return self.sign * (hinge_angle(q, self.joint) - self.limit)
+
+
+def hinge_angle(q: Any, joint: ModelJoint) -> Any:
+    """Return the rotation of b relative to a in a planar joint since the position given."""
+    return angle_of(q, joint.b.number) - angle_of(q, joint.a.number) - (joint.b.rotation - joint.a.rotation)
+
+
+@documented
+class Stops(Loads):
+    """Adds stops to a model, for `twoloop.solve_with_stops`."""
+
+    def stop(
+        self,
+        body: Body | str,
+        at: Any,
+        other: Body | str,
+        foot: Any,
+        *,
+        normal: Any,
+        restitution: float = 0.0,
+        friction: float = 0.0,
+        name: str | None = None,
+    ) -> Stop:
+        """Add a plane on one body that a point of another body cannot cross.
+
+        Parameters
+        ----------
+        body : Body or str
+        at : array_like (2 or 3,) or BodyPoint
+            The point, in space in the position given, m.
+        other : Body or str
+            The body with the plane; the ground for a floor or a wall.
+        foot : array_like (2 or 3,) or BodyPoint
+            A point of the plane, m.
+        normal : array_like (2 or 3,) or BodyDirection
+            Normal of the plane, on the side of the point.
+        restitution : float
+            Coefficient of restitution, from 0 to 1.
+        friction : float
+            Coefficient of Coulomb friction; in space it must be zero.
+        """
+        body_a, body_b = self._body("body", body), self._body("other", other)
+        self._different("stop", body_a, body_b)
+        name = self._new_name("stop", name, body_a, body_b)
+        point, foot = self._point("at", at, body_a), self._point("foot", foot, body_b)
+        geometry = point, body_b, foot, self._direction("normal", normal, body_b)
+        if check_not_negative("friction", friction) and self.dimension == 3:
+            raise ValueError(f"friction of {name!r} must be zero, as stops rub in the plane only; given {friction!r}")
+        slide = PlaneSlide(body_a, *geometry) if friction else None
+        return add(self.stops, Stop(PlaneGap(body_a, *geometry), restitution, name, friction, slide))
+
+    def limit(
+        self,
+        joint: ModelJoint | str,
+        *,
+        lower: float | None = None,
+        upper: float | None = None,
+        restitution: float = 0.0,
+        name: str | None = None,
+    ) -> tuple[Stop, ...]:
+        """Add limits to a revolute joint in the plane or to a prismatic joint.
+
+        Parameters
+        ----------
+        joint : ModelJoint or str
+        lower, upper : float, optional
+            Bounds of the displacement of b on a from the position given, rad or m. None: unbounded.
+        restitution : float
+            Coefficient of restitution, from 0 to 1.
+        name : str, optional
+            Prefix of the names "lower limit" and "upper limit". None: the name of the joint.
+
+        Returns
+        -------
+        tuple of Stop
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is invalid, or no limit is given.
+        """
+        kinds = ("revolute", "prismatic") if self.dimension == 2 else ("prismatic",)
+        limited = self._joint(joint, kinds, "limit")
+        bounds = {"lower": (lower, 1.0), "upper": (upper, -1.0)}
+        if lower is None and upper is None:
+            raise ValueError(f"limit of {limited.name!r} needs lower, upper, or both")
+        if lower is not None and upper is not None and not lower < upper:
+            raise ValueError(f"lower of the limit of {limited.name!r} must be below upper; given {lower!r}, {upper!r}")
+        stops = []
+        for which, (value, sign) in bounds.items():
+            if value is not None:
+                new = self._new_name(f"{which} limit of {limited.name if name is None else name}", None)
+                gap = self._gap(limited, check_finite(which, value), sign)
+                stops.append(add(self.stops, Stop(gap, restitution, new)))
+        return tuple(stops)
+
+    def _gap(self, joint: ModelJoint, limit: float, sign: float) -> Any:
+        if joint.kind == "revolute":
+            return TurnGap(joint, limit, sign)
+        axis = self._axis(joint)
+        there = (
+            joint.b.in_space(np.array(joint.point_b.values)) if joint.b.number >= 0 else np.array(joint.point_b.values)
+        )
+        foot = joint.a.local_point(there) + limit * axis
+        return PlaneGap(joint.b, np.array(joint.point_b.values), joint.a, foot, sign * axis)
+
+    def _axis(self, joint: ModelJoint) -> Array:
+        """Return the axis of a prismatic joint in the axes of a."""
+        raise NotImplementedError
+
+
+@documented
+class Gears(Stops):
+    """Adds gears and racks to a model. Their constants are not parameters of the model."""
+
+    def gear(
+        self, one: ModelJoint | str, other: ModelJoint | str, *, ratio: float, name: str | None = None
+    ) -> ModelJoint:
+        """Couple two hinges: `other` turns by `ratio` times the rotation of `one`, from the position given.
+
+        The reaction is a torque on the bodies of `other`.
+
+        Parameters
+        ----------
+        one, other : ModelJoint or str
+            Revolute joints; the rotation is that of b relative to a. For two wheels on one carrier, a is the carrier.
+        ratio : float
+            Negative for external gears: minus the radius of `one` over that of `other`. In space a ratio of whole
+            numbers up to 1000, as of teeth, because coordinates there do not count turns.
+        """
+        first, second = self._two(one, "revolute", other, "revolute", "gear")
+        factor = check_finite("ratio", ratio)
+        if factor == 0.0:
+            raise ValueError("ratio must not be zero: the other hinge would be held; use fixed(...) for that")
+        row = self._gear_row(first, second, factor)
+        name = self._new_name(f"gear of {first.name} and {second.name}", name)
+        return self._coupled(name, "gear", second, [row], first)
+
+    def rack(
+        self, pinion: ModelJoint | str, slide: ModelJoint | str, *, radius: float, name: str | None = None
+    ) -> ModelJoint:
+        """Couple a pinion to a rack: the slide moves by `radius` times the pinion's rotation since the position given.
+
+        Parameters
+        ----------
+        pinion, slide : ModelJoint or str
+            A revolute and a prismatic joint.
+        radius : float
+            m; negative if a positive rotation moves the slide against its axis.
+        """
+        first, second = self._two(pinion, "revolute", slide, "prismatic", "rack")
+        factor = check_finite("radius", radius)
+        if factor == 0.0:
+            raise ValueError("radius must not be zero: the slide would be held; use fixed(...) for that")
+        name = self._new_name(f"rack of {first.name} and {second.name}", name)
+        return self._coupled(name, "rack", second, [self._rack_row(first, second, factor)], first)
+
+    def _gear_row(self, one: ModelJoint, other: ModelJoint, ratio: float) -> Row:
+        raise NotImplementedError
+
+    def _rack_row(self, pinion: ModelJoint, slide: ModelJoint, radius: float) -> Row:
+        raise NotImplementedError
+
+    def _two(self, one: Any, kind: str, other: Any, other_kind: str, what: str) -> tuple[ModelJoint, ModelJoint]:
+        first, second = self._joint(one, (kind,), what), self._joint(other, (other_kind,), what)
+        if first is second:
+            raise ValueError(f"a {what} needs two joints; given {first.name!r} twice")
+        return first, second
+
+    def _coupled(self, name: str, kind: str, reacting: ModelJoint, rows: list[Row], other: ModelJoint) -> ModelJoint:
+        """Add the joint whose rows are functions of the coordinates of the bodies of two joints."""
+        bodies = {reacting.a, reacting.b, other.a, other.b}
+        columns = tuple(sorted(j for body in bodies for j in body.coordinates))
+        places = listed(columns)
+        ends = reacting.a, reacting.b, reacting.point_a, reacting.point_b
+        functions = (RowFunction(f"{kind} {name!r}", row, columns) for row in rows)
+        joint_rows = tuple(JointRow(ROW_FUNCTION, 1, *ends, places, function) for function in functions)
+        return add(self.joints, ModelJoint(name, kind, *ends[:2], joint_rows, *ends[2:]))
+
+
+def listed(columns: tuple[int, ...]) -> Numbers:
+    """Return the number of columns and the columns, as tables store them."""
+    return Numbers((float(len(columns)), *map(float, columns)))

@@ -1,4 +1,4 @@
-"""Reads models from MJCF, the format of MuJoCo: bodies, hinges, slides, balls; loops closed by connect and weld."""
+"""Read models from MJCF, the format of MuJoCo: bodies, hinges, slides, balls; loops closed by connect and weld."""
 
 from __future__ import annotations
 
@@ -8,10 +8,23 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from twoloop.bodies.mjcf_geometry import Lump, Pose, geom_lump, numbers, pose_of, record_ignored, root_of
-from twoloop.bodies.mjcf_joints import FileJoint, Part, add_part, body_of
+from twoloop.bodies.file_parts import (
+    FileJoint,
+    Lump,
+    Part,
+    Pose,
+    add_part,
+    body_of,
+    geom_lump,
+    numbers,
+    pose_of,
+    record_ignored,
+    root_of,
+    tensor_of,
+    text_of,
+)
 from twoloop.bodies.parts import Body, ModelJoint
-from twoloop.bodies.spatial_model import SpatialModel
+from twoloop.bodies.spatial.model import SpatialModel
 from twoloop.checks.arguments import Array
 
 SEEN_ONLY = {"asset", "visual", "statistic", "size", "custom", "camera", "light"}  # without effect on the motion
@@ -177,7 +190,7 @@ class _Reader:
             elif each.tag == "site":
                 if "fromto" in given:
                     ends = numbers(given["fromto"], 6, f"fromto of {_called(each)}")
-                    given["pos"] = _text(0.5 * (ends[:3] + ends[3:]))
+                    given["pos"] = text_of(0.5 * (ends[:3] + ends[3:]))
                 place = pose.point(self._pose(given, _called(each)).x)
                 self.sites[each.get("name", f"site {len(self.sites)}")] = part, place
             elif each.tag in ("frame", "replicate", "attach", "composite", "flexcomp"):
@@ -252,8 +265,7 @@ class _Reader:
         if "mass" not in given:
             raise ValueError(f"{what} needs a mass")
         if "fullinertia" in given:
-            xx, yy, zz, xy, xz, yz = numbers(given["fullinertia"], 6, f"fullinertia of {what}")
-            J = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+            J = tensor_of(*numbers(given["fullinertia"], 6, f"fullinertia of {what}"))
         else:
             J = np.diag(numbers(given.get("diaginertia", ""), 3, f"diaginertia of {what}"))
         return Lump(float(given["mass"]), np.zeros(3), J).transformed(self._pose(given, what))
@@ -310,7 +322,7 @@ class _Reader:
             )
         wanted = numbers(given.get("relpose", "0 1 0 0 0 0 0"), 7, f"relpose of {_called(element)}")
         if wanted[3:].any():
-            pose = pose_of({"pos": _text(wanted[:3]), "quat": _text(wanted[3:])}, _called(element), True, "xyz")
+            pose = pose_of({"pos": text_of(wanted[:3]), "quat": text_of(wanted[3:])}, _called(element), True, "xyz")
             asked = frames[0][1].then(pose)
             off = max(np.abs(asked.x - frames[1][1].x).max(), np.abs(asked.R - frames[1][1].R).max())
             if off > AGREES:
@@ -376,7 +388,3 @@ def _merged(known: dict[str, str], own: dict[str, str]) -> dict[str, str]:
 
 def _called(element: Element) -> str:
     return f"{element.tag} {element.get('name')!r}" if element.get("name") else element.tag
-
-
-def _text(values: Array) -> str:
-    return " ".join(map(repr, values.tolist()))

@@ -1,4 +1,4 @@
-"""Writes a model as MJCF: a tree of bodies and joints, equalities that close loops, springs and tendons."""
+"""Write a model as MJCF: a tree of bodies and joints, equalities that close loops, springs and tendons."""
 
 from __future__ import annotations
 
@@ -9,14 +9,57 @@ from typing import Any
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from twoloop.bodies.mjcf_geometry import IgnoredWarning
-from twoloop.bodies.parameter_layout import PULL, RAIL, SPRING, TORSION
+from twoloop.bodies.file_parts import IgnoredWarning, text_of
+from twoloop.bodies.parameter_layout import AXIAL_SPRING, SPRING, TORSION_SPRING, ZERO_LENGTH_SPRING
 from twoloop.bodies.parts import Body, Force, ModelJoint
 from twoloop.bodies.rotation import euler_parameters
-from twoloop.bodies.spanning_tree import spanning_tree
 from twoloop.checks.arguments import check_path
+
+# kinds of joints in the order in which they enter the tree: those that cannot close a loop first
+TREE = ("prismatic", "cylindrical", "universal", "planar", "revolute", "fixed", "spherical")
+LOOP = ("spherical", "revolute", "fixed")
+
+
+def spanning_tree(model: Any) -> tuple[dict[int, tuple[Body, ModelJoint]], list[ModelJoint]]:
+    """Return the parent and joint of each body, by its number, and the joints that close loops."""
+    joints = [each for each in model.joints if each.kind != "drive"]
+    unsupported = [each for each in joints if each.kind not in TREE]
+    if unsupported:
+        raise ValueError(f"MJCF has no counterpart of {unsupported[0].name!r}, which is {unsupported[0].kind}")
+    linked = {each.number: {each.number} for each in (model.ground, *model.bodies)}
+    edges: list[ModelJoint] = []
+    loops: list[ModelJoint] = []
+    # joints to the ground first within each kind: loops are then cut between moving bodies, and branches are shorter
+    for joint in sorted(joints, key=lambda each: (TREE.index(each.kind), model.ground not in (each.a, each.b))):
+        group_a, group_b = linked[joint.a.number], linked[joint.b.number]
+        if group_a is group_b:
+            loops.append(joint)
+            continue
+        edges.append(joint)
+        group_a |= group_b
+        linked |= dict.fromkeys(group_b, group_a)
+    unsupported = [each for each in loops if each.kind not in LOOP]
+    if unsupported:
+        raise ValueError(
+            f"{unsupported[0].name!r} closes a loop, which in MJCF {' and '.join(LOOP)} joints can; it is "
+            f"{unsupported[0].kind}"
+        )
+    parents: dict[int, tuple[Body, ModelJoint]] = {}
+    roots: list[Body] = [model.ground, *model.bodies]
+    reached: set[int] = set()
+    for root in roots:
+        stack = [] if root.number in reached else [root]
+        while stack:
+            body = stack.pop()
+            reached.add(body.number)
+            for joint in edges:
+                child = joint.b if joint.a is body else joint.a if joint.b is body else None
+                if child is not None and child.number not in reached:
+                    parents[child.number] = body, joint
+                    stack.append(child)
+    return parents, loops
+
 
 HALF = 0.5  # m: distance of the two connect points that represent a hinge closing a loop
 
@@ -35,7 +78,9 @@ def write(model: Any, path: str | os.PathLike[str]) -> None:
 class _Writer:
     def __init__(self, model: Any):
         self.model = model
-        self.left_out = [f"the start velocity of {each.name!r}" for each in model.bodies if _moves(each)]
+        rates = {body.name: (body.velocity, body.angular_velocity) for body in model.bodies}
+        moving = [name for name, given in rates.items() if any(rate is not None and rate.any() for rate in given)]
+        self.left_out = [f"the start velocity of {name!r}" for name in moving]
         self.left_out += [each.name for each in model.joints if each.kind == "drive"]
         self.left_out += [each.name for each in model.stops]
         self.springs: dict[str, Force] = {}
@@ -43,14 +88,14 @@ class _Writer:
         for force in model.forces:
             if force.function is not None:
                 self.left_out.append(force.name)
-            elif force.kind in (TORSION, RAIL):
+            elif force.kind in (TORSION_SPRING, AXIAL_SPRING):
                 assert force.joint is not None
                 if force.joint.name in self.springs:
                     raise ValueError(
                         f"MJCF has one spring in a joint; {force.name!r} is the second of {force.joint.name!r}"
                     )
                 self.springs[force.joint.name] = force
-            elif force.kind in (SPRING, PULL):
+            elif force.kind in (SPRING, ZERO_LENGTH_SPRING):
                 self.tendons.append(force)
             else:
                 self.left_out.append(force.name)
@@ -60,7 +105,7 @@ class _Writer:
         """Return the root element of the whole file."""
         root = Element("mujoco", model=self.model.name)
         _add(root, "compiler", angle="radian", autolimits="true")
-        _add(root, "option", gravity=_text(self.model.gravity))
+        _add(root, "option", gravity=text_of(self.model.gravity))
         world = _add(root, "worldbody")
         elements: dict[int, Element] = {self.model.ground.number: world}
         waiting = list(self.model.bodies)
@@ -80,47 +125,37 @@ class _Writer:
 
     def _body(self, inside: Element, parent: Body, body: Body, joint: ModelJoint | None) -> Element:
         R = parent.rotation.T @ body.rotation
-        pose = {"pos": _text(parent.local_point(body.position)), "quat": _text(euler_parameters(R))}
-        made = _add(inside, "body", name=body.name, **pose)
+        pose = {"pos": text_of(parent.local_point(body.position)), "quat": text_of(euler_parameters(R))}
+        element = _add(inside, "body", name=body.name, **pose)
         mass, xx, yy, zz, xy, xz, yz = body.inertia.tolist()
-        moments = {"fullinertia": _text([xx, yy, zz, xy, xz, yz])}
-        _add(made, "inertial", pos="0 0 0", mass=repr(mass), **moments)
+        moments = {"fullinertia": text_of([xx, yy, zz, xy, xz, yz])}
+        _add(element, "inertial", pos="0 0 0", mass=repr(mass), **moments)
         if joint is None:
-            _add(made, "freejoint")
+            _add(element, "freejoint")
         else:
-            self._joint(made, body, joint)
-        return made
+            self._joint(element, body, joint)
+        return element
 
-    def _joint(self, made: Element, body: Body, joint: ModelJoint) -> None:
+    def _joint(self, element: Element, body: Body, joint: ModelJoint) -> None:
         forward = joint.b is body
-        own = np.array((joint.point_b if forward else joint.point_a).values)
-        known = {"name": joint.name, "pos": _text(own)}
+        pos = text_of((joint.point_b if forward else joint.point_a).values)
         if joint.kind == "spherical":
-            _add(made, "joint", type="ball", **known)
+            _add(element, "joint", type="ball", name=joint.name, pos=pos)
             return
-        if joint.kind == "fixed":
-            return
+        moves: list[tuple[str, Any]] = []
         if joint.kind == "universal":
-            axes = [
-                body.local_direction(end.rotation @ axis)
-                for end, axis in zip((joint.a, joint.b), joint.axes, strict=True)
-            ]
-            first, second = axes if forward else axes[::-1]
-            _add(made, "joint", type="hinge", axis=_text(first), **known)
-            _add(made, "joint", type="hinge", axis=_text(second), **{**known, "name": f"{joint.name} 2"})
-            return
-        axis = joint.axes[1 if forward else 0] * (1.0 if forward else -1.0)
-        if joint.kind in ("prismatic", "cylindrical"):
-            spring = self._stiffness(joint)
-            _add(made, "joint", type="slide", axis=_text(axis), **known, **spring)
-            known["name"] = f"{joint.name} 2"
-        if joint.kind == "planar":
-            for number, across in enumerate(np.linalg.svd(axis[None])[2][1:]):
-                name = joint.name if number == 0 else f"{joint.name} 2"
-                _add(made, "joint", type="slide", axis=_text(across), **{**known, "name": name})
-            known["name"] = f"{joint.name} 3"
-        if joint.kind != "prismatic":
-            _add(made, "joint", type="hinge", axis=_text(axis), **known, **self._stiffness(joint))
+            ends = zip((joint.a, joint.b), joint.axes, strict=True)
+            axes = [body.local_direction(end.rotation @ axis) for end, axis in ends]
+            moves = [("hinge", axis) for axis in (axes if forward else axes[::-1])]
+        elif joint.kind != "fixed":
+            axis = joint.axes[1 if forward else 0] * (1.0 if forward else -1.0)
+            moves += [("slide", axis)] if joint.kind in ("prismatic", "cylindrical") else []
+            moves += [("slide", across) for across in np.linalg.svd(axis[None])[2][1:] if joint.kind == "planar"]
+            moves += [("hinge", axis)] if joint.kind != "prismatic" else []
+        spring = self._stiffness(joint)
+        for number, (kind, axis) in enumerate(moves, 1):
+            name = joint.name if number == 1 else f"{joint.name} {number}"
+            _add(element, "joint", type=kind, axis=text_of(axis), name=name, pos=pos, **spring)
 
     def _stiffness(self, joint: ModelJoint) -> dict[str, str]:
         force = self.springs.get(joint.name)
@@ -134,19 +169,19 @@ class _Writer:
             raise ValueError(
                 f"the spring {self.springs[joint.name].name!r} is in a joint that closes a loop: MJCF has none there"
             )
-        one, other = (joint.b, joint.a) if joint.a is self.model.ground else (joint.a, joint.b)
-        ends = {"body1": one.name, **({} if other is self.model.ground else {"body2": other.name})}
-        place = np.array((joint.point_a if one is joint.a else joint.point_b).values)
+        body_1, body_2 = (joint.b, joint.a) if joint.a is self.model.ground else (joint.a, joint.b)
+        ends = {"body1": body_1.name, **({} if body_2 is self.model.ground else {"body2": body_2.name})}
+        point = np.array((joint.point_a if body_1 is joint.a else joint.point_b).values)
         if joint.kind == "fixed":
             _add(equality, "weld", name=joint.name, **ends)
             return
         if joint.kind == "spherical":
-            _add(equality, "connect", name=joint.name, anchor=_text(place), **ends)
+            _add(equality, "connect", name=joint.name, anchor=text_of(point), **ends)
             return
-        axis = joint.axes[0 if one is joint.a else 1]
+        axis = joint.axes[0 if body_1 is joint.a else 1]
         for number, side in enumerate((-HALF, HALF)):
             name = joint.name if number == 0 else f"{joint.name} 2"
-            _add(equality, "connect", name=name, anchor=_text(place + side * axis), **ends)
+            _add(equality, "connect", name=name, anchor=text_of(point + side * axis), **ends)
 
     def _tendons(self, root: Element, elements: dict[int, Element]) -> None:
         if not self.tendons:
@@ -156,20 +191,12 @@ class _Writer:
             assert force.on_first is not None and force.on_second is not None and force.more is not None
             ends = {force.first: force.on_first, force.second: force.on_second}
             for body, point in ends.items():
-                _add(elements[body.number], "site", name=f"{force.name} on {body.name}", pos=_text(point.values))
+                _add(elements[body.number], "site", name=f"{force.name} on {body.name}", pos=text_of(point.values))
             stiffness, damping, length = force.more.values if force.kind == SPRING else (*force.more.values, 0.0, 0.0)
             values = {"stiffness": repr(stiffness), "damping": repr(damping), "springlength": repr(length)}
             spatial = _add(tendons, "spatial", name=force.name, **values)
             for body in ends:
                 _add(spatial, "site", site=f"{force.name} on {body.name}")
-
-
-def _moves(body: Body) -> bool:
-    return any(each is not None and each.any() for each in (body.velocity, body.angular_velocity))
-
-
-def _text(values: ArrayLike) -> str:
-    return " ".join(map(repr, np.asarray(values, dtype=float).tolist()))
 
 
 def _add(inside: Element, tag: str, **attributes: str) -> Element:

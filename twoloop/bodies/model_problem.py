@@ -1,19 +1,29 @@
-"""An assembled model: a problem with named parameters, which can be reassembled with other values."""
+"""Assemble a model to a problem with named parameters, which can be reassembled with other values."""
 
 from __future__ import annotations
 
+import copy
 import pickle
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field, replace
+from typing import Any
 
-from twoloop.bodies.assembly import Freedom
-from twoloop.checks.arguments import check_finite
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.bodies import assembly
+from twoloop.bodies.assembly import Freedom, note_of
+from twoloop.bodies.drawings import drawing_of
+from twoloop.bodies.energy import ModelEnergy
+from twoloop.bodies.functions import motion_function
+from twoloop.bodies.loads import Gears
+from twoloop.bodies.parts import Body, DryFriction, ModelJoint, Numbers
+from twoloop.bodies.system import check_forces, check_loads, joints_of, system_of
+from twoloop.bodies.tables import Tables
+from twoloop.checks.arguments import Array, check_finite, check_positive, check_span, check_text, shown
 from twoloop.problem.description import Stop
 from twoloop.problem.problem import Problem
-
-if TYPE_CHECKING:
-    from twoloop.bodies.model import Model
+from twoloop.problem.system import ConstrainedSystem
 
 
 @dataclass(frozen=True)
@@ -85,7 +95,7 @@ class ModelProblem(Problem):
                 f"{self.name!r} came from another process without its model, whose functions cannot travel: make it "
                 "again, or give them names at the top level of a module"
             )
-        return self.model.put_together(self.t_span, self.name, self.keep, values, self.q0)
+        return self.model.assemble(self.t_span, self.name, self.keep, values, self.q0)
 
     def __getstate__(self) -> dict[str, Any]:
         state = dict(vars(self))
@@ -96,14 +106,220 @@ class ModelProblem(Problem):
         return state
 
     def _known(self, name: Any) -> tuple[str, int]:
-        for place, known in enumerate(self.parameters):
-            if name in (known, known.rpartition(" (")[0]):
-                return known, place
+        for place, full_name in enumerate(self.parameters):
+            if name in (full_name, full_name.rpartition(" (")[0]):
+                return full_name, place
         words = str(name).split()
-        near = [known for known in self.parameters if words and words[-1] in known.split()]
+        near = [full_name for full_name in self.parameters if words and words[-1] in full_name.split()]
         raise ValueError(f"{self.name!r} has no parameter {name!r}; it has {_listed(near or list(self.parameters))}")
 
 
 def _listed(names: Sequence[str]) -> str:
     shown = ", ".join(map(repr, names[:6]))
     return shown if len(names) <= 6 else f"{shown} and {len(names) - 6} more: see problem.parameters"
+
+
+class Model(Gears):
+    """Assemble models, in the plane and in space."""
+
+    coordinate_names: tuple[str, ...]
+
+    def problem(
+        self, t_span: tuple[float, float] = (0.0, 10.0), *, name: str | None = None, keep: Sequence[Body | str] = ()
+    ) -> ModelProblem:
+        """Assemble the model.
+
+        Bodies whose poses do not quite fit are moved as little as possible until all joints close. Velocities given
+        with the bodies are kept; the others minimise the kinetic energy subject to the joints and drives.
+
+        Parameters
+        ----------
+        t_span : (float, float)
+            Start and end, s.
+        name : str, optional
+            None: the name of the model.
+        keep : sequence of Body or str
+            Bodies that must not move during the assembly.
+
+        Returns
+        -------
+        ModelProblem
+            The system, a consistent initial state, energy, joints, drawing, names of coordinates and `freedom`.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the model has no bodies, a joint cannot close (the message names it), or the velocities given violate the
+            constraints.
+        """
+        span = check_span(t_span)
+        name = self.name if name is None else check_text("name", name)
+        if isinstance(keep, (str, Body)):
+            keep = (keep,)
+        if not isinstance(keep, (tuple, list)):
+            raise TypeError(f"keep must be a list of bodies, or of their names; given {shown(keep)}")
+        kept = tuple(j for each in keep for j in self._moving_body("keep", each).coordinates)
+        return self.assemble(span, name, kept, None, None)
+
+    def assemble(
+        self,
+        t_span: tuple[float, float],
+        name: str,
+        keep: tuple[int, ...],
+        values: Mapping[str, float] | None,
+        guess: Array | None,
+    ) -> ModelProblem:
+        """Assemble the model with other parameter values and a guess of the positions; see `problem`."""
+        if not self.bodies:
+            raise ValueError(f"{self.name!r} has no bodies: add some with body(...) before problem()")
+        tables = self._tables(self.joints, values)
+        tables.check()
+        for numbers in self.taken:
+            if tables.of(numbers).tolist() != list(numbers.values):
+                raise ValueError(f"{numbers.names[0]} cannot change, as a rack or a limit has it: make the model anew")
+        self._check_inertias(tables)
+        start = self._start() if guess is None else guess
+        start_state = t_span[0], start, np.zeros_like(start)
+        system = system_of(self.dimension, tables, joints_of(tables), name, start_state)
+        coordinates = tuple(f"{each} of {body.name}" for body in self.bodies for each in self.coordinate_names)
+        driveless, joints = tables, [joint for joint in self.joints if joint.kind != "drive"]
+        if len(joints) < len(self.joints):
+            driveless = self._tables(joints, values)
+        still = system
+        if driveless is not tables:
+            still = system_of(self.dimension, driveless, joints_of(driveless), name, start_state)
+        closed = q = assembly.positions(still, t_span[0], start, self._turning(), keep, driveless.rows, coordinates)
+        if driveless is not tables:
+            q = assembly.follow_drives(system, t_span[0], q, keep)
+        self._check_branches(t_span[0], q)
+        given, is_given = self._velocities(q)
+        v = assembly.velocities(system, t_span[0], q, given, is_given, coordinates)
+        check_forces(tables, t_span[0], q, v)
+        freedom = assembly.freedom(system, t_span[0], q, tables.rows)
+        check_loads(tables, freedom.redundant, system.force(t_span[0], q, v))
+        return ModelProblem(
+            name=name,
+            system=system,
+            q0=q,
+            v0=v,
+            t_span=t_span,
+            energy=ModelEnergy(tables.p.copy(), self.dimension),
+            parameters=tables.values,
+            note=note_of(self, tables, freedom, closed if guess is not None else start, closed, q, coordinates),
+            conserved=tables.conserve and not self.dry,
+            tags=self._tags(freedom),
+            coordinates=coordinates,
+            drawing=drawing_of(tables),
+            model=self._copy(),
+            keep=keep,
+            freedom=freedom,
+            stops=tuple(self.stops),
+        )
+
+    def mode(
+        self,
+        name: str,
+        values: Mapping[str, float],
+        friction: Mapping[str, float],
+        held: Mapping[str, float],
+        t: float,
+        q: Array,
+    ) -> tuple[ConstrainedSystem, dict[str, tuple[int, ...]]]:
+        """Return the system with given dry friction forces and sticking joints, and the rows of the latter.
+
+        `friction` and `held` have, by the names of the dry frictions, their forces, and the displacements of b on a at
+        which joints stick. NaN: the displacement equals t, which makes a gauge of the row.
+        """
+        copied = self._copy()
+        for rub in self.dry:
+            if rub.name in friction:
+                number = Numbers((friction[rub.name],))
+                copied.forces[self.forces.index(rub.force)] = replace(rub.force, more=number)
+            if rub.name in held:
+                at, joint = held[rub.name], rub.joint
+                motion = motion_function(rub.name, (lambda t: t) if np.isnan(at) else lambda t, at=at: at, None, None)
+                points = joint.point_a, joint.point_b
+                row = self._drive_row(joint, motion)
+                copied.joints.append(ModelJoint(f"{rub.name} sticks", "drive", joint.a, joint.b, (row,), *points))
+        tables = copied._tables(copied.joints, values)
+        system = system_of(self.dimension, tables, joints_of(tables), name, (t, q, np.zeros_like(q)))
+        return system, {name: tables.rows[f"{name} sticks"] for name in held}
+
+    def pull(self, rub: DryFriction, values: Mapping[str, float]) -> ConstrainedSystem:
+        """Return a system whose only force is unit friction in the joint: its slip as a function of the coordinates."""
+        copied = self._copy()
+        copied.gravity, copied.forces = np.zeros(self.dimension), [replace(rub.force, more=Numbers((1.0,)))]
+        places = {name: value for name, value in values.items() if not name.startswith("gravity")}
+        tables, rest = copied._tables([], places), np.zeros_like(self._start())
+        return system_of(self.dimension, tables, [], rub.name, (0.0, self._start(), rest))
+
+    def _tables(self, joints: Sequence[ModelJoint], values: Mapping[str, float] | None) -> Tables:
+        """Return the tables of the model restricted to some joints, with other parameter values."""
+        tables = Tables(self.gravity, self.bodies, joints, self.forces, self._first_row())
+        tables.replaced(values or {})
+        return tables
+
+    def _copy(self) -> Model:
+        """Return a copy that later additions to the model do not change."""
+        copied = copy.copy(self)
+        copied.bodies, copied.joints, copied.forces = list(self.bodies), list(self.joints), list(self.forces)
+        copied.stops, copied.dry, copied.taken = list(self.stops), list(self.dry), list(self.taken)
+        return copied
+
+    def _turning(self) -> NDArray[np.bool_]:
+        """Return which coordinates are rotations, (n_q,)."""
+        return np.tile(np.arange(len(self.coordinate_names)) >= self.dimension, len(self.bodies))
+
+    def _first_row(self) -> int:
+        """Return the number of rows before those of the joints."""
+        return 0
+
+    def _check_inertias(self, tables: Tables) -> None:
+        for body in self.bodies:
+            place = tables.places[f"mass of {body.name} (kg)"]
+            check_positive(f"mass of {body.name}", float(tables.p[place]))
+            self._check_moments(body.name, tables.p[place + 1 : place + len(body.inertia)])
+
+    def _check_moments(self, name: str, moments: Array) -> None:
+        raise NotImplementedError
+
+    def _check_branches(self, t: float, q: Array) -> None:
+        """Raise if a drive starts half a turn away from its value, or a gear at another tooth."""
+
+    def _start(self) -> Array:
+        """Return the coordinates in the position given, (n_q,)."""
+        raise NotImplementedError
+
+    def _velocities(self, q: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Return the velocities given, (n_q,), and a mask of those that are given."""
+        given = np.full((len(self.bodies), len(self.coordinate_names)), np.nan)
+        for row, body, state in zip(given, self.bodies, q.reshape(given.shape), strict=True):
+            if body.velocity is not None:
+                row[: self.dimension] = body.velocity
+            if body.angular_velocity is not None:
+                row[self.dimension :] = self._turning_rates(state, body.angular_velocity)
+        is_given = np.isfinite(given.ravel())
+        return np.where(is_given, given.ravel(), 0.0), is_given
+
+    def _turning_rates(self, state: Array, spin: Array) -> Array:
+        """Return the rates of the rotational coordinates of a body with a given angular velocity."""
+        return spin
+
+    def _tags(self, freedom: assembly.Freedom) -> tuple[str, ...]:
+        closed = False
+        linked = {body.number: {body.number} for body in (self.ground, *self.bodies)}
+        for joint in self.joints:
+            if joint.kind != "drive":
+                group_a, group_b = linked[joint.a.number], linked[joint.b.number]
+                closed |= group_a is group_b
+                group_a |= group_b
+                linked |= dict.fromkeys(group_b, group_a)
+        tags = {
+            "closed chain" if closed else "open chain": True,
+            "rigid": True,
+            "planar" if self.dimension == 2 else "spatial": True,
+            "driven": any(joint.kind == "drive" for joint in self.joints),
+            "redundant": bool(freedom.redundant),
+            "singular": freedom.singular > 0,
+        }
+        return tuple(tag for tag, holds in tags.items() if holds)

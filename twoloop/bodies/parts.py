@@ -1,4 +1,4 @@
-"""Parts of a model: bodies, points on them, joints, forces, and their numbers."""
+"""Describe the parts of a model: bodies, points on them, joints, forces, and their numbers."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.bodies.functions import Function
+from twoloop.bodies.functions import Function, RowFunction
 from twoloop.bodies.parameter_layout import NONE
-from twoloop.bodies.row_function import RowFunction
 from twoloop.checks.arguments import Array, check_vector
 
 ROUNDING = 4.0 * np.finfo(np.float64).eps

@@ -1,4 +1,4 @@
-"""Parameter vector of a model: named numbers, tables of joints and forces, programs; see `parameter_layout`."""
+"""Write the parameter vector of a model, see `parameter_layout`: numbers, tables of joints and forces, programs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,19 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from twoloop.bodies.functions import is_constant, program_for
-from twoloop.bodies.parameter_layout import AXIAL, BRAKE, NONE, PULL, RAIL, RATE, RUB, SLIDE, SPRING, TORQUE, TORSION
+from twoloop.bodies.parameter_layout import (
+    AXIAL_FORCE,
+    AXIAL_FRICTION,
+    AXIAL_SPRING,
+    AXIAL_TORQUE,
+    HINGE_FRICTION,
+    NONE,
+    RATE_FUNCTION,
+    SPRING,
+    TORQUE,
+    TORSION_SPRING,
+    ZERO_LENGTH_SPRING,
+)
 from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
 from twoloop.checks.arguments import Array, check_not_negative, check_positive
 from twoloop.generate.graph import Untraceable
@@ -20,14 +32,7 @@ TENSOR = [0, 3, 4, 3, 1, 5, 4, 5, 2]  # indices of the entries of the inertia te
 
 
 class Tables:
-    """All numbers of a model in one vector.
-
-    Parameters
-    ----------
-    gravity : ndarray (2 or 3,)
-    bodies, joints, forces : sequence
-    first_row : int
-        Number of rows before those of the joints.
+    """Collect all numbers of a model in one vector.
 
     Attributes
     ----------
@@ -53,7 +58,11 @@ class Tables:
         first_row: int,
     ):
         self.gravity, self.bodies, self.joints, self.forces = gravity, bodies, joints, forces
-        self.loaded = [each for each in forces if each.kind in (BRAKE, RUB) and each.more and len(each.more.values) > 2]
+        self.loaded = [
+            each
+            for each in forces
+            if each.kind in (HINGE_FRICTION, AXIAL_FRICTION) and each.more and len(each.more.values) > 2
+        ]
         self.places: dict[str, int] = {}
         self._values: list[float] = []
         self._constants: list[float] = []
@@ -92,11 +101,11 @@ class Tables:
         """Return True if the model conserves energy: no damper, force, torque, motor, or moving drive."""
         for force in self.forces:
             numbers = np.zeros(0) if force.more is None else self.of(force.more)
-            if force.kind in (SPRING, TORSION, RAIL):
+            if force.kind in (SPRING, TORSION_SPRING, AXIAL_SPRING):
                 numbers = numbers[1:2]  # the damping
-            elif force.kind in (BRAKE, RUB):
+            elif force.kind in (HINGE_FRICTION, AXIAL_FRICTION):
                 numbers = numbers[[0, *range(2, len(numbers))]]
-            if force.function is not None or (force.kind != PULL and numbers.any()):
+            if force.function is not None or (force.kind != ZERO_LENGTH_SPRING and numbers.any()):
                 return False
         return all(is_constant(motion) for motion in self.motions)
 
@@ -104,8 +113,8 @@ class Tables:
         """Raise if a number has a wrong sign."""
         parts: list[Force | JointRow] = [*self.forces, *(row for joint in self.joints for row in joint.rows)]
         for part in parts:
-            rubs = isinstance(part, Force) and part.kind in (BRAKE, RUB)
-            rail = isinstance(part, Force) and part.kind == RAIL
+            rubs = isinstance(part, Force) and part.kind in (HINGE_FRICTION, AXIAL_FRICTION)
+            rail = isinstance(part, Force) and part.kind == AXIAL_SPRING
             numbers = part.more or Numbers(())
             for name, value in zip(numbers.names, self.of(numbers).tolist() if numbers.names else (), strict=True):
                 what = name.split(" of ")[0]
@@ -155,7 +164,7 @@ class Tables:
         for joint in self.joints:
             numbered: list[int] = []
             for part in joint.rows:
-                of_rates = part.kind == RATE
+                of_rates = part.kind == RATE_FUNCTION
                 number = self.n_rates if of_rates else row
                 table += self._joint_row(part, number, NONE if part.motion is None else motion)
                 motion += 0 if part.motion is None else part.motion.n_results
@@ -173,8 +182,12 @@ class Tables:
             table += (self._at(force.more), NONE if function is None else result, self._at(force.point_on_first))
             result += 0 if function is None else function.size
         for force in self.loaded:
-            turns = TORQUE if len(self.gravity) == 2 else AXIAL
-            table += (turns if force.kind == BRAKE else SLIDE, force.first.number, self._at(force.on_first))
+            turns = TORQUE if len(self.gravity) == 2 else AXIAL_TORQUE
+            table += (
+                turns if force.kind == HINGE_FRICTION else AXIAL_FORCE,
+                force.first.number,
+                self._at(force.on_first),
+            )
             table += (force.second.number, self._at(force.on_second), self._at(self._unit), NONE, NONE)
         self.n_rows, self.untraced = row, ""
         programs: list[list[float]] = []

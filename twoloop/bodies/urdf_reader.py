@@ -1,4 +1,4 @@
-"""Reads models from URDF, the robot description format: a tree of links and joints; loops are given separately."""
+"""Read models from URDF, the robot description format: a tree of links and joints; loops are given separately."""
 
 from __future__ import annotations
 
@@ -11,10 +11,22 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import ArrayLike
 
-from twoloop.bodies.mjcf_geometry import Lump, Pose, numbers, pose_of, record_ignored, root_of
-from twoloop.bodies.mjcf_joints import FileJoint, Part, add_part, body_of
+from twoloop.bodies.file_parts import (
+    FileJoint,
+    Lump,
+    Part,
+    Pose,
+    add_part,
+    body_of,
+    numbers,
+    pose_of,
+    record_ignored,
+    root_of,
+    tensor_of,
+    text_of,
+)
 from twoloop.bodies.parts import Body
-from twoloop.bodies.spatial_model import SpatialModel
+from twoloop.bodies.spatial.model import SpatialModel
 from twoloop.checks.arguments import Array, check_choice, check_finite, check_flag, check_vector
 
 KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "floating": "free", "fixed": ""}
@@ -266,7 +278,7 @@ class _Reader:
         if kind == "prismatic":
             pose = pose.then(Pose(value * axis, np.eye(3)))
         elif kind != "floating":
-            turn = {"axisangle": " ".join(map(repr, [*axis.tolist(), value]))}
+            turn = {"axisangle": text_of([*axis, value])}
             pose = pose.then(pose_of(turn, f"joint {name!r}", False, "XYZ"))
         part = Part(child, parent, pose, [moved])
         self._link(child, part, pose)
@@ -284,11 +296,8 @@ class _Reader:
         mass, inertia = inertial.find("mass"), inertial.find("inertia")
         if mass is None or inertia is None:
             raise ValueError(f"{what} needs <mass> and <inertia>")
-        keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-        xx, xy, xz, yy, yz, zz = numbers(
-            " ".join(inertia.get(key, "0") for key in keys), 6, f"inertia of link {name!r}"
-        )
-        J = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        entries = " ".join(inertia.get(key, "0") for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
+        J = tensor_of(*numbers(entries, 6, f"inertia of link {name!r}"))
         (value,) = numbers(mass.get("value", ""), 1, f"mass of link {name!r}")
         part.lumps.append(Lump(float(value), np.zeros(3), J).transformed(pose.then(_origin(inertial, what))))
 
@@ -306,8 +315,8 @@ def _origin(element: Element, what: str) -> Pose:
     given = {} if origin is None else origin.attrib
     if "quat_xyzw" in given:
         raise ValueError(f"{what} has quat_xyzw, which is not read: give rpy")
-    turns = numbers(given.get("rpy", "0 0 0"), 3, f"rpy of {what}").tolist()
-    return pose_of({"pos": given.get("xyz", "0 0 0"), "euler": " ".join(map(repr, turns))}, what, False, "XYZ")
+    turns = text_of(numbers(given.get("rpy", "0 0 0"), 3, f"rpy of {what}"))
+    return pose_of({"pos": given.get("xyz", "0 0 0"), "euler": turns}, what, False, "XYZ")
 
 
 def _direction(body: Body, direction: Array) -> Any:

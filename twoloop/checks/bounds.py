@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 OWN = {
     *("twoloop.checks.bounds", "twoloop.generate.graph", "twoloop.generate.trace"),
-    *("twoloop.generate.parameter_expressions", "twoloop.bodies.model_system"),
+    *("twoloop.generate.parameter_expressions", "twoloop.bodies.system"),
 }
 MANY = 4096  # parameters that a callback may ask for beyond those that it has, for telling which array is too short
 

@@ -1,1 +1,1 @@
-"""Impacts with restitution on stops, rest in contact, and dry friction."""
+"""Integrate impacts with restitution on stops, rest in contact, and dry friction."""

@@ -34,7 +34,7 @@ SLIDING_TOLERANCE = 1e-9  # relative to the terms of an acceleration: smaller ac
 
 
 class Undetermined(ValueError):
-    """No admissible distribution of the load among sticking joints and stops was found."""
+    """Report that no admissible distribution of the load among sticking joints and stops was found."""
 
 
 class Tangents(NamedTuple):

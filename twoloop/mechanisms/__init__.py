@@ -1,4 +1,4 @@
-"""Ready problems, each with its invariants and, where one exists, a reference.
+"""Provide ready problems, each with its invariants and, where one exists, a reference.
 
 A mechanism is imported on first access, because its first import compiles its callbacks.
 """

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from twoloop.bodies.points import LinearPoints
+from twoloop.bodies.frames import LinearPoints
 from twoloop.checks.arguments import check_number, check_positive, check_size
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.kernels.data.common import compiled

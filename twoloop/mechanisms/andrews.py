@@ -1,4 +1,4 @@
-"""Andrews' squeezing mechanism: seven bodies in a plane, three loops, driven by a constant torque.
+"""Define Andrews' squeezing mechanism: seven bodies in a plane, three loops, driven by a constant torque.
 
 Equations in the seven angles beta, Theta, gamma, Phi, delta, Omega, epsilon as in Hairer & Wanner, Solving Ordinary
 Differential Equations II, Sect. VII.7, and in the Test Set for IVP Solvers, "andrews". IFToMM's A03.

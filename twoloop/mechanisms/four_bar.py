@@ -1,4 +1,4 @@
-"""The planar four-bar linkage of Sect. 4.1: nine coordinates, eight constraints, one degree of freedom.
+"""Define the planar four-bar linkage of Sect. 4.1: nine coordinates, eight constraints, one degree of freedom.
 
 Coordinates [x1 y1 th1 x2 y2 th2 x3 y3 th3]: the centres and angles of three uniform rods that form a chain from the
 ground joint O = (0, 0) via the joints 1-2 and 2-3 to the ground joint A = (L, 0). All angles are measured from the x
@@ -10,7 +10,8 @@ from numbers import Real
 
 import numpy as np
 
-from twoloop.bodies.points import GROUND, BodyPoints, PlanarEnergy
+from twoloop.bodies.energy import PlanarEnergy
+from twoloop.bodies.frames import GROUND, BodyPoints
 from twoloop.checks.arguments import check_finite, check_vector
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.problem.callbacks import callbacks_in

@@ -1,4 +1,4 @@
-"""A knife edge on an inclined plane: one non-holonomic row, with a closed-form solution.
+"""Define a knife edge on an inclined plane: one non-holonomic row, with a closed-form solution.
 
 Bloch, Nonholonomic Mechanics and Control (2003), Sect. 1.6. x points down the slope, phi is the angle of the blade.
 """
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.bodies.points import BodyPoints
+from twoloop.bodies.frames import BodyPoints
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.problem.callbacks import callbacks_in
 from twoloop.problem.description import Drawing, Joint

@@ -1,7 +1,7 @@
-"""IFToMM's A02, the N-four-bar mechanism: N windows, 2N + 1 uniform bars of 1 m and 1 kg, cranks upright at the start.
+"""Define IFToMM's A02, the N-four-bar mechanism: N windows, 2N + 1 uniform bars of 1 m and 1 kg.
 
-The rank of C_q drops by N whenever the cranks lie on the ground line, where N + 1 branches of motion meet; on the
-synchronous branch all couplers stay level.
+The cranks are upright at the start. The rank of C_q drops by N whenever the cranks lie on the ground line, where N + 1
+branches of motion meet. On the synchronous branch all couplers stay level.
 """
 
 import math

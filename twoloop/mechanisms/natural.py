@@ -7,7 +7,7 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import ellipj, ellipk
 
-from twoloop.bodies.points import box
+from twoloop.bodies.drawings import box
 from twoloop.checks.arguments import check_finite, check_size
 from twoloop.mechanisms.quadratic import ONE, QuadraticSystem, Scalar, difference, fixed, point
 from twoloop.mechanisms.registry import ready

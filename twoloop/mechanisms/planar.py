@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.bodies.planar_places import motion, place_on
-from twoloop.bodies.points import PlanarEnergy, Sketch
-from twoloop.kernels.compile.caches import helper
+from twoloop.bodies.drawings import Sketch
+from twoloop.bodies.energy import PlanarEnergy
+from twoloop.bodies.planar.frames import add, motion, place
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.problem.callbacks import LARGE, callbacks_in
 from twoloop.problem.description import Drawing, Joint, unused_name
@@ -30,15 +30,6 @@ DISTANCE = 1.0  # half the squared distance of the points is `value`: one row
 COORDINATE = 2.0  # q[i] = ax + ay t + bx sin(by t): one row
 N_NUMBERS = 9  # of a joint
 GROUND = -1
-
-
-@helper
-def add_row(Cq, row, body, fx, fy, dx, dy):
-    """Add to a row the derivative of fx x + fy y of a point with respect to the coordinates of its body."""
-    if body >= 0:
-        Cq[row, 3 * body] += fx
-        Cq[row, 3 * body + 1] += fy
-        Cq[row, 3 * body + 2] += fx * dx + fy * dy
 
 
 @callback("mass")
@@ -62,8 +53,8 @@ def constraint(t, q, p, C):
         if p[k] == COORDINATE:
             C[row] = q[i] - p[k + 3] - p[k + 4] * t - p[k + 6] * math.sin(p[k + 7] * t)
             continue
-        ax, ay, _, _ = place_on(q, i, p[k + 3], p[k + 4])
-        bx, by, _, _ = place_on(q, j, p[k + 6], p[k + 7])
+        ax, ay, _, _ = place(q, i, p, k + 3)
+        bx, by, _, _ = place(q, j, p, k + 6)
         if p[k] == PIN:
             C[row], C[row + 1] = ax - bx, ay - by
         else:
@@ -78,16 +69,16 @@ def jacobian(t, q, p, Cq):
         if p[k] == COORDINATE:
             Cq[row, i] = 1.0
             continue
-        ax, ay, adx, ady = place_on(q, i, p[k + 3], p[k + 4])
-        bx, by, bdx, bdy = place_on(q, j, p[k + 6], p[k + 7])
+        ax, ay, adx, ady = place(q, i, p, k + 3)
+        bx, by, bdx, bdy = place(q, j, p, k + 6)
         if p[k] == PIN:
-            add_row(Cq, row, i, 1.0, 0.0, adx, ady)
-            add_row(Cq, row, j, -1.0, 0.0, bdx, bdy)
-            add_row(Cq, row + 1, i, 0.0, 1.0, adx, ady)
-            add_row(Cq, row + 1, j, 0.0, -1.0, bdx, bdy)
+            add(Cq[row], i, 1.0, 0.0, adx, ady)
+            add(Cq[row], j, -1.0, 0.0, bdx, bdy)
+            add(Cq[row + 1], i, 0.0, 1.0, adx, ady)
+            add(Cq[row + 1], j, 0.0, -1.0, bdx, bdy)
         else:
-            add_row(Cq, row, i, ax - bx, ay - by, adx, ady)
-            add_row(Cq, row, j, bx - ax, by - ay, bdx, bdy)
+            add(Cq[row], i, ax - bx, ay - by, adx, ady)
+            add(Cq[row], j, bx - ax, by - ay, bdx, bdy)
 
 
 @callback("constraint_rate")
@@ -106,8 +97,8 @@ def gamma(t, q, v, p, Qd):
         if p[k] == COORDINATE:
             Qd[row] = -p[k + 6] * p[k + 7] ** 2 * math.sin(p[k + 7] * t)
             continue
-        ax, ay, adx, ady = place_on(q, i, p[k + 3], p[k + 4])
-        bx, by, bdx, bdy = place_on(q, j, p[k + 6], p[k + 7])
+        ax, ay, adx, ady = place(q, i, p, k + 3)
+        bx, by, bdx, bdy = place(q, j, p, k + 6)
         au, av, aa, ab = motion(v, i, adx, ady)
         bu, bv, ba, bb = motion(v, j, bdx, bdy)
         if p[k] == PIN:
@@ -128,21 +119,21 @@ def kinematics(t, q, v, p, C, Cq, Ct, Qd):
             Ct[row] = -p[k + 4] - p[k + 6] * frequency * c
             Qd[row] = -p[k + 6] * frequency**2 * s
             continue
-        ax, ay, adx, ady = place_on(q, i, p[k + 3], p[k + 4])
-        bx, by, bdx, bdy = place_on(q, j, p[k + 6], p[k + 7])
+        ax, ay, adx, ady = place(q, i, p, k + 3)
+        bx, by, bdx, bdy = place(q, j, p, k + 6)
         au, av, aa, ab = motion(v, i, adx, ady)
         bu, bv, ba, bb = motion(v, j, bdx, bdy)
         if p[k] == PIN:
             C[row], C[row + 1] = ax - bx, ay - by
-            add_row(Cq, row, i, 1.0, 0.0, adx, ady)
-            add_row(Cq, row, j, -1.0, 0.0, bdx, bdy)
-            add_row(Cq, row + 1, i, 0.0, 1.0, adx, ady)
-            add_row(Cq, row + 1, j, 0.0, -1.0, bdx, bdy)
+            add(Cq[row], i, 1.0, 0.0, adx, ady)
+            add(Cq[row], j, -1.0, 0.0, bdx, bdy)
+            add(Cq[row + 1], i, 0.0, 1.0, adx, ady)
+            add(Cq[row + 1], j, 0.0, -1.0, bdx, bdy)
             Qd[row], Qd[row + 1] = ba - aa, bb - ab
         else:
             C[row] = 0.5 * ((ax - bx) ** 2 + (ay - by) ** 2) - p[k + 8]
-            add_row(Cq, row, i, ax - bx, ay - by, adx, ady)
-            add_row(Cq, row, j, bx - ax, by - ay, bdx, bdy)
+            add(Cq[row], i, ax - bx, ay - by, adx, ady)
+            add(Cq[row], j, bx - ax, by - ay, bdx, bdy)
             Qd[row] = (bu - au) * (au - bu) + (bv - av) * (av - bv) + (ax - bx) * (ba - aa) + (ay - by) * (bb - ab)
 
 
@@ -162,8 +153,8 @@ def jacobian_values(t, q, p, values):
             values[index] = 1.0
             index += 1
             continue
-        ax, ay, adx, ady = place_on(q, i, p[k + 3], p[k + 4])
-        bx, by, bdx, bdy = place_on(q, j, p[k + 6], p[k + 7])
+        ax, ay, adx, ady = place(q, i, p, k + 3)
+        bx, by, bdx, bdy = place(q, j, p, k + 6)
         fx, fy = ax - bx, ay - by
         for body, sign, dx, dy in ((i, 1.0, adx, ady), (j, -1.0, bdx, bdy)):
             if body < 0:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.bodies.points import LinearPoints
+from twoloop.bodies.frames import LinearPoints
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.problem.callbacks import callbacks_in

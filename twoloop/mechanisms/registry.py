@@ -22,7 +22,7 @@ from twoloop.checks.arguments import Array
 from twoloop.problem.problem import Problem, Reference
 
 if TYPE_CHECKING:
-    from twoloop.bodies.model import Model
+    from twoloop.bodies.model_problem import Model
 
 REFERENCES = Path(__file__).with_name("references.json")
 

@@ -1,4 +1,4 @@
-"""A thin disc rolling without slipping on a horizontal plane: one holonomic and two non-holonomic rows.
+"""Define a thin disc rolling without slipping on a horizontal plane: one holonomic and two non-holonomic rows.
 
 Coordinates: x, y, z of the centre, yaw, lean from the vertical, spin. The disc touches the plane (z = R cos(lean)), and
 the contact point has zero velocity along x and y.

@@ -1,4 +1,4 @@
-"""Slider-cranks of three planar bodies, with a redundant row or driven, and a pendulum on a driven crank.
+"""Define slider-cranks of three planar bodies, with a redundant row or driven, and a pendulum on a driven crank.
 
 Coordinates are x, y and angle of each body. The redundant row is the distance of the crank pin from the slider, which
 equals the length of the rod.

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from twoloop.bodies.rotation import half_spin, rotated
-from twoloop.bodies.spatial_model import SpatialModel
+from twoloop.bodies.spatial.model import SpatialModel
 from twoloop.mechanisms.registry import ready_model
 from twoloop.problem.problem import Array, Problem, Reference
 

@@ -1,4 +1,4 @@
-"""The slider-crank with a spring-damper of SUNDIALS' example for IDA, in crank angle, slider position and rod angle."""
+"""Define the slider-crank with a spring-damper of SUNDIALS' example for IDA, in two angles and the slider position."""
 
 import math
 from dataclasses import dataclass

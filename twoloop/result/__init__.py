@@ -1,1 +1,1 @@
-"""The result of a run and its views."""
+"""Define the result of a run and its views."""

@@ -1,4 +1,4 @@
-"""`result.certify()`: independent verification of a run, interval by interval, with another method."""
+"""Verify a run by `result.certify()`: interval by interval, with another method."""
 
 from __future__ import annotations  # help() shows ArrayLike by name
 

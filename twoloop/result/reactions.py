@@ -1,4 +1,4 @@
-"""Joint forces and torques from the multipliers of a result."""
+"""Compute joint forces and torques from the multipliers of a result."""
 
 from dataclasses import dataclass
 

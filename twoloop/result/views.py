@@ -38,7 +38,7 @@ def _derivative(coordinate: str, quantity: str, per: str) -> str:
     return f"{name}, {quantity} ({unit or 1}/{per})"
 
 
-WIDTH, HEIGHT = 8.0, 2.2  # inches; height of a panel
+PANEL_WIDTH, PANEL_HEIGHT = 8.0, 2.2  # inches
 MAX_LEGEND = 12  # largest number of coordinates in a legend
 
 
@@ -54,7 +54,7 @@ def plot(result: Record, path: str | os.PathLike[str] | None) -> Any:
         units.setdefault(name_and_unit(coordinate)[1], []).append(k)
     description = result.description
     n_panels = len(units) + (description.energy is not None) + (result.system is not None)
-    figure = figure_class(figsize=(WIDTH, HEIGHT * n_panels + 0.5), layout="constrained")
+    figure = figure_class(figsize=(PANEL_WIDTH, PANEL_HEIGHT * n_panels + 0.5), layout="constrained")
     if file is not None and file.suffix and file.suffix[1:].lower() not in figure.canvas.get_supported_filetypes():
         raise ValueError(f"path must end in .png, .svg, .pdf or another format of matplotlib; given {str(path)!r}")
     panels = list(np.atleast_1d(figure.subplots(n_panels, 1, sharex=True)))

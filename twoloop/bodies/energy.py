@@ -1,4 +1,4 @@
-"""Energy of a model: kinetic energy, and potential energy of gravity and springs."""
+"""Evaluate the kinetic energy and the potential energy of gravity and springs."""
 
 from __future__ import annotations
 
@@ -8,12 +8,30 @@ from typing import Any
 import numpy as np
 
 from twoloop.bodies import parameter_layout as layout
+from twoloop.bodies.frames import angle_of, on_grid, point_of, vector_of
 from twoloop.checks.arguments import Array, check_columns
 
 
 @dataclass(frozen=True, eq=False)
+class PlanarEnergy:
+    """Evaluate kinetic energy and potential of gravity of planar bodies, J, for one state or many."""
+
+    masses: Array
+    inertias: Array
+    gravity: float
+
+    def __call__(self, t: Any, q: Array, v: Array) -> Any:
+        """Evaluate for one state, or for many given as columns."""
+        q, v = np.asarray(q), np.asarray(v)
+        check_columns("q", q, 3 * len(self.masses))
+        check_columns("v", v, 3 * len(self.masses))
+        kinetic = 0.5 * (self.masses @ (v[0::3] ** 2 + v[1::3] ** 2) + self.inertias @ v[2::3] ** 2)
+        return kinetic + self.gravity * (self.masses @ q[1::3])
+
+
+@dataclass(frozen=True, eq=False)
 class ModelEnergy:
-    """Kinetic energy and potential energies of gravity and springs, J, for one state or many.
+    """Evaluate kinetic energy and potential energies of gravity and springs, J, for one state or many.
 
     Attributes
     ----------
@@ -28,16 +46,14 @@ class ModelEnergy:
 
     def __call__(self, t: Any, q: Array, v: Array) -> Any:
         """Evaluate the energies of one state, or of many given as columns."""
-        from twoloop.bodies.points import direction_of, place_of  # compiled on import
-
         flat = np.asarray(q)
         n_q = self._n * (3 if self.dimension == 2 else 7)
         check_columns("q", flat, n_q)
         check_columns("v", np.asarray(v), n_q)
 
-        def between(i: int, at: int, j: int, there: int) -> Any:
-            here, end = (self.p[k : k + self.dimension] for k in (at, there))
-            return place_of(flat, j, end) - place_of(flat, i, here)
+        def between(i: int, at_i: int, j: int, at_j: int) -> Any:
+            here, end = (self.p[k : k + self.dimension] for k in (at_i, at_j))
+            return on_grid(flat, point_of(flat, j, end)) - on_grid(flat, point_of(flat, i, here))
 
         q, v = (np.asarray(x).reshape(self._n, -1, *np.shape(x)[1:]) for x in (q, v))
         size = layout.PLANAR_BODY if self.dimension == 2 else layout.SPATIAL_BODY
@@ -49,21 +65,25 @@ class ModelEnergy:
             total += 0.5 * np.einsum("i,i...->...", bodies[:, 1], v[:, 2] ** 2)
         else:
             J = bodies[:, [1, 4, 5, 4, 2, 6, 5, 6, 3]].reshape(-1, 3, 3)
-            spins = _spins(q[:, 3:], v[:, 3:])
+            from twoloop.bodies.rotation import half_spin  # compiled on import
+
+            spins = 2.0 * np.stack(
+                half_spin.py_func(*np.moveaxis(q[:, 3:], 1, 0), *np.moveaxis(v[:, 3:], 1, 0)), axis=1
+            )
             total += 0.5 * np.einsum("ijk,ij...,ik...->...", J, spins, spins)
-        for kind, i, at, j, there, more, given, on_first in self._forces:
-            if given >= 0:  # no potential is known
+        for kind, i, at_i, j, at_j, more, first_result, on_first in self._forces:
+            if first_result >= 0:  # no potential is known
                 continue
-            if kind in (layout.SPRING, layout.PULL):
-                length = np.sqrt((between(i, at, j, there) ** 2).sum(axis=0))
+            if kind in (layout.SPRING, layout.ZERO_LENGTH_SPRING):
+                length = np.sqrt((between(i, at_i, j, at_j) ** 2).sum(axis=0))
                 total += 0.5 * self.p[more] * (length - (self.p[more + 2] if kind == layout.SPRING else 0.0)) ** 2
-            elif kind == layout.TORSION:
-                total += 0.5 * self.p[more] * (self._turned(q, i, j, at, there) - self.p[more + 2]) ** 2
-            elif kind == layout.RAIL:
-                axis = self.p[at : at + 3]
+            elif kind == layout.TORSION_SPRING:
+                total += 0.5 * self.p[more] * (self._turned(flat, i, j, at_i, at_j) - self.p[more + 2]) ** 2
+            elif kind == layout.AXIAL_SPRING:
+                axis = self.p[at_i : at_i + 3]
                 if self.dimension == 2:
                     axis = np.array([np.cos(axis[0]), np.sin(axis[0])])
-                slid = (direction_of(flat, i, axis) * between(i, on_first, j, there)).sum(axis=0)
+                slid = (on_grid(flat, vector_of(flat, i, axis)) * between(i, on_first, j, at_j)).sum(axis=0)
                 total += 0.5 * self.p[more] * (slid - self.p[more + 2]) ** 2
         return total
 
@@ -80,19 +100,12 @@ class ModelEnergy:
 
     def _turned(self, q: Array, i: int, j: int, axis: int, zero: int) -> Any:
         if self.dimension == 2:
-            return (q[j, 2] if j >= 0 else 0.0) - (q[i, 2] if i >= 0 else 0.0)
-        from twoloop.bodies.spatial_places import product  # compiled on import
+            return angle_of(q, j) - angle_of(q, i)
+        from twoloop.bodies.spatial.forces import product  # compiled on import
 
-        one, other = (q[body, 3:] if body >= 0 else (1.0, 0.0, 0.0, 0.0) for body in (i, j))
-        relative = product.py_func(one[0], -one[1], -one[2], -one[3], *other)
+        e_i, e_j = (q[7 * body + 3 : 7 * body + 7] if body >= 0 else (1.0, 0.0, 0.0, 0.0) for body in (i, j))
+        relative = product.py_func(e_i[0], -e_i[1], -e_i[2], -e_i[3], *e_j)
         start = self.p[zero : zero + 4]
         c, *parts = product.py_func(*relative, start[0], *-start[1:])
         s = sum(x * part for x, part in zip(self.p[axis : axis + 3], parts, strict=True))
         return 4.0 * np.arctan(s / (c + np.sqrt(c * c + s * s)))
-
-
-def _spins(e: Array, u: Array) -> Array:
-    """Return angular velocities in body axes, (n, 3) or (n, 3, n_t)."""
-    from twoloop.bodies.rotation import half_spin  # compiled on import
-
-    return 2.0 * np.stack(half_spin.py_func(*np.moveaxis(e, 1, 0), *np.moveaxis(u, 1, 0)), axis=1)

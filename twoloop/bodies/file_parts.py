@@ -1,4 +1,4 @@
-"""Poses, inertias and the warning about ignored parts, shared by the reader and the writer of MJCF.
+"""Parse poses, masses and joints of MJCF and URDF files, and warn about what is ignored.
 
 See MuJoCo's XML reference, mujoco.readthedocs.io/en/stable/XMLreference.html.
 """
@@ -9,13 +9,15 @@ import os
 import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from twoloop.bodies.parts import Body, ModelJoint
 from twoloop.bodies.rotation import rotation_matrix
+from twoloop.bodies.spatial.model import SpatialModel
 from twoloop.checks.arguments import Array, check_path
 
 DENSITY = 1000.0  # kg/m^3, default of MuJoCo for geoms with neither mass nor density
@@ -104,6 +106,16 @@ def numbers(text: str, n: int, what: str) -> Array:
     return found
 
 
+def text_of(values: Any) -> str:
+    """Format numbers so that they are read back exactly."""
+    return " ".join(map(repr, np.asarray(values, dtype=float).tolist()))
+
+
+def tensor_of(xx: float, yy: float, zz: float, xy: float, xz: float, yz: float) -> Array:
+    """Return an inertia tensor (3, 3) from its entries."""
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
 def pose_of(attributes: Mapping[str, str], what: str, degrees: bool, sequence: str) -> Pose:
     """Return the pose given by pos and one of quat, axisangle, xyaxes, zaxis and euler."""
     x = numbers(attributes.get("pos", "0 0 0"), 3, f"pos of {what}")
@@ -156,7 +168,7 @@ def geom_lump(given: Mapping[str, str], what: str, degrees: bool, sequence: str)
     if "fromto" in given:
         ends = numbers(given["fromto"], 6, f"fromto of {what}").reshape(2, 3)
         along = ends[0] - ends[1]
-        pose = Pose(0.5 * ends.sum(axis=0), _rotation({"zaxis": " ".join(map(repr, along.tolist()))}, what, 1.0, "xyz"))
+        pose = Pose(0.5 * ends.sum(axis=0), _rotation({"zaxis": text_of(along)}, what, 1.0, "xyz"))
         half = 0.5 * float(np.linalg.norm(along))
         size = np.append(size[:1], half) if kind in ("capsule", "cylinder") else np.array([size[0], size[0], half])
     needed = {"sphere": 1, "capsule": 2, "cylinder": 2, "box": 3, "ellipsoid": 3}[kind]
@@ -193,7 +205,7 @@ def _cylinder(size: Array) -> tuple[float, Array]:
 
 
 def _capsule(size: Array) -> tuple[float, Array]:
-    """A cylinder and two half balls, whose centres of mass are 3/8 of the radius from its ends."""
+    """Return those of a cylinder and two half balls, whose centres of mass are 3/8 of the radius from its ends."""
     r, h = size[:2]
     whole, (across, _, along) = _cylinder(size)
     ball = 4.0 / 3.0 * np.pi * r**3
@@ -204,3 +216,83 @@ def _capsule(size: Array) -> tuple[float, Array]:
 
 
 _VOLUMES = {"sphere": _sphere, "capsule": _capsule, "cylinder": _cylinder, "box": _box, "ellipsoid": _ellipsoid}
+
+
+SAME = 1e-9  # tolerance of directions, and of positions in m
+
+
+@dataclass(frozen=True)
+class FileJoint:
+    """A joint of MJCF: kind (hinge, slide, ball), position and axis in space, and other attributes."""
+
+    name: str
+    kind: str
+    at: Array
+    axis: Array
+    attributes: dict[str, str]
+
+
+@dataclass
+class Part:
+    """A moving body with everything fixed to it: parent, frame, joints and masses, all in space."""
+
+    name: str
+    parent: Part | None
+    pose: Pose
+    freed: list[FileJoint] = field(default_factory=list)
+    lumps: list[Lump] = field(default_factory=list)
+    body: Body | None = None
+
+
+def body_of(model: SpatialModel, part: Part | None) -> Body:
+    """Return the body of a part; the ground for None."""
+    body = model.ground if part is None else part.body
+    assert body is not None
+    return body
+
+
+def add_part(model: SpatialModel, part: Part) -> ModelJoint | None:
+    """Add the body of a part and its joint to a model; return the joint, or None if the body is free."""
+    lump = combined(part.lumps)
+    if not lump.mass > 0.0:
+        raise ValueError(f"the body {part.name!r} has joints but no mass: give it an <inertial>, or a geom with volume")
+    R = part.pose.R
+    part.body = model.body(part.name, mass=lump.mass, inertia=R.T @ lump.J @ R, position=lump.centre, rotation=R)
+    return add_joints(model, body_of(model, part.parent), part.body, part.freed)
+
+
+def add_joints(model: SpatialModel, parent: Body, child: Body, freed: list[FileJoint]) -> ModelJoint | None:
+    """Add the joint equivalent to several MJCF joints; return it, or None if the body is free."""
+    kinds = sorted(each.kind for each in freed)
+    slid = np.array([each.axis for each in freed if each.kind == "slide"])
+    if len(slid) > 1 and np.linalg.svd(slid, compute_uv=False)[-1] < SAME:
+        raise ValueError(f"the slides of the body {child.name!r} must have axes that do not follow from one another")
+    if kinds in (["free"], ["ball", "slide", "slide", "slide"]):
+        return None
+    hinges, slides = ([each for each in freed if each.kind == kind] for kind in ("hinge", "slide"))
+    name, first = freed[0].name, freed[0]
+    if kinds == ["ball"]:
+        return model.spherical(parent, child, at=first.at, name=name)
+    if kinds == ["hinge"]:
+        return model.revolute(parent, child, at=first.at, axis=first.axis, name=name)
+    if kinds == ["slide"]:
+        return model.prismatic(parent, child, at=first.at, axis=first.axis, name=name)
+    if kinds == ["hinge", "slide"] and _parallel(hinges[0], slides[0]):
+        return model.cylindrical(parent, child, at=hinges[0].at, axis=hinges[0].axis, name=name)
+    if kinds == ["hinge", "hinge"] and _across(*hinges) and np.abs(hinges[0].at - hinges[1].at).max() < SAME:
+        return model.universal(parent, child, at=first.at, axes=[each.axis for each in hinges], name=name)
+    if kinds == ["hinge", "slide", "slide"] and all(_across(hinges[0], slide) for slide in slides):
+        return model.planar(parent, child, at=hinges[0].at, axis=hinges[0].axis, name=name)
+    raise ValueError(
+        f"the joints of the body {child.name!r} ({', '.join(each.kind for each in freed)}) have no counterpart in a "
+        "model: one hinge, slide or ball; a slide and a hinge along one axis; two hinges that cross at right angles; "
+        "two slides and a hinge across both; all six. Put a body with mass between them"
+    )
+
+
+def _parallel(one: FileJoint, other: FileJoint) -> bool:
+    return float(np.abs(np.cross(one.axis, other.axis)).max()) < SAME
+
+
+def _across(one: FileJoint, other: FileJoint) -> bool:
+    return abs(float(one.axis @ other.axis)) < SAME

@@ -1,0 +1,1 @@
+"""Build planar models and evaluate their compiled callbacks."""

@@ -1,0 +1,1 @@
+"""Build spatial models and evaluate their compiled callbacks."""
