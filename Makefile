@@ -2,7 +2,7 @@
 # PYTHON=/path/to/python chooses the interpreter, ARGS="--quick" passes options on.
 
 .DEFAULT_GOAL := help
-.PHONY: help install peers engines compile compile-all table3 reports bench test test-all test-portable test-oldest lint docs lock clean
+.PHONY: help install peers engines compile compile-all table3 reports test test-all test-portable test-oldest lint docs lock clean
 
 # one thread: CPU times can be compared, and no BLAS changes a count
 export OPENBLAS_NUM_THREADS := 1
@@ -72,9 +72,6 @@ table3: install ## the paper's Table 3 into reports/, about three minutes; ARGS=
 
 reports: install ## all studies into reports/
 	$(RUN) -m studies all $(ARGS)
-
-bench: compile-all ## two commits side by side: make bench BASE=main [HEAD=branch] [ARGS=--short]
-	@$(RUN) -m studies.bench_commits $(BASE) $(if $(HEAD),--head $(HEAD)) $(ARGS)
 
 # the inner loop is there; two processes of about equal work, neither of which imports, and so compiles, what the other
 # does: what Newton's matrices and large systems have in common, and bodies in space, are in one of them

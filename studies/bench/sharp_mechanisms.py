@@ -46,12 +46,15 @@ def chain_carried(p, n):  # type: ignore[no-untyped-def]
     """Masses that each link carries along, times its length, and those times the lengths of the others."""
     carried = np.zeros(n)
     for k in range(n):
-        carried[: k + 1] += p[n + k]
+        for i in range(k + 1):  # loops: numba compiles sums and products of slices for seconds
+            carried[i] += p[n + k]
     shared = np.empty((n, n))
     for i in range(n):
         for j in range(n):
             shared[i, j] = carried[max(i, j)] * p[i] * p[j]
-    return carried * p[:n], shared
+    for i in range(n):
+        carried[i] *= p[i]
+    return carried, shared
 
 
 @numba.njit(cache=True)
@@ -71,9 +74,9 @@ def chain_motion(t, y, p):  # type: ignore[no-untyped-def]
         for j in range(n):
             Q[i] -= shared[i, j] * math.sin(th[i] - th[j]) * om[j] ** 2
             shared[i, j] *= math.cos(th[i] - th[j])
-    made = np.empty(2 * n)
-    made[:n] = om
-    made[n:] = np.linalg.solve(shared, Q)
+    accelerations, made = np.linalg.solve(shared, Q), np.empty(2 * n)
+    for i in range(n):
+        made[i], made[n + i] = om[i], accelerations[i]
     return made
 
 

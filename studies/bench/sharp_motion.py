@@ -51,7 +51,7 @@ def march(mechanism: Mechanism, method: str, tolerance: float, y: Array, begin: 
         if not part.success:
             raise RuntimeError(part.message)
         states |= dict(zip(part.t.tolist(), part.y.T, strict=True))
-        y, at = part.y[:, -1], end
+        y, at = part.y[:, -1].copy(), end
         if sharp.driven and end in sharp.breaks:
             y = mechanism.kicked(y, float(sharp.parameters[DRIVE_A]))
     return states
