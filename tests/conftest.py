@@ -10,6 +10,7 @@ from hypothesis import settings
 
 from tests.problems import LINKAGES
 from twoloop import solve
+from twoloop.run import cached
 
 # not collected where the packages of the studies, or of the documentation, are not installed: `make test-oldest`
 NEED_STUDIES = (
@@ -83,12 +84,24 @@ def interruptible():
 @pytest.fixture
 def taken(monkeypatch):
     """Record for each call whether it used the arrays of an earlier run."""
-    made, ways = solve.record_again, []
+    integrate, set_up, ways, new = solve.cached_result, cached.set_up, [], []
 
-    def watched(*asked):
-        record = made(*asked)
-        ways.append(record is not None)
-        return record
+    def watched(*given):
+        before = len(new)
+        made = integrate(*given)
+        ways.append(type(made) is tuple and len(new) == before)
+        return made
 
-    monkeypatch.setattr(solve, "record_again", watched)
+    monkeypatch.setattr(cached, "set_up", lambda *given: new.append(1) or set_up(*given))
+    monkeypatch.setattr(solve, "cached_result", watched)
     return ways
+
+
+@pytest.fixture
+def by_the_loop(monkeypatch):
+    """Let all runs that follow take the integration loop from their start on."""
+
+    def switch():
+        monkeypatch.setattr(solve, "cached_result", lambda *given: None)
+
+    return switch

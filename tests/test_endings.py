@@ -336,7 +336,7 @@ def test_a_stiff_spring_in_python_is_seen(method, monkeypatch):
     start = ([1.0, 0.0, 0.0], [0.0, 0.0, 1.0])
     messages = []
     for allowed in (0.0, np.inf):  # s of a chunk, from which on chunks do not grow
-        monkeypatch.setattr("twoloop.run.course.CHUNK_TIME", allowed)
+        monkeypatch.setattr("twoloop.run.loop.CHUNK_TIME", allowed)
         result = solve_dae(stiff, (0.0, 0.3), *start, method=method, rtol=1e-4, atol=1e-4)
         messages.append(result.message)
     found = re.search(r"vibrations of (\S+) rad/s", result.message)

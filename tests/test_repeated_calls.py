@@ -15,12 +15,12 @@ import pytest
 import twoloop
 from tests.compiled import PENDULUM
 from tests.problems import assert_same, pendulum, quick, some_of
-from twoloop import ConstrainedSystem, ConstraintWarning, Integrator, callback, mechanisms, solve, solve_dae
+from twoloop import ConstrainedSystem, ConstraintWarning, Integrator, callback, mechanisms, solve_dae
 from twoloop.checks.consistency import Look, check_start
 from twoloop.generate.derived_callbacks import exact_derivatives, generic_states
 from twoloop.kernels.layout import _free
 from twoloop.methods.tableaux import gauss, radau_iia
-from twoloop.run import again
+from twoloop.run import cached
 
 METHODS = ["auto", "DOP853", "Adams", "Gauss8", "RadauIIA5", "TRBDF2", "BDF"]
 NAMES = ["four_bar", "andrews", "redundant_slider_crank", "rolling_disc", "heavy_top", "driven_slider_crank"]
@@ -63,7 +63,7 @@ CASES = quick([*IN_EVERY_RUN, *(case for case in CASES if case not in IN_EVERY_R
 
 @pytest.mark.parametrize(("name", "method", "options"), CASES)
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
-def test_a_repeated_call_equals_a_new_one_to_the_bit(name, method, options, taken, monkeypatch):
+def test_a_repeated_call_equals_a_new_one_to_the_bit(name, method, options, taken, by_the_loop):
     """Every step, the solution between the steps, and states at the ends alone."""
     problem, other = getattr(mechanisms, name)(), getattr(mechanisms, name)()
     span = 3e-3 if name == "andrews" else 0.1
@@ -80,14 +80,14 @@ def test_a_repeated_call_equals_a_new_one_to_the_bit(name, method, options, take
         work.notes.base[:], work.counters.base[:] = np.nan, 10**6  # whatever a run has left
     by_arrays = all_runs(problem)
     assert all(taken[-6:-1])
-    monkeypatch.setattr(solve, "record_again", lambda *asked: None)
+    by_the_loop()
     for one, long in zip(by_arrays, all_runs(other), strict=True):
         assert_same(one, long)
 
 
 @pytest.mark.parametrize("name", quick(["heavy_top", "redundant_slider_crank"]))
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
-def test_starts_that_ask_for_other_code_keep_no_arrays_out(name, taken, monkeypatch):
+def test_starts_that_ask_for_other_code_keep_no_arrays_out(name, taken, by_the_loop):
     problem, other = getattr(mechanisms, name)(), getattr(mechanisms, name)()
     span = 0.3 * (problem.t_span[1] - problem.t_span[0])
     solution = solve_dae(problem.system, (0.0, span), problem.q0, problem.v0, dense_output=True).sol
@@ -95,7 +95,7 @@ def test_starts_that_ask_for_other_code_keep_no_arrays_out(name, taken, monkeypa
     by_arrays = runs(problem, states, 0.1)
     *_, kept = problem.system.made["runs"][1].values()
     assert len({id(each.code) for each in kept}) > 1 and sum(taken) > 30
-    monkeypatch.setattr(solve, "record_again", lambda *asked: None)
+    by_the_loop()
     for one, long in zip(by_arrays, runs(other, states, 0.1), strict=True):
         assert_same(one, long)
 
@@ -127,15 +127,14 @@ def test_results_do_not_share_arrays(taken):
 
 
 @pytest.mark.parametrize("options", [*({"method": name} for name in ("DOP853", "Adams")), {}], ids=str)
-def test_a_run_of_several_chunks_is_that_of_the_long_way(options, taken, monkeypatch):
+def test_a_run_of_several_chunks_is_that_of_the_long_way(options, taken, by_the_loop):
     """The clock is read after as many attempts, so that the message is the same, too."""
     problem, other = mechanisms.four_bar(), mechanisms.four_bar()
     options = {"max_step": 0.01, "t_eval": [0.5, 7.3, 25.0]} | options
     states = starts(problem, 1.0, 8)
-    monkeypatch.setattr(again, "LONGEST", np.inf)
     by_arrays = runs(problem, states, 30.0, **options)
     assert min(each.h.size for each in by_arrays) >= 3000 and sum(taken) >= 3, taken
-    monkeypatch.setattr(solve, "record_again", lambda *asked: None)
+    by_the_loop()
     for one, long in zip(by_arrays, runs(other, states, 30.0, **options), strict=True):
         assert_same(one, long)
 
@@ -164,7 +163,7 @@ def test_a_callback_that_is_wrong_where_no_run_was_is_found(taken):
 
 
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
-def test_the_redundant_rows_told_are_those_of_this_start(taken, monkeypatch):
+def test_the_redundant_rows_told_are_those_of_this_start(taken, by_the_loop):
     """The words on them are those of the first start at which they were redundant."""
     problem, other = mechanisms.redundant_slider_crank(), mechanisms.redundant_slider_crank()
     states = repeated(starts(problem, 10.0, 7))
@@ -176,7 +175,7 @@ def test_the_redundant_rows_told_are_those_of_this_start(taken, monkeypatch):
 
     by_arrays = said(problem)
     assert sum(taken) >= 4
-    monkeypatch.setattr(solve, "record_again", lambda *asked: None)
+    by_the_loop()
     assert by_arrays == said(other) and all(by_arrays)
 
 
@@ -423,14 +422,14 @@ def test_ctrl_c_in_a_repeated_call_returns_a_result(interruptible, monkeypatch):
     problem = mechanisms.four_bar()
     for _ in range(8):
         full = run(problem)
-    made, heard = again.partial, []
+    made, heard = cached.partial, []
 
     def pressed(*given):
         signal.raise_signal(signal.SIGINT)
         return made(*given)
 
     with monkeypatch.context() as changed:
-        changed.setattr(again, "partial", pressed)
+        changed.setattr(cached, "partial", pressed)
         assert run(problem).status.name == "INTERRUPTED"
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
         for _ in range(3):

@@ -79,7 +79,7 @@ def test_what_happened_before_each_step_adds_up_to_the_counts(default_four_bar, 
     options = {"method": method, "rtol": 1e-5, "atol": 1e-5}
     t_end = 20.0 if method == "Gauss12" else 3.0  # a hundredth of which is longer than its steps
     whole = run(default_four_bar, t_end, **options)
-    monkeypatch.setattr("twoloop.run.course.BUFFER_STEPS", 7)  # many chunks: nothing may be lost between them
+    monkeypatch.setattr("twoloop.run.loop.BUFFER_STEPS", 7)  # many chunks: nothing may be lost between them
     stats = whole.stats
     assert whole.rejected_error.sum() == stats.n_rejected_error
     assert whole.rejected_convergence.sum() == stats.n_rejected_convergence

@@ -19,7 +19,7 @@ from tests.problems import at_one, pendulum, quick, run, swing, worst
 from tests.processes import ROOT
 from twoloop import Result, Statistics, Status
 from twoloop.mechanisms import closed_chain, four_bar
-from twoloop.run import course
+from twoloop.run import loop
 
 FIELDS = [field.name for field in fields(Result) if field.name != "sol"]
 COMPARED = [name for name in FIELDS if name not in ("stats", "system", "redundant")]
@@ -121,7 +121,7 @@ def test_a_stored_run_is_the_same_as_another(default_four_bar, tmp_path, options
 @pytest.mark.parametrize("options", quick([{}, {"t_eval": True}, {"dense_output": True}]))
 def test_the_memory_holds_a_part_only(tmp_path, options, monkeypatch):
     """Counted is what NumPy asks for: files that are mapped are not among it."""
-    monkeypatch.setattr(course, "BUFFER_ROWS", 64)
+    monkeypatch.setattr(loop, "BUFFER_ROWS", 64)
     problem, peaks, stored = closed_chain(12), [], []
     run(problem, 0.1, dense_output=True)  # traced and compiled
     for end in (20.0, 40.0):

@@ -13,41 +13,29 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.checks.arguments import (
-    check_flag,
-    check_positive,
-    check_size,
-    check_span,
-    check_times,
-    check_tolerance,
-    check_vector,
-    is_vector,
-    shown,
-)
+from twoloop.checks.arguments import check_span, check_times, check_vector, is_vector
 from twoloop.checks.consistency import ConstraintWarning
 from twoloop.kernels.layout import give_back
-from twoloop.methods.code_for import Compiled, check_compiled
+from twoloop.methods.code_for import Compiled
 from twoloop.methods.plan import Method
-from twoloop.methods.presets import PRESETS, is_preset
 from twoloop.problem.events import check_events
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.result.storage import begin_folder, check_folder, end_folder
-from twoloop.run.again import LONGEST, STEPS, Output
-from twoloop.run.asked import Asked
-from twoloop.run.course import Course
+from twoloop.run.cached import STEPS, Missed, Output, cached_result, fields_of, set_up
 from twoloop.run.interrupts import Interrupts, not_begun
 from twoloop.run.kept import InMemory, OnDisk
-from twoloop.run.launch import record_again, run_from
-from twoloop.run.record import record_of
+from twoloop.run.loop import IntegrationLoop
+from twoloop.run.options import options_of
+from twoloop.run.record import Status, record_of
 from twoloop.run.recorder import Wanted
+from twoloop.run.run import Run
 from twoloop.run.short_changes import MOST, closer, may_be_missed
 
 Array = NDArray[np.float64]
 
-ROUNDING = 1e-15
-NO_OPTIONS: Any = (None,) * 12, None
 NO_BAR = nullcontext(lambda t: None)  # in the place of what shows how far a run is
+LONGEST = 0.1  # s of wall-clock time that the first chunk of steps may take
 SAME = 1e-9  # relative: a step and a span that differ by less are one, however they were rounded
 
 
@@ -187,17 +175,8 @@ def solve_dae(
     (True, True)
     """
     check_system(system)
-    # options that are the objects of the last call were checked there; to compare them in a loop takes twice as long
-    last, asked = system.shared.get("options", NO_OPTIONS)
-    m, r, a, first, longest, most, size, dense, shows, limit, checks, code = last
-    same = m is method and r is rtol and a is atol and first is first_step and longest is max_step and most is max_steps
-    same = same and size is step_size and dense is dense_output and shows is progress and limit is time_limit
-    if not (same and checks is check_derivatives and code is compiled):
-        last = method, rtol, atol, first_step, max_step, max_steps, step_size, dense_output, progress, time_limit
-        last = *last, check_derivatives, compiled
-        asked = check_options(system, *last)
-        if type(atol) is float and is_preset(method):  # an array, or another object, may be changed by who gives it
-            system.shared["options"] = last, asked
+    given = method, rtol, atol, first_step, max_step, max_steps, step_size, dense_output, progress, time_limit
+    options = options_of(system, (*given, check_derivatives, compiled))
     event_functions = None if events is None else check_events(events)
     t0, t1 = check_span(t_span)
     if is_vector(q0, system.n_q) and is_vector(v0, system.n_q):
@@ -210,44 +189,46 @@ def solve_dae(
     folder = None if store is None else check_folder(store)
     interrupts = Interrupts()
     try:
-        in_time = time_limit is None or time_limit >= LONGEST
         at_ends = times is not None and times.size <= 2 and set(times.tolist()) <= {t0, t1}
-        if folder is event_functions is asked.own_tolerance is None and in_time and not progress:
-            output = STEPS if times is None and not dense_output else Output(times, at_ends, bool(dense_output))
-            made = record_again(system, t0, t1, q0, v0, asked, output, interrupts)
-            if made is not None and not interrupts.asked:
+        run, every, spent, repeats = None, np.inf, 0.0, MOST
+        in_time = time_limit is None or time_limit >= LONGEST
+        if folder is event_functions is options.own_tolerance is None and in_time and not progress:
+            is_plain = times is time_limit is None and not dense_output
+            output = STEPS if is_plain else Output(times, at_ends, bool(dense_output), time_limit)
+            made = cached_result(system, t0, t1, q0, v0, options, output, interrupts)
+            if type(made) is tuple and (not interrupts.asked or made[0]["status"] == Status.INTERRUPTED):
                 fields, said_of_rows = made
                 if said_of_rows:
                     warnings.warn(said_of_rows, ConstraintWarning, stacklevel=2)
                 return record_of(Result, fields)
+            if isinstance(made, Missed):
+                every, spent, repeats = *made, MOST - 1
+            elif isinstance(made, Run):
+                run = made
         interrupts.listen()
         q0, v0 = check_vector("q0", q0, system.n_q), check_vector("v0", v0, system.n_q)
-        run = run_from(system, t0, t1, q0, v0, asked)
-        if run.said_of_rows:
-            warnings.warn(run.said_of_rows, ConstraintWarning, stacklevel=2)
-        with_code = bool(run.plan.own)
-        lands = run.plan.lands or step_size is not None or at_ends
-        deadline, spent = None if time_limit is None else time.monotonic() + time_limit, 0.0
-        for left in range(MOST, -1, -1):
-            with _progress_bar(asked.method.name, t0, t1) if progress else NO_BAR as report:
+        deadline = None if time_limit is None else time.monotonic() + time_limit
+        for left in range(repeats, -1, -1):
+            if run is None:
+                run, _ = set_up(system, t0, t1, q0, v0, options)
+                if every < np.inf:
+                    run.control[run.a.APART] = every
+            if left == repeats and run.said_of_rows:
+                warnings.warn(run.said_of_rows, ConstraintWarning, stacklevel=2)
+            with_code, lands = bool(run.plan.own), run.lands or at_ends
+            with _progress_bar(options.method.name, t0, t1) if progress else NO_BAR as report:
                 kept = InMemory() if folder is None else begin_folder(folder, system.n_q)
                 wanted = Wanted(times, lands, bool(dense_output), event_functions, kept)
                 limit = None if deadline is None else max(0.0, deadline - time.monotonic())
                 last = left == 0 or folder is not None
-                record = Course(run, t1, wanted, report, limit, interrupts, last).to_end(check_derivatives)
+                record = IntegrationLoop(run, t1, wanted, report, limit, interrupts, last).to_end(check_derivatives)
+            give_back(run.work)
             if last or record.status < 0 or not may_be_missed(run):
                 break
-            spent += record.stats.cpu_time
-            give_back(run.work)
-            every, run = closer(run), run_from(system, t0, t1, q0, v0, asked)
-            run.control[run.a.APART] = every
+            every, spent, run = closer(run), spent + record.stats.cpu_time, None
         if spent > 0.0:
             record = replace(record, stats=replace(record.stats, cpu_time=spent + record.stats.cpu_time))
-        give_back(run.work)
-        told = asked.told | {"system": system, "atol": asked.atol.copy()}
-        if (own := asked.own_tolerance) is not None:  # Newmark's own test, of positions, has its place
-            told |= {"rtol": own, "atol": np.full(system.n_q, own), "untested": np.ones(len(record.h), dtype=bool)}
-        result = record_of(Result, vars(record) | told | {"compiled": with_code})
+        result = record_of(Result, fields_of(record, options, system, with_code))
         if isinstance(kept, OnDisk):
             end_folder(kept, result)
         return result
@@ -256,68 +237,7 @@ def solve_dae(
             raise
     finally:
         interrupts.leave()
-    return record_of(Result, vars(not_begun(system, t0, event_functions, asked.method.name)))
-
-
-def check_options(
-    system: ConstrainedSystem,
-    method: Any,
-    rtol: Any,
-    atol: Any,
-    first_step: Any,
-    max_step: Any,
-    max_steps: Any,
-    step_size: Any,
-    dense_output: Any,
-    progress: Any,
-    time_limit: Any,
-    check_derivatives: Any,
-    compiled: Any,
-) -> Asked:
-    """The options of a call as a run needs them; raises where one is wrong."""
-    check_flag("dense_output", dense_output)
-    if progress is not None:
-        check_flag("progress", progress)
-    compiled = check_compiled(compiled)
-    check_flag("check_derivatives", check_derivatives)
-    chosen = check_method(method)
-    check_positive("rtol", rtol)
-    atol = check_tolerance("atol", atol, system.n_q)
-    if max(rtol, atol.min()) < ROUNDING:
-        raise ValueError(
-            f"rtol and atol must not both be below {ROUNDING:g}, where rounding hides the error; given {rtol!r} and "
-            f"{float(atol.min())!r}"
-        )
-    if first_step is not None:
-        check_positive("first_step", first_step)
-    check_positive("max_step", max_step, infinite=True)
-    if step_size is not None:
-        check_positive("step_size", step_size)
-        if first_step is not None or max_step != np.inf:
-            raise ValueError(
-                "step_size is a constant step: give neither first_step nor max_step with it; given step_size = "
-                f"{step_size!r}, first_step = {first_step!r}, max_step = {max_step!r}"
-            )
-    if max_steps is not None:
-        check_size("max_steps", max_steps, 1)
-    if time_limit is not None:
-        check_positive("time_limit", time_limit)
-    sizes = first_step, float(max_step), max_steps, step_size
-    return Asked(chosen, float(rtol), atol, *sizes, compiled, bool(check_derivatives))
-
-
-def check_method(method: str | Method) -> Method:
-    """The method of a name, or the object itself, or what is wrong with it."""
-    known = ", ".join(PRESETS)
-    if isinstance(method, str):
-        if method not in PRESETS:
-            raise ValueError(f"method must be one of {known}, or a method object; given {shown(method)}")
-        return PRESETS[method]
-    if isinstance(method, type) or not callable(getattr(method, "plan", None)):
-        raise TypeError(
-            f"method must be a name ({known}) or an object such as RungeKutta(gauss(3)); given {shown(method)}"
-        )
-    return method
+    return record_of(Result, vars(not_begun(system, t0, event_functions, options.method.name)))
 
 
 @contextmanager

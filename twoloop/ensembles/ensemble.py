@@ -15,8 +15,9 @@ from twoloop.ensembles.runs import Runs
 from twoloop.ensembles.starts import Starts, all_starts, system_of
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
+from twoloop.run.options import check_method
 from twoloop.run.record import Status
-from twoloop.solve import check_method, solve_dae
+from twoloop.solve import solve_dae
 
 Integers = NDArray[np.int64]
 

@@ -18,9 +18,10 @@ from twoloop.methods.plan import Method
 from twoloop.problem.events import check_events
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
+from twoloop.run.options import check_method, check_options
 from twoloop.run.record import record_of
 from twoloop.run.sampled import SampledRun, SampledState
-from twoloop.solve import check_method, check_options, solve_dae
+from twoloop.solve import solve_dae
 
 MOST = 64  # systems of other parameters that are kept
 FOR_SAMPLES = {"method", "rtol", "atol", "max_step", "check_derivatives"}

@@ -45,8 +45,9 @@ from twoloop.problem.description import Stop
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.run.impulse import corrected
+from twoloop.run.options import check_method
 from twoloop.run.record import Status
-from twoloop.solve import check_method, solve_dae
+from twoloop.solve import solve_dae
 
 if TYPE_CHECKING:
     from twoloop.bodies.model_problem import ModelProblem

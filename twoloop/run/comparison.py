@@ -29,7 +29,9 @@ def compared(
     Compiled ones are not compared again where they were: see CheckedRegion.
     """
     territory = territory_of(run, check_derivatives)
+    parameters = run.varied_parameters
     everywhere = territory.is_due() or run.system.called_in_python
+    everywhere = everywhere or (parameters is not None and not territory.knows(parameters))
     territory.count()
     if not everywhere and end <= run.compared_to[0]:
         return status, message
@@ -37,11 +39,15 @@ def compared(
     status, message = compared_at(run, territory, sample.states(), check_derivatives, status, message, everywhere)
     if status == before:
         run.compared_to[0] = end
+        if parameters is not None:
+            territory.add_parameters(parameters)
     return status, message
 
 
 def territory_of(run: "Run", check_derivatives: bool) -> CheckedRegion:
     """Where runs of its system and kind were that callbacks were compared in."""
+    if run.territory is not None:
+        return run.territory
     what = (check_derivatives, *map(id, run.traced))  # the system keeps these
     return run.system.remembered(("territory", what), CheckedRegion)  # type: ignore[no-any-return]
 

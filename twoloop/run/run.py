@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from twoloop.checks.at_position import dependent_rows, least_inertia, mass_and_rows, pattern_of
 from twoloop.checks.rank import SHOWN, equations_in_words, in_words
 from twoloop.checks.sparse_rows import Rows, SparseRows, norms
+from twoloop.generate.derived_callbacks import CheckedRegion
 from twoloop.generate.time_dependence import Sudden, may_be_narrow, may_be_sudden
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import codes, counters, flags, noted, tolerances
@@ -34,7 +35,7 @@ CONTRADICTS = 1e-6  # relative: what the accelerations of redundant rows may dif
 
 
 class Run:
-    """The arrays of one run, from its start on; `Course` takes it to its end.
+    """The arrays of one run, from its start on; `IntegrationLoop` takes it to its end.
 
     Raises
     ------
@@ -103,6 +104,8 @@ class Run:
         self.lengths: list[float] = []  # of steps across such a position that are still to be tried
         self.jumps: list[float] = []  # times at which velocities changed as by an impulse
         self.compared_to = [-np.inf]  # how far callbacks were compared along the motion, in this run or the same before
+        self.territory: CheckedRegion | None = None  # where callbacks were compared, if cached integrators share it
+        self.varied_parameters: Array | None = None  # of a run that is made for the parameters of several systems
         self._begin()
         self.rank = len(self.work.rows_v)
         self.said: dict[tuple[int, ...], str] = {}  # of redundant rows, at the first start of this run where they are
@@ -151,6 +154,11 @@ class Run:
             other.kit = kit_with(self.system, self.kit.flags, other.plan)
             other.functions = other.kit.functions
         return other
+
+    @property
+    def lands(self) -> bool:
+        """Whether steps end at all output times."""
+        return self.plan.lands or self.control[self.a.FIXED_STEP] > 0.0
 
     def control_by(self, plan: Plan) -> None:
         """Step-size control as a plan wants it."""

@@ -22,10 +22,10 @@ from twoloop.methods.auto import Auto
 from twoloop.methods.plan import Method
 from twoloop.methods.taylor import Taylor
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.course import Course
 from twoloop.run.fields import statistics
 from twoloop.run.interrupts import Interrupts
 from twoloop.run.kept import InMemory
+from twoloop.run.loop import IntegrationLoop
 from twoloop.run.messages import said_of_end, warned
 from twoloop.run.pace import STAGNATION_STEPS
 from twoloop.run.record import Record, Status
@@ -273,7 +273,7 @@ class SampledRun:
         wanted = Wanted(np.array([end]), True, False, None, InMemory())
         interrupts = Interrupts().listen()
         try:
-            record = Course(run, end, wanted, lambda t: None, None, interrupts).to_end(False)
+            record = IntegrationLoop(run, end, wanted, lambda t: None, None, interrupts).to_end(False)
         finally:
             interrupts.leave()
         run.control[run.a.STORE_ALL], run.work.notes[noted.KINK_AFTER] = 0.0, np.inf

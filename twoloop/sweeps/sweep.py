@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 from twoloop.checks.arguments import check_choice, check_flag, check_path, check_positive, check_size, check_span
 from twoloop.checks.optional import needed
 from twoloop.result.result import Result
-from twoloop.solve import check_method, solve_dae
+from twoloop.run.options import check_method
+from twoloop.solve import solve_dae
 from twoloop.sweeps import saved_rows
 from twoloop.sweeps.executors import solve_runs
 from twoloop.sweeps.one_run import STANDARD_COLUMNS, Row, Work, check_parameters, ends, fit_columns, kind_of

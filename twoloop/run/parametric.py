@@ -101,7 +101,7 @@ class Movable:
         self._functions = functions._replace(p=functions.p.copy(), flags=functions.flags.copy())
         run.plan = self._numbered(kin.plan).fresh()
         run.interiors = {kind: self._numbered(each) for kind, each in kin.interiors.items()}
-        run.traced = run.plan.traced
+        run.traced, run.varied_parameters = run.plan.traced, self._functions.p
         self._remembered: dict[Any, Any] = {
             ("family", trace_cache_of): kin.family,
             ("derivatives", trace_cache_of): None if kin.exact is None else kin.exact.with_numbers(array),
@@ -111,11 +111,6 @@ class Movable:
         self._take(run.system)
         run.kit = kit_with(self.system, run.kit.flags, run.plan)
         run.functions = run.kit.functions
-
-    @property
-    def parameters(self) -> Array:
-        """The vector that the arrays hold."""
-        return self._functions.p  # type: ignore[no-any-return]
 
     def take(self, system: ConstrainedSystem) -> bool:
         """Be for a system of the family; whether it was for another one."""

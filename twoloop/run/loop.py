@@ -1,4 +1,4 @@
-"""The course of a run to its end: the chunks that the compiled `advance` returns, and the record made of them."""
+"""Integrate chunk by chunk: call the compiled `advance`, handle the code that it returns, and record the run."""
 
 import time
 from collections.abc import Callable
@@ -13,6 +13,7 @@ from twoloop.kernels.data import intervals, noted, tolerances
 from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.tolerances import LONGEST_UNSEEN
 from twoloop.problem.events import SAMPLES
+from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.between import interpolator_of
 from twoloop.run.comparison import compared
 from twoloop.run.crossings import Place, turned_last
@@ -42,12 +43,13 @@ MOST_SPARE, LARGEST_SPARE = 16, 250_000  # buffers that wait for their next run,
 _spare: dict[tuple[int, int, int], Buffers] = {}  # buffers, by their sizes, for the next run
 
 
-class Course:
-    """A run on its way, with what is noted of it.
+class IntegrationLoop:
+    """Take a run to its end, and record it.
 
     Parameters
     ----------
     run : Run
+        At its start, or behind a first chunk of steps, with which the loop has to `resume`.
     t1 : float
         Where it ends, s.
     wanted : Wanted
@@ -58,6 +60,10 @@ class Course:
     interrupts : Interrupts
     last : bool
         Whether it is not made again, if it may have missed something.
+    start : ndarray, optional
+        The row [q, v, a, lam] at the start of a run that has left it.
+    system : ConstrainedSystem, optional
+        The one that the result is of, where the arrays of that of the run will belong to another.
     """
 
     def __init__(
@@ -69,8 +75,11 @@ class Course:
         time_limit: float | None,
         interrupts: Interrupts,
         last: bool = True,
+        start: Array | None = None,
+        system: ConstrainedSystem | None = None,
     ):
         self.run, self.t1, self.wanted, self.last = run, t1, wanted, last
+        self.start, self.system = run.state if start is None else start, run.system if system is None else system
         self.report, self.interrupts = report, interrupts
         self.deadline = np.inf if time_limit is None else time.monotonic() + time_limit
         self.recorder = self._recorder()
@@ -93,13 +102,19 @@ class Course:
         ends_before = to_event or time_limit is not None  # then t1 may only stand for any time
         self.pace = Pace(run.t0, np.inf if ends_before else OUT_OF_REACH)
         self.looks = Looks(run.plan)
-        self.sample = Sample(run.t0, run.state, 2 * run.system.n_q)
+        self.sample = Sample(run.t0, self.start, 2 * run.system.n_q)
         self.cpu = 0.0
         self.raised: Exception | None = None
         self.code = INTERRUPTED if interrupts.asked else run.a.PAUSED
 
+    def resume(self, code: int, t: Array, rows: Array, steps: Array, cpu_time: float) -> None:
+        """Copy the first chunk, times, rows and steps as of `advance`, and handle the code that it ended with."""
+        self.code, self.cpu = code, cpu_time
+        self._take(t.copy(), rows.copy(), steps.copy(), self._kinds(steps, False, False))
+        self._handle(steps, False, cpu_time)
+
     def to_end(self, check_derivatives: bool) -> Record:
-        """Go on chunk by chunk, look at derivatives once more at the end, and put together what the run returns."""
+        """Go on chunk by chunk, compare derivatives once more at the end, and return the record of the run."""
         run, recorder = self.run, self.recorder
         a, clock = run.a, run.clock
         buffers, copied = self._buffers(), True
@@ -117,16 +132,9 @@ class Course:
             self.cpu += spent
             if recorder.ended is not None:
                 break
-            if self.code == a.ALL_OUTPUT_DONE:
-                if self.looks.kept:
-                    self.looks.pass_by(steps[:, a.H])
-                self.report(self.t1)
-                break
-            self._look(steps, across, spent)
+            self._handle(steps, across, spent)
             if not copied or len(buffers[0]) < min(run.chunk, BUFFER_ROWS):
                 buffers = self._buffers()
-            self._go_on(across, n_steps)
-            self.report(clock[a.T])
         if copied and buffers[1].size <= LARGEST_SPARE:
             _spare[buffers[0].size, buffers[1].size, len(buffers[2])] = buffers
             for oldest in list(_spare)[:-MOST_SPARE]:
@@ -138,6 +146,17 @@ class Course:
         if self.raised is not None and recorder.ended is None:
             raise self.raised
         return self._record(check_derivatives)
+
+    def _handle(self, steps: Array, across: bool, spent: float) -> None:
+        """Handle the code that `advance` came back with: at the end it stays, else it says why the loop stops."""
+        if self.code == self.run.a.ALL_OUTPUT_DONE:
+            if self.looks.kept:
+                self.looks.pass_by(steps[:, self.run.a.H])
+            self.report(self.t1)
+            return
+        self._look(steps, across, spent)
+        self._go_on(across, len(steps))
+        self.report(self.run.clock[self.run.a.T])
 
     def _advance(self, buffers: Buffers) -> None:
         """One chunk, compiled."""
@@ -280,8 +299,8 @@ class Course:
             status, message = Status.INTERRUPTED, said_of_interrupt(reached, table)
         t_events, q_events, v_events = recorder.events()
         fields = of_run(run, t, table) | {name: kept.array(name) for name in OF_STEPS}
-        fields |= message_of(run, message + explained(status), run.system)
-        fields |= {"status": status, "stats": stats, "sol": recorder.solution(), "system": run.system}
+        fields |= message_of(run, message + explained(status), self.system)
+        fields |= {"status": status, "stats": stats, "sol": recorder.solution(), "system": self.system}
         fields |= {"t_events": t_events, "q_events": q_events, "v_events": v_events}
         return record_of(Record, DEFAULTS | fields)
 
@@ -314,10 +333,10 @@ class Course:
     def _recorder(self) -> Recorder:
         """What takes the states; where some are to lie between steps, with what finds them."""
         run, n = self.run, self.run.system.n_q
-        interpolator = interpolator_of(run, run.state[: 3 * n]) if self.wanted.between_steps else None
+        interpolator = interpolator_of(run, self.start[: 3 * n]) if self.wanted.between_steps else None
         apart = LONGEST_UNSEEN * (self.t1 - run.t0) / SAMPLES
         every = float(run.tolerances[tolerances.LOOK]) if run.sudden.by_state else apart
-        return Recorder(self.wanted, interpolator, n, run.t0, run.state, every)
+        return Recorder(self.wanted, interpolator, n, run.t0, self.start, every)
 
     def _kinds(self, steps: Array, across: bool, leaps: bool) -> NDArray[np.int64]:
         """What kind of interval each of these accepted steps is, for the solution between them."""
@@ -329,6 +348,10 @@ class Course:
         if across:
             return np.full(len(steps), intervals.ACROSS)
         return kinds_of(run, steps)
+
+
+def silent(t: float) -> None:
+    """Report nothing of how far a run is."""
 
 
 def _where(name: str, t: float, error: Exception) -> str:

@@ -1,0 +1,605 @@
+"""Cached integrators: a call with the options of an earlier one reuses its plan, code, arrays and checks.
+
+`CachedIntegrator` takes a run from its start: `go` of kernels/short_loops.py evaluates the start and takes the first
+chunk of steps in one compiled call. If that reaches the end and nothing unusual happens, the fields of the result are
+deferred. Otherwise `IntegrationLoop` goes on from there.
+"""
+
+import time
+from contextlib import suppress
+from functools import partial
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.arguments import check_vector
+from twoloop.checks.at_position import has_definite_mass
+from twoloop.checks.consistency import Look, check_start
+from twoloop.generate.choices import BOUNDS, LEAST, RANK, SINGULAR_MASS, Choice, Dependents
+from twoloop.generate.compile_equations import GeneratedCode
+from twoloop.generate.derived_callbacks import exact_near, farthest, with_derived_callbacks
+from twoloop.generate.trace_cache import TraceCache, give_bounds, take_bounds, trace_cache_of
+from twoloop.generate.traced_values import Sample, Traced, states_around
+from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.control.clock import N_STEP_COLUMNS
+from twoloop.kernels.data import flags, noted
+from twoloop.kernels.data.collocation import LANES
+from twoloop.kernels.data.flags import BANDWIDTH, FORM
+from twoloop.kernels.layout import lasting, short_loops
+from twoloop.kernels.linalg.band import addresses
+from twoloop.methods.code_for import code_for, may_have_code
+from twoloop.methods.plans_for import plans_for
+from twoloop.methods.presets import identity
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.between import Between, interpolator_of
+from twoloop.run.comparison import compared_at, territory_of, unlike_before
+from twoloop.run.crossings import TURNED
+from twoloop.run.dense import Table
+from twoloop.run.dense_solution import DenseSolution
+from twoloop.run.fields import BEFORE, kinds_of, of_states, of_steps, statistics
+from twoloop.run.interrupts import Interrupts
+from twoloop.run.kept import OF_STEPS, InMemory
+from twoloop.run.loop import IntegrationLoop, silent
+from twoloop.run.messages import said_of_reached
+from twoloop.run.options import Options
+from twoloop.run.parametric import Kin, Movable
+from twoloop.run.record import DEFAULTS, Record, Status
+from twoloop.run.recorder import Wanted
+from twoloop.run.run import CONTRADICTS, Run
+from twoloop.run.short_changes import WITHIN, closer, may_be_missed
+from twoloop.run.workspace import GAMMA_ACCURACY, sparse_factors_pay
+
+Array = NDArray[np.float64]
+
+MOST_WAITING = 4  # integrators of equal options that wait for a call, one a thread
+FIRST_CHUNKS = 4  # in one call, where no states between them are sampled: then Ctrl-C is answered after 0.1 s at most
+AFTER_ERROR = 16  # calls that do not try the arrays after a callback raised in them
+LATER = (*OF_STEPS, "stats")  # fields that are put together apart from the others
+OTHERS = {name: value for name, value in DEFAULTS.items() if name not in LATER}
+SHORT = 1e-3  # s of CPU time of the last run: below it, the elapsed time is read, which takes less time
+REACHED_END = Status.REACHED_END  # to look it up in the enumeration takes longer
+
+
+class Output(NamedTuple):
+    """States that a run has to store: at all steps, or at times, which may be its ends alone; and whether `sol` is."""
+
+    times: Array | None
+    at_ends: bool
+    dense: bool
+    time_limit: float | None
+
+    @property
+    def between(self) -> Array | None:
+        """Times between steps."""
+        return None if self.at_ends else self.times
+
+    def wanted(self, run: Run) -> Wanted:
+        """Return the same for `IntegrationLoop`."""
+        return Wanted(self.times, self.at_ends or run.lands, self.dense, None, InMemory())
+
+
+STEPS = Output(None, False, False, None)
+
+
+class Missed(NamedTuple):
+    """A run that may have missed short changes: it has to be repeated with evaluations `every` so many seconds."""
+
+    every: float
+    cpu_time: float
+
+
+class CachedIntegrator:
+    """The arrays of a run that starts again and again.
+
+    Parameters
+    ----------
+    run : Run
+        A run at its start; the integrator takes it over.
+    system : ConstrainedSystem
+        The one of the call: `run.system` may be another, with derived callbacks.
+    code : GeneratedCode or None
+        The machine code that its plan calls.
+    definite : bool
+        Whether M has an inverse at its start.
+    options : Options
+    kin : Kin or None
+        What it shares with runs of systems of other parameters, which it may then be made for.
+    """
+
+    def __init__(
+        self,
+        run: Run,
+        system: ConstrainedSystem,
+        code: GeneratedCode | None,
+        definite: bool,
+        options: Options,
+        kin: Kin | None,
+    ):
+        self.movable = None if kin is None else Movable(kin, run)
+        self.run, self.options, self.check_derivatives = run, options, (checks := options.check_derivatives)
+        self.territory = run.territory = territory_of(run, checks) if kin is None else kin.territory(checks)
+        run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, (room := first_chunk(run))
+        looked = system if self.movable is None else self.movable.system
+        self.look, self.loops, self.skips = Look(looked), short_loops(), 0
+        self.arrays, self.given = arrays_of(run, self.look, code, definite, options, room), looked.kit
+        self._go = direct(self.loops.go)
+        # places in the block: where states begin, and the report of a run that has only one
+        self.states_from, self.width = self.arrays.told.size, len(run.state)
+        self.one_state_from = self.states_from - self.loops.FRONT - 1
+        self.moved = False  # whether the loop may have changed `run`, beside its arrays
+        self.at_start = {name: getattr(run, name) for name in ("plan", "memory", "chunk", "kit", "functions")}
+        self.form, self.cpu_time = run.kit.flags[FORM], np.inf  # CPU time of the last run, s
+        self.between = Between(run)
+        self.of_run = run.rank, run.redundant, bool(run.plan.own)
+        self.counted = self.arrays.start_rows.tobytes()  # the rows that count, to which `of_run` belongs
+        self.dependent = {self.counted: (run.redundant, run.said_of_rows)}
+
+    @staticmethod
+    def suits(run: Run) -> bool:
+        """Whether the compiled loop can start this run: in the dense form, at a start without warnings."""
+        return run.static is None and not run.said_of_start and not run.system.called_in_python
+
+    @staticmethod
+    def gives(run: Run, output: Output, kin: Kin | None) -> bool:
+        """Whether arrays that serve from start to start can give an output."""
+        if output.dense and (output.between is not None or kin is not None):
+            return False  # both have the same states within steps; what belongs to kin takes other parameters
+        return output.between is None or not (run.lands or run.kit.flags[FORM] == flags.AUGMENTED)
+
+    def integrate(
+        self,
+        system: ConstrainedSystem,
+        t0: float,
+        t1: float,
+        q0: Array,
+        v0: Array,
+        output: Output,
+        interrupts: Interrupts,
+    ) -> dict[str, Any] | Missed | None:
+        """Integrate a system from a start, and return the fields of the result.
+
+        None if the start has to be checked more closely, or a callback raised: then `set_up` says what is wrong. Where
+        nothing unusual happened, the fields are put together when they are asked for, from a copy of the arrays.
+        """
+        run, territory, arrays, loops, movable = self.run, self.territory, self.arrays, self.loops, self.movable
+        due = territory.is_due()
+        if self.skips > 0:
+            self.skips -= 1
+            return None
+        if movable is not None:
+            if movable.take(system):
+                self.look.system, arrays.begun[loops.HOW_OFTEN] = movable.system, loops.NEVER
+        elif self.check_derivatives and not system.checked:
+            return None
+        if self.moved:
+            self._return_to_start()
+        run.t0 = t0
+        kit, work, sizes, box = run.kit.address, run.work.address, self.look.sizes(), territory.known
+        start = kit, self.given.address, work, arrays.address, t0, t1, q0, v0, sizes, box
+        clock = time.perf_counter if self.cpu_time < SHORT else time.process_time
+        began = clock()
+        try:
+            n = n_rows = self._go(*start, False)
+            if n == loops.IN_DOUBT and self.look.is_surely(0, t0, q0, v0):
+                n = self._go(*start, True)
+        except Exception:  # of a callback; the loop knows what to do
+            self.skips, arrays.begun[loops.HOW_OFTEN] = AFTER_ERROR, loops.NEVER
+            return None
+        self.cpu_time = clock() - began
+        fields: dict[str, Any] = {"status": REACHED_END}
+        at_times = None
+        others = run.said_of_rows != "" and arrays.start_rows.tobytes() != self.counted
+        if n < 0 or others or due or output is not STEPS or movable is not None:
+            if n in (loops.IN_DOUBT, loops.REFUSED):
+                return None
+            interrupts.listen()
+            n_rows, n = arrays.filled.tolist()
+            finished = self._finished(system, t1, q0, v0, output, interrupts, due, fields)
+            if not isinstance(finished, tuple):
+                return finished
+            (at_times,) = finished
+        begin, end = self.one_state_from - n_rows - n * N_STEP_COLUMNS, self.states_from
+        data = arrays.block[begin : end if at_times is not None else end + (1 + n_rows) * self.width].copy()
+        fields["later"] = partial(_field, data, at_times, self.of_run, self.cpu_time, system, t1, self.options)
+        territory.count()  # the loop counts its runs itself
+        return fields
+
+    def _finished(
+        self,
+        system: ConstrainedSystem,
+        t1: float,
+        q0: Array,
+        v0: Array,
+        output: Output,
+        interrupts: Interrupts,
+        due: bool,
+        fields: dict[str, Any],
+    ) -> dict[str, Any] | Missed | tuple[tuple[Array, Array] | None] | None:
+        """Check the first chunk of a run, and go on to its end if that is not its last one.
+
+        Return all fields of a run in which something happened, or else what the deferred fields need: a tuple of the
+        output times and the rows there, or of None for all steps. `fields` gets `sol`.
+        """
+        run, arrays, loops = self.run, self.arrays, self.loops
+        n_rows, n_steps = arrays.filled.tolist()
+        begin = self.one_state_from - n_rows - n_steps * N_STEP_COLUMNS
+        report = arrays.told[begin : begin + loops.N_TOLD].tolist()
+        t, rows, steps = arrays.t[: 1 + n_rows], arrays.states[: 1 + n_rows], arrays.steps[:n_steps]
+        if report[loops.IS_NEW]:
+            run.compared_to[0] = -np.inf
+            if not self._agrees(t1, q0, v0):
+                arrays.begun[loops.HOW_OFTEN] = loops.NEVER
+                return None
+        if report[loops.CODE] != run.a.ALL_OUTPUT_DONE or not report[loops.PLAIN]:
+            self.moved = True
+            arguments = output.wanted(run), silent, output.time_limit, interrupts, False
+            loop = IntegrationLoop(run, t1, *arguments, start=rows[0], system=system)
+            loop.resume(int(report[loops.CODE]), t[1:], rows[1:], steps, self.cpu_time)
+            record = loop.to_end(self.check_derivatives)
+            if record.status >= 0 and may_be_missed(run):
+                return Missed(closer(run), record.stats.cpu_time)
+            return fields_of(record, self.options, system, self.of_run[-1])
+        at_times = None
+        kinds = kinds_of(run, steps) if output.dense or output.between is not None else None
+        if output.between is not None:
+            began = time.process_time()
+            self.between.find(output.between, t, rows, kinds, self.look.pattern)
+            self.cpu_time += time.process_time() - began
+        if not self._compared(t, rows, t1, bool(report[loops.INSIDE]), due):
+            arrays.begun[loops.HOW_OFTEN] = loops.NEVER
+            return None
+        if output.dense:
+            table = Table(t.copy(), rows[:, : 3 * system.n_q].copy(), kinds)
+            fields["sol"] = DenseSolution(interpolator_of(run, table.states[0]), table, t1)
+        if output.times is not None:
+            ends = [0 if time == run.t0 else -1 for time in output.times.tolist()]
+            states = rows[ends] if output.at_ends else self.between.completed(output.times)
+            if states is None:
+                return None
+            at_times = output.times.copy(), states
+        return (at_times,)
+
+    def _agrees(self, t1: float, q0: Array, v0: Array) -> bool:
+        """Check a system of other parameters at a new start, where other rows may be redundant."""
+        run = self.run
+        if run.said_of_rows:  # rounding may decide which row is left out
+            counted = self.arrays.start_rows.tobytes()
+            if counted not in self.dependent:
+                there = run.at(run.t0, q0, v0)
+                if there is None:
+                    return False
+                self.dependent[counted] = there.redundant, there.said_of_rows
+            run.redundant, run.said_of_rows = self.dependent[counted]
+            self.of_run, self.counted = (run.rank, run.redundant, self.of_run[-1]), counted
+        return self.movable is None or self.movable.agrees(run.t0, q0, v0, t1, self.look.mass, self.check_derivatives)
+
+    def _return_to_start(self) -> None:
+        """Put back what the loop may have changed, beside arrays."""
+        run, self.moved = self.run, False
+        if run.plan is self.at_start["plan"] and not run.substituted and run.kit.flags[FORM] == self.form:
+            self.at_start |= {"kit": run.kit, "functions": run.functions}  # it may have loaded a step
+        vars(run).update(self.at_start, crossings=[], jumps=[], lengths=[], substituted=False)
+
+    def _compared(self, t: Array, rows: Array, t1: float, inside: bool, due: bool) -> bool:
+        """Compare callbacks at states that lie where none was compared, or everywhere; whether they were right.
+
+        `inside`: all states lie where callbacks were compared.
+        """
+        run, territory, parameters = self.run, self.territory, self.run.varied_parameters
+        if run.compared_to[0] >= t1 and not due:
+            return True
+        everywhere = due or (parameters is not None and not territory.knows(parameters))
+        if everywhere or not inside:
+            n, status = 2 * run.system.n_q, Status.REACHED_END
+            sample = Sample(float(t[0]), rows[0], n)
+            sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
+            states = sample.states()
+            if not everywhere:  # a sample may lie in known places, and all later runs would be sampled in vain
+                states = np.concatenate([farthest(t, rows[:, :n]), states])
+            if compared_at(run, territory, states, self.check_derivatives, status, "", everywhere)[0] != status:
+                return False
+            if parameters is not None:
+                territory.add_parameters(parameters)
+        run.compared_to[0] = t1
+        return True
+
+
+def fields_of(record: Record, options: Options, system: ConstrainedSystem, compiled: bool) -> dict[str, Any]:
+    """Return the fields of the result of a run that the loop took to its end."""
+    fields = vars(record) | options.metadata | {"system": system, "atol": options.atol.copy(), "compiled": compiled}
+    if (own := options.own_tolerance) is not None:  # Newmark's own test, of positions, has its place
+        fields |= {"rtol": own, "atol": np.full(system.n_q, own), "untested": np.ones(len(record.h), dtype=bool)}
+    return fields
+
+
+def _field(
+    data: Array,
+    at_times: tuple[Array, Array] | None,
+    of_run: tuple[int, NDArray[np.int64], bool],
+    cpu_time: float,
+    system: ConstrainedSystem,
+    t1: float,
+    options: Options,
+    name: str,
+) -> dict[str, Any]:
+    """Return a deferred field of a result, with those that are put together with it; `data` is the report of `go`."""
+    if name == "message":
+        return {name: said_of_reached(t1, options.step_size is not None)}
+    loops, n_states, n_steps = short_loops(), int(data[0]), int(data[1])
+    begin, end = (places := loops.FRONT + n_states), places + n_steps * N_STEP_COLUMNS
+    if name in LATER:
+        counts = data[loops.N_TOLD : loops.FRONT].astype(np.int64)
+        by_step = of_steps(data[begin:end].reshape(n_steps, N_STEP_COLUMNS), BEFORE.copy())
+        return by_step | {"stats": statistics(counts, cpu_time)} | options.metadata
+    rank, redundant, own = of_run
+    defect = float(data[loops.DEFECT]) if data[loops.CHECKED] else None
+    fields = {"rank": rank, "redundant": redundant.copy(), "defect": defect, "compiled": own}
+    fields |= {"widest_gap": float(data[loops.WIDEST]), "system": system, "atol": options.atol.copy()}
+    t, rows = (data[loops.FRONT : begin], data[end:].reshape(n_states, -1)) if at_times is None else at_times
+    return OTHERS | of_states(system.n_q, t, rows) | fields | options.metadata
+
+
+NEARER = 0.1  # of the smallest pivot at the start of the first run: below it, a start is looked at anew
+
+
+def first_chunk(run: Run) -> int:
+    """Return the number of attempts of the first chunk, which fills as many rows at most."""
+    return max(LANES, run.chunk * (FIRST_CHUNKS if run.plan.stable_to is None else 1))
+
+
+def arrays_of(
+    run: Run, look: Look, code: GeneratedCode | None, definite: bool, options: Options, room: int
+) -> SimpleNamespace:
+    """Make the arrays that `go` of kernels/short_loops.py reads and writes, with room for so many steps.
+
+    The run is at its start; its clock, control and tolerances become parts of one array. `look` is of its system, or of
+    the one that it stands for; `code` is the machine code that its plan calls; `definite`: whether M has an inverse.
+    """
+    from twoloop.kernels.evaluation import checks as first_look
+    from twoloop.kernels.linalg import rank as pivots
+    from twoloop.kernels.linalg.dependent_columns import dependents as find
+
+    loops, system = short_loops(), look.system
+    of_mass = 0 if system.constant_mass else first_look.DEFINITE if definite else first_look.INDEFINITE
+    numbers, n_rows = np.concatenate([run.clock, run.control, run.tolerances]), system.n_c + system.n_a
+    i, j = run.clock.size, run.clock.size + run.control.size
+    run.clock, run.control, run.tolerances = numbers[:i], numbers[i:j], numbers[j:]
+    memory, (of_work, integers) = run.plan.memory, lasting(run.work)
+    choice, nothing = None if code is None else code.shared.equations.choice, np.zeros(0, dtype=np.int64)
+    expected, scale = _expected(choice)
+    blocks = [] if choice is None else [(i[0], i[-1], j[0], j[-1]) for i, j in choice.blocks]
+    dependents = Dependents(system, () if choice is None else choice.rows)
+    search = dependents.arguments if dependents.find else (nothing, nothing, 0, np.zeros(0), nothing, nothing)
+    places = np.flatnonzero(memory.view(np.int64))  # -0 is not what is cleared
+    weak = 0.0 if system.constant_mass and system.made.get("no weak mass", False) else SINGULAR_MASS
+    of_start: tuple[float, ...]
+    of_start = max(run.rtol, GAMMA_ACCURACY), run.reuse, 0.0 if run.plan.watchful else 1.0
+    of_start += np.array_equal(search[0] != 0, run.work.pattern.ravel() != 0.0), RANK, weak, scale, CONTRADICTS
+    of_start += of_mass, NEARER * run.work.notes[noted.PIVOT], run.kit.flags[FORM]
+    of_steps = options.first_step or 0.0, run.least_atol, options.max_step, run.plan.looks_within
+    columns, width = run.a.N_STEP_COLUMNS, len(run.state)
+    block = np.empty(loops.FRONT + 1 + (1 + columns) * room + width * (1 + room))
+    told, states = np.split(block, [len(block) - width * (1 + room)])
+    arrays = SimpleNamespace(
+        **look.arrays,
+        **{"numbers": numbers, "begin_numbers": numbers.copy()},
+        **{"memory": memory, "places": places, "begin_memory": memory[places]},
+        **{"clock": run.clock, "control": run.control, "tolerances": run.tolerances, "options": run.plan.options},
+        **{"state": run.state, "new_state": run.new_state, "lasting": of_work, "lasting_integers": integers},
+        **{"saved": np.empty(numbers.size + of_work.size + run.state.size), "saved_integers": integers.copy()},
+        **{"constants": np.array([*of_start, *of_steps, run.near, TURNED, WITHIN])},
+        lapack=np.array(addresses() if run.kit.flags[BANDWIDTH] >= 0 else [], dtype=np.int64),
+        **{"bounds": BOUNDS, "scratch": np.zeros(pivots.room_size(n_rows, system.n_q)), "expected": expected},
+        **{"chosen": np.zeros(2 + 3 * n_rows, dtype=np.int64), "blocks": np.array(blocks, dtype=np.int64).ravel()},
+        **dict(zip(("kinds", "counted", "_", "search", "search_places", "found"), search, strict=True)),
+        **{"begun": np.zeros(loops.BEGUN + 2 + 2 * system.n_q), "start_rows": run.work.rows_v.copy()},
+        **{"end": np.zeros(1), "t": np.empty(room + 1), "states": states.reshape(room + 1, width)},
+        **{"steps": np.empty((room, columns)), "filled": np.zeros(2, dtype=np.int64), "told": told, "block": block},
+        **{"look": first_look.look, "choose": pivots.choose, "dependents": find},
+        **{"start": run.kernels.start, "advance": run.kernels.advance},
+    )
+    arrays.table = loops.AGAIN.table(arrays)
+    arrays.address = arrays.table.ctypes.data
+    return arrays
+
+
+def _expected(choice: Choice | None) -> tuple[NDArray[np.int64], float]:
+    """A choice as kernels have it, and its scale."""
+    if choice is None:
+        return np.zeros(0, dtype=np.int64), 1.0
+    place = int(np.searchsorted(-LEAST, -choice.least))
+    numbers = place, len(choice.rows), len(choice.added), *choice.rows, *choice.added
+    return np.array(numbers, dtype=np.int64), choice.scale
+
+
+MOST, LARGEST = 16, 150_000  # entries of a system's cache, one for each set of options; numbers in a run's workspace
+MOST_ALIKE = 3  # entries of equal options, as starts may ask for other code
+
+
+class CacheEntry(NamedTuple):
+    """A run at its start, for calls with the same options, from there or from elsewhere."""
+
+    run: Run
+    start: tuple[float, bytes, bytes]
+    t1: float
+    code: GeneratedCode | None
+    definite: bool  # whether M was
+    moves: bool  # whether the run of another start differs by that start alone
+    waiting: list[CachedIntegrator] | None  # integrators, one a thread; None: the compiled loop cannot start this run
+    kin: Kin | None = None  # what it shares with systems of other parameters
+
+
+# where the last run began, the entries, and the code of the last run, if it was that of no entry
+NO_RUNS: tuple[Any, dict[Any, tuple[CacheEntry, ...]], int | None] = (None, {}, None)
+
+
+def cached_result(
+    system: ConstrainedSystem,
+    t0: float,
+    t1: float,
+    q0: Array,
+    v0: Array,
+    options: Options,
+    output: Output,
+    interrupts: Interrupts,
+) -> tuple[dict[str, Any], str] | Missed | Run | None:
+    """Integrate by the cached integrator of the system and its options, which the first call makes.
+
+    Returns the fields of the result and a warning of its rows. A `Run` at its start if it cannot be cached; None if
+    `set_up` has to check the start.
+    """
+    alike = system.made.get("runs", NO_RUNS)[1].get(options.key, ())
+    if not alike and (others := system.shared.get("runs")):
+        entry = others.get((options.key, _family_of(system)))
+        alike = (entry,) if isinstance(entry, CacheEntry) else ()
+    run = None
+    if not alike and not system.called_in_python:
+        interrupts.listen()
+        q0, v0 = check_vector("q0", q0, system.n_q), check_vector("v0", v0, system.n_q)
+        run, entry = set_up(system, t0, t1, q0, v0, options)
+        if entry is None or entry.waiting is None or not CachedIntegrator.gives(run, output, None):
+            return run
+        alike = (entry,)
+    for entry in alike:
+        if entry.waiting is None or not (output is STEPS or CachedIntegrator.gives(entry.run, output, entry.kin)):
+            continue
+        try:
+            integrator = entry.waiting.pop()
+        except IndexError:
+            interrupts.listen()
+            run = entry.run.again() if run is None else run
+            integrator = CachedIntegrator(run, system, entry.code, entry.definite, options, entry.kin)
+        made = integrator.integrate(system, t0, t1, q0, v0, output, interrupts)
+        said_of_rows = integrator.run.said_of_rows
+        if len(entry.waiting) < MOST_WAITING:
+            entry.waiting.append(integrator)
+        if made is not None:
+            return made if isinstance(made, Missed) else (made, said_of_rows)
+    return None
+
+
+def set_up(
+    system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
+) -> tuple[Run, CacheEntry | None]:
+    """Make a run at its start, or copy a cached one, from the same start or from another; with the entry of a new one.
+
+    Cached are runs of twoloop's own methods, compiled callbacks and trusted traces.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the start is refused, the method cannot run the system, or asked-for code cannot be had.
+    """
+    if system.called_in_python:  # what such functions find in their surroundings may change
+        return _new_run(system, t0, t1, q0, v0, options)[0], None
+    start, call = (t0, q0.tobytes(), v0.tobytes()), options.key
+    came_from, runs, before = system.made.get("runs", NO_RUNS)
+    alike = runs.get(call, ())
+    run, entry = None, next((each for each in alike if each.start == start), None)
+    if entry is not None:
+        run, code = entry.run.again(), entry.code
+        if entry.t1 != t1:
+            options.set_sizes(run, t1)
+    for each in alike:
+        if run is None and each.moves:
+            run, entry, code = _moved(each, system, t0, t1, q0, v0, options), each, each.code
+    if run is None:
+        (run, code), entry = _new_run(system, t0, t1, q0, v0, options), None
+        if run.system is system:
+            _keep_for_kin(system, run, code, t1, options)
+    new, added = not alike or before == id(code) if entry is None else came_from == start != entry.start, None
+    if new and (added := _entry_of(run, code, t1, options)) is not None:
+        runs = {} if len(runs) == MOST else dict(runs)  # another thread may read the old one
+        runs[call] = added, *[each for each in alike if each is not entry][: MOST_ALIKE - 1]
+    system.made["runs"] = start, runs, id(code) if entry is None else None
+    return run, added
+
+
+def _entry_of(run: Run, code: GeneratedCode | None, t1: float, options: Options) -> CacheEntry | None:
+    """Return what is cached of a run at its start, if it may be."""
+    system, n = run.system, run.system.n_q
+    trusted = identity(options.method) is not None and all(traced.trusted for traced in run.traced)
+    if not trusted or run.work.notes.base.size > LARGEST:
+        return None
+    t0, q0, v0 = run.t0, run.state[:n], run.state[n : 2 * n]
+    settled = code is not None or not may_have_code(
+        system, options.method, options.step_size is not None, options.compiled
+    )
+    definite = has_definite_mass(system, t0, q0)
+    moves = run.static is None and settled and (definite or not sparse_factors_pay(system, run.kit.flags))
+    start = t0, q0.tobytes(), v0.tobytes()
+    waiting: list[CachedIntegrator] | None = [] if moves and CachedIntegrator.suits(run) else None
+    return CacheEntry(run.again(), start, t1, code, definite, moves, waiting)
+
+
+def _family_of(system: ConstrainedSystem) -> TraceCache:
+    made: TraceCache = system.remembered(("family", trace_cache_of), lambda: trace_cache_of(system))
+    return made
+
+
+def _keep_for_kin(system: ConstrainedSystem, run: Run, code: GeneratedCode | None, t1: float, options: Options) -> None:
+    """Keep a run for systems of other parameters, from the second of these on."""
+    call, seen, known = (options.key, _family_of(system)), system.functions, system.shared.get("runs", {})
+    if call not in known:
+        system.shared["runs"] = (known if len(known) < MOST else {}) | {call: seen}
+    elif type(known[call]) is type(seen) and known[call] is not seen:
+        entry = _entry_of(run, code, t1, options)
+        if entry is not None and entry.waiting is not None:
+            fixed = options.step_size is not None
+            with suppress(ValueError):
+                known[call] = entry._replace(kin=Kin(entry.run, code, options.method, fixed, options.compiled))
+                return
+        known[call] = None
+
+
+def _moved(
+    entry: CacheEntry, system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
+) -> Run | None:
+    """A run from another start; None where something else suits that."""
+    _check_start(system, t0, q0, v0, options.check_derivatives)
+    if entry.code is not None and not entry.code.serves(system, t0, q0):
+        return None
+    run = entry.run.at(t0, q0, v0) if has_definite_mass(system, t0, q0) == entry.definite else None
+    if run is not None:
+        options.set_sizes(run, t1)
+    return run
+
+
+def _new_run(
+    system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
+) -> tuple[Run, GeneratedCode | None]:
+    fixed, given, new = options.step_size is not None, system, not system.checked
+    if new:
+        take_bounds(system)
+    _check_start(system, t0, q0, v0, options.check_derivatives)
+
+    def check(traced: Traced) -> None:
+        traced.refuse(system, t0, t1, q0, v0)
+
+    system, derived = with_derived_callbacks(system, check)
+    code = code_for(system, options.method, fixed, options.compiled, t0, q0, check)
+    plan, interiors = plans_for(system, options.method, options.rtol, float(options.atol.min()), fixed, code, check)
+    if derived:
+        plan = plan.changed(traced=(*plan.traced, *derived))
+    if new:
+        give_bounds(given)
+    if system.called_in_python and not fixed:
+        unlike = unlike_before(system, states_around(t0, t1, q0, v0))
+        if unlike is not None:
+            raise ValueError(unlike)
+    run = Run(system, plan, t0, q0, v0, options.rtol, options.atol, options.step_size, interiors)
+    options.set_sizes(run, t1)
+    if options.max_steps is not None:
+        run.control[run.a.MAX_STEPS] = options.max_steps
+    return run, code
+
+
+def _check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, derivatives: bool) -> None:
+    """Check a start, once as long as no other is options for."""
+
+    def check() -> None:
+        check_start(system, t0, q0, v0, derivatives=derivatives, exact=lambda: exact_near(system, t0, q0, v0))
+
+    system.remembered_at(("start", derivatives), (t0, q0.tobytes(), v0.tobytes()), check)

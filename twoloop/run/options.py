@@ -1,0 +1,143 @@
+"""Validate the options of a call, once; calls with equal options share one key, by which integrators are cached."""
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.arguments import check_flag, check_positive, check_size, check_tolerance, shown
+from twoloop.kernels.data import noted
+from twoloop.methods.code_for import Compiled, check_compiled
+from twoloop.methods.plan import Method
+from twoloop.methods.presets import PRESETS, identity, is_preset
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.run import Run
+
+SMALLEST_TOLERANCE = 1e-15  # where both tolerances are below it, rounding hides the error of a step
+
+
+@lru_cache(maxsize=1024)
+def _key(*_: Any) -> object:
+    """Return one object for equal options: a dictionary finds it faster than a long tuple."""
+    return object()
+
+
+@dataclass(frozen=True)
+class Options:
+    """The validated options of a call; `solve_dae` says what the names mean."""
+
+    method: Method
+    rtol: float
+    atol: NDArray[np.float64]
+    first_step: float | None
+    max_step: float
+    max_steps: int | None
+    step_size: float | None
+    compiled: Compiled
+    check_derivatives: bool
+
+    @cached_property
+    def key(self) -> object:
+        """The key of the cache of integrators: equal for calls with equal options."""
+        sizes = self.first_step, self.max_step, self.max_steps, self.step_size
+        tolerances = self.rtol, self.atol.tobytes()
+        return _key(identity(self.method), *tolerances, *sizes, self.compiled, self.check_derivatives)
+
+    @cached_property
+    def own_tolerance(self) -> float | None:
+        """The tolerance of positions of a method that tests these by itself."""
+        return getattr(self.method, "error_tol", None)
+
+    @cached_property
+    def metadata(self) -> dict[str, Any]:
+        """Fields of a result that the options give; `untested` is None where all steps are tested, else of the run."""
+        tested = getattr(self.method, "tested", "all")
+        return {"method": self.method.name, "rtol": self.rtol} | ({} if tested == "positions" else {"untested": None})
+
+    def set_sizes(self, run: Run, t1: float) -> None:
+        """Set the first and the largest step of a run to t1, unless its steps are constant, and where kinks may be."""
+        run.work.notes[noted.KINK_AFTER] = t1
+        if self.step_size is None:
+            run.set_sizes(self.first_step, self.max_step, t1)
+
+
+NO_OPTIONS: Any = (None,) * 12, None
+
+
+def options_of(system: ConstrainedSystem, given: tuple[Any, ...]) -> Options:
+    """Validate the options of a call, `given` as to `check_options`, unless they are the objects of the last call."""
+    last, options = system.shared.get("options", NO_OPTIONS)
+    m, r, a, first, longest, most, size, dense, progress, limit, checks, code = last
+    method, rtol, atol, first_step, max_step, max_steps, step_size, *_ = given
+    # to compare them in a loop takes twice as long
+    same = m is method and r is rtol and a is atol and first is first_step and longest is max_step
+    same = same and most is max_steps and size is step_size and dense is given[7] and progress is given[8]
+    if same and limit is given[9] and checks is given[10] and code is given[11]:
+        return options  # type: ignore[no-any-return]
+    options = check_options(system, *given)
+    if type(atol) is float and is_preset(method):  # the caller may change an array, or another object
+        system.shared["options"] = given, options
+    return options
+
+
+def check_options(
+    system: ConstrainedSystem,
+    method: Any,
+    rtol: Any,
+    atol: Any,
+    first_step: Any,
+    max_step: Any,
+    max_steps: Any,
+    step_size: Any,
+    dense_output: Any,
+    progress: Any,
+    time_limit: Any,
+    check_derivatives: Any,
+    compiled: Any,
+) -> Options:
+    """Return the options of a call; raises where one is wrong."""
+    check_flag("dense_output", dense_output)
+    if progress is not None:
+        check_flag("progress", progress)
+    compiled = check_compiled(compiled)
+    check_flag("check_derivatives", check_derivatives)
+    chosen = check_method(method)
+    check_positive("rtol", rtol)
+    atol = check_tolerance("atol", atol, system.n_q)
+    if max(rtol, atol.min()) < SMALLEST_TOLERANCE:
+        raise ValueError(
+            f"rtol and atol must not both be below {SMALLEST_TOLERANCE:g}, where rounding hides the error; given "
+            f"{rtol!r} and {float(atol.min())!r}"
+        )
+    if first_step is not None:
+        check_positive("first_step", first_step)
+    check_positive("max_step", max_step, infinite=True)
+    if step_size is not None:
+        check_positive("step_size", step_size)
+        if first_step is not None or max_step != np.inf:
+            raise ValueError(
+                "step_size is a constant step: give neither first_step nor max_step with it; given step_size = "
+                f"{step_size!r}, first_step = {first_step!r}, max_step = {max_step!r}"
+            )
+    if max_steps is not None:
+        check_size("max_steps", max_steps, 1)
+    if time_limit is not None:
+        check_positive("time_limit", time_limit)
+    sizes = first_step, float(max_step), max_steps, step_size
+    return Options(chosen, float(rtol), atol, *sizes, compiled, bool(check_derivatives))
+
+
+def check_method(method: str | Method) -> Method:
+    """Return the method of a name, or the object itself; raises where it is neither."""
+    names = ", ".join(PRESETS)
+    if isinstance(method, str):
+        if method not in PRESETS:
+            raise ValueError(f"method must be one of {names}, or a method object; given {shown(method)}")
+        return PRESETS[method]
+    if isinstance(method, type) or not callable(getattr(method, "plan", None)):
+        raise TypeError(
+            f"method must be a name ({names}) or an object such as RungeKutta(gauss(3)); given {shown(method)}"
+        )
+    return method
