@@ -51,9 +51,8 @@ __all__ = [
 _NAMES_OF = {
     "checks.consistency": ("ConstraintWarning",),
     "ensembles.consistent_states": ("consistent_states",),
-    "ensembles.ensemble": ("ensemble",),
+    "ensembles.ensemble": ("Runs", "ensemble"),
     "ensembles.integrator": ("Integrator",),
-    "ensembles.runs": ("Runs",),
     "impacts.motion": ("solve_with_friction", "solve_with_stops"),
     "kernels.compile.callbacks": ("callback",),
     "methods.bdf": ("BDF",),

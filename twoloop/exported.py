@@ -2,9 +2,9 @@
 
 from twoloop.checks.consistency import ConstraintWarning as ConstraintWarning
 from twoloop.ensembles.consistent_states import consistent_states as consistent_states
+from twoloop.ensembles.ensemble import Runs as Runs
 from twoloop.ensembles.ensemble import ensemble as ensemble
 from twoloop.ensembles.integrator import Integrator as Integrator
-from twoloop.ensembles.runs import Runs as Runs
 from twoloop.impacts.motion import solve_with_friction as solve_with_friction
 from twoloop.impacts.motion import solve_with_stops as solve_with_stops
 from twoloop.kernels.compile.callbacks import callback as callback

@@ -23,14 +23,12 @@ from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.result.storage import begin_folder, check_folder, end_folder
 from twoloop.run.cached import STEPS, Missed, Output, cached_result, fields_of, set_up
-from twoloop.run.interrupts import Interrupts, not_begun
-from twoloop.run.kept import InMemory, OnDisk
-from twoloop.run.loop import IntegrationLoop
+from twoloop.run.discontinuities import MOST, closer, may_have_missed_changes
+from twoloop.run.loop import IntegrationLoop, Interrupts, interrupted_record
 from twoloop.run.options import options_of
 from twoloop.run.record import Status, record_of
-from twoloop.run.recorder import Wanted
+from twoloop.run.recorder import FileStore, MemoryStore, OutputRequest
 from twoloop.run.run import Run
-from twoloop.run.short_changes import MOST, closer, may_be_missed
 
 Array = NDArray[np.float64]
 
@@ -196,13 +194,13 @@ def solve_dae(
             is_plain = times is time_limit is None and not dense_output
             output = STEPS if is_plain else Output(times, at_ends, bool(dense_output), time_limit)
             made = cached_result(system, t0, t1, q0, v0, options, output, interrupts)
-            if type(made) is tuple and (not interrupts.asked or made[0]["status"] == Status.INTERRUPTED):
-                fields, said_of_rows = made
-                if said_of_rows:
-                    warnings.warn(said_of_rows, ConstraintWarning, stacklevel=2)
+            if isinstance(made, tuple) and (not interrupts.asked or made[0]["status"] == Status.INTERRUPTED):
+                fields, rows_warning = made
+                if rows_warning:
+                    warnings.warn(rows_warning, ConstraintWarning, stacklevel=2)
                 return record_of(Result, fields)
             if isinstance(made, Missed):
-                every, spent, repeats = *made, MOST - 1
+                every, spent, repeats = made.every, made.cpu_time, MOST - 1
             elif isinstance(made, Run):
                 run = made
         interrupts.listen()
@@ -213,23 +211,23 @@ def solve_dae(
                 run, _ = set_up(system, t0, t1, q0, v0, options)
                 if every < np.inf:
                     run.control[run.a.APART] = every
-            if left == repeats and run.said_of_rows:
-                warnings.warn(run.said_of_rows, ConstraintWarning, stacklevel=2)
+            if left == repeats and run.rows_warning:
+                warnings.warn(run.rows_warning, ConstraintWarning, stacklevel=2)
             with_code, lands = bool(run.plan.own), run.lands or at_ends
             with _progress_bar(options.method.name, t0, t1) if progress else NO_BAR as report:
-                kept = InMemory() if folder is None else begin_folder(folder, system.n_q)
-                wanted = Wanted(times, lands, bool(dense_output), event_functions, kept)
+                kept = MemoryStore() if folder is None else begin_folder(folder, system.n_q)
+                wanted = OutputRequest(times, lands, bool(dense_output), event_functions, kept)
                 limit = None if deadline is None else max(0.0, deadline - time.monotonic())
                 last = left == 0 or folder is not None
                 record = IntegrationLoop(run, t1, wanted, report, limit, interrupts, last).to_end(check_derivatives)
             give_back(run.work)
-            if last or record.status < 0 or not may_be_missed(run):
+            if last or record.status < 0 or not may_have_missed_changes(run):
                 break
             every, spent, run = closer(run), spent + record.stats.cpu_time, None
         if spent > 0.0:
             record = replace(record, stats=replace(record.stats, cpu_time=spent + record.stats.cpu_time))
         result = record_of(Result, fields_of(record, options, system, with_code))
-        if isinstance(kept, OnDisk):
+        if isinstance(kept, FileStore):
             end_folder(kept, result)
         return result
     except KeyboardInterrupt:
@@ -237,7 +235,7 @@ def solve_dae(
             raise
     finally:
         interrupts.leave()
-    return record_of(Result, vars(not_begun(system, t0, event_functions, options.method.name)))
+    return record_of(Result, vars(interrupted_record(system, t0, event_functions, options.method.name)))
 
 
 @contextmanager

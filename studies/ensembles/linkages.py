@@ -10,8 +10,8 @@ from references.paper.four_bar_minimal import MinimalFourBar
 from studies.bench.cli import Call
 from studies.bench.store import Array
 from twoloop import consistent_states, ensemble, mechanisms
-from twoloop.ensembles.in_lanes import threads_of
-from twoloop.ensembles.runs import Runs
+from twoloop.ensembles.ensemble import Runs
+from twoloop.ensembles.lanes import threads_of
 from twoloop.mechanisms import Problem, four_bar
 from twoloop.mechanisms.four_bar import DENSITY, GRAVITY
 

@@ -10,7 +10,7 @@ from tests.compiled import PENDULUM, circle_of_length, heavy
 from tests.marks import slow
 from tests.problems import event, pendulum, pendulum_state, unconstrained
 from twoloop import ConstrainedSystem, ConstraintWarning, Status, callback, ensemble, mechanisms, solve_dae
-from twoloop.ensembles.lane_methods import lane_methods
+from twoloop.ensembles.lanes import lane_methods
 
 SPAN, TOLERANCE = (0.0, 2.0), 1e-8
 TIMES = np.sort(np.concatenate([np.linspace(*SPAN, 9), [1e-4, 0.501, 0.5011, 1.99999]]))
@@ -60,7 +60,7 @@ def far_from_single_runs(runs, which, system, span, q, v, parameters, **options)
 @pytest.fixture(autouse=True)
 def builds(monkeypatch):
     """Lanes are compiled however few runs there are."""
-    monkeypatch.setattr("twoloop.ensembles.in_turn.CALL", 1e9)
+    monkeypatch.setattr("twoloop.ensembles.ensemble.CALL", 1e9)
 
 
 @pytest.fixture(scope="module", params=["auto", *(slow(name) for name in ("DOP853", "RadauIIA9", "RadauIIA13"))])
@@ -68,7 +68,7 @@ def made(request):
     system, q, v, parameters = pendulums(140)
     options = {"method": request.param, "rtol": TOLERANCE, "atol": TOLERANCE, "t_eval": TIMES}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("twoloop.ensembles.in_turn.CALL", 1e9)
+        patch.setattr("twoloop.ensembles.ensemble.CALL", 1e9)
         runs = ensemble(system, SPAN, q, v, parameters=parameters, threads=1, **options)
     return system, q, v, parameters, options, runs
 

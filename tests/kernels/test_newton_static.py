@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-import twoloop.run.newton_form as newton_form
 import twoloop.run.static_form as static_module
 from studies.bench.large import PLANAR, closed_chain, grid, ladder, open_chain, tree
 from tests.kernels.random_assemblies import PlanarAssembly
@@ -28,7 +27,7 @@ def form(monkeypatch):
 
     monkeypatch.setattr(Run, "change_form", noted)
     monkeypatch.setattr(static_module, "SPARSE", 1e9)
-    monkeypatch.setattr(newton_form, "SPARSE", 1e9)
+    monkeypatch.setattr(static_module, "NEWTON_SPARSE", 1e9)
 
     def choose(static):
         monkeypatch.setattr(static_module, "LARGE", 0 if static else 10**9)

@@ -18,8 +18,7 @@ from twoloop.checks.scales import TURNS, generic_factors, scales_of, typical_siz
 from twoloop.checks.sparse_rows import SparseRows, norms
 from twoloop.problem.description import name_and_unit
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.large_projection import dependence, project_sparsely
-from twoloop.run.projection import consistent_state
+from twoloop.run.projection import consistent_state, dependence, project_sparsely
 
 SINGULAR = 1e-9  # singular values of the scaled Jacobian below this fraction of the largest count as zero
 PERTURBATION = 0.02  # relative to max(1, |q|): displacement at which the rank is determined a second time

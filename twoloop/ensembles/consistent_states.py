@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twoloop.checks.arguments import Array, check_finite, check_indices
-from twoloop.ensembles.in_lanes import Integers, aligned, in_blocks, threads_of
+from twoloop.ensembles.lanes import Integers, aligned, in_blocks, threads_of
 from twoloop.ensembles.starts import Starts, all_starts, far_off, generic_parameters, kit_to_write, system_of
 from twoloop.generate.graph import Untraceable
 from twoloop.generate.parameter_expressions import ParameterTape

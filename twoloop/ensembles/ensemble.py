@@ -1,18 +1,17 @@
-"""ensemble: thousands of runs of one system, with parameters and starts of their own, in lanes and threads."""
+"""ensemble: integrate thousands of runs of one system, in SIMD lanes and threads, or one at a time."""
 
 from __future__ import annotations  # ArrayLike stays a word in help()
 
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.checks.arguments import check_positive, check_size, check_span, check_times, check_tolerance
-from twoloop.ensembles.in_lanes import threads_of
-from twoloop.ensembles.in_turn import ManyRuns, of_run
-from twoloop.ensembles.lane_methods import IN_LANES
-from twoloop.ensembles.runs import Runs
-from twoloop.ensembles.starts import Starts, all_starts, system_of
+from twoloop.checks.arguments import Array, check_positive, check_size, check_span, check_times, check_tolerance
+from twoloop.ensembles.lanes import IN_LANES, LOOKS, SHORT, WHY, LaneRuns, is_involved, lane_methods, threads_of
+from twoloop.ensembles.starts import Starts, all_starts, far_off, generic_system, system_of
+from twoloop.generate.graph import Untraceable
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.run.options import check_method
@@ -20,6 +19,212 @@ from twoloop.run.record import Status
 from twoloop.solve import solve_dae
 
 Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Many runs, one along the first axis each.
+
+    Attributes
+    ----------
+    t : ndarray (n_t,)
+        Times, s: `t_eval`, or start and end.
+    q, v : ndarray (n_runs, n_q, n_t)
+        Coordinates and velocities; NaN at times that a run did not reach.
+    status : ndarray (n_runs,)
+        As `Result.status`: 0 where the end was reached, negative where a run failed.
+    success : ndarray (n_runs,) of bool
+    n_steps : ndarray (n_runs,)
+        Accepted steps.
+    n_evaluations : ndarray (n_runs,)
+        Solutions for accelerations, as `Statistics` counts them.
+    singly : ndarray (n_runs,) of bool
+        Runs that were not made in lanes, but one by one, as by `solve_dae`.
+    message : str
+        How many runs reached the end, how many were made in lanes, by which method, how many singly, and why.
+    messages : dict of int to str
+        What `solve_dae` said of those runs that failed.
+    reasons : dict of int to str
+        Why each of the runs that were made singly was.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from twoloop import ensemble
+    >>> from twoloop.mechanisms import pendulum
+    >>> problem = pendulum()
+    >>> speeds = np.array([0.0, 0.5, 1.0])
+    >>> v0 = np.outer(speeds, [0.0, 1.0])  # along the circle
+    >>> runs = ensemble(problem.system, (0.0, 1.0), problem.q0, v0, t_eval=[0.0, 0.5, 1.0])
+    >>> runs.v.shape, runs.status.shape
+    ((3, 2, 3), (3,))
+    """
+
+    t: Array
+    q: Array
+    v: Array
+    status: Integers
+    n_steps: Integers
+    n_evaluations: Integers
+    singly: NDArray[np.bool_]
+    message: str
+    messages: dict[int, str]
+    reasons: dict[int, str]
+
+    @property
+    def success(self) -> NDArray[np.bool_]:
+        """Whether a run reached its end."""
+        made: NDArray[np.bool_] = self.status >= 0
+        return made
+
+    def __len__(self) -> int:
+        return len(self.status)
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} runs to t = {self.t[-1]:g}: {self.message}>"
+
+
+Flags = NDArray[np.bool_]
+
+FAR = 1e5  # tolerances, by which a motion that is not chaotic does not end elsewhere
+CALL = 1e-3  # s of a call of solve_dae beside its steps
+WORTH = 20.0  # times what the runs of a call take singly: what their code may take to compile, as it is kept
+
+
+@dataclass
+class LaneEnsemble:
+    """Runs of one system from t0 to t1, and what came of them so far.
+
+    Attributes
+    ----------
+    system : ConstrainedSystem
+    starts : Starts
+    t1 : float
+    times : ndarray (n_t,)
+        At which states are wanted.
+    rtol, atol : float, ndarray (n_q,)
+    q, v : ndarray (n_runs, n_q, n_t)
+        NaN where there is nothing yet.
+    n_steps, n_evaluations : ndarray (n_runs,)
+    methods : list of str
+        Those that made runs in lanes.
+    turn : ndarray (n_runs,)
+        Which of them made each run; -1: none.
+    reasons : dict
+        Why others were left, by their numbers.
+    why : str
+        Why none was made, or the first method made none.
+    """
+
+    system: ConstrainedSystem
+    starts: Starts
+    t1: float
+    times: Array
+    rtol: float
+    atol: Array
+    q: Array = field(init=False)
+    v: Array = field(init=False)
+    n_steps: Integers = field(init=False)
+    n_evaluations: Integers = field(init=False)
+    turn: NDArray[np.int8] = field(init=False)
+    methods: list[str] = field(default_factory=list)
+    reasons: dict[int, str] = field(default_factory=dict)
+    why: str = ""
+
+    def __post_init__(self) -> None:
+        n_runs = len(self.starts.q)
+        self.q, self.v = np.full((2, n_runs, self.system.n_q, len(self.times)), np.nan)
+        self.n_steps, self.n_evaluations = np.zeros((2, n_runs), dtype=np.int64)
+        self.turn = np.full(n_runs, -1, dtype=np.int8)
+
+    @property
+    def in_lanes(self) -> Flags:
+        """Which runs were made in lanes."""
+        made: Flags = self.turn >= 0
+        return made
+
+    def make_in_lanes(self, method: str, first: Result, threads: int) -> None:
+        """Make those that lanes can make, by the methods of a preset.
+
+        `first` is the first run, made singly: it says whether the motion is stiff and what runs cost, and lanes have
+        to end where it does.
+
+        Raises
+        ------
+        ValueError
+            If a start is not consistent, naming the run.
+        """
+        stiff = (first.stats.n_jacobians or 0) > 0
+        involved = method == "auto" and not stiff and is_involved(generic_system(self.system, self.starts))
+        tolerances = self.rtol, float(self.atol.min())
+        for each in lane_methods(method, stiff, self.system.n_q, *tolerances, involved):
+            left = np.flatnonzero(~self.in_lanes)
+            if len(left) == 1:
+                break
+            try:
+                lanes = LaneRuns(self.system, self.starts, each)
+                singly = len(left) * (first.stats.cpu_time + CALL)
+                if lanes.own.seconds_to_build > WORTH * singly:
+                    raise Untraceable(f"to compile them does not pay for these runs, which take about {singly:.2g} s")
+                self._make(lanes, left, first, threads)
+            except Untraceable as reason:
+                self.why = self.why or str(reason)
+
+    def max_step(self, run: int) -> float:
+        """Of a run that is left: what was met in short looks is to be met again."""
+        return (self.t1 - self.starts.t0) / LOOKS if self.reasons.get(run) == WHY[SHORT] else np.inf
+
+    def _make(self, lanes: LaneRuns, which: Integers, first: Result, threads: int) -> None:
+        """Have these runs made.
+
+        Raises
+        ------
+        Untraceable
+            If the first one ends elsewhere than by itself.
+        """
+        starts, t1, times, rtol, atol = self.starts, self.t1, self.times, self.rtol, self.atol
+        for run in which[far_off(lanes.kit, starts)[which]].tolist():
+            _check_start(self.system, starts, run)
+        within = times[times > starts.t0]
+        ends = within if within.size and within[-1] == t1 else np.append(within, t1)
+        q, v = np.full((2, len(which), self.system.n_q, len(ends)), np.nan)
+        status, steps, evaluations, at_end = lanes.make(which, t1, ends, rtol, atol, threads, q, v)
+        fine = lanes.judge(which, status, t1, rtol, float(atol.min()), q, v, at_end)
+        if fine[0] and first.success:
+            known = first.q[:, -1:]
+            off = np.abs(q[0][:, ends == first.t[-1]] - known)  # of nothing, where that time is not among these
+            if (off > FAR * (atol[:, None] + rtol * np.abs(known))).any():
+                raise Untraceable(f"the first run ends elsewhere by itself, {FAR:g} tolerances and more away")
+        fine[0] = False
+        n, runs = len(within), which[fine]
+        for states, own, start in ((self.q, q, starts.q), (self.v, v, starts.v)):
+            if len(which) == len(states):  # twice as fast as by their numbers
+                np.copyto(states[:, :, len(times) - n :], own[:, :, :n], where=fine[:, None, None])
+            else:
+                states[runs, :, len(times) - n :] = own[fine, :, :n]
+            if n < len(times):
+                states[runs, :, 0] = start[runs]
+        self.n_steps[runs], self.n_evaluations[runs] = steps[fine], evaluations[fine]
+        self.turn[runs] = len(self.methods)
+        self.methods.append(lanes.method.name)
+        left = np.flatnonzero(~fine)
+        self.reasons |= {int(which[i]): WHY[int(status[i])] for i in left.tolist() if which[i] > 0}
+
+
+def _check_start(system: ConstrainedSystem, starts: Starts, run: int) -> None:
+    """Raise unless the start of a run is consistent."""
+    from twoloop.checks.consistency import check_start
+
+    try:
+        check_start(system_of(system, starts, run), starts.t0, starts.q[run], starts.v[run], derivatives=False)
+    except ValueError as error:
+        raise of_run(run, error) from error
+
+
+def of_run(run: int, error: ValueError) -> ValueError:
+    """The error of a single run, with its number, and the function for many runs in the place of that for one."""
+    return ValueError(f"run {run}: {error}".replace("twoloop.consistent_state(", "twoloop.consistent_states("))
+
 
 SHOWN = 5  # numbers of runs in a message
 FIRST = "the first, which checks the system"  # why it is made singly
@@ -117,7 +322,7 @@ def ensemble(
     times = np.array([t0, t1]) if t_eval is None else check_times(t_eval, t0, t1, None)
     n_threads = threads_of(None if threads is None else check_size("threads", threads, 1))
     starts = all_starts(system, t0, q0, v0, parameters)
-    runs = ManyRuns(system, starts, t1, times, float(rtol), tolerance)
+    runs = LaneEnsemble(system, starts, t1, times, float(rtol), tolerance)
     n_runs = len(starts.q)
     status = np.zeros(n_runs, dtype=np.int64)
     options = {"rtol": float(rtol), "atol": tolerance, "t_eval": times, "method": chosen, "events": events}
@@ -167,7 +372,7 @@ def _alone(
         raise of_run(run, error) from error
 
 
-def _message(status: Integers, runs: ManyRuns, reasons: dict[int, str]) -> str:
+def _message(status: Integers, runs: LaneEnsemble, reasons: dict[int, str]) -> str:
     failed, n_runs = int((status < 0).sum()), len(status)
     said = f"{n_runs - failed} of {n_runs} runs reached the end or an event"
     alike: dict[str, list[int]] = {}

@@ -155,8 +155,8 @@ class Integrator:
         )
         asked = self._options["method"], float(rtol), atol, float(max_step), checks
         self._sampled = SampledRun(system, *asked, t0, q, v)
-        if self._sampled.run.said_of_rows:
-            warnings.warn(self._sampled.run.said_of_rows, ConstraintWarning, stacklevel=2)
+        if self._sampled.run.rows_warning:
+            warnings.warn(self._sampled.run.rows_warning, ConstraintWarning, stacklevel=2)
         return self._sampled.state
 
     def step(self, dt: float, inputs: Mapping[int, float] | ArrayLike | None = None) -> SampledState:

@@ -18,7 +18,7 @@ from twoloop.kernels.data import codes, noted
 from twoloop.methods.dop853 import DOP853
 from twoloop.problem.description import Stop
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.impulse import NEGLIGIBLE
+from twoloop.run.discontinuities import NEGLIGIBLE
 from twoloop.run.run import Run
 
 

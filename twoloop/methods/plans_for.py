@@ -26,18 +26,22 @@ def plans_for(
 
     Raises ValueError if the method cannot run the system.
     """
-    known = identity(method)
-    key = (known, rtol, atol, fixed, None if code is None else code.shared.equations.choice)
+    known, choice = identity(method), None if code is None else code.shared.equations.choice
+    key, methods = (known, rtol, atol, fixed, choice), system.remembered("methods", dict)
     kept: dict[tuple[object, ...], Plans] = system.remembered("plans", dict)
     made = None if known is None else kept.get(key)
     if made is None:
-        ready = method.for_system(system, code, check) if hasattr(method, "for_system") else method
+        ready = None if known is None else methods.get((known, choice))  # it does not depend on tolerances
+        if ready is None:
+            ready = method.for_system(system, code, check) if hasattr(method, "for_system") else method
         made = _made(system, ready, rtol, atol, fixed, code)
         settled = code is not None or _series(ready) == _series(method)
         if known is not None and settled and all(each.trusted for each in made[0].traced):
             while len(kept) >= MOST:  # other threads may add to them
                 kept.pop(next(iter(kept.copy())), None)
             kept[key] = made
+            if len(methods) < MOST:
+                methods[known, choice] = ready
     plan, interiors = made
     return plan.fresh(), interiors
 

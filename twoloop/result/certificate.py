@@ -13,7 +13,7 @@ from twoloop.checks.arguments import Array, check_positive, check_tolerance
 from twoloop.kernels.data.intervals import APART
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.record import Record
-from twoloop.run.remake import Remade, Remaker, explicit, implicit, tighter
+from twoloop.run.rerun import IndependentRerun, RerunPiece, explicit, implicit, tighter
 
 PIECES = 200  # the run is divided into at least this many intervals, also the bound of the step size
 LIMIT = 200.0  # tolerances: in tests correct steps had at most 140, wrong ones at least 590 (of TRBDF2: 107)
@@ -157,7 +157,7 @@ class _Checker:
         blocks = np.nan_to_num(np.abs(self.states), posinf=0.0).reshape(len(self.t), 2, len(atol))
         self.rounding = ROUNDING * np.repeat(blocks.max(axis=(0, 2)), len(atol))
         self.gap = 0.0
-        self.remakers: dict[tuple[str, float], Remaker] = {}
+        self.remakers: dict[tuple[str, float], IndependentRerun] = {}
 
     def _steps(self, result: Record) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Return the number of steps of the run in each interval, and whether one of them did not test velocities."""
@@ -270,14 +270,14 @@ class _Checker:
             error = np.abs(state - reference) / self._allowed(reference)
         return float((error[: len(self.atol)] if self.untested[i:j].any() else error).max())
 
-    def _remake(self, method: str, looser: float, start: Array, i: int, j: int) -> Remade | None:
+    def _remake(self, method: str, looser: float, start: Array, i: int, j: int) -> RerunPiece | None:
         """Integrate from `start` at the time of state i to state j; None if that fails."""
         key = (method, looser)
         if key not in self.remakers:
             chosen = explicit() if method == "explicit" else implicit(method == "all")
             q, v = self.states[0].reshape(2, -1).copy()
             rtol, atol = looser * float(tighter(self.rtol)), looser * tighter(self.atol)
-            self.remakers[key] = Remaker(self.system, float(self.t[0]), q, v, chosen, rtol, atol, self.longest)
+            self.remakers[key] = IndependentRerun(self.system, float(self.t[0]), q, v, chosen, rtol, atol, self.longest)
         remaker = self.remakers[key]
         t0, t1 = float(self.t[i]), float(self.t[j])
         max_attempts = MAX_ATTEMPTS + MAX_ATTEMPTS_PER_STEP * (

@@ -18,8 +18,8 @@ from twoloop.result.result import Result
 from twoloop.result.storage import COUNTS, EVENT_FIELDS, FORMAT, METADATA_FILE, NUMBERS, OPTIONAL, REQUIRED, checksum
 from twoloop.run.dense import Interpolator, Table, ranks_at
 from twoloop.run.dense_solution import DenseSolution
-from twoloop.run.kept import read
 from twoloop.run.record import Statistics, Status
+from twoloop.run.recorder import read
 
 KINDS = (intervals.APART, intervals.VELOCITIES, intervals.ACCELERATIONS, intervals.ACROSS)
 INTEGER_LIMIT = 2**63  # of counts

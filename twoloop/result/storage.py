@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import check_path
-from twoloop.run.kept import OF_STEPS, OnDisk
 from twoloop.run.record import Record, Status
+from twoloop.run.recorder import OF_STEPS, FileStore
 
 FORMAT = "twoloop result 1"
 STATES = ("q", "v", "a", "lam")
@@ -76,15 +76,15 @@ def check_folder(store: Any) -> Path:
     return path
 
 
-def begin_folder(path: Path, n_q: int) -> OnDisk:
+def begin_folder(path: Path, n_q: int) -> FileStore:
     """Create the folder of a run; until `end_folder` it counts as that of an interrupted run."""
-    buffers = OnDisk(path)
+    buffers = FileStore(path)
     metadata = {"format": FORMAT, "n_q": n_q, "status": int(Status.INTERRUPTED), "message": INTERRUPTED, "stats": {}}
     (path / METADATA_FILE).write_text(json.dumps(metadata), encoding="utf-8")
     return buffers
 
 
-def end_folder(buffers: OnDisk, result: Record) -> None:
+def end_folder(buffers: FileStore, result: Record) -> None:
     """Write everything that was not written during the run."""
     arrays, metadata = fields_of(result, inside=False)
     for name in arrays.keys() - {*STREAMED, *STATES}:

@@ -7,6 +7,7 @@ deferred. Otherwise `IntegrationLoop` goes on from there.
 
 import time
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -33,22 +34,18 @@ from twoloop.methods.code_for import code_for, may_have_code
 from twoloop.methods.plans_for import plans_for
 from twoloop.methods.presets import identity
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.between import Between, interpolator_of
-from twoloop.run.comparison import compared_at, territory_of, unlike_before
-from twoloop.run.crossings import TURNED
-from twoloop.run.dense import Table
+from twoloop.run.comparison import checked_region_of, compare_callbacks_at, find_nondeterminism
+from twoloop.run.dense import OutputInterpolation, Table, interpolator_of
 from twoloop.run.dense_solution import DenseSolution
-from twoloop.run.fields import BEFORE, kinds_of, of_states, of_steps, statistics
-from twoloop.run.interrupts import Interrupts
-from twoloop.run.kept import OF_STEPS, InMemory
-from twoloop.run.loop import IntegrationLoop, silent
-from twoloop.run.messages import said_of_reached
+from twoloop.run.discontinuities import WITHIN, closer, may_have_missed_changes
+from twoloop.run.loop import NO_KINDS, IntegrationLoop, Interrupts, silent
+from twoloop.run.messages import describe_arrival
 from twoloop.run.options import Options
-from twoloop.run.parametric import Kin, Movable
-from twoloop.run.record import DEFAULTS, Record, Status
-from twoloop.run.recorder import Wanted
+from twoloop.run.parametric import ParametricRun, SharedSetup
+from twoloop.run.record import BEFORE, DEFAULTS, Record, Status, interval_kinds, state_fields, statistics, step_fields
+from twoloop.run.recorder import OF_STEPS, MemoryStore, OutputRequest
 from twoloop.run.run import CONTRADICTS, Run
-from twoloop.run.short_changes import WITHIN, closer, may_be_missed
+from twoloop.run.singular_positions import TURNED
 from twoloop.run.workspace import GAMMA_ACCURACY, sparse_factors_pay
 
 Array = NDArray[np.float64]
@@ -75,15 +72,16 @@ class Output(NamedTuple):
         """Times between steps."""
         return None if self.at_ends else self.times
 
-    def wanted(self, run: Run) -> Wanted:
+    def wanted(self, run: Run) -> OutputRequest:
         """Return the same for `IntegrationLoop`."""
-        return Wanted(self.times, self.at_ends or run.lands, self.dense, None, InMemory())
+        return OutputRequest(self.times, self.at_ends or run.lands, self.dense, None, MemoryStore())
 
 
 STEPS = Output(None, False, False, None)
 
 
-class Missed(NamedTuple):
+@dataclass(frozen=True)
+class Missed:
     """A run that may have missed short changes: it has to be repeated with evaluations `every` so many seconds."""
 
     every: float
@@ -104,7 +102,7 @@ class CachedIntegrator:
     definite : bool
         Whether M has an inverse at its start.
     options : Options
-    kin : Kin or None
+    kin : SharedSetup or None
         What it shares with runs of systems of other parameters, which it may then be made for.
     """
 
@@ -115,13 +113,13 @@ class CachedIntegrator:
         code: GeneratedCode | None,
         definite: bool,
         options: Options,
-        kin: Kin | None,
+        shared: SharedSetup | None,
     ):
-        self.movable = None if kin is None else Movable(kin, run)
+        self.parametric = None if shared is None else ParametricRun(shared, run)
         self.run, self.options, self.check_derivatives = run, options, (checks := options.check_derivatives)
-        self.territory = run.territory = territory_of(run, checks) if kin is None else kin.territory(checks)
+        self.region = run.region = checked_region_of(run, checks) if shared is None else shared.region(checks)
         run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, (room := first_chunk(run))
-        looked = system if self.movable is None else self.movable.system
+        looked = system if self.parametric is None else self.parametric.system
         self.look, self.loops, self.skips = Look(looked), short_loops(), 0
         self.arrays, self.given = arrays_of(run, self.look, code, definite, options, room), looked.kit
         self._go = direct(self.loops.go)
@@ -131,20 +129,20 @@ class CachedIntegrator:
         self.moved = False  # whether the loop may have changed `run`, beside its arrays
         self.at_start = {name: getattr(run, name) for name in ("plan", "memory", "chunk", "kit", "functions")}
         self.form, self.cpu_time = run.kit.flags[FORM], np.inf  # CPU time of the last run, s
-        self.between = Between(run)
+        self.between = OutputInterpolation(run)
         self.of_run = run.rank, run.redundant, bool(run.plan.own)
         self.counted = self.arrays.start_rows.tobytes()  # the rows that count, to which `of_run` belongs
-        self.dependent = {self.counted: (run.redundant, run.said_of_rows)}
+        self.dependent = {self.counted: (run.redundant, run.rows_warning)}
 
     @staticmethod
     def suits(run: Run) -> bool:
         """Whether the compiled loop can start this run: in the dense form, at a start without warnings."""
-        return run.static is None and not run.said_of_start and not run.system.called_in_python
+        return run.static is None and not run.start_warning and not run.system.called_in_python
 
     @staticmethod
-    def gives(run: Run, output: Output, kin: Kin | None) -> bool:
+    def gives(run: Run, output: Output, shared: SharedSetup | None) -> bool:
         """Whether arrays that serve from start to start can give an output."""
-        if output.dense and (output.between is not None or kin is not None):
+        if output.dense and (output.between is not None or shared is not None):
             return False  # both have the same states within steps; what belongs to kin takes other parameters
         return output.between is None or not (run.lands or run.kit.flags[FORM] == flags.AUGMENTED)
 
@@ -163,20 +161,20 @@ class CachedIntegrator:
         None if the start has to be checked more closely, or a callback raised: then `set_up` says what is wrong. Where
         nothing unusual happened, the fields are put together when they are asked for, from a copy of the arrays.
         """
-        run, territory, arrays, loops, movable = self.run, self.territory, self.arrays, self.loops, self.movable
-        due = territory.is_due()
+        run, region, arrays, loops, parametric = self.run, self.region, self.arrays, self.loops, self.parametric
+        due = region.is_due()
         if self.skips > 0:
             self.skips -= 1
             return None
-        if movable is not None:
-            if movable.take(system):
-                self.look.system, arrays.begun[loops.HOW_OFTEN] = movable.system, loops.NEVER
+        if parametric is not None:
+            if parametric.take(system):
+                self.look.system, arrays.begun[loops.HOW_OFTEN] = parametric.system, loops.NEVER
         elif self.check_derivatives and not system.checked:
             return None
         if self.moved:
             self._return_to_start()
         run.t0 = t0
-        kit, work, sizes, box = run.kit.address, run.work.address, self.look.sizes(), territory.known
+        kit, work, sizes, box = run.kit.address, run.work.address, self.look.sizes(), region.known
         start = kit, self.given.address, work, arrays.address, t0, t1, q0, v0, sizes, box
         clock = time.perf_counter if self.cpu_time < SHORT else time.process_time
         began = clock()
@@ -190,8 +188,8 @@ class CachedIntegrator:
         self.cpu_time = clock() - began
         fields: dict[str, Any] = {"status": REACHED_END}
         at_times = None
-        others = run.said_of_rows != "" and arrays.start_rows.tobytes() != self.counted
-        if n < 0 or others or due or output is not STEPS or movable is not None:
+        others = run.rows_warning != "" and arrays.start_rows.tobytes() != self.counted
+        if n < 0 or others or due or output is not STEPS or parametric is not None:
             if n in (loops.IN_DOUBT, loops.REFUSED):
                 return None
             interrupts.listen()
@@ -203,7 +201,7 @@ class CachedIntegrator:
         begin, end = self.one_state_from - n_rows - n * N_STEP_COLUMNS, self.states_from
         data = arrays.block[begin : end if at_times is not None else end + (1 + n_rows) * self.width].copy()
         fields["later"] = partial(_field, data, at_times, self.of_run, self.cpu_time, system, t1, self.options)
-        territory.count()  # the loop counts its runs itself
+        region.count()  # the loop counts its runs itself
         return fields
 
     def _finished(
@@ -228,7 +226,7 @@ class CachedIntegrator:
         report = arrays.told[begin : begin + loops.N_TOLD].tolist()
         t, rows, steps = arrays.t[: 1 + n_rows], arrays.states[: 1 + n_rows], arrays.steps[:n_steps]
         if report[loops.IS_NEW]:
-            run.compared_to[0] = -np.inf
+            run.compared_until[0] = -np.inf
             if not self._agrees(t1, q0, v0):
                 arrays.begun[loops.HOW_OFTEN] = loops.NEVER
                 return None
@@ -238,11 +236,11 @@ class CachedIntegrator:
             loop = IntegrationLoop(run, t1, *arguments, start=rows[0], system=system)
             loop.resume(int(report[loops.CODE]), t[1:], rows[1:], steps, self.cpu_time)
             record = loop.to_end(self.check_derivatives)
-            if record.status >= 0 and may_be_missed(run):
+            if record.status >= 0 and may_have_missed_changes(run):
                 return Missed(closer(run), record.stats.cpu_time)
             return fields_of(record, self.options, system, self.of_run[-1])
         at_times = None
-        kinds = kinds_of(run, steps) if output.dense or output.between is not None else None
+        kinds = interval_kinds(run, steps) if output.dense or output.between is not None else NO_KINDS
         if output.between is not None:
             began = time.process_time()
             self.between.find(output.between, t, rows, kinds, self.look.pattern)
@@ -264,16 +262,17 @@ class CachedIntegrator:
     def _agrees(self, t1: float, q0: Array, v0: Array) -> bool:
         """Check a system of other parameters at a new start, where other rows may be redundant."""
         run = self.run
-        if run.said_of_rows:  # rounding may decide which row is left out
+        if run.rows_warning:  # rounding may decide which row is left out
             counted = self.arrays.start_rows.tobytes()
             if counted not in self.dependent:
                 there = run.at(run.t0, q0, v0)
                 if there is None:
                     return False
-                self.dependent[counted] = there.redundant, there.said_of_rows
-            run.redundant, run.said_of_rows = self.dependent[counted]
+                self.dependent[counted] = there.redundant, there.rows_warning
+            run.redundant, run.rows_warning = self.dependent[counted]
             self.of_run, self.counted = (run.rank, run.redundant, self.of_run[-1]), counted
-        return self.movable is None or self.movable.agrees(run.t0, q0, v0, t1, self.look.mass, self.check_derivatives)
+        mass, derivatives = self.look.mass, self.check_derivatives
+        return self.parametric is None or self.parametric.agrees(run.t0, q0, v0, t1, mass, derivatives)
 
     def _return_to_start(self) -> None:
         """Put back what the loop may have changed, beside arrays."""
@@ -287,10 +286,10 @@ class CachedIntegrator:
 
         `inside`: all states lie where callbacks were compared.
         """
-        run, territory, parameters = self.run, self.territory, self.run.varied_parameters
-        if run.compared_to[0] >= t1 and not due:
+        run, region, parameters = self.run, self.region, self.run.varied_parameters
+        if run.compared_until[0] >= t1 and not due:
             return True
-        everywhere = due or (parameters is not None and not territory.knows(parameters))
+        everywhere = due or (parameters is not None and not region.knows(parameters))
         if everywhere or not inside:
             n, status = 2 * run.system.n_q, Status.REACHED_END
             sample = Sample(float(t[0]), rows[0], n)
@@ -298,11 +297,11 @@ class CachedIntegrator:
             states = sample.states()
             if not everywhere:  # a sample may lie in known places, and all later runs would be sampled in vain
                 states = np.concatenate([farthest(t, rows[:, :n]), states])
-            if compared_at(run, territory, states, self.check_derivatives, status, "", everywhere)[0] != status:
+            if compare_callbacks_at(run, region, states, self.check_derivatives, status, "", everywhere)[0] != status:
                 return False
             if parameters is not None:
-                territory.add_parameters(parameters)
-        run.compared_to[0] = t1
+                region.add_parameters(parameters)
+        run.compared_until[0] = t1
         return True
 
 
@@ -326,19 +325,19 @@ def _field(
 ) -> dict[str, Any]:
     """Return a deferred field of a result, with those that are put together with it; `data` is the report of `go`."""
     if name == "message":
-        return {name: said_of_reached(t1, options.step_size is not None)}
+        return {name: describe_arrival(t1, options.step_size is not None)}
     loops, n_states, n_steps = short_loops(), int(data[0]), int(data[1])
     begin, end = (places := loops.FRONT + n_states), places + n_steps * N_STEP_COLUMNS
     if name in LATER:
         counts = data[loops.N_TOLD : loops.FRONT].astype(np.int64)
-        by_step = of_steps(data[begin:end].reshape(n_steps, N_STEP_COLUMNS), BEFORE.copy())
+        by_step = step_fields(data[begin:end].reshape(n_steps, N_STEP_COLUMNS), BEFORE.copy())
         return by_step | {"stats": statistics(counts, cpu_time)} | options.metadata
     rank, redundant, own = of_run
     defect = float(data[loops.DEFECT]) if data[loops.CHECKED] else None
     fields = {"rank": rank, "redundant": redundant.copy(), "defect": defect, "compiled": own}
     fields |= {"widest_gap": float(data[loops.WIDEST]), "system": system, "atol": options.atol.copy()}
     t, rows = (data[loops.FRONT : begin], data[end:].reshape(n_states, -1)) if at_times is None else at_times
-    return OTHERS | of_states(system.n_q, t, rows) | fields | options.metadata
+    return OTHERS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
 NEARER = 0.1  # of the smallest pivot at the start of the first run: below it, a start is looked at anew
@@ -378,7 +377,7 @@ def arrays_of(
     of_start = max(run.rtol, GAMMA_ACCURACY), run.reuse, 0.0 if run.plan.watchful else 1.0
     of_start += np.array_equal(search[0] != 0, run.work.pattern.ravel() != 0.0), RANK, weak, scale, CONTRADICTS
     of_start += of_mass, NEARER * run.work.notes[noted.PIVOT], run.kit.flags[FORM]
-    of_steps = options.first_step or 0.0, run.least_atol, options.max_step, run.plan.looks_within
+    step_fields = options.first_step or 0.0, run.least_atol, options.max_step, run.plan.looks_within
     columns, width = run.a.N_STEP_COLUMNS, len(run.state)
     block = np.empty(loops.FRONT + 1 + (1 + columns) * room + width * (1 + room))
     told, states = np.split(block, [len(block) - width * (1 + room)])
@@ -389,7 +388,7 @@ def arrays_of(
         **{"clock": run.clock, "control": run.control, "tolerances": run.tolerances, "options": run.plan.options},
         **{"state": run.state, "new_state": run.new_state, "lasting": of_work, "lasting_integers": integers},
         **{"saved": np.empty(numbers.size + of_work.size + run.state.size), "saved_integers": integers.copy()},
-        **{"constants": np.array([*of_start, *of_steps, run.near, TURNED, WITHIN])},
+        **{"constants": np.array([*of_start, *step_fields, run.near, TURNED, WITHIN])},
         lapack=np.array(addresses() if run.kit.flags[BANDWIDTH] >= 0 else [], dtype=np.int64),
         **{"bounds": BOUNDS, "scratch": np.zeros(pivots.room_size(n_rows, system.n_q)), "expected": expected},
         **{"chosen": np.zeros(2 + 3 * n_rows, dtype=np.int64), "blocks": np.array(blocks, dtype=np.int64).ravel()},
@@ -428,7 +427,7 @@ class CacheEntry(NamedTuple):
     definite: bool  # whether M was
     moves: bool  # whether the run of another start differs by that start alone
     waiting: list[CachedIntegrator] | None  # integrators, one a thread; None: the compiled loop cannot start this run
-    kin: Kin | None = None  # what it shares with systems of other parameters
+    shared: SharedSetup | None = None  # what it shares with systems of other parameters
 
 
 # where the last run began, the entries, and the code of the last run, if it was that of no entry
@@ -452,7 +451,7 @@ def cached_result(
     """
     alike = system.made.get("runs", NO_RUNS)[1].get(options.key, ())
     if not alike and (others := system.shared.get("runs")):
-        entry = others.get((options.key, _family_of(system)))
+        entry = others.get((options.key, _trace_cache(system)))
         alike = (entry,) if isinstance(entry, CacheEntry) else ()
     run = None
     if not alike and not system.called_in_python:
@@ -463,20 +462,20 @@ def cached_result(
             return run
         alike = (entry,)
     for entry in alike:
-        if entry.waiting is None or not (output is STEPS or CachedIntegrator.gives(entry.run, output, entry.kin)):
+        if entry.waiting is None or not (output is STEPS or CachedIntegrator.gives(entry.run, output, entry.shared)):
             continue
         try:
             integrator = entry.waiting.pop()
         except IndexError:
             interrupts.listen()
             run = entry.run.again() if run is None else run
-            integrator = CachedIntegrator(run, system, entry.code, entry.definite, options, entry.kin)
+            integrator = CachedIntegrator(run, system, entry.code, entry.definite, options, entry.shared)
         made = integrator.integrate(system, t0, t1, q0, v0, output, interrupts)
-        said_of_rows = integrator.run.said_of_rows
+        rows_warning = integrator.run.rows_warning
         if len(entry.waiting) < MOST_WAITING:
             entry.waiting.append(integrator)
         if made is not None:
-            return made if isinstance(made, Missed) else (made, said_of_rows)
+            return made if isinstance(made, Missed) else (made, rows_warning)
     return None
 
 
@@ -508,7 +507,7 @@ def set_up(
     if run is None:
         (run, code), entry = _new_run(system, t0, t1, q0, v0, options), None
         if run.system is system:
-            _keep_for_kin(system, run, code, t1, options)
+            _share_setup(system, run, code, t1, options)
     new, added = not alike or before == id(code) if entry is None else came_from == start != entry.start, None
     if new and (added := _entry_of(run, code, t1, options)) is not None:
         runs = {} if len(runs) == MOST else dict(runs)  # another thread may read the old one
@@ -534,14 +533,14 @@ def _entry_of(run: Run, code: GeneratedCode | None, t1: float, options: Options)
     return CacheEntry(run.again(), start, t1, code, definite, moves, waiting)
 
 
-def _family_of(system: ConstrainedSystem) -> TraceCache:
+def _trace_cache(system: ConstrainedSystem) -> TraceCache:
     made: TraceCache = system.remembered(("family", trace_cache_of), lambda: trace_cache_of(system))
     return made
 
 
-def _keep_for_kin(system: ConstrainedSystem, run: Run, code: GeneratedCode | None, t1: float, options: Options) -> None:
+def _share_setup(system: ConstrainedSystem, run: Run, code: GeneratedCode | None, t1: float, options: Options) -> None:
     """Keep a run for systems of other parameters, from the second of these on."""
-    call, seen, known = (options.key, _family_of(system)), system.functions, system.shared.get("runs", {})
+    call, seen, known = (options.key, _trace_cache(system)), system.functions, system.shared.get("runs", {})
     if call not in known:
         system.shared["runs"] = (known if len(known) < MOST else {}) | {call: seen}
     elif type(known[call]) is type(seen) and known[call] is not seen:
@@ -549,7 +548,8 @@ def _keep_for_kin(system: ConstrainedSystem, run: Run, code: GeneratedCode | Non
         if entry is not None and entry.waiting is not None:
             fixed = options.step_size is not None
             with suppress(ValueError):
-                known[call] = entry._replace(kin=Kin(entry.run, code, options.method, fixed, options.compiled))
+                shared = SharedSetup(entry.run, code, options.method, fixed, options.compiled)
+                known[call] = entry._replace(shared=shared)
                 return
         known[call] = None
 
@@ -586,7 +586,7 @@ def _new_run(
     if new:
         give_bounds(given)
     if system.called_in_python and not fixed:
-        unlike = unlike_before(system, states_around(t0, t1, q0, v0))
+        unlike = find_nondeterminism(system, states_around(t0, t1, q0, v0))
         if unlike is not None:
             raise ValueError(unlike)
     run = Run(system, plan, t0, q0, v0, options.rtol, options.atol, options.step_size, interiors)

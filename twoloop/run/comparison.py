@@ -21,40 +21,40 @@ Array = NDArray[np.float64]
 LATER = 4  # states of the run at which derivatives are checked again, the last among them
 
 
-def compared(
+def compare_callbacks(
     run: "Run", sample: Sample, end: float, check_derivatives: bool, status: Status, message: str
 ) -> tuple[Status, str]:
     """Status and message, unless callbacks are not what they should be where the run went.
 
     Compiled ones are not compared again where they were: see CheckedRegion.
     """
-    territory = territory_of(run, check_derivatives)
+    region = checked_region_of(run, check_derivatives)
     parameters = run.varied_parameters
-    everywhere = territory.is_due() or run.system.called_in_python
-    everywhere = everywhere or (parameters is not None and not territory.knows(parameters))
-    territory.count()
-    if not everywhere and end <= run.compared_to[0]:
+    everywhere = region.is_due() or run.system.called_in_python
+    everywhere = everywhere or (parameters is not None and not region.knows(parameters))
+    region.count()
+    if not everywhere and end <= run.compared_until[0]:
         return status, message
     before = status
-    status, message = compared_at(run, territory, sample.states(), check_derivatives, status, message, everywhere)
+    status, message = compare_callbacks_at(run, region, sample.states(), check_derivatives, status, message, everywhere)
     if status == before:
-        run.compared_to[0] = end
+        run.compared_until[0] = end
         if parameters is not None:
-            territory.add_parameters(parameters)
+            region.add_parameters(parameters)
     return status, message
 
 
-def territory_of(run: "Run", check_derivatives: bool) -> CheckedRegion:
+def checked_region_of(run: "Run", check_derivatives: bool) -> CheckedRegion:
     """Where runs of its system and kind were that callbacks were compared in."""
-    if run.territory is not None:
-        return run.territory
+    if run.region is not None:
+        return run.region
     what = (check_derivatives, *map(id, run.traced))  # the system keeps these
     return run.system.remembered(("territory", what), CheckedRegion)  # type: ignore[no-any-return]
 
 
-def compared_at(
+def compare_callbacks_at(
     run: "Run",
-    territory: CheckedRegion,
+    region: CheckedRegion,
     states: Array,
     check_derivatives: bool,
     status: Status,
@@ -64,18 +64,18 @@ def compared_at(
     """The same at states [t, q, v] of the run, the last first: those where none was compared, or everywhere."""
     first = states[-1]
     if not everywhere:
-        states = territory.without_known(states)
+        states = region.without_known(states)
     before = status
     if len(states) > 0:
         if check_derivatives:
             status, message = _derivatives_again(run, states, first, status, message)
         status, message = _traces(run, states, status, message)
         if status == before and run.system.called_in_python and run.control[run.a.FIXED_STEP] == 0.0:
-            unlike = unlike_before(run.system, states[:: 1 + len(states) // FEW])
+            unlike = find_nondeterminism(run.system, states[:: 1 + len(states) // FEW])
             if unlike is not None:
                 status, message = Status.WRONG_TRACE, f"In the run {unlike}. {message}"
     if status == before:
-        territory.add(states)
+        region.add(states)
     return status, message
 
 
@@ -97,7 +97,7 @@ def _derivatives_again(run: "Run", states: Array, first: Array, status: Status, 
     return Status.WRONG_DERIVATIVE, f"At t = {found[0]:.10g} of the run {found[1]} {message}"
 
 
-def unlike_before(system: ConstrainedSystem, states: Array) -> str | None:
+def find_nondeterminism(system: ConstrainedSystem, states: Array) -> str | None:
     """Say how a force called in Python differs at a state [t, q, v] once others were in between, or None."""
     n, made = system.n_q, []
     with warnings.catch_warnings(), np.errstate(all="ignore"):

@@ -1,36 +1,142 @@
-"""Integrate chunk by chunk: call the compiled `advance`, handle the code that it returns, and record the run."""
+"""Integrate chunk by chunk: call the compiled `advance`, handle the code that it returns, and record the run.
 
+Ctrl-C ends the run, which returns what it has, wherever the signal arrives. An exception that arises between any two
+instructions of Python finds arrays half written, and machine code between its calls of Python that knows no way out. So
+the signal raises `KeyboardInterrupt` only within the functions of a user, which may take long and from which every
+caller expects exceptions; elsewhere it is kept until the loop looks for it.
+"""
+
+import _signal  # type: ignore[import-not-found]  # `signal` makes enumerations of handlers, which takes 8 microseconds
+import signal
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
+from types import FrameType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.generate.traced_values import Sample
-from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import intervals, noted, tolerances
 from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.tolerances import LONGEST_UNSEEN
-from twoloop.problem.events import SAMPLES
+from twoloop.problem.callbacks import PythonFunctions
+from twoloop.problem.events import SAMPLES, Event
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.between import interpolator_of
-from twoloop.run.comparison import compared
-from twoloop.run.crossings import Place, turned_last
-from twoloop.run.fields import BEFORE, kinds_of, of_run, of_steps, statistics
-from twoloop.run.interrupts import Interrupts, said_of_interrupt
-from twoloop.run.kept import OF_STEPS
-from twoloop.run.messages import message_of, outcome, unless_turned, warned
-from twoloop.run.pace import INTERRUPTED, OUT_OF_REACH, OUT_OF_TIME, STAGNATED, Pace
+from twoloop.run.comparison import compare_callbacks
+from twoloop.run.dense import interpolator_of
+from twoloop.run.discontinuities import warn_of_missed_changes
+from twoloop.run.messages import message_of, outcome, reject_turned_velocities, warn_user
+from twoloop.run.monitors import (
+    INTERRUPTED,
+    OUT_OF_REACH,
+    OUT_OF_TIME,
+    STAGNATED,
+    StallDetector,
+    StiffnessMonitor,
+    describe_stiffness,
+)
 from twoloop.run.passage import beyond, bridge, bridging_kit, give_way, leap, load
-from twoloop.run.record import DEFAULTS, Record, Status, explained, record_of
-from twoloop.run.recorder import Recorder, Wanted
-from twoloop.run.run import Run
-from twoloop.run.short_changes import said_of_missed
-from twoloop.run.stability import Looks, said_of_stiffness
+from twoloop.run.record import (
+    BEFORE,
+    DEFAULTS,
+    Record,
+    Statistics,
+    Status,
+    explained,
+    interval_kinds,
+    of_run,
+    record_of,
+    statistics,
+    step_fields,
+)
+from twoloop.run.recorder import OF_STEPS, OutputRequest, Recorder
+from twoloop.run.run import Buffers, Run
+from twoloop.run.singular_positions import Place, turned_last
 
 Array = NDArray[np.float64]
-Buffers = tuple[Array, Array, Array]  # for times, states and steps
+
+CALLS_A_USER = (PythonFunctions.call.__code__, Event.__call__.__code__)
+IMPATIENCE = 3  # signals after which the next one raises at once, whatever is lost
+
+
+class Interrupts:
+    """Stands in for Python's own handler of Ctrl-C, from when it listens until it is left; a user's handler stays.
+
+    Before, Ctrl-C raises, as ever: that takes less, where all that is half written then is thrown away.
+
+    Attributes
+    ----------
+    asked : int
+        How many signals came.
+    """
+
+    asked, _stands_in = 0, False
+
+    def listen(self) -> "Interrupts":
+        """Keep signals from here on, but for those within the functions of a user."""
+        if _signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            with suppress(ValueError):  # in threads other than the main one, which get no signals
+                _signal.signal(signal.SIGINT, self._heard)
+                self._stands_in = True
+        return self
+
+    def answers(self) -> bool:
+        """Whether Ctrl-C that was raised is to be answered by a result: not the fourth, nor a user's handler's."""
+        self.listen()  # where the handler is Python's own
+        return self._stands_in and self.asked <= IMPATIENCE
+
+    def leave(self) -> None:
+        """Let Python's own handler have its place again."""
+        if self._stands_in:
+            _signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def _heard(self, number: int, frame: FrameType | None) -> None:
+        self.asked += 1
+        if self.asked > IMPATIENCE or _within_a_users_function(frame):
+            raise KeyboardInterrupt
+
+
+def _within_a_users_function(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code in CALLS_A_USER:
+            return True
+        frame = frame.f_back
+    return False
+
+
+def describe_interrupt(t: float, table: Array) -> str:
+    """What is said of a run that Ctrl-C ended at t, with these rows [q, v, a, lam]."""
+    gaps = int(np.isnan(table[:, -1:]).sum())  # where one of them is missing, all are
+    unknown = f" Accelerations and multipliers are NaN at {gaps} of its times." if gaps else ""
+    return f"Interrupted from the keyboard at t = {t:.10g}. The result holds what was computed before.{unknown}"
+
+
+def interrupted_record(system: ConstrainedSystem, t0: float, events: list[Any] | None, method: str) -> Record:
+    """What is returned of a run that Ctrl-C ended before the accelerations at its start were known."""
+    n_q, none = system.n_q, np.zeros(0)
+    columns = np.zeros((n_q, 0))
+    found = None if events is None else [none for _ in events]
+    states = None if events is None else [np.zeros((0, n_q)) for _ in events]
+    return Record(
+        t=none,
+        q=columns,
+        v=columns.copy(),
+        a=columns.copy(),
+        lam=np.zeros((system.n_c + system.n_a, 0)),
+        h=none.copy(),
+        status=Status.INTERRUPTED,
+        message=describe_interrupt(t0, columns.T) + explained(Status.INTERRUPTED),
+        stats=Statistics(n_accepted=0),
+        t_events=found,
+        q_events=states,
+        v_events=states,
+        system=system,
+        method=method,
+    )
+
 
 BUFFER_ROWS = 1024
 BUFFER_STEPS = 4096
@@ -70,7 +176,7 @@ class IntegrationLoop:
         self,
         run: Run,
         t1: float,
-        wanted: Wanted,
+        request: OutputRequest,
         report: Callable[[float], object],
         time_limit: float | None,
         interrupts: Interrupts,
@@ -78,17 +184,17 @@ class IntegrationLoop:
         start: Array | None = None,
         system: ConstrainedSystem | None = None,
     ):
-        self.run, self.t1, self.wanted, self.last = run, t1, wanted, last
+        self.run, self.t1, self.request, self.last = run, t1, request, last
         self.start, self.system = run.state if start is None else start, run.system if system is None else system
         self.report, self.interrupts = report, interrupts
         self.deadline = np.inf if time_limit is None else time.monotonic() + time_limit
         self.recorder = self._recorder()
         self.outputs = np.array([t1])
-        if wanted.times is not None and wanted.lands:
-            self.outputs = np.append(wanted.times[(wanted.times > run.t0) & (wanted.times < t1)], t1)
-        run.control[run.a.STORE_ALL] = wanted.every_step
+        if request.times is not None and request.lands:
+            self.outputs = np.append(request.times[(request.times > run.t0) & (request.times < t1)], t1)
+        run.control[run.a.STORE_ALL] = request.every_step
         self.largest_chunk = BUFFER_STEPS
-        to_event = wanted.events is not None and any(event.terminal < np.inf for event in wanted.events)
+        to_event = request.events is not None and any(event.terminal < np.inf for event in request.events)
         if to_event:
             self.largest_chunk = run.chunk = CHUNK_TO_EVENT
         # the run is looked at after so many attempts, however long the chunks are that the clock allows
@@ -96,12 +202,12 @@ class IntegrationLoop:
         self.plan, self.control, self.kit = run.plan, run.control, run.kit  # at the moment: not always the run's own
         self.counts = BEFORE.copy()
         self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # of which nothing is kept yet
-        if self.wanted.kept.finished:
+        if self.request.store.finished:
             self._tell()
         self.filled = np.zeros(2, dtype=np.int64)
         ends_before = to_event or time_limit is not None  # then t1 may only stand for any time
-        self.pace = Pace(run.t0, np.inf if ends_before else OUT_OF_REACH)
-        self.looks = Looks(run.plan)
+        self.stall = StallDetector(run.t0, np.inf if ends_before else OUT_OF_REACH)
+        self.stiffness = StiffnessMonitor(run.plan)
         self.sample = Sample(run.t0, self.start, 2 * run.system.n_q)
         self.cpu = 0.0
         self.raised: Exception | None = None
@@ -139,7 +245,7 @@ class IntegrationLoop:
             _spare[buffers[0].size, buffers[1].size, len(buffers[2])] = buffers
             for oldest in list(_spare)[:-MOST_SPARE]:
                 _spare.pop(oldest, None)
-        if self.wanted.between_steps:
+        if self.request.between_steps:
             began = time.process_time()
             recorder.finish()
             self.cpu += time.process_time() - began
@@ -150,8 +256,8 @@ class IntegrationLoop:
     def _handle(self, steps: Array, across: bool, spent: float) -> None:
         """Handle the code that `advance` came back with: at the end it stays, else it says why the loop stops."""
         if self.code == self.run.a.ALL_OUTPUT_DONE:
-            if self.looks.kept:
-                self.looks.pass_by(steps[:, self.run.a.H])
+            if self.stiffness.samples:
+                self.stiffness.add_steps(steps[:, self.run.a.H])
             self.report(self.t1)
             return
         self._look(steps, across, spent)
@@ -164,20 +270,7 @@ class IntegrationLoop:
         run.control[a.MAX_ATTEMPTS] = min(run.chunk, max(0, self.next_look - run.attempts()))
         self.filled[:] = 0  # for Ctrl-C before the chunk begins
         try:
-            self.code = direct(run.kernels.advance)(
-                self.kit,
-                run.work,
-                self.plan.options,
-                self.plan.memory,
-                run.tolerances,
-                self.control,
-                run.clock,
-                run.state,
-                run.new_state,
-                self.outputs,
-                *buffers,
-                self.filled,
-            )
+            self.code = run.advance(self.outputs, buffers, self.filled, (self.plan, self.control, self.kit))
         except KeyboardInterrupt:
             self.code = INTERRUPTED
         except Exception as error:  # of a callback; beyond a terminal event it does not matter
@@ -193,28 +286,28 @@ class IntegrationLoop:
         run = self.run
         self.sample.add(t, rows, float(run.clock[run.a.T]), run.state)
         self.step_parts.append(steps)
-        if self.wanted.kept.finished:
+        if self.request.store.finished:
             self._tell()
         self.recorder.add(t, rows, kinds)
 
     def _tell(self) -> None:
         """Keep what is told of each step."""
         steps, self.step_parts = np.concatenate(self.step_parts), self.step_parts[:1]
-        for name, values in of_steps(steps, self.counts).items():
-            self.wanted.kept.add(name, values)
+        for name, values in step_fields(steps, self.counts).items():
+            self.request.store.add(name, values)
 
     def _look(self, steps: Array, across: bool, spent: float) -> None:
         """See whether the run gets anywhere, and how long the next chunk may be."""
         run, a = self.run, self.run.a
         h = steps[:, a.H]
-        self.looks.pass_by(h)
-        self.pace.pass_by(h)
+        self.stiffness.add_steps(h)
+        self.stall.add_steps(h)
         if self.code == a.PAUSED and run.attempts() >= self.next_look:
             self.between_looks = min(2 * self.between_looks, self.largest_chunk)
             self.next_look = run.attempts() + self.between_looks
             if not across:
-                self.looks.take(float(run.clock[a.T]), run.state, run.system.n_q)
-            if self.pace.stagnates(run.clock[a.T], self.t1) and run.control[a.MAX_STEPS] == np.inf:
+                self.stiffness.sample_state(float(run.clock[a.T]), run.state, run.system.n_q)
+            if self.stall.stagnates(run.clock[a.T], self.t1) and run.control[a.MAX_STEPS] == np.inf:
                 self.code = STAGNATED
         if spent < CHUNK_TIME:
             run.chunk = min(2 * run.chunk, self.largest_chunk)
@@ -259,46 +352,46 @@ class IntegrationLoop:
     def _record(self, check_derivatives: bool) -> Record:
         run, recorder, code = self.run, self.recorder, self.code
         t, table = recorder.output()
-        stats, kept = statistics(run.work.counters, self.cpu), self.wanted.kept
+        stats, store = statistics(run.work.counters, self.cpu), self.request.store
         self._tell()
         reached = float(run.clock[run.a.T])
         if recorder.ended is not None or recorder.broken_off is not None:
             for name in OF_STEPS:
-                kept.cut(name, recorder.n_steps)
+                store.cut(name, recorder.n_steps)
             stats = replace(stats, n_accepted=recorder.n_steps)
         if recorder.ended is not None:
             event, end = recorder.ended
             if recorder.n_steps > 0:
-                kept.cut("h", recorder.n_steps - 1)
-                kept.add("h", np.array([recorder.last_step]))
+                store.cut("h", recorder.n_steps - 1)
+                store.add("h", np.array([recorder.last_step]))
             status, message = Status.EVENT, f"{event.name} ended the run at t = {end:.10g}."
         if recorder.broken_off is not None:
             reached = recorder.broken_off
         try:
             if recorder.ended is None:
-                status, message = outcome(run, code, self.t1, self.pace)
+                status, message = outcome(run, code, self.t1, self.stall)
             if status >= 0:
                 end = reached if recorder.ended is None else recorder.ended[1]
                 places = self._last_step(t, table), self._landed(t, table)
-                status, message = unless_turned(run, *places, end, status, message)
+                status, message = reject_turned_velocities(run, *places, end, status, message)
             if code != INTERRUPTED:
                 end = reached
                 if recorder.last is not None:
                     self.sample.end(*recorder.last)
                     end = recorder.last[0]
-                status, message = compared(run, self.sample, end, check_derivatives, status, message)
+                status, message = compare_callbacks(run, self.sample, end, check_derivatives, status, message)
             if self.last and status >= 0:
-                message += said_of_missed(run)
-            if status >= 0 and run.said_of_start:
-                message += warned(run.said_of_start)
+                message += warn_of_missed_changes(run)
+            if status >= 0 and run.start_warning:
+                message += warn_user(run.start_warning)
             if status in EXPLAINED_BY_STIFFNESS:
-                message += said_of_stiffness(self.looks, run.kit, run.work)
+                message += describe_stiffness(self.stiffness, run.kit, run.work)
         except KeyboardInterrupt:
             code = INTERRUPTED
         if self.interrupts.asked or recorder.interrupted or (code == INTERRUPTED and recorder.ended is None):
-            status, message = Status.INTERRUPTED, said_of_interrupt(reached, table)
+            status, message = Status.INTERRUPTED, describe_interrupt(reached, table)
         t_events, q_events, v_events = recorder.events()
-        fields = of_run(run, t, table) | {name: kept.array(name) for name in OF_STEPS}
+        fields = of_run(run, t, table) | {name: store.array(name) for name in OF_STEPS}
         fields |= message_of(run, message + explained(status), self.system)
         fields |= {"status": status, "stats": stats, "sol": recorder.solution(), "system": self.system}
         fields |= {"t_events": t_events, "q_events": q_events, "v_events": v_events}
@@ -307,7 +400,7 @@ class IntegrationLoop:
     def _last_step(self, t: Array, table: Array) -> list[Place]:
         """The beginning of the last step where velocities turned in it, as near a singular position: else nothing."""
         run = self.run
-        if self.wanted.times is not None or self.recorder.ended is not None:
+        if self.request.times is not None or self.recorder.ended is not None:
             return []
         if run.plan.watchful and run.work.notes[noted.NEARLY_SINGULAR] != 1.0:
             return []
@@ -315,9 +408,9 @@ class IntegrationLoop:
 
     def _landed(self, t: Array, table: Array) -> list[Place]:
         """The states on which steps had to end, where one of them is near a singular position: else nothing."""
-        run, wanted = self.run, self.wanted
-        grid = run.control[run.a.FIXED_STEP] > 0.0 and wanted.times is None
-        if not run.came_near() or not (grid or (wanted.times is not None and wanted.lands)):
+        run, request = self.run, self.request
+        grid = run.control[run.a.FIXED_STEP] > 0.0 and request.times is None
+        if not run.passed_near_singular() or not (grid or (request.times is not None and request.lands)):
             return []
         return list(zip(t.tolist(), table, strict=True))
 
@@ -333,21 +426,21 @@ class IntegrationLoop:
     def _recorder(self) -> Recorder:
         """What takes the states; where some are to lie between steps, with what finds them."""
         run, n = self.run, self.run.system.n_q
-        interpolator = interpolator_of(run, self.start[: 3 * n]) if self.wanted.between_steps else None
+        interpolator = interpolator_of(run, self.start[: 3 * n]) if self.request.between_steps else None
         apart = LONGEST_UNSEEN * (self.t1 - run.t0) / SAMPLES
         every = float(run.tolerances[tolerances.LOOK]) if run.sudden.by_state else apart
-        return Recorder(self.wanted, interpolator, n, run.t0, self.start, every)
+        return Recorder(self.request, interpolator, n, run.t0, self.start, every)
 
     def _kinds(self, steps: Array, across: bool, leaps: bool) -> NDArray[np.int64]:
         """What kind of interval each of these accepted steps is, for the solution between them."""
         run = self.run
-        if not self.wanted.between_steps:
+        if not self.request.between_steps:
             return NO_KINDS
         if leaps:
             return np.full(len(steps), intervals.JUMP)
         if across:
             return np.full(len(steps), intervals.ACROSS)
-        return kinds_of(run, steps)
+        return interval_kinds(run, steps)
 
 
 def silent(t: float) -> None:

@@ -1,5 +1,6 @@
 """What is said of how a run ended: status and message, and what to try."""
 
+import sys
 import warnings
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
@@ -11,16 +12,17 @@ from twoloop.checks.at_position import dependent_rows, least_inertia, not_finite
 from twoloop.checks.consistency import ConstraintWarning
 from twoloop.checks.rank import in_words, surely_above
 from twoloop.kernels.data import codes, noted, tolerances
-from twoloop.run.crossings import (
-    Place,
-    ratio_in_any_units,
-    said_of_crossings,
-    said_of_turn,
-    singular_ratio,
-)
-from twoloop.run.pace import INTERRUPTED, OUT_OF_TIME, STAGNATED, STAGNATION_STEPS, Pace
+from twoloop.run.monitors import INTERRUPTED, OUT_OF_TIME, STAGNATED, STAGNATION_STEPS, StallDetector
 from twoloop.run.record import Later, Status
-from twoloop.run.undetermined import WEAK, turned_by_rounding
+from twoloop.run.singular_positions import (
+    WEAK,
+    Place,
+    describe_crossings,
+    describe_turn,
+    ratio_in_any_units,
+    singular_ratio,
+    velocity_rounding_errors,
+)
 
 if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
@@ -44,7 +46,7 @@ _REASONS = {
 }
 
 
-def _said_of_passages(run: "Run") -> str:
+def _describe_passages(run: "Run") -> str:
     """What a run that succeeded has to say of jumps and of singular positions."""
     if not run.jumps and not run.crossings:
         return ""
@@ -66,13 +68,13 @@ def message_of(run: "Run", words: str, system: "ConstrainedSystem", later: Later
     def made(name: str) -> dict[str, Any]:
         if name != "message" and later is not None:
             return later(name)
-        return {"message": words.replace(CROSSINGS, said_of_crossings(system, crossings, now, rank))}
+        return {"message": words.replace(CROSSINGS, describe_crossings(system, crossings, now, rank))}
 
     # what functions in Python find in their surroundings may change
     return made("message") if system.called_in_python else {"later": made}
 
 
-def unless_turned(
+def reject_turned_velocities(
     run: "Run", last_step: list[Place], landed: list[Place], end: float, status: Status, message: str
 ) -> tuple[Status, str]:
     """Status and message, unless velocities turned at a singular position that was crossed, or in the last step.
@@ -80,16 +82,16 @@ def unless_turned(
     `landed`: states before the end on which steps had to end.
     """
     now, crossings = (float(run.clock[run.a.T]), run.state), [each for each in run.crossings if each[0][0] < end]
-    turned = said_of_rounding(run, [*(place for each in crossings for place in each), *landed], end)
+    turned = describe_rounding(run, [*(place for each in crossings for place in each), *landed], end)
     if last_step:
         crossings.append(last_step)
     if crossings and not turned:
         rtol, atol = float(run.tolerances[tolerances.RTOL]), run.tolerances[tolerances.ATOL :]
-        turned = said_of_turn(run.system, crossings, now, run.rank, rtol, atol)
+        turned = describe_turn(run.system, crossings, now, run.rank, rtol, atol)
     return (Status.RANK_LOST, turned) if turned else (status, message)
 
 
-def said_of_rounding(run: "Run", places: list[Place], end: float) -> str:
+def describe_rounding(run: "Run", places: list[Place], end: float) -> str:
     """Where steps went on from velocities that rounding had made; nothing if they did so nowhere."""
     system, n = run.system, run.system.n_q
     for t, state in sorted({place[0]: place for place in places}.values(), key=itemgetter(0)):
@@ -106,17 +108,17 @@ def said_of_rounding(run: "Run", places: list[Place], end: float) -> str:
     return ""
 
 
-def said_of_reached(t: float, fixed: bool) -> str:
+def describe_arrival(t: float, fixed: bool) -> str:
     """The first sentence of a run that came to its end."""
     return f"Reached the end, t = {t:g}{', with a constant step: no error was estimated' if fixed else ''}."
 
 
-def outcome(run: "Run", code: int, t1: float, pace: Pace) -> tuple[Status, str]:
+def outcome(run: "Run", code: int, t1: float, pace: StallDetector) -> tuple[Status, str]:
     """Status and message for how the run ended."""
     a, t = run.a, float(run.clock[run.a.T])
     if code == a.ALL_OUTPUT_DONE:
-        reached = said_of_reached(t, run.control[a.FIXED_STEP] > 0.0)
-        return Status.REACHED_END, reached + _said_of_passages(run) + said_of_end(run)
+        reached = describe_arrival(t, run.control[a.FIXED_STEP] > 0.0)
+        return Status.REACHED_END, reached + _describe_passages(run) + warn_of_singular_end(run)
     stopped = f"Stopped at t = {t:.10g}"
     failure = int(run.clock[a.FAILURE_CODE])
     if code == INTERRUPTED:
@@ -143,7 +145,7 @@ def outcome(run: "Run", code: int, t1: float, pace: Pace) -> tuple[Status, str]:
     if code == a.ROWS_VIOLATED:
         return Status.ROWS_CONTRADICT, _contradiction(run)
     if failure == codes.NOT_FINITE:
-        return (Status.NOT_FINITE, f"{stopped}: {said_of_not_finite(run)}. The result holds what was computed before.")
+        return (Status.NOT_FINITE, f"{stopped}: {describe_not_finite(run)}. The result holds what was computed before.")
     if code == a.RANK_LOST or failure == codes.SINGULAR:
         rows = dependent_rows(run.system, t, run.state[: run.system.n_q])
         return (
@@ -174,7 +176,7 @@ def outcome(run: "Run", code: int, t1: float, pace: Pace) -> tuple[Status, str]:
     )
 
 
-def _standstill(run: "Run", t1: float, pace: Pace) -> str:
+def _standstill(run: "Run", t1: float, pace: StallDetector) -> str:
     """How short the steps are, how many the rest takes, and what may be why."""
     left = (t1 - float(run.clock[run.a.T])) / pace.mean
     before, advice = "", "Shorten t_span, or look at the units of velocities, masses and forces. "
@@ -201,9 +203,9 @@ def _contradiction(run: "Run") -> str:
     )
 
 
-def said_of_end(run: "Run") -> str:
+def warn_of_singular_end(run: "Run") -> str:
     """A warning, and the sentence, where the run ends with constraints that have lost rank, or nearly so."""
-    if not run.came_near():
+    if not run.passed_near_singular():
         return ""
     system, n, t = run.system, run.system.n_q, float(run.clock[run.a.T])
     q, v = run.state[:n], run.state[n : 2 * n]
@@ -224,19 +226,22 @@ def said_of_end(run: "Run") -> str:
             f"changes velocities there {_times_allowed(over)}, and accelerations by more. "
             "End t_span a little before, or beyond, or loosen rtol and atol"
         )
-    return warned(said)
+    return warn_user(said)
 
 
-def warned(said: str, calls: int = 4) -> str:
-    """A sentence for the message of what is warned of, to who called the solver."""
-    warnings.warn(said, ConstraintWarning, stacklevel=calls + 1)
-    return f" {said[0].upper()}{said[1:]}."
+def warn_user(text: str) -> str:
+    """Warn where twoloop was called, and return the warning as a sentence of the message."""
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("twoloop."):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(text, ConstraintWarning, stacklevel=level)
+    return f" {text[0].upper()}{text[1:]}."
 
 
 def _over_allowed(run: "Run", t: float, q: Array, v: Array) -> float:
     """Errors of velocities that rounding of positions makes, over the tolerances."""
     allowed = run.tolerances[tolerances.ATOL :] + run.rtol * np.abs(v).max()
-    return float((turned_by_rounding(run.system, t, q, v, run.rank) / allowed).max())
+    return float((velocity_rounding_errors(run.system, t, q, v, run.rank) / allowed).max())
 
 
 def _times_allowed(over: float) -> str:
@@ -275,7 +280,7 @@ def _near_massless(run: "Run") -> str:
     return f"There {words}. " if ratio < NEARLY_SINGULAR else ""
 
 
-def said_of_not_finite(run: "Run") -> str:
+def describe_not_finite(run: "Run") -> str:
     """Which callback returned a value that is not finite, and when, as far as it is known."""
     kind, at = int(run.work.notes[noted.FAULT_KIND]), float(run.work.notes[noted.FAULT_TIME])
     if kind >= 0:

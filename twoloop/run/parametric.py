@@ -34,7 +34,7 @@ NUMBERS = ("options", "numbers", "own_numbers")  # of a plan, that may be formul
 PARTS = ("interior", "substitute", "within_newton")  # plans that a plan holds
 
 
-class Kin:
+class SharedSetup:
     """What runs share that ask for the same of the systems of a family.
 
     Parameters
@@ -54,7 +54,7 @@ class Kin:
 
     def __init__(self, run: Run, code: GeneratedCode | None, method: Method, fixed: bool, compiled: Compiled):
         system, t, q = run.system, run.t0, run.state[: run.system.n_q]
-        self.family, self._territories = trace_cache_of(system), dict[bool, CheckedRegion]()
+        self.family, self._regions = trace_cache_of(system), dict[bool, CheckedRegion]()
         form, banded = run.kit.flags[FORM], run.kit.flags[BANDWIDTH] >= 0
         if run.static is not None or form == AUGMENTED or banded or system.entries:
             raise ValueError("of large systems more is decided by numbers")
@@ -69,21 +69,21 @@ class Kin:
         give_bounds(system)
         if not self.family.within_bounds >= system.given.keys():
             raise ValueError("a callback may branch on its parameters")
-        made = Movable(self, run.again()).run
+        made = ParametricRun(self, run.again()).run
         if (code is None) is not (own is None) or _told(made) != _told(run):
             raise ValueError("its numbers are not those of the family")
 
-    def territory(self, with_derivatives: bool) -> CheckedRegion:
+    def region(self, with_derivatives: bool) -> CheckedRegion:
         """Where callbacks were compared."""
-        return self._territories.setdefault(with_derivatives, CheckedRegion())
+        return self._regions.setdefault(with_derivatives, CheckedRegion())
 
 
-class Movable:
+class ParametricRun:
     """Arrays of a run for the parameters of one system after another.
 
     Parameters
     ----------
-    kin : Kin
+    kin : SharedSetup
     run : Run
         A copy of that of the kin, at its start. It gets these arrays.
 
@@ -95,16 +95,16 @@ class Movable:
         The same with these arrays, and with what is remembered of it.
     """
 
-    def __init__(self, kin: Kin, run: Run):
-        self.kin, self.run, self._formulas = kin, run, ParameterArrays()
+    def __init__(self, shared: SharedSetup, run: Run):
+        self.shared, self.run, self._formulas = shared, run, ParameterArrays()
         functions, array = run.system.functions, self._formulas.array
         self._functions = functions._replace(p=functions.p.copy(), flags=functions.flags.copy())
-        run.plan = self._numbered(kin.plan).fresh()
-        run.interiors = {kind: self._numbered(each) for kind, each in kin.interiors.items()}
+        run.plan = self._numbered(shared.plan).fresh()
+        run.interiors = {kind: self._numbered(each) for kind, each in shared.interiors.items()}
         run.traced, run.varied_parameters = run.plan.traced, self._functions.p
         self._remembered: dict[Any, Any] = {
-            ("family", trace_cache_of): kin.family,
-            ("derivatives", trace_cache_of): None if kin.exact is None else kin.exact.with_numbers(array),
+            ("family", trace_cache_of): shared.family,
+            ("derivatives", trace_cache_of): None if shared.exact is None else shared.exact.with_numbers(array),
             ("kit", id(self._functions)): Kit(self._functions),
             "kits": {},
         }
@@ -122,10 +122,10 @@ class Movable:
     def _take(self, system: ConstrainedSystem) -> None:
         self.given = system
         self._functions.p[:] = system.functions.p
-        self._formulas.write(self.kin.family.products(self._functions.p))
+        self._formulas.write(self.shared.family.products(self._functions.p))
         self.system = self.run.system = copy.copy(system)
         self.system.functions, self.system.made = self._functions, self._remembered.copy()
-        self.system.within_bounds.update(self.kin.family.within_bounds)
+        self.system.within_bounds.update(self.shared.family.within_bounds)
         self.system.checked, self._mass_agrees = False, not system.constant_mass
         self.system.bandwidth = None  # no run of these makes use of it
         for traced in self.run.traced:
@@ -139,7 +139,7 @@ class Movable:
         run, system = self.run, self.system
         if not self._mass_agrees:
             system.remember_at("definite mass", None, is_definite(mass))
-            known = self.kin.definite, bool(run.kit.flags[DIAGONAL_MASS])
+            known = self.shared.definite, bool(run.kit.flags[DIAGONAL_MASS])
             self._mass_agrees = known == (has_definite_mass(system, t0, q), is_diagonal(mass))
         try:
             if with_derivatives:

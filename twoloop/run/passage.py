@@ -11,7 +11,7 @@ from twoloop.kernels.data.kit import Kit
 from twoloop.kernels.steps.named_step import loaded
 from twoloop.methods.plan import INNER_TOL, LARGEST_MOVE, Plan
 from twoloop.methods.tableaux import gauss
-from twoloop.run.impulse import beyond_jump
+from twoloop.run.discontinuities import state_behind_jump
 from twoloop.run.run import Run
 from twoloop.run.workspace import kit_of, kit_with
 
@@ -117,7 +117,7 @@ def leap(run: Run, t1: float) -> bool:
     """Make ready the step over a jump of C_t or b, after which the method begins anew; whether there is one."""
     a, clock, n = run.a, run.clock, run.system.n_q
     end = float(clock[a.JUMP_TO])
-    state = beyond_jump(run.system, end, run.state[:n], run.state[n : 2 * n])
+    state = state_behind_jump(run.system, end, run.state[:n], run.state[n : 2 * n])
     if state is None:
         return False
     run.new_state[: 2 * n] = state

@@ -1,8 +1,10 @@
-"""What a run keeps of its accepted steps as they come: all states, or those at output times; and its events."""
+"""Record accepted steps as they come: all states, or those at output times, and events; in memory or in files."""
 
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +13,111 @@ from twoloop.kernels.data.intervals import WINDOW
 from twoloop.problem.events import Event, EventSearch
 from twoloop.run.dense import Interpolator, Table
 from twoloop.run.dense_solution import DenseSolution
-from twoloop.run.kept import Kept
+
+MAGIC, HEAD = b"\x93NUMPY\x01\x00", 128  # bytes before the numbers of a file, in NumPy's format npy
+OF_STEPS = ("h", "rejected_error", "rejected_convergence", "partitioned", "untested")  # with a row a step
+
+
+class MemoryStore:
+    """Arrays by name, each of parts that follow one another.
+
+    Attributes
+    ----------
+    finished : bool
+        Whether what is added should be as it is to stay, as no later look would reach all of it.
+    """
+
+    finished = False
+
+    def __init__(self) -> None:
+        self._parts: defaultdict[str, list[NDArray[Any]]] = defaultdict(list)
+
+    def add(self, name: str, part: NDArray[Any]) -> None:
+        """Append rows to an array, which may be kept as they are."""
+        self._parts[name].append(part)
+
+    def cut(self, name: str, n: int) -> None:
+        """Leave the first n rows of an array."""
+        self._parts[name] = [self.array(name)[:n]]
+
+    def array(self, name: str) -> NDArray[Any]:
+        """All rows."""
+        first, *others = self._parts[name]
+        return np.concatenate([first, *others]) if others else first
+
+
+class FileStore:
+    """The same in a folder that is made for it: a file of NumPy's for each array, complete after each part.
+
+    Parameters
+    ----------
+    folder : Path
+
+    Raises
+    ------
+    OSError
+        Of `add`, if there is no room left.
+    """
+
+    finished = True
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir()
+        self.folder = folder
+        self._shapes: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {}
+
+    def add(self, name: str, part: NDArray[Any]) -> None:
+        """Append rows to an array."""
+        dtype, (n, *width) = self._shapes.get(name, (part.dtype, (0, *part.shape[1:])))
+        with self._path(name).open("r+b" if name in self._shapes else "x+b") as file:
+            file.seek(HEAD + n * self._row(dtype, width))
+            file.write(np.ascontiguousarray(part).data)
+            self._close(file, name, dtype, (n + len(part), *width))
+
+    def cut(self, name: str, n: int) -> None:
+        """Leave the first n rows of an array."""
+        dtype, (before, *width) = self._shapes[name]
+        with self._path(name).open("r+b") as file:
+            file.truncate(HEAD + min(n, before) * self._row(dtype, width))
+            self._close(file, name, dtype, (min(n, before), *width))
+
+    def array(self, name: str) -> NDArray[Any]:
+        """All rows, which are read as they are used; what is written to them stays out of the file."""
+        return mapped(self._path(name))
+
+    def _path(self, name: str) -> Path:
+        return self.folder / f"{name}.npy"
+
+    @staticmethod
+    def _row(dtype: np.dtype[Any], width: list[int]) -> int:
+        return int(dtype.itemsize * np.prod(width, dtype=np.int64))
+
+    def _close(self, file: Any, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
+        """Write the head, last: a process that dies before leaves the array as it was."""
+        head = repr({"descr": dtype.str, "fortran_order": False, "shape": shape}).ljust(HEAD - len(MAGIC) - 3) + "\n"
+        file.flush()
+        file.seek(0)
+        file.write(MAGIC + (len(head)).to_bytes(2, "little") + head.encode())
+        self._shapes[name] = dtype, shape
+
+
+Store = MemoryStore | FileStore
+
+
+def mapped(path: Path) -> NDArray[Any]:
+    """The array in a file, read as it is used."""
+    return np.load(path, mmap_mode="c", allow_pickle=False).view(np.ndarray)  # type: ignore[no-any-return]
+
+
+def read(folder: Path) -> dict[str, NDArray[Any]]:
+    """The arrays in a folder by name, without rows that others have not yet: those of a process that died."""
+    arrays = {path.stem: mapped(path) for path in sorted(folder.glob("*.npy"))}
+    for group in (("t", "states"), OF_STEPS, ("sol_t", "sol_states")):
+        there = [name for name in group if name in arrays]
+        n = min((len(arrays[name]) for name in there), default=0)
+        arrays |= {name: arrays[name][:n] for name in there}
+    return arrays
+
 
 Array = NDArray[np.float64]
 
@@ -19,7 +125,7 @@ PENDING = 1024  # states that wait for a look at the intervals between them, whe
 
 
 @dataclass(frozen=True)
-class Wanted:
+class OutputRequest:
     """What a run is to keep.
 
     Attributes
@@ -32,7 +138,7 @@ class Wanted:
         Whether the dense solution is wanted.
     events : list of Event or None
         None: no events were asked for.
-    kept : InMemory or OnDisk
+    kept : MemoryStore or FileStore
         What takes it.
     """
 
@@ -40,7 +146,7 @@ class Wanted:
     lands: bool
     dense: bool
     events: list[Event] | None
-    kept: Kept
+    store: Store
 
     @property
     def every_step(self) -> bool:
@@ -84,20 +190,20 @@ class Recorder:
     """
 
     def __init__(
-        self, wanted: Wanted, interpolator: Interpolator | None, n_q: int, t0: float, state: Array, every: float
+        self, request: OutputRequest, interpolator: Interpolator | None, n_q: int, t0: float, state: Array, every: float
     ):
-        self.wanted, self.interpolator, self._n_q, self._width = wanted, interpolator, n_q, len(state)
+        self.request, self.interpolator, self._n_q, self._width = request, interpolator, n_q, len(state)
         self.n_steps, self.last_step = 0, 0.0
         self.interrupted = False
         self._t, self._rows = np.array([t0]), state[None, :].copy()  # the last states, and those not looked at
         self._kinds = np.empty(0, dtype=np.int64)
         self._next = 0  # the first interval of these that was not looked at
         self._n_outputs = 0
-        ends = wanted.events is not None and any(event.terminal < np.inf for event in wanted.events)
-        self._waits_for = 0 if ends or wanted.kept.finished else PENDING
-        self.search = None if wanted.events is None else EventSearch(wanted.events, t0, state[: 2 * n_q], every)
+        ends = request.events is not None and any(event.terminal < np.inf for event in request.events)
+        self._waits_for = 0 if ends or request.store.finished else PENDING
+        self.search = None if request.events is None else EventSearch(request.events, t0, state[: 2 * n_q], every)
         self._add(self._t, self._rows, self._kinds)
-        if wanted.times is not None and not wanted.lands:
+        if request.times is not None and not request.lands:
             self._store(self._t[:0], self._rows[:0, : 2 * self._n_q])
 
     def add(self, t: Array, rows: Array, kinds: NDArray[np.int64]) -> None:
@@ -106,7 +212,7 @@ class Recorder:
         Of the kinds there is one a step where states between steps are wanted, else none.
         """
         self._add(t, rows, kinds)
-        if not self.wanted.between_steps:
+        if not self.request.between_steps:
             return
         self._t, self._rows = np.concatenate([self._t, t]), np.concatenate([self._rows, rows])
         self._kinds = np.concatenate([self._kinds, kinds])
@@ -114,21 +220,21 @@ class Recorder:
             self._look(len(self._t) - WINDOW)
 
     def _add(self, t: Array, rows: Array, kinds: NDArray[np.int64]) -> None:
-        wanted, kept = self.wanted, self.wanted.kept
-        if wanted.times is None:
+        request, store = self.request, self.request.store
+        if request.times is None:
             self._store(t, rows)
-        elif wanted.lands:  # the ends of the run may not be among the times
-            landed = np.append(wanted.times, np.inf)[np.searchsorted(wanted.times, t)] == t
+        elif request.lands:  # the ends of the run may not be among the times
+            landed = np.append(request.times, np.inf)[np.searchsorted(request.times, t)] == t
             self._store(t[landed], rows[landed])
-        if wanted.dense:
-            kept.add("sol_t", t)
-            kept.add("sol_states", rows[:, : 3 * self._n_q])
-            kept.add("sol_kinds", kinds)
+        if request.dense:
+            store.add("sol_t", t)
+            store.add("sol_states", rows[:, : 3 * self._n_q])
+            store.add("sol_kinds", kinds)
 
     def _store(self, t: Array, rows: Array) -> None:
         """Take rows [q, v, a, lam], or [q, v] where the rest is found at the end."""
-        self.wanted.kept.add("t", t)
-        self.wanted.kept.add("states", self._completed(t, rows) if self.wanted.kept.finished else rows)
+        self.request.store.add("t", t)
+        self.request.store.add("states", self._completed(t, rows) if self.request.store.finished else rows)
 
     def finish(self) -> None:
         """No more states come."""
@@ -171,8 +277,8 @@ class Recorder:
                 self.last_step = float(self.ended[1] - ends[max(before - 1, 0)])
                 ends = np.append(ends[:before], self.ended[1])
         self.n_steps += len(ends) - 1
-        if self.wanted.times is not None and not self.wanted.lands:
-            times = self.wanted.times[self._n_outputs :]
+        if self.request.times is not None and not self.request.lands:
+            times = self.request.times[self._n_outputs :]
             times = times[times <= ends[-1]]
             try:
                 self._store(times, interpolator.states(table, times))
@@ -185,17 +291,17 @@ class Recorder:
 
     def output(self) -> tuple[Array, Array]:
         """Times and rows [q, v, a, lam] of the result."""
-        kept, end = self.wanted.kept, self.broken_off if self.ended is None else self.ended[1]
+        store, end = self.request.store, self.broken_off if self.ended is None else self.ended[1]
         if end is not None:
-            n = int(np.searchsorted(kept.array("t"), end, side="right"))
-            kept.cut("t", n)
-            kept.cut("states", n)
-        t = kept.array("t")
-        if self.wanted.times is None and self.last is not None and t[-1] < self.last[0]:
+            n = int(np.searchsorted(store.array("t"), end, side="right"))
+            store.cut("t", n)
+            store.cut("states", n)
+        t = store.array("t")
+        if self.request.times is None and self.last is not None and t[-1] < self.last[0]:
             last = np.array([self.last[0]])
             self._store(last, self._completed(last, self.last[1][None, :]))
-            t = kept.array("t")
-        return t, self._completed(t, kept.array("states"))
+            t = store.array("t")
+        return t, self._completed(t, store.array("states"))
 
     def _completed(self, times: Array, rows: Array) -> Array:
         """Rows [q, v, a, lam] at rows [q, v]."""
@@ -211,9 +317,9 @@ class Recorder:
 
     def solution(self) -> DenseSolution | None:
         """The dense solution, if it is wanted."""
-        if not self.wanted.dense or self.interpolator is None:
+        if not self.request.dense or self.interpolator is None:
             return None
-        table = Table(*(self.wanted.kept.array(f"sol_{name}") for name in ("t", "states", "kinds")))
+        table = Table(*(self.request.store.array(f"sol_{name}") for name in ("t", "states", "kinds")))
         end = float(table.t[-1]) if self.broken_off is None else self.broken_off
         return DenseSolution(self.interpolator, table, end if self.ended is None else self.ended[1])
 

@@ -14,17 +14,19 @@ from twoloop.generate.derived_callbacks import CheckedRegion
 from twoloop.generate.time_dependence import Sudden, may_be_narrow, may_be_sudden
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import codes, counters, flags, noted, tolerances
+from twoloop.kernels.data.kit import Kit
 from twoloop.kernels.evaluation.tasks import SOLVE
 from twoloop.kernels.layout import copy_of, empty, short_loops
 from twoloop.methods.auto import with_matrix_cost
 from twoloop.methods.plan import Plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.messages import said_of_not_finite
+from twoloop.run.messages import describe_not_finite
+from twoloop.run.singular_positions import LEAST, MARGIN, WEAK, describe_singular_start, singular_threshold
 from twoloop.run.static_form import static_form, with_newton
-from twoloop.run.undetermined import LEAST, MARGIN, WEAK, nearness, said_of_start
-from twoloop.run.workspace import kit_of, kit_with, made_ready, workspace
+from twoloop.run.workspace import kit_of, kit_with, prepare_workspace, workspace
 
 Array = NDArray[np.float64]
+Buffers = tuple[Array, Array, Array]  # for times, states and steps
 
 FIRST_CHUNK = 1024  # attempts of a small compiled system before Python looks at the run: a look costs 0.2 ms
 FIRST_CHUNK_IN_PYTHON = 64  # ... of one whose callbacks are plain Python functions, which may be slow
@@ -88,29 +90,27 @@ class Run:
         first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
         self.chunk = max(1, first_chunk // max(1, system.n_q // SMALL))  # attempts in one call of advance, at most
         self.clock = np.zeros(clock.N_CLOCK)
-        self.clock[clock.T] = self.clock[clock.T_START] = t0
+        self._set_clock(t0)
         self.control_by(plan)
         self.substituted = False  # whether another plan has taken over, for good
-        self.clock[[clock.JUMP_FROM, clock.JUMP_TO, clock.PIVOT_AT_OUTPUT]] = np.inf
-        self.near = nearness(rtol)  # pivots at output times below which velocities are looked at
-        looked = clock.LOOKED_TO, clock.ALONG_TO, clock.SUDDEN, clock.ALONG, clock.COMPARED, clock.FLANK
-        self.clock[[clock.ROUGH_TO, *looked]] = -np.inf
-        self.clock[clock.BRIEFEST] = np.inf
-        ran_on_symbols = any("force" in each.kinds for each in plan.traced)
-        self.sudden = Sudden(False, False) if step_size is not None else may_be_sudden(system, ran_on_symbols)
+        self.near = singular_threshold(rtol)  # pivots at output times below which velocities are looked at
+        ran = any("force" in each.kinds for each in plan.traced)
+        changes = system.remembered(("changes", ran), lambda: (may_be_sudden(system, ran), may_be_narrow(system, ran)))
+        sudden, narrow = (Sudden(False, False), True) if step_size is not None else changes
+        self.sudden: Sudden = sudden
         self.control[[clock.BY_TIME, clock.BY_STATE]] = self.sudden
-        self.narrow = step_size is not None or plan.unseen == 1.0 or may_be_narrow(system, ran_on_symbols)
+        self.narrow = narrow or plan.unseen == 1.0
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and behind steps across singular positions
         self.lengths: list[float] = []  # of steps across such a position that are still to be tried
         self.jumps: list[float] = []  # times at which velocities changed as by an impulse
-        self.compared_to = [-np.inf]  # how far callbacks were compared along the motion, in this run or the same before
-        self.territory: CheckedRegion | None = None  # where callbacks were compared, if cached integrators share it
+        self.compared_until = [-np.inf]  # how far callbacks were compared, in this run or an equal one
+        self.region: CheckedRegion | None = None  # where callbacks were compared, if cached integrators share it
         self.varied_parameters: Array | None = None  # of a run that is made for the parameters of several systems
         self._begin()
         self.rank = len(self.work.rows_v)
         self.said: dict[tuple[int, ...], str] = {}  # of redundant rows, at the first start of this run where they are
-        self.redundant, self.said_of_rows = self.redundant_rows()
-        self.said_of_start = self._said_of_start()
+        self.redundant, self.rows_warning = self.redundant_rows()
+        self.start_warning = self._start_warning()
 
     def again(self) -> "Run":
         """A copy of this run at its start; this one must not have taken a step."""
@@ -123,19 +123,60 @@ class Run:
 
         Not of the static form.
         """
-        other, n = self._copy(), self.system.n_q
-        other.t0, other.compared_to = t0, [-np.inf]
-        other.state[:n], other.state[n : 2 * n], other.state[2 * n :] = q0, v0, 0.0
-        other.clock[self.a.T] = other.clock[self.a.T_START] = t0
+        other = self._copy()
+        other.t0, other.compared_until = t0, [-np.inf]
         work = empty(self.work.sizes)
-        made_ready(work, self.system, self.kit.flags, other._pattern(q0), q0, self.rtol, self.reuse)
+        prepare_workspace(work, self.system, self.kit.flags, other._pattern(q0), q0, self.rtol, self.reuse)
         work.notes[noted.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
         other.work = work
-        if direct(self.kernels.start)(other.kit, work, t0, other.state) != codes.DONE:
+        if other.restart(t0, q0, v0) != codes.DONE:
             return None
-        other.redundant, other.said_of_rows = other.redundant_rows()
-        other.said_of_start = other._said_of_start()
+        other.redundant, other.rows_warning = other.redundant_rows()
+        other.start_warning = other._start_warning()
         return other
+
+    def restart(self, t: float, q: Array, v: Array) -> int:
+        """Begin at a state, with a method that remembers nothing; the code of the accelerations there."""
+        n, state = self.system.n_q, self.state
+        state[:n], state[n : 2 * n], state[2 * n :] = q, v, 0.0
+        self.plan.memory[:] = self.memory
+        self._set_clock(t)
+        code: int = direct(self.kernels.start)(self.kit, self.work, t, state)
+        return code
+
+    def _set_clock(self, t: float) -> None:
+        """Put the clock to the start of a run at t."""
+        a, clock = self.a, self.clock
+        clock[:] = 0.0
+        clock[a.T] = clock[a.T_START] = t
+        clock[[a.JUMP_FROM, a.JUMP_TO, a.PIVOT_AT_OUTPUT, a.BRIEFEST]] = np.inf
+        clock[[a.ROUGH_TO, a.LOOKED_TO, a.ALONG_TO, a.SUDDEN, a.ALONG, a.COMPARED, a.FLANK]] = -np.inf
+        clock[a.H_LIMIT] = self.plan.limit_start
+
+    def advance(
+        self,
+        outputs: Array,
+        buffers: Buffers,
+        filled: NDArray[np.int64],
+        active: tuple[Plan, Array, Kit] | None = None,
+    ) -> int:
+        """Take steps in compiled code, to the last output time or until something has to be handled; return its code.
+
+        Parameters
+        ----------
+        outputs : ndarray
+            Times on which steps have to end.
+        buffers : tuple of ndarray
+            Times, states and steps; these get rows.
+        filled : ndarray (2,)
+            Gets the number of states, and of steps.
+        active : (Plan, ndarray, Kit), optional
+            The plan, the controls and the kit of these steps. None: those of the run.
+        """
+        plan, control, kit = active or (self.plan, self.control, self.kit)
+        arrays = plan.options, plan.memory, self.tolerances, control, self.clock, self.state, self.new_state
+        code: int = direct(self.kernels.advance)(kit, self.work, *arrays, outputs, *buffers, filled)
+        return code
 
     def _copy(self) -> "Run":
         other = object.__new__(Run)
@@ -269,7 +310,7 @@ class Run:
                 "another position"
             )
         raise ValueError(
-            f"the accelerations of {self.system.name!r} cannot be found at t = {self.t0!r}: {said_of_not_finite(self)}"
+            f"the accelerations of {self.system.name!r} cannot be found at t = {self.t0!r}: {describe_not_finite(self)}"
         )
 
     def redundant_rows(self, rows: Rows | None = None) -> tuple[NDArray[np.int64], str]:
@@ -294,12 +335,12 @@ class Run:
             )
         return np.array(redundant), self.said[found]
 
-    def _said_of_start(self) -> str:
+    def _start_warning(self) -> str:
         """What is said of a start beside a singular position, where pivots are small: those of static factors vary."""
         if self.work.notes[noted.PIVOT] > (MARGIN * WEAK if self.static is None else LEAST):
             return ""
         atol, q = self.tolerances[tolerances.ATOL :], self.state[: self.system.n_q]
-        return said_of_start(self.system, self.t0, q, self.rank, self.rtol, atol)
+        return describe_singular_start(self.system, self.t0, q, self.rank, self.rtol, atol)
 
     def contradicting(self, rows: Rows) -> NDArray[np.int64]:
         """Of C_q and A at the start, rows that depend on others with which the accelerations disagree."""
@@ -359,7 +400,7 @@ class Run:
         checked = self.work.counters[counters.N_ACCEPTED] > 0 and notes[noted.UNCHECKED] == 0.0
         return float(notes[noted.LARGEST_DEFECT]) if checked else None
 
-    def came_near(self) -> bool:
+    def passed_near_singular(self) -> bool:
         """Whether a singular position was so near where a step had to end that rounding may have made velocities."""
         near = self.near if self.static is None else LEAST  # pivots of static factors vary more, and a look takes long
         return bool(self.clock[self.a.PIVOT_AT_OUTPUT] < near)

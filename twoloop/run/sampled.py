@@ -22,20 +22,15 @@ from twoloop.methods.auto import Auto
 from twoloop.methods.plan import Method
 from twoloop.methods.taylor import Taylor
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.fields import statistics
-from twoloop.run.interrupts import Interrupts
-from twoloop.run.kept import InMemory
-from twoloop.run.loop import IntegrationLoop
-from twoloop.run.messages import said_of_end, warned
-from twoloop.run.pace import STAGNATION_STEPS
-from twoloop.run.record import Record, Status
-from twoloop.run.recorder import Wanted
+from twoloop.run.discontinuities import MOST, closer, may_have_missed_changes, warn_of_missed_changes
+from twoloop.run.loop import IntegrationLoop, Interrupts
+from twoloop.run.messages import warn_of_singular_end, warn_user
+from twoloop.run.record import Record, Status, statistics
+from twoloop.run.recorder import MemoryStore, OutputRequest
 from twoloop.run.run import Run
-from twoloop.run.short_changes import MOST, closer, may_be_missed, said_of_missed
 
 Array = NDArray[np.float64]
 
-CALLS = 4  # from a warning to who calls step of an integrator
 STEPS = 1024  # in one call of the compiled loop
 FORCES = {"force", "force_by_q", "force_by_v"}
 CHANGED = "the parameters changed at samples"
@@ -111,8 +106,8 @@ class SampledRun:
         self.system, self.method, self.max_step, self.t0 = system, method, max_step, t0
         self._tolerances = rtol, atol
         self.run = self._run_from(t0, q0, v0)
-        if self.run.said_of_start:
-            warned(self.run.said_of_start, CALLS)
+        if self.run.start_warning:
+            warn_user(self.run.start_warning)
         self.p = system.functions.p[system.called_in_python :]
         self._free: set[int] = set()  # places of parameters that are known to enter forces alone
         self._changed = self._failed = False
@@ -167,14 +162,14 @@ class SampledRun:
         for left in range(MOST, -1, -1):
             self._go_to(end)
             run = self.run
-            if left == 0 or not may_be_missed(run):
+            if left == 0 or not may_have_missed_changes(run):
                 break
             if len(self.times) > 1:  # samples before may have missed something, and are not made again
-                said_of_missed(run, CALLS)
+                warn_of_missed_changes(run)
             self._every = closer(run)
             self._return()
         else:
-            said_of_missed(run, CALLS)
+            warn_of_missed_changes(run)
         self.cpu += time.process_time() - began
         self._note(end)
         return self.state
@@ -182,26 +177,19 @@ class SampledRun:
     def _go_to(self, end: float) -> None:
         """Steps from the last sample to the end of the next one."""
         run, a, clock = self.run, self.run.a, self.run.clock
-        t, code = self.times[-1], self.run.a.PAUSED
+        t = self.times[-1]
         if self._changed or self.system.called_in_python:  # what such functions find in their surroundings may change
-            code = self._begin_anew(t)
+            self._begin_anew(t)
         run.first_step(self.t0, end, run.state, run.max_step)
         run.control[a.APART] = min(self._every, run.control[a.APART])
         self._outputs[0], clock[a.NEXT_OUTPUT], clock[a.T_START], clock[a.N_FIXED] = end, 0.0, t, 0.0
         run.control[run.a.MAX_ATTEMPTS], clock[a.PIVOT_AT_OUTPUT] = STEPS, np.inf
-        steps = self._buffers[2]
-        before = run.attempts()
-        while code == a.PAUSED and run.attempts() - before < STAGNATION_STEPS:  # then it is seen whether it gets there
-            code = direct(run.kernels.advance)(
-                *(run.kit, run.work, run.plan.options, run.plan.memory, run.tolerances, run.control, clock),
-                *(run.state, run.new_state, self._outputs, *self._buffers, self._filled),
-            )
-            if self._filled[1]:
-                self.steps.append(steps[: self._filled[1]].copy())
+        code = run.advance(self._outputs, self._buffers, self._filled)
+        self.steps.append(self._buffers[2][: self._filled[1]].copy())
         if code != a.ALL_OUTPUT_DONE:
-            self._by_course(end)
+            self._finish_by_loop(end)
         else:
-            said_of_end(run)
+            warn_of_singular_end(run)
 
     @property
     def state(self) -> SampledState:
@@ -236,7 +224,7 @@ class SampledRun:
             changes=CHANGED,
         )
 
-    def _begin_anew(self, t: float) -> int:
+    def _begin_anew(self, t: float) -> None:
         """Accelerations with other parameters, and a method that forgets those before."""
         run, a = self.run, self.run.a
         code = direct(run.kernels.start)(run.kit, run.work, t, run.state)
@@ -253,7 +241,6 @@ class SampledRun:
                 "forces are not finite, or the constraints have lost rank"
             )
         self._changed = False
-        return int(a.PAUSED)
 
     def _return(self) -> None:
         """Go back to the last sample: the run stands where it failed, with whatever it tried there."""
@@ -266,11 +253,11 @@ class SampledRun:
         del self.steps[self._n_steps :]
         self._changed = False
 
-    def _by_course(self, end: float) -> None:
-        """What the compiled loop cannot do by itself: a singular position, a jump, another algebra; or a failure."""
+    def _finish_by_loop(self, end: float) -> None:
+        """Go on where one call of the compiled loop did not come to the end: many steps, a jump, or a failure."""
         run = self.run
-        run.t0, run.said_of_start = float(run.clock[run.a.T]), ""
-        wanted = Wanted(np.array([end]), True, False, None, InMemory())
+        run.t0, run.start_warning = float(run.clock[run.a.T]), ""
+        wanted = OutputRequest(np.array([end]), True, False, None, MemoryStore())
         interrupts = Interrupts().listen()
         try:
             record = IntegrationLoop(run, end, wanted, lambda t: None, None, interrupts).to_end(False)

@@ -167,10 +167,10 @@ def workspace(
     sizes = (system.n_q, system.n_c, system.n_a, *ranks, bool(reduced), bool(augmented), n_nodes)
     n_matrices = matrices * system.n_q**2 if static is None else static.n_matrices(matrices)
     work = make_work(*sizes, None if static is None else static.static, n_matrices)
-    return made_ready(work, system, flags, pattern, q0, rtol, reuse, static)
+    return prepare_workspace(work, system, flags, pattern, q0, rtol, reuse, static)
 
 
-def made_ready(
+def prepare_workspace(
     work: common.Work,
     system: ConstrainedSystem,
     flags: Array,

@@ -1,7 +1,8 @@
-"""Whether stability, not accuracy, limited the steps of an explicit run: a look at a few of its states when it is over.
+"""Monitor a run: a stall detector, and a monitor that says whether stability, not accuracy, limited the steps.
 
-At each, the largest rate of the motion is found by power iteration: that of dF/dq and of dF/dv, F being the
-accelerations. A rate times the step is compared with what the method is stable to, for vibrations and for decay.
+For the second, the largest rate of the motion is found by power iteration at a few states when the run is over: that of
+dF/dq and of dF/dv, F being the accelerations. A rate times the step is compared with what the method is stable to, for
+vibrations and for decay.
 """
 
 from typing import Any, NamedTuple
@@ -15,7 +16,49 @@ from twoloop.methods.plan import Plan
 
 Array = NDArray[np.float64]
 
-MOST = 8  # states that are kept; they lie about as far from one another
+INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # beside what advance() returns
+STAGNATION_STEPS = 20_000  # accepted steps over which the pace is judged ...
+STAGNATION_PACE = 1e-3  # ... against the longest step of the run, and ...
+STAGNATION_LEFT = 1e7  # ... the steps that the rest of the run would take
+OUT_OF_REACH = 1e11  # such steps at which a run ends, however long the others were: they take days at the least
+
+
+class StallDetector:
+    """Lengths of the accepted steps, to see that a run does not get anywhere.
+
+    Parameters
+    ----------
+    t0 : float
+        Where the run begins, s.
+    most : float
+        Steps that the rest may take if they are as long as those before.
+    """
+
+    def __init__(self, t0: float, most: float = OUT_OF_REACH):
+        self.most = most
+        self.window_t, self.window_n = t0, 0
+        self.longest = self.mean = 0.0
+
+    def add_steps(self, h: Array) -> None:
+        """Note the lengths of accepted steps."""
+        self.longest = max(self.longest, float(h.max(initial=0.0)))
+        self.window_n += len(h)
+
+    def stagnates(self, t: float, t1: float) -> bool:
+        """Whether the run has come to a standstill, at time t."""
+        if self.window_n < STAGNATION_STEPS:
+            return False
+        self.mean = (t - self.window_t) / self.window_n
+        self.window_t, self.window_n = t, 0
+        return t1 - t > (STAGNATION_LEFT if self.slows else self.most) * self.mean
+
+    @property
+    def slows(self) -> bool:
+        """Whether the steps were much longer before."""
+        return self.mean < STAGNATION_PACE * self.longest
+
+
+MOST = 8  # sampled states; they lie about as far from one another
 LAST_STEPS = 8  # whose median is the step at a state
 ITERATIONS = 6
 START = 0.1  # share of all coordinates in the direction of each look
@@ -24,7 +67,7 @@ MANY = 200  # accepted steps before the last look, from which on it is worth a s
 NEXT_TO = 0.45  # of the limit of stability, which half of the states have to reach; smooth motion stays below 0.4
 
 
-class Look(NamedTuple):
+class StiffnessSample(NamedTuple):
     """A state of a run, the step h there, and what h times a rate of vibration or decay may be for stability."""
 
     t: float
@@ -36,21 +79,21 @@ class Look(NamedTuple):
     decay: float
 
 
-class Looks:
-    """States of a run, kept as it goes on."""
+class StiffnessMonitor:
+    """Sample states of a run as it goes on, to find out at its end whether stability limited its steps."""
 
     def __init__(self, plan: Plan):
         self.plan, self.every, self.n_seen, self.n_steps = plan, 1, 0, 0
         self.last = np.zeros(0)  # lengths of the last steps
-        self.kept: list[Look] = []
+        self.samples: list[StiffnessSample] = []
 
-    def pass_by(self, steps: Array) -> None:
+    def add_steps(self, steps: Array) -> None:
         """Note the lengths of accepted steps."""
         self.n_steps += steps.size
         last = steps[-LAST_STEPS:]
         self.last = last if last.size == LAST_STEPS else np.concatenate([self.last, last])[-LAST_STEPS:]
 
-    def take(self, t: float, state: Array, n_q: int) -> None:
+    def sample_state(self, t: float, state: Array, n_q: int) -> None:
         """Keep this state, that after the last steps; of many only every second, fourth, ..."""
         if self.plan.stable_to is None or self.last.size < LAST_STEPS:
             return
@@ -59,27 +102,28 @@ class Looks:
             return
         q, v, a = state[: 3 * n_q].reshape(3, n_q).copy()
         limits = self.plan.stable_to(self.plan.memory)
-        self.kept.append(Look(t, q, v, a, float(np.median(self.last)), *limits))
-        if len(self.kept) > MOST:
-            self.kept = self.kept[1::2]
+        self.samples.append(StiffnessSample(t, q, v, a, float(np.median(self.last)), *limits))
+        if len(self.samples) > MOST:
+            self.samples = self.samples[1::2]
             self.every *= 2
 
 
-def said_of_stiffness(looks: Looks, kit: Any, work: Any) -> str:
+def describe_stiffness(looks: StiffnessMonitor, kit: Any, work: Any) -> str:
     """A sentence where stability limited the steps, else nothing. What stands in the workspace is lost."""
-    if not looks.kept or looks.n_steps < MANY:
+    if not looks.samples or looks.n_steps < MANY:
         return ""
     start = first_direction(work.Q.size)
     directions = [np.zeros_like(start), np.zeros_like(start)]
     found = []
-    for look in looks.kept:
+    for sample in looks.samples:
         for direction in directions:  # that of the look before, in which no coordinate may have been lost for good
             direction += START * start
         try:
-            vibration, decay = _rates(kit, work, look, directions)
+            vibration, decay = _rates(kit, work, sample, directions)
         except Exception:  # of a callback at a displaced state, which is none of the run: there is nothing to say
             return ""
-        found.append((look.h * vibration / look.vibration, look.h * decay / look.decay, vibration, decay, look.h))
+        h = sample.h
+        found.append((h * vibration / sample.vibration, h * decay / sample.decay, vibration, decay, h))
     by_vibration, by_decay, vibration, decay, h = np.median(found, axis=0)
     if max(by_vibration, by_decay) < NEXT_TO:
         return ""
@@ -90,33 +134,33 @@ def said_of_stiffness(looks: Looks, kit: Any, work: Any) -> str:
     )
 
 
-def _rates(kit: Any, work: Any, look: Look, directions: list[Array]) -> tuple[float, float]:
+def _rates(kit: Any, work: Any, sample: StiffnessSample, directions: list[Array]) -> tuple[float, float]:
     """Angular frequency of the fastest vibration and the fastest rate of decay, 1/s, as far as they dominate."""
     from twoloop.kernels.evaluation import tasks
 
-    if kit.inner(kit, work, tasks.RENEW, look.t, look.q, look.v, 0.0, work.x, work.lam) != codes.DONE:
+    if kit.inner(kit, work, tasks.RENEW, sample.t, sample.q, sample.v, 0.0, work.x, work.lam) != codes.DONE:
         return 0.0, 0.0
-    squared, opposed_q = _largest(kit, work, look, directions[0], work.independent, False)
-    rate, opposed_v = _largest(kit, work, look, directions[1], work.independent_v, True)
+    squared, opposed_q = _largest(kit, work, sample, directions[0], work.independent, False)
+    rate, opposed_v = _largest(kit, work, sample, directions[1], work.independent_v, True)
     vibration = np.sqrt(squared) if opposed_q else 0.0
     return (vibration, rate) if opposed_v else (max(vibration, rate), 0.0)
 
 
 def _largest(
-    kit: Any, work: Any, look: Look, direction: Array, places: NDArray[np.int64], by_v: bool
+    kit: Any, work: Any, sample: StiffnessSample, direction: Array, places: NDArray[np.int64], by_v: bool
 ) -> tuple[float, bool]:
     """The largest factor by which dF/dq or dF/dv makes a direction longer, and whether it turns it round."""
     from twoloop.kernels.evaluation import tasks
 
-    size = DISPLACEMENT * max(1.0, float(np.abs(look.v if by_v else look.q).max()))
+    size = DISPLACEMENT * max(1.0, float(np.abs(sample.v if by_v else sample.q).max()))
     factor, opposed = 0.0, False
-    a = np.zeros_like(look.a)
+    a = np.zeros_like(sample.a)
     for _ in range(ITERATIONS):
-        Q, V = look.q.copy(), look.v.copy()
+        Q, V = sample.q.copy(), sample.v.copy()
         (V if by_v else Q)[places] += size * direction[places]
-        if kit.inner(kit, work, tasks.EVALUATE, look.t, Q, V, INNER_TOL, a, work.lam) != codes.DONE:
+        if kit.inner(kit, work, tasks.EVALUATE, sample.t, Q, V, INNER_TOL, a, work.lam) != codes.DONE:
             return 0.0, False
-        image = (a - look.a)[places]
+        image = (a - sample.a)[places]
         longest = float(np.abs(image).max(initial=0.0))
         if not 0.0 < longest < np.inf:
             return 0.0, False

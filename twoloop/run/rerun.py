@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import codes, noted
 from twoloop.methods import dop853_tableau
 from twoloop.methods.dop853 import DOP853
@@ -42,7 +41,7 @@ def implicit(velocities: bool) -> tuple[Method, Array]:
     return RungeKutta(tableau, outer="newton", tested="all" if velocities else "positions"), tableau.c
 
 
-class Remade(NamedTuple):
+class RerunPiece(NamedTuple):
     """States [q, v] at a time within a piece and at its end, and the longest step, s."""
 
     between: Array
@@ -50,7 +49,7 @@ class Remade(NamedTuple):
     longest: float
 
 
-class Remaker:
+class IndependentRerun:
     """Makes pieces of a run again, each from a state that is given; the arrays are made once.
 
     Parameters
@@ -85,40 +84,30 @@ class Remaker:
         control[a.MAX_STEP], control[a.BRIDGE], control[a.STORE_ALL] = max_step, 0.0, 0.0
         control[a.MAX_ATTEMPTS] = CHUNK
         self.run.work.notes[noted.GAMMA_REQUIRED] = np.inf  # the run has judged its differences
-        rows = (np.empty(len(Remade._fields)), np.empty((len(Remade._fields), len(self.run.state))))
-        self.out = (*rows, np.empty((CHUNK, a.N_STEP_COLUMNS)), np.zeros(2, dtype=np.int64))
+        rows = (np.empty(len(RerunPiece._fields)), np.empty((len(RerunPiece._fields), len(self.run.state))))
+        self.buffers, self.filled = (*rows, np.empty((CHUNK, a.N_STEP_COLUMNS))), np.zeros(2, dtype=np.int64)
         self.next_step = np.inf
 
-    def to(self, t0: float, state: Array, between: float, t1: float, most: int) -> Remade | None:
+    def to(self, t0: float, state: Array, between: float, t1: float, most: int) -> RerunPiece | None:
         """Start from a state [q, v] at t0; None if t1 is not reached within so many attempts at steps."""
         run, a, n = self.run, self.run.a, len(state)
-        run.state[:] = 0.0
-        run.state[:n] = state
-        run.plan.memory[:] = run.memory
-        clock = run.clock
-        clock[:] = 0.0
-        clock[a.JUMP_FROM] = clock[a.JUMP_TO] = np.inf
-        clock[a.ROUGH_TO] = -np.inf
-        clock[a.T] = clock[a.T_START] = t0
-        clock[a.H_LIMIT] = run.plan.limit_start
-        clock[a.H_NEXT] = self.next_step if self.next_step < np.inf else FIRST_TRY * (t1 - t0)
-        self.next_step = np.inf
-        if run.kernels.start(run.kit, run.work, t0, run.state) != codes.DONE:
+        first_step, self.next_step = self.next_step, np.inf
+        if run.restart(t0, state[: n // 2], state[n // 2 :]) != codes.DONE:
             return None
+        run.clock[a.H_NEXT] = first_step if first_step < np.inf else FIRST_TRY * (t1 - t0)
         run.work.notes[noted.KINK_AFTER] = t1
         times = np.array([between, t1] if t0 < between < t1 else [t1])
-        arrays = (run.plan.options, run.plan.memory, run.tolerances, run.control, clock, run.state, run.new_state)
         found: list[Array] = []
-        longest, advance = 0.0, direct(run.kernels.advance)
-        _, states, steps, filled = self.out
+        longest = 0.0
+        buffers, filled = self.buffers, self.filled
         for _ in range(0, most, CHUNK):
-            code = advance(run.kit, run.work, *arrays, times, *self.out)
+            code = run.advance(times, buffers, filled)
             n_rows, n_steps = filled.tolist()
-            found.extend(states[:n_rows, :n].copy())
-            longest = max(longest, float(steps[:n_steps, a.H].max(initial=0.0)))
+            found.extend(buffers[1][:n_rows, :n].copy())
+            longest = max(longest, float(buffers[2][:n_steps, a.H].max(initial=0.0)))
             if code == a.ALL_OUTPUT_DONE:
-                self.next_step = float(clock[a.H_NEXT])
-                return Remade(found[0], found[-1], longest)
+                self.next_step = float(run.clock[a.H_NEXT])
+                return RerunPiece(found[0], found[-1], longest)
             if code != a.PAUSED and not (code == a.AT_JUMP and leap(run, t1)):
                 break
         return None

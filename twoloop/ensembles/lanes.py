@@ -1,0 +1,393 @@
+"""Integrate runs in SIMD lanes: choose the methods, compile their code, look at short forces, judge each run."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+from twoloop.checks.arguments import Array
+from twoloop.ensembles.starts import Starts, generic_parameters, generic_system, kit_to_write, system_of
+from twoloop.generate.choices import Choice
+from twoloop.generate.graph import Untraceable
+from twoloop.generate.parameter_expressions import ParameterTape
+from twoloop.generate.program import OnArrays
+from twoloop.generate.series import series_for
+from twoloop.generate.time_dependence import BY_TIME, TIME, may_be_narrow, may_be_sudden
+from twoloop.generate.trace import Equations
+from twoloop.kernels.control.sudden import FLOOR, LEAST, SHARE, STEEPER  # what counts as sudden in single runs
+from twoloop.kernels.control.sudden import PLACES as N_PLACES
+from twoloop.kernels.lanes import lane_ends
+from twoloop.kernels.layout import short_loops
+from twoloop.methods import dop853_tableau as tableau
+from twoloop.methods.auto import TIGHTEST
+from twoloop.methods.dop853 import COARSE_SHARE, UNSEEN
+from twoloop.methods.plan import Method, least_tolerance
+from twoloop.methods.presets import PRESETS
+from twoloop.methods.runge_kutta import RungeKutta
+from twoloop.methods.tableaux import radau_iia
+from twoloop.methods.taylor import order_in_lanes
+from twoloop.problem.system import ConstrainedSystem
+
+if TYPE_CHECKING:
+    from twoloop.generate.generated_lanes import GeneratedLanes
+    from twoloop.generate.lane_code import LaneCode
+
+AT_ONCE = 30_000  # numbers that are compared together
+
+
+class ShortLooks:
+    """Looks at forces and drives of many runs, at times a two-thousandth of a run apart.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+        Whose callbacks run on symbols, and have no nonholonomic rows.
+    values, varying
+        Of a `ParameterTape`: generic parameters, and which of them differ from run to run.
+    """
+
+    def __init__(self, system: ConstrainedSystem, values: Array, varying: Sequence[int]):
+        self._record = ParameterTape(values.tolist(), varying)
+        equations = Equations(system, self._record.parameters)
+        self._graph = graph = equations.graph
+        forms = np.concatenate([equations.of(kind).ravel() for kind in BY_TIME if kind in system.given])
+        self._forms = np.array([x for x in forms if any(graph.inputs_of[i] & TIME for i in x.terms)], dtype=object)
+
+    def meet(self, times: Array, rtol: float, parameters: Array, q: Array, v: Array) -> NDArray[np.bool_]:
+        """Which runs, of these parameters, meet what lasts for less than two looks, or has no value.
+
+        q, v : (n_runs, n), of one state of each run.
+        """
+        met = np.zeros(len(q), dtype=bool)
+        size = max(1, AT_ONCE // max(1, len(times) * len(self._forms)))
+        for begin in range(0, len(q), size):
+            rows = slice(begin, begin + size)
+            at = OnArrays(self._graph, self._record, parameters[rows])
+            met[rows] = _are_short(at.evaluate([self._forms], times[:, None], q[rows], v[rows])[0], rtol)
+        return met
+
+
+def _are_short(values: Array, rtol: float) -> NDArray[np.bool_]:
+    """In which runs some value, (n_times, n_runs, n), changes suddenly twice within two looks."""
+    if not values.size:
+        return np.zeros(values.shape[1], dtype=bool)
+    finite: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=(0, 2)))
+    values = np.where(finite[:, None], values, 0.0)
+    least = np.maximum(FLOOR, LEAST * rtol * np.abs(values).max(axis=(0, 2)))
+    size = N_PLACES + 1
+    ranges = maximum_filter1d(values, size, axis=0) - minimum_filter1d(values, size, axis=0)
+    change, within = np.diff(values, axis=0), np.maximum(ranges[:-1], ranges[1:])
+    beside = np.zeros_like(change)
+    direction = np.sign(change)
+    beside[1:] = change[:-1] * direction[1:]
+    beside[:-1] = np.maximum(beside[:-1], change[1:] * direction[:-1])
+    flanks = (np.abs(change) > SHARE * within) & (STEEPER * beside < np.abs(change)) & (within > least[:, None])
+    short = (flanks[:-1] & flanks[1:]).any(axis=(0, 2)) | (flanks[:-2] & flanks[2:]).any(axis=(0, 2))
+    return np.asarray(short | ~finite)
+
+
+INVOLVED = 6.0  # operations of a series a coordinate, from which on "auto" takes DOP853 (measured at 2, 11 and 13) ...
+STAGES_TO = 1e-9  # ... down to this tolerance
+STAGES = {"RadauIIA5": 3, "RadauIIA9": 5, "RadauIIA13": 7}  # of the implicit methods
+IN_LANES = ("auto", "Taylor", "DOP853", *STAGES)  # presets that go in lanes
+
+
+@dataclass(frozen=True)
+class LaneMethod:
+    """A method made ready for runs in lanes.
+
+    Attributes
+    ----------
+    name : str
+    series : bool
+        Whether it needs code for Taylor series.
+    order : int
+        What code made for a mechanism gets as the order.
+    evaluations : int
+        Of an attempt, besides those that its kernel counts and the one at its end.
+    options : ndarray
+        What its step reads.
+    tableau : tuple of ndarray or None
+        Of an explicit method, for which code is made: A, b, c and the weights of two estimates of its error.
+    unseen : float
+        Of a step, the longest part within which the equations are not looked at.
+    step, memory : callable
+        Its kernel, compiled when it is first asked for, and the length of its memory, in vectors, for such code.
+    """
+
+    name: str
+    series: bool
+    order: int
+    evaluations: int
+    options: Array
+    step: Callable[[], Any]
+    memory: Callable[[LaneCode], int]
+    tableau: tuple[Array, Array, Array, Array, Array] | None = None
+    unseen: float = 1.0
+
+
+def is_involved(system: ConstrainedSystem) -> bool:
+    """Whether a Taylor series takes so many operations that a dozen evaluations cost less.
+
+    Not where something is narrow: there steps of DOP853 have to be short, and a series is only looked at within them.
+    """
+    if may_be_narrow(system, ran_on_symbols=True):
+        return False
+    try:
+        return series_for(system).n_operations > INVOLVED * system.n_q
+    except Untraceable:
+        return False
+
+
+def lane_methods(name: str, stiff: bool, n: int, rtol: float, atol: float, involved: bool = False) -> list[LaneMethod]:
+    """Methods for runs of n coordinates by a preset; the next one where no code can be had for one.
+
+    "auto" takes Taylor series, or DOP853 where there are none or, down to STAGES_TO, these are `involved`; for stiff
+    motion the Radau method that it takes singly, at loose tolerances that of order 5.
+    """
+    if name == "DOP853":
+        return [_dop853(n, rtol, atol)]
+    if name == "Taylor":
+        return [_taylor(rtol, atol)]
+    if name != "auto":
+        return [_newton(name, "all", n, rtol, atol)]
+    tolerance = least_tolerance(rtol, atol)
+    if not stiff:
+        made = [_taylor(rtol, atol), _dop853(n, rtol, atol)]
+        return made[::-1] if involved and tolerance >= STAGES_TO else made
+    radau = "RadauIIA5" if tolerance >= TIGHTEST else "RadauIIA9"
+    return [_newton(radau, "positions", n, rtol, atol)]
+
+
+def _taylor(rtol: float, atol: float) -> LaneMethod:
+    def step() -> Any:
+        from twoloop.kernels.lanes.lane_taylor import step_by_series
+
+        return step_by_series
+
+    order = order_in_lanes(rtol, atol) + 1
+    return LaneMethod("Taylor", True, order, order - 1, np.zeros(0), step, lambda code: code.series_size(order))
+
+
+def _dop853(n: int, rtol: float, atol: float) -> LaneMethod:
+    def step() -> Any:
+        from twoloop.kernels.lanes.lane_dop853 import step_by_dop853
+
+        return step_by_dop853
+
+    def memory(code: LaneCode) -> int:
+        from twoloop.kernels.lanes.lane_dop853 import memory_size
+
+        return memory_size(len(tableau.B), n)
+
+    weights = tableau.A, tableau.B, tableau.C, tableau.E5, COARSE_SHARE * tableau.E3
+    stages, options = len(tableau.B), _options(PRESETS["DOP853"], n, rtol, atol)
+    return LaneMethod("DOP853", False, 8, stages - 1, options, step, memory, weights, UNSEEN)
+
+
+def _newton(name: str, tested: Literal["all", "positions"], n: int, rtol: float, atol: float) -> LaneMethod:
+    def step() -> Any:
+        from twoloop.kernels.lanes.lane_implicit import step_by_newton
+
+        return step_by_newton
+
+    def memory(code: LaneCode) -> int:
+        from twoloop.kernels.lanes.lane_newton import memory_size
+
+        return memory_size(radau.stages, n)
+
+    radau = radau_iia(STAGES[name])
+    method = RungeKutta(radau, outer="newton", tested=tested)
+    for_derivatives = 2 * n + 1
+    return LaneMethod(name, False, radau.order, for_derivatives, _options(method, n, rtol, atol), step, memory)
+
+
+def _options(method: Method, n: int, rtol: float, atol: float) -> Array:
+    """What a step reads, behind what lane_control.py reads."""
+    plan = method.plan(n, rtol, atol, False)
+    return np.concatenate(
+        [plan.rule, [plan.rough, short_loops().FIRST_STEP, least_tolerance(rtol, atol)], plan.options]
+    )
+
+
+Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+PLACES = 100  # of a run, at least as many at which the equations are looked at ...
+OF_SUDDEN = 20  # ... times as many where a force may act for a short time: lanes do not look ahead
+SMALLEST, LARGEST = 128, 4096  # runs of a block; numbers of all of a block's runs are made at once
+FOR_EACH = 3  # blocks for each of several threads, so that all end at about the same time
+LOOKS = PLACES * OF_SUDDEN
+SHORT = min(lane_ends.NO_START, lane_ends.UNLIKE) - 1  # beside what lane_ends.py says
+AGREES = 1e-7  # of the terms of an equation: what rounding may leave of it at the end of a run
+
+WHY = {  # a run is left to a run of its own, by what lane_ends.py says of it
+    lane_ends.NO_START: "the code made for the first run does not hold at the start",
+    lane_ends.NO_STATE: "a state at t_eval could not be put on the constraints",
+    lane_ends.NO_VALUES: "the equations have no values in a step (constraints lose rank, a root of a negative number)",
+    lane_ends.OFTEN_REFUSED: "steps are refused again and again (a sudden force, stiff motion, a singular position)",
+    lane_ends.MANY_STEPS: "it takes more than 100,000 steps in lanes (stiff, or very fast motion)",
+    lane_ends.UNLIKE: "the callbacks do not agree with the code at the end (they branch)",
+    SHORT: "forces or drives change for so short a time that lanes may miss others",
+}
+
+
+class LaneRuns:
+    """The code of a system for lanes, and what it makes of many runs.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+    starts : Starts
+    method : LaneMethod
+
+    Raises
+    ------
+    Untraceable
+        Saying why lanes cannot do it.
+    """
+
+    def __init__(self, system: ConstrainedSystem, starts: Starts, method: LaneMethod):
+        self.system, self.starts, self.method, self.kit = system, starts, method, kit_to_write(system)
+        generic, varying = generic_parameters(starts.parameters)
+        of_all = generic_system(system, starts)
+        sudden = may_be_sudden(of_all, ran_on_symbols=True)
+        unseen = 1.0 if may_be_narrow(of_all, ran_on_symbols=True) else method.unseen
+        self.places = LOOKS if any(sudden) else PLACES * unseen
+        self.looks = ShortLooks(system, generic, varying) if sudden.by_time else None
+        choice = Choice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
+        kind = ("lanes", method.series, method.tableau is None, choice, tuple(varying))  # of which the latest is kept
+
+        def make() -> GeneratedLanes[LaneCode]:
+            from twoloop.generate.generated_lanes import GeneratedLanes
+            from twoloop.generate.lane_code import LaneCode  # compiled, or read from the cache, at the first ensemble
+
+            record = ParameterTape(generic.tolist(), varying)
+            return GeneratedLanes(record, LaneCode(system, choice, record.parameters, method.series, method.tableau))
+
+        self.own = system.remembered_at(kind, generic.tobytes(), make)
+
+    def make(
+        self,
+        which: Integers,
+        t1: float,
+        times: Array,
+        rtol: float,
+        atol: Array,
+        threads: int,
+        out_q: Array,
+        out_v: Array,
+    ) -> tuple[Integers, Integers, Integers, Array]:
+        """Make these runs: what became of each, as lane_ends.py has it, steps, evaluations, a and lam at the end."""
+        n_runs = len(which)
+        status, n_steps, n_evaluations = np.zeros((3, n_runs), dtype=np.int64)
+        n_evaluations += 1  # at the start
+        ends = np.full((n_runs, self.system.n_q + self.system.n_c), np.nan)
+
+        def block(rows: slice) -> None:
+            out = out_q[rows], out_v[rows], ends[rows]
+            told = status[rows], n_steps[rows], n_evaluations[rows]
+            self._make(which[rows], t1, times, rtol, atol, out, told)
+
+        in_blocks(block, n_runs, threads)
+        return status, n_steps, n_evaluations, ends
+
+    def _make(
+        self,
+        which: Integers,
+        t1: float,
+        times: Array,
+        rtol: float,
+        atol: Array,
+        out: tuple[Array, Array, Array],
+        told: tuple[Integers, Integers, Integers],
+    ) -> None:
+        from twoloop.kernels.lanes import lane_room, lane_runs
+
+        starts, code, method = self.starts, self.own.code, self.method
+        n, n_rows = code.n, code.n_rows
+        numbers = self.own.numbers(starts.parameters[which])
+        begin = lane_room.places(n, n_rows, code.n_numbers)[-1]
+        room = aligned(begin + method.memory(code), lane_room.LANES)
+        kit = lane_room.LaneKit(self.own.functions, method.step())
+        redundant = bool(code.equations.redundant.conditions)
+        settings = np.array([n, n_rows, method.order, redundant, code.n_numbers, method.evaluations], dtype=np.int64)
+        control = np.concatenate([[starts.t0, t1, (t1 - starts.t0) / self.places, rtol], atol, code.numbers.values])
+        given = np.ascontiguousarray(starts.q[which]), np.ascontiguousarray(starts.v[which])
+        arrays = times, numbers, *given, *out, *told, room
+        lane_runs.advance_lanes(kit, settings, control, method.options, *arrays)
+
+    def agree(self, which: Integers, made: Flags, t1: float, atol: float, q: Array, v: Array, ends: Array) -> Flags:
+        """Of which of these runs, of those that were made, callbacks say that the equations hold at their end.
+
+        q, v : (n_runs, n, n_t), the last at the end; ends : a and lam there.
+        """
+        from twoloop.kernels.evaluation.residuals import disagreement
+
+        n, n_c = self.system.n_q, self.system.n_c
+        room, worst = np.zeros(n * (n + 3) + n_c * (n + 3)), np.full(len(which), np.inf)
+        rows = np.where(made, which, -1)
+        disagreement(*self.kit, t1, AGREES, atol, rows, self.starts.parameters, q, v, ends, room, worst)
+        agreed: Flags = worst <= 1.0
+        return agreed
+
+    def judge(
+        self,
+        which: Integers,
+        status: Integers,
+        t1: float,
+        rtol: float,
+        atol: float,
+        q: Array,
+        v: Array,
+        ends: Array,
+    ) -> Flags:
+        """Of which of these runs all states were found and agree; the status of others says why not."""
+        made = status == lane_ends.ENDED
+        found = np.isfinite(q).all(axis=(1, 2))
+        fine = made & found
+        status[made & ~found] = lane_ends.NO_STATE
+        agreed = self.agree(which, fine, t1, atol, q, v, ends)
+        status[fine & ~agreed] = lane_ends.UNLIKE
+        fine &= agreed
+        if self.looks is not None:
+            times, runs = np.linspace(self.starts.t0, t1, LOOKS + 1), np.flatnonzero(fine)
+            given = self.starts.parameters[which[runs]], q[runs, :, -1], v[runs, :, -1]
+            short = runs[self.looks.meet(times, rtol, *given)]
+            status[short], fine[short] = SHORT, False
+        return fine
+
+
+def in_blocks(make: Callable[[slice], None], n_runs: int, threads: int) -> None:
+    """Have blocks of runs made, by so many threads."""
+    n_blocks = 1 if threads == 1 else FOR_EACH * threads
+    size = int(np.clip(-(-n_runs // n_blocks), SMALLEST, LARGEST))
+    blocks = [slice(begin, min(begin + size, n_runs)) for begin in range(0, n_runs, size)]
+    if threads == 1 or len(blocks) == 1:
+        for rows in blocks:
+            make(rows)
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(make, blocks))
+
+
+def aligned(vectors: int, lanes: int) -> Array:
+    """Zeros whose address a vector of all lanes may have."""
+    size = 8 * lanes
+    room = np.zeros(vectors * lanes + lanes)
+    first = -room.ctypes.data % size // 8
+    return room[first : first + vectors * lanes]
+
+
+def threads_of(wanted: int | None) -> int:
+    """How many threads: those that are wanted, else one for each core that this process may use."""
+    if wanted is not None:
+        return wanted
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

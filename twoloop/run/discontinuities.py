@@ -1,0 +1,85 @@
+"""Repeat runs that may have missed short changes of forces, and compute velocities behind a jump of C_t or b.
+
+A run that met a short change is repeated with more evaluations, at most MOST times: changes that follow one another
+without end, as noise does, would take evaluations without end. Then a warning says so.
+"""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.messages import warn_user
+
+if TYPE_CHECKING:
+    from twoloop.run.run import Run
+
+WITHIN = 2.0  # looks: a run that met what lasts no longer is made again, as some of it may last shorter still
+SEEN = 1.25  # looks: what lasts longer does not fall between two of them; of the rest it is said
+CLOSER = 4.0  # looks within the shortest change, when the run is made again ...
+MOST_CLOSER = 8.0  # ... but no more times as many looks as before
+MOST = 2  # runs that are made again
+
+
+def may_have_missed_changes(run: "Run", looks: float = WITHIN) -> bool:
+    """Whether something changed for so short a time that the next such change may have been passed over."""
+    a, clock = run.a, run.clock
+    return bool(clock[a.BRIEFEST] < looks * clock[a.WIDEST_LOOK])
+
+
+def closer(run: "Run") -> float:
+    """The time between two looks of a run that is to meet what this one may have missed, s."""
+    a, clock = run.a, run.clock
+    return float(max(clock[a.BRIEFEST] / CLOSER, clock[a.WIDEST_LOOK] / MOST_CLOSER))
+
+
+def warn_of_missed_changes(run: "Run") -> str:
+    """A warning, and the sentence, of a run that succeeded, and is not made again, but may have missed something."""
+    if not may_have_missed_changes(run, SEEN):
+        return ""
+    a, clock = run.a, run.clock
+    said = (
+        f"forces, constraint_rate or nonholonomic_rate change suddenly for {clock[a.BRIEFEST]:.2g} s, and were looked "
+        f"at every {clock[a.WIDEST_LOOK]:.2g} s only, where steps are long: other changes as short may have been "
+        f"missed. Give max_step, at most {clock[a.BRIEFEST]:.2g}"
+    )
+    return warn_user(said)
+
+
+Array = NDArray[np.float64]
+
+CORRECTIONS = 3  # of positions, which are off by less than the tolerances
+NEGLIGIBLE = 1e-12  # relative: singular values, and eigenvalues, that count as zero: redundant rows
+HOLDS = 1e-8  # relative: what is left of them where there is a solution
+
+
+def state_behind_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Array | None:
+    """The state [q, v] at t, right after a jump, from the one before; None: no velocities fit the constraints.
+
+    M (v+ - v) + G^T p = 0 and G v+ + (C_t, b) = 0: of all velocities that the constraints allow the nearest in the
+    metric of M.
+    """
+    q = corrected(system, t, q)
+    equations, lengths, size = scaled_equations(system, t, q)
+    right = np.concatenate([np.zeros(system.n_q), -system.velocity_constraint(t, q, v) / lengths * size])
+    change = np.linalg.lstsq(equations, right, rcond=NEGLIGIBLE)[0]
+    if not np.abs(equations @ change - right).max() <= HOLDS * np.abs(right).max():
+        return None
+    return np.concatenate([q, v + change[: system.n_q]])
+
+
+def corrected(system: ConstrainedSystem, t: float, q: Array) -> Array:
+    """The nearest positions on the constraints, by Newton's method."""
+    for _ in range(CORRECTIONS if system.n_c > 0 else 0):
+        q = q - np.linalg.lstsq(system.jacobian(t, q), system.constraint(t, q), rcond=NEGLIGIBLE)[0]
+    return q
+
+
+def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, float]:
+    """The matrix [M G^T; G 0], its rows G over their lengths and times the size of M; these lengths, and that size."""
+    mass, rows = system.mass(t, q), system.rows(t, q)
+    lengths, size = np.linalg.norm(rows, axis=1), float(np.abs(mass).max())
+    lengths[lengths == 0.0] = 1.0
+    scaled = rows / lengths[:, None] * size
+    return np.block([[mass, scaled.T], [scaled, np.zeros((len(rows), len(rows)))]]), lengths, size
