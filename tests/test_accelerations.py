@@ -63,7 +63,7 @@ class Code:
         if self.equations.quick is not None:
             module, numbers = Module(), self.code.shared.numbers
             kind = BIT, ["double*"] * 5
-            write_function(module, "quick", kind, self.equations.graph, self.equations.quick, numbers)
+            write_function(module, "quick", kind, self.equations.quick, numbers)
             self.quick = function_of(module, "quick", *[ctypes.c_void_p] * 5)
 
     def at(self, t, q, v):
@@ -169,7 +169,7 @@ def test_they_take_fewer_operations(name, most, mass_first):
         len(equations.graph.needed_by(outputs.arrays["a"])) for outputs in (equations.quick, equations.there)
     )
     assert quick_ones <= most < all_of_them <= mass_first
-    assert len(equations.quick.quantities(equations.graph)) < 0.8 * len(equations.there.quantities(equations.graph))
+    assert len(equations.quick.quantities()) < 0.8 * len(equations.there.quantities())
 
 
 @pytest.mark.parametrize("name", ["pendulum", "double_pendulum", "heavy_top", "closed_chain", "rolling_disc"])
@@ -233,7 +233,7 @@ def test_in_lanes_no_run_depends_on_those_beside_it():
     equations = Elimination(system, Choice.at(system, 0.0, problem.q0))
     module, numbers = Module(), Coefficients()
     for outputs in equations.accelerations:
-        list(numbers.structure(equations.graph, outputs.forms))
+        list(numbers.structure(outputs))
     builder = module.function("in_lanes", "void", ["double*"] * 3)
     emit = LaneEmitter(builder)
     states, emit.constants, out = builder.arguments

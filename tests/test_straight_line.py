@@ -14,10 +14,10 @@ from tests.problems import pendulum, quick, unconstrained, worst
 from twoloop import ConstraintWarning, mechanisms
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.compile_equations import generated_code, write_function
-from twoloop.generate.elimination import Outputs
 from twoloop.generate.graph import Graph
 from twoloop.generate.llvm_code import LARGEST_ANGLE
 from twoloop.generate.llvm_text import Module
+from twoloop.generate.program import Program
 from twoloop.generate.symbolic_factors import Factors
 from twoloop.kernels.compile.generated_functions import OwnFunctions, object_code
 from twoloop.kernels.data.codes import DONE
@@ -178,24 +178,24 @@ def test_redundant_rows_that_stop_holding_end_the_run():
 
 
 # --- forms of a graph as machine code: elimination, sines and cosines to rounding, derivatives of every operation
-def read_by(graph, outputs):
-    """The numbers that code for some outputs reads."""
+def read_by(program):
+    """The coefficients that code for a program reads."""
     numbers = Coefficients()
-    list(numbers.structure(graph, outputs.forms))
+    list(numbers.structure(program))
     return numbers
 
 
-def compute(graph, outputs, inputs, divided=False):
-    """What code for some outputs gives: whether its conditions hold, and the arrays."""
-    numbers = read_by(graph, outputs)
-    filled = tuple(np.full(len(forms), np.nan) for forms in outputs.arrays.values())
-    return machine_code_of(graph, outputs, numbers, divided)(*inputs, numbers.values, *filled), filled
+def compute(program, inputs, divided=False):
+    """What code for a program gives: whether its conditions hold, and the arrays."""
+    numbers = read_by(program)
+    filled = tuple(np.full(len(forms), np.nan) for forms in program.arrays.values())
+    return machine_code_of(program, numbers, divided)(*inputs, numbers.values, *filled), filled
 
 
-def machine_code_of(graph, outputs, numbers, divided=False):
+def machine_code_of(program, numbers, divided=False):
     """What Python calls, on arrays, for a function of LLVM."""
-    module, n = Module(divided), len(graph.sizes) + 1 + len(outputs.arrays)
-    write_function(module, "function", ("i1", ["double*"] * n), graph, outputs, numbers)
+    module, n = Module(divided), len(program.graph.sizes) + 1 + len(program.arrays)
+    write_function(module, "function", ("i1", ["double*"] * n), program, numbers)
     assert ("blockaddress" in str(module)) is divided
     made = OwnFunctions(["function"], object_code(str(module)))
     function = ctypes.CFUNCTYPE(ctypes.c_bool, *[ctypes.c_void_p] * n)(made.addresses["function"])
@@ -236,7 +236,7 @@ def test_elimination_solves_what_dense_linear_algebra_solves(n, m, seed):
 
 def evaluated(form, known):
     """The number that a form of sums, products and quotients is."""
-    for i in Outputs({"": [form]}, []).quantities(form.graph):
+    for i in Program(form.graph, {"": [form]}).quantities():
         kind, first, second = form.graph.operations[i]
         x = first.constant + sum(c * known[j] for j, c in first.terms.items())
         y = 1.0 if second is None else second.constant + sum(c * known[j] for j, c in second.terms.items())
@@ -248,9 +248,9 @@ def evaluated(form, known):
 def test_sine_and_cosine_are_right_to_rounding(size):
     graph = Graph()
     (angle,) = graph.inputs(1, False)
-    outputs = Outputs({"of": [angle.sine(), angle.cosine()]}, [])
-    numbers = read_by(graph, outputs)
-    function, values = machine_code_of(graph, outputs, numbers), numbers.values
+    program = Program(graph, {"of": [angle.sine(), angle.cosine()]})
+    numbers = read_by(program)
+    function, values = machine_code_of(program, numbers), numbers.values
     rng = np.random.default_rng(6)
     angles = np.concatenate([size * rng.uniform(-1.0, 1.0, 20_000), np.arange(-50, 51) * np.pi / 4.0])
     found = np.zeros((angles.size, 2))
@@ -265,9 +265,9 @@ def test_sine_and_cosine_are_right_to_rounding(size):
 def test_beyond_the_angles_that_it_takes_and_where_nothing_is_finite_it_says_so():
     graph = Graph()
     x, y = graph.inputs(2, False)
-    outputs = Outputs({"of": [x.sine() * y]}, [])
-    assert compute(graph, outputs, (np.array([1.0, 2.0]),))[0]
+    program = Program(graph, {"of": [x.sine() * y]})
+    assert compute(program, (np.array([1.0, 2.0]),))[0]
     for each in ([2.0 * LARGEST_ANGLE, 1.0], [math.nan, 1.0], [1.0, math.inf], [1.0, math.nan]):
-        holds, (filled,) = compute(graph, outputs, (np.array(each),))
+        holds, (filled,) = compute(program, (np.array(each),))
         assert not holds
         assert np.isnan(filled).all()  # nothing was written

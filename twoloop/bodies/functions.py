@@ -11,7 +11,7 @@ import numpy as np
 
 from twoloop.checks.arguments import Array, check_finite, check_real, shown
 from twoloop.generate.graph import Affine, Derivative, Graph, Untraceable, symbols
-from twoloop.generate.program import Program, numbers_of, program_of
+from twoloop.generate.program import OperationTable
 from twoloop.generate.trace import as_forms, trace
 
 
@@ -42,7 +42,8 @@ class RowFunction:
             results = self.forms(graph, t, q, v)
         except Untraceable as error:
             raise ValueError(f"{self.name} must be made of numpy's functions, without branches: {error}") from None
-        object.__setattr__(self, "traced", np.array(numbers_of(program_of(graph, 1 + 2 * n, dict(enumerate(results))))))
+        table = OperationTable.of(graph, 1 + 2 * n, dict(enumerate(results)))
+        object.__setattr__(self, "traced", np.array(table.flat()))
 
     @property
     def n_results(self) -> int:
@@ -215,7 +216,7 @@ def motion_function(name: str, motion: Any, rate: Any, acceleration: Any) -> Fun
     function = Function(name, motion, 1, 1, () if rate is None else (rate, acceleration))
     if rate is None:
         try:
-            return replace(function, traced=np.array(numbers_of(program_for([function], 0, True))))
+            return replace(function, traced=np.array(program_for([function], 0, True).flat()))
         except Untraceable as error:
             raise ValueError(
                 f"{error}; so it cannot be differentiated exactly. Write it with numpy functions and without "
@@ -234,7 +235,7 @@ def motion_forms(function: Function, graph: Graph, t: Affine) -> list[Affine]:
     return results
 
 
-def program_for(functions: Sequence[Function | RowFunction], n_q: int, motions: bool) -> Program:
+def program_for(functions: Sequence[Function | RowFunction], n_q: int, motions: bool) -> OperationTable:
     """Return one program for all functions, in order; raise Untraceable if one cannot be traced."""
     graph = Graph()
     (t,) = graph.inputs(1, False)
@@ -249,7 +250,7 @@ def program_for(functions: Sequence[Function | RowFunction], n_q: int, motions: 
                 results += each.forms(graph, t, q_part, v_part)
         except Untraceable as error:
             raise Untraceable(f"{each.name}: {error}") from None
-    return program_of(graph, 1 + 2 * n, dict(enumerate(results)))
+    return OperationTable.of(graph, 1 + 2 * n, dict(enumerate(results)))
 
 
 def is_constant(function: Function | RowFunction) -> bool:

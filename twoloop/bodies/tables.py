@@ -23,7 +23,6 @@ from twoloop.bodies.parameter_layout import (
 from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
 from twoloop.checks.arguments import Array, check_not_negative, check_positive
 from twoloop.generate.graph import Untraceable
-from twoloop.generate.program import numbers_of
 
 GRAVITY = ("x", "y", "z")
 MOMENTS = {2: ("moment of inertia",), 3: tuple(f"J_{which}" for which in ("xx", "yy", "zz", "xy", "xz", "yz"))}
@@ -193,7 +192,7 @@ class Tables:
         programs: list[list[float]] = []
         for functions, motions in ((self.motions, True), (self.functions, False)):
             try:
-                programs.append(numbers_of(program_for(functions, n_q, motions)) if functions else [])
+                programs.append(program_for(functions, n_q, motions).flat() if functions else [])
             except Untraceable as error:
                 self.untraced = str(error)
                 programs.append([])

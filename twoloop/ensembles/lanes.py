@@ -17,7 +17,7 @@ from twoloop.ensembles.starts import Starts, generic_parameters, generic_system,
 from twoloop.generate.choices import Choice
 from twoloop.generate.graph import Untraceable
 from twoloop.generate.parameter_expressions import ParameterTape
-from twoloop.generate.program import OnArrays
+from twoloop.generate.program import Arrays, Program
 from twoloop.generate.series import series_for
 from twoloop.generate.time_dependence import BY_TIME, TIME, may_be_narrow, may_be_sudden
 from twoloop.generate.trace import Equations
@@ -56,9 +56,9 @@ class ShortLooks:
     def __init__(self, system: ConstrainedSystem, values: Array, varying: Sequence[int]):
         self._record = ParameterTape(values.tolist(), varying)
         equations = Equations(system, self._record.parameters)
-        self._graph = graph = equations.graph
+        graph = equations.graph
         forms = np.concatenate([equations.of(kind).ravel() for kind in BY_TIME if kind in system.given])
-        self._forms = np.array([x for x in forms if any(graph.inputs_of[i] & TIME for i in x.terms)], dtype=object)
+        self._program = Program(graph, {"": [x for x in forms if any(graph.inputs_of[i] & TIME for i in x.terms)]})
 
     def meet(self, times: Array, rtol: float, parameters: Array, q: Array, v: Array) -> NDArray[np.bool_]:
         """Which runs, of these parameters, meet what lasts for less than two looks, or has no value.
@@ -66,11 +66,15 @@ class ShortLooks:
         q, v : (n_runs, n), of one state of each run.
         """
         met = np.zeros(len(q), dtype=bool)
-        size = max(1, AT_ONCE // max(1, len(times) * len(self._forms)))
+        size = max(1, AT_ONCE // max(1, len(times) * len(self._program.forms)))
         for begin in range(0, len(q), size):
             rows = slice(begin, begin + size)
-            at = OnArrays(self._graph, self._record, parameters[rows])
-            met[rows] = _are_short(at.evaluate([self._forms], times[:, None], q[rows], v[rows])[0], rtol)
+            algebra = Arrays(self._record, parameters[rows])
+            (forces,) = self._program.run(algebra, [times[:, None], *q[rows].T, *v[rows].T])
+            values = np.empty((len(times), len(q[rows]), len(forces)))
+            for k, force in enumerate(forces):
+                values[..., k] = force
+            met[rows] = _are_short(values, rtol)
         return met
 
 

@@ -1,7 +1,6 @@
-"""What numbers decide at a position before equations are written down.
+"""Choose by numbers at a position what an elimination needs.
 
-Which rows of C_q and A count, how M helps, and which coordinates these rows give from the others.
-
+These are independent rows of C_q and A, rows to be added to a singular M, and the coordinates that the rows determine.
 The choice depends on the position alone, so that the same call gets the same code whatever ran before it.
 """
 
@@ -16,19 +15,19 @@ from numpy.typing import NDArray
 from twoloop.checks.at_position import mass_and_rows
 from twoloop.generate.graph import Untraceable
 from twoloop.generate.trace import Equations
-from twoloop.generate.trace_cache import TraceCache, trace_cache_of
+from twoloop.generate.trace_cache import shared_cache
 from twoloop.kernels.compile.linking import direct
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-SINGULAR_MASS = 1e-10  # smallest over largest eigenvalue, below which rows of G are added to M
-RANK = 1e-9  # of a row of G, of which no more is left without its part in the rows before: it depends on them
-NEAR = 0.01  # of the smallest pivot that a row of G may have at the start: where the constraints are near losing rank
-LEAST = 10.0 ** np.arange(-2, -9, -1)  # from what pivots may be at most down to what is not nearly lost to rounding
+SINGULAR_MASS = 1e-10  # smallest over largest eigenvalue of M, below which rows of G are added to it
+RANK = 1e-9  # relative norm of a row of G without its part in the rows before, below which it depends on them
+NEAR = 0.01  # smallest allowed pivot over the smallest pivot of a row of G at the start
+LEAST = 10.0 ** np.arange(-2, -9, -1)  # smallest allowed pivots, down to those nearly lost to rounding
 BOUNDS = LEAST[:-1] / NEAR
-# of the rows of G over the coordinates, from which on it pays to express some coordinates by the others: below, the
-# system of the rows is the smaller one
+# rows of G over coordinates, above which it pays to express some coordinates by the others: below, the system of the
+# rows is the smaller one
 MOSTLY_ROWS = 2.0 / 3.0
 
 Blocks = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
@@ -36,19 +35,19 @@ Blocks = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
 
 @dataclass(frozen=True)
 class Choice:
-    """What is decided by numbers at a position.
+    """Decisions that depend on numbers at a position.
 
     Attributes
     ----------
     rows : tuple of int
-        Rows of G of full rank.
+        Independent rows of G.
     added, scale : tuple of int, float
-        Rows of G that make M definite when added, and by what factor: a power of two that brings them to its size.
+        Rows of G that make M definite when added, and their factor: a power of two that brings them to its size.
     least : float
-        What the pivot of a row must be, of what it is without the others, a power of ten.
+        Smallest allowed pivot of a row, over its pivot without the other rows; a power of ten.
     blocks : tuple of (rows, columns)
-        One or two of `rows`, by their places in it, and as many coordinates that these give: all of them, in the order
-        in which they are eliminated; empty where it does not pay, or no coordinates will do.
+        One or two of `rows`, by their places in it, and as many coordinates that they determine, in the order of
+        elimination; empty if it does not pay, or if no coordinates are suitable.
     """
 
     rows: tuple[int, ...]
@@ -59,7 +58,7 @@ class Choice:
 
     @classmethod
     def at(cls, system: ConstrainedSystem, t: float, q: Array) -> "Choice":
-        """The choice at a position.
+        """Return the choice at a position.
 
         Raises
         ------
@@ -72,7 +71,7 @@ class Choice:
 
 
 class Dependents:
-    """Finds the coordinates that rows of G give, at one position after another.
+    """Finds the coordinates that rows of G determine, at one position after another.
 
     Parameters
     ----------
@@ -99,17 +98,17 @@ class Dependents:
             self.arguments = kinds, np.array(rows, np.int64), len(rows), room, work, blocks
 
     def blocks(self, G: Array) -> Blocks:
-        """Those of a choice."""
+        """Return the blocks of a choice."""
         if self.find is None:
             return ()
         n = self.find(G, *self.arguments)
-        found = self._blocks[: 4 * n].reshape(n, 4).tolist()
-        return tuple(((i,), (j,)) if i == k else ((i, k), (j, l)) for i, k, j, l in found)
+        pivots = self._blocks[: 4 * n].reshape(n, 4).tolist()
+        return tuple(((i,), (j,)) if i == k else ((i, k), (j, l)) for i, k, j, l in pivots)
 
 
 def _kinds(system: ConstrainedSystem) -> Any:
-    """Which entries of G are zero, 0, or a number, 1, or vary, 2; None: it is not known."""
-    if system.called_in_python:  # may keep what it gets, and so is traced no earlier than it must be
+    """Return for each entry of G whether it is zero, 0, a number, 1, or varies, 2; None if unknown."""
+    if system.called_in_python:  # a function may keep its arguments, so it is traced as late as possible
         return None
 
     def make(equations: Callable[[], Equations]) -> Any:
@@ -119,15 +118,15 @@ def _kinds(system: ConstrainedSystem) -> Any:
             return None
         return np.array([2 if form.terms else int(form.constant != 0.0) for form in rows], dtype=np.int64)
 
-    family: TraceCache = system.remembered(("family", trace_cache_of), partial(trace_cache_of, system))
-    kinds = family.remembered("kinds of entries", partial(make, partial(family.equations, system)))
-    if kinds is None:  # it may be traced with numbers
+    cache = shared_cache(system)
+    kinds = cache.remembered("kinds of entries", partial(make, partial(cache.equations, system)))
+    if kinds is None:  # it may be traceable with numbers
         kinds = system.remembered("kinds of entries", partial(make, partial(Equations, system)))
     return kinds
 
 
 class Chooser:
-    """The choice for one M and G of a system after another; it is mostly the last one."""
+    """Makes the choice for one M and G of a system after another; it is mostly the same."""
 
     def __init__(self, system: ConstrainedSystem):
         from twoloop.kernels.linalg.rank import choose, room_size
@@ -135,20 +134,20 @@ class Chooser:
         n_rows = system.n_c + system.n_a
         self.system, self._choose = system, direct(choose)
         self._room, self._chosen = np.zeros(room_size(n_rows, system.n_q)), np.zeros(2 + 3 * n_rows, dtype=np.int64)
-        self._decided, self._last = (0, b"", 0.0), Choice((), (), 1.0, 0.0)
+        self._key, self._last = (0, b"", 0.0), Choice((), (), 1.0, 0.0)
 
     def choice(self, mass: Array, G: Array) -> Choice:
-        """The choice; raises as `Choice.at`."""
+        """Return the choice; raises as `Choice.at`."""
         system, room, chosen = self.system, self._room, self._chosen
         constant = system.constant_mass and system.made.get("no weak mass", False)
         room[0] = 0.0
         place = self._choose(mass, G, RANK, 0.0 if constant else SINGULAR_MASS, BOUNDS, room, chosen)
         decided = place, chosen.tobytes(), float(room[0])
-        if decided != self._decided:
-            self._last, self._decided = self._made(place), decided
+        if decided != self._key:
+            self._last, self._key = self._decode(place), decided
         return self._last
 
-    def _made(self, place: int) -> Choice:
+    def _decode(self, place: int) -> Choice:
         from twoloop.kernels.linalg.rank import STAYS_SINGULAR
 
         system, n_rows = self.system, self.system.n_c + self.system.n_a

@@ -1,4 +1,4 @@
-"""Numbers that code made for a mechanism reads when it runs: one code serves all mechanisms of its structure."""
+"""Coefficients that generated code reads when it runs, so that it serves all mechanisms of its structure."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -8,19 +8,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.generate.graph import Affine, Graph, rounded
+from twoloop.generate.graph import Affine, rounded
 from twoloop.generate.parameter_expressions import Parameter, ParameterTape, Powers, array_of
+from twoloop.generate.program import Program
 
 Terms = tuple[tuple[int, float], ...]  # quantities and their coefficients
 
-IN_THE_CODE = (0.0, 1.0, -1.0)  # which take no multiplication, and what differs from these by rounding
-ROUNDING = 8.0 * 2.0**-52
+IN_THE_CODE = (0.0, 1.0, -1.0)  # coefficients that need no multiplication, and stand in the code
+ROUNDING = 8.0 * 2.0**-52  # relative: what differs from these by less is taken for them
 
 
 class Coefficient(float):
-    """A coefficient that stands at a place in memory; equal to no other, whatever their values are.
+    """A coefficient that is read from a place in memory; equal to no other, whatever their values.
 
-    Those that vary with parameters stand in a place of their own.
+    Coefficients that vary with parameters may have a memory of their own.
     """
 
     __slots__ = ("place", "varies")
@@ -28,10 +29,10 @@ class Coefficient(float):
     varies: bool
 
     def __new__(cls, value: float, place: int, varies: bool = False) -> "Coefficient":
-        """A number for a place."""
-        made = super().__new__(cls, value)
-        made.place, made.varies = place, varies
-        return made
+        """Create the coefficient of a place."""
+        coefficient = super().__new__(cls, value)
+        coefficient.place, coefficient.varies = place, varies
+        return coefficient
 
     def __eq__(self, other: object) -> bool:
         return self is other
@@ -44,9 +45,10 @@ class Coefficient(float):
 
 
 class Coefficients:
-    """The coefficients of forms, in the order in which these are met first; the same form has the same numbers.
+    """Assigns places to the coefficients of expressions, in the order of their first use.
 
-    `apart`: those that vary with parameters stand in a memory of their own, as each lane has its own.
+    Equal expressions share their places. `apart`: coefficients that vary with parameters have a memory of their own, as
+    each SIMD lane has other values.
     """
 
     def __init__(self, apart: bool = False) -> None:
@@ -54,78 +56,76 @@ class Coefficients:
         self._values: list[float] = []
         self._formulas: Any = np.zeros(0)
         self._varying: dict[tuple[float, Powers], Parameter] = {}
-        self._known: dict[tuple[Terms, float], tuple[Terms, float]] = {}
+        self._numbered: dict[tuple[Terms, float], tuple[Terms, float]] = {}
         self._of_forms: dict[Any, tuple[Terms, float]] = {}
 
     @property
     def values(self) -> NDArray[np.float64]:
-        """What code reads."""
+        """Return the numbers that code reads."""
         return np.array(self._values, dtype=np.float64)
 
     @property
     def formulas(self) -> Any:
-        """The same, as formulas where they know their parameters: one array, until there are more."""
+        """Return the same numbers as expressions in the parameters; the array is the same until there are more."""
         if len(self._formulas) != len(self._values):
             self._formulas = array_of(self._values)
         return self._formulas
 
     def of(self, terms: Terms, constant: float = 0.0) -> tuple[Terms, float]:
-        """Terms and constant with numbers in their places."""
+        """Return terms and a constant, with coefficients in the place of numbers."""
         key = tuple((i, rounded(c)) for i, c in terms), rounded(constant)
-        known = self._known.get(key)
-        if known is None:
-            known = self._known[key] = tuple((i, self._number(c)) for i, c in terms), self._number(constant)
-        return known
+        numbers = self._numbered.get(key)
+        if numbers is None:
+            numbers = self._numbered[key] = tuple((i, self._number(c)) for i, c in terms), self._number(constant)
+        return numbers
 
     def of_form(self, form: Affine) -> tuple[Terms, float]:
-        """The same of a form."""
-        known = self._of_forms.get(form.key)
-        if known is None:
-            known = self._of_forms[form.key] = self.of(tuple(form.terms.items()), form.constant)
-        return known
+        """Return the same for an expression."""
+        numbers = self._of_forms.get(form.key)
+        if numbers is None:
+            numbers = self._of_forms[form.key] = self.of(tuple(form.terms.items()), form.constant)
+        return numbers
 
-    def structure(
-        self, graph: Graph, forms: Iterable[Affine], kept: Mapping[int, int] = MappingProxyType({})
-    ) -> Iterable[Any]:
-        """What code for these forms depends on, the values of its numbers apart; `kept`: at which places others are."""
-        forms = list(forms)
-        needed = graph.needed_by(forms, kept)
+    def structure(self, program: Program, given: Mapping[int, int] = MappingProxyType({})) -> Iterable[Any]:
+        """List what code for a program depends on, the values of numbers apart; `given`: places of given quantities."""
+        graph, forms = program.graph, program.forms
+        needed = graph.needed_by(forms, given)
         name: dict[int, Any] = {i: f"input {i}" for i, each in enumerate(graph.operations) if each is None}
         name |= {i: k for k, i in enumerate(needed)}
-        name |= {i: f"kept {place}" for i, place in kept.items()}
+        name |= {i: f"kept {place}" for i, place in given.items()}
 
-        def told(form: Affine) -> Any:
+        def described(form: Affine) -> Any:
             terms, constant = self.of_form(form)
             return [(name[i], c) for i, c in terms], constant
 
-        yield [told(form) for form in forms]
+        yield [described(form) for form in forms]
         for i in needed:
             kind, *arguments = graph.operations[i]  # type: ignore[misc]
-            yield kind, [told(each) for each in arguments if isinstance(each, Affine)]
+            yield kind, [described(each) for each in arguments if isinstance(each, Affine)]
 
     @property
     def n_varying(self) -> int:
-        """How many vary with parameters."""
+        """Return how many coefficients vary with parameters."""
         return len(self._varying)
 
     def for_parameters(self, record: ParameterTape, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Those that vary, for parameters (n_runs, n_p), a row a run."""
+        """Return the varying coefficients for parameters (n_runs, n_p), a row a run."""
         return record.evaluate(list(self._varying.values()), parameters)
 
     def _number(self, value: float) -> float:
-        if type(value) is Parameter:  # which is another number for other parameters, whatever it is now
+        if type(value) is Parameter:  # its present value means nothing
             if self._apart:
-                made_of = value.scale, value.powers
-                self._varying.setdefault(made_of, value)
-                return Coefficient(value, list(self._varying).index(made_of), varies=True)
-        elif (near := in_the_code(value)) is not None:
-            return near
+                expression = value.scale, value.powers
+                self._varying.setdefault(expression, value)
+                return Coefficient(value, list(self._varying).index(expression), varies=True)
+        elif (exact := in_the_code(value)) is not None:
+            return exact
         self._values.append(value)
         return Coefficient(value, len(self._values) - 1)
 
 
 def in_the_code(value: float) -> float | None:
-    """A number as it may stand in the code, if it may."""
+    """Return a number that may stand in the code, or None."""
     if type(value) is Parameter or not math.isfinite(value):
         return None
     near = float(round(value))

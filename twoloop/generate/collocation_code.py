@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 
 from twoloop.generate import lane_emitter, lane_memory, llvm_code, lobatto_tables
 from twoloop.generate.compile_equations import GeneratedCode, SharedCode, call_accelerations
-from twoloop.generate.elimination import Outputs
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.lane_memory import column, load_lanes, over, place_of, store_lanes, two_sums
 from twoloop.generate.llvm_code import Emitter
 from twoloop.generate.llvm_text import BIT, DOUBLE, INTEGER, NOTHING, Module, Value, constant, constants, integer
 from twoloop.generate.lobatto_tables import tables
-from twoloop.generate.lowering import Lowering, conditions_hold, results_of
+from twoloop.generate.lowering import Lowering, lower
+from twoloop.generate.program import Program
 from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.generated_functions import LaterFunctions, own_functions
 from twoloop.kernels.data import collocation as at
@@ -91,15 +91,15 @@ class CollocationCode:
             outputs = [*self.equations.accelerations, self.equations.closer, self.equations.nearer]
         else:  # the digest of `own` tells the others
             outputs = self.equations.accelerations[:1]
-        graph, numbers = self.equations.graph, self.numbers
-        told = [[each.sizes, *numbers.structure(graph, each.forms)] for each in outputs]
+        numbers = self.numbers
+        told = [[each.sizes, *numbers.structure(each)] for each in outputs]
         self.structure = hashlib.sha256(repr([own.digest, told]).encode()).hexdigest()
 
     def _iterated(self) -> list[int]:
         graph, forms = self.equations.graph, []
         for outputs in self.equations.accelerations:
             forms += outputs.forms
-            forms += [form for i in outputs.quantities(graph) for form in graph.arguments(i)]
+            forms += [form for i in outputs.quantities() for form in graph.arguments(i)]
         found = {i for form in forms for i in form.terms if graph.operations[i] is None}
         return sorted({(i - 1) % self.n for i in found if i > 0})
 
@@ -133,7 +133,7 @@ class CollocationCode:
             def finish() -> Value:
                 put(self.others)
                 written.forms(graph, [form for pair in outputs.conditions for form in pair])
-                return conditions_hold(emit, written, outputs, self._accelerations(emit, room))
+                return written.holds(outputs, self._accelerations(emit, room))
 
             put(self.iterated)
             return finish
@@ -512,12 +512,12 @@ class CollocationCode:
 
     # what they are made of
 
-    def _project(self, emit: LaneEmitter, room: Value, numbers: Value, outputs: Outputs) -> None:
+    def _project(self, emit: LaneEmitter, room: Value, numbers: Value, outputs: Program) -> None:
         emit.numbers = emit.constants = numbers
         inputs = [load_lanes(emit, room, self.ends + LANES * k) for k in range(1 + 2 * self.n)]
-        written, arrays = results_of(emit, self.equations.graph, outputs, inputs, self.numbers)
+        written, arrays = lower(emit, outputs, inputs, self.numbers)
         values = dict(zip(outputs.arrays, arrays, strict=True))
-        holds = conditions_hold(emit, written, outputs, [value for array in arrays for value in array])
+        holds = written.holds(outputs, [value for array in arrays for value in array])
         for name, place in self._places_of_ends().items():
             for k, value in enumerate(values.get(name, [])):
                 store_lanes(emit, value, room, place + LANES * k)
@@ -608,7 +608,7 @@ class Collocation(NamedTuple):
 def compiled_collocation(of_one: GeneratedCode) -> Collocation:
     """The code for a mechanism; its machine code is kept on disk, and compiled when steps are to call it."""
     own = of_one.shared
-    made: Collocation = own.family.remembered(("collocation", own.equations.choice), lambda: _compiled(own))
+    made: Collocation = own.cache.remembered(("collocation", own.equations.choice), lambda: _compiled(own))
     return made._replace(numbers=of_one.evaluate(made.numbers))
 
 

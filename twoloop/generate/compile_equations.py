@@ -24,11 +24,12 @@ from numpy.typing import NDArray
 from twoloop.generate import llvm_code
 from twoloop.generate.choices import Choice
 from twoloop.generate.coefficients import Coefficients
-from twoloop.generate.elimination import Elimination, Outputs, Solution
+from twoloop.generate.elimination import Elimination, Solution
 from twoloop.generate.graph import Graph, Untraceable
 from twoloop.generate.llvm_code import Emitter
 from twoloop.generate.llvm_text import BIT, DOUBLE, Module, Value, integer, width_of
-from twoloop.generate.lowering import Lowering, Place, conditions_hold
+from twoloop.generate.lowering import Lowering, Place
+from twoloop.generate.program import Program
 from twoloop.generate.trace_cache import Evaluator, TraceCache, derive_cached
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.kernels.compile.dependencies import digest_of
@@ -41,9 +42,9 @@ ARRAY = f"{DOUBLE}*"
 def write_accelerations(
     emit: Emitter, equations: Elimination, inputs: Sequence[Value], numbers: Coefficients
 ) -> tuple[list[Value], Value]:
-    """Write the accelerations at [t, q, v], and whether they may be used.
+    """Write the accelerations at [t, q, v]; return them, and whether they are valid.
 
-    What follows goes on in the block in which the builder is then. `emit` says where numbers stand.
+    The builder may be in another block afterwards. `emit` knows where coefficients stand.
     """
     lowering, n = Lowering(emit, numbers), equations.system.n_q
     for quantity, value in enumerate(inputs):
@@ -61,7 +62,7 @@ def write_accelerations(
 def write_acceleration_function(
     module: Module, name: str, kind: tuple[str, list[str]], equations: Elimination, numbers: Coefficients
 ) -> None:
-    """Write a function of t, q, v and `numbers`, which fills a and returns whether it could."""
+    """Write a function of t, q, v and `numbers` that fills a, and returns whether a is valid."""
 
     def emit_all(emit: Emitter, t: Value, q: Value, v: Value, given: Value, filled: Value) -> Value:
         lowering, emit.numbers = Lowering(emit, numbers), given
@@ -78,24 +79,24 @@ def write_acceleration_function(
 def call_accelerations(
     emit: Emitter, equations: Elimination, way: int, inputs: Sequence[Value], numbers: Coefficients, filled: Value
 ) -> Value:
-    """Fill an array with the accelerations at [t, q, v] by a function of the module; whether they may be used.
+    """Call a function that fills an array with the accelerations at [t, q, v]; return whether they are valid.
 
-    `way` is a place in `equations.accelerations`: 0, that of the fewest operations; -1, the elimination of M.
+    `way` is an index of `equations.accelerations`: 0 has the fewest operations, -1 eliminates M.
     """
     place = _room(emit, 2 * equations.system.n_q)
     for i, value in enumerate(inputs[1:]):
         emit.store(value, place, i)
     given = [inputs[0], place, emit.pointer(place, equations.system.n_q), *_numbers(emit), filled]
-    return emit.builder.call(_function(emit, equations, way, numbers), emit.bit, given)
+    return emit.builder.call(_acceleration_function(emit, equations, way, numbers), emit.bit, given)
 
 
 def _accelerations(
     emit: Emitter, equations: Elimination, lowering: Lowering, state: Callable[[], list[Value]]
 ) -> tuple[list[Value], Value]:
-    """The same of what is written; `state` puts t, q and v where a function finds them."""
-    outputs, *others = equations.accelerations
-    a, holds = _outputs(emit, equations, lowering, outputs)
-    if not others:
+    """Write accelerations with a lowering; `state` returns t and pointers to q and v for a call."""
+    outputs, *alternatives = equations.accelerations
+    a, holds = _run_accelerations(emit, equations, lowering, outputs)
+    if not alternatives:
         return a, holds
     builder = emit.builder
     everywhere = holds
@@ -104,29 +105,31 @@ def _accelerations(
     before, otherwise, after = builder.block, builder.append_block(), builder.append_block()
     builder.branch(everywhere, after, otherwise)
     builder.position_at_end(otherwise)
-    name, place = _function(emit, equations, -1, lowering.numbers), _room(emit, len(a))
-    found = builder.call(name, emit.bit, [*state(), *_numbers(emit), place])
+    name, place = _acceleration_function(emit, equations, -1, lowering.numbers), _room(emit, len(a))
+    finite = builder.call(name, emit.bit, [*state(), *_numbers(emit), place])
     b = [builder.select(holds, value, emit.load(place, i)) for i, value in enumerate(a)]
-    found, last = builder.operation("or", holds, found), builder.block
+    finite, last = builder.operation("or", holds, finite), builder.block
     builder.go_to(after)
     builder.position_at_end(after)
-    joined: list[Value] = []
-    for one, other in zip([*a, holds], [*b, found], strict=True):
-        phi = builder.phi(one.type)
-        phi.add_incoming(one, before)
-        phi.add_incoming(other, last)
-        joined.append(phi)
-    *a, holds = joined
+    merged: list[Value] = []
+    for value, alternative in zip([*a, holds], [*b, finite], strict=True):
+        phi = builder.phi(value.type)
+        phi.add_incoming(value, before)
+        phi.add_incoming(alternative, last)
+        merged.append(phi)
+    *a, holds = merged
     return a, holds
 
 
-def _outputs(emit: Emitter, equations: Elimination, lowering: Lowering, outputs: Outputs) -> tuple[list[Value], Value]:
-    (a,) = lowering.results(equations.graph, outputs)
-    return a, conditions_hold(emit, lowering, outputs, a)
+def _run_accelerations(
+    emit: Emitter, equations: Elimination, lowering: Lowering, outputs: Program
+) -> tuple[list[Value], Value]:
+    (a,) = outputs.run(lowering)
+    return a, lowering.holds(outputs, a)
 
 
-def _function(emit: Emitter, equations: Elimination, way: int, numbers: Coefficients) -> str:
-    """The name of the function of the module for a way to find accelerations; `numbers` are those that it reads."""
+def _acceleration_function(emit: Emitter, equations: Elimination, way: int, numbers: Coefficients) -> str:
+    """Return the name of a function of the module for accelerations, which is written at the first call."""
     outputs, mass_first = equations.accelerations[way], way in (-1, len(equations.accelerations) - 1)
     module, name = emit.builder.module, f"{'mass_first' if mass_first else 'quick'}_{emit.suffix}"
     if not module.defines(name):
@@ -145,7 +148,7 @@ def _function(emit: Emitter, equations: Elimination, way: int, numbers: Coeffici
         for first, array in ((1, q), (1 + n, v)):
             for i in range(n):
                 lowering.define(first + i, inner.load(array, i))
-        a, holds = _outputs(inner, equations, lowering, outputs)
+        a, holds = _run_accelerations(inner, equations, lowering, outputs)
         for i, value in enumerate(a):
             inner.store(value, filled, i)
         builder.ret(holds)
@@ -153,7 +156,7 @@ def _function(emit: Emitter, equations: Elimination, way: int, numbers: Coeffici
 
 
 def _numbers(emit: Emitter) -> list[Value]:
-    """Where the numbers that code reads stand; in lanes also those that all have in common."""
+    """Return where coefficients stand; in SIMD lanes also those that all lanes share."""
     constants = getattr(emit, "constants", None)
     return [emit.numbers] if constants is None else [emit.numbers, constants]
 
@@ -162,13 +165,13 @@ def _room(emit: Emitter, size: int) -> Value:
     return emit.builder.room(DOUBLE, size * width_of(emit.double))
 
 
-# operations from which on equations are written in parts, which takes half as long to build: where these are for
-# projections alone, and where accelerations, too, would take half as long again by them
-LONG, LONG_OF_ALL = 200, 500
+# numbers of operations above which equations are split, which halves the time to build: `SPLIT_PROJECTIONS` if only
+# projections are, `SPLIT_ALL` if accelerations are, too, which then take half as long again
+SPLIT_PROJECTIONS, SPLIT_ALL = 200, 500
 
 
 class SplitFunctions:
-    """Writes the parts, and the functions of which they are parts.
+    """Writes equations in parts, which are functions of the module, and the functions that call them.
 
     Parameters
     ----------
@@ -178,9 +181,9 @@ class SplitFunctions:
     Attributes
     ----------
     solution : Solution
-        Which keeps what parts have in common.
+        Keeps what parts share.
     at_position, with_factors : dict
-        Outputs of parts by their names: from t, q, v and what is kept, and from r, c and what is kept.
+        Programs of parts by their names: of t, q, v and what is kept, and of r, c and what is kept.
     """
 
     def __init__(self, equations: Elimination, numbers: Coefficients):
@@ -195,47 +198,47 @@ class SplitFunctions:
             self.with_factors["least"] = self.solution.least
         self._parts: dict[str, Callable[..., Value]] = {"factors": self._factors}
         for name, outputs in self.at_position.items():
-            self._parts[name] = partial(self._part, equations.graph, outputs, self.solution.known)
+            self._parts[name] = partial(self._part, outputs, self.solution.known)
         for name, outputs in self.with_factors.items():
-            self._parts[name] = partial(self._part, self.solution.graph, outputs, None)
+            self._parts[name] = partial(self._part, outputs, {})
 
     def described(self) -> Iterable[Any]:
-        """What the functions depend on, the values of numbers apart."""
-        equations, solution, numbers = self.equations, self.solution, self.numbers
-        yield solution.kept.sizes, list(numbers.structure(equations.graph, solution.kept.forms))
+        """List what the functions depend on, the values of numbers apart."""
+        solution, numbers = self.solution, self.numbers
+        yield solution.kept.sizes, list(numbers.structure(solution.kept))
         for outputs in self.at_position.values():
-            yield outputs.sizes, list(numbers.structure(equations.graph, outputs.forms, solution.known))
+            yield outputs.sizes, list(numbers.structure(outputs, solution.known))
         for outputs in self.with_factors.values():
-            yield outputs.sizes, list(numbers.structure(solution.graph, outputs.forms))
+            yield outputs.sizes, list(numbers.structure(outputs))
 
     def write(self, module: Module, kinds: Callable[[str], tuple[str, list[str]]]) -> list[str]:
-        """Put the functions that kernels know into a module; their names. `kinds` has their types."""
-        known: dict[str, Callable[..., Any]] = {"own_closer": self.closer, "own_nearer": self.nearer}
+        """Write the functions that kernels call into a module, and return their names; `kinds` has their types."""
+        functions: dict[str, Callable[..., Any]] = {"own_closer": self.closer, "own_nearer": self.nearer}
         if self.equations.quick is None:
-            known["own_there"] = self.there
-        for name, emit in known.items():
+            functions["own_there"] = self.there
+        for name, emit in functions.items():
             llvm_code.write(module, name, kinds(name), emit)
-        return list(known)
+        return list(functions)
 
     # the parts
 
     def _call(self, emit: Emitter, *calls: tuple[str, Sequence[Value]]) -> Value:
-        """Whether what parts compute holds; they are written when they are first called."""
+        """Call parts, which are written at their first call; return whether their results are valid."""
         module, holds = emit.builder.module, None
         for part, arguments in calls:
             name = f"{part}_{emit.suffix}"
             if not module.defines(name):
                 builder = module.function(name, emit.bit, [value.type for value in arguments], internal=True)
                 builder.ret(self._parts[part](emit.like(builder), *builder.arguments))
-            found = emit.builder.call(name, emit.bit, arguments)
-            holds = found if holds is None else emit.builder.both(holds, found)
+            valid = emit.builder.call(name, emit.bit, arguments)
+            holds = valid if holds is None else emit.builder.both(holds, valid)
         assert holds is not None
         return holds
 
     def _lowering(
         self, emit: Emitter, graph: Graph, arguments: Sequence[Value], places: Mapping[int, Place]
     ) -> Lowering:
-        """For code of three inputs of a graph, which are given first, and then the numbers that it reads."""
+        """Return a lowering for a part, whose first arguments are three inputs of a graph and the coefficients."""
         *given, emit.numbers = arguments[:4]
         if width_of(emit.double) > 1:
             emit.constants = emit.numbers  # type: ignore[attr-defined]
@@ -244,38 +247,36 @@ class SplitFunctions:
         return lowering
 
     def _factors(self, emit: Emitter, *arguments: Value) -> Value:
-        """Whether the conditions hold; what is kept is stored when it is found."""
+        """Compute and store what is kept; return whether the conditions hold."""
         graph, solution, kept = self.equations.graph, self.solution, arguments[4]
         lowering = self._lowering(emit, graph, arguments, {})
         places = {i: (kept, place) for i, place in solution.known.items()}
         for i, place in places.items():
-            if graph.operations[i] is None:  # an entry is t or a coordinate
+            if graph.operations[i] is None:  # an entry that is t or a coordinate
                 emit.store(lowering.value(i), *place)
-        lowering.write(graph, graph.in_order_of_use(solution.kept.forms), places)
-        return conditions_hold(emit, lowering, solution.kept, [])
+        lowering.run(graph, graph.in_order_of_use(solution.kept.forms), places)
+        return lowering.holds(solution.kept, [])
 
-    def _part(
-        self, graph: Graph, outputs: Outputs, known: Mapping[int, int] | None, emit: Emitter, *arguments: Value
-    ) -> Value:
-        """Whether outputs hold; they are stored. `known`: what is kept, and where, which is then the fifth argument."""
-        places = {} if known is None else {i: (arguments[4], place) for i, place in known.items()}
-        lowering = self._lowering(emit, graph, arguments, places)
-        results = lowering.results(graph, outputs)
+    def _part(self, program: Program, kept: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
+        """Compute and store outputs; return whether they are valid. `kept`: places in the fifth argument."""
+        places = {i: (arguments[4], place) for i, place in kept.items()}
+        lowering = self._lowering(emit, program.graph, arguments, places)
+        results = program.run(lowering)
         for array, values in zip(arguments[-len(results) :], results, strict=True):
             for j, value in enumerate(values):
                 emit.store(value, array, j)
-        return conditions_hold(emit, lowering, outputs, results[0])
+        return lowering.holds(program, results[0])
 
-    # what kernels call, and code in lanes
+    # functions for kernels, and for code in SIMD lanes
 
     def there(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, a: Value) -> Value:
-        """Accelerations."""
+        """Compute accelerations."""
         kept, r, c, lam = self._rooms(emit)
         at = [t, q, v, numbers, kept]
         return self._call(emit, ("factors", at), ("right", [*at, r, c]), ("solution", [r, c, kept, numbers, a, lam]))
 
     def closer(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, moved: Value, out: Value) -> Value:
-        """Positions moved towards the constraints."""
+        """Move positions towards the constraints."""
         kept, r, c, lam = self._rooms(emit)
         at = [t, q, v, numbers, kept]
         _clear(emit, self.n, r)
@@ -297,7 +298,7 @@ class SplitFunctions:
         new_v: Value,
         lam: Value,
     ) -> Value:
-        """The same, and velocities, accelerations and multipliers; moves are in the metric of M."""
+        """Move positions and velocities in the metric of M, and compute accelerations and multipliers."""
         kept, r, c, change = self._rooms(emit)
         u, at = self._room(emit, self.n), [t, q, v, numbers, kept]
         _clear(emit, self.n, r)
@@ -322,7 +323,7 @@ class SplitFunctions:
         return holds
 
     def _rooms(self, emit: Emitter) -> list[Value]:
-        """For what is kept, r, c, and a solution."""
+        """Return memory for what is kept, r, c, and a solution."""
         sizes = self.solution.n_kept, self.n, self.n_rows, max(self.n, self.n_rows)
         return [self._room(emit, size) for size in sizes]
 
@@ -331,7 +332,7 @@ class SplitFunctions:
 
 
 def _leave_unless(emit: Emitter, holds: Value) -> None:
-    """Change nothing that is given where it does not hold; in lanes, others may hold."""
+    """Return before any argument is changed where results are invalid; in SIMD lanes, other lanes may be valid."""
     if holds.type == BIT:
         emit.builder.leave_unless(holds)
 
@@ -341,9 +342,9 @@ def _clear(emit: Emitter, n: int, out: Value) -> None:
         emit.store(emit.constant(0.0), emit.pointer(out, j))
 
 
-def _sum(emit: Emitter, n: int, one: Value, other: Value, out: Value) -> None:
+def _sum(emit: Emitter, n: int, a: Value, b: Value, out: Value) -> None:
     with emit.loop(integer(0), integer(n), []) as (j, _, _):
-        total = emit.add(emit.load(emit.pointer(one, j)), emit.load(emit.pointer(other, j)))
+        total = emit.add(emit.load(emit.pointer(a, j)), emit.load(emit.pointer(b, j)))
         emit.store(total, emit.pointer(out, j))
 
 
@@ -351,25 +352,20 @@ Array = NDArray[np.float64]
 
 
 def write_function(
-    module: Module,
-    name: str,
-    kind: tuple[str, list[str]],
-    graph: Graph,
-    outputs: Outputs,
-    numbers: Coefficients,
+    module: Module, name: str, kind: tuple[str, list[str]], program: Program, numbers: Coefficients
 ) -> None:
-    """Write a function of inputs, of the values of `numbers`, and of arrays to fill.
+    """Write a function of inputs, coefficients, and arrays to fill.
 
-    It returns whether the conditions hold and what it computes is finite, and fills the arrays only then.
+    It returns whether the conditions hold and the first array is finite, and fills the arrays only then.
     """
 
     def emit_all(emit: Emitter, *arguments: Value) -> Value:
-        n_given = len(graph.sizes)
+        n_given = len(program.graph.sizes)
         given, emit.numbers, filled = arguments[:n_given], arguments[n_given], arguments[n_given + 1 :]
         lowering = Lowering(emit, numbers)
-        lowering.take(graph, given)
-        results = lowering.results(graph, outputs)
-        holds = conditions_hold(emit, lowering, outputs, results[0])
+        lowering.take(program.graph, given)
+        results = program.run(lowering)
+        holds = lowering.holds(program, results[0])
         with emit.builder.if_then(holds):
             for place, array in zip(filled, results, strict=True):
                 for j, value in enumerate(array):
@@ -380,42 +376,40 @@ def write_function(
 
 
 class SharedCode:
-    """Functions made for the equations of a family of systems, compiled, or read from the disk.
+    """Compiled functions for the equations that some systems share, or read from the disk.
 
     Parameters
     ----------
     equations : Elimination
-    family : TraceCache
+    cache : TraceCache
 
     Attributes
     ----------
-    solution : Solution
-        Of them.
     numbers : Coefficients
-        Of both.
+        Coefficients that the functions read.
     digest : str
-        Of all that the functions depend on, the values of these apart.
+        Digest of what the functions depend on, the values of coefficients apart.
     functions : OwnFunctions
     """
 
-    def __init__(self, equations: Elimination, family: TraceCache):
-        self.equations, self.family, self.numbers, self.parts = equations, family, Coefficients(), None
-        if equations.n_operations > (LONG_OF_ALL if equations.quick is None else LONG):
+    def __init__(self, equations: Elimination, cache: TraceCache):
+        self.equations, self.cache, self.numbers, self.parts = equations, cache, Coefficients(), None
+        if equations.n_operations > (SPLIT_ALL if equations.quick is None else SPLIT_PROJECTIONS):
             self.parts = SplitFunctions(equations, self.numbers)
-        self.outputs = self._outputs()
+        self.outputs = self._programs()
         structure = repr(list(self._described()))
         self.digest = hashlib.sha256((structure + _stamp()).encode()).hexdigest()
-        # LLVM finds nothing that makes equations faster, and takes up to a quarter of a build to look for it
+        # passes of LLVM find nothing that makes equations faster, and take up to a quarter of a build
         self.functions = own_functions("equations", _stamp(), self.digest, self._write, passes=False)
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "GeneratedCode":
-        """The code, and what it reads for one of the systems."""
+        """Return the code with the coefficients of one of the systems."""
         return GeneratedCode(
             self, evaluate(self.numbers.formulas), self.equations.traced.of(system, evaluate), evaluate
         )
 
-    def _outputs(self) -> dict[str, Outputs]:
-        """What functions compute that are no parts of others."""
+    def _programs(self) -> dict[str, Program]:
+        """Return the programs of functions that are not split."""
         equations = self.equations
         outputs = {"own_redundant": equations.redundant}
         if self.parts is None:
@@ -426,7 +420,7 @@ class SharedCode:
         equations, parts, numbers = self.equations, self.parts, self.numbers
         yield equations.system.n_q, equations.choice.rows, equations.choice.added
         for outputs in (*self.outputs.values(), *equations.accelerations[: None if parts is None else -1]):
-            yield outputs.sizes, list(numbers.structure(equations.graph, outputs.forms))
+            yield outputs.sizes, list(numbers.structure(outputs))
         if parts is not None:
             yield from parts.described()
 
@@ -436,7 +430,7 @@ class SharedCode:
         equations = self.equations
         module = Module(divided=True)
         for name, outputs in self.outputs.items():
-            write_function(module, name, KIT.own_type(name), equations.graph, outputs, self.numbers)
+            write_function(module, name, KIT.own_type(name), outputs, self.numbers)
         parts = [] if self.parts is None else self.parts.write(module, KIT.own_type)
         if "own_there" not in parts:
             write_acceleration_function(module, "own_there", KIT.own_type("own_there"), equations, self.numbers)
@@ -445,20 +439,20 @@ class SharedCode:
 
 
 class GeneratedCode(NamedTuple):
-    """The code of a family, for one system."""
+    """Compiled functions with the coefficients of one system."""
 
     shared: SharedCode
-    numbers: Array  # that it reads
+    numbers: Array  # coefficients that the code reads
     traced: Traced
-    evaluate: Evaluator  # of other formulas of the family
+    evaluate: Evaluator  # evaluates other expressions of the cache
 
     @property
     def kinds(self) -> frozenset[str]:
-        """Of callbacks that ran on symbols."""
+        """Return the kinds of callbacks that were traced."""
         return self.traced.kinds
 
     def serves(self, system: ConstrainedSystem, t0: float, q0: Array) -> bool:
-        """Whether a run of the same system from this position gets the same code."""
+        """Return whether a run of the same system from this position gets the same code."""
         try:
             return Choice.at(system, t0, q0) == self.shared.equations.choice
         except Untraceable:
@@ -466,7 +460,7 @@ class GeneratedCode(NamedTuple):
 
 
 def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = unchecked) -> GeneratedCode:
-    """The code for a system, for a run that starts at a position; `check` raises where the callbacks are not in it.
+    """Return the code for a system and a start; `check` raises where calls of callbacks differ from their traces.
 
     Raises
     ------
@@ -476,18 +470,18 @@ def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check
     try:
         choice = system.remembered_at("choice", (t0, q0.tobytes()), lambda: Choice.at(system, t0, q0))
 
-        def make(family: TraceCache) -> SharedCode:
-            return SharedCode(Elimination(system, choice, family.equations(system)), family)
+        def make(cache: TraceCache) -> SharedCode:
+            return SharedCode(Elimination(system, choice, cache.equations(system)), cache)
 
-        made: GeneratedCode = derive_cached(system, ("code", choice), make, lambda code: check(code.traced))
+        code: GeneratedCode = derive_cached(system, ("code", choice), make, lambda code: check(code.traced))
     except Untraceable as error:
         raise ValueError(f"compiled=True needs equations that can be written down; {error}. Leave it out") from error
-    return made
+    return code
 
 
 @cache
 def _stamp() -> str:
-    """A digest of what writes the functions, and of what they are called as."""
+    """Return a digest of the modules that write the functions, and of their signatures."""
     from twoloop.generate import coefficients, elimination, llvm_code, llvm_text, lowering, null_space, symbolic_factors
     from twoloop.kernels.data.common import KIT
 

@@ -15,8 +15,7 @@ all its coordinates, so that the pivots are those of definite matrices, M and -G
 - Of redundant rows, a set of full rank is kept.
 """
 
-from collections.abc import Callable, Container, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -26,96 +25,55 @@ from twoloop.generate.choices import Choice
 from twoloop.generate.graph import Affine, Graph, Untraceable, is_zero
 from twoloop.generate.null_space import DependentCoordinates, NotReduced, reduced_accelerations
 from twoloop.generate.parameter_expressions import elementwise
+from twoloop.generate.program import Program
 from twoloop.generate.symbolic_factors import Block, Factors, solve
 from twoloop.generate.trace import Equations, only
 from twoloop.generate.traced_values import Traced
-from twoloop.kernels.evaluation.operations import PRODUCT, RECIPROCAL
 from twoloop.kernels.evaluation.partition import CONTRADICTS
 from twoloop.problem.system import ConstrainedSystem
 
-MOST_ELIMINATED = 60_000  # operations with their elimination: those of more than 40 bodies on hinges in space
-# cost of `quick` over that of `there`, from which on it does not pay: where pivots are small both are needed, code of
-# both takes longer to build, and with 0.68 (four-bar) a run gains 5 %
+MOST_ELIMINATED = 60_000  # operations with the elimination: enough for 40 bodies on hinges in space
+# largest cost of `quick` over that of `there` at which both are written. Where pivots are small both are needed, and
+# code of both takes longer to build; with 0.68 (four-bar) a run gains 5 %
 WORTH = 0.75
-COSTS = {PRODUCT: 1, RECIPROCAL: 4}  # in multiplications; sums are counted by their terms, and functions are the same
-
-
-@dataclass(frozen=True)
-class Outputs:
-    """What code is to compute from t, q and v: arrays, and conditions that are to hold.
-
-    Attributes
-    ----------
-    arrays : dict
-        Forms, for each array by its name.
-    conditions : list of (Affine, Affine)
-        The first is to be larger than the second.
-    """
-
-    arrays: dict[str, list[Affine]]
-    conditions: list[tuple[Affine, Affine]]
-
-    def quantities(self, graph: Graph, known: Container[int] = ()) -> list[int]:
-        """What all of this is made of, inputs and what is known apart, in an order in which it can be computed."""
-        return graph.needed_by(self.forms, known)
-
-    def cost(self, graph: Graph) -> int:
-        """About how long all of this takes to compute, functions apart, in multiplications and additions."""
-        forms, total = self.forms, 0
-        for i in self.quantities(graph):
-            kind, *arguments = graph.operations[i]  # type: ignore[misc]
-            total += COSTS.get(kind, 0)
-            forms += [form for form in arguments if isinstance(form, Affine)]
-        return total + sum(max(len(form.terms) - 1, 0) for form in forms)
-
-    @property
-    def sizes(self) -> tuple[dict[str, int], int]:
-        """Of the arrays, and how many conditions there are."""
-        return {name: len(forms) for name, forms in self.arrays.items()}, len(self.conditions)
-
-    @property
-    def forms(self) -> list[Affine]:
-        """All of them."""
-        forms = [form for array in self.arrays.values() for form in array]
-        return [*forms, *(form for condition in self.conditions for form in condition)]
 
 
 class Elimination:
-    """The equations of a system, with rows G = [C_q; A].
+    """Eliminates the equations of a system, with rows G = [C_q; A].
 
     Parameters
     ----------
     system : ConstrainedSystem
     choice : Choice
-        What numbers decide.
+        The decisions that depend on numbers.
     equations : Equations, optional
-        Of the system, which are continued.
+        Traced equations of the system, whose graph is extended.
 
     Attributes
     ----------
     graph : Graph
-        Its first quantities are t, q and v.
-    there : Outputs
-        "a" (n_q,), the accelerations at (q, v) as they stand.
-    quick : Outputs or None
-        The same by dependent coordinates, where that takes fewer operations. `there` holds in more positions.
-    right : Outputs
-        "r" (n_q,) and "c" (n_c + n_a,), Q and the right-hand sides of the rows of G that are used; without conditions.
-    closer : Outputs
+        Its first inputs are t, q and v.
+    there : Program
+        "a" (n_q,), the accelerations at a state, without projection.
+    quick : Program or None
+        The same by dependent coordinates, if that takes fewer operations. `there` is valid in more positions.
+    right : Program
+        "r" (n_q,) and "c" (n_c + n_a,), Q and the right-hand sides of the rows of G in use; without conditions.
+    closer : Program
         "q" (n_q,), moved by a step of Newton's method towards the constraints, in directions that A allows, and "moved"
         (n_q,), by how much.
-    nearer : Outputs
-        The same, "v" (n_q,) on the rows at the position before the move, and "a" (n_q,), "lam" (n_c + n_a,) for these.
-    off, faster : Outputs
-        "c" (n_c + n_a,) of the moves to positions and to velocities on the rows.
-    redundant : Outputs
-        No arrays; its conditions are that the rows of C_q that do not count hold, too.
+    nearer : Program
+        The same, and "v" (n_q,) on the rows at the position before the move, with "a" (n_q,), "lam" (n_c + n_a,) there.
+    off, faster : Program
+        "c" (n_c + n_a,), the right-hand sides of the corrections of positions and of velocities.
+    redundant : Program
+        Its conditions are that the redundant constraints hold, too; no arrays.
     parts : SplitFunctions or None
         Writes the elimination of M in parts, where equations are long: see compile_equations.py, which sets it.
     n_operations : int
-        Of callbacks and elimination, without solutions.
+        Number of operations of callbacks and elimination, without solutions.
     traced : Traced
-        What the callbacks gave.
+        The traced callbacks.
 
     Raises
     ------
@@ -128,11 +86,11 @@ class Elimination:
     def __init__(self, system: ConstrainedSystem, choice: Choice, equations: Equations | None = None):
         self.equations = Equations(system) if equations is None else equations
         self.system, self.choice, self.graph = system, choice, self.equations.graph
-        self.nothing, self._beside = Affine(self.graph, 0.0, {}), 0  # operations of `quick`
+        self.nothing, self._n_alternative = Affine(self.graph, 0.0, {}), 0  # operations of `quick`
         n, (self.q, self.v) = system.n_q, (self.equations.q, self.equations.v)
-        self.mass = self._made("mass")
-        rows = [self._made("jacobian"), self._made("nonholonomic")]
-        rates = [self._made("constraint_rate"), self._made("nonholonomic_rate")]
+        self.mass = self._values_of("mass")
+        rows = [self._values_of("jacobian"), self._values_of("nonholonomic")]
+        rates = [self._values_of("constraint_rate"), self._values_of("nonholonomic_rate")]
         self.all_rows, counting = np.vstack(rows), list(choice.rows)
         self.rows, self.rates = self.all_rows[counting], np.concatenate(rates)[counting]
         self.factors = Factors(self._matrix(), n + len(self.rows), n)
@@ -146,15 +104,15 @@ class Elimination:
         self.traced = Traced(system, self.graph)
 
     def _bound(self) -> None:
-        if len(self.graph.operations) - self._beside > MOST_ELIMINATED:
+        if len(self.graph.operations) - self._n_alternative > MOST_ELIMINATED:
             raise Untraceable(f"its equations are more than {MOST_ELIMINATED} operations")
 
-    def _made(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
+    def _values_of(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
         return elementwise(Affine.value, [self.equations.of(kind, v)])
 
-    def _redundant(self, rates: Any) -> Outputs:
+    def _redundant(self, rates: Any) -> Program:
         left = [k for k in range(self.system.n_c) if k not in self.choice.rows]
-        off = self._made("constraint")
+        off = self._values_of("constraint")
         one, conditions = Affine(self.graph, 1.0, {}), []
         size, speed = (sum((x * x for x in state), one) for state in (self.q, self.v))
         for k in left:
@@ -163,7 +121,7 @@ class Elimination:
             allowed = sum((entry * entry for entry in row), self.nothing).times(CONTRADICTS**2)
             for what, scale in ((off[k], size), (faster, speed)):
                 conditions.append((allowed * scale, what * what))
-        return Outputs({"": []}, conditions)
+        return Program(self.graph, {"": []}, conditions)
 
     def _matrix(self) -> dict[tuple[int, int], Affine]:
         n = self.system.n_q
@@ -186,163 +144,170 @@ class Elimination:
                     matrix[n + k, i] = matrix[i, n + k] = row[i]
         return matrix
 
-    def _given(self, v: Sequence[Affine]) -> tuple[list[Affine], list[Affine]]:
-        """Q, and the right-hand sides of all rows of G, at velocities v."""
-        return list(self._made("force", v)), [*self._made("gamma", v), *self._made("nonholonomic_gamma", v)]
+    def _right_sides(self, v: Sequence[Affine]) -> tuple[list[Affine], list[Affine]]:
+        """Return Q, and the right-hand sides of all rows of G, at velocities v."""
+        return list(self._values_of("force", v)), [
+            *self._values_of("gamma", v),
+            *self._values_of("nonholonomic_gamma", v),
+        ]
 
     @cached_property
-    def there(self) -> Outputs:
-        """See the class."""
+    def there(self) -> Program:
+        """Return the program, see the class."""
         solution = self._accelerations(self.v)
         self._bound()
-        return Outputs({"a": solution[: self.system.n_q]}, self.conditions)
+        return Program(self.graph, {"a": solution[: self.system.n_q]}, self.conditions)
 
     @cached_property
-    def quick(self) -> Outputs | None:
-        """See the class."""
+    def quick(self) -> Program | None:
+        """Return the program, see the class."""
         blocks = self.choice.blocks
         if not blocks:
             return None
-        most, before = int(WORTH * self.there.cost(self.graph)), len(self.graph.operations)
-        force, gamma = self._given(self.v)
+        most, before = int(WORTH * self.there.cost()), len(self.graph.operations)
+        force, gamma = self._right_sides(self.v)
         try:
             of = DependentCoordinates(self.rows.tolist(), [gamma[k] for k in self.choice.rows], blocks, most)
             a, conditions = reduced_accelerations(self.mass, force, of)
-            quick = Outputs({"a": a}, [*of.conditions, *conditions])
+            quick = Program(self.graph, {"a": a}, [*of.conditions, *conditions])
         except NotReduced:
             quick = None
-        self._beside += len(self.graph.operations) - before
-        return quick if quick is not None and quick.cost(self.graph) < most else None
+        self._n_alternative += len(self.graph.operations) - before
+        return quick if quick is not None and quick.cost() < most else None
 
     @property
-    def accelerations(self) -> list[Outputs]:
-        """What code for accelerations is made of, see `compile_equations.write_accelerations`."""
+    def accelerations(self) -> list[Program]:
+        """Return the programs for accelerations, see `compile_equations.write_accelerations`."""
         return [self.there] if self.quick is None else [self.quick, self.there]
 
     @cached_property
-    def right(self) -> Outputs:
-        """See the class."""
-        force, gamma = self._given(self.v)
+    def right(self) -> Program:
+        """Return the program, see the class."""
+        force, gamma = self._right_sides(self.v)
         used = {*self.choice.rows, *self.choice.added}
-        return Outputs({"r": force, "c": [each if k in used else self.nothing for k, each in enumerate(gamma)]}, [])
+        return Program(
+            self.graph, {"r": force, "c": [each if k in used else self.nothing for k, each in enumerate(gamma)]}
+        )
 
     def _accelerations(self, v: Sequence[Affine]) -> list[Affine]:
-        """a and the multipliers of the rows that count, at velocities v."""
-        right, gamma = self._given(v)
+        """Return a and the multipliers of the independent rows, at velocities v."""
+        right, gamma = self._right_sides(v)
         for k in self.choice.added:
             for i, entry in enumerate(self.all_rows[k]):
                 right[i] = right[i] + (entry * gamma[k]).times(self.choice.scale)
         return self.factors.solve([*right, *(gamma[k] for k in self.choice.rows)])
 
-    def _spread(self, counting: Sequence[Affine]) -> list[Affine]:
-        """Numbers for all rows from those for the rows that count, the others 0."""
+    def _on_all_rows(self, independent: Sequence[Affine]) -> list[Affine]:
+        """Return numbers for all rows from those for independent rows; the others are 0."""
         numbers = [self.nothing] * len(self.all_rows)
-        for k, number in zip(self.choice.rows, counting, strict=True):
+        for k, number in zip(self.choice.rows, independent, strict=True):
             numbers[k] = number
         return numbers
 
     @cached_property
-    def off(self) -> Outputs:
-        """See the class."""
-        off = [*(-each for each in self._made("constraint")), *[self.nothing] * self.system.n_a]
-        return Outputs({"c": self._spread([off[k] for k in self.choice.rows])}, [])
+    def off(self) -> Program:
+        """Return the program, see the class."""
+        off = [*(-each for each in self._values_of("constraint")), *[self.nothing] * self.system.n_a]
+        return Program(self.graph, {"c": self._on_all_rows([off[k] for k in self.choice.rows])})
 
     @cached_property
-    def faster(self) -> Outputs:
-        """See the class."""
+    def faster(self) -> Program:
+        """Return the program, see the class."""
         faster = []
         for row, rate in zip(self.rows, self.rates, strict=True):
             total = rate
             for entry, u in zip(row, self.v, strict=True):
                 total = total + entry * u
             faster.append(-total)
-        return Outputs({"c": self._spread(faster)}, [])
+        return Program(self.graph, {"c": self._on_all_rows(faster)})
 
     @cached_property
-    def closer(self) -> Outputs:
-        """See the class."""
+    def closer(self) -> Program:
+        """Return the program, see the class."""
         moved = self._correction(self.off)
-        position = {"moved": moved, "q": [one + other for one, other in zip(self.q, moved, strict=True)]}
-        return Outputs(position, self.conditions)
+        position = {"moved": moved, "q": [x + change for x, change in zip(self.q, moved, strict=True)]}
+        return Program(self.graph, position, self.conditions)
 
     @cached_property
-    def nearer(self) -> Outputs:
-        """See the class."""
+    def nearer(self) -> Program:
+        """Return the program, see the class."""
         arrays = self.nearest.arrays
         known = [arrays["lam"][k] for k in self.choice.rows]
         lam = of_least_norm(self.graph, known, self.all_rows, self.choice.rows, self.factors.solve)
         self._bound()
-        return Outputs({**arrays, "lam": lam}, self.conditions)
+        return Program(self.graph, {**arrays, "lam": lam}, self.conditions)
 
     @cached_property
-    def nearest(self) -> Outputs:
-        """The same, "lam" 0 for rows that do not count."""
+    def nearest(self) -> Program:
+        """Return `nearer` with "lam" 0 for dependent rows."""
         n, position = self.system.n_q, self.closer.arrays
-        v = [(one + other).value() for one, other in zip(self.v, self._correction(self.faster), strict=True)]
+        v = [(u + change).value() for u, change in zip(self.v, self._correction(self.faster), strict=True)]
         solution = self._accelerations(v)
         self._bound()
-        return Outputs({"a": solution[:n], **position, "v": v, "lam": self._spread(solution[n:])}, self.conditions)
+        return Program(
+            self.graph, {"a": solution[:n], **position, "v": v, "lam": self._on_all_rows(solution[n:])}, self.conditions
+        )
 
-    def _correction(self, c: Outputs) -> list[Affine]:
+    def _correction(self, c: Program) -> list[Affine]:
         n = self.system.n_q
         return self.factors.solve([*([self.nothing] * n), *(c.arrays["c"][k] for k in self.choice.rows)])[:n]
 
 
 def of_least_norm(
     graph: Graph,
-    known: Sequence[Affine],
+    independent: Sequence[Affine],
     all_rows: Any,
     rows: Sequence[int],
     solve: Callable[[Sequence[Affine]], list[Affine]],
 ) -> list[Affine]:
-    """Multipliers of all rows from those of the rows that count.
+    """Return multipliers of all rows, of least norm, from those of the independent rows.
 
-    A row that does not is a combination of these, by the numbers Z; less its part in the null space of G^T, spanned
-    by e_i - sum_k Z_ik e_k, lam has least norm.
+    A dependent row is a combination of independent ones, with the coefficients Z. The null space of G^T is spanned by
+    e_i - sum_k Z_ik e_k; without its part in that space, lam has least norm.
     """
     nothing = Affine(graph, 0.0, {})
     lam = [nothing] * len(all_rows)
-    for k, value in zip(rows, known, strict=True):
+    for k, value in zip(rows, independent, strict=True):
         lam[k] = value
-    others = [k for k in range(len(lam)) if k not in rows]
-    Z = [solve([*all_rows[k], *([nothing] * len(rows))])[len(all_rows[k]) :] for k in others]
+    dependent = [k for k in range(len(lam)) if k not in rows]
+    Z = [solve([*all_rows[k], *([nothing] * len(rows))])[len(all_rows[k]) :] for k in dependent]
     gram = {
-        (i, j): sum((x * y for x, y in zip(one, other, strict=True)), Affine(graph, float(i == j), {}))
-        for i, one in enumerate(Z)
-        for j, other in enumerate(Z)
+        (i, j): sum((x * y for x, y in zip(z, w, strict=True)), Affine(graph, float(i == j), {}))
+        for i, z in enumerate(Z)
+        for j, w in enumerate(Z)
     }
-    parts = [sum((-(x * y) for x, y in zip(one, known, strict=True)), nothing) for one in Z]
-    for row, one, part in zip(others, Z, Factors(gram, len(Z), len(Z)).solve(parts), strict=True):
+    parts = [sum((-(x * y) for x, y in zip(z, independent, strict=True)), nothing) for z in Z]
+    for row, z, part in zip(dependent, Z, Factors(gram, len(Z), len(Z)).solve(parts), strict=True):
         lam[row] = lam[row] - part
-        for k, x in zip(rows, one, strict=True):
+        for k, x in zip(rows, z, strict=True):
             lam[k] = lam[k] + part * x
     return lam
 
 
 class Solution:
-    """M a + G^T lam = r with G a = c, by the factors of a position that are kept.
+    """Solves M a + G^T lam = r with G a = c by factors of a position that are kept in memory.
 
     Parameters
     ----------
     equations : Elimination
-    more : sequence of Outputs
-        Of the equations: what these share with the factors is kept, too.
+    more : sequence of Program
+        Programs of the equations; what they share with the factors is kept, too.
 
     Attributes
     ----------
     known : dict
-        Quantities of the equations, and at which place each is kept.
-    kept : Outputs
-        Of the equations: what is to be kept.
+        The place in memory of each quantity that is kept.
+    kept : Program
+        Computes what is kept.
     graph : Graph
         Its inputs are r (n_q,), c (n_c + n_a,) and the factors, which are kept first.
-    solved : Outputs
-        "a" (n_q,) and "lam" (n_c + n_a,); 0 for rows that do not count.
-    least : Outputs
+    solved : Program
+        "a" (n_q,) and "lam" (n_c + n_a,); 0 for dependent rows.
+    least : Program
         "lam" (n_c,) of least norm, where c is "lam" of `solved`.
     """
 
-    def __init__(self, equations: Elimination, more: Sequence[Outputs] = ()):
+    def __init__(self, equations: Elimination, more: Sequence[Program] = ()):
         factors, self._choice, self._n = equations.factors, equations.choice, equations.system.n_q
         n_rows, rows = len(equations.all_rows), self._choice.rows
         others = [k for k in range(n_rows) if k not in rows] if more else []
@@ -353,7 +318,7 @@ class Solution:
         shared = _shared(equations.graph, factors_kept, more)
         self.known = {i: k for k, i in enumerate([*factors_kept, *shared])}
         kept = [equations.graph.quantity(i) for i in self.known]
-        self.kept = Outputs({"kept": kept}, equations.conditions)
+        self.kept = Program(equations.graph, {"kept": kept}, equations.conditions)
         self.graph = Graph()
         self._r, self._c = self.graph.inputs(self._n, False), self.graph.inputs(n_rows, False)
         places = [only(form) for form in self.graph.inputs(len(factors_kept), False)]
@@ -375,38 +340,40 @@ class Solution:
 
     @property
     def n_kept(self) -> int:
-        """How many numbers are kept."""
+        """Return the number of quantities that are kept."""
         return len(self.known)
 
     def _solve(self, right: Sequence[Affine]) -> list[Affine]:
         return solve(self._blocks, right)
 
-    def _counting(self) -> list[Affine]:
+    def _independent(self) -> list[Affine]:
         return [self._c[k] for k in self._choice.rows]
 
-    def _solved(self) -> Outputs:
+    def _solved(self) -> Program:
         r, lam = self._r, [self._nothing] * len(self._c)
         for k in self._choice.added:
-            r = [one + (x * self._c[k]).times(self._choice.scale) for one, x in zip(r, self._rows[k], strict=True)]
-        solution = self._solve([*r, *self._counting()])
+            r = [entry + (x * self._c[k]).times(self._choice.scale) for entry, x in zip(r, self._rows[k], strict=True)]
+        solution = self._solve([*r, *self._independent()])
         for k, value in zip(self._choice.rows, solution[self._n :], strict=True):
             lam[k] = value
-        return Outputs({"a": solution[: self._n], "lam": lam}, [])
+        return Program(self.graph, {"a": solution[: self._n], "lam": lam})
 
     @cached_property
-    def least(self) -> Outputs:
-        """See the class."""
+    def least(self) -> Program:
+        """Return the program, see the class."""
         rows = [self._rows.get(k, []) for k in range(len(self._c))]
-        return Outputs({"lam": of_least_norm(self.graph, self._counting(), rows, self._choice.rows, self._solve)}, [])
+        return Program(
+            self.graph, {"lam": of_least_norm(self.graph, self._independent(), rows, self._choice.rows, self._solve)}
+        )
 
 
-def _shared(graph: Graph, kept: Sequence[int], more: Sequence[Outputs]) -> list[int]:
-    """What more outputs take of the quantities that what is kept is made of."""
-    made = set(graph.needed_by(map(graph.quantity, kept)))
-    found = {i for outputs in more for form in outputs.forms for i in form.terms}
+def _shared(graph: Graph, kept: Sequence[int], more: Sequence[Program]) -> list[int]:
+    """Return the quantities that programs share with what is kept."""
+    computed = set(graph.needed_by(map(graph.quantity, kept)))
+    used = {i for outputs in more for form in outputs.forms for i in form.terms}
     for outputs in more:
-        for j in outputs.quantities(graph, made):
+        for j in outputs.quantities(computed):
             operation = graph.operations[j]
             assert operation is not None
-            found |= {i for form in operation[1:] if isinstance(form, Affine) for i in form.terms}
-    return sorted(found & made - set(kept))
+            used |= {i for form in operation[1:] if isinstance(form, Affine) for i in form.terms}
+    return sorted(used & computed - set(kept))

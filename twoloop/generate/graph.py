@@ -24,51 +24,60 @@ from twoloop.generate.parameter_expressions import (
 )
 from twoloop.kernels.evaluation import operations as op
 
-# the second form of a logarithm or an arctangent is what the derivative of the first is divided by
-MOST_OPERATIONS = 20_000  # of a program; with more it would take longer to make than a run
-LEAST_FACTOR = 1e-100  # that is taken out of a product: factors of high powers would underflow, or overflow ...
-HIGH_POWER = 8  # ... so from above this none are taken out, whatever values parameters have
+# the second argument of a logarithm or an arctangent is the divisor of its derivative
+MOST_OPERATIONS = 20_000  # in a program; more would take longer to trace than a run takes
+LEAST_FACTOR = 1e-100  # smallest factor taken out of a product: those of high powers would underflow or overflow ...
+HIGH_POWER = 8  # ... so above this power none are taken out, whatever the values of parameters
 BRANCHES = "it branches on, or converts to a number, what depends on t, q or v"
 
-# of numbers
+# functions of numbers, which may be Parameters
 SIN, COS, EXP, LOG, ATAN, ROOT = map(function_of_number, ("sin", "cos", "exp", "log", "atan", "sqrt"))
 
-_equal = float.__eq__  # of numbers, whether or not they know their parameters
-_size = float.__abs__  # a plain number, also of one that knows its parameters
+_equal = float.__eq__  # also of Parameters, without their refusal to be compared
+_size = float.__abs__  # a plain number, also for a Parameter
 
 CONVERTS = "it converts what depends on t, q or v to a number, as functions of math do within methods (numpy's do not)"
 
 
 class Graph(Symbolic):
-    """Quantities, numbered from 0; `operations[i]` is None for an input, else (kind, first form, second form).
+    """Quantities, numbered from 0.
 
-    `sizes`: how many inputs were made at a time; `traced`: what callbacks gave on symbols, arrays of forms by kind.
+    Attributes
+    ----------
+    operations : list
+        For each quantity None, if it is an input, or its kind and one or two arguments.
+    sizes : list of int
+        Numbers of inputs that were added together.
+    traced : dict
+        What callbacks returned for symbols: arrays of expressions by kind of callback.
     """
 
     def __init__(self) -> None:
         self.sizes: list[int] = []
         self.operations: list[tuple[int, Affine, Affine | None] | None] = []
-        self.late: list[bool] = []  # whether a quantity depends on more than time and coordinates
-        self.inputs_of: list[int] = []  # the inputs that a quantity depends on, a bit each
+        self.late: list[bool] = []  # whether a quantity depends on other inputs than time and coordinates
+        self.inputs_of: list[int] = []  # bits of the inputs that a quantity depends on
         self.traced: dict[str, Any] = {}
-        self._known: dict[tuple[int, int, int], int] = {}
-        self._seen: dict[int, int] = {}  # factors, in the order in which they came: values have no part in it
-        self._numbers: dict[Any, int] = {}  # of forms, by their keys, which take long to compare
+        self._recorded: dict[tuple[int, int, int], int] = {}
+        self._order: dict[int, int] = {}  # order of first use of factors, independent of their values
+        self._numbers: dict[Any, int] = {}  # numbers of expressions by key, as keys take long to compare
         self._quantities: dict[int, Affine] = {}
 
     def copy(self) -> "Graph":
-        """A graph of the same quantities, which may be continued otherwise; what callbacks gave is not in it."""
-        other = Graph()
-        other.sizes, other.late, other.inputs_of = self.sizes.copy(), self.late.copy(), self.inputs_of.copy()
-        other._known, other._seen, other._numbers = self._known.copy(), self._seen.copy(), self._numbers.copy()
-        other.operations = [
-            None if each is None else (each[0], each[1].on(other), None if each[2] is None else each[2].on(other))
-            for each in self.operations
+        """Return a graph with the same quantities, to be extended on its own; `traced` is empty."""
+        graph = Graph()
+        graph.sizes, graph.late, graph.inputs_of = self.sizes.copy(), self.late.copy(), self.inputs_of.copy()
+        graph._recorded, graph._order, graph._numbers = self._recorded.copy(), self._order.copy(), self._numbers.copy()
+        graph.operations = [
+            None
+            if operation is None
+            else (operation[0], operation[1].on(graph), None if operation[2] is None else operation[2].on(graph))
+            for operation in self.operations
         ]
-        return other
+        return graph
 
     def inputs(self, n: int, late: bool) -> list["Affine"]:
-        """New quantities that are given, as forms."""
+        """Add n inputs and return them; `late`: they are neither time nor coordinates."""
         first = len(self.operations)
         self.sizes.append(n)
         self.operations += [None] * n
@@ -77,90 +86,96 @@ class Graph(Symbolic):
         return [self.quantity(first + i) for i in range(n)]
 
     def quantity(self, i: int) -> "Affine":
-        """A quantity as a form."""
-        known = self._quantities.get(i)
-        if known is None:
-            self._quantities[i] = known = Affine(self, 0.0, {i: 1.0})
-        return known
+        """Return a quantity as an expression."""
+        expression = self._quantities.get(i)
+        if expression is None:
+            self._quantities[i] = expression = Affine(self, 0.0, {i: 1.0})
+        return expression
 
     def number(self, form: "Affine") -> int:
-        """The same of equal forms, rounding of their coefficients apart."""
-        if form.kept_number is None:
-            form.kept_number = self._numbers.setdefault(form.key, len(self._numbers))
-        return form.kept_number
+        """Return a number that equal expressions share, rounding of their coefficients apart."""
+        if form.cached_number is None:
+            form.cached_number = self._numbers.setdefault(form.key, len(self._numbers))
+        return form.cached_number
 
     def operation(self, kind: int, first: "Affine", second: "Affine | None" = None) -> "Affine":
-        """The result of an operation, the one known before if there is one."""
+        """Return the result of an operation, which is recorded unless it was before."""
         key = kind, self.number(first), -1 if second is None else self.number(second)
-        known = self._known.get(key)
-        if known is None:
-            known = self._known[key] = len(self.operations)
+        quantity = self._recorded.get(key)
+        if quantity is None:
+            quantity = self._recorded[key] = len(self.operations)
             self.operations.append((kind, first, second))
             self.late.append(first.late or (second is not None and second.late))
             bits = 0
             for i in (*first.terms, *(() if second is None else second.terms)):
                 bits |= self.inputs_of[i]
             self.inputs_of.append(bits)
-        return self.quantity(known)
+        return self.quantity(quantity)
 
-    def needed_by(self, forms: Iterable["Affine"], known: Container[int] = ()) -> list[int]:
-        """What forms are made of, inputs and what is known apart, in an order in which it can be computed."""
-        found: set[int] = set()
-        ahead = [i for form in forms for i in form.terms]
-        while ahead:
-            i = ahead.pop()
+    def needed_by(self, forms: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
+        """Return what expressions depend on, inputs and available quantities apart, in an order of computation."""
+        needed: set[int] = set()
+        stack = [i for form in forms for i in form.terms]
+        while stack:
+            i = stack.pop()
             operation = self.operations[i]
-            if i not in found and operation is not None and i not in known:
-                found.add(i)
-                ahead += [j for form in operation[1:] if isinstance(form, Affine) for j in form.terms]
-        return sorted(found)
+            if i not in needed and operation is not None and i not in available:
+                needed.add(i)
+                stack += [j for form in operation[1:] if isinstance(form, Affine) for j in form.terms]
+        return sorted(needed)
+
+    def kind(self, i: int) -> int:
+        """Return the kind of the operation of a quantity that is no input."""
+        operation = self.operations[i]
+        assert operation is not None
+        return operation[0]
 
     def arguments(self, i: int) -> list["Affine"]:
-        """What a quantity is computed from; nothing of an input."""
+        """Return the arguments of the operation of a quantity; none for an input."""
         return [form for form in (self.operations[i] or ())[1:] if isinstance(form, Affine)]
 
-    def in_order_of_use(self, forms: Iterable["Affine"], known: Container[int] = ()) -> list[int]:
-        """The same, each as late as it can be: just before what is made of it first."""
+    def in_order_of_use(self, forms: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
+        """Return the same quantities, each just before its first use."""
         order: list[int] = []
-        found: set[int] = set()
-        ahead = [i for form in forms for i in form.terms][::-1]
-        while ahead:
-            i = ahead.pop()
+        needed: set[int] = set()
+        stack = [i for form in forms for i in form.terms][::-1]
+        while stack:
+            i = stack.pop()
             operation = None if i < 0 else self.operations[i]
-            if i < 0:  # all that it is made of is in the list
+            if i < 0:  # all its arguments are in the list
                 order.append(~i)
-            elif i not in found and operation is not None and i not in known:
-                found.add(i)
-                ahead.append(~i)
-                ahead += [j for form in operation[1:] if isinstance(form, Affine) for j in form.terms][::-1]
+            elif i not in needed and operation is not None and i not in available:
+                needed.add(i)
+                stack.append(~i)
+                stack += [j for form in operation[1:] if isinstance(form, Affine) for j in form.terms][::-1]
         return order
 
-    def product(self, one: "Affine", other: "Affine") -> "Affine":
-        """One form times another, factors taken out so that multiples of a product are one quantity."""
-        if not one.terms:
-            return other.times(one.constant)
-        if not other.terms:
-            return one.times(other.constant)
-        (scale, first), (scale_too, second) = one.normalised(), other.normalised()
+    def product(self, a: "Affine", b: "Affine") -> "Affine":
+        """Return a b; factors are taken out, so that multiples of a product are one quantity."""
+        if not a.terms:
+            return b.times(a.constant)
+        if not b.terms:
+            return a.times(b.constant)
+        (scale, first), (scale_too, second) = a.normalised(), b.normalised()
         factor = scale * scale_too
         if not LEAST_FACTOR < _size(factor) < 1.0 / LEAST_FACTOR:
-            first, second, factor = one, other, 1.0
+            first, second, factor = a, b, 1.0
         return self._product(first, second).times(factor)
 
-    def _product(self, one: "Affine", other: "Affine") -> "Affine":
-        seen = self._seen
-        first = seen.setdefault(self.number(one), len(seen))
-        if seen.setdefault(self.number(other), len(seen)) < first:
-            one, other = other, one
-        return self.operation(op.PRODUCT, one, other)
+    def _product(self, a: "Affine", b: "Affine") -> "Affine":
+        seen = self._order
+        first = seen.setdefault(self.number(a), len(seen))
+        if seen.setdefault(self.number(b), len(seen)) < first:
+            a, b = b, a
+        return self.operation(op.PRODUCT, a, b)
 
     def square(self, form: "Affine", high: bool) -> "Affine":
-        """A form times itself; `high`: on the way to a high power, of which no factors are taken out."""
+        """Return a square; `high`: it is part of a high power, from which no factors are taken out."""
         return self._product(form, form) if high and form.terms else self.product(form, form)
 
 
 def rounded(value: float) -> Any:
-    """To 41 bits, 12 digits; of a number that knows its parameters, what it is made of: other values may differ."""
+    """Round a number to 41 bits (12 digits); return the expression of a Parameter, whose values may differ."""
     if type(value) is Parameter:
         return rounded(value.scale), value.powers
     value = float(value)
@@ -169,38 +184,38 @@ def rounded(value: float) -> Any:
 
 
 class Affine:
-    """An affine form; does what a number does, but has no size to be compared.
+    """An affine expression, with the arithmetic of a number.
 
-    While a callback runs on it, whatever could tell it from a number is refused.
+    It has no value to be compared. While a callback runs on it, whatever could tell it from a number is refused.
     """
 
-    __slots__ = ("constant", "graph", "kept_key", "kept_number", "terms")
+    __slots__ = ("cached_key", "cached_number", "constant", "graph", "terms")
 
     def __init__(self, graph: Graph, constant: float, terms: dict[int, float]):
         self.graph, self.constant, self.terms = graph, constant, terms
-        self.kept_key: tuple[Any, ...] | None = None
-        self.kept_number: int | None = None  # see Graph.number
+        self.cached_key: tuple[Any, ...] | None = None
+        self.cached_number: int | None = None  # see Graph.number
 
     def on(self, graph: Graph) -> "Affine":
-        """The same of a graph that has these quantities, too."""
-        made = Affine(graph, self.constant, self.terms)
-        made.kept_key = self.kept_key
-        return made
+        """Return the same expression in a graph that has the same quantities."""
+        copy = Affine(graph, self.constant, self.terms)
+        copy.cached_key = self.cached_key
+        return copy
 
     @property
     def key(self) -> tuple[Any, ...]:
-        """What equal forms have in common, rounding of their coefficients apart."""
-        if self.kept_key is None:
-            self.kept_key = rounded(self.constant), *[(i, rounded(self.terms[i])) for i in sorted(self.terms)]
-        return self.kept_key
+        """Return a key that equal expressions share, rounding of their coefficients apart."""
+        if self.cached_key is None:
+            self.cached_key = rounded(self.constant), *[(i, rounded(self.terms[i])) for i in sorted(self.terms)]
+        return self.cached_key
 
     @property
     def late(self) -> bool:
-        """Whether it depends on more than time and coordinates."""
+        """Return whether it depends on other inputs than time and coordinates."""
         return any(self.graph.late[i] for i in self.terms)
 
     def times(self, factor: float) -> "Affine":
-        """A multiple."""
+        """Return a multiple."""
         if type(factor) is float and factor == 1.0:
             return self
         if _equal(factor, 0.0):
@@ -208,7 +223,7 @@ class Affine:
         return Affine(self.graph, self.constant * factor, {i: c * factor for i, c in self.terms.items()})
 
     def normalised(self) -> tuple[float, "Affine"]:
-        """A factor, and the form over it, whose first coefficient is 1."""
+        """Return a factor, and the quotient by it, whose first coefficient is 1."""
         first = min(self.terms)
         factor = self.terms[first]
         if type(factor) is float and factor == 1.0:
@@ -220,7 +235,7 @@ class Affine:
             return factor, Affine(self.graph, self.constant * inverse, {i: c * inverse for i, c in self.terms.items()})
         return factor, Affine(self.graph, self.constant / factor, {i: c / factor for i, c in self.terms.items()})
 
-    def _other(self, other: Any) -> "Affine":
+    def _lifted(self, other: Any) -> "Affine":
         if type(other) is not Affine:
             return Affine(self.graph, number(other), {})
         if other.graph is not self.graph:
@@ -231,12 +246,12 @@ class Affine:
     def __add__(self, other: Any) -> Any:
         if type(other) is not Affine and isinstance(other, np.ndarray):
             return elementwise(lambda x: x + self, [other])
-        other = self._other(other)
+        other = self._lifted(other)
         terms = dict(self.terms)
         for i, c in other.terms.items():
             total = terms[i] + c if i in terms else c
             if _size(total) <= CANCELLED * _size(c):
-                terms.pop(i, None)  # a coefficient that underflowed is not there
+                terms.pop(i, None)  # also where a coefficient underflowed and is absent
             else:
                 terms[i] = total
         if _equal(other.constant, 0.0):
@@ -261,7 +276,7 @@ class Affine:
     def __mul__(self, other: Any) -> Any:
         if type(other) is not Affine and isinstance(other, np.ndarray):
             return elementwise(lambda x: x * self, [other])
-        return self.graph.product(self, self._other(other))
+        return self.graph.product(self, self._lifted(other))
 
     __rmul__ = __mul__
 
@@ -299,51 +314,51 @@ class Affine:
             square = self.graph.square(square, high) if n else square
         return result.reciprocal() if exponent < 0.0 else result
 
-    def _function(self, kind: int, known: Callable[[float], float]) -> "Affine":
+    def _function(self, kind: int, of_number: Callable[[float], float]) -> "Affine":
         if not self.terms:
-            return Affine(self.graph, known(self.constant), {})
+            return Affine(self.graph, of_number(self.constant), {})
         return self.graph.operation(kind, self)
 
     def reciprocal(self) -> "Affine":
-        """1 / x."""
+        """Return 1 / x."""
         if not self.terms:
             return Affine(self.graph, 1.0 / self.constant, {})
         scale, form = self.normalised()
         return self.graph.operation(op.RECIPROCAL, form).times(1.0 / scale)
 
     def square_root(self) -> "Affine":
-        """The square root."""
+        """Return the square root."""
         return self._function(op.SQUARE_ROOT, ROOT)
 
     def exponential(self) -> "Affine":
-        """exp x."""
+        """Return exp x."""
         return self._function(op.EXPONENTIAL, EXP)
 
     def sine(self) -> "Affine":
-        """sin x; sine and cosine are made together, as each needs the other."""
+        """Return sin x; the cosine is recorded, too, as the derivative of each is the other."""
         self._function(op.COSINE, COS)
         return self._function(op.SINE, SIN)
 
     def cosine(self) -> "Affine":
-        """cos x."""
+        """Return cos x."""
         self._function(op.SINE, SIN)
         return self._function(op.COSINE, COS)
 
     def value(self) -> "Affine":
-        """The same as a multiple of one quantity, or as a number."""
+        """Return the same value as a multiple of one quantity, or as a number."""
         if len(self.terms) + (not _equal(self.constant, 0.0)) < 2:
             return self
         scale, form = self.normalised()
         return self.graph.operation(op.SUM, form).times(scale)
 
     def logarithm(self) -> "Affine":
-        """log x, whose derivative is x' / x."""
+        """Return log x, whose derivative is x' / x."""
         if not self.terms:
             return Affine(self.graph, LOG(self.constant), {})
         return self.graph.operation(op.LOGARITHM, self, self)
 
     def arctangent(self) -> "Affine":
-        """atan x, whose derivative is x' / (1 + x^2)."""
+        """Return atan x, whose derivative is x' / (1 + x^2)."""
         if not self.terms:
             return Affine(self.graph, ATAN(self.constant), {})
         return self.graph.operation(op.ARCTANGENT, self, self * self + 1.0)
@@ -373,13 +388,13 @@ class Affine:
         return self
 
     def item(self) -> "Affine":
-        """As a number of NumPy has it."""
+        """Return itself, as a number of NumPy does."""
         return self
 
     real = property(item)
 
     @property  # type: ignore[misc]
-    def __class__(self) -> Any:  # of which isinstance asks
+    def __class__(self) -> Any:  # which isinstance reads
         if self.graph.running:
             self.graph.refuse("it asks for the type of what depends on t, q or v")
         return Affine
@@ -412,33 +427,33 @@ FUNCTIONS: dict[str, Callable[[Affine], Any]] = {
     "cosh": lambda x: (x.exponential() + (-x).exponential()) * 0.5,
     "tanh": lambda x: 1.0 - 2.0 / ((2.0 * x).exponential() + 1.0),
 }
-for _name, _function in FUNCTIONS.items():  # NumPy calls them on arrays of forms by these names
+for _name, _function in FUNCTIONS.items():  # NumPy calls them by these names on arrays of expressions
     setattr(Affine, _name, _function)
 
 
 def symbols(forms: Iterable[Affine]) -> Any:
-    """Forms as an array that callbacks take."""
+    """Return expressions as an array for callbacks."""
     forms = list(forms)
-    made = np.empty(len(forms), dtype=object)
-    made[:] = forms
-    return made
+    array = np.empty(len(forms), dtype=object)
+    array[:] = forms
+    return array
 
 
 def is_zero(form: Affine) -> bool:
-    """Whether a form is zero by its structure."""
+    """Return whether an expression is zero by its structure."""
     return not form.terms and form.constant == 0.0
 
 
 class Derivative:
-    """Derivatives of quantities along a direction in which the inputs change, by the rules of differentiation."""
+    """Differentiate expressions along a direction of the inputs; derivatives are expressions of the same graph."""
 
     def __init__(self, graph: Graph, direction: dict[int, Affine]):
         self.graph = graph
-        self._known = dict(direction)
+        self._derivatives = dict(direction)
         self._changing = sum(1 << i for i in direction)
 
     def of(self, form: Affine) -> Affine:
-        """The derivative of a form."""
+        """Return the derivative of an expression."""
         total = Affine(self.graph, 0.0, {})
         for i, c in form.terms.items():
             if self.graph.inputs_of[i] & self._changing:
@@ -446,24 +461,24 @@ class Derivative:
         return total
 
     def _of_quantity(self, i: int) -> Affine:
-        ahead = [i]  # no recursion: products may be a thousand deep
-        while i not in self._known:
-            operation = self.graph.operations[ahead[-1]]
+        stack = [i]  # no recursion, as products may be nested a thousand deep
+        while i not in self._derivatives:
+            operation = self.graph.operations[stack[-1]]
             forms = () if operation is None else [form for form in operation[1:] if isinstance(form, Affine)]
             unknown = [
                 k
                 for form in forms
                 for k in form.terms
-                if k not in self._known and self.graph.inputs_of[k] & self._changing
+                if k not in self._derivatives and self.graph.inputs_of[k] & self._changing
             ]
             if unknown:
-                ahead += unknown
+                stack += unknown
                 continue
-            k = ahead.pop()
-            if k not in self._known:
+            k = stack.pop()
+            if k not in self._derivatives:
                 change = Affine(self.graph, 0.0, {}) if operation is None else self._of_operation(k, *operation)
-                self._known[k] = change.value()
-        return self._known[i]
+                self._derivatives[k] = change.value()
+        return self._derivatives[i]
 
     def _of_operation(self, i: int, kind: int, first: Affine, second: Affine | None) -> Affine:
         result, change = self.graph.quantity(i), self.of(first)

@@ -11,7 +11,7 @@ from typing import Any
 from twoloop.generate.choices import Choice
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.compile_equations import write_accelerations
-from twoloop.generate.elimination import Elimination, Outputs, Solution
+from twoloop.generate.elimination import Elimination, Solution
 from twoloop.generate.graph import Untraceable, is_zero
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.lane_series import LaneSeries
@@ -19,7 +19,8 @@ from twoloop.generate.lane_stages import LaneStages, Tableau
 from twoloop.generate.lane_steps import LaneSteps, Places, common, is_set, keep_fine, store_mask
 from twoloop.generate.lane_turns import turned
 from twoloop.generate.llvm_text import Value, integer
-from twoloop.generate.lowering import conditions_hold, results_of
+from twoloop.generate.lowering import lower
+from twoloop.generate.program import Program
 from twoloop.generate.series import series_program
 from twoloop.generate.trace import Equations
 from twoloop.kernels.lanes import lane_projection
@@ -68,13 +69,13 @@ class LaneCode(LaneSteps):
             self.recurrences = LaneSeries(program, self.solution, self.numbers, self.n, self.n_rows)
         rows = self.equations.rows
         self._entries = [(k, j) for k, row in enumerate(rows) for j in range(self.n) if not is_zero(row[j])]
-        self._rows_at = Outputs({"G": [rows[k, j] for k, j in self._entries]}, [])
+        self._rows_at = Program(equations.graph, {"G": [rows[k, j] for k, j in self._entries]})
         self.structure = self._structure()
         self.n_numbers = self.numbers.n_varying
         parts = [*equations.accelerations, equations.closer, equations.nearest, equations.redundant]
         parts += [self.solution.kept] if series else []
-        counts = [len(each.quantities(equations.graph)) for each in parts]
-        counts += [len(self.solution.solved.quantities(self.solution.graph))] if series else []
+        counts = [len(each.quantities()) for each in parts]
+        counts += [len(self.solution.solved.quantities())] if series else []
         self.n_quantities = sum(counts)
 
     @property
@@ -100,9 +101,9 @@ class LaneCode(LaneSteps):
         else:
             parts.append(self._rows_at)  # whose numbers have to be known where the code comes from the disk
         for outputs in parts:
-            told += [outputs.sizes, *numbers.structure(equations.graph, outputs.forms)]
+            told += [outputs.sizes, *numbers.structure(outputs)]
         if self.recurrences is not None:
-            told += list(numbers.structure(self.solution.graph, self.solution.solved.forms))
+            told += list(numbers.structure(self.solution.solved))
         return hashlib.sha256(repr(told).encode()).hexdigest()
 
     # what is emitted
@@ -112,8 +113,8 @@ class LaneCode(LaneSteps):
         builder, n, at = emit.builder, self.n, self.places(emit, order, control, room)
         unit, out, scratch = self.unit(emit, control, room), at.series, at.scratch
         inputs = [emit.load(room, lanes.T), *(emit.load(at.state, i) for i in range(2 * n))]
-        written, (kept,) = results_of(emit, self.equations.graph, self.solution.kept, inputs, self.numbers)
-        holds = conditions_hold(emit, written, self.solution.kept, kept)
+        written, (kept,) = lower(emit, self.solution.kept, inputs, self.numbers)
+        holds = written.holds(self.solution.kept, kept)
         for i, value in enumerate(kept):
             emit.store(value, scratch, i)
         for j in range(n):
@@ -187,13 +188,13 @@ class LaneCode(LaneSteps):
         waited = builder.operation("xor", fine, builder.both(fine, left))
         store_mask(emit, room, lanes.FINE, builder.operation("or", waited, there))
 
-    def _project(self, emit: LaneEmitter, outputs: Outputs, which: int, at: Places) -> tuple[Value, Value]:
+    def _project(self, emit: LaneEmitter, outputs: Program, which: int, at: Places) -> tuple[Value, Value]:
         """Which of some lanes could be moved, and how far they were."""
         select, room = emit.builder.select, at.room
         inputs = self._new(emit, room, at)
-        written, arrays = results_of(emit, self.equations.graph, outputs, inputs, self.numbers)
+        written, arrays = lower(emit, outputs, inputs, self.numbers)
         made = dict(zip(outputs.arrays, arrays, strict=True))
-        act = emit.builder.both(is_set(emit, room, which), conditions_hold(emit, written, outputs, arrays[0]))
+        act = emit.builder.both(is_set(emit, room, which), written.holds(outputs, arrays[0]))
         largest = emit.constant(0.0)
         for value in made["moved"]:
             largest = emit.larger(emit.function("fabs", value), largest)
@@ -228,7 +229,7 @@ class LaneCode(LaneSteps):
     def _rows(self, emit: LaneEmitter, at: Places, time: int, base: Value) -> list[dict[int, Value]]:
         """The entries of G that are not zero, row by row, at a state."""
         inputs = [emit.load(at.room, time), *(emit.load(base, i) for i in range(2 * self.n))]
-        _, (entries,) = results_of(emit, self.equations.graph, self._rows_at, inputs, self.numbers)
+        _, (entries,) = lower(emit, self._rows_at, inputs, self.numbers)
         rows: list[dict[int, Value]] = [{} for _ in self.equations.rows]
         for (k, j), value in zip(self._entries, entries, strict=True):
             rows[k][j] = value
@@ -242,8 +243,8 @@ class LaneCode(LaneSteps):
     def redundant(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
         """Whether the rows that do not count hold, too."""
         at, outputs = self.places(emit, order, control, room), self.equations.redundant
-        written, (none,) = results_of(emit, self.equations.graph, outputs, self._new(emit, room, at), self.numbers)
-        keep_fine(emit, room, conditions_hold(emit, written, outputs, none))
+        written, (none,) = lower(emit, outputs, self._new(emit, room, at), self.numbers)
+        keep_fine(emit, room, written.holds(outputs, none))
 
     def _new(self, emit: LaneEmitter, room: Value, at: Places) -> list[Value]:
         return [emit.load(room, lanes.AHEAD), *(emit.load(at.new, i) for i in range(2 * self.n))]

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from twoloop.generate.coefficients import Coefficients
-from twoloop.generate.elimination import Outputs
 from twoloop.generate.graph import is_zero
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.lane_steps import LaneSteps, keep_fine
 from twoloop.generate.llvm_text import Value
-from twoloop.generate.lowering import conditions_hold, results_of
+from twoloop.generate.lowering import lower
+from twoloop.generate.program import Program
 from twoloop.generate.trace import Equations
 from twoloop.kernels.lanes import lane_room as lanes
 from twoloop.problem.system import ConstrainedSystem
@@ -49,17 +49,17 @@ class LaneConstraints(LaneSteps):
         self.pattern = np.array([*begins, *chain(*columns)], dtype=np.int64)
         entries = [G[i, j] for i, row in enumerate(columns) for j in row]
         values = {kind: list(equations.of(kind)) for kind in ("constraint", "constraint_rate")}
-        self._rows = Outputs({**values, "entries": entries}, [])
-        told = self.n, self.pattern.tolist(), *self.numbers.structure(self._graph, self._rows.forms)
+        self._rows = Program(self._graph, {**values, "entries": entries})
+        told = self.n, self.pattern.tolist(), *self.numbers.structure(self._rows)
         self.structure = hashlib.sha256(repr(told).encode()).hexdigest()
-        self.n_numbers, self.n_quantities = self.numbers.n_varying, len(self._rows.quantities(self._graph))
+        self.n_numbers, self.n_quantities = self.numbers.n_varying, len(self._rows.quantities())
 
     def rows(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
         """C, C_t and entries of C_q at NEW and AHEAD, in the memory of the method; FINE: they have values."""
         at = self.places(emit, order, control, room)
         inputs = [emit.load(room, lanes.AHEAD), *(emit.load(at.new, i) for i in range(2 * self.n))]
-        written, arrays = results_of(emit, self._graph, self._rows, inputs, self.numbers)
+        written, arrays = lower(emit, self._rows, inputs, self.numbers)
         values = [value for array in arrays for value in array]
         for k, value in enumerate(values):
             emit.store(value, at.series, k)
-        keep_fine(emit, room, conditions_hold(emit, written, self._rows, values))
+        keep_fine(emit, room, written.holds(self._rows, values))

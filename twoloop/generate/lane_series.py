@@ -11,7 +11,7 @@ from twoloop.generate.elimination import Solution
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.llvm_code import Quantities, sine_and_cosine
 from twoloop.generate.llvm_text import Value, integer
-from twoloop.generate.lowering import FUNCTIONS, results_of
+from twoloop.generate.lowering import FUNCTIONS, lower
 from twoloop.generate.series import SeriesProgram, Sums, Table
 from twoloop.kernels.evaluation.operations import (
     ARCTANGENT,
@@ -178,7 +178,7 @@ class LaneSeries:
         r = [emit.load(scratch, self.r + i) for i in range(n)]
         kept = [emit.load(scratch, i) for i in range(self.solution.n_kept)]
         solution = self.solution
-        _, (a, lam) = results_of(emit, solution.graph, solution.solved, [*r, *c, *kept], self.numbers)
+        _, (a, lam) = lower(emit, solution.solved, [*r, *c, *kept], self.numbers)
         per_v, per_q = emit.multiply(unit, inverse), emit.divide(unit, emit.number(following))
         before = Quantities(emit, lambda i: zero)  # a and lam of the order before
         for j in range(n):

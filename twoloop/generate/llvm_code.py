@@ -26,74 +26,74 @@ from twoloop.generate.llvm_text import (
 from twoloop.kernels.data.common import OPTIONS
 
 FLAGS = " ".join(sorted(OPTIONS["fastmath"]))
-LONG = 4  # terms of a sum that is made of two
+LONG = 4  # number of terms from which a sum is written as two sums
 ZERO, ONE = constant(DOUBLE, 0.0), constant(DOUBLE, 1.0)
-# functions of LLVM; others are those of libm
+# intrinsic functions of LLVM; other functions are called in libm
 INTRINSICS = {name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqrt", "rint", "ceil", "fabs")}
 
 
 class Emitter:
     """Appends operations to a function of LLVM.
 
-    Operations are on doubles or on vectors of them. Places in memory are counted in doubles. `numbers` points to those
-    that the code reads: a function that reads any says where they are.
+    Operands are doubles or vectors of them. Places in memory are counted in doubles. `numbers` points to the
+    coefficients that the code reads.
     """
 
     double, whole_number, bit = DOUBLE, INTEGER, BIT
-    suffix = "f64"  # of the names of LLVM's functions
+    suffix = "f64"  # suffix of the names of intrinsic functions
 
     def __init__(self, builder: Builder):
         self.builder = builder
         self.numbers: Any = None
 
     def like(self, builder: Builder) -> "Emitter":
-        """One of the same kind, for another function."""
+        """Return an emitter of the same kind for another function."""
         return type(self)(builder)
 
     def constant(self, value: float) -> Value:
-        """A number that stands in the code."""
+        """Return a number that stands in the code."""
         return constant(self.double, value)
 
     def far(self, value: float) -> Value:
-        """A number that is loaded where it is used."""
+        """Return a number that is loaded where it is used."""
         return self.builder.far(value)
 
     def whole(self, value: int) -> Value:
-        """An integer that stands in the code, of those that go with numbers."""
+        """Return an integer that stands in the code, as wide as numbers."""
         return constant(self.whole_number, value)
 
     def known(self, number: float) -> Value:
-        """A number that is known, or read, which never changes."""
+        """Return a number that stands in the code, or load a coefficient, which never changes."""
         if not isinstance(number, Coefficient):
             return self.constant(number)
         return self.load(self.numbers, number.place, constant=True)
 
     def add(self, a: Value, b: Value) -> Value:
-        """a + b."""
+        """Return a + b."""
         return self.builder.operation(f"fadd {FLAGS}", a, b)
 
     def apart(self, a: Value, b: Value) -> Value:
-        """a + b of two sums that stay apart: LLVM would make one chain of them, to spare an operation."""
+        """Add two sums without reassociation: LLVM would chain their terms, to spare an operation."""
         return self.builder.operation("fadd", a, b)
 
     def subtract(self, a: Value, b: Value) -> Value:
-        """a - b."""
+        """Return a - b."""
         return self.builder.operation(f"fsub {FLAGS}", a, b)
 
     def multiply(self, a: Value, b: Value) -> Value:
-        """a b."""
+        """Return a b."""
         return self.builder.operation(f"fmul {FLAGS}", a, b)
 
     def divide(self, a: Value, b: Value) -> Value:
-        """a / b."""
+        """Return a / b."""
         return self.builder.operation(f"fdiv {FLAGS}", a, b)
 
     def fused(self, a: Value, b: Value, c: Value) -> Value:
-        """a b + c, rounded once."""
+        """Return a b + c, rounded once."""
         return self.builder.call(f"llvm.fma.{self.suffix}", a.type, [a, b, c])
 
     def polynomial(self, coefficients: Sequence[float], x: Value) -> Value:
-        """A polynomial, its constant first; pairs of terms do not wait for one another."""
+        """Evaluate a polynomial, its constant first; pairs of terms do not wait for one another."""
         square, terms = self.builder.operation("fmul", x, x), [self.far(each) for each in coefficients]
         pairs = [self.fused(second, x, first) for first, second in zip(terms[::2], terms[1::2], strict=False)]
         pairs += terms[2 * len(pairs) :]
@@ -103,61 +103,61 @@ class Emitter:
         return total
 
     def negative(self, a: Value) -> Value:
-        """-a."""
+        """Return -a."""
         return self.builder.negative(FLAGS, a)
 
     def larger(self, a: Value, b: Value) -> Value:
-        """The larger of two numbers."""
+        """Return the larger of two numbers."""
         return self.builder.select(self.builder.compare("fcmp ogt", a, b), a, b)
 
     def smaller(self, a: Value, b: Value) -> Value:
-        """The smaller of two numbers."""
+        """Return the smaller of two numbers."""
         return self.builder.select(self.builder.compare("fcmp olt", a, b), a, b)
 
     def times(self, factor: float, a: Value) -> Value:
-        """A multiple of a number by a known one."""
+        """Multiply by a number that stands in the code, or a coefficient."""
         if factor in (1.0, -1.0):
             return a if factor == 1.0 else self.negative(a)
         return self.multiply(self.known(factor), a)
 
     def number(self, whole: Value) -> Value:
-        """An integer as a double."""
+        """Convert an integer to a double."""
         return self.builder.convert("sitofp", whole, DOUBLE)
 
     def function(self, name: str, x: Value) -> Value:
-        """A function of libm, of a number."""
+        """Call a function of libm, or its intrinsic."""
         known = INTRINSICS.get(name)
         return self.builder.call(f"{known}.{self.suffix}" if known else name, x.type, [x])
 
     def pointer(self, base: Value, *places: Value | int) -> Value:
-        """A pointer some doubles further on."""
+        """Return a pointer some doubles further on."""
         for place in places:
             base = self.builder.gep(base, integer(place) if isinstance(place, int) else place)
         return base
 
     def load(self, base: Value, place: int = 0, constant: bool = False) -> Value:
-        """The number at a place; `constant`: it never changes."""
+        """Load the number at a place; `constant`: it never changes."""
         return self.builder.load(self.pointer(base, place), constant=constant)
 
     def store(self, value: Value, base: Value, place: int = 0) -> None:
-        """Put a number at a place."""
+        """Store a number at a place."""
         self.builder.store(value, self.pointer(base, place))
 
     def load_vector(self, base: Value, place: int, width: int) -> Value:
-        """As many numbers side by side; base + place is aligned to them.
+        """Load a vector; base + place is aligned to its size.
 
-        Slow just after they were stored one by one, because the processor then waits until they are in its cache.
+        This is slow just after the numbers were stored one by one: the processor waits until they are in its cache.
         """
         pointer = self.builder.convert("bitcast", self.pointer(base, place), f"{vector_of(DOUBLE, width)}*")
         return self.builder.load(pointer, 8 * width)
 
     def store_vector(self, value: Value, base: Value, place: int) -> None:
-        """Put numbers side by side; base + place is aligned to them."""
+        """Store a vector; base + place is aligned to its size."""
         pointer = self.builder.convert("bitcast", self.pointer(base, place), f"{value.type}*")
         self.builder.store(value, pointer, 8 * width_of(value.type))
 
     def vector(self, values: Sequence[Value]) -> Value:
-        """Numbers side by side."""
+        """Return a vector of numbers."""
         vector = undefined(vector_of(DOUBLE, len(values)))
         for place, value in enumerate(values):
             vector = self.builder.insert(vector, value, place)
@@ -165,10 +165,10 @@ class Emitter:
 
     @contextmanager
     def loop(self, first: Value, end: Value, initial: Sequence[Value]) -> Iterator[tuple[Value, list[Any], list[Any]]]:
-        """A loop over integers from `first` to below `end`.
+        """Write a loop over integers from `first` to below `end`.
 
-        Yields the integer; what is carried from one turn to the next, `initial` in the first; and a list that takes
-        its new values. After the loop that list has the last ones.
+        It yields the integer, the values carried from the turn before, which begin with `initial`, and a list for their
+        new values. After the loop that list has the last values.
         """
         builder = self.builder
         goes = builder.compare("icmp slt", first, end)
@@ -196,8 +196,8 @@ class Emitter:
 class Quantities:
     """Values of numbered quantities, and sums of multiples of them; each is loaded, or summed, once.
 
-    In each part of a divided function it is loaded again, as a number that waits in a register is stored and loaded,
-    too. So memory from which quantities are loaded must stay as it is.
+    Each part of a divided function loads quantities again, as a number that waits in a register would be stored and
+    loaded, too. So memory from which they are loaded must not change.
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ class Quantities:
         self._values[quantity] = value
 
     def value(self, quantity: int) -> Value:
-        """What was defined, or loaded."""
+        """Return a value that was defined, or load it."""
         if quantity in self._values:
             return self._values[quantity]
         loaded = self._here()
@@ -227,17 +227,17 @@ class Quantities:
         return loaded[quantity]
 
     def stored(self, quantity: int) -> None:
-        """Say that it can be loaded from now on."""
+        """Forget a value that can be loaded from now on."""
         self._here()[quantity] = self._values.pop(quantity)
 
     def _here(self) -> dict[int, Value]:
-        """What was loaded in this part."""
+        """Return what was loaded in this part."""
         if self._part != self._emit.builder.part:
             self._part, self._loaded = self._emit.builder.part, {}
         return self._loaded
 
     def sum(self, terms: Terms, constant: float = 0.0) -> Value:
-        """constant + the sum of coefficient * quantity."""
+        """Return constant + the sum of coefficient * quantity."""
         key = terms, constant
         if self._emit.builder.module.divided and len(terms) == 1 and constant == 0.0:
             ((quantity, coefficient),) = terms  # to multiply again takes no longer than to keep a multiple
@@ -267,7 +267,7 @@ def write(
     emit: Callable[..., Any],
     emitter: Callable[..., Emitter] = Emitter,
 ) -> None:
-    """Put a function into a module: its result and arguments are of a kind, emit(emitter, *arguments) its code."""
+    """Write a function into a module: emit(emitter, *arguments) its code, `kind` the types of result and arguments."""
     builder = module.function(name, *kind)
     builder.ret(emit(emitter(builder), *builder.arguments))
 
@@ -295,7 +295,7 @@ COSINES = (
 
 
 def sine_and_cosine(emit: Emitter, x: Value) -> tuple[Value, Value]:
-    """Both, right to rounding for angles up to LARGEST_ANGLE."""
+    """Return sine and cosine, correct to rounding for angles up to LARGEST_ANGLE."""
     builder, whole = emit.builder, emit.whole
     turns = emit.function("rint", builder.operation("fmul", x, emit.far(1.0 / HALF_PI[0])))
     rest = x
@@ -308,9 +308,9 @@ def sine_and_cosine(emit: Emitter, x: Value) -> tuple[Value, Value]:
     cosine = emit.fused(fourth, emit.polynomial(COSINES, square), cosine)
     quarter = builder.convert("fptosi", turns, emit.whole_number)
     odd, following = builder.convert("trunc", quarter, emit.bit), builder.add(quarter, whole(1))
-    made = []
+    results = []
     for one, other, number in ((cosine, sine, quarter), (sine, cosine, following)):
         sign = builder.operation("shl", builder.both(number, whole(2)), whole(62))
         bits = builder.convert("bitcast", builder.select(odd, one, other), emit.whole_number)
-        made.append(builder.convert("bitcast", builder.operation("xor", bits, sign), emit.double))
-    return made[0], made[1]
+        results.append(builder.convert("bitcast", builder.operation("xor", bits, sign), emit.double))
+    return results[0], results[1]

@@ -1,7 +1,7 @@
-"""The language of LLVM as text: modules, functions, blocks and the operations in them.
+"""Write modules of LLVM as text: functions, blocks and operations.
 
-llvmlite writes it, too, from objects, which takes ten times as long: more than LLVM takes for machine code of it. Types
-are their text. Pointers are written with what they point to, which all versions of LLVM read.
+llvmlite writes them from objects, which takes ten times as long: more than LLVM takes to compile them. A type is its
+text. Pointers are written with the type that they point to, which all versions of LLVM read.
 """
 
 import struct
@@ -9,12 +9,12 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 DOUBLE, INTEGER, WORD, BIT, NOTHING = "double", "i64", "i32", "i1", "void"
-LINE = 8  # doubles in a line of the cache
+LINE = 8  # doubles in a cache line
 LONGEST = 400  # lines of a block of a divided function; longer ones take more than twice as long to compile
 
 
 class Value:
-    """A number, a vector of numbers or a pointer: its type, and how it is written."""
+    """A number, a vector or a pointer: its type and its text."""
 
     __slots__ = ("text", "type")
 
@@ -22,12 +22,12 @@ class Value:
         self.type, self.text = kind, text
 
     def __str__(self) -> str:
-        """As an argument."""
+        """Return the text of an argument."""
         return f"{self.type} {self.text}"
 
 
 class Phi(Value):
-    """A value that depends on the block from which its own is entered."""
+    """A value that depends on the block from which its block is entered."""
 
     __slots__ = ("incoming",)
 
@@ -36,45 +36,45 @@ class Phi(Value):
         self.incoming: list[tuple[Value, Block]] = []
 
     def add_incoming(self, value: Value, block: "Block") -> None:
-        """What it is from a block."""
+        """Add the value for a block."""
         self.incoming.append((value, block))
 
     def line(self) -> str:
-        """Its definition."""
+        """Return its definition."""
         ways = ", ".join(f"[{value.text}, %{block.name}]" for value, block in self.incoming)
         return f"{self.text} = phi {self.type} {ways}"
 
 
 class Block:
-    """Operations one after another."""
+    """A sequence of operations."""
 
     def __init__(self, name: str):
         self.name = name
         self.lines: list[str | Phi] = []
 
     def text(self) -> str:
-        """All of them."""
+        """Return the text of the block."""
         lines = (line if isinstance(line, str) else line.line() for line in self.lines)
         return "\n ".join([f"{self.name}:", *lines])
 
 
 def vector_of(kind: str, width: int) -> str:
-    """The type of a vector; of one number it is the number's."""
+    """Return the type of a vector; of width 1 it is that of a number."""
     return kind if width == 1 else f"<{width} x {kind}>"
 
 
 def width_of(kind: str) -> int:
-    """How many numbers a value of a type has."""
+    """Return how many numbers a value of a type has."""
     return int(kind[1:].split()[0]) if kind.startswith("<") else 1
 
 
 def element_of(kind: str) -> str:
-    """Of what a vector type is."""
+    """Return the type of the elements of a vector."""
     return kind[1:-1].split(" x ")[1] if kind.startswith("<") else kind
 
 
 def constant(kind: str, number: float) -> Value:
-    """A number, or a vector of the same one."""
+    """Return a number, or a vector of equal numbers."""
     element, width = element_of(kind), width_of(kind)
     bits = struct.unpack("<Q", struct.pack("<d", number))[0]
     text = f"0x{bits:016X}" if element == DOUBLE else str(number)
@@ -82,25 +82,25 @@ def constant(kind: str, number: float) -> Value:
 
 
 def constants(numbers: Iterable[float]) -> Value:
-    """A vector of numbers."""
+    """Return a vector of numbers."""
     each = [str(constant(DOUBLE, float(number))) for number in numbers]
     return Value(vector_of(DOUBLE, len(each)), f"<{', '.join(each)}>")
 
 
 def integer(number: int) -> Value:
-    """An integer."""
+    """Return an integer."""
     return Value(INTEGER, str(number))
 
 
 def undefined(kind: str) -> Value:
-    """A value that does not matter."""
+    """Return an undefined value."""
     return Value(kind, "undef")
 
 
 class Module:
-    """Functions, and those of others that they call.
+    """Functions, and declarations of functions that they call.
 
-    `divided`: long blocks are divided, as LLVM's time to select, order and place operations grows faster than a block.
+    `divided`: long blocks are divided, as LLVM's time grows faster than the length of a block.
     """
 
     def __init__(self, divided: bool = False) -> None:
@@ -112,29 +112,29 @@ class Module:
         self._functions: list[Builder] = []
 
     def function(self, name: str, result: str, arguments: Sequence[str], internal: bool = False) -> "Builder":
-        """A new function, in whose first block operations are put; `internal`: only others of the module call it."""
-        made = Builder(self, name, result, arguments, internal)
-        self._functions.append(made)
-        return made
+        """Add a function, and return its builder; `internal`: only functions of the module call it."""
+        builder = Builder(self, name, result, arguments, internal)
+        self._functions.append(builder)
+        return builder
 
     def defines(self, name: str) -> bool:
-        """Whether there is a function of a name."""
+        """Return whether there is a function of a name."""
         return any(function.name == name for function in self._functions)
 
     def table(self, places: Sequence[int]) -> Value:
-        """A pointer to integers that never change."""
+        """Add constant integers, and return a pointer to them."""
         kind, name = f"[{len(places)} x {WORD}]", f"@table{len(self._tables)}"
         entries = ", ".join([f"{WORD} {place}" for place in places])
         self._tables.append(f"{name} = internal constant {kind} [{entries}]")
         return Value(f"{WORD}*", f"getelementptr inbounds ({kind}, {kind}* {name}, {INTEGER} 0, {INTEGER} 0)")
 
     def far_number(self, number: float) -> int:
-        """A place of its own for a number, see `Builder.far`."""
+        """Add a number to those of `Builder.far`, and return its place."""
         self._numbers.append(number)
         return len(self._numbers) - 1
 
     def declare(self, name: str, result: str, arguments: Iterable[str]) -> None:
-        """Say of which type a function of LLVM, or of libm, is."""
+        """Declare a function of LLVM or of libm."""
         self._declared[name] = f"declare {result} @{name}({', '.join(arguments)})"
 
     def __str__(self) -> str:
@@ -162,13 +162,13 @@ class Builder:
         self.arguments = [Value(kind, f"%a{k}") for k, kind in enumerate(arguments)]
         self._n = self._n_rooms = 0
         self._far: Value | None = None
-        self.part = 0  # of a divided function, in which operations are put now
+        self.part = 0  # present part of a divided function
         self._blocks: list[Block] = []
         self._n_blocks = 0
         self.position_at_end(self.append_block())
 
     def text(self) -> str:
-        """The definition of the function."""
+        """Return the definition of the function."""
         arguments = ", ".join(map(str, self.arguments))
         body = "\n".join(block.text() for block in self._blocks)
         linkage = "internal " if self.internal else ""
@@ -177,12 +177,12 @@ class Builder:
         return f"define {linkage}{self.result} @{self.name}({arguments}) {attributes} {{\n{body}\n}}"
 
     def append_block(self) -> Block:
-        """A new block, which stands in the text where it is gone on with, once: values are numbered in that order."""
+        """Return a new block, which stands in the text where `position_at_end` is called with it."""
         self._n_blocks += 1
         return Block(f"b{self._n_blocks - 1}")
 
     def position_at_end(self, block: Block) -> None:
-        """Put what follows into a block."""
+        """Append what follows to a block."""
         self.block = block
         self._blocks.append(block)
 
@@ -192,13 +192,13 @@ class Builder:
     def _value(self, kind: str, text: str) -> Value:
         if self.module.divided and len(self.block.lines) >= LONGEST:
             self._divide()
-        made = Value(kind, f"%{self._n}")  # LLVM reads numbers in a third less time than names
+        value = Value(kind, f"%{self._n}")  # LLVM reads numbers in a third less time than names
         self._n += 1
-        self.block.lines.append(f"{made.text} = {text}")
-        return made
+        self.block.lines.append(f"{value.text} = {text}")
+        return value
 
     def _divide(self) -> None:
-        """Go on in another block, whose address is taken: so LLVM leaves it apart."""
+        """Continue in another block, whose address is taken, so that LLVM does not merge it."""
         block = self.append_block()
         self.go_to(block)
         self.module.kept_apart.append(f"i8* blockaddress(@{self.name}, %{block.name})")
@@ -206,60 +206,62 @@ class Builder:
         self.part += 1
 
     def operation(self, name: str, a: Value, b: Value) -> Value:
-        """An operation on two values of a type, such as "add" or "fmul fast"."""
+        """Append an operation on two values of a type, such as "add" or "fmul fast"."""
         return self._value(a.type, f"{name} {a.type} {a.text}, {b.text}")
 
     def negative(self, flags: str, a: Value) -> Value:
-        """-a of a number that is no integer."""
+        """Return -a of a floating-point number."""
         return self._value(a.type, f"fneg {flags} {a.type} {a.text}")
 
     def add(self, a: Value, b: Value) -> Value:
-        """a + b of integers."""
+        """Return a + b of integers."""
         return self.operation("add", a, b)
 
     def sub(self, a: Value, b: Value) -> Value:
-        """a - b of integers."""
+        """Return a - b of integers."""
         return self.operation("sub", a, b)
 
     def mul(self, a: Value, b: Value) -> Value:
-        """a b of integers."""
+        """Return a b of integers."""
         return self.operation("mul", a, b)
 
     def both(self, a: Value, b: Value) -> Value:
-        """The bits that both have."""
+        """Return the bitwise and."""
         return self.operation("and", a, b)
 
     def convert(self, name: str, a: Value, kind: str) -> Value:
-        """Another type of a value, such as "sitofp" or "bitcast"."""
+        """Convert a value, by "sitofp", "bitcast" and so on."""
         return self._value(kind, f"{name} {a.type} {a.text} to {kind}")
 
     def compare(self, name: str, a: Value, b: Value) -> Value:
-        """Whether a relation holds, such as "fcmp oeq" or "icmp slt"."""
+        """Compare two values, by "fcmp oeq", "icmp slt" and so on."""
         kind = vector_of(BIT, width_of(a.type))
         return self._value(kind, f"{name} {a.type} {a.text}, {b.text}")
 
     def select(self, condition: Value, a: Value, b: Value) -> Value:
-        """The first of two values where the condition holds."""
+        """Return the first of two values where the condition holds, else the second."""
         return self._value(a.type, f"select {condition}, {a}, {b}")
 
     def call(self, name: str, kind: str, arguments: Sequence[Value], flags: str = "") -> Value:
-        """The value of a function of the module, or of one that is declared by this; `flags` as of operations."""
+        """Call a function, which is declared if the module does not define it; `flags` as of operations."""
         self.module.declare(name, kind, [value.type for value in arguments])
         return self._value(kind, f"call {flags} {kind} @{name}({', '.join(map(str, arguments))})")
 
     def run(self, name: str, arguments: Sequence[Value]) -> None:
-        """Call a function of the module that has no result."""
+        """Call a function of the module without result."""
         self._line(f"call {NOTHING} @{name}({', '.join(map(str, arguments))})")
 
     def room(self, kind: str, size: int) -> Value:
-        """Memory for some values, until the function ends: where it begins, as within a loop it would grow."""
-        made = Value(f"{kind}*", f"%room{self._n_rooms}")
-        self._blocks[0].lines.insert(self._n_rooms, f"{made.text} = alloca {kind}, {integer(max(size, 1))}, align 64")
+        """Allocate memory on the stack, in the first block, as it would grow within a loop."""
+        pointer = Value(f"{kind}*", f"%room{self._n_rooms}")
+        self._blocks[0].lines.insert(
+            self._n_rooms, f"{pointer.text} = alloca {kind}, {integer(max(size, 1))}, align 64"
+        )
         self._n_rooms += 1
-        return made
+        return pointer
 
     def far(self, number: float) -> Value:
-        """A number that is loaded where it is used; a constant would wait in a register, or on the stack, before it."""
+        """Load a number where it is used; a constant would occupy a register, or the stack, before."""
         if self._far is None:
             self._far = Value(f"{DOUBLE}*", "%far")
             self._blocks[0].lines.insert(0, f"%far = load {DOUBLE}*, {DOUBLE}** @far")
@@ -267,7 +269,7 @@ class Builder:
         return self.load(self.gep(self._far, integer(self.module.far_number(number))))
 
     def leave_unless(self, condition: Value) -> None:
-        """End the function where a condition does not hold, which is its result."""
+        """Return false from the function where a condition does not hold."""
         go_on, leave = self.append_block(), self.append_block()
         self.branch(condition, go_on, leave)
         self.position_at_end(leave)
@@ -275,54 +277,54 @@ class Builder:
         self.position_at_end(go_on)
 
     def gep(self, base: Value, place: Value) -> Value:
-        """A pointer some elements further on."""
+        """Return a pointer some elements further on."""
         return self._value(base.type, f"getelementptr inbounds {base.type[:-1]}, {base}, {place}")
 
     def load(self, pointer: Value, align: int = 8, constant: bool = False) -> Value:
-        """What stands in memory; `constant`: it never changes."""
+        """Load a value; `constant`: it never changes."""
         kind, never = pointer.type[:-1], ", !invariant.load !0" if constant else ""
         return self._value(kind, f"load {kind}, {pointer}, align {align}{never}")
 
     def store(self, value: Value, pointer: Value, align: int = 8) -> None:
-        """Put a value into memory."""
+        """Store a value."""
         self._line(f"store {value}, {pointer}, align {align}")
 
     def insert(self, vector: Value, value: Value, place: int) -> Value:
-        """A vector with another element."""
+        """Return a vector with one element replaced."""
         return self._value(vector.type, f"insertelement {vector}, {value}, {WORD} {place}")
 
     def extract(self, vector: Value, place: int) -> Value:
-        """An element of a vector."""
+        """Return an element of a vector."""
         return self._value(element_of(vector.type), f"extractelement {vector}, {WORD} {place}")
 
     def shuffle(self, a: Value, b: Value, places: Sequence[int]) -> Value:
-        """Elements of two vectors of a type, those of the second counted on from the first."""
+        """Select elements of two vectors; those of the second are counted on from the first."""
         mask = f"<{len(places)} x {WORD}> <{', '.join(f'{WORD} {place}' for place in places)}>"
         return self._value(vector_of(element_of(a.type), len(places)), f"shufflevector {a}, {b}, {mask}")
 
     def first_everywhere(self, vector: Value) -> Value:
-        """A vector of its first element."""
+        """Return a vector filled with the first element."""
         mask = f"<{width_of(vector.type)} x {WORD}> zeroinitializer"
         return self._value(vector.type, f"shufflevector {vector}, {vector}, {mask}")
 
     def phi(self, kind: str) -> Phi:
-        """A value that depends on where the block is entered from."""
-        made = Phi(kind, f"%{self._n}")
+        """Append a value that depends on the block before."""
+        phi = Phi(kind, f"%{self._n}")
         self._n += 1
-        self.block.lines.append(made)
-        return made
+        self.block.lines.append(phi)
+        return phi
 
     def go_to(self, block: Block) -> None:
-        """End a block."""
+        """End the block by a jump."""
         self._line(f"br label %{block.name}")
 
     def branch(self, condition: Value, then: Block, otherwise: Block) -> None:
-        """End a block by a choice."""
+        """End the block by a branch."""
         self._line(f"br {condition}, label %{then.name}, label %{otherwise.name}")
 
     @contextmanager
     def if_then(self, condition: Value) -> Iterator[None]:
-        """What is done where a condition holds."""
+        """Surround operations that run only if a condition holds."""
         then, after = self.append_block(), self.append_block()
         self.branch(condition, then, after)
         self.position_at_end(then)
@@ -331,5 +333,5 @@ class Builder:
         self.position_at_end(after)
 
     def ret(self, value: Value | None) -> None:
-        """End the function."""
+        """Return from the function."""
         self._line("ret void" if value is None else f"ret {value}")

@@ -1,4 +1,4 @@
-"""Numbers that record how they were computed from parameters, so that one trace serves other values of these.
+"""Numbers that tape how they were computed from parameters, so that one trace serves other values of these.
 
 A `Parameter` is a float with which callbacks compute as with any other; the result is a `Parameter` again. Tracing
 decides by values (what cancels, which expressions are equal), so these must be generic.
@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-Powers = tuple[tuple[int, float], ...]  # atoms and their exponents: a product; empty for 1
+Powers = tuple[tuple[int, float], ...]  # a product of atoms: their places and exponents; empty for 1
 
-MOST_TERMS = 200  # of a sum: each is told apart by all of its terms
-_plain = float.__pos__  # a number as a float, which is not asked for as by a callback
-CANCELLED = 8.0 * 2.0**-52  # of a term: what rounding leaves of two that cancel
+MOST_TERMS = 200  # in a sum: its key holds all of them, and takes long to compare
+_as_float = float.__pos__  # a Parameter as a float, without its refusal to be converted
+CANCELLED = 8.0 * 2.0**-52  # relative: what rounding leaves of two terms that cancel
 NUMBERS = (int, float, np.number)
-_OF_ONE = ("sin", "cos", "tan", "sqrt", "exp", "log", "arctan", "sinh", "cosh", "tanh", "absolute")
-FUNCTIONS = {name: getattr(np, name) for name in (*_OF_ONE, "hypot", "power")}
-OPERATORS: dict[str, Callable[..., Any]] = {  # of NumPy, as operators of Python
+_UNARY = ("sin", "cos", "tan", "sqrt", "exp", "log", "arctan", "sinh", "cosh", "tanh", "absolute")
+FUNCTIONS = {name: getattr(np, name) for name in (*_UNARY, "hypot", "power")}
+OPERATORS: dict[str, Callable[..., Any]] = {  # functions of NumPy as operators of Python
     "add": operator.add,
     "subtract": operator.sub,
     "multiply": operator.mul,
@@ -41,28 +41,28 @@ NAMES = {"atan": "arctan", "fabs": "absolute", "abs": "absolute", "pow": "power"
 
 
 class Untraceable(ValueError):
-    """Raised for a callback that does not run on symbols; the text says why."""
+    """Raised for a callback that does not run on symbols; the message says why."""
 
 
 class Refusal(BaseException):
-    """Leaves a callback that does not run on symbols: no `except Exception` of its own holds it."""
+    """Leaves a callback that does not run on symbols; its own `except Exception` cannot catch it."""
 
 
 class Symbolic:
-    """What callbacks run on once, in the place of numbers.
+    """Base of what callbacks run on in the place of numbers.
 
     Attributes
     ----------
     running : bool
-        Whether a callback runs on it now ...
+        Whether a callback runs on it now.
     refused : str
-        ... and why it cannot, which it may have caught.
+        Why that callback cannot run on it; the callback may have caught the exception.
     """
 
     running, refused = False, ""
 
     def refuse(self, reason: str) -> NoReturn:
-        """Leave the callback that runs, and keep the reason."""
+        """Leave the running callback, and keep the reason."""
         if not self.running:
             raise Untraceable(reason)
         self.refused = self.refused or reason
@@ -70,7 +70,7 @@ class Symbolic:
 
     @contextmanager
     def watched(self) -> Iterator[None]:
-        """While a callback runs: raises Untraceable if it was refused something and has caught that."""
+        """Surround the run of a callback; raise Untraceable if it was refused something and caught the exception."""
         self.running, self.refused = True, ""
         try:
             yield
@@ -81,23 +81,22 @@ class Symbolic:
 
 
 class ParameterTape(Symbolic):
-    """What numbers were made of: atoms, which are parameters, sums of products of atoms, or functions of these.
+    """Records how numbers were computed from parameters.
+
+    Its atoms are parameters, sums of products of atoms, and functions of such products. A callback that runs on its
+    numbers must not branch on their present values.
 
     Parameters
     ----------
     values : sequence of float
-        Of all parameters, generic ones where these vary.
+        Values of all parameters, generic ones for those that vary.
     varying : sequence of int
-        Which of them do.
-
-    Notes
-    -----
-    A callback that runs on its numbers must not decide by what these are just now.
+        Places of the parameters that vary.
     """
 
     def __init__(self, values: Sequence[float], varying: Iterable[int]):
         self.atoms: list[Any] = [None] * len(values)
-        self.merged: dict[tuple[Powers, Powers], Powers] = {}  # products of two
+        self.merged: dict[tuple[Powers, Powers], Powers] = {}  # products of two products
         self._places: dict[Any, int] = {}
         self.parameters = np.empty(len(values), dtype=object)
         self.parameters[:] = [float(value) for value in values]
@@ -105,14 +104,14 @@ class ParameterTape(Symbolic):
             self.parameters[place] = Parameter(float(values[place]), self, 1.0, ((place, 1.0),))
 
     def atom(self, definition: Any) -> Powers:
-        """The power of a sum or a function, the one known before if there is one."""
+        """Return a sum or a function as a product of one atom, which is recorded unless it was before."""
         if definition not in self._places:
             self._places[definition] = len(self.atoms)
             self.atoms.append(definition)
         return ((self._places[definition], 1.0),)
 
     def terms(self, number: float) -> dict[Powers, float]:
-        """A number as a sum of products."""
+        """Return a number as a sum of products, by their coefficients."""
         if type(number) is not Parameter:
             return {(): number} if number else {}
         (place, exponent), *others = number.powers
@@ -122,14 +121,14 @@ class ParameterTape(Symbolic):
         return {powers: number.scale * c for powers, c in definition[1]}
 
     def on(self, parameters: Array) -> Callable[[float], Any]:
-        """A function that gives what a number is for other parameters, as `products` does for one of its factors."""
+        """Return a function that evaluates a number for other parameters, of shapes as for `products`."""
         product = self.products(parameters)
         return lambda number: number.scale * product(number.powers) if type(number) is Parameter else number
 
     def products(self, parameters: Array) -> Callable[[Powers], Any]:
-        """A function that gives what a product of atoms is for other parameters.
+        """Return a function that evaluates products of atoms for other parameters.
 
-        These are (n_p,), or (n_runs, n_p): then it gives (n_runs,), or one number for all.
+        For parameters (n_runs, n_p) it returns an array (n_runs,), or one number for all runs.
         """
         atoms: dict[int, Any] = {}
         products: dict[Powers, Any] = {(): 1.0}
@@ -157,7 +156,7 @@ class ParameterTape(Symbolic):
         return product
 
     def evaluate(self, numbers: Sequence["Parameter"], parameters: Array) -> Array:
-        """What numbers are for other parameters (n_runs, n_p): (n_runs, len(numbers))."""
+        """Evaluate numbers for other parameters (n_runs, n_p): (n_runs, len(numbers))."""
         product = self.products(parameters)
         places = {powers: k for k, powers in enumerate(dict.fromkeys(each.powers for each in numbers))}
         products = np.empty((len(places), len(parameters)))
@@ -165,23 +164,23 @@ class ParameterTape(Symbolic):
             for powers, k in places.items():
                 products[k] = product(powers)
             scales = np.array([[each.scale] for each in numbers]).reshape(-1, 1)
-            made = scales * products[[places[each.powers] for each in numbers]]
-        return np.ascontiguousarray(made.T)
+            values = scales * products[[places[each.powers] for each in numbers]]
+        return np.ascontiguousarray(values.T)
 
 
 class Parameter(float):
-    """A float, and the product of atoms that it is a multiple of."""
+    """A float, and the product of atoms of which it is a multiple."""
 
-    __slots__ = ("powers", "record", "scale")
-    record: ParameterTape
+    __slots__ = ("powers", "scale", "tape")
+    tape: ParameterTape
     scale: float
     powers: Powers
 
-    def __new__(cls, value: float, record: ParameterTape, scale: float, powers: Powers) -> "Parameter":
-        """A number of a record."""
-        made = float.__new__(cls, value)
-        made.record, made.scale, made.powers = record, scale, powers
-        return made
+    def __new__(cls, value: float, tape: ParameterTape, scale: float, powers: Powers) -> "Parameter":
+        """Create a number of a tape."""
+        parameter = float.__new__(cls, value)
+        parameter.tape, parameter.scale, parameter.powers = tape, scale, powers
+        return parameter
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, out: Any = None, **options: Any) -> Any:
         name = NAMES.get(ufunc.__name__, ufunc.__name__)
@@ -192,18 +191,18 @@ class Parameter(float):
         return elementwise(lambda *given: applied(name, *given), inputs, out)
 
     def _decides(self, reason: str = "it branches on its parameters, or rounds them") -> None:
-        """Refuse a callback what is true of this value alone; what traces it may ask."""
+        """Refuse what is true of the present value alone; the tracer itself may ask."""
         caller = sys._getframe(2).f_globals.get("__name__", "")
-        if self.record.running and not caller.startswith(__name__.rpartition(".")[0]):
-            self.record.refuse(reason)
+        if self.tape.running and not caller.startswith(__name__.rpartition(".")[0]):
+            self.tape.refuse(reason)
 
     def to(self, exponent: float) -> "Parameter":
-        """The power with a whole exponent that is not 0."""
-        powers = tuple([(place, exponent * own) for place, own in self.powers])
-        return Parameter(_plain(self) ** exponent, self.record, self.scale**exponent, powers)
+        """Return a power with a whole exponent that is not 0."""
+        powers = tuple([(place, exponent * power) for place, power in self.powers])
+        return Parameter(_as_float(self) ** exponent, self.tape, self.scale**exponent, powers)
 
     def __neg__(self) -> "Parameter":
-        return Parameter(-_plain(self), self.record, -self.scale, self.powers)
+        return Parameter(-_as_float(self), self.tape, -self.scale, self.powers)
 
     def __pos__(self) -> "Parameter":
         return self
@@ -221,69 +220,68 @@ class Parameter(float):
         return self
 
 
-def _sum(one: float, other: float) -> float:
-    record = _record(one, other)
-    terms, value = record.terms(one), _plain(one) + _plain(other)
-    for powers, c in record.terms(other).items():
+def _sum(a: float, b: float) -> float:
+    tape = _tape_of(a, b)
+    terms, value = tape.terms(a), _as_float(a) + _as_float(b)
+    for powers, c in tape.terms(b).items():
         total = terms.get(powers, 0.0) + c
         if abs(total) <= CANCELLED * abs(c):
             terms.pop(powers, None)
         else:
             terms[powers] = total
     if len(terms) > MOST_TERMS:
-        record.refuse(f"it adds up more than {MOST_TERMS} terms of its parameters")
+        tape.refuse(f"it adds up more than {MOST_TERMS} terms of its parameters")
     if len(terms) < 2:
         ((powers, c),) = terms.items() or (((), 0.0),)
-        return Parameter(value, record, c, powers) if powers else c
+        return Parameter(value, tape, c, powers) if powers else c
     (_, scale), *_ = items = sorted(terms.items())
-    return Parameter(value, record, scale, record.atom(("sum", tuple((powers, c / scale) for powers, c in items))))
+    return Parameter(value, tape, scale, tape.atom(("sum", tuple((powers, c / scale) for powers, c in items))))
 
 
-def _product(one: float, other: float) -> float:
-    if type(one) is not Parameter:
-        one, other = other, one
-    assert isinstance(one, Parameter)
-    record = one.record
-    if type(other) is not Parameter:
-        if other == 1.0:
-            return one
-        return Parameter(_plain(one) * other, record, one.scale * other, one.powers) if other else 0.0
-    scale, both = one.scale * other.scale, (one.powers, other.powers)
-    left = record.merged.get(both)
-    if left is None:
-        powers = dict(one.powers)
-        for place, exponent in other.powers:
+def _product(a: float, b: float) -> float:
+    if type(a) is not Parameter:
+        a, b = b, a
+    assert isinstance(a, Parameter)
+    tape = a.tape
+    if type(b) is not Parameter:
+        if b == 1.0:
+            return a
+        return Parameter(_as_float(a) * b, tape, a.scale * b, a.powers) if b else 0.0
+    scale, pair = a.scale * b.scale, (a.powers, b.powers)
+    merged = tape.merged.get(pair)
+    if merged is None:
+        powers = dict(a.powers)
+        for place, exponent in b.powers:
             powers[place] = powers.get(place, 0.0) + exponent
-        left = record.merged[both] = tuple(sorted(each for each in powers.items() if each[1]))
-    return Parameter(_plain(one) * _plain(other), record, scale, left) if left else scale
+        merged = tape.merged[pair] = tuple(sorted(each for each in powers.items() if each[1]))
+    return Parameter(_as_float(a) * _as_float(b), tape, scale, merged) if merged else scale
 
 
-def _power(one: float, exponent: float) -> float:
-    if type(exponent) is Parameter or not exponent.is_integer():  # the root of a square is no product: it has no sign
-        return _function("power", one, exponent)
-    assert isinstance(one, Parameter)
-    return one.to(exponent) if exponent else 1.0
+def _power(base: float, exponent: float) -> float:
+    if type(exponent) is Parameter or not exponent.is_integer():  # the root of a square is no product: its sign is lost
+        return _function("power", base, exponent)
+    assert isinstance(base, Parameter)
+    return base.to(exponent) if exponent else 1.0
 
 
 _OPERATIONS: dict[str, Callable[[float, float], float]] = {
     "add": _sum,
-    "subtract": lambda one, other: _sum(one, -other),
+    "subtract": lambda a, b: _sum(a, -b),
     "multiply": _product,
-    "divide": lambda one, other: _product(one, other.to(-1.0) if type(other) is Parameter else 1.0 / other),
+    "divide": lambda a, b: _product(a, b.to(-1.0) if type(b) is Parameter else 1.0 / b),
     "power": _power,
 }
 
 
-def _record(*numbers: float) -> ParameterTape:
-    return next(each.record for each in numbers if type(each) is Parameter)
+def _tape_of(*numbers: float) -> ParameterTape:
+    return next(number.tape for number in numbers if type(number) is Parameter)
 
 
 def applied(name: str, *arguments: Any) -> Any:
-    """A function, by its name in NumPy or `math`, of numbers: a Parameter one if one of these is."""
+    """Apply a function of NumPy or `math` by its name; the result is a Parameter if an argument is."""
     name = NAMES.get(name, name)
-    if any(not issubclass(type(each), NUMBERS) for each in arguments):  # a symbol, which goes by its own rules
-        one, other = arguments
-        return OPERATORS[name](one, other)
+    if any(not issubclass(type(each), NUMBERS) for each in arguments):  # a symbol has its own operators
+        return OPERATORS[name](*arguments)
     numbers = [each if type(each) is Parameter else float(each) for each in arguments]
     if not any(type(each) is Parameter for each in numbers):
         return float(getattr(np, name)(*numbers))
@@ -293,25 +291,25 @@ def applied(name: str, *arguments: Any) -> Any:
 
 
 def _function(name: str, *numbers: float) -> Parameter:
-    record = _record(*numbers)
-    made = tuple((each.powers, each.scale) if isinstance(each, Parameter) else ((), each) for each in numbers)
-    with np.errstate(all="ignore"):  # a generic number may be where the function has no value
+    tape = _tape_of(*numbers)
+    arguments = tuple((each.powers, each.scale) if isinstance(each, Parameter) else ((), each) for each in numbers)
+    with np.errstate(all="ignore"):  # a generic number may be outside the domain
         value = float(FUNCTIONS[name](*map(float, numbers)))
-    return Parameter(value, record, 1.0, record.atom((name, made)))
+    return Parameter(value, tape, 1.0, tape.atom((name, arguments)))
 
 
 def _operator(name: str, swapped: bool) -> Callable[[Parameter, Any], Any]:
-    known = _OPERATIONS[name]
+    operation = _OPERATIONS[name]
 
     def operate(self: Parameter, other: Any) -> Any:
         if type(other) is float or type(other) is Parameter:
-            return known(other, self) if swapped else known(self, other)
+            return operation(other, self) if swapped else operation(self, other)
         pair = (other, self) if swapped else (self, other)
         if issubclass(type(other), np.ndarray):
             return self.__array_ufunc__(getattr(np, name), "__call__", *pair)
         if not issubclass(type(other), NUMBERS):  # by type(), as a symbol refuses isinstance
             return NotImplemented
-        return known(*(each if type(each) is Parameter else float(each) for each in pair))
+        return operation(*(each if type(each) is Parameter else float(each) for each in pair))
 
     return operate
 
@@ -333,41 +331,41 @@ Parameter.__hash__ = float.__hash__  # type: ignore[method-assign]
 for _symbol, _name in {"add": "add", "sub": "subtract", "mul": "multiply", "truediv": "divide", "pow": "power"}.items():
     setattr(Parameter, f"__{_symbol}__", _operator(_name, False))
     setattr(Parameter, f"__r{_symbol}__", _operator(_name, True))
-for _name in _OF_ONE:
+for _name in _UNARY:
     setattr(Parameter, _name, lambda self, name=_name: applied(name, self))  # NumPy calls them on arrays of objects
 
 
 def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = None) -> Any:
-    """A function of numbers and symbols, for arrays of them, by NumPy, which does not ask these again how to go on."""
+    """Apply a function to arrays of numbers and symbols, without NumPy calling their `__array_ufunc__` again."""
     operands = list(map(_operand, inputs))
-    made = np.frompyfunc(function, len(operands), 1)(*operands)
+    results = np.frompyfunc(function, len(operands), 1)(*operands)
     if out is None:
-        return made
-    out[0][...] = made
+        return results
+    out[0][...] = results
     return out[0]
 
 
 def _operand(value: Any) -> Any:
-    """An array of objects, or of one that is a number of Python's or a symbol, which refuses isinstance."""
+    """Return an array of objects, also for a single number, or for a symbol, which refuses isinstance."""
     if issubclass(type(value), np.ndarray):
         return value.astype(object)
-    made = np.empty((), dtype=object)
-    made[()] = float(value) if issubclass(type(value), np.generic) else value
-    return made
+    array = np.empty((), dtype=object)
+    array[()] = float(value) if issubclass(type(value), np.generic) else value
+    return array
 
 
 def array_of(values: Iterable[float]) -> Any:
-    """An array of floats, or of objects where some know their parameters."""
+    """Return an array of floats, or of objects if some are Parameters."""
     values = list(values)
     return np.array(values, dtype=object if any(type(each) is Parameter for each in values) else float)
 
 
 def number(value: Any) -> float:
-    """A coefficient of a form: a Parameter one as it is, any other as a float."""
+    """Return a coefficient: a Parameter as it is, any other number as a float."""
     return value if type(value) is Parameter else float(value)
 
 
 def function_of_number(name: str) -> Callable[[float], float]:
-    """A function of `math` that keeps what a number is made of."""
+    """Return a function of `math` that records its result for a Parameter."""
     plain = getattr(math, name)
     return lambda x: applied(name, x) if type(x) is Parameter else plain(x)

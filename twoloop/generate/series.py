@@ -1,8 +1,8 @@
-"""The program by which the Taylor series of a mechanism's motion is found, made of its callbacks once.
+"""Write the program for the Taylor series of a mechanism's motion.
 
-What each order needs, see taylor_step.py: G = [C_q; A] and its rates, M and Q. The entries of G and M are forms of
-quantities that depend on time and coordinates ("early"); Q may depend on velocities too ("late"). G v and
-G^T lam + M a are written as few products: terms that share a factor are one product.
+Each order needs G = [C_q; A] and its rates, M and Q, see taylor_step.py. Quantities on which G and M depend are early:
+they depend on time and coordinates. Those of Q may be late: they depend on velocities, too. G v and G^T lam + M a are
+written with few products: terms that share a factor are one product.
 """
 
 from collections.abc import Container, Sequence
@@ -24,13 +24,13 @@ from twoloop.problem.system import ConstrainedSystem
 Integers = NDArray[np.int64]
 Array = NDArray[np.float64]
 
-MOST_ENTRIES = 200_000  # of M and C_q, above which no series is looked for unless asked for
+MOST_ENTRIES = 200_000  # entries of M and C_q, above which a series is traced only on request
 
 READ = ("mass", "force", "jacobian", "nonholonomic", "constraint_rate", "nonholonomic_rate")
 
 
 class Sums(NamedTuple):
-    """Forms: each its first term, then what more there is, row by row."""
+    """Affine expressions: the first term of each, then the further terms, row by row."""
 
     column: Integers  # of the first term
     coefficient: Array
@@ -42,14 +42,14 @@ class Sums(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """Operations in an order in which they can be done; their results are quantities side by side.
+    """Operations in an order of computation; their results are consecutive quantities.
 
     Attributes
     ----------
     groups : ndarray (n, 7)
         Kind, first and end of operations that do not depend on one another, and of the further terms of their first and
-        second forms. Sines are followed by the cosines of the same angles, in one group. The last group are products
-        that wait for the solution of an order.
+        second arguments. A group of sines holds the cosines of the same angles, too. The last group are products that
+        wait for the solution of an order.
     first, second : Sums
         Arguments of the operations.
     """
@@ -61,21 +61,21 @@ class Table:
 
 @dataclass(frozen=True)
 class SeriesProgram:
-    """See the head of this file. Quantities: t, q, v, a, lam, results of `early`, results of `late`.
+    """The program of a series, on the quantities t, q, v, a, lam, results of `early`, results of `late`.
 
     Attributes
     ----------
     n_q, n_rows : int
     early : Table
-        Ends with the products of G v.
+        Early operations; the last are the products of G v.
     late : Table
-        Ends with those of G^T lam + M a.
+        Late operations; the last are the products of G^T lam + M a.
     rows, row_places : Sums, ndarray
-        G v + G_t, but for multiples of v: those that are not zero, and which they are.
+        G v + G_t without multiples of v: rows that are not zero, and their places.
     balance, balance_places : Sums, ndarray
-        Q - G^T lam - M a, but for multiples of lam and a, likewise.
+        Q - G^T lam - M a without multiples of lam and a, likewise.
     traced : Traced or None
-        What the callbacks gave.
+        The traced callbacks.
     """
 
     n_q: int
@@ -90,11 +90,11 @@ class SeriesProgram:
 
     @property
     def n_operations(self) -> int:
-        """Number of operations, products of G v and G^T lam + M a among them."""
+        """Return the number of operations, with the products of G v and G^T lam + M a."""
         return len(self.early.first.column) + len(self.late.first.column)
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "SeriesProgram":
-        """The program for a system of the family, with numbers in the place of formulas."""
+        """Return the program with the coefficients of one system."""
 
         def sums(given: Sums) -> Sums:
             coefficient, constant = evaluate(given.coefficient), evaluate(given.constant)
@@ -109,22 +109,22 @@ class SeriesProgram:
 
     @property
     def kinds(self) -> frozenset[str]:
-        """Of callbacks that ran on symbols."""
+        """Return the kinds of callbacks that were traced."""
         return frozenset() if self.traced is None else self.traced.kinds
 
     @property
     def n_nodes(self) -> int:
-        """Number of quantities."""
+        """Return the number of quantities."""
         return 1 + 3 * self.n_q + self.n_rows + self.n_operations
 
 
 def is_quick(system: ConstrainedSystem) -> bool:
-    """Whether a series is found in a second or so: what is traced are full matrices."""
+    """Return whether a series is traced within a second or so: matrices are traced as full ones."""
     return system.n_q * (system.n_q + system.n_c + system.n_a) <= MOST_ENTRIES
 
 
 def series_for(system: ConstrainedSystem, check: Check = unchecked) -> SeriesProgram:
-    """The program of a system, by its family; `check` raises where the callbacks are not in it.
+    """Return the cached program of a system; `check` raises where calls of callbacks differ from their traces.
 
     Raises
     ------
@@ -132,24 +132,24 @@ def series_for(system: ConstrainedSystem, check: Check = unchecked) -> SeriesPro
         As of `series_program`.
     """
 
-    def make(family: TraceCache) -> SeriesProgram:
-        return series_program(system, family.equations(system))
+    def make(cache: TraceCache) -> SeriesProgram:
+        return series_program(system, cache.equations(system))
 
-    made: SeriesProgram = derive_cached(system, "series", make, lambda program: check(program.traced))
-    return made
+    program: SeriesProgram = derive_cached(system, "series", make, lambda program: check(program.traced))
+    return program
 
 
 def series_program(
-    system: ConstrainedSystem, equations: Equations | None = None, counting: Container[int] | None = None
+    system: ConstrainedSystem, equations: Equations | None = None, independent: Container[int] | None = None
 ) -> SeriesProgram:
-    """The program of a system, of callbacks that do not branch on t, q or v.
+    """Trace the callbacks of a system and write its program.
 
-    `counting`: the rows of G that have multipliers, None: all; there are no others in the program.
+    `independent`: the rows of G that have multipliers; None: all. The program leaves the others out.
 
     Raises
     ------
     Untraceable
-        Naming the callback, and why its equations cannot be had.
+        Names the callback, and why it cannot be traced.
     """
     equations = Equations(system) if equations is None else equations
     n, n_rows = system.n_q, system.n_c + system.n_a
@@ -160,25 +160,25 @@ def series_program(
     arrays = np.vstack([jacobian, nonholonomic]), mass, np.append(rate, nonholonomic_rate), force
     G, mass, rates, force = (elementwise(partial(_without_sums, sums), [each]) for each in arrays)
     row_products: dict[Any, Any] = {}
-    nothing = Affine(graph, 0.0, {})
-    kept = [i for i in range(n_rows) if counting is None or i in counting]
-    rows = [nothing] * n_rows
+    zero = Affine(graph, 0.0, {})
+    kept = [i for i in range(n_rows) if independent is None or i in independent]
+    rows = [zero] * n_rows
     for i in kept:
         rows[i] = _sum_of_products(graph, G[i], v, rates[i], row_products, of_rates=True)
     reaction_products: dict[Any, Any] = {}
     balance = []
     for i in range(n):
-        factors, others = [-G[k, i] for k in kept], [lam[k] for k in kept]
+        factors, multipliers = [-G[k, i] for k in kept], [lam[k] for k in kept]
         factors += [-each for each in mass[i]]
-        total = _sum_of_products(graph, factors, [*others, *a], force[i], reaction_products, of_rates=False)
+        total = _sum_of_products(graph, factors, [*multipliers, *a], force[i], reaction_products, of_rates=False)
         balance.append(total)
     inputs = [*range(1 + 2 * n), *map(only, a), *map(only, lam)]
-    program = _assembled(graph, sums, inputs, n, n_rows, rows, balance, row_products, reaction_products)
+    program = _assemble(graph, sums, inputs, n, n_rows, rows, balance, row_products, reaction_products)
     return replace(program, traced=Traced(system, graph))
 
 
 def _sums_of(graph: Graph) -> dict[int, Affine]:
-    """What the sums that are quantities are made of: series are linear, and have no recurrence for them."""
+    """Return the expressions of quantities that are sums: a series needs no recurrence for them."""
     sums: dict[int, Affine] = {}
     for i, operation in enumerate(graph.operations):
         if operation is not None and operation[0] == SUM:
@@ -187,7 +187,7 @@ def _sums_of(graph: Graph) -> dict[int, Affine]:
 
 
 def _without_sums(sums: dict[int, Affine], form: Affine) -> Affine:
-    """A form in terms of other quantities than sums."""
+    """Return an expression without quantities that are sums."""
     named = [i for i in form.terms if i in sums]
     if not named:
         return form
@@ -200,50 +200,52 @@ def _without_sums(sums: dict[int, Affine], form: Affine) -> Affine:
 def _sum_of_products(
     graph: Graph,
     factors: Sequence[Affine],
-    others: Sequence[Affine],
+    multipliers: Sequence[Affine],
     rest: Affine,
-    known: dict[Any, Any],
+    products: dict[Any, Any],
     of_rates: bool,
 ) -> Affine:
-    """rest + sum_i factors[i] others[i] with few products, which go into `known`: by factor, or by what is in these.
+    """Return rest + sum_i factors[i] multipliers[i] with few products, which are added to `products`.
 
-    Where both take as few, those of rates go by what is in the factors: a sine's with the rate of its angle is a
-    derivative.
+    Terms are collected by factors, or by the quantities in these, whichever gives fewer products. If both give as many,
+    rates are collected by quantities: a cosine times the rate of its angle is the derivative of the sine.
     """
     total = rest
     by_factor: dict[Any, tuple[Affine, Affine]] = {}
     by_quantity: dict[Any, tuple[Affine, Affine]] = {}
-    for factor, other in zip(factors, others, strict=True):
+    for factor, multiplier in zip(factors, multipliers, strict=True):
         if factor.constant != 0.0:
-            total = total + other.times(factor.constant)
+            total = total + multiplier.times(factor.constant)
         if not factor.terms:
             continue
         varying = Affine(graph, 0.0, factor.terms)
         scale, form = varying.normalised()
-        _collect(by_factor, form, other.times(scale))
+        _collect(by_factor, form, multiplier.times(scale))
         for i, c in factor.terms.items():
-            _collect(by_quantity, graph.quantity(i), other.times(c))
+            _collect(by_quantity, graph.quantity(i), multiplier.times(c))
     groups = (by_quantity, by_factor) if of_rates else (by_factor, by_quantity)
-    ways = [[_normalised(*each) for each in way.values() if each[1].terms] for way in groups]
-    for key, scale, factor, other in min(ways, key=lambda way: len({key for key, *_ in way} - known.keys())):
-        if key not in known:
-            known[key] = (*graph.inputs(1, True), factor, other)
-        total = total + known[key][0].times(scale)
+    candidates = [[_unit_product(*each) for each in candidate.values() if each[1].terms] for candidate in groups]
+    for key, scale, factor, multiplier in min(
+        candidates, key=lambda candidate: len({key for key, *_ in candidate} - products.keys())
+    ):
+        if key not in products:
+            products[key] = (*graph.inputs(1, True), factor, multiplier)
+        total = total + products[key][0].times(scale)
     return total
 
 
-def _normalised(factor: Affine, other: Affine) -> tuple[Any, float, Affine, Affine]:
-    """A product with a scale of 1: its key, the scale, and both factors."""
-    scale, other = other.normalised()
-    return (factor.key, other.key), scale, factor, other
+def _unit_product(factor: Affine, multiplier: Affine) -> tuple[Any, float, Affine, Affine]:
+    """Return the key of a product of unit scale, the scale, and both factors."""
+    scale, multiplier = multiplier.normalised()
+    return (factor.key, multiplier.key), scale, factor, multiplier
 
 
-def _collect(groups: dict[Any, tuple[Affine, Affine]], factor: Affine, other: Affine) -> None:
+def _collect(groups: dict[Any, tuple[Affine, Affine]], factor: Affine, multiplier: Affine) -> None:
     before = groups.get(factor.key)
-    groups[factor.key] = (factor, other if before is None else before[1] + other)
+    groups[factor.key] = (factor, multiplier if before is None else before[1] + multiplier)
 
 
-def _assembled(
+def _assemble(
     graph: Graph,
     sums: dict[int, Affine],
     inputs: list[int],
@@ -260,14 +262,14 @@ def _assembled(
     for i, operation in _used(graph, [*rows, *balance, *factors]):
         if i not in sums:
             kind, first, second = operation
-            made = (_without_sums(sums, first), None if second is None else _without_sums(sums, second))
-            (late if graph.late[i] else early).append((i, kind, *made))
+            arguments = (_without_sums(sums, first), None if second is None else _without_sums(sums, second))
+            (late if graph.late[i] else early).append((i, kind, *arguments))
     if len(early) + len(late) + len(row_products) + len(reaction_products) > MOST_OPERATIONS:
         raise Untraceable(f"its equations are more than {MOST_OPERATIONS} operations")
     tables = [
         [
-            *_ordered(operations),
-            (PENDING, sorted([(only(form), *factors) for form, *factors in products.values()], key=_n_terms)),
+            *_grouped(operations),
+            (PENDING, sorted([(only(form), *factors) for form, *factors in products.values()], key=_term_counts)),
         ]
         for operations, products in ((early, row_products), (late, reaction_products))
     ]
@@ -282,13 +284,13 @@ def _assembled(
         n_rows,
         _table(tables[0], place),
         _table(tables[1], place),
-        *_scattered([_without(form, v_and_a) for form in rows], place),
-        *_scattered([_without(form, lam_and_a) for form in balance], place),
+        *_nonzero([_without(form, v_and_a) for form in rows], place),
+        *_nonzero([_without(form, lam_and_a) for form in balance], place),
     )
 
 
 def _used(graph: Graph, forms: list[Affine]) -> list[tuple[int, Any]]:
-    """The operations that forms are made of, and those that are made with them: sines and cosines of an angle."""
+    """Return the operations that expressions need; with a sine goes the cosine of its angle, and vice versa."""
     needed = set(graph.needed_by(forms))
     pairs = (SINE, COSINE)
     angles = {each[1].key for i in needed if (each := graph.operations[i]) is not None and each[0] in pairs}
@@ -299,8 +301,8 @@ def _used(graph: Graph, forms: list[Affine]) -> list[tuple[int, Any]]:
     ]
 
 
-def _scattered(forms: list[Affine], place: dict[int, int]) -> tuple[Sums, Integers]:
-    """Those forms that are not zero, and which they are."""
+def _nonzero(forms: list[Affine], place: dict[int, int]) -> tuple[Sums, Integers]:
+    """Return the expressions that are not zero, and their places."""
     kept = [k for k, form in enumerate(forms) if form.terms or form.constant]
     sums = _sums([forms[k] for k in kept], place)
     places = np.array(kept, dtype=np.int64)
@@ -308,17 +310,17 @@ def _scattered(forms: list[Affine], place: dict[int, int]) -> tuple[Sums, Intege
 
 
 def _without(form: Affine, inputs: Container[int]) -> Affine:
-    """A form less its multiples of some quantities."""
+    """Return an expression without its multiples of some quantities."""
     return Affine(form.graph, form.constant, {i: c for i, c in form.terms.items() if i not in inputs})
 
 
-def _ordered(operations: list[Any]) -> list[tuple[int, list[Any]]]:
-    """Operations in groups by level and kind: what a group depends on is made by groups before it."""
-    own = {node for node, *_ in operations}
+def _grouped(operations: list[Any]) -> list[tuple[int, list[Any]]]:
+    """Group operations by level and kind: a group depends on groups before it only."""
+    nodes = {node for node, *_ in operations}
     level: dict[int, int] = {}
     groups: dict[tuple[int, int], list[Any]] = {}
-    for node, kind, first, second in operations:  # made in an order in which they can be done
-        used = [i for form in (first, second) if form is not None for i in form.terms if i in own]
+    for node, kind, first, second in operations:  # in an order of computation
+        used = [i for form in (first, second) if form is not None for i in form.terms if i in nodes]
         level[node] = 1 + max((level[i] for i in used), default=0)
         if second is None:
             second = Affine(first.graph, 0.0, {})
@@ -327,7 +329,7 @@ def _ordered(operations: list[Any]) -> list[tuple[int, list[Any]]]:
     for (number, kind), members in sorted(groups.items()):
         if kind == COSINE:
             continue
-        members.sort(key=_n_terms)  # side by side is done what takes as long
+        members.sort(key=_term_counts)  # neighbours take equally long
         if kind == SINE:
             cosines = {first.key: node for node, first, _ in groups[number, COSINE]}
             members += [(cosines[first.key], first, second) for _, first, second in members]
@@ -335,7 +337,7 @@ def _ordered(operations: list[Any]) -> list[tuple[int, list[Any]]]:
     return ordered
 
 
-def _n_terms(operation: tuple[int, Affine, Affine]) -> tuple[int, int]:
+def _term_counts(operation: tuple[int, Affine, Affine]) -> tuple[int, int]:
     _, first, second = operation
     return len(first.terms), len(second.terms)
 

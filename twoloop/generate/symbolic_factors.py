@@ -1,4 +1,4 @@
-"""Symbolic elimination of a symmetric matrix whose zeros are known: factors, and solutions by them."""
+"""Factor a symmetric matrix of expressions whose zeros are known, and solve with its factors."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -7,7 +7,7 @@ from twoloop.generate.graph import Affine
 
 
 class Block(NamedTuple):
-    """One or two places that are eliminated together, which takes one division."""
+    """One or two rows that are eliminated together, which takes one division."""
 
     places: tuple[int, ...]
     inverse: list[list[Affine]]  # of the pivots
@@ -15,16 +15,16 @@ class Block(NamedTuple):
 
 
 class Factors:
-    """L D L^T of a symmetric matrix of forms, by an order that a definite matrix of this pattern allows.
+    """L D L^T of a symmetric matrix of expressions, in an order that a definite matrix of this pattern allows.
 
     Attributes
     ----------
     blocks : list of Block
         In the order of elimination.
     conditions : list of (Affine, Affine)
-        Two numbers for each row from `n` on, the first over the second: its pivot over what it is without the others.
+        For each row from `n` on its pivot, and the pivot that it would have without the other rows.
     positive : list of Affine
-        Coefficients that are positive where the matrix of the first `n` is definite.
+        Pivots that are positive if the matrix of the first `n` rows is definite.
     """
 
     def __init__(self, matrix: dict[tuple[int, int], Affine], size: int, n: int):
@@ -54,74 +54,74 @@ class Factors:
             self.blocks.append(Block(places, inverse, below))
 
     def _inverse(self, pivots: list[list[Affine]], alone: list[Any]) -> list[list[Affine]]:
-        """The inverse of one or two pivots; of rows of G, conditions too."""
-        own = [None if each is None else each.value() for each in alone]
+        """Return the inverse of one or two pivots, and record their conditions."""
+        diagonal = [None if each is None else each.value() for each in alone]
         a = pivots[0][0]
-        if own[0] is None:
+        if diagonal[0] is None:
             self.positive.append(a)
         else:
-            self.conditions.append((-a, -own[0]))
+            self.conditions.append((-a, -diagonal[0]))
         if len(pivots) == 1:
             return [[a.reciprocal()]]
         b, c = pivots[0][1], pivots[1][1]
         determinant = (a * c - b * b).value()
-        if own[1] is None:
+        if diagonal[1] is None:
             self.positive.append(determinant)
         else:
-            self.conditions.append((determinant, (a * own[1]).value()))
+            self.conditions.append((determinant, (a * diagonal[1]).value()))
         inverse = determinant.reciprocal()
         return [[(c * inverse).value(), (-b * inverse).value()], [(-b * inverse).value(), (a * inverse).value()]]
 
     def solve(self, right: Sequence[Affine]) -> list[Affine]:
-        """The solution for a right-hand side."""
+        """Return the solution for a right-hand side."""
         return solve(self.blocks, right)
 
 
-def _dot(one: Sequence[Affine], other: Sequence[Affine]) -> Affine:
-    total = one[0] * other[0]
-    for x, y in zip(one[1:], other[1:], strict=True):
+def _dot(a: Sequence[Affine], b: Sequence[Affine]) -> Affine:
+    total = a[0] * b[0]
+    for x, y in zip(a[1:], b[1:], strict=True):
         total = total + x * y
     return total
 
 
 def solve(blocks: Sequence[Block], right: Sequence[Affine]) -> list[Affine]:
-    """The solution for a right-hand side; multiples of one quantity are summed up before they are multiplied by it."""
+    """Return the solution for a right-hand side; multiples of a quantity are added before the multiplication."""
     solution = list(right)
-    owed: list[list[tuple[Affine, Affine]]] = [[] for _ in right]
+    pending: list[list[tuple[Affine, Affine]]] = [[] for _ in right]
     for places, _, below in blocks:
         for i in places:
-            solution[i] = (solution[i] - _gathered(owed[i])).value()
+            solution[i] = (solution[i] - _gathered(pending[i])).value()
         for j, multiples in below:
-            owed[j] += [(multiple, solution[i]) for multiple, i in zip(multiples, places, strict=True)]
+            pending[j] += [(multiple, solution[i]) for multiple, i in zip(multiples, places, strict=True)]
     for places, inverse, below in reversed(blocks):
-        known = [solution[i] for i in places]
+        pivots = [solution[i] for i in places]
         for place, (i, row) in enumerate(zip(places, inverse, strict=True)):
-            found = [(multiples[place], solution[j]) for j, multiples in below]
-            solution[i] = (_dot(row, known) - _gathered(found)).value()
+            products = [(multiples[place], solution[j]) for j, multiples in below]
+            solution[i] = (_dot(row, pivots) - _gathered(products)).value()
     return solution
 
 
 def _gathered(products: Sequence[tuple[Affine, Affine]]) -> Any:
-    """The sum of products, those of multiples of one factor as one."""
+    """Return the sum of products, with one product for all multiples of a factor."""
     total: Any = 0.0
     groups: dict[Any, tuple[Affine, Affine]] = {}
-    for one, other in products:
-        if not one.terms:
-            total = total + other.times(one.constant)
+    for factor_a, factor_b in products:
+        if not factor_a.terms:
+            total = total + factor_b.times(factor_a.constant)
             continue
-        scale, factor = one.normalised()
+        scale, factor = factor_a.normalised()
         before = groups.get(factor.key)
-        other = other.times(scale)
-        groups[factor.key] = (factor, other if before is None else before[1] + other)
-    for factor, other in groups.values():
-        total = total + factor * other.value()
+        factor_b = factor_b.times(scale)
+        groups[factor.key] = (factor, factor_b if before is None else before[1] + factor_b)
+    for factor, factor_b in groups.values():
+        total = total + factor * factor_b.value()
     return total
 
 
 def _pairs(rows: list[dict[int, Affine]], n: int) -> list[tuple[int, int]]:
-    """Coordinates and rows of G that give them: by a number, each in one row alone, of a mass that is a number.
+    """Return pairs of a coordinate and a row of G whose entry is a number, in no other row, and whose mass is a number.
 
-    The rank of G is that of the rows without such pairs, and as many more: they take no condition, and no division.
+    The rank of G is that of the other rows plus the number of pairs, which take no condition and no division.
     """
     pairs: dict[int, int] = {}  # by rows
     for i, row in enumerate(rows[:n]):
@@ -131,9 +131,9 @@ def _pairs(rows: list[dict[int, Affine]], n: int) -> list[tuple[int, int]]:
 
 
 def _order(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, ...]]:
-    """Least degree first; a row from n on only after all that it has below n; in pairs where their neighbours agree.
+    """Order rows by least degree, each row from n on after its neighbours below n, in pairs where neighbours agree.
 
-    Among equals those first that wait for the fewest divisions: what does not depend on one another runs side by side.
+    Among equals, rows that wait for the fewest divisions come first, so that independent operations run side by side.
     """
     neighbours = [set(row) - {i} for i, row in enumerate(rows)]
     waits = [{j for j in neighbours[i] if j < n} if i >= n else set() for i in range(len(rows))]
@@ -158,7 +158,7 @@ def _order(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int, int
 
 
 def _eliminate(neighbours: list[set[int]], places: Sequence[int]) -> set[int]:
-    """The neighbours of places, which become neighbours of one another in their stead."""
+    """Eliminate rows, connect their neighbours with one another, and return these."""
     around = set().union(*(neighbours[i] for i in places)) - set(places)
     for j in around:
         neighbours[j] = (neighbours[j] | around) - {*places, j}

@@ -33,7 +33,7 @@ from twoloop.kernels.compile.dependencies import Rewritten, of_library
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.problem.system import ConstrainedSystem
 
-# functions of NumPy that do with arrays of forms what they do with numbers
+# functions of NumPy that handle arrays of expressions like arrays of numbers
 AS_WITH_NUMBERS = {
     *("add", "append", "atleast_1d", "atleast_2d", "block", "column_stack", "concatenate", "copy", "cross", "diag"),
     *("diagonal", "divide", "dot", "einsum", "expand_dims", "flip", "hstack", "inner", "kron", "matmul", "mean"),
@@ -46,12 +46,12 @@ CONVERSIONS = ("array", "asarray", "ascontiguousarray")
 
 
 def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
-    """Run a callback in Python on symbols: what it returns, None of a compiled one.
+    """Run a callback in Python on symbols, and return its result, which is None for a compiled one.
 
     Raises
     ------
     Untraceable
-        If it does not run on them, or does with them what it would not do with numbers.
+        If it does not run on symbols, or treats them otherwise than numbers.
     """
     graph, value = t.graph, None
     with graph.watched():
@@ -59,7 +59,7 @@ def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
             value = _Traced(lambda copy, _: copy).callback(function)(t, *arguments)
         except (Refusal, Untraceable) as refusal:
             raise Untraceable(f"{graph.refused or refusal}{place_of(refusal)}") from None
-        except Exception as error:  # what a callback makes of symbols is its own
+        except Exception as error:  # a callback may raise anything on symbols
             if not graph.refused:
                 said = str(error).partition("\n")[0].replace("twoloop.generate.graph.", "").replace("Affine", "symbol")
                 said = f"it does not run on symbols in the place of t, q and v: {type(error).__name__}: {said}"
@@ -67,31 +67,31 @@ def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
     return value
 
 
-def as_forms(graph: Graph, made: Any) -> Any:
-    """What a callback filled or returned, as an array of forms."""
-    for place in np.ndindex(made.shape):
-        entry = made[place]
+def as_forms(graph: Graph, values: Any) -> Any:
+    """Convert what a callback filled or returned to expressions, in place."""
+    for place in np.ndindex(values.shape):
+        entry = values[place]
         if type(entry) is not Affine:
             try:
-                made[place] = Affine(graph, number(entry), {})
+                values[place] = Affine(graph, number(entry), {})
             except Exception as error:
                 raise Untraceable(f"on symbols its entry {place} is {entry!r}, which is not a number") from error
         elif entry.graph is not graph:
             raise Untraceable("it returns t, q or v of another call, which it has kept")
-    return made
+    return values
 
 
 class _Traced(Rewritten):
-    """Copies of callbacks with the mathematics of forms in the place of `math` and `numpy`."""
+    """Copies callbacks, with the mathematics of expressions in the place of `math` and `numpy`."""
 
     def copies(self, value: Any) -> bool:
         return isinstance(value, Dispatcher | types.FunctionType)
 
     def callback(self, function: Any) -> Any:
-        """A callback that may be an object with a method to call it."""
-        own = next((vars(each)["__call__"] for each in type(function).__mro__ if "__call__" in vars(each)), None)
-        if isinstance(own, types.FunctionType) and not isinstance(function, Dispatcher):
-            return types.MethodType(self.value(own), function)
+        """Copy a callback, which may be an object with `__call__`."""
+        method = next((vars(each)["__call__"] for each in type(function).__mro__ if "__call__" in vars(each)), None)
+        if isinstance(method, types.FunctionType) and not isinstance(function, Dispatcher):
+            return types.MethodType(self.value(method), function)
         return self.value(function)
 
     def value(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
@@ -121,21 +121,21 @@ def _type(value: Any, *more: Any) -> Any:
 
 
 def _symbol_in(value: Any) -> Affine | None:
-    """A form in a number, an array, or a list of these."""
+    """Return an expression in a number, an array, or a list of these; None if there is none."""
     if type(value) is Affine:
         return value
     if isinstance(value, np.ndarray):
         value = value.ravel().tolist() if value.dtype == object else ()
     if isinstance(value, list | tuple):
-        return next((found for found in map(_symbol_in, value) if found is not None), None)
+        return next((symbol for symbol in map(_symbol_in, value) if symbol is not None), None)
     return None
 
 
-def _remembers(value: Any) -> bool:
-    """Whether a number, an array or a list of these holds a number that knows its parameters."""
+def _has_parameters(value: Any) -> bool:
+    """Return whether a number, an array or a list of these holds a Parameter."""
     if isinstance(value, np.ndarray):
         value = value.ravel().tolist() if value.dtype == object else ()
-    return any(map(_remembers, value)) if isinstance(value, list | tuple) else type(value) is Parameter
+    return any(map(_has_parameters, value)) if isinstance(value, list | tuple) else type(value) is Parameter
 
 
 def _refuse(value: Any, does: str) -> None:
@@ -144,27 +144,27 @@ def _refuse(value: Any, does: str) -> None:
         symbol.graph.refuse(f"it {does} what depends on t, q or v")
 
 
-def _of_numbers(known: Any, name: str) -> Callable[..., Any]:
-    """A function that is not known to take forms."""
+def _of_numbers(function_of_numbers: Any, name: str) -> Callable[..., Any]:
+    """Wrap a function that is not known to take expressions: it refuses them."""
 
-    @functools.wraps(known)
+    @functools.wraps(function_of_numbers)
     def function(*arguments: Any, **options: Any) -> Any:
         _refuse([*arguments, *options.values()], f"calls {name} on")
-        return known(*arguments, **options)
+        return function_of_numbers(*arguments, **options)
 
     return function
 
 
-def _either(known: Any, own: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of numbers, and of forms."""
+def _either(of_numbers: Any, of_symbols: Callable[..., Any]) -> Callable[..., Any]:
+    """Join a function of numbers with one of expressions."""
 
     def function(*arguments: Any) -> Any:
         if _symbol_in(arguments) is None:
-            remembers = any(type(x) is Parameter for x in arguments)
-            return applied(known.__name__, *arguments) if remembers else known(*arguments)
+            has_parameters = any(type(x) is Parameter for x in arguments)
+            return applied(of_numbers.__name__, *arguments) if has_parameters else of_numbers(*arguments)
         if any(isinstance(x, np.ndarray) for x in arguments if type(x) is not Affine):
             return elementwise(function, arguments)
-        return own(*arguments)
+        return of_symbols(*arguments)
 
     return function
 
@@ -173,26 +173,26 @@ def _is_real(dtype: Any) -> bool:
     return dtype is None or np.dtype(dtype) == np.float64
 
 
-def _constructor(known: Any) -> Callable[..., Any]:
-    """`zeros` and its kin, which hold forms where they would hold real numbers."""
+def _constructor(constructor: Any) -> Callable[..., Any]:
+    """Wrap `zeros`, `ones` or `empty`, whose arrays of real numbers hold expressions."""
 
     def function(shape: Any, dtype: Any = None, **options: Any) -> Any:
         if not _is_real(dtype):
-            return known(shape, dtype, **options)
-        return np.full(shape, 1.0 if known is np.ones else 0.0, dtype=object)
+            return constructor(shape, dtype, **options)
+        return np.full(shape, 1.0 if constructor is np.ones else 0.0, dtype=object)
 
     return function
 
 
-def _conversion(known: Any) -> Callable[..., Any]:
-    """`array` and its kin."""
+def _conversion(conversion: Any) -> Callable[..., Any]:
+    """Wrap `array`, `asarray` or `ascontiguousarray`."""
 
     def function(value: Any, dtype: Any = None, **options: Any) -> Any:
-        if _symbol_in(value) is None and not _remembers(value):
-            return known(value, dtype, **options)
+        if _symbol_in(value) is None and not _has_parameters(value):
+            return conversion(value, dtype, **options)
         if not _is_real(dtype):
             _refuse(value, f"makes {np.dtype(dtype).name} of")
-        return known(value, object, **options)
+        return conversion(value, object, **options)
 
     return function
 
@@ -200,7 +200,7 @@ def _conversion(known: Any) -> Callable[..., Any]:
 def _full(shape: Any, value: Any, dtype: Any = None) -> Any:
     if (
         _symbol_in(value) is None
-        and not _remembers(value)
+        and not _has_parameters(value)
         and not (_is_real(dtype) and np.asarray(value).dtype == np.float64)
     ):
         return np.full(shape, value, dtype)
@@ -219,32 +219,32 @@ def _norm(x: Any, *more: Any, **options: Any) -> Any:
 
 
 class _Mathematics:
-    """`math`, `numpy` or a part of it, with functions that take forms too, and arrays that hold them."""
+    """`math`, `numpy` or a part of it, whose functions take expressions, too, and whose arrays hold them."""
 
     def __init__(self, module: types.ModuleType):
         self._module = module
 
     def __getattr__(self, name: str) -> Any:
-        known = getattr(self._module, name)
-        if isinstance(known, types.ModuleType):
-            return _Mathematics(known)
-        if isinstance(known, type) or not callable(known):
-            return known
+        original = getattr(self._module, name)
+        if isinstance(original, types.ModuleType):
+            return _Mathematics(original)
+        if isinstance(original, type) or not callable(original):
+            return original
         if name in FUNCTIONS or name == "hypot":
-            return _either(known, FUNCTIONS.get(name) or OPERATORS[name])
+            return _either(original, FUNCTIONS.get(name) or OPERATORS[name])
         if name in ("pow", "power"):
             return lambda x, y: x**y
         if self._module is np and name in CONSTRUCTORS:
-            return _constructor(known)
+            return _constructor(original)
         if self._module is np and name in CONVERSIONS:
-            return _conversion(known)
-        if known is np.full:
+            return _conversion(original)
+        if original is np.full:
             return _full
-        if known is np.linalg.norm:
+        if original is np.linalg.norm:
             return _norm
         if self._module is np and name in AS_WITH_NUMBERS:
-            return known
-        return _of_numbers(known, f"{self._module.__name__}.{name}")
+            return original
+        return _of_numbers(original, f"{self._module.__name__}.{name}")
 
 
 # in the order in which they are traced
@@ -256,18 +256,18 @@ OF_ROWS = {"gamma": ("jacobian", "constraint_rate"), "nonholonomic_gamma": ("non
 
 
 class Equations:
-    """What the callbacks of a system make of symbols; each is traced when it is first asked for, once.
+    """The traced callbacks of a system; each is traced once, at its first use.
 
     Parameters
     ----------
     system : ConstrainedSystem
     parameters : array of float or Parameter, optional
-        In the place of its own.
+        In the place of the system's own.
 
     Attributes
     ----------
     graph : Graph
-        Its first quantities are t, q and v.
+        Its first inputs are t, q and v.
     t : Affine
     q, v : list of Affine (n_q,)
     """
@@ -275,35 +275,35 @@ class Equations:
     def __init__(self, system: ConstrainedSystem, parameters: Any = None):
         self.system, self.graph = system, Graph()
         self.parameters = system.parameters if parameters is None else parameters
-        self.watched: Any = next((x.record.watched for x in self.parameters if type(x) is Parameter), nullcontext)
+        self.watched: Any = next((x.tape.watched for x in self.parameters if type(x) is Parameter), nullcontext)
         (self.t,) = self.graph.inputs(1, False)
         self.q, self.v = self.graph.inputs(system.n_q, False), self.graph.inputs(system.n_q, True)
-        self._made: dict[str, Any] = {}
-        self._before: dict[str, Any] = {}  # what was traced in the graph of which this one is a copy
+        self._forms: dict[str, Any] = {}
+        self._copied: dict[str, Any] = {}  # traced in the graph of which this one is a copy
 
     def trace_all(self) -> "Equations":
-        """Trace all callbacks that can be traced, for copies."""
+        """Trace all callbacks that can be traced, so that copies share them."""
         for kind in CALLBACKS:
             if not self._is_derived(kind):
-                with suppress(Untraceable):  # which who needs it is told
+                with suppress(Untraceable):  # raised again where the callback is needed
                     self.of(kind)
         return self
 
     def copy(self) -> "Equations":
-        """Equations with a graph of their own, in which what was traced here is not traced again."""
-        other = copy.copy(self)
-        other.graph = self.graph.copy()
-        other.t, other.q, other.v = (
-            self.t.on(other.graph),
-            *([x.on(other.graph) for x in each] for each in (self.q, self.v)),
+        """Return equations with a graph of their own, which do not trace again what was traced here."""
+        equations = copy.copy(self)
+        equations.graph = self.graph.copy()
+        equations.t, equations.q, equations.v = (
+            self.t.on(equations.graph),
+            *([x.on(equations.graph) for x in each] for each in (self.q, self.v)),
         )
-        other._made, other._before = {}, self.graph.traced
-        return other
+        equations._forms, equations._copied = {}, self.graph.traced
+        return equations
 
     def of(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
-        """What a kind of callback gives, as an array of forms: zeros, or derivatives, where there is none.
+        """Return the array of a kind of callback, as expressions: zeros, or derivatives, if it is not given.
 
-        `v`: forms in the place of the velocities, if not these themselves.
+        `v`: expressions in the place of the velocities.
 
         Raises
         ------
@@ -312,12 +312,12 @@ class Equations:
         """
         if v is not None and "v" in KINDS[kind].state:
             return self._make(kind, v)
-        if kind not in self._made:
-            self._made[kind] = self._make(kind, self.v)
-        return self._made[kind].copy()
+        if kind not in self._forms:
+            self._forms[kind] = self._make(kind, self.v)
+        return self._forms[kind].copy()
 
     def derived(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
-        """C_q, C_t or a right-hand side by the rules of differentiation, whether there is a callback or not."""
+        """Differentiate for C_q, C_t or a right-hand side, whether there is a callback or not."""
         if kind == "jacobian":
             return self._jacobian()
         return self._rate() if kind == "constraint_rate" else self._gamma(*OF_ROWS[kind], self.v if v is None else v)
@@ -325,10 +325,10 @@ class Equations:
     def _make(self, kind: str, v: Sequence[Affine]) -> Any:
         if self._is_derived(kind):
             return self.derived(kind, v)
-        if kind in self._before and v is self.v:
-            made = elementwise(lambda form: form.on(self.graph), [self._before[kind]])
-            self.graph.traced.setdefault(kind, made.copy())
-            return made
+        if kind in self._copied and v is self.v:
+            forms = elementwise(lambda form: form.on(self.graph), [self._copied[kind]])
+            self.graph.traced.setdefault(kind, forms.copy())
+            return forms
         return self._traced(kind, v)
 
     def _is_derived(self, kind: str) -> bool:
@@ -355,34 +355,34 @@ class Equations:
         return out
 
     def _jacobian(self) -> Any:
-        """C_q from C."""
-        constraint, one = self.of("constraint"), Affine(self.graph, 1.0, {})
-        made = np.empty((self.system.n_c, self.system.n_q), dtype=object)
+        """Return C_q from C."""
+        constraint, unit = self.of("constraint"), Affine(self.graph, 1.0, {})
+        jacobian = np.empty((self.system.n_c, self.system.n_q), dtype=object)
         for j, coordinate in enumerate(self.q):
-            by = Derivative(self.graph, {only(coordinate): one})
-            made[:, j] = [by.of(form) for form in constraint]
-        return made
+            by = Derivative(self.graph, {only(coordinate): unit})
+            jacobian[:, j] = [by.of(form) for form in constraint]
+        return jacobian
 
     def _rate(self) -> Any:
-        """C_t from C."""
+        """Return C_t from C."""
         constraint, by_t = self.of("constraint"), Derivative(self.graph, {only(self.t): Affine(self.graph, 1.0, {})})
         return symbols(by_t.of(form) for form in constraint)
 
     def _gamma(self, rows: str, rates: str, v: Sequence[Affine]) -> Any:
-        """-(dG/dt v + dG_t/dt) at constant v, the right-hand side of G a = gamma, by the rules of differentiation."""
+        """Return -(dG/dt v + dG_t/dt) at constant v, the right-hand side of G a = gamma."""
         moving = {only(coordinate): u for coordinate, u in zip(self.q, v, strict=True)}
         along = Derivative(self.graph, {only(self.t): Affine(self.graph, 1.0, {}), **moving})
-        made = self.of(rates)
+        gamma = self.of(rates)
         for i, row in enumerate(self.of(rows)):
-            total = along.of(made[i])
+            total = along.of(gamma[i])
             for entry, u in zip(row, v, strict=True):
                 total = total + along.of(entry) * u if entry.terms else total
-            made[i] = -total
-        return made
+            gamma[i] = -total
+        return gamma
 
 
 def runs_on_symbols(system: ConstrainedSystem, kind: str, parameters: Any) -> bool:
-    """Whether a compiled callback does the same whatever its arguments are, and these parameters where they vary."""
+    """Return whether a compiled callback does not branch on its arguments, nor on parameters that vary."""
     equations = Equations(system, parameters)
     state = {"q": equations.q, "v": equations.v, "lam": equations.graph.inputs(system.n_c, True)}
     arrays = [symbols(state[name]) for name in KINDS[kind].state]
@@ -398,6 +398,6 @@ def runs_on_symbols(system: ConstrainedSystem, kind: str, parameters: Any) -> bo
 
 
 def only(form: Affine) -> int:
-    """The one quantity that a form is."""
+    """Return the one quantity of which an expression consists."""
     (place,) = form.terms
     return place

@@ -21,66 +21,68 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 Gathered = tuple[Array, NDArray[np.int64], list[Powers]]
-Evaluator = Callable[[Any], Array]  # of an array of numbers, some of which may be formulas, for one system
+Evaluator = Callable[[Any], Array]  # gives the numbers of an array of expressions for one system
 
-GENERIC = 0.5, 1.5  # range of the numbers with which callbacks are traced: of one size, so that none hides another
-EXTREME = 1e-30  # what is smaller, or larger than its inverse, stays what it is: its powers would leave the range
+GENERIC = 0.5, 1.5  # range of the parameters with which callbacks are traced: of one size, so that none hides another
+EXTREME = 1e-30  # parameters below it, or above its inverse, keep their values: their powers would leave the range
 
-_FAMILIES = Newest()
+_CACHES = Newest()
 
 
 class TraceCache:
-    """What is made of the callbacks of some systems.
+    """What is derived from the callbacks that some systems share.
 
     Parameters
     ----------
     parameters : ndarray (n_p,)
-        Of one of the systems.
+        Parameters of one of the systems.
     classes : ndarray of int (n_p,)
-        Which of its numbers each parameter is, from 1 on, negative for a negative one; 0: it stays what it is.
+        For each parameter the number that it is, counted from 1 and negative for a negative one; 0: it keeps its value.
 
     Attributes
     ----------
     parameters : ndarray of float and Parameter (n_p,)
-        With which callbacks are traced.
+        Parameters with which callbacks are traced.
     traced : set of str
-        Kinds of callbacks that were: they do the same in all systems, at the same places of their arrays.
+        Kinds of callbacks that were traced: they write the same entries in all systems.
+    within_bounds : set of str
+        Kinds among these that `check_bounds` has checked in one of the systems.
     """
 
     def __init__(self, parameters: Array, classes: NDArray[np.int64]):
         self._classes = classes
         n_numbers = int(np.abs(self._classes).max(initial=0))
         _, first = np.unique(np.abs(self._classes), return_index=True)
-        self._first = first[self._classes[first] != 0]  # where each number stands first
-        self._record = ParameterTape(np.random.default_rng(7).uniform(*GENERIC, n_numbers).tolist(), range(n_numbers))
+        self._first = first[self._classes[first] != 0]  # first place of each number
+        self._tape = ParameterTape(np.random.default_rng(7).uniform(*GENERIC, n_numbers).tolist(), range(n_numbers))
         self.parameters = parameters.astype(object) if self._classes.any() else parameters.copy()
         for place in np.flatnonzero(self._classes).tolist():
             which = int(self._classes[place])
-            known = self._record.parameters[abs(which) - 1]
-            self.parameters[place] = known if which > 0 else -known
+            parameter = self._tape.parameters[abs(which) - 1]
+            self.parameters[place] = parameter if which > 0 else -parameter
         self.traced: set[str] = set()
-        self.within_bounds: set[str] = set()  # of these, what `check_bounds` has looked at in one of the systems
+        self.within_bounds: set[str] = set()
         self._made: dict[Any, Any] = {}
-        self._arrays: dict[int, tuple[Any, Gathered]] = {}  # of formulas, by their ids
-        self._tracing = RLock()  # what is traced is put down in one record
+        self._arrays: dict[int, tuple[Any, Gathered]] = {}  # by the ids of the arrays, which are kept alive here
+        self._tracing = RLock()  # all traces record on one tape
 
     def equations(self, system: ConstrainedSystem) -> Equations:
-        """What its callbacks were traced to, as a beginning of a graph."""
-        if system.called_in_python:  # may keep what it gets, and so is traced no earlier than it must be
+        """Return the traced callbacks, with a graph to be extended."""
+        if system.called_in_python:  # a function may keep its arguments, so it is traced as late as possible
             return Equations(system, self.parameters)
         traced: Equations = self.remembered("equations", lambda: Equations(system, self.parameters).trace_all())
         return traced.copy()
 
     def numbers(self, parameters: Array) -> Array:
-        """The numbers, one for each class, of a system's parameters."""
+        """Return the numbers of a system's parameters, one for each class."""
         return np.abs(parameters[self._first])
 
     def products(self, parameters: Array) -> Callable[[Powers], Any]:
-        """What gives the products of which formulas are multiples, for a system's parameters."""
-        return self._record.products(self.numbers(parameters))
+        """Return a function that evaluates products of atoms for a system's parameters."""
+        return self._tape.products(self.numbers(parameters))
 
     def evaluator(self, parameters: Array) -> Evaluator:
-        """What evaluates formulas for a system's parameters; their arrays are those that are kept with the family."""
+        """Return a function that evaluates arrays of expressions, which this cache keeps, for a system's parameters."""
         product = self.products(parameters)
 
         def evaluate(array: Any) -> Array:
@@ -88,17 +90,17 @@ class TraceCache:
                 return array
             scales, places, products = self._gathered(array)
             with np.errstate(all="ignore"):
-                made: Array = scales * np.array(list(map(product, products)))[places]
-            if not np.isfinite(made).all():  # as a sum of parameters by which a formula divides is zero
+                values: Array = scales * np.array(list(map(product, products)))[places]
+            if not np.isfinite(values).all():  # as where an expression divides by a sum of parameters that is zero
                 raise Untraceable("a number of them is not finite for these parameters")
-            return made
+            return values
 
         return evaluate
 
     def _gathered(self, array: Any) -> Gathered:
-        """Numbers of an array as multiples of products of atoms, the places of these, and the products."""
-        known = self._arrays.get(id(array))
-        if known is None:
+        """Return the scales of an array's entries, the places of their products, and the products."""
+        entry = self._arrays.get(id(array))
+        if entry is None:
             powers = [each.powers if type(each) is Parameter else () for each in array.ravel()]
             products = {each: place for place, each in enumerate(dict.fromkeys(powers))}
             scales = np.array(
@@ -106,15 +108,15 @@ class TraceCache:
             )
             places = np.array([products[each] for each in powers], dtype=np.int64)
             gathered = scales.reshape(array.shape), places.reshape(array.shape), list(products)
-            known = self._arrays[id(array)] = array, gathered  # what is named by its id is held
-        return known[1]
+            entry = self._arrays[id(array)] = array, gathered
+        return entry[1]
 
     def remembered(self, what: Any, make: Callable[[], Any]) -> Any:
-        """What `make` makes of the callbacks, once."""
+        """Return what `make` returned at the first call for this key."""
         if what not in self._made:
             with self._tracing:
                 if what not in self._made:
-                    with uncollected():  # what is traced all stays, too
+                    with uncollected():  # all of it stays in memory
                         self._made[what] = make()
         return self._made[what]
 
@@ -122,35 +124,35 @@ class TraceCache:
 def derive_cached(
     system: ConstrainedSystem, what: Any, make: Callable[[TraceCache], Any], check: Callable[[Any], None]
 ) -> Any:
-    """What `make` makes of the callbacks of a family, for one of its systems: what its method `of` gives.
+    """Return what `make` derives from shared traces, for one system: the result of its method `of`.
 
-    Where it cannot be traced with formulas, or `check` refuses it (a callback may do with these what it does not with
-    numbers), the system gets a family of its own.
+    The system gets a trace of its own if callbacks cannot be traced with parameters that vary, or if `check` refuses
+    the result, as a callback may treat these otherwise than numbers.
 
     Raises
     ------
     Untraceable
-        If it cannot be made of the system, or is refused.
+        If it cannot be derived, or is refused.
     """
-    for family_for in (_alone,) if system.called_in_python else (trace_cache_of, _alone):
-        family = system.remembered(("family", family_for), partial(family_for, system))
-        made = system.remembered((what, family_for), partial(_made_for, system, family, what, make))
+    for find in (_own_cache,) if system.called_in_python else (trace_cache_of, _own_cache):
+        cache = system.remembered(("family", find), partial(find, system))
+        derived = system.remembered((what, find), partial(_derived_for, system, cache, what, make))
         try:
-            if isinstance(made, Untraceable):
-                raise made
-            check(made)
-            family.traced |= made.kinds
-            return made
+            if isinstance(derived, Untraceable):
+                raise derived
+            check(derived)
+            cache.traced |= derived.kinds
+            return derived
         except Untraceable as error:
             reason = error
     raise reason
 
 
-def _made_for(system: ConstrainedSystem, family: TraceCache, what: Any, make: Callable[[TraceCache], Any]) -> Any:
-    """What a system gets of a family, or why it cannot be had."""
+def _derived_for(system: ConstrainedSystem, cache: TraceCache, what: Any, make: Callable[[TraceCache], Any]) -> Any:
+    """Return what is derived for a system, or the reason why it cannot be."""
     try:
-        shared = family.remembered(what, partial(make, family))
-        return shared.of(system, system.remembered(("numbers", family), partial(family.evaluator, system.parameters)))
+        shared = cache.remembered(what, partial(make, cache))
+        return shared.of(system, system.remembered(("numbers", cache), partial(cache.evaluator, system.parameters)))
     except Untraceable as error:
         return error.with_traceback(None)
     except (ArithmeticError, RecursionError) as error:
@@ -158,38 +160,42 @@ def _made_for(system: ConstrainedSystem, family: TraceCache, what: Any, make: Ca
 
 
 def take_bounds(system: ConstrainedSystem) -> None:
-    """Let a system have what `check_bounds` has found in others of its family, whose callbacks do the same."""
+    """Take over what `check_bounds` found in systems that share the traces, whose callbacks do the same."""
     if not system.called_in_python:
-        family: TraceCache = system.remembered(("family", trace_cache_of), partial(trace_cache_of, system))
-        system.within_bounds |= family.within_bounds
+        system.within_bounds |= shared_cache(system).within_bounds
 
 
 def give_bounds(system: ConstrainedSystem) -> None:
-    """Let others of its family have what `check_bounds` has found in a system."""
+    """Share what `check_bounds` found in a system."""
     if not system.called_in_python:
-        family: TraceCache = system.remembered(("family", trace_cache_of), partial(trace_cache_of, system))
-        family.within_bounds |= family.traced & system.within_bounds
+        cache = shared_cache(system)
+        cache.within_bounds |= cache.traced & system.within_bounds
+
+
+def shared_cache(system: ConstrainedSystem) -> TraceCache:
+    """Return the traces that a system of compiled callbacks shares with others."""
+    return system.remembered(("family", trace_cache_of), partial(trace_cache_of, system))  # type: ignore[no-any-return]
 
 
 def trace_cache_of(system: ConstrainedSystem) -> TraceCache:
-    """The family of a system of compiled callbacks, which depend on their arguments alone."""
+    """Look up the traces that a system of compiled callbacks shares with others, which `run` puts into systems, too."""
     parameters = system.parameters
     classes = _classes(parameters)
     fixed = parameters[classes == 0] + 0.0  # without a sign of zero
     key = (*system.given.items(), system.n_q, system.n_c, system.n_a, classes.tobytes(), fixed.tobytes())
-    known: TraceCache | None = _FAMILIES.get(key)
-    if known is None:
-        _FAMILIES[key] = known = TraceCache(parameters, classes)
-    return known
+    cache: TraceCache | None = _CACHES.get(key)
+    if cache is None:
+        _CACHES[key] = cache = TraceCache(parameters, classes)
+    return cache
 
 
-def _alone(system: ConstrainedSystem) -> TraceCache:
-    """A family of a system with these parameters only, all of which are plain numbers."""
+def _own_cache(system: ConstrainedSystem) -> TraceCache:
+    """Return traces for the parameters of a system alone, all of which are plain numbers."""
     return TraceCache(system.parameters, np.zeros(system.parameters.size, dtype=np.int64))
 
 
 def _classes(parameters: Array) -> NDArray[np.int64]:
-    """Which number each parameter is, in the order in which they come, with its sign; 0 where it stays what it is."""
+    """Number the sizes of parameters in order of appearance, with the signs; 0 for those that keep their values."""
     size = np.abs(parameters)
     varies = (size > EXTREME) & (size < 1.0 / EXTREME) & (size != np.floor(size))
     _, first, which = np.unique(size[varies], return_index=True, return_inverse=True)
@@ -201,29 +207,29 @@ def _classes(parameters: Array) -> NDArray[np.int64]:
 
 
 class ParameterArrays:
-    """Arrays in the place of arrays of formulas, all of which `write` fills for some parameters.
+    """Arrays of numbers for arrays of expressions in parameters; `write` evaluates all of them at once.
 
-    One array stands for one of formulas, however often that is asked for; one that holds plain numbers stays itself.
+    The same array of expressions always gets the same array of numbers. An array of plain numbers stays itself.
     """
 
     def __init__(self) -> None:
-        self._arrays: dict[int, tuple[Any, Array]] = {}  # by the ids of those of formulas, which are held
+        self._arrays: dict[int, tuple[Any, Array]] = {}  # by the ids of the arrays, which are kept alive here
         self._places: list[tuple[Array, NDArray[np.int64], slice]] = []
         self._products: dict[Powers, int] = {}
         self._scales: list[float] = []
         self._which: list[int] = []
         self._gathered: tuple[list[Powers], Array, NDArray[np.int64]] | None = None
 
-    def array(self, formulas: Any) -> Array:
-        """What stands in the place of an array; its numbers are there after the next `write`."""
-        if formulas.dtype != object:
-            return formulas  # type: ignore[no-any-return]
-        if id(formulas) not in self._arrays:
-            self._arrays[id(formulas)] = formulas, self._made(formulas)
-        return self._arrays[id(formulas)][1]
+    def array(self, expressions: Any) -> Array:
+        """Return the numbers of an array of expressions, which the next `write` fills in."""
+        if expressions.dtype != object:
+            return expressions  # type: ignore[no-any-return]
+        if id(expressions) not in self._arrays:
+            self._arrays[id(expressions)] = expressions, self._numbers_for(expressions)
+        return self._arrays[id(expressions)][1]
 
-    def _made(self, formulas: Any) -> Array:
-        entries, begin = formulas.ravel().tolist(), len(self._scales)
+    def _numbers_for(self, expressions: Any) -> Array:
+        entries, begin = expressions.ravel().tolist(), len(self._scales)
         where = [k for k, entry in enumerate(entries) if type(entry) is Parameter]
         for k in where:
             self._scales.append(entries[k].scale)
@@ -232,10 +238,10 @@ class ParameterArrays:
         numbers = np.array(entries, dtype=np.float64)
         self._places.append((numbers, np.array(where, dtype=np.int64), slice(begin, len(self._scales))))
         self._gathered = list(self._products), np.array(self._scales), np.array(self._which, dtype=np.int64)
-        return numbers.reshape(formulas.shape)
+        return numbers.reshape(expressions.shape)
 
     def write(self, product: Callable[[Powers], Any]) -> None:
-        """Put in the numbers for parameters, of which `product` gives the products: see TraceCache."""
+        """Fill in the numbers for the parameters of `product`, see TraceCache.products."""
         if self._gathered is None:
             return
         products, scales, which = self._gathered

@@ -1,8 +1,8 @@
-"""What callbacks were traced to, compared in numbers with what they give when they are called.
+"""Compare traced callbacks in numbers with what they return when they are called.
 
-A callback that branches where nothing shows it, keeps something from call to call, or reads what changes beside its
-arguments (a global that numba froze when it compiled it) is not what it was traced to. At the start both are compared
-at states spread over the time of the run and about its start, later at states of the run itself.
+A trace is wrong if the callback branches undetected, keeps something from call to call, or reads what changes beside
+its arguments (a global that numba froze when it compiled it). At the start both are compared at states spread over the
+time of the run and about its start, later at states of the run itself.
 """
 
 import copy
@@ -16,100 +16,101 @@ from numpy.typing import NDArray
 
 from twoloop.checks.scales import sizes
 from twoloop.generate.graph import Graph, Untraceable
-from twoloop.generate.program import program_of
+from twoloop.generate.program import OperationTable
 from twoloop.generate.trace_cache import Evaluator
 from twoloop.kernels.compile.linking import direct
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-# those that are traced, in the order in which the kernel calls them
+# kinds of callbacks that are traced, in the order in which the kernel calls them
 KINDS = (
     *("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma"),
     *("nonholonomic", "nonholonomic_rate", "nonholonomic_gamma"),
 )
 AROUND = 8  # states about the start, beside it
-TIMES = np.linspace(0.0, 1.0, AROUND)  # of a run, over its length, at which these are
-AWAY = 0.3  # of the size of coordinates: how far these are from it
-EACH, MOST = 32, 64  # states of a part of a run, and of a run ...
-FEW = 9  # ... if callbacks are called in Python
-ENTRIES = 20_000  # of all callbacks at all states of a run, about: fewer states of large systems
-LOST = 16.0 * np.finfo(float).eps  # of the largest term of all entries: rounding of what operations cancel exactly
-CLEAR = 1e-6  # of the largest term: a smaller difference is no rounding of the callback's if it stays ...
-NEXT = 1e-7  # ... where the state changes by so little
+TIMES = np.linspace(0.0, 1.0, AROUND)  # their times, as shares of the run
+AWAY = 0.3  # their distance from the start, as a share of the size of coordinates
+EACH, MOST = 32, 64  # largest numbers of states of a part of a run, and of a run ...
+FEW = 9  # ... and of a run whose callbacks are called in Python
+ENTRIES = 20_000  # entries of callbacks compared in a run, about: large systems are compared at fewer states
+LOST = 16.0 * np.finfo(float).eps  # of the largest term of a kind: a smaller difference is rounding
+CLEAR = 1e-6  # of the largest term: a smaller difference counts only if it is the same at neighbouring states, ...
+NEXT = 1e-7  # ... which differ by this relative change
 NEIGHBOURS = 12
+MARGIN = 0.01  # margin of a CheckedRegion, as a share of its sides: states of a run lie farther apart
+AT_REST = 1e-9  # the same, as a share of its longest side without that of time: for coordinates at rest
 
 
 class Traced:
-    """The operations that callbacks were traced to, as a program for numbers.
+    """Traced callbacks as an operation table, to be compared with calls.
 
     Parameters
     ----------
     system : ConstrainedSystem
     graph : Graph
-        On whose first quantities, t, q and v, the callbacks ran.
+        The graph of the trace, whose first inputs are t, q and v.
     forms : mapping or None
-        By kind of callback, what it should give. None: what those that are given were traced to.
+        What callbacks must return, by their kinds. None: the traces of those that are given.
     """
 
     def __init__(self, system: ConstrainedSystem, graph: Graph, forms: Mapping[str, Any] | None = None):
         if forms is None:
-            forms = {kind: made for kind, made in graph.traced.items() if kind in system.given}
-        known = [kind for kind in KINDS if kind in forms and forms[kind].size]
-        self.places = [(kind, place) for kind in known for place in np.ndindex(forms[kind].shape)]
-        self.n_of = np.array([forms[kind].size for kind in known], dtype=np.int64)
-        self.which = np.array([kind in known for kind in KINDS], dtype=np.int64)
+            forms = {kind: results for kind, results in graph.traced.items() if kind in system.given}
+        kinds = [kind for kind in KINDS if kind in forms and forms[kind].size]
+        self.places = [(kind, place) for kind in kinds for place in np.ndindex(forms[kind].shape)]
+        self.n_of = np.array([forms[kind].size for kind in kinds], dtype=np.int64)
+        self.which = np.array([kind in kinds for kind in KINDS], dtype=np.int64)
         self.sizes = np.array([system.n_q, system.n_c, system.n_a], dtype=np.int64)
         self.name = system.name
-        self.kinds = frozenset(graph.traced)  # that ran on symbols
+        self.kinds = frozenset(graph.traced)  # kinds that were traced
         self.trusted = False
         entries = (forms[kind][place] for kind, place in self.places)
-        made = {k: form for k, form in enumerate(entries) if form.terms or form.constant}  # others stay zero
-        self.not_zero = frozenset(self.places[k][0] for k in made)  # kinds of callbacks that have such entries
-        self.program = program_of(graph, 1 + 2 * system.n_q, made)
+        results = {k: form for k, form in enumerate(entries) if form.terms or form.constant}  # others are zero
+        self.not_zero = frozenset(self.places[k][0] for k in results)  # kinds of callbacks that are not all zero
+        self.program = OperationTable.of(graph, 1 + 2 * system.n_q, results)
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Traced":
-        """The same of another system of the family."""
-        other = self.with_numbers(evaluate)
-        other.name = system.name
-        return other
+        """Return the traces of another system of the same cache."""
+        traced = self.with_numbers(evaluate)
+        traced.name = system.name
+        return traced
 
     def with_numbers(self, numbers_for: Callable[[Any], Array]) -> "Traced":
-        """The same with other arrays in the place of those of its numbers, which have to be compared first."""
-        other = copy.copy(self)
-        constants, coefficients = numbers_for(self.program.constants), numbers_for(self.program.coefficients)
-        other.program = self.program._replace(constants=constants, coefficients=coefficients)
-        other.trusted = False
-        return other
+        """Return the traces with other arrays of numbers, not yet trusted."""
+        traced = copy.copy(self)
+        traced.program = self.program.with_numbers(numbers_for)
+        traced.trusted = False
+        return traced
 
     def refuse(self, system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:
-        """Compare at states about the start, spread over the time of a run: see `refuse_wrong`."""
+        """Compare at states about the start of a run, see `refuse_wrong`."""
         refuse_wrong([self], system, t0, t1, q, v)
 
-    def looked_at(self, system: ConstrainedSystem, around: Array) -> None:
-        """The same at such states, the first of which is the start."""
+    def check_around(self, system: ConstrainedSystem, around: Array) -> None:
+        """Compare at states, of which the first is the start; raise Untraceable at a difference."""
         wrong = None
-        for states in (around, *around[:, None, :]):  # all at once, or one by one
+        for states in (around, *around[:, None, :]):  # all at once, or one by one if a call raises
             try:
                 wrong = wrong or self.wrong(system, states, everywhere=False)
-            except Exception:  # outside what the callbacks are made for
+            except Exception:  # outside the domain of the callbacks
                 continue
             if states is around:
                 break
         if wrong is not None:
             raise Untraceable(wrong)
-        self.trusted = not system.called_in_python  # whose compiled callbacks do not change any more
+        self.trusted = not system.called_in_python  # compiled callbacks never change
 
     def wrong(self, system: ConstrainedSystem, states: Array, everywhere: bool = True) -> str | None:
-        """Say which callback does not give at states [t, q, v] what it was traced to, or None.
+        """Describe the first difference between calls and traces at states [t, q, v]; None if there is none.
 
-        `everywhere`: whether what is not finite counts.
+        `everywhere`: values that are not finite must agree, too.
         """
         from twoloop.kernels.evaluation import traced as kernels
 
         most = FEW if system.called_in_python else MOST
         states = states[:: 1 + max(len(states) // most, len(states) * len(self.places) // ENTRIES)]
-        n_different, called, traced, bounds = self._both(system, states)
+        n_different, called, traced, bounds = self._evaluate(system, states)
         if n_different == 0:
             return None
         finite = np.isfinite(called)
@@ -128,7 +129,7 @@ class Traced:
                 return self._message(states[k], int(entry), called[k, entry], traced[k, entry])
         return None
 
-    def _both(self, system: ConstrainedSystem, states: Array) -> tuple[int, Array, Array, Array]:
+    def _evaluate(self, system: ConstrainedSystem, states: Array) -> tuple[int, Array, Array, Array]:
         from twoloop.kernels.evaluation import traced as kernels
 
         called, traced, bounds = np.zeros((3, len(states), len(self.places)))
@@ -146,9 +147,9 @@ class Traced:
         return n_different, called, traced, bounds
 
     def _stays(self, system: ConstrainedSystem, state: Array, entry: int) -> bool:
-        """Whether a difference is the same at neighbouring states, as rounding is not."""
+        """Return whether a difference is about the same at neighbouring states, unlike rounding."""
         parts = np.random.default_rng(5).uniform(-1.0, 1.0, (NEIGHBOURS, len(state)))
-        _, called, traced, _ = self._both(system, state * (1.0 + NEXT * parts))
+        _, called, traced, _ = self._evaluate(system, state * (1.0 + NEXT * parts))
         off = (called - traced)[:, entry]
         return bool(np.abs(off).min() > 0.5 * np.abs(off).max() and np.abs(off.sum()) == np.abs(off).sum())
 
@@ -164,14 +165,14 @@ class Traced:
 
 
 class Sample:
-    """Some states [t, q, v] of a run, rows, from its start to where it has come to."""
+    """Some states [t, q, v] of a run, from its start to its present time."""
 
     def __init__(self, t: float, state: Array, n: int) -> None:
         self._n, self._parts = n, list[Array]()
         self.add(state[:0], state[None, :][:0], t, state)
 
     def add(self, t: Array, rows: Array, end: float, state: Array) -> None:
-        """Take some states of a part of the run, rows that begin with [q, v] of n numbers, and that at its end."""
+        """Take states of a part of the run, whose rows begin with [q, v], and its last state."""
         stride = 1 + len(t) // EACH
         some = t[::stride]
         part = np.empty((len(some) + 1, 1 + self._n))
@@ -182,18 +183,18 @@ class Sample:
             self._parts = self._parts[::2]
 
     def end(self, t: float, state: Array) -> None:
-        """Leave out what is beyond a time, and take the state there."""
+        """Drop states beyond a time, and take the state there."""
         states = self.states()
         self._parts = [states[states[:, 0] <= t]]
         self.add(states[:0, 0], states[:0], t, state)
 
     def states(self) -> Array:
-        """All of them, the last first."""
+        """Return all states, the last first."""
         return np.concatenate(self._parts)
 
 
 def refuse_wrong(traced: Sequence[Traced], system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:
-    """Compare what is not trusted yet at states about the start, spread over the time of a run.
+    """Compare traces that are not trusted yet at states about the start, spread over the time of a run.
 
     Raises
     ------
@@ -207,18 +208,18 @@ def refuse_wrong(traced: Sequence[Traced], system: ConstrainedSystem, t0: float,
         warnings.simplefilter("ignore")
         around = states_around(t0, t1, q, v)
         for each in new:
-            each.looked_at(system, around)
+            each.check_around(system, around)
 
 
 Check = Callable[[Traced], None]
 
 
 def unchecked(traced: Traced) -> None:
-    """No check: of what is not to be run."""
+    """Accept traces whose results are not used in a run."""
 
 
 def states_around(t0: float, t1: float, q: Array, v: Array) -> Array:
-    """States [t, q, v], a start first, others about it at times of a run, at the speed of its size a second or more."""
+    """Return a start [t, q, v], and states about it at times of a run, whose speeds are at least a size a second."""
     size = sizes(q)
     speed = np.maximum(size, np.abs(v))
     n, parts = len(q), _parts(len(q))
@@ -232,5 +233,65 @@ def states_around(t0: float, t1: float, q: Array, v: Array) -> Array:
 
 @cache
 def _parts(n_q: int) -> Array:
-    """Between -1 and 1, (2, AROUND, n_q): always the same."""
+    """Return fixed numbers between -1 and 1, (2, AROUND, n_q)."""
     return np.random.default_rng(6).uniform(-1.0, 1.0, (2, AROUND, n_q))
+
+
+def farthest(t: Array, rows: Array) -> Array:
+    """Return the states [t, q, v] of a run at which a number is smallest or largest, from rows [q, v]."""
+    states = np.column_stack([t, rows])
+    return states[np.unique([states.argmin(axis=0), states.argmax(axis=0)])]
+
+
+class CheckedRegion:
+    """The region of [t, q, v], and of parameters, in which runs compared callbacks with their traces: two boxes.
+
+    Attributes
+    ----------
+    known : ndarray (2, 1 + 2 n_q) or (2, 0)
+        The least and the largest numbers of states that need no new comparison.
+    """
+
+    def __init__(self) -> None:
+        self._runs = 0
+        self._parameters: tuple[Array, Array] | None = None  # the least and the largest, of runs of many systems
+        self._box = np.zeros((2, 0))  # the least and the largest of each number
+        self.known = self._box
+
+    def is_due(self) -> bool:
+        """Return whether the next run must compare everywhere: the 1st, 2nd, 4th, 8th, ..."""
+        return (self._runs + 1) & self._runs == 0
+
+    def count(self) -> None:
+        """Count a run."""
+        self._runs += 1
+
+    def without_known(self, states: Array) -> Array:
+        """Return the states outside the region, with its margin."""
+        if not self._box.size:
+            return states
+        least, largest = self.known
+        new = (states < least) | (states > largest)
+        return states[new.any(axis=1)] if new.any() else states[:0]
+
+    def knows(self, parameters: Array) -> bool:
+        """Return whether parameters lie in the region, with its margin."""
+        if self._parameters is None:
+            return False
+        least, largest = self._parameters
+        beside = MARGIN * (largest - least)
+        return bool((least - beside <= parameters).all() and (parameters <= largest + beside).all())
+
+    def add_parameters(self, parameters: Array) -> None:
+        """Extend the region by the parameters of a run without differences."""
+        least, largest = self._parameters or (parameters, parameters)
+        self._parameters = np.minimum(least, parameters), np.maximum(largest, parameters)
+
+    def add(self, states: Array) -> None:
+        """Extend the region by states of a run without differences."""
+        if len(states) == 0:
+            return
+        checked = np.concatenate([states, self._box]) if self._box.size else states
+        least, largest = self._box = np.array([checked.min(axis=0), checked.max(axis=0)])
+        beside = MARGIN * (largest - least) + AT_REST * float((largest - least)[1:].max())
+        self.known = np.array([least - beside, largest + beside])

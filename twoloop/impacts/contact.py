@@ -10,7 +10,7 @@ import numpy as np
 from twoloop.checks.arguments import Array, shown
 from twoloop.generate.derived_callbacks import with_derived_callbacks
 from twoloop.generate.graph import Affine, Derivative, Graph, Untraceable, symbols
-from twoloop.generate.program import AGREES, BETWEEN, STATES, numbers_of, program_of
+from twoloop.generate.program import AGREES, BETWEEN, STATES, OperationTable
 from twoloop.generate.trace import as_forms, trace
 from twoloop.generate.traced_values import unchecked
 from twoloop.kernels.compile.linking import direct
@@ -60,8 +60,8 @@ class Gaps:
                     f"branches: {error}"
                 ) from None
             outputs += _with_derivatives(graph, gap, t, q, v)
-        program = program_of(graph, 1 + 2 * self._n_q, dict(enumerate(outputs)))
-        self._p = np.array(numbers_of(program))
+        program = OperationTable.of(graph, 1 + 2 * self._n_q, dict(enumerate(outputs)))
+        self._p = np.array(program.flat())
         self._last: tuple[Any, Gap] | None = None
         self._compare(stops, t0, q0)
 

@@ -20,9 +20,9 @@ from twoloop.checks.at_position import has_definite_mass
 from twoloop.checks.consistency import Look, check_start
 from twoloop.generate.choices import BOUNDS, LEAST, RANK, SINGULAR_MASS, Choice, Dependents
 from twoloop.generate.compile_equations import GeneratedCode
-from twoloop.generate.derived_callbacks import exact_near, farthest, with_derived_callbacks
+from twoloop.generate.derived_callbacks import exact_near, with_derived_callbacks
 from twoloop.generate.trace_cache import TraceCache, give_bounds, take_bounds, trace_cache_of
-from twoloop.generate.traced_values import Sample, Traced, states_around
+from twoloop.generate.traced_values import Sample, Traced, farthest, states_around
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.control.clock import N_STEP_COLUMNS
 from twoloop.kernels.data import flags, noted

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from twoloop.checks.derivatives import wrong_derivative
 from twoloop.checks.structure import unlike_itself
-from twoloop.generate.derived_callbacks import CheckedRegion, exact_derivatives, generic_states
-from twoloop.generate.traced_values import CLEAR, FEW, Sample
+from twoloop.generate.derived_callbacks import exact_derivatives, generic_states
+from twoloop.generate.traced_values import CLEAR, FEW, CheckedRegion, Sample
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.record import Status
 

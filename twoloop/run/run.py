@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from twoloop.checks.at_position import dependent_rows, least_inertia, mass_and_rows, pattern_of
 from twoloop.checks.rank import SHOWN, equations_in_words, in_words
 from twoloop.checks.sparse_rows import Rows, SparseRows, norms
-from twoloop.generate.derived_callbacks import CheckedRegion
 from twoloop.generate.time_dependence import Sudden, may_be_narrow, may_be_sudden
+from twoloop.generate.traced_values import CheckedRegion
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import codes, counters, flags, noted, tolerances
 from twoloop.kernels.data.kit import Kit

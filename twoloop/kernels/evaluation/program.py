@@ -1,6 +1,8 @@
-"""C_q and Gamma by what callbacks were traced to, where they are not given: see generate/derived.py.
+"""Interpret traced programs: the walk over an operation table in numbers.
 
-An exact derivative may overflow where the callback does not, as that of tanh does for large numbers.
+Programs compute C_q and Gamma where no callback gives them (generate/derived_callbacks.py), and forces, motions and
+rows of models that are functions (bodies/program_results.py). An exact derivative may overflow where the callback does
+not, as that of tanh does for large numbers.
 """
 
 import math
@@ -11,7 +13,7 @@ from twoloop.kernels.evaluation import operations as op
 
 @exact
 def operation(kind, x, y):
-    """The result of an operation; y is the second factor of a product."""
+    """Return the result of an operation; y is the second factor of a product."""
     if kind == op.PRODUCT:
         z = x * y
     elif kind == op.RECIPROCAL:
@@ -34,42 +36,51 @@ def operation(kind, x, y):
 
 
 @exact
-def _sum(program, numbers, nodes, terms, coefficients, constant, begin, end):
-    """A form: a constant and multiples of nodes."""
-    total = constant
+def affine(nodes, table, columns, numbers, coefficients, constant, begin, end):
+    """Return a constant plus the multiples of nodes that are terms begin to end."""
+    total = numbers[constant]
     for k in range(begin, end):
-        total += numbers[coefficients + k] * nodes[program[terms + k]]
+        total = total + numbers[coefficients + k] * nodes[int(table[columns + k])]
     return total
 
 
 @exact
-def _run(program, numbers, nodes, t, q, v):
-    """Make all nodes from t, q and v."""
-    n, n_rows = q.size, program[op.N_ROWS]
-    terms, coefficients = op.HEAD + op.N_COLUMNS * n_rows, 2 * n_rows
-    nodes[0] = t
-    for j in range(n):
-        nodes[1 + j] = q[j]
-        nodes[1 + n + j] = v[j]
+def run_table(table, rows, n_rows, columns, numbers, coefficients, constants, nodes, inputs, t, q, v):
+    """Compute all nodes from t, q and v, which become the nodes from `inputs` on.
+
+    The table may hold integers, or whole floats among the parameters of a model. `rows` and `columns` are places in it,
+    `coefficients` and `constants` places in `numbers`.
+    """
+    nodes[inputs] = t
+    for j in range(q.size):
+        nodes[inputs + 1 + j] = q[j]
+        nodes[inputs + 1 + q.size + j] = v[j]
     for i in range(n_rows):
-        row = op.HEAD + op.N_COLUMNS * i
-        begin, middle, end = program[row + op.FIRST], program[row + op.SECOND], program[row + op.END]
-        kind, made = program[row + op.KIND], program[row + op.MADE]
-        x = _sum(program, numbers, nodes, terms, coefficients, numbers[2 * i], begin, middle)
-        y = _sum(program, numbers, nodes, terms, coefficients, numbers[2 * i + 1], middle, end)
-        nodes[made] = operation(kind, x, y)
+        row = rows + op.N_COLUMNS * i
+        begin, middle, end = int(table[row + op.FIRST]), int(table[row + op.SECOND]), int(table[row + op.END])
+        x = affine(nodes, table, columns, numbers, coefficients, constants + 2 * i, begin, middle)
+        y = affine(nodes, table, columns, numbers, coefficients, constants + 2 * i + 1, middle, end)
+        nodes[int(table[row + op.NODE])] = operation(int(table[row + op.KIND]), x, y)
+
+
+@exact
+def _run(program, numbers, nodes, t, q, v):
+    """Compute all nodes of a program of a system."""
+    n_rows = program[op.N_ROWS]
+    columns = op.HEAD + op.N_COLUMNS * n_rows
+    run_table(program, op.HEAD, n_rows, columns, numbers, 2 * n_rows, 0, nodes, 0, t, q, v)
 
 
 @exact
 def _results(program):
-    """How many results there are, at which node they begin, and where it stands to what they belong."""
+    """Return the number of results, their first node, and where their entries stand."""
     n = program[op.N_RESULTS]
     return n, program[op.N_NODES] - n, op.HEAD + op.N_COLUMNS * program[op.N_ROWS] + program[op.N_TERMS]
 
 
 @compiled
 def gamma_by_program(f, w, t, q, v):
-    """Rows of Gamma that no callback gives, into w.Gamma; whether there is a program and all are finite."""
+    """Compute rows of Gamma that no callback gives; return whether there is a program and all are finite."""
     program = f.gamma_program
     if program.size == 0:
         return False
@@ -84,7 +95,7 @@ def gamma_by_program(f, w, t, q, v):
 
 @compiled
 def jacobian_by_program(f, w, t, q, G):
-    """C_q at (t, q) into the first rows of G, full of zeros; whether there is a program and all is finite."""
+    """Compute C_q into the first rows of G, which are zero; return whether there is a program and all is finite."""
     program = f.jacobian_program
     if program.size == 0:
         return False

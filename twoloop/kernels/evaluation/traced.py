@@ -58,11 +58,11 @@ def _traced(program, columns, coefficients, constants, nodes, values, bounds):
         first, second, end = program[i, op.FIRST], program[i, op.SECOND], program[i, op.END]
         x, dx = _sum(columns, coefficients, constants[i, 0], nodes, first, second)
         if program[i, op.KIND] == op.RESULT:
-            values[program[i, op.MADE]], bounds[program[i, op.MADE]] = x, dx
+            values[program[i, op.NODE]], bounds[program[i, op.NODE]] = x, dx
         else:
             y, dy = _sum(columns, coefficients, constants[i, 1], nodes, second, end)
             z, dz = _operation(program[i, op.KIND], x, dx, y, dy)
-            nodes[VALUE, program[i, op.MADE]], nodes[BOUND, program[i, op.MADE]] = z, dz
+            nodes[VALUE, program[i, op.NODE]], nodes[BOUND, program[i, op.NODE]] = z, dz
 
 
 @exact
