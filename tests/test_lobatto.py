@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from twoloop import ConstrainedSystem, solve_dae
+from twoloop import ConstrainedSystem, ConstraintWarning, solve_dae
+from twoloop.bodies import PlanarModel
 from twoloop.generate import lobatto_tables
 from twoloop.mechanisms import four_bar, spatial_four_bar
 
@@ -144,6 +145,36 @@ def test_states_in_a_row_are_on_the_constraints(make):
     for t, q, v in zip(result.t, result.q.T, result.v.T, strict=True):
         assert np.abs(problem.system.constraint(t, q)).max() < 1e-12
         assert np.abs(problem.system.jacobian(t, q) @ v).max() < 1e-11 * (1.0 + np.abs(v).max())
+
+
+def two_rods(angle):
+    """A slider-crank with two rods between the same pins: either row of the second one's end is redundant."""
+    pin = np.array([0.5 * np.cos(angle), 0.5 * np.sin(angle)])
+    end = np.array([pin[0] + np.sqrt(1.2**2 - pin[1] ** 2), 0.0])
+    model = PlanarModel(name="slider-crank, two rods")
+    model.rod("crank", (0.0, 0.0), pin, mass=1.0, angular_velocity=8.0)
+    model.body("slider", mass=0.8, inertia=0.02, position=end)
+    model.revolute("ground", "crank", at=(0.0, 0.0))
+    for name in ("rod", "second rod"):
+        model.rod(name, pin, end, mass=1.0)
+        model.revolute("crank", name, at=pin)
+        model.revolute(name, "slider", at=end)
+    model.prismatic("ground", "slider", at=end, axis=(1.0, 0.0))
+    return model.problem((0.0, 5.0))
+
+
+@pytest.mark.parametrize("angle", [0.2, 0.5, 2.0, 4.0])
+def test_the_rows_that_count_stay_independent_at_dead_centres(angle):
+    """With the row along the rods, these would depend on one another where the crank and the rods are in line."""
+    problem = two_rods(angle)
+    run = problem.system, problem.t_span, problem.q0, problem.v0
+    with pytest.warns(ConstraintWarning, match="have rank 11 of 12"):
+        exact = solve_dae(*run, method="DOP853", rtol=1e-11, atol=1e-11)
+    for tolerance in (1e-4, 1e-7, 1e-10):
+        with pytest.warns(ConstraintWarning, match="have rank 11 of 12"):
+            result = solve_dae(*run, rtol=tolerance, atol=tolerance)
+        assert result.success and result.stats.n_rejected_convergence == 0
+        assert np.abs(result.q[:, -1] - exact.q[:, -1]).max() < 100.0 * tolerance
 
 
 def test_without_code_it_says_so():

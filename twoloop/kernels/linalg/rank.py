@@ -175,6 +175,10 @@ TINY = 1e-300
 # smallest over largest eigenvalue of M, from which on pivots that keep one of the bounds, 1e-5 at least, say that all
 # rows count and none has to help M: what is left of a row is 1e-6 of it then, where 1e-9 would do
 LIKE = 1e-7
+# largest share that a row which counts has in a redundant one, both scaled to length 1: above it the two change places.
+# Where the share passes zero on the way, the rows that count depend on one another, as at each dead centre of the
+# slider-crank with two rods; so it is to be far from zero. Above 1, as rows often have equal shares
+EXCHANGED = 1.5
 
 
 def room_size(n_rows: int, n: int) -> int:
@@ -288,6 +292,46 @@ def _add_rows(mass, G, weak, scale, A, x, order, added):
     return n_added
 
 
+@compiled
+def _exchange_rows(G, n_kept, basis, factors, kept, order, shares, others):
+    """Exchange rows that count for redundant ones in which they have large shares, so that they stay independent.
+
+    An exchange multiplies the volume that the rows which count span by the share. `basis`, `factors` and `kept` are as
+    `first_rows` left them; `order` and `shares` (n_rows each) and `others` (n, n) are scratch.
+    """
+    for _ in range(2 * (len(G) - n_kept)):
+        largest, leaves, enters, place = EXCHANGED, -1, -1, 0
+        for i in range(len(G)):
+            if place < n_kept and kept[place] == i:
+                place += 1
+                continue
+            _find_shares(n_kept, basis, factors, G[i], shares)
+            length = 0.0
+            for j in range(G.shape[1]):
+                length += G[i, j] * G[i, j]
+            for k in range(n_kept):
+                square = 0.0
+                for j in range(G.shape[1]):
+                    square += G[kept[k], j] * G[kept[k], j]
+                share = abs(shares[k]) * math.sqrt(square / max(length, TINY))
+                if share > largest:
+                    largest, leaves, enters = share, k, i
+        if leaves < 0:
+            return
+        k = leaves  # the others move up, or down, so that they stay sorted
+        while k + 1 < n_kept and kept[k + 1] < enters:
+            kept[k] = kept[k + 1]
+            k += 1
+        while k > 0 and kept[k - 1] > enters:
+            kept[k] = kept[k - 1]
+            k -= 1
+        kept[k] = enters
+        for i in range(n_kept):
+            for j in range(G.shape[1]):
+                others[i, j] = G[kept[i], j]
+        first_rows(others[:n_kept], 0.0, basis, factors, order)
+
+
 @merged
 def _first_bound_kept(mass, G, kept, n_rows, bounds, factors, solved_room, S_room, sizes):
     """Place of the first bound that no pivot is below, each over what it is without the other rows; how many, if none.
@@ -330,9 +374,10 @@ def _first_bound_kept(mass, G, kept, n_rows, bounds, factors, solved_room, S_roo
 def choose(given, G, least, weak, bounds, room, chosen):
     """What a Choice (generate/choices.py) says of M and G, and the place of the first of these bounds that is kept.
 
-    Rows of G count as `independent_rows` has it for `least`; others help M where eigenvalues of it are below the share
-    `weak` of the largest, 0 where that is known not to be. `chosen`, of 2 + 3 n_rows numbers, begins with how many
-    count and how many help, then has these, and those, each in n_rows places; `room` begins with their factor.
+    Rows of G count as `independent_rows` has it for `least`, but for exchanges. Others help M where eigenvalues of it
+    are below the share `weak` of the largest, 0 where that is known not to be. `chosen`, of 2 + 3 n_rows numbers,
+    begins with how many count and how many help, then has these, and those, each in n_rows places; `room` begins with
+    their factor.
     """
     n_rows, n = G.shape
     most = min(n_rows, n) + 1
@@ -352,6 +397,8 @@ def choose(given, G, least, weak, bounds, room, chosen):
             chosen[0], chosen[1], room[0] = n_rows, 0, 1.0
             return place
     n_kept = first_rows(G, least, basis, factors, kept)
+    if n_kept < n_rows:
+        _exchange_rows(G, n_kept, basis, factors, kept, order, sizes, A)
     copy_matrix(given, mass)
     n_added, scale = 0, 1.0
     if n_kept > 0 and weak > 0.0 and _count_weak(mass, weak, A) > 0:
