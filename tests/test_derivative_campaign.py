@@ -15,8 +15,8 @@ from twoloop.checks.derivatives import check_derivatives, wrong_derivative
 from twoloop.mechanisms import four_bar, moderately_stiff_beam, very_flexible_beam
 
 CHANGES = {"sign": lambda x: -x, "1e-6": lambda x: 1.000001 * x, "1e-3": lambda x: 1.001 * x}
-CHANGES |= {"twice": lambda x: 2.0 * x, "dropped": lambda x: 0.0}
-FEW, MORE = ("1e-6", "dropped"), ("sign", "1e-6", "twice", "dropped")
+CHANGES |= {"dropped": lambda x: 0.0}
+FEW, MORE = ("1e-6", "dropped"), ("sign", "1e-6", "dropped")
 # entries that are not zero: of the linkage's C_q, which has many, one in each kind of place
 ENTRIES = {
     slider_crank: {"jacobian": [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1)], "gamma": [0, 1]},
@@ -231,7 +231,7 @@ def without_jacobian(problem):
     )
 
 
-@pytest.mark.parametrize("problem", [four_bar(), very_flexible_beam()], ids=lambda problem: problem.name)
+@pytest.mark.parametrize("problem", quick([very_flexible_beam(), four_bar()]), ids=lambda problem: problem.name)
 def test_it_agrees_with_the_formula(problem):
     system = without_jacobian(problem)
     for q in problem.q0 + np.random.default_rng(0).normal(size=(10, problem.q0.size)):

@@ -99,7 +99,7 @@ def off(name, **options):
 @pytest.mark.parametrize("compiled", quick([False, True]))
 @pytest.mark.parametrize("name", FORCES)
 def test_a_series_sees_what_it_cannot_foresee(name, compiled):
-    for tolerance in (1e-5, 1e-8, 1e-11):
+    for tolerance in (1e-5, 1e-11):
         result, error = off(name, method="Taylor", compiled=compiled, rtol=tolerance, atol=tolerance)
         assert error < MISSED * max(tolerance, 1e-12) and 0.0 <= result.defect < 10.0
         assert result.widest_gap <= 0.01 * T_END * (1.0 + 1e-9)
@@ -114,7 +114,7 @@ def test_no_method_passes_over_a_hundredth_of_the_run(name, method):
 
 
 @pytest.mark.parametrize("name", ["brake", "switching"])
-@pytest.mark.parametrize(("method", "tolerances"), [("TRBDF2", (1e-4, 1e-7)), ("ESDIRK4", (1e-6, 1e-8))])
+@pytest.mark.parametrize(("method", "tolerances"), quick([("TRBDF2", (1e-4, 1e-7)), ("ESDIRK4", (1e-6, 1e-8))]))
 def test_few_digits_and_many_are_what_was_asked_for(name, method, tolerances):
     for tolerance in tolerances:
         _, error = off(name, method=method, rtol=tolerance, atol=tolerance, max_step=0.01 * T_END)
@@ -131,7 +131,7 @@ SLOWLY += [(lambda t, q, v: -0.1 * np.sin(q) * np.cos(t), True), (lambda t, q, v
 SLOWLY += [(lambda t, q, v: -0.1 * np.sin((q + v) * (q - 8.0 * v)), True)]
 
 
-@pytest.mark.parametrize(("force", "short"), quick(SLOWLY, 3))
+@pytest.mark.parametrize(("force", "short"), quick(SLOWLY, 2))
 def test_steps_are_longer_than_a_hundredth_where_forces_change_slowly(force, short):
     """4/15 of a step is the longest part without a stage: the equations are still evaluated in each hundredth."""
     system = unconstrained(force, compile=True)
@@ -217,7 +217,7 @@ def test_a_jump_of_the_force_is_passed_within_the_tolerance(method, limit):
 def test_a_short_step_of_adams_does_not_hide_a_jump():
     """Of a step much shorter than those before it the order's formula says an error of 1/1000 of that of the jump."""
     system = unconstrained(lambda t, q, v, p: np.array([(p[1] if t > p[0] else 0.0) - W * W * q[0]]), parameters=[0, 0])
-    for at, push in np.random.default_rng(3).uniform((0.1, -1.0), (0.9, 2.0), (40, 2)):
+    for at, push in np.random.default_rng(3).uniform((0.1, -1.0), (0.9, 2.0), (12, 2)):
         result = solve_dae(system.with_parameters([at, 10.0**push]), (0.0, END), [1.0], [0.0], "Adams", TOL, TOL)
         v = -W * np.sin(W * END) + 10.0**push / W * np.sin(W * (END - at))
         assert abs(result.v[0, -1] - v) < 10.0 * TOL * (1.0 + abs(v))
@@ -303,16 +303,16 @@ def test_nor_is_a_force_that_is_switched_on_for_that_time(method):
 @pytest.mark.parametrize("compile", [True, False])
 def test_nor_is_what_acts_at_a_place_that_is_passed_in_that_time(compile, p=(0.3, 3e-3)):
     expected = reference(magnet, FAST, p, 5e-4)
-    for method in ("auto", "DOP853", "RadauIIA9", "Adams", "BDF"):
+    for method in ("auto", "DOP853", "RadauIIA9", "Adams", "BDF") if compile else ("auto",):
         assert np.abs(end_of(magnet, p, FAST, compile, method=method, **LOOSE) - expected).max() < 1e-4
 
 
 @pytest.mark.parametrize("options", quick([{}, {"compiled": False}, {"method": "Taylor"}, {"method": "DOP853"}], 2))
 def test_nor_is_a_smooth_force_at_such_a_place(options):
     """It is passed at 3/s, a width in a two-thousandth of the run or more."""
-    for p in ((0.1, 5e-3), (-0.2, 1e-2)):
-        expected = reference(smooth_magnet, FAST, p, 1e-3)
-        assert np.abs(end_of(smooth_magnet, p, FAST, **TIGHT, **options) - expected).max() < 1e-5
+    p = 0.1, 5e-3
+    expected = reference(smooth_magnet, FAST, p, 1e-3)
+    assert np.abs(end_of(smooth_magnet, p, FAST, **TIGHT, **options) - expected).max() < 1e-5
 
 
 @pytest.mark.parametrize("method", quick(["Adams", "BDF", "SunRadau5"]))
@@ -354,6 +354,7 @@ def test_nor_are_gusts_in_lanes():
         assert np.abs(q - at_a_time(short_gust, at)).max() < 1e-5
 
 
+@pytest.mark.slow
 def test_nor_are_pulses_of_a_high_power_of_a_cosine():
     """Between these the force and its series are zero to rounding; each acts for a hundredth of the run."""
     widths = np.linspace(0.04, 0.09, 5).tolist()

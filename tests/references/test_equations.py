@@ -58,6 +58,7 @@ def test_full_mass_that_varies_and_baumgarte_terms_off_the_constraints():
             assert worst(system.jacobian(t, q) @ a[:, k], right) < 1e-12
 
 
+@pytest.mark.slow  # its two systems are compiled for seconds
 def test_gamma_is_the_callback_or_differences():
     given, differenced = moving_pivot(), moving_pivot(gamma=False)
     times = np.array([0.2, 1.9])
