@@ -49,7 +49,7 @@ def test_drift_and_its_cures():
     assert velocity["baumgarte"] < 1e-4 and position["projection"] < 1e-14 and velocity["projection"] < 1e-13
 
 
-@pytest.mark.parametrize("stabilisation", slow_but(STABILISATIONS[:2], STABILISATIONS))
+@pytest.mark.parametrize("stabilisation", slow_but(("none", "baumgarte"), STABILISATIONS))
 def test_accelerations_and_multipliers_are_those_of_the_equations_solved(stabilisation):
     system = LINKAGES["default"].system
     result = run("default", 2.0, rtol=1e-5, atol=1e-5, stabilisation=stabilisation)
