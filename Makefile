@@ -99,10 +99,11 @@ SHARED := -n 2 --dist loadfile --no-loadscope-reorder
 
 # what tests compile when they are imported is compiled before: both workers would do that
 test: CALLBACKS_OF_TESTS := import tests.compiled, tests.problems, tests.test_bounds, tests.test_callbacks, \
-	tests.test_repeated_calls, tests.test_other_parameters, tests.test_certificate, tests.references.test_solver_setups
+	tests.test_repeated_calls, tests.test_certificate, tests.references.test_solver_setups
 test: CALLBACKS_OF_MORE_TESTS := import tests.studies.test_honesty, tests.test_differential, \
 	tests.test_derivative_campaign, tests.references.test_equations, tests.references.test_ida, \
-	tests.general.test_consistent_states, tests.general.test_lane_methods, tests.kernels.test_switching, tests.test_traced_values
+	tests.general.test_consistent_states, tests.general.test_lane_methods, tests.kernels.test_switching, tests.test_traced_values, \
+	tests.test_other_parameters
 test: compile ## the tests that a change needs, on two cores
 	$(RUN) -m pytest $(SHARED) $(ARGS)
 

@@ -9,7 +9,15 @@ from tests.mechanisms.make_references import solution
 METHODS = ("DOP853", "Gauss12", "Adams")
 DIGITS = {"Adams": 1e-8}  # its errors are up to a hundred times the tolerance
 # by default one method runs each mechanism, in turn; motions in space take seconds each
-LONG = ("spatial slider-crank", "spatial four-bar", "A05 governor", "A04 Bricard", "closed chain of 5")
+LONG = (
+    "spatial slider-crank",
+    "spatial four-bar",
+    "A05 governor",
+    "A04 Bricard",
+    "closed chain of 4",
+    "closed chain of 5",
+    "SUNDIALS slider-crank",
+)
 CASES = [
     pytest.param(name, method, marks=[pytest.mark.slow] * (k % 3 != i or name in LONG))
     for k, name in enumerate(REGULAR)

@@ -77,6 +77,7 @@ def test_a_rotor_on_a_torsion_spring_loses_as_much_in_every_half_turn(spatial):
     assert abs(left) <= f / k and np.abs(result.v[:, -1]).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_a_block_on_a_belt_sticks_and_slips():
     m, k, speed, kinetic, static = 1.5, 40.0, 0.3, 4.0, 6.0
     model = PlanarModel()
@@ -134,6 +135,7 @@ def test_wheels_that_mesh_come_to_rest():
     assert not result.v[:, -1].any()
 
 
+@pytest.mark.slow
 def test_a_short_push_releases_a_joint_that_sticks():
     """For a two-hundredth of the run friction is exceeded, by little, while nothing else moves."""
     model = PlanarModel((0.0, 0.0))

@@ -73,6 +73,7 @@ def test_error_of_the_stiff_beam_goes_with_the_tolerance(beam):
     assert evaluations[1] < 8000  # an explicit method needs 70,000
 
 
+@pytest.mark.slow
 def test_damping_without_a_derivative_by_position():
     """v' = -k v with k = 1e6, beside a free coordinate: J_v is all there is."""
     system = unconstrained(lambda t, q, v: np.array([-1e6 * (v[0] - np.cos(t)), -q[1]]), 2, compile=True)

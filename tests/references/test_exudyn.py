@@ -142,6 +142,7 @@ def distance(one, other):
     return np.abs(one - other).max()
 
 
+@pytest.mark.slow
 def test_cable_converges_in_mesh_and_in_time():
     fine = theirs("cable", 16)
     assert distance(theirs("cable", 4), fine) < 1.5e-3 and distance(theirs("cable", 8), fine) < 8e-5

@@ -60,6 +60,7 @@ def test_accelerations_and_multipliers_are_those_of_the_equations_solved(stabili
         assert worst(system.jacobian(t, q) @ a, system.gamma(t, q, v) - feedback) < 1e-11
 
 
+@pytest.mark.slow
 def test_failure_of_a_projection_comes_back_as_a_row():
     def constraint(t, q):
         return np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0) + (5.0 if t > 0.5 else 0.0)])

@@ -198,7 +198,7 @@ def test_implicit_solvers_get_the_analytic_jacobian(monkeypatch):
         assert np.abs(exact[name].q[:, -1] - differenced[name].q[:, -1]).max() < 1e-4
 
 
-@pytest.mark.slow  # compiles three Jacobians
+@pytest.mark.slow  # compiles right-hand sides and their Jacobian for seconds
 def test_a_jacobian_is_given_only_where_it_is_that_of_the_equations():
     system, q, v = PENDULUM.system, PENDULUM.q0, PENDULUM.v0
     y = np.concatenate([q, v])

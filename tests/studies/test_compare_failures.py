@@ -8,7 +8,6 @@ from studies import compare
 from studies.bench import metrics, reference_motion
 from studies.bench.collector import Case, Run, called_from
 from studies.bench.solvers import CATALOGUE
-from tests.marks import slow
 
 MECHANISMS = """
 import dataclasses
@@ -119,6 +118,7 @@ def test_a_run_that_cannot_be_measured_is_a_row(mechanisms, monkeypatch):
     assert found["DOP853 (twoloop)"][1] == "REACHED_END, but it cannot be measured: LinAlgError: Singular matrix"
 
 
+@pytest.mark.slow  # the accelerations of its mechanisms are compiled
 @pytest.mark.parametrize(
     ("call", "kept"),
     [
@@ -126,7 +126,7 @@ def test_a_run_that_cannot_be_measured_is_a_row(mechanisms, monkeypatch):
         ("swinging(0.1)", False),
         ("swinging(1e-6)", False),
         ("still()", False),
-        slow("top()", True),
+        ("top()", True),
     ],
 )
 def test_whether_the_energy_is_an_invariant_is_found(mechanisms, call, kept):

@@ -55,6 +55,11 @@ def rows(loaded):
     return energy.judged(loaded)
 
 
+@pytest.fixture(scope="module")
+def found(loaded):
+    return energy.findings_of(loaded)
+
+
 @pytest.fixture
 def quick(out):
     return energy.judged(Output(Call("energy", True, out, False, "")).load_rows(curves=True)[0])
@@ -123,8 +128,8 @@ TURNING = {  # finding: rows, and their slope; the finding is there before that 
 
 
 @pytest.mark.parametrize(("finding", "where", "slope"), TURNING.values(), ids=TURNING)
-def test_findings_turn_with_the_rows(finding, where, slope, rows):
-    assert finding(energy.findings_of(rows))
+def test_findings_turn_with_the_rows(finding, where, slope, rows, found):
+    assert finding(found)
     assert not finding(energy.findings_of(changed(rows, where, slope_error=0.0, slope=slope)))
 
 
@@ -154,6 +159,7 @@ def test_freedom_from_drift_pays_where_it_is_cheaper(rows):
     assert found["ratios"] is None and all(at["no_drift"]["own"] is None for at in found["at"])
 
 
+@pytest.mark.slow
 def test_times_of_energy_are_ranked_by_the_rule_of_the_other_comparisons(rows):
     """Five repetitions, beyond 5 %, also against runs whose error is a little too large; a single run ranks nothing."""
     here = rows["case"] == SWITCHING

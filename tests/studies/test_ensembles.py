@@ -39,6 +39,7 @@ def test_every_way_ends_where_each_linkage_does(name, few, monkeypatch):
         np.testing.assert_allclose(solve(1e-9), few.true, rtol=0.0, atol=1e-6 if name != CVODE else 1e-4)
 
 
+@pytest.mark.slow
 def test_other_mechanisms_are_refused(few):
     for make, package in ((by_heyoka, "heyoka"), (by_diffrax, "diffrax")):
         pytest.importorskip(package)
@@ -120,6 +121,7 @@ def test_a_package_that_is_not_there_is_a_row(monkeypatch, few):
     assert row["way"] == HEYOKA and "not installed" in row["message"]
 
 
+@pytest.mark.slow
 def test_rows_have_their_processor(monkeypatch, tmp_path):
     made = rows(**{ENSEMBLE: 0.01, HEYOKA: 0.05}).to_dict("records")
     monkeypatch.setattr(ensembles, "rows_of", lambda of, names, quick: made[:-2])

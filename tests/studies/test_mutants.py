@@ -46,6 +46,7 @@ def test_a_mutant_is_one_change_of_one_line():
         assert len(differ) == 1 and ast.dump(ast.parse(made)) != ast.dump(ast.parse(SOURCE))
 
 
+@pytest.mark.slow
 def test_the_sample_is_the_same_every_time_and_of_all_kernels():
     chosen = mutants.sample(False)
     assert chosen == mutants.sample(False)

@@ -45,6 +45,7 @@ def test_a_wrong_trace_is_refused_or_ends_the_run(name):
     assert planted_errors.row_of(FAULTS[name])["caught_by"] == expected
 
 
+@pytest.mark.slow
 def test_a_sound_run_is_not_caught():
     fault = Fault(
         "nothing", "trace", problem=replace(mechanisms.pendulum(), system=pendulum_in_python()), solver=TRACING

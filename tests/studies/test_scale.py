@@ -100,6 +100,7 @@ def test_assemblies_start_on_their_constraints(build):
     assert np.linalg.matrix_rank(made.system.jacobian(0.0, made.q), 1e-8) == made.system.n_c - redundant
 
 
+@pytest.mark.slow
 def test_exudyns_bodies_move_as_those_of_twoloop():
     pytest.importorskip("exudyn")
     from references.exudyn.mechanisms import solve_pinned

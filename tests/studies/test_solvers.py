@@ -87,6 +87,7 @@ def test_names_and_flags_agree():
     assert CATALOGUE["SunRadau5"].family == "two-loop" and CATALOGUE["IDA, index1"].own_accelerations
 
 
+@pytest.mark.slow
 def test_long_runs_of_fixed_steps_are_thinned_and_end_at_the_end():
     result = CATALOGUE[gear(2)].run(Case("four-bar", four_bar(), 0.7), 5e-5, 0)
     assert result.stats.n_accepted == 14000 and result.t.size == 7001 and result.t[-1] == 0.7

@@ -157,6 +157,7 @@ class Kept(dict):
     add, made = dict.__setitem__, KeptRows.made
 
 
+@pytest.mark.slow
 def test_repetitions_are_interleaved_and_what_is_refused_is_asked_once():
     todo = [run for run in mechanisms.runs(True) if run.solver.name in ("DOP853 (twoloop)", "CVODE from C, Adams")]
     pytest.importorskip("sksundae")

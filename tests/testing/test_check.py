@@ -250,6 +250,7 @@ def test_redundant_rows_are_named_where_a_run_ends():
     assert check_simulator(simulate, "four_bar").failures[0].hint == ""
 
 
+@pytest.mark.slow
 def test_a_coarse_step_may_say_no_and_the_finest_may_not():
     example = module_of(RK).simulate
 

@@ -25,6 +25,7 @@ def near(a, b, digits=12.0):
 CHECKS = "twoloop.checks twoloop.checks.arguments"  # of wrong calls, which need numpy alone
 
 
+@pytest.mark.slow
 def test_an_import_is_of_numpy_only():
     told = run_python(
         """
