@@ -81,7 +81,7 @@ compile: install ## compile the kernels, and the callbacks of bodies, mechanisms
 	@$(RUN) -c "from twoloop.kernels.steps import diagonal_step, newton_step; \
 	from twoloop.kernels.evaluation import sparse_inner_loop; from twoloop.bodies.spatial import callbacks, programs; \
 	from studies.bench import sharp_callbacks; $(CALLBACKS_OF_TESTS)" & \
-	$(RUN) -c "from twoloop.kernels import advance, interpolation, short_loops; \
+	$(RUN) -c "from twoloop.kernels import advance, interpolation, cached_run; \
 	from twoloop.kernels.linalg import dependent_columns, rank; from twoloop.kernels.control import switching; \
 	from twoloop.kernels.evaluation import checks, residuals, traced; \
 	from twoloop.kernels.lanes import lane_dop853, lane_runs, lane_starts, lane_taylor; \

@@ -24,7 +24,7 @@ from twoloop.generate.trace import Equations
 from twoloop.kernels.control.sudden import FLOOR, LEAST, SHARE, STEEPER  # what counts as sudden in single runs
 from twoloop.kernels.control.sudden import PLACES as N_PLACES
 from twoloop.kernels.lanes import lane_ends
-from twoloop.kernels.layout import short_loops
+from twoloop.kernels.layout import cached_run
 from twoloop.methods import dop853_tableau as tableau
 from twoloop.methods.auto import TIGHTEST
 from twoloop.methods.dop853 import COARSE_SHARE, UNSEEN
@@ -216,9 +216,7 @@ def _newton(name: str, tested: Literal["all", "positions"], n: int, rtol: float,
 def _options(method: Method, n: int, rtol: float, atol: float) -> Array:
     """What a step reads, behind what lane_control.py reads."""
     plan = method.plan(n, rtol, atol, False)
-    return np.concatenate(
-        [plan.rule, [plan.rough, short_loops().FIRST_STEP, least_tolerance(rtol, atol)], plan.options]
-    )
+    return np.concatenate([plan.rule, [plan.rough, cached_run().FIRST_STEP, least_tolerance(rtol, atol)], plan.options])
 
 
 Integers = NDArray[np.int64]

@@ -141,11 +141,11 @@ def cleared(work: Work) -> Work:
 
 
 @cache
-def short_loops() -> Any:
+def cached_run() -> Any:
     """The module of that name: compiled, or read from the disk, when it is first asked for."""
-    from twoloop.kernels import short_loops
+    from twoloop.kernels import cached_run
 
-    return short_loops
+    return cached_run
 
 
 def _of_static_form(n_q: int, n_c: int, rank: int, static: Static) -> tuple[dict[str, tuple[int, ...]], ...]:

@@ -1,8 +1,8 @@
-"""Cached integrators: a call with the options of an earlier one reuses its plan, code, arrays and checks.
+"""Cache integrators: a call with the options of an earlier one reuses its plan, code, arrays and checks.
 
-`CachedIntegrator` takes a run from its start: `go` of kernels/short_loops.py evaluates the start and takes the first
-chunk of steps in one compiled call. If that reaches the end and nothing unusual happens, the fields of the result are
-deferred. Otherwise `IntegrationLoop` goes on from there.
+`CachedIntegrator` calls `start_and_advance` of kernels/cached_run.py, which checks the start and takes a first chunk of
+steps. If that reaches the end and nothing unusual happens, the fields of the result are deferred. Otherwise
+`IntegrationLoop` goes on from there.
 """
 
 import time
@@ -28,7 +28,7 @@ from twoloop.kernels.control.clock import N_STEP_COLUMNS
 from twoloop.kernels.data import flags, noted
 from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.flags import BANDWIDTH, FORM
-from twoloop.kernels.layout import lasting, short_loops
+from twoloop.kernels.layout import cached_run, lasting
 from twoloop.kernels.linalg.band import addresses
 from twoloop.methods.code_for import code_for, may_have_code
 from twoloop.methods.plans_for import plans_for
@@ -120,12 +120,12 @@ class CachedIntegrator:
         self.region = run.region = checked_region_of(run, checks) if shared is None else shared.region(checks)
         run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, (room := first_chunk(run))
         looked = system if self.parametric is None else self.parametric.system
-        self.look, self.loops, self.skips = Look(looked), short_loops(), 0
+        self.look, self.loops, self.skips = Look(looked), cached_run(), 0
         self.arrays, self.given = arrays_of(run, self.look, code, definite, options, room), looked.kit
-        self._go = direct(self.loops.go)
+        self._start_and_advance = direct(self.loops.start_and_advance)
         # places in the block: where states begin, and the report of a run that has only one
-        self.states_from, self.width = self.arrays.told.size, len(run.state)
-        self.one_state_from = self.states_from - self.loops.FRONT - 1
+        self.states_from, self.width = self.arrays.report.size, len(run.state)
+        self.one_state_from = self.states_from - self.loops.N_HEAD - 1
         self.moved = False  # whether the loop may have changed `run`, beside its arrays
         self.at_start = {name: getattr(run, name) for name in ("plan", "memory", "chunk", "kit", "functions")}
         self.form, self.cpu_time = run.kit.flags[FORM], np.inf  # CPU time of the last run, s
@@ -168,7 +168,7 @@ class CachedIntegrator:
             return None
         if parametric is not None:
             if parametric.take(system):
-                self.look.system, arrays.begun[loops.HOW_OFTEN] = parametric.system, loops.NEVER
+                self.look.system, arrays.last_start[loops.N_EQUAL] = parametric.system, loops.NEVER
         elif self.check_derivatives and not system.checked:
             return None
         if self.moved:
@@ -179,11 +179,11 @@ class CachedIntegrator:
         clock = time.perf_counter if self.cpu_time < SHORT else time.process_time
         began = clock()
         try:
-            n = n_rows = self._go(*start, False)
+            n = n_rows = self._start_and_advance(*start, False)
             if n == loops.IN_DOUBT and self.look.is_surely(0, t0, q0, v0):
-                n = self._go(*start, True)
+                n = self._start_and_advance(*start, True)
         except Exception:  # of a callback; the loop knows what to do
-            self.skips, arrays.begun[loops.HOW_OFTEN] = AFTER_ERROR, loops.NEVER
+            self.skips, arrays.last_start[loops.N_EQUAL] = AFTER_ERROR, loops.NEVER
             return None
         self.cpu_time = clock() - began
         fields: dict[str, Any] = {"status": REACHED_END}
@@ -223,12 +223,12 @@ class CachedIntegrator:
         run, arrays, loops = self.run, self.arrays, self.loops
         n_rows, n_steps = arrays.filled.tolist()
         begin = self.one_state_from - n_rows - n_steps * N_STEP_COLUMNS
-        report = arrays.told[begin : begin + loops.N_TOLD].tolist()
+        report = arrays.report[begin : begin + loops.N_REPORT].tolist()
         t, rows, steps = arrays.t[: 1 + n_rows], arrays.states[: 1 + n_rows], arrays.steps[:n_steps]
         if report[loops.IS_NEW]:
             run.compared_until[0] = -np.inf
             if not self._agrees(t1, q0, v0):
-                arrays.begun[loops.HOW_OFTEN] = loops.NEVER
+                arrays.last_start[loops.N_EQUAL] = loops.NEVER
                 return None
         if report[loops.CODE] != run.a.ALL_OUTPUT_DONE or not report[loops.PLAIN]:
             self.moved = True
@@ -246,7 +246,7 @@ class CachedIntegrator:
             self.between.find(output.between, t, rows, kinds, self.look.pattern)
             self.cpu_time += time.process_time() - began
         if not self._compared(t, rows, t1, bool(report[loops.INSIDE]), due):
-            arrays.begun[loops.HOW_OFTEN] = loops.NEVER
+            arrays.last_start[loops.N_EQUAL] = loops.NEVER
             return None
         if output.dense:
             table = Table(t.copy(), rows[:, : 3 * system.n_q].copy(), kinds)
@@ -323,20 +323,20 @@ def _field(
     options: Options,
     name: str,
 ) -> dict[str, Any]:
-    """Return a deferred field of a result, with those that are put together with it; `data` is the report of `go`."""
+    """Return a deferred field of a result, with those that belong to it; `data` is the report of the run."""
     if name == "message":
         return {name: describe_arrival(t1, options.step_size is not None)}
-    loops, n_states, n_steps = short_loops(), int(data[0]), int(data[1])
-    begin, end = (places := loops.FRONT + n_states), places + n_steps * N_STEP_COLUMNS
+    loops, n_states, n_steps = cached_run(), int(data[0]), int(data[1])
+    begin, end = (places := loops.N_HEAD + n_states), places + n_steps * N_STEP_COLUMNS
     if name in LATER:
-        counts = data[loops.N_TOLD : loops.FRONT].astype(np.int64)
+        counts = data[loops.N_REPORT : loops.N_HEAD].astype(np.int64)
         by_step = step_fields(data[begin:end].reshape(n_steps, N_STEP_COLUMNS), BEFORE.copy())
         return by_step | {"stats": statistics(counts, cpu_time)} | options.metadata
     rank, redundant, own = of_run
     defect = float(data[loops.DEFECT]) if data[loops.CHECKED] else None
     fields = {"rank": rank, "redundant": redundant.copy(), "defect": defect, "compiled": own}
     fields |= {"widest_gap": float(data[loops.WIDEST]), "system": system, "atol": options.atol.copy()}
-    t, rows = (data[loops.FRONT : begin], data[end:].reshape(n_states, -1)) if at_times is None else at_times
+    t, rows = (data[loops.N_HEAD : begin], data[end:].reshape(n_states, -1)) if at_times is None else at_times
     return OTHERS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
@@ -351,7 +351,7 @@ def first_chunk(run: Run) -> int:
 def arrays_of(
     run: Run, look: Look, code: GeneratedCode | None, definite: bool, options: Options, room: int
 ) -> SimpleNamespace:
-    """Make the arrays that `go` of kernels/short_loops.py reads and writes, with room for so many steps.
+    """Make the arrays that `start_and_advance` of kernels/cached_run.py reads and writes, with room for so many steps.
 
     The run is at its start; its clock, control and tolerances become parts of one array. `look` is of its system, or of
     the one that it stands for; `code` is the machine code that its plan calls; `definite`: whether M has an inverse.
@@ -360,7 +360,7 @@ def arrays_of(
     from twoloop.kernels.linalg import rank as pivots
     from twoloop.kernels.linalg.dependent_columns import dependents as find
 
-    loops, system = short_loops(), look.system
+    loops, system = cached_run(), look.system
     of_mass = 0 if system.constant_mass else first_look.DEFINITE if definite else first_look.INDEFINITE
     numbers, n_rows = np.concatenate([run.clock, run.control, run.tolerances]), system.n_c + system.n_a
     i, j = run.clock.size, run.clock.size + run.control.size
@@ -379,12 +379,12 @@ def arrays_of(
     of_start += of_mass, NEARER * run.work.notes[noted.PIVOT], run.kit.flags[FORM]
     step_fields = options.first_step or 0.0, run.least_atol, options.max_step, run.plan.looks_within
     columns, width = run.a.N_STEP_COLUMNS, len(run.state)
-    block = np.empty(loops.FRONT + 1 + (1 + columns) * room + width * (1 + room))
-    told, states = np.split(block, [len(block) - width * (1 + room)])
+    block = np.empty(loops.N_HEAD + 1 + (1 + columns) * room + width * (1 + room))
+    report_part, states = np.split(block, [len(block) - width * (1 + room)])
     arrays = SimpleNamespace(
         **look.arrays,
-        **{"numbers": numbers, "begin_numbers": numbers.copy()},
-        **{"memory": memory, "places": places, "begin_memory": memory[places]},
+        **{"numbers": numbers, "start_numbers": numbers.copy()},
+        **{"memory": memory, "memory_places": places, "start_memory": memory[places]},
         **{"clock": run.clock, "control": run.control, "tolerances": run.tolerances, "options": run.plan.options},
         **{"state": run.state, "new_state": run.new_state, "lasting": of_work, "lasting_integers": integers},
         **{"saved": np.empty(numbers.size + of_work.size + run.state.size), "saved_integers": integers.copy()},
@@ -393,13 +393,14 @@ def arrays_of(
         **{"bounds": BOUNDS, "scratch": np.zeros(pivots.room_size(n_rows, system.n_q)), "expected": expected},
         **{"chosen": np.zeros(2 + 3 * n_rows, dtype=np.int64), "blocks": np.array(blocks, dtype=np.int64).ravel()},
         **dict(zip(("kinds", "counted", "_", "search", "search_places", "found"), search, strict=True)),
-        **{"begun": np.zeros(loops.BEGUN + 2 + 2 * system.n_q), "start_rows": run.work.rows_v.copy()},
+        **{"last_start": np.zeros(loops.START + 2 + 2 * system.n_q), "start_rows": run.work.rows_v.copy()},
         **{"end": np.zeros(1), "t": np.empty(room + 1), "states": states.reshape(room + 1, width)},
-        **{"steps": np.empty((room, columns)), "filled": np.zeros(2, dtype=np.int64), "told": told, "block": block},
+        **{"steps": np.empty((room, columns)), "filled": np.zeros(2, dtype=np.int64)},
+        **{"report": report_part, "block": block},
         **{"look": first_look.look, "choose": pivots.choose, "dependents": find},
         **{"start": run.kernels.start, "advance": run.kernels.advance},
     )
-    arrays.table = loops.AGAIN.table(arrays)
+    arrays.table = loops.RUN_ARRAYS.table(arrays)
     arrays.address = arrays.table.ctypes.data
     return arrays
 

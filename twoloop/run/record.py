@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import counters, intervals, noted
-from twoloop.kernels.layout import short_loops
+from twoloop.kernels.layout import cached_run
 from twoloop.problem.description import Description
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.dense_solution import DenseSolution
@@ -263,7 +263,7 @@ def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
     """What is told of each step, by the names of OF_STEPS; `counts`, those before the steps, become those after."""
     n = len(steps)
     h, changes, untested = np.empty(n), np.empty((3, n), dtype=np.int64), np.empty(n, dtype=np.bool_)
-    direct(short_loops().tell_steps)(steps, counts, h, changes, untested)
+    direct(cached_run().split_steps)(steps, counts, h, changes, untested)
     return dict(zip(OF_STEPS, (h, *changes, untested), strict=True))
 
 

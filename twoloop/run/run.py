@@ -16,7 +16,7 @@ from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import codes, counters, flags, noted, tolerances
 from twoloop.kernels.data.kit import Kit
 from twoloop.kernels.evaluation.tasks import SOLVE
-from twoloop.kernels.layout import copy_of, empty, short_loops
+from twoloop.kernels.layout import cached_run, copy_of, empty
 from twoloop.methods.auto import with_matrix_cost
 from twoloop.methods.plan import Plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
@@ -377,7 +377,7 @@ class Run:
         found = self.first_step(self.t0, t1, self.state, max_step)
         first = min(first_step or found, t1 - self.t0)
         self.clock[self.a.H_NEXT], self.control[self.a.FIRST_GIVEN] = first, float(first_step is not None)
-        self.control[self.a.SHORTEST] = short_loops().SHORTEST_STEP * first
+        self.control[self.a.SHORTEST] = cached_run().SHORTEST_STEP * first
 
     def limit_steps(self) -> None:
         """Let no step pass over a hundredth of the run without an evaluation.
@@ -391,7 +391,7 @@ class Run:
     def first_step(self, t: float, t1: float, state: Array, longest: float = 0.0) -> float:
         """The first step from a state, s. With a longest one, no hundredth of the run to t1 is to pass unseen."""
         numbers = self.system.n_q, t, t1, self.least_atol, longest, self.plan.looks_within
-        first: float = direct(short_loops().set_sizes)(self.control, self.tolerances, state, *numbers)
+        first: float = direct(cached_run().set_sizes)(self.control, self.tolerances, state, *numbers)
         return first
 
     def defect(self) -> float | None:

@@ -21,7 +21,7 @@ from twoloop.kernels.data.flags import (
 )
 from twoloop.kernels.data.kit import Kit
 from twoloop.kernels.evaluation.operations import N_NODES
-from twoloop.kernels.layout import lasting, make_work, short_loops
+from twoloop.kernels.layout import cached_run, lasting, make_work
 from twoloop.kernels.linalg.band import addresses, banded_pays
 from twoloop.kernels.linalg.saddle_point import sparse_pays
 from twoloop.kernels.steps.named_step import LOADED, at_hand, loaded
@@ -182,7 +182,7 @@ def prepare_workspace(
 ) -> common.Work:
     """A workspace with what a run finds in it, whatever the one before has left."""
     given = map(np.ascontiguousarray, (pattern, q0))
-    direct(short_loops().make_ready)(work, *lasting(work), *given, max(rtol, GAMMA_ACCURACY), reuse)
+    direct(cached_run().prepare_workspace)(work, *lasting(work), *given, max(rtol, GAMMA_ACCURACY), reuse)
     if static is not None:
         _fill(work, system, static, q0)
         return work

@@ -1,4 +1,14 @@
-"""What is done before and after the steps of a run: each function spares Python several calls of NumPy or kernels."""
+"""Run from a start to the end of the first chunk in one compiled call, and report on it; parts of this for Python.
+
+`start_and_advance` checks the start, makes the same choices as the run before it, takes steps, and fills one block:
+
+    ... | report: N_REPORT numbers, counters | times | steps | states ...
+                                                             ^ a fixed place
+
+`advance` writes states as they come, from the fixed place on. The rest is as long as the run has steps, and is copied
+when these are over, so that it ends where states begin. All that a result needs is then one piece without gaps, which
+Python copies by one slice, and takes apart when a field of the result is asked for.
+"""
 
 import math
 
@@ -20,7 +30,7 @@ ROUNDING = 1e-15  # of the largest coordinate: corrections of this size are roun
 
 
 @merged
-def put_ready(w, numbers, integers, pattern, q, accuracy, reuse):
+def prepare_work(w, numbers, integers, pattern, q, accuracy, reuse):
     """Make a workspace as it is before a run from q; `numbers` and `integers` are what counts when a step begins."""
     for k in range(numbers.size):
         numbers[k] = 0.0
@@ -41,9 +51,9 @@ def put_ready(w, numbers, integers, pattern, q, accuracy, reuse):
 
 
 @kernel(types.void(WORK, VECTOR, INTEGERS, MATRIX, VECTOR, f8, f8))
-def make_ready(w, numbers, integers, pattern, q, accuracy, reuse):
-    """The same, for Python."""
-    put_ready(w, numbers, integers, pattern, q, accuracy, reuse)
+def prepare_workspace(w, numbers, integers, pattern, q, accuracy, reuse):
+    """Call `prepare_work` from Python."""
+    prepare_work(w, numbers, integers, pattern, q, accuracy, reuse)
 
 
 FIRST_STEP = 0.01  # of the shortest time scale that a state shows: the first step ...
@@ -92,7 +102,7 @@ def set_sizes(control, tolerances, state, n, t, t1, least, longest, within):
 
 
 @merged
-def _lie_within(t, rows, box):
+def _all_within(t, rows, box):
     """Whether all times, and rows as far as the box has numbers, lie between its rows [t, q, v]."""
     for k in range(t.size):
         if not box[0, 0] <= t[k] <= box[1, 0]:
@@ -104,8 +114,8 @@ def _lie_within(t, rows, box):
 
 
 @kernel(types.void(MATRIX, INTEGERS, VECTOR, types.int64[:, ::1], types.boolean[::1]))
-def tell_steps(steps, counts, h, changes, untested):
-    """Put down of each step its length, what it added to `counts`, and whether it was one of Newton's method.
+def split_steps(steps, counts, h, changes, untested):
+    """Split the rows of steps: length, what each added to `counts`, and whether it was one of Newton's method.
 
     `counts` are rejections and partitions before, and then after these steps.
     """
@@ -116,34 +126,36 @@ def tell_steps(steps, counts, h, changes, untested):
             changes[i, k], counts[i] = count - counts[i], count
 
 
-# how `go` ended, where it does not return how many steps it took: another way has to be gone; a closer look has to be
-# taken at the start; something has to be looked at, or more steps have to be taken, as `told` says
-REFUSED, IN_DOUBT, OTHERWISE = -1, -2, -3
+# what `start_and_advance` returns instead of the number of its steps: the start needs other choices; it is not surely
+# consistent and has to be checked more closely; the report has to be read, or more steps have to be taken
+REFUSED, IN_DOUBT, UNUSUAL = -1, -2, -3
 
-# Arrays of a run that starts again and again, of looks at its starts and of choices; and room for its states and steps.
-# `begin_numbers` is what `numbers` is full of before a start, `begin_memory` what stands in `memory` at `places`: of
-# the rest, nearly all, to clear it takes less than to copy it. `begun`: the last start, see BEGUN. `saved` and
-# `saved_integers`: all that counts there, once a second run began there; `start_rows`, the rows that count there.
-# `told` is followed by counters, times and steps, and these by `states`: all ends where those begin
-AGAIN = Reference(
-    "Again",
+# Arrays of a run that starts again and again: of the checks of a start and of choices, then of the run itself.
+# - `start_numbers`: clock, control and tolerances at a start, which `numbers` becomes
+# - `start_memory`: what stands in the method's `memory` at `memory_places`; the rest, nearly all, is zero
+# - `last_start`: the last start, see START; `saved` and `saved_integers`: all that counts there, from the second equal
+#   start on; `start_rows`: the rows that count there
+RUN_ARRAYS = Reference(
+    "RunArrays",
     {
         **dict.fromkeys(
             ("looked", "lam", "room", "least", "bounds", "scratch", "constants", "saved", "search"), VECTOR
         ),
-        **dict.fromkeys(("begin_numbers", "numbers", "begin_memory", "memory", "lasting", "options"), VECTOR),
-        **dict.fromkeys(("tolerances", "control", "clock", "state", "new_state", "begun", "end", "t", "told"), VECTOR),
+        **dict.fromkeys(("start_numbers", "numbers", "start_memory", "memory", "lasting", "options"), VECTOR),
+        **dict.fromkeys(
+            ("tolerances", "control", "clock", "state", "new_state", "last_start", "end", "t", "report"), VECTOR
+        ),
         **dict.fromkeys(("mass", "rows", "ways", "pattern", "states", "steps"), MATRIX),
         **dict.fromkeys(("chosen", "expected", "lapack", "lasting_integers", "saved_integers"), INTEGERS),
-        **dict.fromkeys(("places", "filled", "kinds", "counted", "search_places", "blocks", "found"), INTEGERS),
+        **dict.fromkeys(("memory_places", "filled", "kinds", "counted", "search_places", "blocks", "found"), INTEGERS),
         "start_rows": INTEGERS,
     },
 )
-AGAIN.add_function("look", i8(KIT, f8, *(VECTOR,) * 5, *(MATRIX,) * 4, VECTOR))
-AGAIN.add_function("choose", i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS))
-AGAIN.add_function("dependents", i8(MATRIX, INTEGERS, INTEGERS, i8, VECTOR, INTEGERS, INTEGERS))
-AGAIN.add_function("start", i8(KIT, WORK, f8, VECTOR))
-AGAIN.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS))
+RUN_ARRAYS.add_function("look", i8(KIT, f8, *(VECTOR,) * 5, *(MATRIX,) * 4, VECTOR))
+RUN_ARRAYS.add_function("choose", i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS))
+RUN_ARRAYS.add_function("dependents", i8(MATRIX, INTEGERS, INTEGERS, i8, VECTOR, INTEGERS, INTEGERS))
+RUN_ARRAYS.add_function("start", i8(KIT, WORK, f8, VECTOR))
+RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS))
 # in `constants`: of starts, whether rows have entries wherever `kinds` says so, what `choose` takes, the flag of an M
 # that varies, else 0, the smallest pivot with which one is taken and the form of the equations; of steps, a first one,
 # or 0, and what set_sizes takes; of ends, the pivot below which speeds are looked at, how many times what accelerations
@@ -154,7 +166,7 @@ PLACE, N_KEPT, N_ADDED, KEPT = range(4)  # in `expected`, which is empty without
 
 
 @merged
-def _is_expected(b):
+def _makes_same_choices(b):
     """Whether the rows that count, those that help M, and the coordinates that follow are those of the code."""
     b.scratch[0] = 0.0
     place = b.choose(b.mass, b.rows, b.constants[RANK], b.constants[WEAK], b.bounds, b.scratch, b.chosen)
@@ -185,7 +197,7 @@ def _copy(one, other):
 
 
 @merged
-def _agree(w, b, n):
+def _left_out_rows_hold(w, b, n):
     """Whether the accelerations agree with all rows where some, which depend on others, were left out."""
     if w.rows_v.size == len(b.rows):
         return True
@@ -200,7 +212,7 @@ def _agree(w, b, n):
 
 
 @merged
-def _look(given, b, t, q, v, sizes, ways):
+def _check_start(given, b, t, q, v, sizes, ways):
     for k in range(b.looked.size):
         b.looked[k] = 0.0
     return b.look(given, t, q, v, sizes, b.lam, b.room, b.mass, b.rows, ways, b.pattern, b.least)
@@ -216,7 +228,7 @@ def _has_all_entries(b):
 
 
 @merged
-def _begin(f, given, w, b, t, t1, q, v, sizes, sure):
+def _start_run(f, given, w, b, t, t1, q, v, sizes, sure):
     """Begin a run to t1 at a state, with the same choices as the run before it; 0, or why it cannot.
 
     `given`: the system that is looked at, with `sizes` as of `look`. `sure`: the state is known to be consistent.
@@ -224,23 +236,23 @@ def _begin(f, given, w, b, t, t1, q, v, sizes, sure):
     n = q.size
     if not (finite_vector(q) and finite_vector(v)):
         return REFUSED
-    found = _look(given, b, t, q, v, sizes, b.ways[: 0 if b.constants[IN_ALL_PLACES] > 0.0 else len(b.ways)])
+    found = _check_start(given, b, t, q, v, sizes, b.ways[: 0 if b.constants[IN_ALL_PLACES] > 0.0 else len(b.ways)])
     if b.constants[IN_ALL_PLACES] > 0.0 and not _has_all_entries(b):
-        found = _look(given, b, t, q, v, sizes, b.ways)
+        found = _check_start(given, b, t, q, v, sizes, b.ways)
     if found & IN_ORDER == 0 or found & (DEFINITE | INDEFINITE) != int(b.constants[OF_MASS]):
         return REFUSED
     if found & CONSISTENT == 0 and not sure:
         return IN_DOUBT
-    if b.expected.size > 0 and not _is_expected(b):
+    if b.expected.size > 0 and not _makes_same_choices(b):
         return REFUSED
-    _copy(b.begin_numbers, b.numbers)
+    _copy(b.start_numbers, b.numbers)
     for j in range(b.state.size):
         b.state[j] = q[j] if j < n else v[j - n] if j < 2 * n else 0.0
     b.clock[at.T] = b.clock[at.T_START] = t
-    put_ready(w, b.lasting, b.lasting_integers, b.pattern, q, b.constants[ACCURACY], b.constants[REUSE])
+    prepare_work(w, b.lasting, b.lasting_integers, b.pattern, q, b.constants[ACCURACY], b.constants[REUSE])
     _copy(b.lapack, w.lapack[: b.lapack.size])
     w.notes[noted.NEARLY_SINGULAR] = b.constants[NEARLY_SINGULAR]
-    if b.start(f, w, t, b.state) != codes.DONE or not _agree(w, b, n):
+    if b.start(f, w, t, b.state) != codes.DONE or not _left_out_rows_hold(w, b, n):
         return REFUSED
     if w.notes[noted.PIVOT] < b.constants[LEAST_PIVOT]:
         return REFUSED
@@ -255,7 +267,7 @@ def _begin(f, given, w, b, t, t1, q, v, sizes, sure):
 
 
 @merged
-def _save(b):
+def _save_start(b):
     i, j = b.numbers.size, b.numbers.size + b.lasting.size
     _copy(b.numbers, b.saved[:i])
     _copy(b.lasting, b.saved[i:j])
@@ -264,7 +276,7 @@ def _save(b):
 
 
 @merged
-def _put_back(b):
+def _restore_start(b):
     i, j = b.numbers.size, b.numbers.size + b.lasting.size
     _copy(b.saved[:i], b.numbers)
     _copy(b.saved[i:j], b.lasting)
@@ -272,32 +284,33 @@ def _put_back(b):
     _copy(b.saved_integers, b.lasting_integers)
 
 
-# in `begun`, before t, t1, q and v: how often a run began there, up to IS_SAVED
-HOW_OFTEN, BEGUN = 0, 1
+# in `last_start`, before t, t1, q and v: how often a run began there, up to IS_SAVED
+N_EQUAL, START = 0, 1
 NEVER, IS_SAVED = 0.0, 2.0
 
 
 @exact
-def _begins_as_before(begun, t, t1, q, v):
+def _is_last_start(last_start, t, t1, q, v):
     """Whether a start is the last one, to the bit; it becomes that."""
-    n, same = q.size, begun[HOW_OFTEN] > NEVER
+    n, same = q.size, last_start[N_EQUAL] > NEVER
     for k in range(2 + 2 * n):
         x = t if k == 0 else t1 if k == 1 else q[k - 2] if k < 2 + n else v[k - 2 - n]
-        before = begun[BEGUN + k]
+        before = last_start[START + k]
         same = same and x == before and math.copysign(1.0, x) == math.copysign(1.0, before)
-        begun[BEGUN + k] = x
+        last_start[START + k] = x
     return same
 
 
-# in `told`: numbers of states, the first included, and of steps; as numbers, whether nothing has to be looked at,
-# velocities turned in the last step, and all states lie in a box; what stands in the workspace; the code of `advance`,
-# and whether the start is new. Then counters
-N_STATES, N_STEPS, PLAIN, TURNED, INSIDE, CHECKED, DEFECT, WIDEST, CODE, IS_NEW, N_TOLD = range(11)
-FRONT = N_TOLD + N_COUNTERS
+# the report: numbers of states, the first included, and of steps; as numbers, whether the run is plain (nothing has to
+# be checked), velocities turned in the last step, all states lie where callbacks were compared, and all steps found
+# their defect; the largest defect, the widest gap without an evaluation, the code of `advance`, and whether the start
+# is new. Then counters
+N_STATES, N_STEPS, PLAIN, TURNED, INSIDE, CHECKED, DEFECT, WIDEST, CODE, IS_NEW, N_REPORT = range(11)
+N_HEAD = N_REPORT + N_COUNTERS
 
 
 @merged
-def _turned(b, k, n):
+def _velocities_turned(b, k, n):
     """Whether the velocities of the last two states differ by more than one of their accelerations gives."""
     change, first, last = 0.0, 0.0, 0.0
     for j in range(n):
@@ -307,62 +320,56 @@ def _turned(b, k, n):
 
 
 @merged
-def _tell(w, b, box, n_rows, n_steps, code, is_new):
-    """Put down what is told of a run with so many rows, behind the first, and steps; their number, if all is well.
+def _write_report(w, b, box, n_rows, n_steps, code, is_new):
+    """Report on a run with so many rows, behind the first, and steps; return the number of steps if the run is plain.
 
     `box` has rows [t, q, v], or nothing.
     """
-    turned = n_rows > 0 and _turned(b, n_rows, w.Q.size)
-    inside = box.shape[1] > 0 and _lie_within(b.t[: 1 + n_rows], b.states, box)
+    turned = n_rows > 0 and _velocities_turned(b, n_rows, w.Q.size)
+    inside = box.shape[1] > 0 and _all_within(b.t[: 1 + n_rows], b.states, box)
     near = b.clock[at.PIVOT_AT_OUTPUT] < b.constants[NEAR]
     missed = b.clock[at.BRIEFEST] < b.constants[LOOKS] * b.clock[at.WIDEST_LOOK]
     plain, width = not (turned or near or missed), b.steps.shape[1]
-    begin = b.told.size - FRONT - 1 - n_rows - width * n_steps
-    told = b.told[begin:]
-    told[N_STATES], told[N_STEPS], told[PLAIN] = 1 + n_rows, n_steps, plain
-    told[TURNED], told[INSIDE], told[CODE], told[IS_NEW] = turned, inside, code, is_new
-    told[CHECKED] = w.counters[N_ACCEPTED] > 0 and w.notes[noted.UNCHECKED] == 0.0
-    told[DEFECT], told[WIDEST] = w.notes[noted.LARGEST_DEFECT], w.notes[noted.WIDEST_GAP]
+    begin = b.report.size - N_HEAD - 1 - n_rows - width * n_steps
+    report = b.report[begin:]
+    report[N_STATES], report[N_STEPS], report[PLAIN] = 1 + n_rows, n_steps, plain
+    report[TURNED], report[INSIDE], report[CODE], report[IS_NEW] = turned, inside, code, is_new
+    report[CHECKED] = w.counters[N_ACCEPTED] > 0 and w.notes[noted.UNCHECKED] == 0.0
+    report[DEFECT], report[WIDEST] = w.notes[noted.LARGEST_DEFECT], w.notes[noted.WIDEST_GAP]
     for k in range(N_COUNTERS):
-        told[N_TOLD + k] = w.counters[k]
-    _copy(b.t[: 1 + n_rows], told[FRONT : FRONT + 1 + n_rows])
+        report[N_REPORT + k] = w.counters[k]
+    _copy(b.t[: 1 + n_rows], report[N_HEAD : N_HEAD + 1 + n_rows])
     for k in range(n_steps):
-        _copy(b.steps[k], told[FRONT + 1 + n_rows + k * width : FRONT + 1 + n_rows + (k + 1) * width])
+        _copy(b.steps[k], report[N_HEAD + 1 + n_rows + k * width : N_HEAD + 1 + n_rows + (k + 1) * width])
     well = code == at.ALL_OUTPUT_DONE and plain and inside and n_rows == n_steps
     b.filled[0], b.filled[1] = n_rows, n_steps
-    return n_steps if well else OTHERWISE
+    return n_steps if well else UNUSUAL
 
 
-@kernel(i8(WORK, AGAIN, MATRIX, i8, i8, i8))
-def tell(w, b, box, n_rows, n_steps, code):
-    """The same, for Python, of steps beyond the first chunk."""
-    return _tell(w, b, box, n_rows, n_steps, code, False)
+@kernel(i8(KIT, KIT, WORK, RUN_ARRAYS, f8, f8, VECTOR, VECTOR, VECTOR, MATRIX, types.boolean), vectorized=True)
+def start_and_advance(f, given, w, b, t, t1, q, v, sizes, box, sure):
+    """Start a run to t1 and take the first chunk of steps; return how many if nothing has to be checked in Python.
 
-
-@kernel(i8(KIT, KIT, WORK, AGAIN, f8, f8, VECTOR, VECTOR, VECTOR, MATRIX, types.boolean), vectorized=True)
-def go(f, given, w, b, t, t1, q, v, sizes, box, sure):
-    """Begin a run to t1 and make the first chunk of its steps: how many these are, if all is well with them.
-
-    A start that is the last one to the bit is looked at once more, and then saved for those that follow.
+    A start that equals the last one to the bit is checked once more, and then saved for those that follow.
     """
     f.flags[FORM] = int(b.constants[IN_FORM])  # which a run may have changed
-    same, often = _begins_as_before(b.begun, t, t1, q, v), b.begun[HOW_OFTEN]
+    same, often = _is_last_start(b.last_start, t, t1, q, v), b.last_start[N_EQUAL]
     if same and often == IS_SAVED:
-        _put_back(b)
+        _restore_start(b)
     else:
-        b.begun[HOW_OFTEN] = NEVER
-        refused = _begin(f, given, w, b, t, t1, q, v, sizes, sure or same)
+        b.last_start[N_EQUAL] = NEVER
+        refused = _start_run(f, given, w, b, t, t1, q, v, sizes, sure or same)
         if refused != 0:
             return refused
         if same:
-            _save(b)
-        b.begun[HOW_OFTEN] = IS_SAVED if same else 1.0
+            _save_start(b)
+        b.last_start[N_EQUAL] = IS_SAVED if same else 1.0
     for k in range(b.memory.size):
         b.memory[k] = 0.0
-    for k in range(b.places.size):
-        b.memory[b.places[k]] = b.begin_memory[k]
+    for k in range(b.memory_places.size):
+        b.memory[b.memory_places[k]] = b.start_memory[k]
     b.end[0], b.t[0] = t1, t
     _copy(b.state, b.states[0])
     arrays = b.tolerances, b.control, b.clock, b.state, b.new_state
     code = b.advance(f, w, b.options, b.memory, *arrays, b.end, b.t[1:], b.states[1:], b.steps, b.filled)
-    return _tell(w, b, box, b.filled[0], b.filled[1], code, not same)
+    return _write_report(w, b, box, b.filled[0], b.filled[1], code, not same)
