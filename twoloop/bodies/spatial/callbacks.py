@@ -56,7 +56,7 @@ def direction(p, kind, at, results, first_result):
     return numbers(p, at)
 
 
-@helper
+@inlined
 def bend(a, au, aa, b, bu, ba):
     """Return the second derivative of a . b without the accelerations; au and aa: first and second derivative of a."""
     return dot(aa, b) + 2.0 * dot(au, bu) + dot(a, ba)
@@ -162,16 +162,17 @@ def fill_gamma(q, v, p, results, Qd):
             Qd[row] = -bend(vector(q, i, a), au, aa, vector(q, j, b), bu, ba)
             continue
         point_i = more if kind == layout.PLANE else at_i
-        d = minus(place(q, j, p, at_j), place(q, i, p, point_i))
         bu, ba = motion(q, v, j, p, at_j)
         su, sa = motion(q, v, i, p, point_i)
+        if kind == layout.POINT:
+            Qd[row], Qd[row + 1], Qd[row + 2] = minus(sa, ba)
+            continue
+        d = minus(place(q, j, p, at_j), place(q, i, p, point_i))
         du, da = minus(bu, su), minus(ba, sa)
         if kind == layout.PLANE:
             nu, na = vector_rate(q, v, i, numbers(p, at_i))
             n = vector(q, i, numbers(p, at_i))
             Qd[row] = result(results, first_result, 2) - bend(n, nu, na, d, du, da)
-        elif kind == layout.POINT:
-            Qd[row], Qd[row + 1], Qd[row + 2] = times(-1.0, da)
         else:
             Qd[row] = -(dot(du, du) + dot(d, da))
 
