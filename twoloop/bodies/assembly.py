@@ -84,18 +84,18 @@ def positions(
     if (np.abs(system.constraint(t, guess)) <= ROUNDING * terms).all():
         return guess
     try:
-        found = consistent_state(system, t, guess, np.zeros(system.n_q))[0]
+        q = consistent_state(system, t, guess, np.zeros(system.n_q))[0]
         reason = ""
     except ValueError as error:
         reason = re.sub(r"coordinate (\d+)", lambda of: name_and_unit(coordinates[int(of[1])])[0], str(error))
     if len(keep) or reason:
-        found = _least_squares_positions(system, t, guess, keep)
-        left = np.abs(system.constraint(t, found))
+        q = _least_squares_positions(system, t, guess, keep)
+        left = np.abs(system.constraint(t, q))
         if (left > OPEN_TOLERANCE * np.maximum(terms, terms.max())).any():
             raise ValueError(_open_joints_message(system, left, rows))
     if reason:
         raise ValueError(f"the bodies of {system.name!r} cannot be assembled from the poses given: {reason}")
-    return found
+    return q
 
 
 def follow_drives(system: ConstrainedSystem, t: float, start: Array, keep: Sequence[int]) -> Array:
@@ -147,7 +147,7 @@ def _least_squares_positions(system: ConstrainedSystem, t: float, guess: Array, 
         q[free] = x
         return q
 
-    found = least_squares(
+    solution = least_squares(
         lambda x: system.constraint(t, put(x)),
         guess[free],
         jac=lambda x: system.jacobian(t, put(x))[:, free],
@@ -156,7 +156,7 @@ def _least_squares_positions(system: ConstrainedSystem, t: float, guess: Array, 
         gtol=1e-15,
         max_nfev=300,
     )
-    return put(found.x).copy()
+    return put(solution.x).copy()
 
 
 def velocities(
@@ -231,11 +231,11 @@ def freedom(system: ConstrainedSystem, t: float, q: Array, rows: Mapping[str, tu
         direction = free @ np.random.default_rng(3).uniform(0.5, 1.0, free.shape[1])
         away = q + PERTURBATION * max(1.0, float(np.abs(q).max())) * direction / np.abs(direction).max()
         try:
-            there = consistent_state(system, t, away, np.zeros(system.n_q), check_assembly=False)[0]
-            beside = max(beside, _rank(system, t, there))
+            nearby = consistent_state(system, t, away, np.zeros(system.n_q), check_assembly=False)[0]
+            beside = max(beside, _rank(system, t, nearby))
         except ValueError:  # no consistent state nearby: keep the rank at the start
-            there = q
-        q = there if beside > at_start else q
+            nearby = q
+        q = nearby if beside > at_start else q
     degrees = system.n_q - beside
     return Freedom(degrees, beside - at_start, _redundant(system, t, q, rows))
 

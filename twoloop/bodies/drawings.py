@@ -39,11 +39,11 @@ class Sketch:
     def point(self, body: int, point: Any) -> int:
         """Return the index of a point, which is added if it is new."""
         place = np.asarray(point, dtype=float)
-        there = self._on.setdefault(body, [])
-        for number in there:
+        on_body = self._on.setdefault(body, [])
+        for number in on_body:
             if np.abs(self.points[number] - place).max() < 1e-12:
                 return number
-        there.append(len(self.bodies))
+        on_body.append(len(self.bodies))
         self.bodies.append(body)
         self.points.append(place)
         return len(self.bodies) - 1
@@ -92,7 +92,7 @@ def drawing_of(tables: Tables) -> Drawing:
             place = tables.of(numbers).copy()
             if body.name not in ends:
                 sketch.point(body.number, place)
-            elif not any(np.abs(place - other).max() < 1e-12 for other in ends[body.name]):
+            elif not any(np.abs(place - end_b).max() < 1e-12 for end_b in ends[body.name]):
                 ends[body.name].append(place)
     for body in tables.bodies:
         sketch.add_body(body.number, ends[body.name], 0.0, _size(body))
@@ -102,8 +102,8 @@ def drawing_of(tables: Tables) -> Drawing:
     for force in tables.forces:
         if force.kind in (SPRING, ZERO_LENGTH_SPRING):
             assert force.on_first is not None and force.on_second is not None
-            one, other = tables.of(force.on_first), tables.of(force.on_second)
-            sketch.line((force.first.number, one.copy()), (force.second.number, other.copy()))
+            end_a, end_b = tables.of(force.on_first), tables.of(force.on_second)
+            sketch.line((force.first.number, end_a.copy()), (force.second.number, end_b.copy()))
     return sketch.drawing
 
 

@@ -52,8 +52,8 @@ class ModelEnergy:
         check_columns("v", np.asarray(v), n_q)
 
         def between(i: int, at_i: int, j: int, at_j: int) -> Any:
-            here, end = (self.p[k : k + self.dimension] for k in (at_i, at_j))
-            return on_grid(flat, point_of(flat, j, end)) - on_grid(flat, point_of(flat, i, here))
+            point_i, point_j = (self.p[k : k + self.dimension] for k in (at_i, at_j))
+            return on_grid(flat, point_of(flat, j, point_j)) - on_grid(flat, point_of(flat, i, point_i))
 
         q, v = (np.asarray(x).reshape(self._n, -1, *np.shape(x)[1:]) for x in (q, v))
         size = layout.PLANAR_BODY if self.dimension == 2 else layout.SPATIAL_BODY

@@ -98,12 +98,12 @@ def record_ignored(path: str | os.PathLike[str], model: Any, ignored: list[str])
 def numbers(text: str, n: int, what: str) -> Array:
     """Parse the n numbers of an attribute."""
     try:
-        found = np.array([float(each) for each in text.split()])
+        values = np.array([float(each) for each in text.split()])
     except ValueError:
-        found = np.zeros(0)
-    if len(found) != n or not np.isfinite(found).all():
+        values = np.zeros(0)
+    if len(values) != n or not np.isfinite(values).all():
         raise ValueError(f"{what} must be {n} finite numbers; given {text!r}")
-    return found
+    return values
 
 
 def text_of(values: Any) -> str:
@@ -290,9 +290,9 @@ def add_joints(model: SpatialModel, parent: Body, child: Body, freed: list[FileJ
     )
 
 
-def _parallel(one: FileJoint, other: FileJoint) -> bool:
-    return float(np.abs(np.cross(one.axis, other.axis)).max()) < SAME
+def _parallel(a: FileJoint, b: FileJoint) -> bool:
+    return float(np.abs(np.cross(a.axis, b.axis)).max()) < SAME
 
 
-def _across(one: FileJoint, other: FileJoint) -> bool:
-    return abs(float(one.axis @ other.axis)) < SAME
+def _across(a: FileJoint, b: FileJoint) -> bool:
+    return abs(float(a.axis @ b.axis)) < SAME

@@ -56,10 +56,10 @@ class RowFunction:
         if value.shape not in ((), (1,)):
             raise Untraceable(f"on symbols it returns shape {value.shape}")
         row = as_forms(graph, value.reshape(1))[0]
-        one, places = Affine(graph, 1.0, {}), [next(iter(each.terms)) for each in q]
-        along = dict(zip(places, v, strict=True))
+        unit, inputs = Affine(graph, 1.0, {}), [next(iter(each.terms)) for each in q]
+        along = dict(zip(inputs, v, strict=True))
         bend = Derivative(graph, along).of(Derivative(graph, along).of(row))
-        gradient = [Derivative(graph, {places[j]: one}).of(row) for j in self.columns]
+        gradient = [Derivative(graph, {inputs[j]: unit}).of(row) for j in self.columns]
         return [row, Affine(graph, 0.0, {}), bend.times(-1.0), *gradient]
 
     def at(self, t: float, q: Array, v: Array) -> Array:
@@ -82,10 +82,10 @@ class RateFunction(RowFunction):
     def forms(self, graph: Graph, t: Affine, q: Sequence[Affine], v: Sequence[Affine]) -> list[Affine]:
         """Return the results as symbols."""
         function: Callable[..., Any] = self.function
-        value = trace(lambda _, one, other: function(one, other), t, symbols(q), symbols(v))
-        row, one = as_forms(graph, np.array(value, dtype=object).reshape(1))[0], Affine(graph, 1.0, {})
+        value = trace(lambda _, coordinates, rates: function(coordinates, rates), t, symbols(q), symbols(v))
+        row, unit = as_forms(graph, np.array(value, dtype=object).reshape(1))[0], Affine(graph, 1.0, {})
         along = {next(iter(each.terms)): rate for each, rate in zip(q, v, strict=True)}
-        gradient = [Derivative(graph, {next(iter(v[j].terms)): one}).of(row) for j in self.columns]
+        gradient = [Derivative(graph, {next(iter(v[j].terms)): unit}).of(row) for j in self.columns]
         return [Derivative(graph, along).of(row).times(-1.0), *gradient]
 
 

@@ -256,9 +256,9 @@ class Loads(Collection):
         """
         on = self._moving_body("body", body)
         name = self._new_name(f"force on {on.name}", name)
-        there = self._numbers(name, on, self._point("at", at, on))
+        point = self._numbers(name, on, self._point("at", at, on))
         function, more = self._function(name, f, self.dimension, "N")
-        return add(self.forces, Force(name, FORCE, self.ground, on, None, there, more, function))
+        return add(self.forces, Force(name, FORCE, self.ground, on, None, point, more, function))
 
     def torque(self, body: Body | str, f: Any, *, name: str | None = None) -> Force:
         """Add a torque on a body: in the plane a number, positive from x to y; in space (3,) along the axes of space.
@@ -479,10 +479,10 @@ class Stops(Loads):
         if joint.kind == "revolute":
             return TurnGap(joint, limit, sign)
         axis = self._axis(joint)
-        there = (
+        point = (
             joint.b.in_space(np.array(joint.point_b.values)) if joint.b.number >= 0 else np.array(joint.point_b.values)
         )
-        foot = joint.a.local_point(there) + limit * axis
+        foot = joint.a.local_point(point) + limit * axis
         return PlaneGap(joint.b, np.array(joint.point_b.values), joint.a, foot, sign * axis)
 
     def _axis(self, joint: ModelJoint) -> Array:
@@ -509,13 +509,13 @@ class Gears(Stops):
             Negative for external gears: minus the radius of `one` over that of `other`. In space a ratio of whole
             numbers up to 1000, as of teeth, because coordinates there do not count turns.
         """
-        first, second = self._two(one, "revolute", other, "revolute", "gear")
+        joint_1, joint_2 = self._two(one, "revolute", other, "revolute", "gear")
         factor = check_finite("ratio", ratio)
         if factor == 0.0:
             raise ValueError("ratio must not be zero: the other hinge would be held; use fixed(...) for that")
-        row = self._gear_row(first, second, factor)
-        name = self._new_name(f"gear of {first.name} and {second.name}", name)
-        return self._coupled(name, "gear", second, [row], first)
+        row = self._gear_row(joint_1, joint_2, factor)
+        name = self._new_name(f"gear of {joint_1.name} and {joint_2.name}", name)
+        return self._coupled(name, "gear", joint_2, [row], joint_1)
 
     def rack(
         self, pinion: ModelJoint | str, slide: ModelJoint | str, *, radius: float, name: str | None = None
@@ -529,12 +529,12 @@ class Gears(Stops):
         radius : float
             m; negative if a positive rotation moves the slide against its axis.
         """
-        first, second = self._two(pinion, "revolute", slide, "prismatic", "rack")
+        joint_1, joint_2 = self._two(pinion, "revolute", slide, "prismatic", "rack")
         factor = check_finite("radius", radius)
         if factor == 0.0:
             raise ValueError("radius must not be zero: the slide would be held; use fixed(...) for that")
-        name = self._new_name(f"rack of {first.name} and {second.name}", name)
-        return self._coupled(name, "rack", second, [self._rack_row(first, second, factor)], first)
+        name = self._new_name(f"rack of {joint_1.name} and {joint_2.name}", name)
+        return self._coupled(name, "rack", joint_2, [self._rack_row(joint_1, joint_2, factor)], joint_1)
 
     def _gear_row(self, one: ModelJoint, other: ModelJoint, ratio: float) -> Row:
         raise NotImplementedError

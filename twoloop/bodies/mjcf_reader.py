@@ -157,13 +157,13 @@ class _Reader:
 
     def _default(self, element: Element, name: str, inherited: dict[str, dict[str, str]]) -> None:
         name = element.get("class", name)
-        known = {tag: dict(values) for tag, values in inherited.items()}
+        merged = {tag: dict(values) for tag, values in inherited.items()}
         for each in element:
             if each.tag != "default":
-                known[each.tag] = _merged(known.get(each.tag, {}), each.attrib)
-        self.defaults[name] = known
+                merged[each.tag] = _merged(merged.get(each.tag, {}), each.attrib)
+        self.defaults[name] = merged
         for each in element.findall("default"):
-            self._default(each, name, known)
+            self._default(each, name, merged)
 
     def _attributes(self, element: Element, childclass: str) -> dict[str, str]:
         name = element.get("class", childclass)
@@ -305,16 +305,16 @@ class _Reader:
         if "site1" in given and element.tag == "weld":
             raise ValueError(f"{_called(element)} between sites is not read; give bodies")
         if "site1" in given:
-            (part, here), (other_part, there) = (self._site(given[key]) for key in ("site1", "site2"))
-            one, other = self._of(part), self._of(other_part)
-            at: Any = one.point(*one.local_point(here)), other.point(*other.local_point(there))
+            (part_1, point_1), (part_2, point_2) = (self._site(given[key]) for key in ("site1", "site2"))
+            body_1, body_2 = self._of(part_1), self._of(part_2)
+            at: Any = body_1.point(*body_1.local_point(point_1)), body_2.point(*body_2.local_point(point_2))
         else:
             frames = [self._frame(given[key]) if key in given else self.frames["world"] for key in ("body1", "body2")]
-            one, other = (self._of(part) for part, _ in frames)
+            body_1, body_2 = (self._of(part_1) for part_1, _ in frames)
             if element.tag == "connect":
                 at = frames[0][1].point(numbers(given.get("anchor", ""), 3, f"anchor of {_called(element)}"))
         if element.tag == "connect":
-            self.model.spherical(one, other, at=at, name=self._name_of(element, given, one, other))
+            self.model.spherical(body_1, body_2, at=at, name=self._name_of(element, given, body_1, body_2))
             return
         if float(given.get("torquescale", 1.0)) == 0.0:
             raise ValueError(
@@ -329,10 +329,10 @@ class _Reader:
                 raise ValueError(
                     f"relpose of {_called(element)} must be the one that the bodies have; it is off by {off:.3g}"
                 )
-        self.model.fixed(one, other, name=self._name_of(element, given, one, other))
+        self.model.fixed(body_1, body_2, name=self._name_of(element, given, body_1, body_2))
 
-    def _name_of(self, element: Element, given: dict[str, str], one: Body, other: Body) -> str:
-        return self._free(given.get("name"), f"{element.tag} of {one.name} and {other.name}")
+    def _name_of(self, element: Element, given: dict[str, str], body_1: Body, body_2: Body) -> str:
+        return self._free(given.get("name"), f"{element.tag} of {body_1.name} and {body_2.name}")
 
     def _tendon(self, element: Element) -> None:
         given = self._attributes(element, "main")
@@ -344,18 +344,17 @@ class _Reader:
             self.ignored.append(f"tendon: {_called(element)}")
             return
         self._soft(given, _called(element))
-        (one, here), (other, there) = (self._site(each.get("site", "")) for each in element)
+        (part_1, point_1), (part_2, point_2) = (self._site(each.get("site", "")) for each in element)
         length = None if float(rest[0]) < 0.0 else float(rest[0])
-        if length is None and float(stiffness) and (away := self._away(one) or self._away(other)):
+        if length is None and float(stiffness) and (moved := self._away(part_1) or self._away(part_2)):
             raise ValueError(
                 f"{_called(element)} needs a springlength: MuJoCo takes that which it has where joints are at their "
-                f"springref, and that of {away!r} is not its ref"
+                f"springref, and that of {moved!r} is not its ref"
             )
-        first, second = self._of(one), self._of(other)
-        name = self._free(given.get("name"), f"spring of {first.name} and {second.name}")
-        self.model.spring(
-            first, here, second, there, stiffness=float(stiffness), damping=float(damping), length=length, name=name
-        )
+        body_1, body_2 = self._of(part_1), self._of(part_2)
+        name = self._free(given.get("name"), f"spring of {body_1.name} and {body_2.name}")
+        values: dict[str, Any] = {"stiffness": float(stiffness), "damping": float(damping), "length": length}
+        self.model.spring(body_1, point_1, body_2, point_2, name=name, **values)
 
     def _away(self, part: Part | None) -> str:
         """Return the name of a joint between a part and the ground whose springref differs from its ref, or ""."""
@@ -378,11 +377,11 @@ class _Reader:
         return self.frames[name]
 
 
-def _merged(known: dict[str, str], own: dict[str, str]) -> dict[str, str]:
+def _merged(inherited: dict[str, str], own: dict[str, str]) -> dict[str, str]:
     """Merge attributes of an element into its defaults; they have one orientation, and the last sizes stay."""
-    kept = {key: value for key, value in known.items() if key not in TURNS or not own.keys() & TURNS}
+    kept = {key: value for key, value in inherited.items() if key not in TURNS or not own.keys() & TURNS}
     sizes = own.get("size", "").split()
-    sizes += known.get("size", "").split()[len(sizes) :]
+    sizes += inherited.get("size", "").split()[len(sizes) :]
     return {**kept, **own, **({"size": " ".join(sizes)} if sizes else {})}
 
 

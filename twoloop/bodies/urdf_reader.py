@@ -188,49 +188,49 @@ class _Reader:
         roots = [name for name in self.links if name not in parents]
         if len(roots) != 1:
             raise ValueError(f"a URDF file must be one tree of links; roots of this one are {roots}")
-        here = Pose(np.zeros(3), np.eye(3))
+        origin = Pose(np.zeros(3), np.eye(3))
         base = None
         if free_base:
-            base = Part(roots[0], None, here, [FileJoint("base", "free", np.zeros(3), np.array([0.0, 0.0, 1.0]), {})])
+            base = Part(roots[0], None, origin, [FileJoint("base", "free", np.zeros(3), np.array([0.0, 0.0, 1.0]), {})])
         parts = [] if base is None else [base]
-        self._link(roots[0], base, here)
-        ahead = [roots[0]]
-        while ahead:
-            name = ahead.pop(0)
+        self._link(roots[0], base, origin)
+        waiting = [roots[0]]
+        while waiting:
+            name = waiting.pop(0)
             for joint in children[name]:
                 parts += self._joint(joint, *self.frames[name])
-                ahead.append(self._end(joint, "child"))
+                waiting.append(self._end(joint, "child"))
         for part in parts:
-            made = add_part(self.model, part)
+            joint_of_part = add_part(self.model, part)
             freed = part.freed[0]
             (damping,) = numbers(freed.attributes.get("damping", "0"), 1, f"damping of joint {freed.name!r}")
-            if damping and made is None:
+            if damping and joint_of_part is None:
                 self.ignored.append(f"damping of joint {freed.name!r}")
-            if damping and made is not None and made.kind == "revolute":
-                self.model.torsion_spring(made, stiffness=0.0, damping=damping)
-            elif damping and made is not None:
-                self.model.axial_spring(made, stiffness=0.0, damping=damping)
+            elif damping and joint_of_part is not None:
+                revolute = joint_of_part.kind == "revolute"
+                add_spring = self.model.torsion_spring if revolute else self.model.axial_spring
+                add_spring(joint_of_part, stiffness=0.0, damping=damping)
         if self.collisions > 1:
             self.ignored.append("contacts between links")
 
     def close(self, loop: Loop) -> None:
         """Add a joint that closes a loop."""
         kind = check_choice("kind of a loop", loop.kind, CLOSING) or loop.kind
-        (part, here), (other, there) = (self._frame(name) for name in (loop.a, loop.b))
-        one, two = body_of(self.model, part), body_of(self.model, other)
-        at: Any = here.point(check_vector("at of a loop", loop.at, 3))
+        (part_a, frame_a), (part_b, frame_b) = (self._frame(name) for name in (loop.a, loop.b))
+        body_a, body_b = body_of(self.model, part_a), body_of(self.model, part_b)
+        at: Any = frame_a.point(check_vector("at of a loop", loop.at, 3))
         if loop.at_b is not None:
-            at_b = there.point(check_vector("at_b of a loop", loop.at_b, 3))
-            at = one.point(*one.local_point(at)), two.point(*two.local_point(at_b))
+            at_b = frame_b.point(check_vector("at_b of a loop", loop.at_b, 3))
+            at = body_a.point(*body_a.local_point(at)), body_b.point(*body_b.local_point(at_b))
         more: dict[str, Any] = {}
         if kind not in ("spherical", "fixed"):
             if loop.axis is None:
                 raise ValueError(f"a {kind} loop needs an axis; that of {loop.a!r} and {loop.b!r} has none")
-            axis = here.R @ check_vector("axis of a loop", loop.axis, 3)
-            axis_b = axis if loop.axis_b is None else there.R @ check_vector("axis_b of a loop", loop.axis_b, 3)
-            pair = _direction(one, axis), _direction(two, axis_b)
+            axis = frame_a.R @ check_vector("axis of a loop", loop.axis, 3)
+            axis_b = axis if loop.axis_b is None else frame_b.R @ check_vector("axis_b of a loop", loop.axis_b, 3)
+            pair = _direction(body_a, axis), _direction(body_b, axis_b)
             more = {"axes" if kind == "universal" else "axis": pair}
-        getattr(self.model, kind)(one, two, at=at, name=loop.name, **more)
+        getattr(self.model, kind)(body_a, body_b, at=at, name=loop.name, **more)
 
     def _frame(self, name: str) -> tuple[Part | None, Pose]:
         if name == "ground":

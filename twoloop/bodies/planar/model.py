@@ -128,20 +128,20 @@ class Couplings(Model):
         name = self._new_name("point on curve", name, body_a, body_b)
         if not callable(curve):
             raise TypeError(f"curve of {name!r} must be a function of x and y; given {curve!r}")
-        there = self._point("at", at, body_b)
-        here = body_a.local_point(body_b.in_space(there))
-        points = Numbers(tuple(here)), Numbers(tuple(there))
+        point_b = self._point("at", at, body_b)
+        point_a = body_a.local_point(body_b.in_space(point_b))
+        points = Numbers(tuple(point_a)), Numbers(tuple(point_b))
 
         def off(q: Any) -> Any:
-            return curve(*_in_body_axes(q, body_a, point_of(q, body_b.number, there)))
+            return curve(*_in_body_axes(q, body_a, point_of(q, body_b.number, point_b)))
 
         joint = ModelJoint(name, "point on curve", body_a, body_b, (), *points)
         return self._coupled(name, "point on curve", joint, [off], joint)
 
 
-def _along(q: Any, a: Body, angle: float, here: Any, b: Body, there: Any) -> Any:
+def _along(q: Any, a: Body, angle: float, point_a: Any, b: Body, point_b: Any) -> Any:
     """Return the displacement of a point of b from a point of a along a direction of a."""
-    (x, y), (u, w) = point_of(q, a.number, here), point_of(q, b.number, there)
+    (x, y), (u, w) = point_of(q, a.number, point_a), point_of(q, b.number, point_b)
     total = angle_of(q, a.number) + angle
     return np.cos(total) * (u - x) + np.sin(total) * (w - y)
 

@@ -320,9 +320,9 @@ class SpatialModel(SpatialCouplings):
         write(self, path)
 
     def _weld(self, name: str, a: Body, b: Body, points: Points) -> tuple[JointRow, ...]:
-        there = b.rotation.T @ a.rotation
+        axes_of_a = b.rotation.T @ a.rotation
         pairs = ((0, 1), (0, 2), (1, 2))
-        return JointRow(POINT, 3, a, b, *points), *(across(a, np.eye(3)[i], b, there[:, j]) for i, j in pairs)
+        return JointRow(POINT, 3, a, b, *points), *(across(a, np.eye(3)[i], b, axes_of_a[:, j]) for i, j in pairs)
 
     def _no_rotation(self) -> Array:
         return np.eye(3)
