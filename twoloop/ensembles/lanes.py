@@ -54,8 +54,8 @@ class ShortLooks:
     """
 
     def __init__(self, system: ConstrainedSystem, values: Array, varying: Sequence[int]):
-        self._record = ParameterTape(values.tolist(), varying)
-        equations = Equations(system, self._record.parameters)
+        self._tape = ParameterTape(values.tolist(), varying)
+        equations = Equations(system, self._tape.parameters)
         graph = equations.graph
         forms = np.concatenate([equations.of(kind).ravel() for kind in BY_TIME if kind in system.given])
         self._program = Program(graph, {"": [x for x in forms if any(graph.inputs_of[i] & TIME for i in x.terms)]})
@@ -69,7 +69,7 @@ class ShortLooks:
         size = max(1, AT_ONCE // max(1, len(times) * len(self._program.forms)))
         for begin in range(0, len(q), size):
             rows = slice(begin, begin + size)
-            algebra = Arrays(self._record, parameters[rows])
+            algebra = Arrays(self._tape, parameters[rows])
             (forces,) = self._program.run(algebra, [times[:, None], *q[rows].T, *v[rows].T])
             values = np.empty((len(times), len(q[rows]), len(forces)))
             for k, force in enumerate(forces):

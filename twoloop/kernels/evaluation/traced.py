@@ -1,6 +1,6 @@
-"""What callbacks were traced to, in numbers, beside what they give when called: see generate/traced_values.py.
+"""Compare calls of callbacks with their traces in numbers, see generate/traced_values.py.
 
-With every number goes a bound of what rounding does to it, in units of EPS; it is at least the size of the terms.
+Every number has a bound of its rounding error, in units of EPS, which is at least the size of its terms.
 """
 
 import math
@@ -14,13 +14,13 @@ from twoloop.kernels.evaluation.program import operation
 VALUE, BOUND = range(2)  # rows of `nodes`
 
 EPS = 2.0**-52
-SAME = 1e-9  # relative: what is larger counts as a difference, if it is not rounding of the traced operations,
-ROUNDED = 200.0 * EPS  # times their bound
+SAME = 1e-9  # relative to the largest number: a difference beyond it counts unless it may be rounding, which is ...
+ROUNDED = 200.0 * EPS  # ... this multiple of the bound
 
 
 @exact
 def _sum(columns, coefficients, constant, nodes, begin, end):
-    """A form, and its bound."""
+    """Return an affine expression, and its bound."""
     total, bound = constant, abs(constant)
     for k in range(begin, end):
         term = coefficients[k] * nodes[VALUE, columns[k]]
@@ -31,7 +31,7 @@ def _sum(columns, coefficients, constant, nodes, begin, end):
 
 @exact
 def _operation(kind, x, dx, y, dy):
-    """The result of an operation, and its bound."""
+    """Return the result of an operation, and its bound."""
     z = operation(kind, x, y)
     if kind == op.PRODUCT:
         dz = abs(x) * dy + abs(y) * dx
@@ -53,7 +53,7 @@ def _operation(kind, x, dx, y, dy):
 
 @exact
 def _traced(program, columns, coefficients, constants, nodes, values, bounds):
-    """Run the program on what stands in the first nodes."""
+    """Compute results and bounds from the inputs, which are the first nodes."""
     for i in range(len(program)):
         first, second, end = program[i, op.FIRST], program[i, op.SECOND], program[i, op.END]
         x, dx = _sum(columns, coefficients, constants[i, 0], nodes, first, second)
@@ -67,7 +67,7 @@ def _traced(program, columns, coefficients, constants, nodes, values, bounds):
 
 @exact
 def _differences(called, traced, bounds):
-    """How many numbers differ, rounding apart; what is not finite does."""
+    """Count the numbers that differ beyond rounding; those that are not finite do."""
     count = 0
     for i in range(called.shape[1]):
         largest = 0.0
@@ -84,11 +84,11 @@ def _differences(called, traced, bounds):
     i8(KIT, INTEGERS, INTEGERS, MATRIX, types.int64[:, ::1], INTEGERS, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, MATRIX)
 )
 def compare(f, sizes, which, states, program, columns, coefficients, constants, nodes, called, traced, bounds):
-    """What callbacks give at states [t, q, v] and what they were traced to, with bounds of rounding, a row a state.
+    """Call callbacks at states [t, q, v] and run their traces, with bounds of rounding, a row a state.
 
-    Returns how many numbers differ by more than SAME of the largest at these states and ROUNDED times the bound.
+    Returns how many numbers differ by more than SAME of the largest at these states plus ROUNDED times the bound.
 
-    `sizes`: n_q, n_c and n_a; `which`: 1 for those of KINDS in traced_values.py that are looked at. `called` has zeros.
+    `sizes`: n_q, n_c and n_a; `which`: 1 for each of KINDS in traced_values.py to be compared; `called`: zeros.
     """
     n, n_c, n_a = sizes[0], sizes[1], sizes[2]
     for k in range(len(states)):

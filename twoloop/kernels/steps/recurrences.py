@@ -1,6 +1,6 @@
-"""The Taylor series of the motion about a state, by the program of `twoloop.generate.series`, order by order.
+"""Interpret the program of a Taylor series (generate/series.py), order by order, where no code is generated.
 
-See the head of taylor.py.
+See taylor_step.py for the equations.
 """
 
 import numpy as np
@@ -53,7 +53,7 @@ def memory_size(order: int, n_q: int, n_rows: int, n_nodes: int, early: int, lat
 
 @inlined
 def accelerations_found(memory, n):
-    """Room for the accelerations of the series at one time: the last numbers of `memory`."""
+    """Return the last numbers of `memory`, which hold the accelerations of the series at one time."""
     return memory[memory.size - n :]
 
 
@@ -70,14 +70,14 @@ def _numbers(options, which):
 
 @inlined
 def series_of(memory, order, n, which):
-    """One of the two series of q; row by row, as numba calls a function for an array of two dimensions."""
+    """Return one of the two series of q, row by row: numba calls a function for an array of two dimensions."""
     begin = N_MEMORY_SCALARS + int(which) * (order + 1) * n
     return memory[begin : begin + (order + 1) * n]
 
 
 @merged
 def interior(X, Y, K, total):
-    """total[m] = sum over 0 < j < K of X[j, m] Y[K - j, m]."""
+    """Compute total[m] = sum over 0 < j < K of X[j, m] Y[K - j, m]."""
     for m in range(0, total.size, 8):
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
         for j in range(1, K):
@@ -102,7 +102,7 @@ def interior(X, Y, K, total):
 
 @merged
 def _gather(options, sums, groups, g, more, values, out):
-    """The sums of one group of operations, less their constants, into out."""
+    """Compute the arguments of a group of operations, without their constants."""
     column, coefficient = _integers(options, sums + COLUMN), _numbers(options, sums + COEFFICIENT)
     for o in range(groups[g + BEGIN], groups[g + END]):
         out[o] = coefficient[o] * values[column[o]]
@@ -114,7 +114,7 @@ def _gather(options, sums, groups, g, more, values, out):
 
 @merged
 def _sum(options, sums, scale, values, out):
-    """All sums of a list, less their constants, times a factor; the rest of `out` stays."""
+    """Compute all sums of a list without their constants, times a factor; other entries of `out` stay."""
     column, coefficient = _integers(options, sums + COLUMN), _numbers(options, sums + COEFFICIENT)
     places = _integers(options, sums + PLACES)
     for o in range(column.size):
@@ -127,7 +127,7 @@ def _sum(options, sums, scale, values, out):
 
 @compiled
 def begin_operations(options, table, values, z, x, y):
-    """Order zero of all operations of a table: the functions themselves; those that wait stay zero."""
+    """Compute order zero of the operations of a table by their functions; pending products stay zero."""
     groups = _integers(options, table + GROUPS)
     constant, constant_2 = _numbers(options, table + FIRST + CONSTANT), _numbers(options, table + SECOND + CONSTANT)
     for g in range(0, groups.size, N_GROUP):
@@ -162,7 +162,7 @@ def begin_operations(options, table, values, z, x, y):
 
 @merged
 def _operate(options, table, K, values, z, x, y, x0, y0, total):
-    """Order K > 0 of the operations of a table, into z, x and y; of those that wait, what is known before."""
+    """Compute order K > 0 of the operations of a table; of pending products the part known before the solution."""
     groups = _integers(options, table + GROUPS)
     inverse = 1.0 / K
     for g in range(0, groups.size, N_GROUP):
@@ -203,14 +203,14 @@ def _operate(options, table, K, values, z, x, y, x0, y0, total):
 
 @merged
 def _complete(options, table, values, y):
-    """The second factors of the operations that waited."""
+    """Compute the second factors of pending products."""
     groups = _integers(options, table + GROUPS)
     _gather(options, table + SECOND, groups, groups.size - N_GROUP, MORE_SECOND, values, y)
 
 
 @inlined
 def arrays_of(options, memory, n, n_rows):
-    """Scratch: the coefficients of all quantities, of the arguments of operations, sums of products, r and c."""
+    """Return arrays for coefficients of quantities and of arguments of operations, sums of products, r and c."""
     n_nodes, early, late = int(options[N_NODES]), int(options[EARLY_WIDTH]), int(options[LATE_WIDTH])
     order = int(options[ORDER])
     depth = order + 2
@@ -234,7 +234,7 @@ def arrays_of(options, memory, n, n_rows):
 
 @merged
 def begin_series(options, t, unit, state, N, series, first, x, y, r, c):
-    """What is known of the orders 0 and 1, and the early operations of order 0; r and c are zero."""
+    """Set orders 0 and 1 of the state, and compute early operations of order 0; r and c become zero."""
     n = r.size
     r[:], c[:] = 0.0, 0.0
     N[0, 0], N[1, 0] = t, unit
@@ -247,7 +247,7 @@ def begin_series(options, t, unit, state, N, series, first, x, y, r, c):
 
 @merged
 def take_order(K, unit, N, series, a):
-    """Velocities of order K and positions of order K + 1, from accelerations of order K - 1."""
+    """Compute velocities of order K and positions of order K + 1 from accelerations of order K - 1."""
     n = a.size
     per_v, per_q = unit / K, unit / (K + 1)
     for j in range(n):
@@ -258,7 +258,7 @@ def take_order(K, unit, N, series, a):
 
 @merged
 def end_series(w, order, series):
-    """Count, and look whether all is finite."""
+    """Count evaluations, and check that the last order is finite."""
     w.counters[N_EVALUATIONS] += order - 1
     n = series.size // (order + 1)
     for j in range(n):
@@ -269,7 +269,7 @@ def end_series(w, order, series):
 
 @compiled
 def expand(f, w, options, memory, t, state, unit):
-    """The series about a state whose factors are in w, in a unit of time; DONE, or why there is none."""
+    """Compute the series about a state whose factors are in w, in a unit of time; return DONE or a reason."""
     n, n_rows, order = w.Q.size, w.Rate.size, int(options[ORDER])
     N, X1, Y1, X2, Y2, total1, total2, r, c = arrays_of(options, memory, n, n_rows)
     series = series_of(memory, order, n, memory[TARGET])

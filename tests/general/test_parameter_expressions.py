@@ -1,4 +1,4 @@
-"""Test numbers that remember how they depend on parameters: for other values they are what plain numbers would be."""
+"""Test numbers that record how they depend on parameters: for other values they equal plain numbers."""
 
 import math
 
@@ -27,12 +27,12 @@ values = st.floats(0.3, 3.0) | st.floats(-3.0, -0.3)
 @pytest.mark.parametrize("expression", EXPRESSIONS)
 @given(st.tuples(values, values, st.floats(0.3, 3.0)))
 def test_for_other_parameters_they_are_what_plain_numbers_are(expression, other):
-    record = ParameterTape([0.7, 1.9, 1.3], range(3))
-    made = expression(record.parameters)
+    tape = ParameterTape([0.7, 1.9, 1.3], range(3))
+    made = expression(tape.parameters)
     assert isinstance(made, Parameter) and made == pytest.approx(expression(np.array([0.7, 1.9, 1.3])))
     if expression is EXPRESSIONS[-2]:
         other = (abs(other[0]), *other[1:])  # the branch was taken for a positive one
-    assert record.evaluate([made], np.array([other]))[0, 0] == pytest.approx(expression(np.array(other)), abs=1e-12)
+    assert tape.evaluate([made], np.array([other]))[0, 0] == pytest.approx(expression(np.array(other)), abs=1e-12)
 
 
 def test_what_cancels_is_gone():
@@ -42,6 +42,6 @@ def test_what_cancels_is_gone():
 
 
 def test_parameters_that_do_not_vary_are_plain_numbers():
-    record = ParameterTape([0.7, 1.9], [1])
-    assert type(record.parameters[0]) is float and type(record.parameters[1]) is Parameter
-    assert record.evaluate([record.parameters[1]], np.array([[5.0, 6.0]])).tolist() == [[6.0]]
+    tape = ParameterTape([0.7, 1.9], [1])
+    assert type(tape.parameters[0]) is float and type(tape.parameters[1]) is Parameter
+    assert tape.evaluate([tape.parameters[1]], np.array([[5.0, 6.0]])).tolist() == [[6.0]]
