@@ -17,7 +17,6 @@ import numpy as np
 
 from twoloop.bodies.parts import Body, ModelJoint
 from twoloop.bodies.rotation import rotation_matrix
-from twoloop.bodies.spatial.model import SpatialModel
 from twoloop.checks.arguments import Array, check_path
 
 DENSITY = 1000.0  # kg/m^3, default of MuJoCo for geoms with neither mass nor density
@@ -244,14 +243,14 @@ class Part:
     body: Body | None = None
 
 
-def body_of(model: SpatialModel, part: Part | None) -> Body:
-    """Return the body of a part; the ground for None."""
+def body_of(model: Any, part: Part | None) -> Body:
+    """Return the body of a part of a SpatialModel; the ground for None."""
     body = model.ground if part is None else part.body
     assert body is not None
     return body
 
 
-def add_part(model: SpatialModel, part: Part) -> ModelJoint | None:
+def add_part(model: Any, part: Part) -> ModelJoint | None:
     """Add the body of a part and its joint to a model; return the joint, or None if the body is free."""
     lump = combined(part.lumps)
     if not lump.mass > 0.0:
@@ -261,7 +260,7 @@ def add_part(model: SpatialModel, part: Part) -> ModelJoint | None:
     return add_joints(model, body_of(model, part.parent), part.body, part.freed)
 
 
-def add_joints(model: SpatialModel, parent: Body, child: Body, freed: list[FileJoint]) -> ModelJoint | None:
+def add_joints(model: Any, parent: Body, child: Body, freed: list[FileJoint]) -> ModelJoint | None:
     """Add the joint equivalent to several MJCF joints; return it, or None if the body is free."""
     kinds = sorted(each.kind for each in freed)
     slid = np.array([each.axis for each in freed if each.kind == "slide"])
