@@ -80,6 +80,7 @@ def test_threads_give_the_same_numbers(rows):
     pd.testing.assert_frame_equal(by_threads.drop(columns="seconds"), rows.drop(columns="seconds"))
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_gives_the_same_numbers(rows):
     distributed = pytest.importorskip("dask.distributed")
     with (

@@ -165,6 +165,7 @@ def test_a_block_rebounds_and_sticks(spatial):
     assert "sticks" in result.arcs[-1].system.name and "1 impacts, 2 changes" in result.message
 
 
+@pytest.mark.slow
 def test_a_block_slides_down_bounces_and_rests_on_the_limit():
     """Its weight overcomes the friction: each rebound is lower by that, too, until the limit carries it."""
     slope, e, drop = 0.6, 0.3, 0.4

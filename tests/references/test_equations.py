@@ -44,6 +44,7 @@ def unbalanced(system, t, q, v, a, lam):
     return worst(system.mass(t, q) @ a + system.jacobian(t, q).T @ lam, system.force(t, q, v))
 
 
+@pytest.mark.slow
 def test_full_mass_that_varies_and_baumgarte_terms_off_the_constraints():
     system = oblique_pendulum()
     q, v = (np.array(x, dtype=float) for x in oblique_start())

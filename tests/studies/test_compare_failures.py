@@ -138,6 +138,7 @@ def test_whether_the_energy_is_an_invariant_is_found(mechanisms, call, kept):
     assert (case.scale.kinetic is not None) == kept
 
 
+@pytest.mark.slow
 def test_a_problem_that_says_so_is_believed(mechanisms):
     names = {}
     exec(MECHANISMS, names)

@@ -149,6 +149,7 @@ def test_linkages_by_the_hundred_are_assembled_as_one_is():
     assert np.abs(made - q0).max() < 1e-14
 
 
+@pytest.mark.slow
 def test_energies_and_ends_of_many_are_those_of_one(monkeypatch):
     monkeypatch.setattr(linkages, "N_WORST", 2)
     monkeypatch.setattr(linkages, "N_ANY", 3)

@@ -174,6 +174,7 @@ def test_both_readings_of_the_stopping_test_are_compared_with_the_printed_row(tm
 
 
 @pytest.mark.usefixtures("unsaved")
+@pytest.mark.slow
 def test_the_exchanged_labels_fit_only_where_they_do(tmp_path):
     assert not found_of(full, tmp_path, rows(step=2.0))["exchanged_fits_better"]
     made = rows()

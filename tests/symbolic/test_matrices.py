@@ -5,6 +5,7 @@ import pytest
 import sympy as sp
 from sympy.physics import mechanics as me
 
+from tests.marks import slow
 from tests.symbolic.models import body_spin, rates, rotation, symbolic_heavy_top, t
 from twoloop.symbolic import from_lagrangian, from_matrices, from_method
 
@@ -43,7 +44,7 @@ def two_rods(pivot=0):
     return T, m * g * (first[1] + second[1]), [second[1] - span * sp.sin(k * t)], q
 
 
-@pytest.mark.parametrize("pivot", [0, span * sp.sin(k * t)])  # the second: T depends on time
+@pytest.mark.parametrize("pivot", [0, slow(span * sp.sin(k * t))])  # the second: T depends on time
 def test_lagranges_method_gives_what_the_energies_give(pivot):
     T, V, constraints, q = two_rods(pivot)
     known = from_lagrangian(T, V, constraints, q, parameters=VALUES)
