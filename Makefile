@@ -48,7 +48,7 @@ $(STAMP): requirements.lock pyproject.toml
 	@echo "[2/3] Installing packages; beside that, on the second core, compiling the inner loop of the integrator (once)"
 	@{ $(RUN) $(PIP) install --no-compile -r requirements.lock \
 		&& $(RUN) $(PIP) install --no-compile --no-deps --no-build-isolation --editable .; } & \
-	$(RUN) -W ignore -c "from twoloop.kernels import advance; from twoloop.kernels.evaluation import own_inner" 2>/dev/null; \
+	$(RUN) -W ignore -c "from twoloop.kernels import advance" 2>/dev/null; \
 	wait $$!
 	@touch $@
 

@@ -53,6 +53,16 @@ def test_least_versions_are_those_that_are_tested(requirement):
     assert oldest < numbers(pins("requirements.lock")[name])
 
 
+def test_what_the_makefile_compiles_is_there():
+    """While packages are installed, an import that fails would not be seen."""
+    text = (ROOT / "Makefile").read_text().replace("\\\n", "")
+    found = re.findall(r"from ((?:twoloop|studies)[\w.]*) import ([\w, \t]+)", text)
+    names = [f"{package}.{name.strip()}" for package, listed in found for name in listed.split(",")]
+    names += re.findall(r"\btests\.[\w.]+", text)
+    assert len(names) > 30
+    assert [name for name in names if not (ROOT / f"{name.replace('.', '/')}.py").is_file()] == []
+
+
 # --- private parts of numba: in one folder, of versions that are known, and put back after each compilation
 def test_other_versions_of_numba_are_refused_with_what_to_install():
     for known in ("0.61.0", "0.68.1", "0.68.0rc1"):
