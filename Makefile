@@ -85,7 +85,7 @@ compile: install ## compile the kernels, and the callbacks of bodies, mechanisms
 	from twoloop.kernels.linalg import dependent_columns, rank; from twoloop.kernels.control import switching; \
 	from twoloop.kernels.evaluation import checks, residuals, traced; \
 	from twoloop.kernels.lanes import lane_dop853, lane_runs, lane_starts, lane_taylor; \
-	from twoloop.kernels.steps import adams_step, asking_step, bdf_step, bridge, explicit_step, lobatto_step, \
+	from twoloop.kernels.steps import adams_step, asking_step, bdf_step, crossing_step, explicit_step, lobatto_step, \
 	fixed_point_step, newmark_step, paper_step, taylor_step; from twoloop.bodies.planar import callbacks, programs; \
 	from twoloop.mechanisms import *; from studies.honesty import traps; $(CALLBACKS_OF_MORE_TESTS)" && wait $$!
 

@@ -28,6 +28,15 @@ from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.comparison import compare_callbacks
 from twoloop.run.dense import interpolator_of
 from twoloop.run.discontinuities import warn_of_missed_changes
+from twoloop.run.fallbacks import (
+    after_crossing,
+    apply_jump,
+    cross_singularity,
+    crossing_kit,
+    load,
+    may_cross,
+    switch_method,
+)
 from twoloop.run.messages import message_of, outcome, reject_turned_velocities, warn_user
 from twoloop.run.monitors import (
     INTERRUPTED,
@@ -38,7 +47,6 @@ from twoloop.run.monitors import (
     StiffnessMonitor,
     describe_stiffness,
 )
-from twoloop.run.passage import beyond, bridge, bridging_kit, give_way, leap, load
 from twoloop.run.record import (
     BEFORE,
     DEFAULTS,
@@ -322,8 +330,12 @@ class IntegrationLoop:
         if self.code == a.HAS_TO_BE_DENSE or run.is_lost_without_dense(self.code):
             run.change_form()
             self.plan, self.kit, self.code = run.plan, run.kit, a.PAUSED
+        elif may_cross(run, self.code):
+            self.plan, self.control = cross_singularity(run)
+            self.kit = crossing_kit(run.kit)
+            self.code = a.PAUSED
         elif self.code == a.HAS_TO_GIVE_WAY or self._stalls(across):
-            give_way(run)
+            switch_method(run)
             if self.code == a.STEP_TOO_SMALL:
                 run.clock[a.H_NEXT] = run.first_step(float(run.clock[a.T]), self.t1, run.state)
             self.plan, self.control, self.kit, self.code = run.plan, run.control, run.kit, a.PAUSED
@@ -332,14 +344,10 @@ class IntegrationLoop:
             load(run)
             self.deadline += time.monotonic() - began  # compilation does not count
             self.kit, self.code = run.kit, a.PAUSED
-        elif self.code == a.AT_JUMP and not across and leap(run, self.t1):
-            self.code = a.PAUSED
-        elif self.code == a.NEAR_SINGULAR:
-            self.plan, self.control = bridge(run)
-            self.kit = bridging_kit(run.kit)
+        elif self.code == a.AT_JUMP and not across and apply_jump(run, self.t1):
             self.code = a.PAUSED
         elif self.plan is not run.plan and self.code != a.ALL_OUTPUT_DONE:
-            self.plan, self.control, self.code = beyond(run, self.plan, self.control, self.code, n_steps)
+            self.plan, self.control, self.code = after_crossing(run, self.plan, self.control, self.code, n_steps)
             if self.plan is run.plan:
                 self.kit = run.kit
 

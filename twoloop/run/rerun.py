@@ -14,7 +14,7 @@ from twoloop.methods.plan import Method
 from twoloop.methods.runge_kutta import RungeKutta
 from twoloop.methods.tableaux import radau_iia
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.passage import leap
+from twoloop.run.fallbacks import apply_jump
 from twoloop.run.run import Run
 
 Array = NDArray[np.float64]
@@ -108,6 +108,6 @@ class IndependentRerun:
             if code == a.ALL_OUTPUT_DONE:
                 self.next_step = float(run.clock[a.H_NEXT])
                 return RerunPiece(found[0], found[-1], longest)
-            if code != a.PAUSED and not (code == a.AT_JUMP and leap(run, t1)):
+            if code != a.PAUSED and not (code == a.AT_JUMP and apply_jump(run, t1)):
                 break
         return None

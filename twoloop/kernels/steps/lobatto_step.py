@@ -17,7 +17,7 @@ from twoloop.kernels.control.predictor import departure, keep_predicted
 from twoloop.kernels.control.progress import count_step
 from twoloop.kernels.control.singular import COLLAPSED, SHORT, SINGULAR_PIVOT
 from twoloop.kernels.data import collocation as room_at
-from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED, UNSUITED
+from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED, SINGULAR, UNSUITED
 from twoloop.kernels.data.collocation import GUESSED, LANES, LEFT, MADE, REFUSED, places
 from twoloop.kernels.data.common import ATTEMPT, MANY, SETTLE, Attempt, Step, compiled, inlined, kernel, merged
 from twoloop.kernels.data.counters import (
@@ -28,10 +28,10 @@ from twoloop.kernels.data.counters import (
     N_OUTER,
     N_REJECTED_ERROR,
 )
-from twoloop.kernels.data.noted import BY_GENERAL, DEFECT, NEARLY_SINGULAR, ORIENTATION_NEW, PIVOT, ROUNDED
-from twoloop.kernels.data.tolerances import ESTIMATE, LOOK, ROUNDING, allowed
+from twoloop.kernels.data.noted import BY_GENERAL, DEFECT, NEAR_NOW, NEARLY_SINGULAR, ORIENTATION_NEW, PIVOT, ROUNDED
+from twoloop.kernels.data.tolerances import ESTIMATE, LEAST, LOOK, ROUNDING, allowed
 from twoloop.kernels.evaluation.accelerations import ABOVE_ROUNDING
-from twoloop.kernels.evaluation.inner_loop import check_redundant, project
+from twoloop.kernels.evaluation.inner_loop import check_redundant, project, renew_partition
 from twoloop.kernels.linalg.dense import copy
 
 # FREE: how many times LOOK a step may be long that nothing is looked at within, beside the nodes
@@ -41,6 +41,9 @@ WANTED_START = 0.12  # contraction of the first step, see collocation_code.py
 MOST_STARTS = 4
 SHORTER, SAFETY = 0.6, 0.75
 LIMITED, STRAIGHT = 24.0, 0.1  # such steps, after which another method goes on; what the iteration leaves of CURVED
+N_CHECKED, MUCH_NEARER = 4, 0.4  # parts of a step at whose ends pivots are checked, and their least ratio to the first
+# tolerance below which another method goes on behind a singular position: here five more runs of A02 were wrong
+TIGHT = 1e-8
 REFUSALS = 12.0  # of UNMADE, which each accepted step lessens by 1 and each that did not converge raises by 2
 BETWEEN = 0.0908  # of a step, the longest part that an audit leaves unseen: half that between two nodes
 EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
@@ -141,10 +144,30 @@ def _accept(room):
 
 
 @merged
-def _is_unsuited(w, room):
+def _is_unsuited(w, room, tolerances):
     """Whether another method should go on: near a singular position, and where stiffness limits the steps."""
     stiff = room[room_at.LIMITED] >= LIMITED or room[room_at.UNMADE] >= REFUSALS
-    return stiff or w.notes[NEARLY_SINGULAR] == 1.0
+    near = w.notes[NEAR_NOW] == 1.0 or tolerances[LEAST] < TIGHT
+    return stiff or (w.notes[NEARLY_SINGULAR] == 1.0 and near)
+
+
+@compiled
+def _passes_singular(f, w, t, h, state, new_state):
+    """Return whether C_q is much nearer to losing rank within a step than at its beginning.
+
+    Stages beside the constraints have wrong accelerations near a singular position; other steps are to cross it. The
+    motion within the step is taken for the cubic through its ends.
+    """
+    n, pivot = w.Q.size, w.notes[PIVOT]
+    for k in range(1, N_CHECKED):
+        s = k / N_CHECKED
+        rest = 1.0 - s
+        for m in range(n):
+            q0, v0, q1, v1 = state[m], h * state[n + m], new_state[m], h * new_state[n + m]
+            w.y[m] = q0 + s * s * (3.0 - 2.0 * s) * (q1 - q0) + s * rest * (rest * v0 - s * v1)
+        if renew_partition(f, w, t + s * h, w.y) != DONE or w.notes[PIVOT] < MUCH_NEARER * pivot:
+            return True
+    return False
 
 
 @kernel(SETTLE)
@@ -161,7 +184,7 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt."""
     room, n = _room(memory), w.Q.size
     room[room_at.TRIED] = 0.0
-    if tolerances[ESTIMATE] == 1.0 and _is_unsuited(w, room):
+    if tolerances[ESTIMATE] == 1.0 and _is_unsuited(w, room, tolerances):
         return Attempt(UNSUITED, math.inf, 0.0)
     ended, error, factor = _collocate(f, w, options, room, tolerances, t, h, state)
     if ended == LEFT or (ended == REFUSED and tolerances[ESTIMATE] == 0.0):
@@ -176,6 +199,10 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
     code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
     if code == DONE:
         error = max(error, departure(w, tolerances, h, state[:n], state[n : 2 * n], q1))
+    if code == DONE and error <= 1.0 and w.notes[NEARLY_SINGULAR] == 1.0 and tolerances[ESTIMATE] == 1.0:
+        w.notes[NEAR_NOW] = 2.0  # pivots are to be looked at behind the step, too
+        if _passes_singular(f, w, t, h, state, new_state):
+            code = SINGULAR
     return Attempt(code, error, factor if error <= 1.0 else 0.0)
 
 
@@ -236,10 +263,10 @@ def _take(f, w, options, room, tolerances, driven, n, k, t, row, state):
 
 
 @merged
-def _may_follow(w, room, control, clock, h):
+def _may_follow(w, room, tolerances, control, clock, h):
     """Whether a step of this length may be made in a row, and nothing has to be looked at before it."""
     long = clock[at.H_LONG]
-    if h <= control[at.SHORTEST] or h < COLLAPSED * long or _is_unsuited(w, room):
+    if h <= control[at.SHORTEST] or h < COLLAPSED * long or _is_unsuited(w, room, tolerances):
         return False
     near = control[at.BRIDGE] == 1.0 and w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]
     return not (near and h < SHORT * long)
@@ -251,7 +278,7 @@ def _make(f, w, options, room, tolerances, control, clock, goal, state, n_most, 
     n, t, n_ends = w.Q.size, clock[at.T], 0
     while n_ends < n_most and t < goal:
         wanted = min(clock[at.H_NEXT], control[at.MAX_STEP])
-        if not _may_follow(w, room, control, clock, wanted):
+        if not _may_follow(w, room, tolerances, control, clock, wanted):
             break
         h, reaches = off_grid(control, t, wanted, goal - t, False)
         if reaches:
@@ -285,7 +312,7 @@ def lobatto_steps(
     put on the constraints together depends on nothing but the run.
     """
     room, n = _room(memory), w.Q.size
-    if out_t.size < LANES:
+    if out_t.size < LANES or w.notes[NEARLY_SINGULAR] == 1.0:
         return 0
     if control[at.FIRST_GIVEN] == 1.0:
         room[room_at.STARTS] = MOST_STARTS

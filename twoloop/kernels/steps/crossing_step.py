@@ -1,10 +1,14 @@
-"""Steps across a position where C_q loses rank, such as a parallelogram with its bars in line.
+"""Step across a singular position, where C_q loses rank, such as a parallelogram with its bars in line.
 
-Near such a position no partition determines the dependents well, and loops on independent coordinates do not converge,
-nor do those that leave stages off the constraints, though the motion is smooth. A step by collocation at Gauss nodes
-goes across. Its stages are moved to the nearest positions that the constraints allow: there accelerations are those of
-the motion, and iteration converges as it does elsewhere. The state at its beginning, which may be near the position,
-enters by q and v alone. Its end is put on the constraints with a partition of its own.
+Near such a position no partition determines the dependent coordinates well. Loops on independent coordinates do not
+converge there, nor does iteration with stages off the constraints, though the motion is smooth. This step is a
+collocation at Gauss nodes whose stages are projected onto the constraints: there the accelerations are those of the
+motion, and the fixed-point iteration converges as it does elsewhere.
+
+- Of the state at the beginning only q and v enter the result: its accelerations may be rounding.
+- The end is put on the constraints with a partition of its own.
+- Stages are projected by the generated code of the mechanism. A partition is chosen at a stage only where there is no
+  such code, or where its pivots are too small.
 """
 
 import numpy as np
@@ -12,10 +16,11 @@ import numpy as np
 from twoloop.kernels.control.controller import nothing_to_settle
 from twoloop.kernels.control.predictor import keep_predicted
 from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED, SINGULAR
-from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, kernel
+from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, kernel, merged
 from twoloop.kernels.data.counters import N_OUTER
-from twoloop.kernels.data.noted import ORIENTATION, ORIENTATION_NEW, PIVOT
-from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL, allowed
+from twoloop.kernels.data.flags import STRAIGHT
+from twoloop.kernels.data.noted import BY_GENERAL, ORIENTATION, ORIENTATION_NEW, PIVOT
+from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, GAP, RTOL, allowed
 from twoloop.kernels.evaluation.inner_loop import evaluate_state, project, renew_partition
 from twoloop.kernels.linalg.dense import copy
 
@@ -25,6 +30,7 @@ S = 8  # nodes
 LEFT = 0.01  # of the tolerances: what iteration may leave ...
 STAGNANT, NOISE = 0.5, 0.3  # ... or NOISE of them, where changes fall no further
 MOST, FEW = 40, 8  # sweeps; and those after which a node is left out
+UNSEEN, UNSEEN_WITHOUT = 0.1834, 0.3545  # of a step, the longest part without a node: of all, and with one left out
 ORDER, SHARE = 12.0, 0.5  # of the estimate; and what it counts
 ROUNDING = 1e-13  # relative: what a step without an estimate is iterated to
 NEARER = 0.5  # of the smallest pivot at the start of a step, which there must be at its end
@@ -32,7 +38,7 @@ LEAST = 1e-300  # in place of a coefficient of zero
 
 
 def options_array(A, b, c, inner_tol, theta):
-    """The parameter block, for a tableau of Gauss."""
+    """Return the parameter block for a Gauss tableau."""
     degrees = np.arange(S)
     legendre = np.polynomial.legendre.legvander(2.0 * c - 1.0, S - 1).T * b * (2 * degrees + 1)[:, None]
     gaps = c[:, None] - c + np.eye(S)
@@ -43,12 +49,13 @@ def options_array(A, b, c, inner_tol, theta):
 
 
 def memory_size(n):
-    """Length of `memory`."""
+    """Return the length of `memory`."""
     return (S + 3) * n
 
 
 @compiled
 def _combined(weights, a, total):
+    """Sum the accelerations at the nodes with these weights."""
     total[:] = 0.0
     for k in range(S):
         for m in range(total.size):
@@ -57,7 +64,7 @@ def _combined(weights, a, total):
 
 @compiled
 def _weight(tolerances, m, n, h, state):
-    """1 / what an error of velocity m may be."""
+    """Return the reciprocal of the allowed error of velocity m."""
     q, v = abs(state[m]), abs(state[n + m])
     if tolerances[ESTIMATE] == 0.0:
         return 1.0 / (ROUNDING * (1.0 + v))
@@ -68,7 +75,7 @@ def _weight(tolerances, m, n, h, state):
 
 @compiled
 def _error(tolerances, h, state, legendre, a, every_node):
-    """As that of collocation_code.py: from how fast the coefficients of a in Legendre polynomials fall."""
+    """Estimate the error as collocation_code.py does, from the decay of the Legendre coefficients of a."""
     n, largest = a.shape[1], 0.0
     for m in range(n):
         first = before = top = 0.0
@@ -83,30 +90,52 @@ def _error(tolerances, h, state, legendre, a, every_node):
             else:
                 top = max(top, abs(value))
         before = max(before, top, LEAST)
-        falls, far = top / before, top / max(first, before)
+        decay, far = top / before, top / max(first, before)
         if every_node:
-            falls *= np.sqrt(falls)
-        largest = max(largest, top * max(falls, far) * h * _weight(tolerances, m, n, h, state))
+            decay *= np.sqrt(decay)
+        largest = max(largest, top * max(decay, far) * h * _weight(tolerances, m, n, h, state))
     return SHARE * largest
 
 
+@merged
+def _integrate(h, c, A, AA, a, q, v, q_end, v_end):
+    """Set q_end and v_end to positions and velocities a time c h later, from integrals of the accelerations."""
+    _combined(A, a, v_end)
+    _combined(AA, a, q_end)
+    for m in range(q.size):
+        q_end[m] = q[m] + h * (c * v[m] + h * q_end[m])
+        v_end[m] = v[m] + h * v_end[m]
+
+
+@merged
+def _choose_partition_at_end(f, w, t, q, pivot):
+    """Choose the partition at the end of a step; SINGULAR where the next step would begin nearer to the position.
+
+    `pivot` is the smallest pivot at the beginning.
+    """
+    code = renew_partition(f, w, t, q)
+    if code == DONE and w.notes[PIVOT] < NEARER * pivot:
+        return SINGULAR
+    return code
+
+
 @kernel(ATTEMPT)
-def bridging_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """One attempt."""
+def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """Attempt one step."""
     n = w.Q.size
     q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
     a1, lam1 = new_state[2 * n : 3 * n], new_state[3 * n :]
     A, AA, legendre, without = options[N_SCALARS : N_SCALARS + 4 * S * S].reshape((4, S, S))
     b, bA, c = options[N_SCALARS + 4 * S * S :].reshape((3, S))
-    a, rest = memory[: S * n].reshape((S, n)), memory[S * n :].reshape((3, n))
-    q_stage, v_stage, a_stage = rest[0], rest[1], rest[2]
-    estimated = tolerances[ESTIMATE] == 1.0
+    a, stage = memory[: S * n].reshape((S, n)), memory[S * n :].reshape((3, n))
+    q_stage, v_stage, a_stage = stage[0], stage[1], stage[2]
+    estimated, generated = tolerances[ESTIMATE] == 1.0, f.flags[STRAIGHT] == 1
     w.counters[N_OUTER] += 1
     code = renew_partition(f, w, t, q)
     pivot = w.notes[PIVOT] if code == DONE else 0.0
     for j in range(S):
         copy(state[2 * n : 3 * n], a[j])
-    before, ended, left_out = np.inf, False, -1
+    change_before, converged, left_out = np.inf, False, -1
     for sweep in range(MOST):
         change, nearest, least = 0.0, -1, np.inf
         for j in range(S):
@@ -115,16 +144,20 @@ def bridging_step(f, w, options, memory, t, h, tolerances, state, new_state):
                 copy(a_stage, a[j])
                 continue
             time = t + c[j] * h
-            _combined(A[j], a, v_stage)
-            _combined(AA[j], a, q_stage)
-            for m in range(n):
-                q_stage[m] = q[m] + h * (c[j] * v[m] + h * q_stage[m])
-                v_stage[m] = v[m] + h * v_stage[m]
-            code = renew_partition(f, w, time, q_stage)
-            if w.notes[PIVOT] < least:
-                nearest, least = j, w.notes[PIVOT]
-            if code == DONE:
-                code = project(f, w, time, q_stage, v_stage, options[THETA], a_stage, w.lam)
+            renews = not generated or sweep == FEW
+            while True:
+                _integrate(h, c[j], A[j], AA[j], a, q, v, q_stage, v_stage)
+                code = DONE
+                if renews:
+                    code = renew_partition(f, w, time, q_stage)
+                    if w.notes[PIVOT] < least:
+                        nearest, least = j, w.notes[PIVOT]
+                if code == DONE:
+                    code = project(f, w, time, q_stage, v_stage, options[THETA], a_stage, w.lam)
+                if renews or w.notes[BY_GENERAL] == 0.0:
+                    break
+                # pivots of the generated code are too small: the general one took over, with another stage's partition
+                renews, generated = True, False
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
             for m in range(n):
@@ -138,27 +171,28 @@ def bridging_step(f, w, options, memory, t, h, tolerances, state, new_state):
                             a[k, m] += (a[j, m] - a[j - 1, m]) * (c[k] - c[j]) / (c[j] - c[j - 1])
         if not np.isfinite(change):
             return Attempt(OUTER_DIVERGED, np.inf, 0.0)
-        if change <= LEFT or (sweep > 2 and STAGNANT * before <= change <= NOISE):
-            ended = True
+        if change <= LEFT or (sweep > 2 and STAGNANT * change_before <= change <= NOISE):
+            converged = True
             break
+        if sweep == 0 and estimated:  # most steps that are refused are so for their end, which is known well enough now
+            _integrate(h, 1.0, b, bA, a, q, v, q1, v1)
+            code = _choose_partition_at_end(f, w, t + h, q1, pivot)
+            if code != DONE:
+                return Attempt(code, np.inf, 0.0)
         if sweep == FEW:  # accelerations nearest to the singular position are rounding: they follow from the others
+            if estimated and UNSEEN_WITHOUT * h > tolerances[GAP] * (1.0 + ROUNDING):
+                return Attempt(OUTER_DIVERGED, np.inf, 0.0)
             left_out = nearest
-        before = change
-    if not ended and estimated:
+        change_before = change
+    if not converged and estimated:
         return Attempt(OUTER_DIVERGED, np.inf, 0.0)
     error = 0.0
     if estimated:
         error = _error(tolerances, h, state, legendre, a, left_out < 0)
         if not error <= 1.0:
             return Attempt(DONE, error, 0.0)
-    _combined(b, a, v1)
-    _combined(bA, a, q1)
-    for m in range(n):
-        q1[m] = q[m] + h * (v[m] + h * q1[m])
-        v1[m] = v[m] + h * v1[m]
-    code = renew_partition(f, w, t + h, q1)
-    if code == DONE and w.notes[PIVOT] < NEARER * pivot:
-        code = SINGULAR  # from there it would be harder still
+    _integrate(h, 1.0, b, bA, a, q, v, q1, v1)
+    code = _choose_partition_at_end(f, w, t + h, q1, pivot)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
     keep_predicted(w, q1)
@@ -171,4 +205,4 @@ def bridging_step(f, w, options, memory, t, h, tolerances, state, new_state):
     return Attempt(code, error, 0.0)
 
 
-BRIDGING = Step(bridging_step, nothing_to_settle)
+CROSSING = Step(crossing_step, nothing_to_settle)

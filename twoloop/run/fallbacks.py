@@ -1,4 +1,4 @@
-"""What goes on where a run's own steps cannot: another plan, a step to load, one across what is singular, a jump."""
+"""Go on where a run's own steps cannot: with another method, across a singular position, or over a jump."""
 
 from functools import cache
 
@@ -17,13 +17,24 @@ from twoloop.run.workspace import kit_of, kit_with
 
 Array = NDArray[np.float64]
 
-# of the longest of the last steps: lengths tried for a step across a singular position, on which no stage should fall
-BRIDGES = tuple(0.85**k for k in range(28))
-CLEAR = 0.3  # of the largest pivot that C_q had: where the run's own steps go on
+# of the longest of the last steps: lengths to try for a step across a singular position, on which no stage should fall
+LENGTHS = tuple(0.85**k for k in range(28))
+CLEAR = 0.3  # of the largest pivot that C_q had, from which on the run's own steps go on
 
 
-def give_way(run: Run) -> None:
-    """Go on with the plan that takes over where values of this one are not finite."""
+def may_cross(run: Run, code: int) -> bool:
+    """Return whether steps across follow: near a singular position, also where the method is not suited to it."""
+    a, notes = run.a, run.work.notes
+    if code == a.HAS_TO_GIVE_WAY:
+        from twoloop.kernels.steps.lobatto_step import TIGHT
+
+        near = notes[noted.NEARLY_SINGULAR] == notes[noted.NEAR_NOW] == 1.0
+        return bool(near and run.control[a.BRIDGE] == 1.0 and run.tolerances[tolerances.LEAST] >= TIGHT)
+    return code == a.NEAR_SINGULAR
+
+
+def switch_method(run: Run) -> None:
+    """Go on with the plan of another method, where that of the run is not suited, or its values are not finite."""
     substitute = run.plan.substitute
     assert substitute is not None
     run.plan, run.memory = substitute.fresh(), substitute.memory  # in which no run writes
@@ -37,13 +48,13 @@ def give_way(run: Run) -> None:
 
 
 def load(run: Run) -> None:
-    """Load the step that a run has come to."""
+    """Load the compiled step that a run has come to."""
     loaded(run.plan.second)
     _renew_kit(run)
 
 
 def _renew_kit(run: Run) -> None:
-    """Have kernels call what the run's plan names now."""
+    """Make the kit that calls the steps of the run's plan."""
     if run.static is None:
         run.kit = kit_with(run.system, run.functions.flags, run.plan)
     else:
@@ -51,70 +62,81 @@ def _renew_kit(run: Run) -> None:
     run.functions = run.kit.functions
 
 
-def bridge(run: Run) -> tuple[Plan, Array]:
-    """The plan and the controls for steps across a singular position, see kernels/steps/bridge.py."""
+def cross_singularity(run: Run) -> tuple[Plan, Array]:
+    """Return the plan and the controls for steps across a singular position, see kernels/steps/crossing_step.py."""
     a, clock = run.a, run.clock
     run.crossings.append([(float(clock[a.T]), run.state.copy())])
-    plan = _plan_across(run.system.n_q)
+    from twoloop.kernels.steps.crossing_step import UNSEEN
+
+    plan = _crossing_plan(run.system.n_q)
     control = run.control.copy()
     control[: a.N_RULE] = plan.rule
     control[a.SYMMETRIC], control[a.BRIDGE], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
     control[a.GIVES_WAY] = control[a.IN_A_ROW] = 0.0
     if control[a.FIXED_STEP] == 0.0:
-        control[a.MAX_STEP] = min(run.max_step, run.tolerances[tolerances.GAP])
+        control[a.UNSEEN] = 1.0 if run.narrow else UNSEEN
+        control[a.MAX_STEP] = min(run.max_step, run.tolerances[tolerances.GAP] / control[a.UNSEEN])
     clock[a.H_LIMIT], clock[a.LIMIT_AGE] = np.inf, 0.0
-    run.lengths = [float(clock[a.H_LONG]) * part for part in BRIDGES]
+    run.lengths = _lengths(run, control)
     clock[a.H_NEXT] = run.lengths.pop(0)
     return plan, control
 
 
-def _plan_across(n_q: int) -> Plan:
-    """The plan of steps across a singular position."""
-    from twoloop.kernels.steps import bridge
+def _lengths(run: Run, control: Array) -> list[float]:
+    """Lengths to try for a step across, s: a longer one than is allowed would be the same attempt once more."""
+    longest = float(run.clock[run.a.H_LONG])
+    allowed = min(longest, float(control[run.a.MAX_STEP]))
+    return [allowed, *(longest * part for part in LENGTHS if longest * part < allowed)]
 
-    return Plan(bridge.BRIDGING, _options_across(), np.zeros(bridge.memory_size(n_q)), exponent=1.0 / bridge.ORDER)
+
+def _crossing_plan(n_q: int) -> Plan:
+    """Make the plan of steps across a singular position."""
+    from twoloop.kernels.steps import crossing_step as kernels
+
+    return Plan(kernels.CROSSING, _crossing_options(), np.zeros(kernels.memory_size(n_q)), exponent=1.0 / kernels.ORDER)
 
 
 @cache
-def _options_across() -> Array:
+def _crossing_options() -> Array:
     """Compute the options of such steps once: the tableau takes longer than most steps across."""
-    from twoloop.kernels.steps import bridge
+    from twoloop.kernels.steps import crossing_step as kernels
 
-    tableau = gauss(bridge.S)
-    return bridge.options_array(tableau.A, tableau.b, tableau.c, INNER_TOL, LARGEST_MOVE)
+    tableau = gauss(kernels.S)
+    return kernels.options_array(tableau.A, tableau.b, tableau.c, INNER_TOL, LARGEST_MOVE)
 
 
-def bridging_kit(kit: Kit) -> Kit:
-    """What steps across call; it stays with what the run's own steps call."""
-    from twoloop.kernels.steps.bridge import BRIDGING
+def crossing_kit(kit: Kit) -> Kit:
+    """Return the kit of steps across; it is kept with that of the run's own steps."""
+    from twoloop.kernels.steps.crossing_step import CROSSING
 
     known = vars(kit)
-    if "bridging" not in known:
-        known["bridging"] = Kit(kit.functions, kit.general, BRIDGING)
-    return known["bridging"]  # type: ignore[no-any-return]
+    if "crossing" not in known:
+        known["crossing"] = Kit(kit.functions, kit.general, CROSSING)
+    return known["crossing"]  # type: ignore[no-any-return]
 
 
-def beyond(run: Run, plan: Plan, control: Array, code: int, accepted: int) -> tuple[Plan, Array, int]:
-    """What goes on after an attempt at a step across: the same, or the run's own steps again."""
+def after_crossing(run: Run, plan: Plan, control: Array, code: int, accepted: int) -> tuple[Plan, Array, int]:
+    """Choose what follows an attempt at a step across: another length, another such step, or the run's own steps."""
     a = run.a
     if code == a.PAUSED and accepted == 0 and run.lengths:
         run.clock[a.H_NEXT], run.clock[a.H_LIMIT] = run.lengths.pop(0), np.inf
         return plan, control, code
     if code == a.PAUSED and accepted > 0 and (run.work.notes[noted.PIVOT] < CLEAR * run.clock[a.LARGEST_PIVOT]):
-        run.lengths = [float(run.clock[a.H_LONG]) * part for part in BRIDGES]
+        run.lengths = _lengths(run, control)
         return plan, control, code
     if code not in (a.PAUSED, a.STEP_TOO_SMALL, a.FIXED_STEP_FAILED, a.RANK_LOST):
         return plan, control, code
     if accepted == 0:  # there is no way across: the run's own steps go on as far as they can
         run.control[a.BRIDGE] = 0.0
     run.crossings[-1].append((float(run.clock[a.T]), run.state.copy()))
+    run.work.notes[noted.NEAR_NOW] = 0.0
     run.plan.memory[:] = run.memory
     run.clock[: a.N_PAST] = 0.0
     return run.plan, run.control, a.PAUSED
 
 
-def leap(run: Run, t1: float) -> bool:
-    """Make ready the step over a jump of C_t or b, after which the method begins anew; whether there is one."""
+def apply_jump(run: Run, t1: float) -> bool:
+    """Prepare the step over a jump of C_t or b, after which the method restarts; return whether there is one."""
     a, clock, n = run.a, run.clock, run.system.n_q
     end = float(clock[a.JUMP_TO])
     state = state_behind_jump(run.system, end, run.state[:n], run.state[n : 2 * n])

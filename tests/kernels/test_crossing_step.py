@@ -5,15 +5,15 @@ import pytest
 
 from tests.general.mechanisms import error, mechanism
 from twoloop import solve_dae
-from twoloop.kernels.steps import bridge
+from twoloop.kernels.steps import crossing_step
 from twoloop.methods.tableaux import gauss
 
-S = bridge.S
+S = crossing_step.S
 
 
 def test_the_tables_are_exact_for_polynomials():
     tableau = gauss(S)
-    options = bridge.options_array(tableau.A, tableau.b, tableau.c, 0.0, 0.0)[bridge.N_SCALARS :]
+    options = crossing_step.options_array(tableau.A, tableau.b, tableau.c, 0.0, 0.0)[crossing_step.N_SCALARS :]
     _, twice, legendre, without = options[: 4 * S * S].reshape(4, S, S)
     _, end_twice, c = options[4 * S * S :].reshape(3, S)
     for degree in range(S - 1):
