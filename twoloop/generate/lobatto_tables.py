@@ -1,7 +1,7 @@
-"""Collocation at nine Lobatto nodes, the first of which is the end of the step before: its coefficients, order 16.
+"""Compute the coefficients of Lobatto IIIA with nine nodes, the first of which is the end of the step before.
 
-Polynomials of degree 8 through values at the nodes are written in Legendre's, whose coefficients, integrals and
-derivatives at the end are known (Hairer & Wanner, Solving ODEs II, IV.5, on Lobatto IIIA).
+A polynomial of degree 8 through values at the nodes is expanded in Legendre polynomials, whose integrals and
+derivatives at the ends are known (Hairer & Wanner, Solving ODEs II, IV.5). The order is 16.
 """
 
 from functools import cache
@@ -18,16 +18,16 @@ N = 9
 
 
 class Tables(NamedTuple):
-    """For nodes c_0 = 0 < ... < c_8 = 1; rows belong to values at the nodes, the first to that at the beginning.
+    """Hold the tables for nodes c_0 = 0 < ... < c_8 = 1. Row k multiplies the value at node k.
 
     Attributes
     ----------
     nodes, between : (8,)
-        Nodes that are not known, and places half-way from one node to the next.
+        Nodes 1 to 8, and the midpoints between neighbouring nodes.
     velocities, positions : (9, 8)
-        Single and double integrals from 0 to each node.
+        Single and double integrals from 0 to each of the nodes 1 to 8.
     values_between, velocities_between, positions_between : (9, 8)
-        The polynomial and these integrals at the places between nodes.
+        Values of the polynomial, and the same integrals, at the midpoints.
     spectrum : (9, 8)
         Coefficients of the Legendre polynomials 1 to 8 on [0, 1], which are 1 at its end.
     begin, end : (9, 8)
@@ -48,7 +48,7 @@ class Tables(NamedTuple):
 
 @cache
 def tables() -> Tables:
-    """The coefficients, right to rounding."""
+    """Return the coefficients, computed in extended precision and rounded once."""
     x = _nodes()
     between: Extended = (x[1:] + x[:-1]) / np.longdouble(2)
     values = _legendre(x)
@@ -71,7 +71,7 @@ def tables() -> Tables:
 
 
 def _nodes() -> Extended:
-    """-1, the zeros of P_8', 1."""
+    """Return -1, the zeros of P_8', and 1."""
     inner = legendre.legroots(legendre.legder([0] * (N - 1) + [1])).astype(np.longdouble)
     derivative = legendre.legder(np.array([0] * (N - 1) + [1], dtype=np.longdouble))
     for _ in range(3):
@@ -80,12 +80,12 @@ def _nodes() -> Extended:
 
 
 def _legendre(z: Extended) -> Extended:
-    """P_0 to P_10, a row each."""
+    """Evaluate P_0 to P_10, a row each."""
     return np.array([legendre.legval(z, np.array([0] * k + [1], dtype=np.longdouble)) for k in range(N + 2)])
 
 
 def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended, Extended]:
-    """Lagrange polynomials on [0, 1], and their single and double integrals from its beginning, a row a node."""
+    """Evaluate the Lagrange polynomials on [0, 1], and their single and double integrals from 0; a row a node."""
     values = _legendre(z)
     # the integral of P_k from -1 is (P_k+1 - P_k-1) / (2 k + 1)
     once = np.array([values[1] + 1, *((values[k + 1] - values[k - 1]) / (2 * k + 1) for k in range(1, N + 1))])

@@ -1,4 +1,4 @@
-"""Lobatto16(): implicit Runge-Kutta steps by fixed-point iteration, all stages at once."""
+"""Define Lobatto16: implicit Runge-Kutta steps by fixed-point iteration, all stages at once."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -21,15 +21,15 @@ UNSEEN = float(np.diff([0.0, *tables().nodes]).max())  # of a step, between two 
 
 @dataclass(frozen=True)
 class Lobatto16:
-    """Collocation at nine Lobatto nodes, of order 16, whose stages are found by fixed-point iteration.
+    """Take steps of order 16 by collocation at nine Lobatto nodes; fixed-point iteration finds the stages.
 
     It is the outer loop of the paper's procedure with another tableau, and for all coordinates: no Jacobian, and a
-    prediction by the polynomial of the step before. The eight unknown stages are evaluated at once, one in each lane of
-    a vector, by code made for the mechanism; a step takes four to eight such sweeps. It is for smooth motion that is
-    not stiff. Accepted states are on the constraints.
+    prediction by the polynomial of the step before. Generated code evaluates the eight unknown stages at once, one in
+    each SIMD lane; a step takes four to eight such sweeps. Accepted states are on the constraints.
 
-    Where the iteration converges too slowly for the accuracy asked for, as in stiff motion, and near singular
-    positions, "DOP853" goes on.
+    It is for smooth motion that is not stiff. Where the iteration converges too slowly, as in stiff motion, "DOP853"
+    goes on. So it does behind a singular position at tolerances below 1e-8; the position itself is crossed by
+    collocation with projected stages.
 
     Raises
     ------
@@ -60,7 +60,7 @@ class Lobatto16:
     def for_system(
         self, system: ConstrainedSystem, code: GeneratedCode | None = None, check: Check = unchecked
     ) -> "Lobatto16":
-        """The method with what is compiled for this system.
+        """Return the method with the generated code of this system.
 
         Raises
         ------
@@ -75,11 +75,11 @@ class Lobatto16:
         return replace(self, code=code, narrow=may_be_narrow(system, ran_on_symbols=True))
 
     def takes_code(self, fixed: bool) -> bool:
-        """Whether its steps may be run with code made for the mechanism."""
+        """Return whether its steps may call generated code."""
         return True
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Make the method ready for a run of n_q coordinates."""
+        """Return the plan of a run of n_q coordinates."""
         from twoloop.kernels.steps import lobatto_step as kernels
 
         if self.code is None:

@@ -1,58 +1,60 @@
-"""What steps by collocation have in memory: generated code fills it, and steps/lobatto_step.py reads it.
+"""Lay out the memory of collocation steps, which generated code fills and steps/lobatto_step.py reads.
 
-Places are counted in numbers from an aligned place on. "Lanes" are eight numbers side by side, one for each unknown
-node, or for each of eight steps that are put on the constraints together.
+Offsets are counted in numbers from an aligned place on. A group of eight numbers, "lanes", has one for each unknown
+node, or one for each of eight steps that are projected together.
 """
 
 LANES = 8
 ORDER = 12.0  # of the estimate of the error
-NOISE = 1e-13  # of values: what their differences may be for rounding's sake
-MADE, REFUSED, GUESSED, LEFT = range(4)  # how the stages of a step ended
+NOISE = 1e-13  # relative: differences of values below it may be rounding
+# how the iteration of the stages ended; GUESSED: the step size was a guess, and another is to be tried; LEFT: the
+# accelerations could not be found
+MADE, REFUSED, GUESSED, LEFT = range(4)
 
 (
     T,  # beginning of the step
     H,
     H_BEFORE,  # of the step whose polynomial predicts this one
     DEGREE,  # of the polynomial that predicts
-    PREDICTS,  # 1: there is one; 0: accelerations are taken for constant
-    WHICH,  # of two such polynomials is that of the last accepted step
-    TRIED,  # 1: the other one is that of the step just made
+    PREDICTS,  # 1: there is a polynomial; 0: accelerations are predicted to be constant
+    WHICH,  # which of two polynomials is that of the last accepted step
+    TRIED,  # 1: the other polynomial is that of the step just attempted
     NEXT_DEGREE,
-    KEPT_DEGREE,  # that of the prediction before a step that was refused; 0: none was
-    MAY_GUESS,  # 1: the length of the step is a guess, and another is tried where its sweeps contract too well or badly
-    CAREFUL,  # steps that are still to be made by the elimination of M
-    STARTS,  # guesses for the first step so far
+    KEPT_DEGREE,  # degree of the prediction before a refused step; 0: none was refused
+    MAY_GUESS,  # 1: the step size is a guess, and another is tried if the contraction is far from what is aimed at
+    CAREFUL,  # steps that are still to be taken by the elimination that begins with M
+    STARTS,  # guesses of the first step size so far
     N_STEPS,  # since the beginning
     LIMITED,  # steps that convergence, not accuracy, kept short, less the others
-    UNMADE,  # twice the steps that did not converge, less those accepted
-    DEFECT,  # between nodes, over what is allowed; -1: it was not looked for
+    UNMADE,  # twice the number of steps that did not converge, less those accepted
+    DEFECT,  # largest defect between nodes, over what is allowed; -1: there was no audit
     RHO,  # contraction of a sweep
-    SWEEPS,  # of the step
-    TARGETED,  # how many these were to be
-    CHANGE,  # by the last one, over the tolerances
+    SWEEPS,  # number of sweeps of the step
+    TARGETED,  # number of sweeps aimed at
+    CHANGE,  # of velocities by the last sweep, over the tolerances
     ERROR,  # of the step, over the tolerances
-    CURVED,  # the coefficients of degree 5 and 6 of its accelerations, over the tolerances
-    FACTOR,  # by which the next step may be longer as the sweeps converge; and for the sake of the error, a defect
-    FACTOR_OF_ERROR,
-    FACTOR_OF_DEFECT,
-    ALLOWED_H,  # how long the step might have been for its error
+    CURVED,  # Legendre coefficients of degree 5 and 6 of the accelerations, over the tolerances
+    FACTOR,  # of the next step size, by convergence ...
+    FACTOR_OF_ERROR,  # ... by the error ...
+    FACTOR_OF_DEFECT,  # ... and by the defect
+    ALLOWED_H,  # step size that the error would have allowed
     SIZE,  # of velocities and their changes, over the tolerances
-    STRICTER,  # how many times less of the coordinates that are iterated the tolerances of others allow
+    STRICTER,  # ratio by which the tolerances of other coordinates are stricter than those of the iterated ones
 ) = range(28)
-POWERS = 32  # lanes: of the length of the step over that before
-SCALED = 40  # lanes: the coefficients of a polynomial times these
-MOVED = 48  # lanes: how far positions were moved last, the largest coordinate
-FINE = 56  # lanes: 1 where the projection could be made
-DEFECTS = 64  # lanes: of steps in a row
-WEIGHTS = 72  # (n): 1 / what an error of a velocity may be
+POWERS = 32  # lanes: powers 1 to 8 of the step size over the one before
+SCALED = 40  # lanes: coefficients of a polynomial times these powers
+MOVED = 48  # lanes: largest move of a coordinate by the last projection
+FINE = 56  # lanes: 1 where the projection succeeded
+DEFECTS = 64  # lanes: defects of steps in a row
+WEIGHTS = 72  # (n): reciprocals of the allowed errors of velocities
 
 
 def places(n, n_iterated, n_rows):
-    """Where what has no fixed place begins, and the length of the whole.
+    """Return the offsets of the arrays whose sizes depend on the mechanism, and the length of the whole.
 
-    Accelerations at the nodes (n lanes), positions and velocities there and two polynomials (n_iterated lanes each),
-    the spectrum of accelerations (n lanes); and for the projection t, q and v (1 + 2 n lanes), a (n lanes) and lam
-    (n_rows lanes).
+    For the stages: accelerations (n lanes), positions, velocities and two polynomials (n_iterated lanes each), and the
+    Legendre coefficients of the accelerations (n lanes). For the projection: t, q and v (1 + 2 n lanes), a (n lanes)
+    and lam (n_rows lanes).
     """
     a = WEIGHTS + LANES * (-(-n // LANES))
     q = a + LANES * n

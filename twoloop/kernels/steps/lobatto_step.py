@@ -1,12 +1,17 @@
-"""Steps by collocation at nine Lobatto nodes, of order 16: the outer loop of the paper's procedure, in lanes.
+"""Take implicit Runge-Kutta steps of order 16 at nine Lobatto nodes: the paper's outer loop, in SIMD lanes.
 
-The stages of an implicit Runge-Kutta step are iterated without any Jacobian, as the paper does, all of them at once:
-see generate/collocation_code.py, whose functions do the arithmetic. (M. Antonana, J. Makazaga and A. Murua do so for
-ordinary differential equations at high precision, arXiv 2511.03655.) Here the length of a step is chosen. A sweep over
-the stages shrinks their error by rho, which grows with the step and with the derivatives of the accelerations; the
-length is such that a given number of sweeps suffices, or such that the top coefficients of the accelerations in
-Legendre polynomials are as small as the tolerance asks for. The integrator asks for one step after another; or several
-are made in a row, while nothing else has to be looked at, and put on the constraints side by side.
+The stages are found by fixed-point iteration without any Jacobian, as in the paper, all of them at once. The generated
+code of generate/collocation_code.py does the arithmetic; this file chooses the step size. (M. Antonana, J. Makazaga and
+A. Murua iterate so on ordinary differential equations at high precision, arXiv 2511.03655.)
+
+One sweep over the stages multiplies their error by the contraction rho, which grows with the step size and with the
+derivatives of the accelerations. Two things limit the step size:
+
+- convergence: a given number of sweeps is to suffice;
+- accuracy: the last Legendre coefficients of the accelerations are to be as small as the tolerance asks for.
+
+The integrator calls for one step at a time, or for several in a row while it has nothing to check between them. The
+ends of steps in a row are projected onto the constraints together, one in each lane.
 """
 
 import math
@@ -34,13 +39,15 @@ from twoloop.kernels.evaluation.accelerations import ABOVE_ROUNDING
 from twoloop.kernels.evaluation.inner_loop import check_redundant, project, renew_partition
 from twoloop.kernels.linalg.dense import copy
 
-# FREE: how many times LOOK a step may be long that nothing is looked at within, beside the nodes
+# FREE: longest step, in units of LOOK, whose nodes alone are close enough; a longer one is audited between its nodes
 THETA, N_ITERATED, N_ROWS, FREE, N_OPTIONS = range(5)
 
-WANTED_START = 0.12  # contraction of the first step, see collocation_code.py
+WANTED_START = 0.12  # contraction aimed at in the first step, between the limits of collocation_code.py
 MOST_STARTS = 4
 SHORTER, SAFETY = 0.6, 0.75
-LIMITED, STRAIGHT = 24.0, 0.1  # such steps, after which another method goes on; what the iteration leaves of CURVED
+# steps limited by convergence, after which another method goes on: then the motion is stiff; and the value of CURVED
+# below which accelerations hardly vary within a step
+LIMITED, STRAIGHT = 24.0, 0.1
 N_CHECKED, MUCH_NEARER = 4, 0.4  # parts of a step at whose ends pivots are checked, and their least ratio to the first
 # tolerance below which another method goes on behind a singular position: here five more runs of A02 were wrong
 TIGHT = 1e-8
@@ -53,19 +60,19 @@ _places = merged(places)
 
 
 def memory_size(n, n_iterated, n_rows):
-    """Length of `memory`, with room to begin at an aligned place."""
+    """Return the length of `memory`, with a margin for alignment."""
     return places(n, n_iterated, n_rows)[-1] + LANES
 
 
 @inlined
 def _room(memory):
-    """The memory from an aligned place on."""
+    """Return the memory from the first place that is aligned for vector loads."""
     return memory[(-(memory.ctypes.data >> 3)) & (LANES - 1) :]
 
 
 @merged
 def _keep_refused(f, room, state):
-    """The polynomial of a step with too large an error is good enough to predict a shorter one in its place."""
+    """Let the polynomial of a step whose error is too large predict the shorter one in its place."""
     f.retry_nodes(room, state)
     if room[room_at.KEPT_DEGREE] == 0.0:
         room[room_at.KEPT_DEGREE] = max(room[room_at.DEGREE], 3.0)
@@ -74,7 +81,7 @@ def _keep_refused(f, room, state):
 
 @compiled
 def _collocate(f, w, options, room, tolerances, t, h, state):
-    """The stages of a step: how it ended, its error, and the factor for the next one."""
+    """Iterate the stages of a step; return how that ended, the error, and the factor for the next step size."""
     first, estimated = room[room_at.PREDICTS] == 0.0, tolerances[ESTIMATE] == 1.0
     longest = tolerances[LOOK] / BETWEEN
     if estimated and h > longest * (1.0 + ROUNDING):
@@ -117,11 +124,11 @@ def _collocate(f, w, options, room, tolerances, t, h, state):
         most = min(most, of_defect)
     most = min(most, longest / h)
     beyond = room[room_at.SWEEPS] - room[room_at.TARGETED]
-    # the motion hardly bends within the step, which nonetheless takes about all its sweeps
+    # stiff: accelerations hardly vary within the step, and yet it takes about all its sweeps
     limited = room[room_at.CURVED] < STRAIGHT and beyond >= -1.0
     room[room_at.LIMITED] = max(0.0, room[room_at.LIMITED] + (1.0 if limited else -1.0))
     factor = room[room_at.FACTOR]
-    # how long a step may be changes from one to the next, mostly by as much as it did before
+    # the step size that accuracy allows mostly changes as it did from the step before to this one
     allowed_h = h * min(room[room_at.FACTOR_OF_ERROR], FAR)
     if error > 1e-6 and room[room_at.CURVED] >= STRAIGHT:
         trend = 1.0 if first else min(max(allowed_h / room[room_at.ALLOWED_H], LEAST_TREND), 1.0)
@@ -134,7 +141,7 @@ def _collocate(f, w, options, room, tolerances, t, h, state):
 
 @merged
 def _accept(room):
-    """The polynomial of this step predicts the next."""
+    """Let the polynomial of this step predict the next."""
     if room[room_at.KEPT_DEGREE] > 0.0:
         room[room_at.NEXT_DEGREE], room[room_at.KEPT_DEGREE] = room[room_at.KEPT_DEGREE], 0.0
     room[room_at.WHICH] = 1.0 - room[room_at.WHICH]
@@ -145,7 +152,7 @@ def _accept(room):
 
 @merged
 def _is_unsuited(w, room, tolerances):
-    """Whether another method should go on: near a singular position, and where stiffness limits the steps."""
+    """Return whether another method is to go on: near a singular position, and where stiffness limits the steps."""
     stiff = room[room_at.LIMITED] >= LIMITED or room[room_at.UNMADE] >= REFUSALS
     near = w.notes[NEAR_NOW] == 1.0 or tolerances[LEAST] < TIGHT
     return stiff or (w.notes[NEARLY_SINGULAR] == 1.0 and near)
@@ -172,7 +179,7 @@ def _passes_singular(f, w, t, h, state, new_state):
 
 @kernel(SETTLE)
 def settle_lobatto(f, w, options, memory, tolerances, accepted):
-    """The polynomial of an accepted step predicts the next."""
+    """Commit a step: the polynomial of an accepted one predicts the next."""
     room = _room(memory)
     if accepted and room[room_at.TRIED] == 1.0:
         _accept(room)
@@ -181,7 +188,7 @@ def settle_lobatto(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """One attempt."""
+    """Attempt one step."""
     room, n = _room(memory), w.Q.size
     room[room_at.TRIED] = 0.0
     if tolerances[ESTIMATE] == 1.0 and _is_unsuited(w, room, tolerances):
@@ -208,7 +215,7 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
 
 @merged
 def _project_all(f, w, options, room, n, n_ends, out_t, out_state):
-    """Put the states of so many rows on the constraints, in the lanes of `room`, with accelerations and multipliers."""
+    """Project the first n_ends rows onto the constraints, one in each lane, and find accelerations and multipliers."""
     ends = _places(n, int(options[N_ITERATED]), int(options[N_ROWS]))[5]
     for k in range(LANES):
         row = min(k, n_ends - 1)
@@ -234,10 +241,10 @@ def _project_all(f, w, options, room, n, n_ends, out_t, out_state):
 
 @merged
 def _take(f, w, options, room, tolerances, driven, n, k, t, row, state):
-    """Make `row`, a state beside the constraints, that of lane k, on them; whether it was near enough.
+    """Replace `row` by its projection, that of lane k; return whether the projection moved it by the tolerance at most.
 
-    Where constraints depend on time (`driven`), a velocity that they change is one that the accelerations at the nodes
-    do not explain: see drive_discontinuities.py.
+    Where constraints depend on time (`driven`), velocities are compared, too: a change that the accelerations at the
+    nodes do not explain may come from a discontinuity of the drive, see drive_discontinuities.py.
     """
     _, _, _, _, _, ends, end_a, lam, _ = _places(n, int(options[N_ITERATED]), int(options[N_ROWS]))
     if room[room_at.FINE + k] == 0.0:
@@ -264,7 +271,7 @@ def _take(f, w, options, room, tolerances, driven, n, k, t, row, state):
 
 @merged
 def _may_follow(w, room, tolerances, control, clock, h):
-    """Whether a step of this length may be made in a row, and nothing has to be looked at before it."""
+    """Return whether a step of this length may be taken without a check by the integrator before it."""
     long = clock[at.H_LONG]
     if h <= control[at.SHORTEST] or h < COLLAPSED * long or _is_unsuited(w, room, tolerances):
         return False
@@ -274,7 +281,7 @@ def _may_follow(w, room, tolerances, control, clock, h):
 
 @merged
 def _make(f, w, options, room, tolerances, control, clock, goal, state, n_most, out_t, out_state, out_steps):
-    """Steps in a row, at most so many, beside the constraints; how many."""
+    """Take at most n_most steps in a row without projecting their ends; return how many."""
     n, t, n_ends = w.Q.size, clock[at.T], 0
     while n_ends < n_most and t < goal:
         wanted = min(clock[at.H_NEXT], control[at.MAX_STEP])
@@ -306,10 +313,10 @@ def _make(f, w, options, room, tolerances, control, clock, goal, state, n_most, 
 def lobatto_steps(
     f, w, options, memory, tolerances, control, clock, goal, state, new_state, out_t, out_state, out_steps
 ):
-    """Steps in a row while nothing else has to be looked at, at most as many as there are lanes; how many.
+    """Take steps in a row, at most as many as there are lanes, and project their ends together; return how many.
 
-    Such a group ends where the number of steps is a multiple of that, whatever else makes the integrator pause: what is
-    put on the constraints together depends on nothing but the run.
+    A group ends where the number of accepted steps is a multiple of the lanes, whatever else makes the integrator
+    pause: which steps are projected together depends on the run alone, so that results can be repeated.
     """
     room, n = _room(memory), w.Q.size
     if out_t.size < LANES or w.notes[NEARLY_SINGULAR] == 1.0:
