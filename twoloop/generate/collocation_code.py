@@ -1,11 +1,11 @@
-"""Code for steps by collocation: the stages of a step side by side, one in each lane of a vector.
+"""Generate code for collocation steps whose stages are evaluated side by side, one in each SIMD lane.
 
-An implicit Runge-Kutta step whose stages are found by fixed-point iteration evaluates all of them anew in each sweep,
-none of which waits for another: one sweep takes little longer than one evaluation. Accelerations depend on some
-coordinates only, mostly; those are iterated, and the others follow from the accelerations at the end. Then states at
-the ends of eight steps are moved to the constraints side by side, too.
+Fixed-point iteration evaluates all stages of an implicit Runge-Kutta step anew in each sweep. No stage waits for
+another, so that a sweep takes little longer than one evaluation. Mostly the accelerations depend on some of the
+coordinates only: these are iterated, and the others follow from the accelerations at the end. The ends of eight steps
+are projected onto the constraints side by side, too.
 
-The functions work in a memory that kernels/data/collocation.py describes; kernels/steps/lobatto_step.py calls them.
+The functions work in a memory that kernels/data/collocation.py lays out; kernels/steps/lobatto_step.py calls them.
 """
 
 import hashlib
@@ -35,33 +35,33 @@ from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL
 Array = NDArray[np.float64]
 LONGEST = 5000  # operations of the equations: code of as many takes 2 s to compile
 SMALLEST = 1e-300  # in place of a coefficient of zero
-FAILED = -1.0  # what an audit gives in place of a defect where accelerations cannot be had
+FAILED = -1.0  # result of an audit that cannot evaluate the accelerations, in place of the defect
 INFINITE = float("inf")
-CAREFULLY = 8.0  # steps made by the elimination of M after one in which the other accelerations would not do
+CAREFULLY = 8.0  # steps by the elimination that begins with M, after one where the conditions of the other failed
 FIRST_DEGREE = 3.0  # of the polynomial that predicts the second step
 
 # the iteration
-KAPPA = 0.02  # of the tolerance: what it may leave; errors are then at most those of other methods of ours
-TARGET = 6.0  # sweeps that a step is to take; more where a polynomial of high degree predicts well
+KAPPA = 0.02  # of the tolerance, what the iteration may leave: errors are then no larger than those of DOP853
+TARGET = 6.0  # sweeps aimed at; more where a polynomial of high degree predicts well, as the step is long then
 MORE = 7  # sweeps beyond the target, after which a step is refused
-SLOW = 0.8  # contraction that is too slow
+SLOW = 0.8  # contraction from which on a step is refused after the third sweep
 LEAST_RHO, MOST_RHO = 1e-3, 0.9
-SLOW_START, FAST_START = 0.3, 0.04  # contraction of the first step: between these is well
-STAGNANT = 0.5  # changes that fall no further, and are as small as NOISE relative to the values, are rounding
-# of steps without an estimate of their error; forces may have rounding errors of their own
+SLOW_START, FAST_START = 0.3, 0.04  # limits of the contraction of the first step, beyond which its size is changed
+STAGNANT = 0.5  # ratio of changes from which on they are rounding, if they are below NOISE relative to the values
+# the same for steps of fixed size, and the largest number of sweeps; forces may have rounding errors of their own
 ROUNDING_OF_FIXED, NOISE_OF_FIXED, MOST_OF_FIXED = 1e-16, 1e-9, 60.0
 LEAST_CHANGE = 1e-30  # over what may be left
-SHARE = 0.5  # what the estimate of the error counts
-ALLOWED = 16.0  # the defect between nodes, over the tolerances: most of it does not last to the end
+SHARE = 0.5  # weight of the error estimate
+ALLOWED = 16.0  # defect between nodes, over the tolerances: most of it oscillates, and does not last to the end
 
 
 def suits(own: SharedCode) -> bool:
-    """Whether the code of a mechanism takes no longer than some seconds to compile."""
+    """Return whether the code of a mechanism compiles within a few seconds."""
     return own.equations.n_operations <= LONGEST
 
 
 class CollocationCode:
-    """Writes the functions for a mechanism.
+    """Write the functions of a mechanism.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ class CollocationCode:
 
         if self.parts is None:
             outputs = [*self.equations.accelerations, self.equations.closer, self.equations.nearer]
-        else:  # the digest of `own` tells the others
+        else:  # the digest of `own` covers the others
             outputs = self.equations.accelerations[:1]
         numbers = self.numbers
         told = [[each.sizes, *numbers.structure(each)] for each in outputs]
@@ -106,7 +106,7 @@ class CollocationCode:
     # the functions
 
     def attempt(self, emit: LaneEmitter, room: Value, state: Value, tolerances: Value, numbers: Value) -> Value:
-        """Make the stages of a step: how that ended, see data/collocation.py, and what is to be known of it.
+        """Write the iteration of the stages of a step; its result is how that ended, see data/collocation.py.
 
         Where conditions of the accelerations of the fewest operations fail, another function makes the step, and some
         of the next ones, by those that eliminate M first. They are looked at once, for the last sweep.
@@ -153,7 +153,7 @@ class CollocationCode:
         return self._iterate(emit, room, state, tolerances, quick, otherwise)
 
     def _careful(self, emit: LaneEmitter, kinds: list[str]) -> str:
-        """The name of the function of the module that makes steps by accelerations that eliminate M first."""
+        """Return the name of the function that iterates with the elimination that begins with M; write it once."""
         module, name = emit.builder.module, "careful_nodes"
         if not module.defines(name):
             builder = module.function(name, DOUBLE, kinds, internal=True)
@@ -165,7 +165,7 @@ class CollocationCode:
         return name
 
     def _called(self, emit: LaneEmitter, room: Value, way: int) -> Callable[[list[Value]], Callable[[], Value]]:
-        """What evaluates accelerations by a function of the module, see `call_accelerations`."""
+        """Return a writer of calls of the module's function for accelerations, see `call_accelerations`."""
         filled = Emitter(emit.builder).pointer(room, self.a)
 
         def evaluate(inputs: list[Value]) -> Callable[[], Value]:
@@ -175,12 +175,12 @@ class CollocationCode:
         return evaluate
 
     def _accelerations(self, emit: LaneEmitter, room: Value) -> list[Value]:
-        """What is in memory: what else is done with a number after a loop has to wait on the stack in each turn."""
+        """Load accelerations from memory: values kept across the loop would go to the stack in each turn."""
         return [load_lanes(emit, room, self.a + LANES * i) for i in range(self.n)]
 
     @contextmanager
     def _leaving(self, emit: LaneEmitter, condition: Value) -> Iterator[None]:
-        """What is done, and returned, where a condition holds."""
+        """Write what is done where a condition holds; the block has to return."""
         builder = emit.builder
         leave, go_on = builder.append_block(), builder.append_block()
         builder.branch(condition, leave, go_on)
@@ -189,7 +189,7 @@ class CollocationCode:
         builder.position_at_end(go_on)
 
     def _call(self, emit: LaneEmitter, name: str, write: Callable[..., None], arguments: Sequence[Value]) -> None:
-        """Call a function of the module, which `write` writes, for those that share it."""
+        """Call a function of the module; `write` writes it at the first call."""
         module = emit.builder.module
         if not module.defines(name):
             builder = module.function(name, NOTHING, [each.type for each in arguments], internal=True)
@@ -198,7 +198,7 @@ class CollocationCode:
         emit.builder.run(name, arguments)
 
     def _begin(self, emit: LaneEmitter, room: Value, state: Value, tolerances: Value) -> None:
-        """Weights of errors, and positions and velocities at the nodes by the accelerations that are predicted.
+        """Write the error weights, and predict positions and velocities at the nodes.
 
         Errors are relative to what positions and velocities are at the beginning, or what half a step adds if that is
         more. Where no error is estimated, they are relative, of values below 1 absolute.
@@ -237,7 +237,7 @@ class CollocationCode:
         kept = builder.select(builder.compare("fcmp olt", known, degree), powers, emit.constant(0.0))
         old = self._polynomial(emit, room, other=False)
         nodes = np.array(tables().nodes)
-        # integrals of the polynomial from the beginning to the nodes: rows belong to its powers, from 0 on
+        # integrals of the powers 0 to 8 from the beginning to the nodes, a row for each power
         velocities = np.array([nodes ** (k + 1) / (k + 1) for k in range(LANES + 1)])
         positions = np.array([nodes ** (k + 2) / ((k + 1) * (k + 2)) for k in range(LANES + 1)])
         with over(emit, self.iterated) as (k, i, _, _):
@@ -249,7 +249,7 @@ class CollocationCode:
             )
 
     def _powers(self, emit: LaneEmitter, x: Value) -> Value:
-        """x to the powers 1 to 8, one in each lane."""
+        """Compute the powers 1 to 8 of x, one in each lane."""
         builder, power = emit.builder, emit.splat(x)
         factors = []
         for bit in (1, 2, 4, 8):
@@ -259,7 +259,7 @@ class CollocationCode:
         return emit.multiply(emit.multiply(*factors[:2]), emit.multiply(*factors[2:]))
 
     def _several(self, emit: LaneEmitter) -> tuple[LaneEmitter, list[int]]:
-        """For arithmetic on coordinates side by side: where vectors of them begin, the last of which may overlap."""
+        """Return an emitter for vectors of coordinates, and where these begin; the last one may overlap."""
         lanes = min(LANES, 1 << (self.n.bit_length() - 1))
         return LaneEmitter(emit.builder, lanes), [*range(0, self.n - lanes, lanes), self.n - lanes]
 
@@ -272,7 +272,7 @@ class CollocationCode:
         evaluate: Callable[[list[Value]], Callable[[], Value]],
         otherwise: Callable[[], Value],
     ) -> Value:
-        """Sweeps over the stages until they are right, or the step is given up; and what is to be known of it.
+        """Write the sweeps over the stages until they have converged, or the step is refused.
 
         `evaluate` puts accelerations at [t, q, v] into memory, those of coordinates that are not iterated when what it
         gives is called, which says whether all may be used. Where they may not, `otherwise` does the step.
@@ -354,7 +354,7 @@ class CollocationCode:
         return ended
 
     def _judge(self, emit: LaneEmitter, room: Value, state: Value) -> None:
-        """ERROR and CURVED, over the tolerances; and by how much the next step may be longer for convergence's sake.
+        """Write ERROR and CURVED, and the factors of the next step size by convergence and by the error.
 
         The coefficients of a in Legendre polynomials tell how fast they fall: t is the larger one of degrees 7 and 8, s
         of 5 and 6, f of all from 3 on. The error is estimated as t (t / s)^1.5 or, if that is more, t^2 / f. Errors of
@@ -397,7 +397,7 @@ class CollocationCode:
         one.store(builder.extract(factors, 1), room, at.FACTOR_OF_ERROR)
 
     def audit(self, emit: LaneEmitter, room: Value, state: Value, numbers: Value) -> Value:
-        """What a step as long as this one would make of the largest defect between nodes, over what is allowed.
+        """Evaluate the accelerations between the nodes; the result is the largest defect over what is allowed.
 
         And by how much the next may be longer.
         """
@@ -435,14 +435,14 @@ class CollocationCode:
         return builder.select(all_hold, defect, constant(DOUBLE, FAILED))
 
     def retry(self, emit: LaneEmitter, room: Value, state: Value) -> None:
-        """Let the polynomial of a step that was refused predict the shorter one in its place."""
+        """Let the polynomial of a refused step predict the shorter one in its place."""
         one, old = Emitter(emit.builder), self._polynomial(emit, room, other=False)
         with over(emit, self.iterated) as (k, i, _, _):
             a0 = one.load(one.pointer(state, i), 2 * self.n)
             store_lanes(emit, self._combined(emit, tables().begin, a0, room, i), one.pointer(old, place_of(emit, k)))
 
     def end(self, emit: LaneEmitter, room: Value, state: Value, new_state: Value) -> None:
-        """[q, v, a] at the end of the step, and the polynomial that predicts the next, with the degree it is to have.
+        """Write [q, v, a] at the end of the step, and the polynomial that predicts the next one, with its degree.
 
         The best degree is the one that would have predicted the end of this step best, near the one that it had.
         """
@@ -483,7 +483,7 @@ class CollocationCode:
                 one.store(builder.extract(a, last), here, 2 * n)
 
     def _choose_degree(self, emit: LaneEmitter, room: Value, worst: Value) -> None:
-        """NEXT_DEGREE, from the errors of predictions of degree 1 to 8 at the end of the step."""
+        """Write NEXT_DEGREE, by the errors of predictions of degree 1 to 8 at the end of the step."""
         builder, one = emit.builder, Emitter(emit.builder)
         least = one.negative(emit.largest_lane(emit.negative(worst)))
         good = builder.compare("fcmp ole", worst, emit.splat(one.multiply(least, constant(DOUBLE, 1.2))))
@@ -497,20 +497,20 @@ class CollocationCode:
         one.store(builder.select(predicts, degree, constant(DOUBLE, FIRST_DEGREE)), room, at.NEXT_DEGREE)
 
     def closer(self, emit: LaneEmitter, room: Value, numbers: Value) -> None:
-        """Positions at the ends of eight steps, moved towards the constraints; FINE and MOVED."""
+        """Move positions at the ends of eight steps towards the constraints; write FINE and MOVED."""
         if self.parts is None:
             self._project(emit, room, numbers, self.equations.closer)
         else:
             self._project_in_parts(emit, room, numbers, self.parts.closer, ("moved", "q"))
 
     def nearer(self, emit: LaneEmitter, room: Value, numbers: Value) -> None:
-        """The same, and velocities, accelerations and multipliers there."""
+        """Do the same, and find velocities, accelerations and multipliers there."""
         if self.parts is None:
             self._project(emit, room, numbers, self.equations.nearer)
         else:
             self._project_in_parts(emit, room, numbers, self.parts.nearer, ("a", "moved", "q", "v", "lam"))
 
-    # what they are made of
+    # parts of the functions
 
     def _project(self, emit: LaneEmitter, room: Value, numbers: Value, outputs: Program) -> None:
         emit.numbers = emit.constants = numbers
@@ -526,7 +526,7 @@ class CollocationCode:
     def _project_in_parts(
         self, emit: LaneEmitter, room: Value, numbers: Value, write: Callable[..., Value], names: tuple[str, ...]
     ) -> None:
-        """The same by a function of compile_equations.py, which fills arrays of these names."""
+        """Do the same by a function of compile_equations.py, which fills arrays of these names."""
         one, moved = Emitter(emit.builder), emit.builder.room(DOUBLE, LANES * self.n)
         places = {name: one.pointer(room, place) for name, place in self._places_of_ends().items()} | {"moved": moved}
         state = load_lanes(emit, room, self.ends), places["q"], places["v"]
@@ -545,7 +545,7 @@ class CollocationCode:
         store_lanes(emit, emit.builder.select(holds, before, emit.constant(0.0)), room, at.FINE)
 
     def _integrate(self, emit: LaneEmitter, room: Value, state: Value) -> Value:
-        """Positions and velocities at the nodes from accelerations there; the largest change of a velocity."""
+        """Integrate the accelerations to the nodes; return the largest change of a velocity."""
         one = Emitter(emit.builder)
         with over(emit, self.iterated, [emit.constant(0.0)]) as (k, i, (largest,), new):
             before = load_lanes(emit, one.pointer(room, place_of(emit, k)), self.v)
@@ -560,7 +560,7 @@ class CollocationCode:
     def _put_stages(
         self, emit: LaneEmitter, room: Value, state: Value, k: Value, i: Value, sums: Sequence[Value]
     ) -> Value:
-        """Velocities and positions of coordinate i, the k-th that is iterated, at the nodes; and these velocities."""
+        """Store velocities and positions of coordinate i, the k-th iterated one; return the velocities."""
         one = Emitter(emit.builder)
         h = emit.splat(one.load(room, at.H))
         place, begin = one.pointer(room, place_of(emit, k)), one.pointer(state, i)
@@ -572,24 +572,24 @@ class CollocationCode:
         return v
 
     def _values(self, emit: LaneEmitter, first: Value, room: Value, i: Value) -> list[Value]:
-        """Values of coordinate i at all nodes; `first` is that at the beginning."""
+        """Load the accelerations of coordinate i at all nodes; `first` is that at the beginning."""
         one = Emitter(emit.builder)
         place = one.pointer(room, place_of(emit, i))
         return [first, *(one.load(place, self.a + node) for node in range(LANES))]
 
     def _combined(self, emit: LaneEmitter, table: Array, first: Value, room: Value, i: Value) -> Value:
-        """The sum of rows of a table times such values."""
+        """Sum the rows of a table times such accelerations."""
         return self._sums(emit, table, self._values(emit, first, room, i))
 
     def _sums(self, emit: LaneEmitter, table: Array, terms: Sequence[Value]) -> Value:
-        """The sum of rows of a table times numbers."""
+        """Sum the rows of a table times numbers, in two accumulators."""
         sums = [emit.multiply(emit.splat(term), constants(row)) for term, row in zip(terms[:2], table[:2], strict=True)]
         for k, (term, row) in enumerate(zip(terms[2:], table[2:], strict=True)):
             sums[(k + 1) % 2] = emit.fused(emit.splat(term), constants(row), sums[(k + 1) % 2])
         return emit.apart(*sums)
 
     def _polynomial(self, emit: LaneEmitter, room: Value, other: bool) -> Value:
-        """Where the coefficients begin of the polynomial of the last accepted step, or of the step being made."""
+        """Point to the coefficients of the polynomial of the last accepted step, or of the step being made."""
         builder, one = emit.builder, Emitter(emit.builder)
         second = builder.compare("fcmp one" if not other else "fcmp oeq", one.load(room, at.WHICH), llvm_code.ZERO)
         size = LANES * len(self.iterated)
@@ -598,7 +598,7 @@ class CollocationCode:
 
 
 class Collocation(NamedTuple):
-    """Functions for the steps of a mechanism by collocation."""
+    """Hold the functions of a mechanism for collocation steps."""
 
     functions: LaterFunctions
     code: CollocationCode
@@ -606,7 +606,7 @@ class Collocation(NamedTuple):
 
 
 def compiled_collocation(of_one: GeneratedCode) -> Collocation:
-    """The code for a mechanism; its machine code is kept on disk, and compiled when steps are to call it."""
+    """Return the code of a mechanism; its machine code is compiled at the first step, and kept on disk."""
     own = of_one.shared
     made: Collocation = own.cache.remembered(("collocation", own.equations.choice), lambda: _compiled(own))
     return made._replace(numbers=of_one.evaluate(made.numbers))
@@ -639,5 +639,5 @@ def _compiled(own: SharedCode) -> Collocation:
 
 @cache
 def _stamp() -> str:
-    """A digest of what writes the functions; what they share with those of the equations is in the key."""
+    """Return a digest of the writers of the functions; what these share with the equations' code is in the key."""
     return digest_of("", __file__, lane_emitter, lane_memory, lobatto_tables, at)

@@ -1,4 +1,4 @@
-"""Accelerations by dependent coordinates: rows G a = gamma give those of some coordinates from those of the others.
+"""Eliminate dependent coordinates from the equations of motion by the rows G a = gamma.
 
 With G = [G_d G_i], a_d = g + B a_i for B = -G_d^-1 G_i and g = G_d^-1 gamma. What is left is the small system
 (T^T M T) a_i = T^T (Q - M g) with T = [B; 1]. It takes about half the operations of an elimination that begins with M,
@@ -22,11 +22,11 @@ LEAST = 0.03**2
 
 
 class NotReduced(Exception):
-    """Raised where a pivot is zero by its structure, or it takes too many operations."""
+    """Say that a pivot is zero by its structure, or that the elimination takes too many operations."""
 
 
 class DependentCoordinates:
-    """a_d = g + B a_i from G a = gamma.
+    """Solve G a = gamma for the dependent accelerations, a_d = g + B a_i.
 
     Parameters
     ----------
@@ -101,12 +101,12 @@ class DependentCoordinates:
             self._add_conditions(block, columns, pivot, solved)
 
     def check(self, more: int = 0) -> None:
-        """Raise `NotReduced` where it has become too long, or would with more operations."""
+        """Raise `NotReduced` where the elimination has become too long, or would with more operations."""
         if len(self._graph.operations) + more > self._most:
             raise NotReduced
 
     def _inverse(self, block: list[list[Affine]]) -> tuple[Affine, list[list[Affine]]]:
-        """The determinant of a block, and its inverse."""
+        """Return the determinant of a block, and its inverse."""
         if len(block) == 1:
             ((determinant,),) = block
         else:
@@ -125,7 +125,7 @@ class DependentCoordinates:
     def _add_conditions(
         self, block: list[list[Affine]], columns: tuple[int, ...], pivot: Affine, solved: list[Terms]
     ) -> None:
-        """What is solved is not divided by too small a pivot, nor are rows nearly dependent.
+        """Require that no pivot is too small for what is divided by it, and that rows are not nearly dependent.
 
         Then columns of a block are nearly parallel, or one pivot is small in its column, where its row may be, too.
 
@@ -158,7 +158,7 @@ class DependentCoordinates:
 def reduced_accelerations(
     mass: Any, force: Sequence[Affine], coordinates: DependentCoordinates
 ) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-    """Accelerations by those of the coordinates that stay, and conditions that these have inertia, as of the class."""
+    """Return the accelerations, and the conditions that the independent coordinates have inertia."""
     n, T, g, independent = len(mass), coordinates.T, coordinates.g, coordinates.independent
     zero = Affine(mass[0, 0].graph, 0.0, {})
     rows = [[(mass[i, j], j) for j in range(n) if not is_zero(mass[i, j])] for i in range(n)]
@@ -179,7 +179,7 @@ def reduced_accelerations(
 
 
 def _definite(matrix: dict[tuple[int, int], Affine], factors: Factors) -> Iterator[tuple[Affine, Affine]]:
-    """What pivots of the small mass matrix are larger than: a share of what they are without those before."""
+    """Yield the conditions on pivots of the reduced mass matrix: each over its value without those before."""
     pivots = iter(factors.positive)
     for places, _, _ in factors.blocks:
         alone: Affine | None = None
