@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
+from studies.bench.closed_loops import parallelogram, parallelogram_motion
 from tests.general.mechanisms import error, mechanism
 from twoloop import solve_dae
 from twoloop.kernels.steps import crossing_step
 from twoloop.methods.tableaux import gauss
+from twoloop.run.fallbacks import lengths_across
 
 S = crossing_step.S
 
@@ -38,3 +40,21 @@ def test_runs_find_across_at_tight_tolerances(n):
         ended += result.success
         assert not result.success or error(m, result) < 1e3 * tolerance
     assert ended >= 3
+
+
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-6])
+def test_few_steps_lead_across_and_the_method_goes_on_behind(tolerance):
+    """Five positions in 2 s. Equal attempts, and another method behind the first position, took five times as many."""
+    problem = parallelogram()
+    (exact,) = parallelogram_motion(np.array([problem.t_span[1]]))[0].T
+    result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, rtol=tolerance, atol=tolerance)
+    assert result.success and np.abs(result.q[:, -1] - exact).max() < 100.0 * tolerance
+    assert len(result.h) < 40 and result.stats.n_inner < 1500
+
+
+def test_no_length_is_tried_twice():
+    """A length above the longest step allowed would be cut to that, and the attempt be the same once more."""
+    for longest, allowed in ((0.1, 0.02), (0.01, 0.02)):
+        lengths = lengths_across(longest, allowed)
+        assert lengths[0] == min(longest, allowed) and len(set(lengths)) == len(lengths)
+        assert lengths == sorted(lengths, reverse=True)

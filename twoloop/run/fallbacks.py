@@ -77,16 +77,15 @@ def cross_singularity(run: Run) -> tuple[Plan, Array]:
         control[a.UNSEEN] = 1.0 if run.narrow else UNSEEN
         control[a.MAX_STEP] = min(run.max_step, run.tolerances[tolerances.GAP] / control[a.UNSEEN])
     clock[a.H_LIMIT], clock[a.LIMIT_AGE] = np.inf, 0.0
-    run.lengths = _lengths(run, control)
+    run.lengths = lengths_across(float(clock[a.H_LONG]), float(control[a.MAX_STEP]))
     clock[a.H_NEXT] = run.lengths.pop(0)
     return plan, control
 
 
-def _lengths(run: Run, control: Array) -> list[float]:
-    """Lengths to try for a step across, s: a longer one than is allowed would be the same attempt once more."""
-    longest = float(run.clock[run.a.H_LONG])
-    allowed = min(longest, float(control[run.a.MAX_STEP]))
-    return [allowed, *(longest * part for part in LENGTHS if longest * part < allowed)]
+def lengths_across(longest: float, allowed: float) -> list[float]:
+    """Return the lengths to try for a step across, s: each above the largest one allowed would be the same attempt."""
+    first = min(longest, allowed)
+    return [first, *(longest * part for part in LENGTHS if longest * part < first)]
 
 
 def _crossing_plan(n_q: int) -> Plan:
@@ -122,7 +121,7 @@ def after_crossing(run: Run, plan: Plan, control: Array, code: int, accepted: in
         run.clock[a.H_NEXT], run.clock[a.H_LIMIT] = run.lengths.pop(0), np.inf
         return plan, control, code
     if code == a.PAUSED and accepted > 0 and (run.work.notes[noted.PIVOT] < CLEAR * run.clock[a.LARGEST_PIVOT]):
-        run.lengths = _lengths(run, control)
+        run.lengths = lengths_across(float(run.clock[a.H_LONG]), float(control[a.MAX_STEP]))
         return plan, control, code
     if code not in (a.PAUSED, a.STEP_TOO_SMALL, a.FIXED_STEP_FAILED, a.RANK_LOST):
         return plan, control, code
