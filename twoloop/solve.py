@@ -173,8 +173,21 @@ def solve_dae(
     (True, True)
     """
     check_system(system)
-    given = method, rtol, atol, first_step, max_step, max_steps, step_size, dense_output, progress, time_limit
-    options = options_of(system, (*given, check_derivatives, compiled))
+    options = options_of(
+        system,
+        method,
+        rtol,
+        atol,
+        first_step,
+        max_step,
+        max_steps,
+        step_size,
+        dense_output,
+        progress,
+        time_limit,
+        check_derivatives,
+        compiled,
+    )
     event_functions = None if events is None else check_events(events)
     t0, t1 = check_span(t_span)
     if is_vector(q0, system.n_q) and is_vector(v0, system.n_q):

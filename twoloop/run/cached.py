@@ -60,7 +60,7 @@ REACHED_END = Status.REACHED_END  # to look it up in the enumeration takes longe
 
 
 class Output(NamedTuple):
-    """States that a run has to store: at all steps, or at times, which may be its ends alone; and whether `sol` is."""
+    """Say which states a run has to store: at all steps, or at times, which may be its ends alone; and if `sol`."""
 
     times: Array | None
     at_ends: bool
@@ -82,14 +82,14 @@ STEPS = Output(None, False, False, None)
 
 @dataclass(frozen=True)
 class Missed:
-    """A run that may have missed short changes: it has to be repeated with evaluations `every` so many seconds."""
+    """Ask for a run to be repeated, as it may have missed short changes, with evaluations `every` so many seconds."""
 
     every: float
     cpu_time: float
 
 
 class CachedIntegrator:
-    """The arrays of a run that starts again and again.
+    """Integrate from start after start with the same plan and the same arrays.
 
     Parameters
     ----------
@@ -136,12 +136,12 @@ class CachedIntegrator:
 
     @staticmethod
     def suits(run: Run) -> bool:
-        """Whether the compiled loop can start this run: in the dense form, at a start without warnings."""
+        """Return whether the compiled loop can start this run: in the dense form, at a start without warnings."""
         return run.static is None and not run.start_warning and not run.system.called_in_python
 
     @staticmethod
     def gives(run: Run, output: Output, shared: SharedSetup | None) -> bool:
-        """Whether arrays that serve from start to start can give an output."""
+        """Return whether arrays that serve from start to start can give an output."""
         if output.dense and (output.between is not None or shared is not None):
             return False  # both have the same states within steps; what belongs to kin takes other parameters
         return output.between is None or not (run.lands or run.kit.flags[FORM] == flags.AUGMENTED)
@@ -406,7 +406,7 @@ def arrays_of(
 
 
 def _expected(choice: Choice | None) -> tuple[NDArray[np.int64], float]:
-    """A choice as kernels have it, and its scale."""
+    """Return a choice of pivots as kernels read it, and its scale."""
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
     place = int(np.searchsorted(-LEAST, -choice.least))
@@ -419,7 +419,7 @@ MOST_ALIKE = 3  # entries of equal options, as starts may ask for other code
 
 
 class CacheEntry(NamedTuple):
-    """A run at its start, for calls with the same options, from there or from elsewhere."""
+    """Keep a run at its start, and its integrators, for calls with the same options, from there or from elsewhere."""
 
     run: Run
     start: tuple[float, bytes, bytes]
@@ -558,7 +558,7 @@ def _share_setup(system: ConstrainedSystem, run: Run, code: GeneratedCode | None
 def _moved(
     entry: CacheEntry, system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
 ) -> Run | None:
-    """A run from another start; None where something else suits that."""
+    """Return a run from another start; None where that needs another form of the equations, or other code."""
     _check_start(system, t0, q0, v0, options.check_derivatives)
     if entry.code is not None and not entry.code.serves(system, t0, q0):
         return None

@@ -45,7 +45,7 @@ def compare_callbacks(
 
 
 def checked_region_of(run: "Run", check_derivatives: bool) -> CheckedRegion:
-    """Where runs of its system and kind were that callbacks were compared in."""
+    """Return the region in which callbacks were compared, in runs of this system and kind."""
     if run.region is not None:
         return run.region
     what = (check_derivatives, *map(id, run.traced))  # the system keeps these
@@ -61,7 +61,7 @@ def compare_callbacks_at(
     message: str,
     everywhere: bool = False,
 ) -> tuple[Status, str]:
-    """The same at states [t, q, v] of the run, the last first: those where none was compared, or everywhere."""
+    """Compare them at states [t, q, v] of the run, the last first: those outside the checked region, or everywhere."""
     first = states[-1]
     if not everywhere:
         states = region.without_known(states)

@@ -33,7 +33,7 @@ REPAIRED = 4  # steps into which an interval is divided whose polynomials are
 
 
 class Table(NamedTuple):
-    """States at accepted steps: times (n,), rows [q, v, a] (n, 3 n_q), the kind of the interval behind each but one."""
+    """Hold states at accepted steps: times (n,), rows [q, v, a] (n, 3 n_q), the kind of the interval behind each."""
 
     t: Array
     states: Array
@@ -101,7 +101,7 @@ class Interpolator:
         self._make_room()
 
     def _prepare(self) -> None:
-        """The workspace, and what is called with it."""
+        """Set up the workspace, and the kernels that are called with it."""
         system, t0, row = self.made_of[:3]
         q0, static = row[: system.n_q], self.static
         for plan in self.plans.values():
@@ -149,7 +149,7 @@ class Interpolator:
         self._make_room()
 
     def states(self, table: Table, times: Array) -> Array:
-        """Rows [q, v] at `times`, sorted, each within the table."""
+        """Interpolate rows [q, v] at `times`, sorted, each within the table."""
         if len(times) == 0 or len(table.t) == 1:
             return np.repeat(table.states[:1, : 2 * self.system.n_q], len(times), axis=0)
         intervals = np.searchsorted(table.t[1:-1], times, side="right")
@@ -223,7 +223,7 @@ class Interpolator:
             self._repair(table, groups[k], float(off[k]))
 
     def _judged(self, table: Table, groups: Groups) -> Array:
-        """How far the polynomials of these intervals are off, over the tolerances."""
+        """Estimate the errors of the polynomials of these intervals, over the tolerances."""
         out = np.zeros(len(groups))
         arrays = (
             self.tolerances,
@@ -370,7 +370,7 @@ def _warn(what: str, stacklevel: int = 4) -> None:
 
 
 class OutputInterpolation:
-    """What finds states at times of a run, again and again: as `Recorder` does for one.
+    """Interpolate states at output times of runs that use the same arrays, one after another.
 
     Parameters
     ----------
@@ -398,7 +398,7 @@ class OutputInterpolation:
         self._interpolator, self._found = known, known.states(table, times)
 
     def completed(self, times: Array) -> Array | None:
-        """Rows [q, v, a, lam] at these times; None where some are off the constraints, or have no accelerations."""
+        """Return rows [q, v, a, lam] at these times; None if some are off the constraints, or lack accelerations."""
         known, found = self._interpolator, self._found
         if known is None or known.failures > 0:
             return None
@@ -410,7 +410,7 @@ class OutputInterpolation:
 
 
 def interpolator_of(run: "Run", row: Array) -> Interpolator:
-    """What finds states between the steps of a run, which starts with this row [q, v, a]."""
+    """Make the interpolator of a run, which starts with this row [q, v, a]."""
     ranks, atol = (len(run.work.rows), len(run.work.rows_v)), run.tolerances[tolerances.ATOL :]
     interiors = {kind: plan.fresh() for kind, plan in run.interiors.items()}
     return Interpolator(run.system, run.t0, row, run.rtol, atol, ranks, interiors)

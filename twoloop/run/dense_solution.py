@@ -13,7 +13,7 @@ from twoloop.run.dense import Array, Groups, Interpolator, Table
 
 
 class DenseState:
-    """The state of a run at any times.
+    """Hold the state of a run at any times.
 
     Attributes
     ----------

@@ -23,19 +23,19 @@ MOST = 2  # runs that are made again
 
 
 def may_have_missed_changes(run: "Run", looks: float = WITHIN) -> bool:
-    """Whether something changed for so short a time that the next such change may have been passed over."""
+    """Return whether something changed for so short a time that the next such change may have been passed over."""
     a, clock = run.a, run.clock
     return bool(clock[a.BRIEFEST] < looks * clock[a.WIDEST_LOOK])
 
 
 def closer(run: "Run") -> float:
-    """The time between two looks of a run that is to meet what this one may have missed, s."""
+    """Return the time between evaluations, s, with which a repeated run meets what this one may have missed."""
     a, clock = run.a, run.clock
     return float(max(clock[a.BRIEFEST] / CLOSER, clock[a.WIDEST_LOOK] / MOST_CLOSER))
 
 
 def warn_of_missed_changes(run: "Run") -> str:
-    """A warning, and the sentence, of a run that succeeded, and is not made again, but may have missed something."""
+    """Warn that a run, which is not repeated, may have missed short changes, and return the sentence."""
     if not may_have_missed_changes(run, SEEN):
         return ""
     a, clock = run.a, run.clock
@@ -55,7 +55,7 @@ HOLDS = 1e-8  # relative: what is left of them where there is a solution
 
 
 def state_behind_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Array | None:
-    """The state [q, v] at t, right after a jump, from the one before; None: no velocities fit the constraints.
+    """Return the state [q, v] at t, right after a jump, from the one before; None: no velocities fit the constraints.
 
     M (v+ - v) + G^T p = 0 and G v+ + (C_t, b) = 0: of all velocities that the constraints allow the nearest in the
     metric of M.
@@ -70,14 +70,14 @@ def state_behind_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -
 
 
 def corrected(system: ConstrainedSystem, t: float, q: Array) -> Array:
-    """The nearest positions on the constraints, by Newton's method."""
+    """Project positions onto the constraints by Newton's method."""
     for _ in range(CORRECTIONS if system.n_c > 0 else 0):
         q = q - np.linalg.lstsq(system.jacobian(t, q), system.constraint(t, q), rcond=NEGLIGIBLE)[0]
     return q
 
 
 def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, float]:
-    """The matrix [M G^T; G 0], its rows G over their lengths and times the size of M; these lengths, and that size."""
+    """Build the matrix [M G^T; G 0], rows G over their lengths and times the size of M; with these numbers."""
     mass, rows = system.mass(t, q), system.rows(t, q)
     lengths, size = np.linalg.norm(rows, axis=1), float(np.abs(mass).max())
     lengths[lengths == 0.0] = 1.0

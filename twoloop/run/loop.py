@@ -92,7 +92,7 @@ class Interrupts:
         return self
 
     def answers(self) -> bool:
-        """Whether Ctrl-C that was raised is to be answered by a result: not the fourth, nor a user's handler's."""
+        """Return whether Ctrl-C that was raised is answered by a result: not the fourth, nor a user's handler's."""
         self.listen()  # where the handler is Python's own
         return self._stands_in and self.asked <= IMPATIENCE
 
@@ -116,14 +116,14 @@ def _within_a_users_function(frame: FrameType | None) -> bool:
 
 
 def describe_interrupt(t: float, table: Array) -> str:
-    """What is said of a run that Ctrl-C ended at t, with these rows [q, v, a, lam]."""
+    """Describe a run that Ctrl-C ended at t, with these rows [q, v, a, lam]."""
     gaps = int(np.isnan(table[:, -1:]).sum())  # where one of them is missing, all are
     unknown = f" Accelerations and multipliers are NaN at {gaps} of its times." if gaps else ""
     return f"Interrupted from the keyboard at t = {t:.10g}. The result holds what was computed before.{unknown}"
 
 
 def interrupted_record(system: ConstrainedSystem, t0: float, events: list[Any] | None, method: str) -> Record:
-    """What is returned of a run that Ctrl-C ended before the accelerations at its start were known."""
+    """Return the record of a run that Ctrl-C ended before the accelerations at its start were known."""
     n_q, none = system.n_q, np.zeros(0)
     columns = np.zeros((n_q, 0))
     found = None if events is None else [none for _ in events]
@@ -352,7 +352,7 @@ class IntegrationLoop:
                 self.kit = run.kit
 
     def _stalls(self, across: bool) -> bool:
-        """Whether a method that has a substitute takes no step, though no singular position is near."""
+        """Return whether a method that has a substitute takes no step, though no singular position is near."""
         run, a = self.run, self.run.a
         stalls = self.code == a.STEP_TOO_SMALL and run.control[a.GIVES_WAY] == 1.0
         return stalls and not across and run.work.notes[noted.NEARLY_SINGULAR] != 1.0
@@ -406,7 +406,7 @@ class IntegrationLoop:
         return record_of(Record, DEFAULTS | fields)
 
     def _last_step(self, t: Array, table: Array) -> list[Place]:
-        """The beginning of the last step where velocities turned in it, as near a singular position: else nothing."""
+        """Return the beginning of the last step if velocities turned in it, as near a singular position."""
         run = self.run
         if self.request.times is not None or self.recorder.ended is not None:
             return []
@@ -415,7 +415,7 @@ class IntegrationLoop:
         return [(float(t[-2]), table[-2])] if turned_last(t, table, run.system.n_q) else []
 
     def _landed(self, t: Array, table: Array) -> list[Place]:
-        """The states on which steps had to end, where one of them is near a singular position: else nothing."""
+        """Return the states on which steps had to end, if one of them is near a singular position."""
         run, request = self.run, self.request
         grid = run.control[run.a.FIXED_STEP] > 0.0 and request.times is None
         if not run.passed_near_singular() or not (grid or (request.times is not None and request.lands)):
@@ -423,7 +423,7 @@ class IntegrationLoop:
         return list(zip(t.tolist(), table, strict=True))
 
     def _buffers(self) -> Buffers:
-        """Room for the states and steps of a chunk, each attempt of which fills one row at most."""
+        """Return buffers for the states and steps of a chunk, each attempt of which fills one row at most."""
         chunk, width = self.run.chunk, len(self.run.state)
         n_rows, n_steps = max(min(chunk, BUFFER_ROWS), LANES), max(min(chunk, BUFFER_STEPS), LANES)
         spare = _spare.pop((n_rows, n_rows * width, n_steps), None)
@@ -432,7 +432,7 @@ class IntegrationLoop:
         return np.empty(n_rows), np.empty((n_rows, width)), np.empty((n_steps, self.run.a.N_STEP_COLUMNS))
 
     def _recorder(self) -> Recorder:
-        """What takes the states; where some are to lie between steps, with what finds them."""
+        """Make the recorder, with an interpolator if states between steps are requested."""
         run, n = self.run, self.run.system.n_q
         interpolator = interpolator_of(run, self.start[: 3 * n]) if self.request.between_steps else None
         apart = LONGEST_UNSEEN * (self.t1 - run.t0) / SAMPLES
@@ -440,7 +440,7 @@ class IntegrationLoop:
         return Recorder(self.request, interpolator, n, run.t0, self.start, every)
 
     def _kinds(self, steps: Array, across: bool, leaps: bool) -> NDArray[np.int64]:
-        """What kind of interval each of these accepted steps is, for the solution between them."""
+        """Return the kind of interval of each accepted step, for the solution between them."""
         run = self.run
         if not self.request.between_steps:
             return NO_KINDS
@@ -456,6 +456,6 @@ def silent(t: float) -> None:
 
 
 def _where(name: str, t: float, error: Exception) -> str:
-    """What of a compiled callback's error the error does not say."""
+    """Describe what the error of a compiled callback does not say: the system, and the time."""
     beyond = ": it asks an array for more than it has, as beyond the end of a table" * isinstance(error, IndexError)
     return f"raised by a compiled callback of system {name!r} in a step from t = {t:.10g}{beyond}"

@@ -47,7 +47,7 @@ _REASONS = {
 
 
 def _describe_passages(run: "Run") -> str:
-    """What a run that succeeded has to say of jumps and of singular positions."""
+    """Describe jumps and singular positions in a run that succeeded."""
     if not run.jumps and not run.crossings:
         return ""
     said = ""
@@ -57,7 +57,7 @@ def _describe_passages(run: "Run") -> str:
 
 
 def message_of(run: "Run", words: str, system: "ConstrainedSystem", later: Later | None = None) -> dict[str, Any]:
-    """The message of these words, or a `later` that makes it: to measure what was crossed takes longer than many a run.
+    """Return the message, or a `later` that makes it: to measure what was crossed takes longer than many a run.
 
     `system`: one that stays what it is, as the arrays of the run may not; `later`: of other fields.
     """
@@ -92,7 +92,7 @@ def reject_turned_velocities(
 
 
 def describe_rounding(run: "Run", places: list[Place], end: float) -> str:
-    """Where steps went on from velocities that rounding had made; nothing if they did so nowhere."""
+    """Describe where steps went on from velocities that rounding had made; nothing if they did so nowhere."""
     system, n = run.system, run.system.n_q
     for t, state in sorted({place[0]: place for place in places}.values(), key=itemgetter(0)):
         q, v = state[:n], state[n : 2 * n]
@@ -109,7 +109,7 @@ def describe_rounding(run: "Run", places: list[Place], end: float) -> str:
 
 
 def describe_arrival(t: float, fixed: bool) -> str:
-    """The first sentence of a run that came to its end."""
+    """Return the first sentence of the message of a run that came to its end."""
     return f"Reached the end, t = {t:g}{', with a constant step: no error was estimated' if fixed else ''}."
 
 
@@ -177,7 +177,7 @@ def outcome(run: "Run", code: int, t1: float, pace: StallDetector) -> tuple[Stat
 
 
 def _standstill(run: "Run", t1: float, pace: StallDetector) -> str:
-    """How short the steps are, how many the rest takes, and what may be why."""
+    """Describe how short the steps are, how many the rest takes, and what may be the reason."""
     left = (t1 - float(run.clock[run.a.T])) / pace.mean
     before, advice = "", "Shorten t_span, or look at the units of velocities, masses and forces. "
     if pace.slows:
@@ -193,7 +193,7 @@ def _standstill(run: "Run", t1: float, pace: StallDetector) -> str:
 
 
 def _contradiction(run: "Run") -> str:
-    """Which row that was left out is violated, and which rows it depended on."""
+    """Describe which row that was left out is violated, and which rows it depended on."""
     t, n, row = float(run.clock[run.a.T]), run.system.n_q, int(run.work.notes[noted.CONTRADICTION])
     words = in_words(run.system.rows(t, run.state[:n]), [row])
     return (
@@ -204,7 +204,7 @@ def _contradiction(run: "Run") -> str:
 
 
 def warn_of_singular_end(run: "Run") -> str:
-    """A warning, and the sentence, where the run ends with constraints that have lost rank, or nearly so."""
+    """Warn if the run ends with constraints that have lost rank, or nearly so, and return the sentence."""
     if not run.passed_near_singular():
         return ""
     system, n, t = run.system, run.system.n_q, float(run.clock[run.a.T])
@@ -239,7 +239,7 @@ def warn_user(text: str) -> str:
 
 
 def _over_allowed(run: "Run", t: float, q: Array, v: Array) -> float:
-    """Errors of velocities that rounding of positions makes, over the tolerances."""
+    """Estimate the errors of velocities that rounding of positions makes, over the tolerances."""
     allowed = run.tolerances[tolerances.ATOL :] + run.rtol * np.abs(v).max()
     return float((velocity_rounding_errors(run.system, t, q, v, run.rank) / allowed).max())
 
@@ -254,7 +254,7 @@ def _measured(run: "Run", t: float, q: Array) -> str:
 
 
 def _end_is_near(run: "Run", t1: float) -> str:
-    """A sentence where the end of the run is what was not reached, else nothing."""
+    """Return a sentence if the run stopped just before its end, else nothing."""
     left = t1 - float(run.clock[run.a.T])
     if left > NEXT_TO_END * (t1 - run.t0):
         return ""
@@ -262,7 +262,7 @@ def _end_is_near(run: "Run", t1: float) -> str:
 
 
 def _near_singular(run: "Run", t1: float) -> str:
-    """A sentence where the constraint Jacobian is close to losing rank at the last state, else nothing."""
+    """Return a sentence if the constraint Jacobian is close to losing rank at the last state, else nothing."""
     ratio = singular_ratio(run.system, float(run.clock[run.a.T]), run.state[: run.system.n_q], run.rank)
     if ratio > NEARLY_SINGULAR:
         return ""
@@ -274,14 +274,14 @@ def _near_singular(run: "Run", t1: float) -> str:
 
 
 def _near_massless(run: "Run") -> str:
-    """A sentence where some motion has next to no inertia at the last state, else nothing."""
+    """Return a sentence if some motion has next to no inertia at the last state, else nothing."""
     t, q = float(run.clock[run.a.T]), run.state[: run.system.n_q]
     ratio, words = least_inertia(run.system, t, q)
     return f"There {words}. " if ratio < NEARLY_SINGULAR else ""
 
 
 def describe_not_finite(run: "Run") -> str:
-    """Which callback returned a value that is not finite, and when, as far as it is known."""
+    """Describe which callback returned a value that is not finite, and when, as far as it is known."""
     kind, at = int(run.work.notes[noted.FAULT_KIND]), float(run.work.notes[noted.FAULT_TIME])
     if kind >= 0:
         name = run.functions._fields[kind]

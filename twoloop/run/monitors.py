@@ -45,7 +45,7 @@ class StallDetector:
         self.window_n += len(h)
 
     def stagnates(self, t: float, t1: float) -> bool:
-        """Whether the run has come to a standstill, at time t."""
+        """Return whether the run has come to a standstill, at time t."""
         if self.window_n < STAGNATION_STEPS:
             return False
         self.mean = (t - self.window_t) / self.window_n
@@ -68,7 +68,7 @@ NEXT_TO = 0.45  # of the limit of stability, which half of the states have to re
 
 
 class StiffnessSample(NamedTuple):
-    """A state of a run, the step h there, and what h times a rate of vibration or decay may be for stability."""
+    """Hold a state of a run, the step h there, and what h times a rate of vibration or decay may be for stability."""
 
     t: float
     q: Array
@@ -109,7 +109,7 @@ class StiffnessMonitor:
 
 
 def describe_stiffness(looks: StiffnessMonitor, kit: Any, work: Any) -> str:
-    """A sentence where stability limited the steps, else nothing. What stands in the workspace is lost."""
+    """Return a sentence if stability limited the steps, else nothing. What stands in the workspace is lost."""
     if not looks.samples or looks.n_steps < MANY:
         return ""
     start = first_direction(work.Q.size)
@@ -149,7 +149,7 @@ def _rates(kit: Any, work: Any, sample: StiffnessSample, directions: list[Array]
 def _largest(
     kit: Any, work: Any, sample: StiffnessSample, direction: Array, places: NDArray[np.int64], by_v: bool
 ) -> tuple[float, bool]:
-    """The largest factor by which dF/dq or dF/dv makes a direction longer, and whether it turns it round."""
+    """Find the largest growth of a direction under dF/dq or dF/dv by power iteration, and whether it is reversed."""
     from twoloop.kernels.evaluation import tasks
 
     size = DISPLACEMENT * max(1.0, float(np.abs(sample.v if by_v else sample.q).max()))

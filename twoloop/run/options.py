@@ -26,7 +26,7 @@ def _key(*_: Any) -> object:
 
 @dataclass(frozen=True)
 class Options:
-    """The validated options of a call; `solve_dae` says what the names mean."""
+    """Hold the validated options of a call; `solve_dae` says what the names mean."""
 
     method: Method
     rtol: float
@@ -66,19 +66,34 @@ class Options:
 NO_OPTIONS: Any = (None,) * 12, None
 
 
-def options_of(system: ConstrainedSystem, given: tuple[Any, ...]) -> Options:
-    """Validate the options of a call, `given` as to `check_options`, unless they are the objects of the last call."""
+def options_of(
+    system: ConstrainedSystem,
+    method: Any,
+    rtol: Any,
+    atol: Any,
+    first_step: Any,
+    max_step: Any,
+    max_steps: Any,
+    step_size: Any,
+    dense_output: Any,
+    progress: Any,
+    time_limit: Any,
+    check_derivatives: Any,
+    compiled: Any,
+) -> Options:
+    """Validate the options of a call, unless they are the objects of the last call: these were validated there."""
     last, options = system.shared.get("options", NO_OPTIONS)
-    m, r, a, first, longest, most, size, dense, progress, limit, checks, code = last
-    method, rtol, atol, first_step, max_step, max_steps, step_size, *_ = given
-    # to compare them in a loop takes twice as long
-    same = m is method and r is rtol and a is atol and first is first_step and longest is max_step
-    same = same and most is max_steps and size is step_size and dense is given[7] and progress is given[8]
-    if same and limit is given[9] and checks is given[10] and code is given[11]:
+    m, r, a, first, longest, most, size, dense, shows, limit, checks, code = last
+    # to compare them in a loop, or to collect them in a tuple, takes a tenth of a short repeated call
+    same = m is method and r is rtol and a is atol and first is first_step and longest is max_step and most is max_steps
+    same = same and size is step_size and dense is dense_output and shows is progress and limit is time_limit
+    if same and checks is check_derivatives and code is compiled:
         return options  # type: ignore[no-any-return]
-    options = check_options(system, *given)
+    last = method, rtol, atol, first_step, max_step, max_steps, step_size, dense_output, progress, time_limit
+    last = *last, check_derivatives, compiled
+    options = check_options(system, *last)
     if type(atol) is float and is_preset(method):  # the caller may change an array, or another object
-        system.shared["options"] = given, options
+        system.shared["options"] = last, options
     return options
 
 

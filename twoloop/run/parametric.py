@@ -35,7 +35,7 @@ PARTS = ("interior", "substitute", "within_newton")  # plans that a plan holds
 
 
 class SharedSetup:
-    """What runs share that ask for the same of the systems of a family.
+    """Hold the setup shared by runs that differ only in the parameters.
 
     Parameters
     ----------
@@ -74,12 +74,12 @@ class SharedSetup:
             raise ValueError("its numbers are not those of the family")
 
     def region(self, with_derivatives: bool) -> CheckedRegion:
-        """Where callbacks were compared."""
+        """Return the region in which callbacks were compared."""
         return self._regions.setdefault(with_derivatives, CheckedRegion())
 
 
 class ParametricRun:
-    """Arrays of a run for the parameters of one system after another.
+    """Run for the parameters of one system after another in the same arrays.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ class ParametricRun:
             traced.trusted = False
 
     def agrees(self, t0: float, q: Array, v: Array, t1: float, mass: Array, with_derivatives: bool) -> bool:
-        """Whether callbacks at the start of a run to t1, and about it are as they should be, and M as it was.
+        """Check callbacks at the start of a run to t1 and about it, and whether M has the same structure as before.
 
         `mass`: M at the start.
         """
@@ -150,7 +150,7 @@ class ParametricRun:
         return self._mass_agrees
 
     def _numbered(self, plan: Plan) -> Plan:
-        """A plan with these arrays in the place of formulas."""
+        """Return a plan with these arrays in the place of formulas."""
         array, known = self._formulas.array, vars(plan)
         changes: dict[str, Any] = {name: array(known[name]) for name in NUMBERS if known[name] is not None}
         changes |= {name: self._numbered(known[name]) for name in PARTS if known[name] is not None}
@@ -158,7 +158,7 @@ class ParametricRun:
 
 
 def _told(run: Run) -> list[Any]:
-    """All that the plans of a run say, numbers to the bit."""
+    """List all that the plans of a run hold, numbers to the bit."""
     plans = [run.plan, *run.interiors.values()]
     return [run.kit.flags.tobytes(), *(each for plan in plans for each in _of_plan(plan))]
 

@@ -77,7 +77,7 @@ MEANINGS: dict[Status, str] = {
 
 
 def explained(status: Status) -> str:
-    """Where the documentation explains a failure, for the end of its message; nothing for a run that succeeded."""
+    """Name the page that explains a failure, for the end of its message; nothing for a run that succeeded."""
     return "" if status >= 0 else f" See docs/when_it_fails.md#{status.name.lower()}."
 
 
@@ -221,7 +221,7 @@ class Record:
 
 
 def record_of(kind: type[AnyRecord], fields: dict[str, Any]) -> AnyRecord:
-    """A record with these fields, which it takes over: the constructor of a frozen dataclass with thirty is slow."""
+    """Make a record of these fields, which it takes over: the constructor of a frozen dataclass with thirty is slow."""
     made = _new(kind)
     _set_fields(made, fields)
     return made
@@ -231,7 +231,7 @@ _new, _set_fields = object.__new__, vars(Record)["__dict__"].__set__
 
 
 class _Deferred:
-    """A field that is put together when it is first asked for: where a record lacks it, its `later` makes it.
+    """Defer a field until it is first read: where a record lacks it, its `later` makes it.
 
     It stands beside the fields in `vars(record)`.
     """
@@ -260,7 +260,7 @@ BEFORE = np.array([0, 0, 1])  # rejections and partitions before all steps: the 
 
 
 def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
-    """What is told of each step, by the names of OF_STEPS; `counts`, those before the steps, become those after."""
+    """Return the fields of a record that have a row a step; `counts`, those before the steps, become those after."""
     n = len(steps)
     h, changes, untested = np.empty(n), np.empty((3, n), dtype=np.int64), np.empty(n, dtype=np.bool_)
     direct(cached_run().split_steps)(steps, counts, h, changes, untested)
@@ -268,12 +268,12 @@ def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
 
 
 def statistics(counted: Integers, cpu: float) -> Statistics:
-    """What was counted in a workspace, with the CPU time that it took, s."""
+    """Return the counts of a workspace, with the CPU time of the run, s."""
     return Statistics(**dict(zip(COUNTED, COUNTERS(counted.tolist()), strict=True)), cpu_time=cpu)
 
 
 def of_run(run: "Run", t: Array, table: Array) -> dict[str, Any]:
-    """The trajectory, of rows [q, v, a, lam], and what is known of the run as a whole."""
+    """Return the fields of a trajectory, of rows [q, v, a, lam], and those of the run as a whole."""
     return {
         **state_fields(run.system.n_q, t, table),
         "rank": run.rank,
@@ -284,7 +284,7 @@ def of_run(run: "Run", t: Array, table: Array) -> dict[str, Any]:
 
 
 def state_fields(n: int, t: Array, table: Array) -> dict[str, Array]:
-    """The trajectory alone, of n coordinates."""
+    """Return the fields of a trajectory alone, of n coordinates."""
     columns = table.T
     return {
         "t": t,
@@ -296,7 +296,7 @@ def state_fields(n: int, t: Array, table: Array) -> dict[str, Array]:
 
 
 def interval_kinds(run: "Run", steps: Array) -> Integers:
-    """What kind of interval each of these steps is, made by the plan that the run has, for the solution within them."""
+    """Return the kind of interval of each step that the plan of the run made, for the solution within them."""
     if run.plan.apart:
         return np.full(len(steps), intervals.APART)
     explicit = intervals.ACROSS if run.substituted else intervals.ACCELERATIONS

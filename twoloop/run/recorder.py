@@ -19,7 +19,7 @@ OF_STEPS = ("h", "rejected_error", "rejected_convergence", "partitioned", "untes
 
 
 class MemoryStore:
-    """Arrays by name, each of parts that follow one another.
+    """Store arrays by name in memory, each of parts that follow one another.
 
     Attributes
     ----------
@@ -41,13 +41,13 @@ class MemoryStore:
         self._parts[name] = [self.array(name)[:n]]
 
     def array(self, name: str) -> NDArray[Any]:
-        """All rows."""
+        """Return all rows."""
         first, *others = self._parts[name]
         return np.concatenate([first, *others]) if others else first
 
 
 class FileStore:
-    """The same in a folder that is made for it: a file of NumPy's for each array, complete after each part.
+    """Store arrays in a new folder: a file of NumPy's for each array, complete after each part.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ class FileStore:
             self._close(file, name, dtype, (min(n, before), *width))
 
     def array(self, name: str) -> NDArray[Any]:
-        """All rows, which are read as they are used; what is written to them stays out of the file."""
+        """Return all rows, which are read as they are used; what is written to them stays out of the file."""
         return mapped(self._path(name))
 
     def _path(self, name: str) -> Path:
@@ -105,12 +105,12 @@ Store = MemoryStore | FileStore
 
 
 def mapped(path: Path) -> NDArray[Any]:
-    """The array in a file, read as it is used."""
+    """Map the array in a file, which is read as it is used."""
     return np.load(path, mmap_mode="c", allow_pickle=False).view(np.ndarray)  # type: ignore[no-any-return]
 
 
 def read(folder: Path) -> dict[str, NDArray[Any]]:
-    """The arrays in a folder by name, without rows that others have not yet: those of a process that died."""
+    """Read the arrays in a folder, without rows that others have not yet: those of a process that died."""
     arrays = {path.stem: mapped(path) for path in sorted(folder.glob("*.npy"))}
     for group in (("t", "states"), OF_STEPS, ("sol_t", "sol_states")):
         there = [name for name in group if name in arrays]
@@ -126,7 +126,7 @@ PENDING = 1024  # states that wait for a look at the intervals between them, whe
 
 @dataclass(frozen=True)
 class OutputRequest:
-    """What a run is to keep.
+    """Say what a run has to store.
 
     Attributes
     ----------
@@ -160,7 +160,7 @@ class OutputRequest:
 
 
 class _Between(NamedTuple):
-    """States between steps, as a search for events asks for them."""
+    """Interpolate states between steps for the search for events."""
 
     interpolator: Interpolator
     table: Table
@@ -290,7 +290,7 @@ class Recorder:
         self._next = end - drop
 
     def output(self) -> tuple[Array, Array]:
-        """Times and rows [q, v, a, lam] of the result."""
+        """Return times and rows [q, v, a, lam] of the result."""
         store, end = self.request.store, self.broken_off if self.ended is None else self.ended[1]
         if end is not None:
             n = int(np.searchsorted(store.array("t"), end, side="right"))
@@ -304,7 +304,7 @@ class Recorder:
         return t, self._completed(t, store.array("states"))
 
     def _completed(self, times: Array, rows: Array) -> Array:
-        """Rows [q, v, a, lam] at rows [q, v]."""
+        """Complete rows [q, v] to rows [q, v, a, lam]."""
         if self.interpolator is None or rows.shape[1] == self._width:
             return rows
         added = np.full((len(times), self._width - rows.shape[1]), np.nan)
@@ -316,7 +316,7 @@ class Recorder:
         return np.concatenate([rows, added], axis=1)
 
     def solution(self) -> DenseSolution | None:
-        """The dense solution, if it is wanted."""
+        """Return the dense solution, if it is requested."""
         if not self.request.dense or self.interpolator is None:
             return None
         table = Table(*(self.request.store.array(f"sol_{name}") for name in ("t", "states", "kinds")))

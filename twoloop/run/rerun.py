@@ -31,18 +31,18 @@ def tighter(tolerance: ArrayLike) -> Array:
 
 
 def explicit() -> tuple[Method, Array]:
-    """The method for motion that is not stiff, and its nodes."""
+    """Return the method for motion that is not stiff, and its nodes."""
     return DOP853(), dop853_tableau.C
 
 
 def implicit(velocities: bool) -> tuple[Method, Array]:
-    """The method for stiff motion, and its nodes; `velocities`: their errors are tested, too."""
+    """Return the method for stiff motion, and its nodes; `velocities`: their errors are tested, too."""
     tableau = radau_iia(7)
     return RungeKutta(tableau, outer="newton", tested="all" if velocities else "positions"), tableau.c
 
 
 class RerunPiece(NamedTuple):
-    """States [q, v] at a time within a piece and at its end, and the longest step, s."""
+    """Hold states [q, v] at a time within a piece and at its end, and the longest step, s."""
 
     between: Array
     end: Array
@@ -50,7 +50,7 @@ class RerunPiece(NamedTuple):
 
 
 class IndependentRerun:
-    """Makes pieces of a run again, each from a state that is given; the arrays are made once.
+    """Recompute pieces of a run, each from a given state, in the same arrays.
 
     Parameters
     ----------

@@ -37,7 +37,7 @@ CONTRADICTS = 1e-6  # relative: what the accelerations of redundant rows may dif
 
 
 class Run:
-    """The arrays of one run, from its start on; `IntegrationLoop` takes it to its end.
+    """Set up the arrays of a run at its start; `IntegrationLoop` takes it to its end.
 
     Raises
     ------
@@ -113,13 +113,13 @@ class Run:
         self.start_warning = self._start_warning()
 
     def again(self) -> "Run":
-        """A copy of this run at its start; this one must not have taken a step."""
+        """Copy this run at its start; it must not have taken a step."""
         other = self._copy()
         other.work = copy_of(self.work)
         return other
 
     def at(self, t0: float, q0: Array, v0: Array) -> "Run | None":
-        """The same from another start, where C_q is of the same ranks; None where it is not, or nothing can begin.
+        """Copy this run for another start of equal ranks of C_q; None if these differ, or it cannot begin there.
 
         Not of the static form.
         """
@@ -214,7 +214,7 @@ class Run:
         self.clock[a.H_LIMIT] = plan.limit_start
 
     def _workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
-        """Arrays for ranks of C_q and of all rows; without them for full ones."""
+        """Make the workspace for ranks of C_q and of all rows; without them for full ones."""
         q0 = self.state[: self.system.n_q]
         pattern = self._pattern(q0) if self.static is None else NONE
         ranks = rank, rank_v
@@ -223,12 +223,12 @@ class Run:
         return work
 
     def _pattern(self, q: Array) -> Array:
-        """Where the rows have entries."""
+        """Return where the rows of the constraints have entries."""
         system, t0 = self.system, self.t0
         return system.remembered_at("pattern", (t0, q.tobytes()), lambda: pattern_of(system, t0, q))  # type: ignore[no-any-return]
 
     def is_lost_without_dense(self, code: int) -> bool:
-        """Whether the static form found no step, however short, and others may."""
+        """Return whether the static form found no step, however short, and others may."""
         reasons = (codes.INNER_DIVERGED, codes.SINGULAR, codes.MASS_NOT_DEFINITE)
         return (
             self.static is not None
@@ -314,7 +314,7 @@ class Run:
         )
 
     def redundant_rows(self, rows: Rows | None = None) -> tuple[NDArray[np.int64], str]:
-        """Which of C_q and A at the start depend on others, and what is said of them; `rows`: where these are known."""
+        """Find rows of C_q and A at the start that depend on others, and describe them; `rows`: if these are known."""
         n_rows = self.system.n_c + self.system.n_a
         if self.rank == n_rows:
             return np.zeros(0, dtype=np.int64), ""
@@ -336,14 +336,14 @@ class Run:
         return np.array(redundant), self.said[found]
 
     def _start_warning(self) -> str:
-        """What is said of a start beside a singular position, where pivots are small: those of static factors vary."""
+        """Describe a start beside a singular position, where pivots are small: those of static factors vary."""
         if self.work.notes[noted.PIVOT] > (MARGIN * WEAK if self.static is None else LEAST):
             return ""
         atol, q = self.tolerances[tolerances.ATOL :], self.state[: self.system.n_q]
         return describe_singular_start(self.system, self.t0, q, self.rank, self.rtol, atol)
 
     def contradicting(self, rows: Rows) -> NDArray[np.int64]:
-        """Of C_q and A at the start, rows that depend on others with which the accelerations disagree."""
+        """Find rows of C_q and A at the start that depend on others and with which the accelerations disagree."""
         n = self.system.n_q
         a, gamma = self.state[2 * n : 3 * n], self.work.Gamma
         off = np.abs(rows @ a - gamma)
@@ -359,7 +359,7 @@ class Run:
         return mass_and_rows(system, self.t0, q)[1]
 
     def _in_words(self, all_rows: Rows, rows: list[int]) -> str:
-        """Which rows depend on which others; the factors of the static form tell the shares of the first."""
+        """Describe which rows depend on which others; the factors of the static form give the shares of the first."""
         if not isinstance(all_rows, SparseRows):
             return in_words(all_rows, rows)
         q, counted = self.state[: self.system.n_q], self.work.rows_v.tolist()
@@ -389,23 +389,23 @@ class Run:
         self.control[self.a.MAX_STEP], self.control[self.a.UNSEEN] = min(self.max_step, longest), unseen
 
     def first_step(self, t: float, t1: float, state: Array, longest: float = 0.0) -> float:
-        """The first step from a state, s. With a longest one, no hundredth of the run to t1 is to pass unseen."""
+        """Return the first step from a state, s. With a longest one, let no step skip a hundredth of the run."""
         numbers = self.system.n_q, t, t1, self.least_atol, longest, self.plan.looks_within
         first: float = direct(cached_run().set_sizes)(self.control, self.tolerances, state, *numbers)
         return first
 
     def defect(self) -> float | None:
-        """The largest defect of the steps, if all looked for it."""
+        """Return the largest defect of the steps, if all of them found theirs."""
         notes = self.work.notes
         checked = self.work.counters[counters.N_ACCEPTED] > 0 and notes[noted.UNCHECKED] == 0.0
         return float(notes[noted.LARGEST_DEFECT]) if checked else None
 
     def passed_near_singular(self) -> bool:
-        """Whether a singular position was so near where a step had to end that rounding may have made velocities."""
+        """Return whether steps had to end so near a singular position that rounding may have made velocities."""
         near = self.near if self.static is None else LEAST  # pivots of static factors vary more, and a look takes long
         return bool(self.clock[self.a.PIVOT_AT_OUTPUT] < near)
 
     def attempts(self) -> int:
-        """How many steps were tried so far."""
+        """Return the number of steps that were tried so far."""
         c = self.work.counters
         return int(c[counters.N_ACCEPTED] + c[counters.N_REJECTED_ERROR] + c[counters.N_REJECTED_CONVERGENCE])

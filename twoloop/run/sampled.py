@@ -59,7 +59,7 @@ class SampledState(NamedTuple):
 
 
 class SampledRun:
-    """A run from sample to sample.
+    """Integrate from sample to sample.
 
     Parameters
     ----------
@@ -205,7 +205,7 @@ class SampledRun:
         self._n_steps, self._failed = len(self.steps), False
 
     def record(self) -> Record:
-        """All states at samples so far."""
+        """Return the record of all states at samples so far."""
         run, a, n = self.run, self.run.a, self.run.system.n_q
         table = np.array(self.rows)
         steps = np.concatenate([np.empty((0, a.N_STEP_COLUMNS)), *self.steps[: self._n_steps]])
@@ -225,7 +225,7 @@ class SampledRun:
         )
 
     def _begin_anew(self, t: float) -> None:
-        """Accelerations with other parameters, and a method that forgets those before."""
+        """Find accelerations with other parameters, and let the method forget the motion before."""
         run, a = self.run, self.run.a
         code = direct(run.kernels.start)(run.kit, run.work, t, run.state)
         first = 0

@@ -28,7 +28,7 @@ APPARENT = 10.0  # ... which counts where it exceeds the tolerances so many time
 
 
 def describe_crossings(system: ConstrainedSystem, crossings: list[list[Place]], now: Place, rank: int) -> str:
-    """Where steps went across, from the states before and, if the run came so far, behind; with what was measured."""
+    """Describe where steps went across, from the states before and, if the run came so far, behind."""
     found = {ends[0][0]: _least_ratio(system, ends[0], [*ends, now][1], rank) for ends in crossings[:SHOWN]}
     lost = {t: ratio for t, ratio in found.items() if ratio < LOST}
     others = {t: ratio for t, ratio in found.items() if ratio >= LOST}
@@ -55,7 +55,7 @@ def singular_ratio(system: ConstrainedSystem, t: float, q: Array, rank: int) -> 
 def _least_ratio(
     system: ConstrainedSystem, before: Place, behind: Place, rank: int, ratio: Ratio = singular_ratio
 ) -> float:
-    """The least ratio on the way between two states."""
+    """Return the least ratio of singular values on the way between two states."""
     n, (t0, first), (t1, last) = system.n_q, before, behind
     if t1 == t0:
         return ratio(system, t0, first[:n], rank)
@@ -68,7 +68,7 @@ def _least_ratio(
 def describe_turn(
     system: ConstrainedSystem, crossings: list[list[Place]], now: Place, rank: int, rtol: float, atol: Array
 ) -> str:
-    """Where velocities turned on the way across by more than accelerations explain; nothing if they did so nowhere.
+    """Describe where velocities turned by more than accelerations explain; nothing if they did so nowhere.
 
     Positions within the tolerance are near other branches of the motion there, onto which steps may have come.
     """
@@ -99,7 +99,7 @@ def describe_turn(
 
 
 def turned_last(times: Array, rows: Array, n: int) -> bool:
-    """Whether the velocities of the last two states [q, v, a] differ by more than one of their accelerations gives."""
+    """Return whether velocities of the last two states [q, v, a] differ by more than their accelerations give."""
     most = np.maximum.reduce  # a method max of arrays takes three calls, and repeated runs few more
     if times.size < 2:
         return False
@@ -183,12 +183,12 @@ LEAST, MARGIN = 1e-5, 30.0  # of pivots that are looked at more closely, and how
 
 
 def singular_threshold(rtol: float) -> float:
-    """The smallest pivot over the largest, below which rounding may turn velocities by more than rtol allows."""
+    """Return the ratio of pivots below which rounding may turn velocities by more than rtol allows."""
     return min(WEAK, max(LEAST, MARGIN * float(np.sqrt(ROUNDING / (UNTRUE * max(rtol, ROUNDING))))))
 
 
 def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: Array, rank: int) -> Array:
-    """The errors of the velocities that rounding of positions makes, about, (n_q,); NaN where callbacks fail near q."""
+    """Estimate the errors of velocities by rounding of positions, (n_q,); NaN where callbacks fail near q."""
     rows = system.rows(t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     errors = np.zeros(len(q))
@@ -212,7 +212,7 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
 
 
 def describe_singular_start(system: ConstrainedSystem, t: float, q: Array, rank: int, rtol: float, atol: Array) -> str:
-    """What is said of a start from which the tolerances reach to where the constraints lose rank; nothing elsewhere."""
+    """Describe a start from which the tolerances reach to where the constraints lose rank; nothing elsewhere."""
     if rank == 0 or surely_above(WEAK, system.rows(t, q), rank):
         return ""
     ratio = singular_ratio(system, t, q, rank)

@@ -28,7 +28,7 @@ def newton_form(
     together: list[tuple[int, ...]],
     stiff: list[int],
 ) -> tuple[NDArray[np.int32], int] | None:
-    """The program of Newton's matrix, see sparse_lu.py, and the number of groups of columns that are differenced.
+    """Make the program of Newton's matrix, see sparse_lu.py, and count the groups of columns that are differenced.
 
     None where it is not sparse, or cannot be found.
     """
@@ -53,7 +53,7 @@ def newton_form(
 
 
 def _entries(system: ConstrainedSystem, t: float, q: Array, v: Array, lam: Array, most: float) -> set[tuple[int, int]]:
-    """Where Q - C_q^T lam changes with a coordinate, and Q with a velocity, and the same mirrored."""
+    """Find where Q - C_q^T lam changes with a coordinate, and Q with a velocity, and the same mirrored."""
 
     def reaction(q: Array) -> Array:
         if "jacobian" not in system.entries:
@@ -83,7 +83,7 @@ SPARSE = 0.05  # of the multiplications of dense factors: a program with more of
 
 
 class StaticForm(NamedTuple):
-    """The program of a system, and what a workspace for it needs."""
+    """Hold the program of a system, and what a workspace for it needs."""
 
     program: NDArray[np.int32]
     static: Static
@@ -111,7 +111,7 @@ class StaticForm(NamedTuple):
 
 
 def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -> StaticForm | None:
-    """The static form of a system for runs by these plans; None where it does not serve, or would not pay."""
+    """Make the static form of a system for runs by these plans; None where it does not serve, or would not pay."""
     if system.n_q < LARGE or system.n_c == 0 or system.n_a > 0 or system.bandwidth is not None:
         return None
     known = "gamma" in system.given or system.functions.gamma_program.size > 0
@@ -124,7 +124,7 @@ def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -
 
 
 def with_newton(system: ConstrainedSystem, t0: float, q0: Array, form: StaticForm) -> StaticForm | None:
-    """The same with the program of Newton's matrix; None where there is none, or would not pay."""
+    """Add the program of Newton's matrix; None where there is none, or would not pay."""
     if system.n_q < NEWTON * LARGE:
         return None
     made = system.remembered("newton form", lambda: newton_form(system, t0, q0, *form.known))
@@ -174,7 +174,7 @@ def _together(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]
 def _stiff_rows(
     system: ConstrainedSystem, t0: float, q0: Array, mass: Entries, jacobian: Entries, together: list[tuple[int, ...]]
 ) -> list[int]:
-    """Rows of single bodies that M is singular along, with no entry but where M has some: see sparse_ldl.py.
+    """Find rows of single bodies that M is singular along, with no entry but where M has some: see sparse_ldl.py.
 
     No more than make it definite: others, as of a hinge on the ground, hold the body as joints do.
     """
@@ -219,7 +219,7 @@ def _without_mass(block: Array) -> Array:
 
 
 def _is_sparse(n_q: int, n_entries: int) -> bool:
-    """Whether there are so few entries that it is worth while to look for an order."""
+    """Return whether there are so few entries that it is worth while to look for an order."""
     return n_entries <= SPARSE * n_q * n_q + 24 * n_q
 
 

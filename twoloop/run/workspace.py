@@ -38,7 +38,7 @@ MOST_KITS = 16  # that are kept with a system
 def kit_of(
     system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = None, static: StaticForm | None = None
 ) -> Kit:
-    """The callbacks of a system, with flags that say which linear algebra suits it, and what a plan calls."""
+    """Make the kit of a system: callbacks, flags that choose the linear algebra, and the steps of a plan."""
     from twoloop.kernels.evaluation.inner_loop import inner_loop
 
     if static is not None:
@@ -58,7 +58,7 @@ def kit_of(
 
 
 def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) -> Kit:
-    """The same for the static form."""
+    """Make the kit of a system in the static form."""
     from twoloop.kernels.evaluation.sparse_inner_loop import static_inner_loop
 
     flags = system.functions.flags.copy()
@@ -72,7 +72,7 @@ def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) 
 
 
 def _flags_at(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
-    """Flags at a position, not to be written to."""
+    """Return the flags at a position, which must not be written to."""
     definite = has_definite_mass(system, t0, q0)
     key = ("flags", system.functions.flags.tobytes(), definite)
     flags, sparse = system.remembered(key, lambda: _flags(system, t0, q0, definite))
@@ -86,7 +86,7 @@ def _flags_at(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
 
 
 def _flags(system: ConstrainedSystem, t0: float, q0: Array, definite: bool) -> tuple[Array, bool]:
-    """Flags with dense or banded algebra, and whether sparse factors would pay."""
+    """Choose dense or banded algebra, and say whether sparse factors would pay."""
     flags: Array = system.functions.flags.copy()
     if system.constant_mass:
         flags[DIAGONAL_MASS] = is_diagonal(system.mass(t0, q0))
@@ -100,17 +100,17 @@ def _flags(system: ConstrainedSystem, t0: float, q0: Array, definite: bool) -> t
 
 
 def sparse_factors_pay(system: ConstrainedSystem, flags: Array) -> bool:
-    """Whether sparse factors would pay, which need an M with an inverse, or inertia in all that moves."""
+    """Return whether sparse factors would pay, which need an M with an inverse, or inertia in all that moves."""
     return sparse_pays(system.n_q, system.n_c + system.n_a, bool(flags[DIAGONAL_MASS]))
 
 
 def is_diagonal(mass: Array) -> bool:
-    """Whether M has no entries beside its diagonal."""
+    """Return whether M has no entries beside its diagonal."""
     return np.count_nonzero(mass) == np.count_nonzero(mass.diagonal())
 
 
 def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
-    """The callbacks with these flags, and what a plan calls; kept with the system for the next run."""
+    """Make the kit of these flags and of a plan, which the system keeps for the next run."""
     from twoloop.kernels.evaluation.inner_loop import inner_loop
 
     read = (plan.numbers, plan.own_numbers)
@@ -132,12 +132,12 @@ def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
 
 
 def _steps_of(plan: Plan) -> tuple[Any, Any, Any]:
-    """The step that is called, and the two between which it chooses: the second one may stay unused."""
+    """Return the step that is called, and the two between which it chooses: the second one may stay unused."""
     return loaded(plan.step), loaded(plan.first), at_hand(plan.second)
 
 
 def _with_own_flags(kit: Kit) -> Kit:
-    """A copy for one run, which takes a tenth of the time that another kit does."""
+    """Copy a kit for one run, which takes a tenth of the time that another kit does."""
     other, flags, table = object.__new__(Kit), kit.flags.copy(), kit.table.copy()
     table[common.KIT.places["flags"]] = flags.ctypes.data
     functions = kit.functions._replace(flags=flags)
@@ -156,7 +156,7 @@ def workspace(
     static: StaticForm | None = None,
     matrices: int = 0,
 ) -> common.Work:
-    """Arrays for ranks of C_q and of all rows; without them for full ones. `pattern` is that of all rows.
+    """Make a workspace for ranks of C_q and of all rows; without them for full ones. `pattern` is that of all rows.
 
     `matrices`: as of a plan.
     """
@@ -180,7 +180,7 @@ def prepare_workspace(
     reuse: float,
     static: StaticForm | None = None,
 ) -> common.Work:
-    """A workspace with what a run finds in it, whatever the one before has left."""
+    """Prepare a workspace for a run, whatever the one before has left in it."""
     given = map(np.ascontiguousarray, (pattern, q0))
     direct(cached_run().prepare_workspace)(work, *lasting(work), *given, max(rtol, GAMMA_ACCURACY), reuse)
     if static is not None:
@@ -192,7 +192,7 @@ def prepare_workspace(
 
 
 def _fill(work: common.Work, system: ConstrainedSystem, form: StaticForm, q0: Array) -> None:
-    """What stays as it is in a workspace of the static form."""
+    """Fill in what stays constant in a workspace of the static form."""
     work.pattern[:], work.mass_pattern[:] = form.pattern, form.mass_pattern
     work.dependent[:] = work.independent[:] = np.arange(system.n_q)
     work.counts[:] = 1.0
