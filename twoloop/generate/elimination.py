@@ -111,11 +111,11 @@ class Elimination:
         return elementwise(Affine.value, [self.equations.of(kind, v)])
 
     def _redundant(self, rates: Any) -> Program:
-        left = [k for k in range(self.system.n_c) if k not in self.choice.rows]
+        redundant = [k for k in range(self.system.n_c) if k not in self.choice.rows]
         off = self._values_of("constraint")
-        one, conditions = Affine(self.graph, 1.0, {}), []
-        size, speed = (sum((x * x for x in state), one) for state in (self.q, self.v))
-        for k in left:
+        unit, conditions = Affine(self.graph, 1.0, {}), []
+        size, speed = (sum((x * x for x in state), unit) for state in (self.q, self.v))
+        for k in redundant:
             row, rate = self.all_rows[k], rates[k]
             faster = sum((entry * u for entry, u in zip(row, self.v, strict=True)), rate)
             allowed = sum((entry * entry for entry in row), self.nothing).times(CONTRADICTS**2)
@@ -232,8 +232,8 @@ class Elimination:
     def nearer(self) -> Program:
         """Return the program, see the class."""
         arrays = self.nearest.arrays
-        known = [arrays["lam"][k] for k in self.choice.rows]
-        lam = of_least_norm(self.graph, known, self.all_rows, self.choice.rows, self.factors.solve)
+        independent = [arrays["lam"][k] for k in self.choice.rows]
+        lam = of_least_norm(self.graph, independent, self.all_rows, self.choice.rows, self.factors.solve)
         self._bound()
         return Program(self.graph, {**arrays, "lam": lam}, self.conditions)
 
@@ -310,8 +310,8 @@ class Solution:
     def __init__(self, equations: Elimination, more: Sequence[Program] = ()):
         factors, self._choice, self._n = equations.factors, equations.choice, equations.system.n_q
         n_rows, rows = len(equations.all_rows), self._choice.rows
-        others = [k for k in range(n_rows) if k not in rows] if more else []
-        forms = [form for k in (*self._choice.added, *others) for form in equations.all_rows[k]]
+        dependent = [k for k in range(n_rows) if k not in rows] if more else []
+        forms = [form for k in (*self._choice.added, *dependent) for form in equations.all_rows[k]]
         forms += [form for block in factors.blocks for row in block.inverse for form in row]
         forms += [form for block in factors.blocks for _, row in block.below for form in row]
         factors_kept = sorted({i for form in forms for i in form.terms})
@@ -334,7 +334,7 @@ class Solution:
             )
             for block in factors.blocks
         ]
-        self._rows = {k: [here(x) for x in equations.all_rows[k]] for k in (*self._choice.added, *others)}
+        self._rows = {k: [here(x) for x in equations.all_rows[k]] for k in (*self._choice.added, *dependent)}
         self._nothing = Affine(self.graph, 0.0, {})
         self.solved = self._solved()
 

@@ -126,8 +126,8 @@ class Emitter:
 
     def function(self, name: str, x: Value) -> Value:
         """Call a function of libm, or its intrinsic."""
-        known = INTRINSICS.get(name)
-        return self.builder.call(f"{known}.{self.suffix}" if known else name, x.type, [x])
+        intrinsic = INTRINSICS.get(name)
+        return self.builder.call(f"{intrinsic}.{self.suffix}" if intrinsic else name, x.type, [x])
 
     def pointer(self, base: Value, *places: Value | int) -> Value:
         """Return a pointer some doubles further on."""
@@ -309,8 +309,8 @@ def sine_and_cosine(emit: Emitter, x: Value) -> tuple[Value, Value]:
     quarter = builder.convert("fptosi", turns, emit.whole_number)
     odd, following = builder.convert("trunc", quarter, emit.bit), builder.add(quarter, whole(1))
     results = []
-    for one, other, number in ((cosine, sine, quarter), (sine, cosine, following)):
-        sign = builder.operation("shl", builder.both(number, whole(2)), whole(62))
-        bits = builder.convert("bitcast", builder.select(odd, one, other), emit.whole_number)
+    for if_odd, if_even, turn in ((cosine, sine, quarter), (sine, cosine, following)):
+        sign = builder.operation("shl", builder.both(turn, whole(2)), whole(62))
+        bits = builder.convert("bitcast", builder.select(odd, if_odd, if_even), emit.whole_number)
         results.append(builder.convert("bitcast", builder.operation("xor", bits, sign), emit.double))
     return results[0], results[1]

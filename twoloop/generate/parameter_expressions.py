@@ -114,9 +114,9 @@ class ParameterTape(Symbolic):
         """Return a number as a sum of products, by their coefficients."""
         if type(number) is not Parameter:
             return {(): number} if number else {}
-        (place, exponent), *others = number.powers
+        (place, exponent), *further = number.powers
         definition = self.atoms[place]
-        if others or exponent != 1.0 or definition is None or definition[0] != "sum":
+        if further or exponent != 1.0 or definition is None or definition[0] != "sum":
             return {number.powers: number.scale}
         return {powers: number.scale * c for powers, c in definition[1]}
 

@@ -40,8 +40,8 @@ class Factors:
             nothing = Affine(rows[places[0]][places[0]].graph, 0.0, {})
             pivots = [[rows[i].pop(j, nothing).value() for j in places] for i in places]
             inverse = self._inverse(pivots, [alone.get(i) for i in places])
-            others = dict.fromkeys(j for i in places for j in rows[i])
-            entries = [(j, [rows[i].get(j, nothing).value() for i in places]) for j in others]
+            neighbours = dict.fromkeys(j for i in places for j in rows[i])
+            entries = [(j, [rows[i].get(j, nothing).value() for i in places]) for j in neighbours]
             below = [(j, [_dot(row, values).value() for row in inverse]) for j, values in entries]
             for first, (j, multiples) in enumerate(below):
                 for k, values in entries[first:]:
@@ -138,19 +138,19 @@ def _order(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int, int
     neighbours = [set(row) - {i} for i, row in enumerate(rows)]
     waits = [{j for j in neighbours[i] if j < n} if i >= n else set() for i in range(len(rows))]
     order: list[tuple[int, ...]] = []
-    left, depth = set(range(len(rows))), [0] * len(rows)
+    remaining, depth = set(range(len(rows))), [0] * len(rows)
     for pair in pairs:
-        left -= set(pair)
+        remaining -= set(pair)
         _eliminate(neighbours, pair)
-        for j in left:
+        for j in remaining:
             waits[j] -= set(pair)
-    while left:
-        i = min((j for j in left if not waits[j]), key=lambda j: (len(neighbours[j]), depth[j], j))
+    while remaining:
+        i = min((j for j in remaining if not waits[j]), key=lambda j: (len(neighbours[j]), depth[j], j))
         ready = [j for j in neighbours[i] if not waits[j] and (j < n) == (i < n)]
         alike = [j for j in ready if neighbours[j] | {j} == neighbours[i] | {i}]
         places = (i, *sorted(alike)[:1])
         order.append(places)
-        left -= set(places)
+        remaining -= set(places)
         for j in _eliminate(neighbours, places):
             waits[j] -= set(places)
             depth[j] = max(depth[j], depth[i] + 1)
