@@ -11,7 +11,7 @@ from scipy.special import ellipj
 
 from tests.compiled import PENDULUM
 from twoloop import ConstrainedSystem, Result, solve_dae
-from twoloop.kernels.compile.caches import compile_kept, kept_when_called
+from twoloop.kernels.compile.caches import compile_cached, compiled_when_called
 from twoloop.kernels.compile.linking import KernelCompiler
 from twoloop.kernels.data.common import OPTIONS, stamp
 from twoloop.kernels.data.flags import FORCE_BY_Q_GIVEN
@@ -115,7 +115,7 @@ def driven_cart(place, speed, **more):
 def entry(helper):
     """A helper of the kernels, which has no entry from Python, as a function of Python's; its machine code is kept."""
 
-    @kept_when_called(pipeline_class=KernelCompiler, **OPTIONS)
+    @compiled_when_called(pipeline_class=KernelCompiler, **OPTIONS)
     def call(arguments):
         return helper(*arguments)
 
@@ -130,7 +130,7 @@ def called(helper, *arguments):
 def kept(signature):
     """Compile a function that calls helpers of an evaluation, and keep it until a file changes that these need."""
     watched = (stamp("evaluation.calls"), "")
-    return lambda function: compile_kept(function, signature, watched, pipeline_class=KernelCompiler, **OPTIONS)
+    return lambda function: compile_cached(function, signature, watched, pipeline_class=KernelCompiler, **OPTIONS)
 
 
 def pendulum_state(t, angle=-0.5 * np.pi):

@@ -20,9 +20,9 @@ from twoloop.generate.elimination import Elimination
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.llvm_text import BIT, Module
 from twoloop.generate.null_space import LEAST
-from twoloop.kernels.compile.generated_functions import OwnFunctions, object_code
+from twoloop.kernels.compile.generated_functions import GeneratedFunctions, object_code
 from twoloop.kernels.lanes.lane_room import LANES
-from twoloop.kernels.linalg.dependent_columns import NONE, NUMBER, VARIES, dependents, room_size
+from twoloop.kernels.linalg.dependent_columns import NONE, NUMBER, VARIES, choose_dependent_columns, room_size
 
 pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 
@@ -43,7 +43,7 @@ KIND = BIT, ["double", *["double*"] * 4]
 
 def function_of(module, name, *kinds):
     """A function of a module, on numbers and arrays."""
-    made = OwnFunctions([name], object_code(str(module)))
+    made = GeneratedFunctions([name], object_code(str(module)))
     function = ctypes.CFUNCTYPE(ctypes.c_bool, *kinds)(made.addresses[name])
     return lambda *given, made=made: function(*(x if isinstance(x, float) else x.ctypes.data for x in given))
 
@@ -187,7 +187,7 @@ def test_pivots_are_one_for_each_row_and_not_small(m, freedom, seed):
     kinds = np.where(G == 0.0, NONE, np.where(rng.random((m, n)) < 0.5, NUMBER, VARIES))
     numbers, integers = room_size(m, n)
     out, work = np.zeros(4 * m, np.int64), np.zeros(integers, np.int64)
-    count = dependents(G, kinds.ravel(), np.arange(m), m, np.zeros(numbers), work, out)
+    count = choose_dependent_columns(G, kinds.ravel(), np.arange(m), m, np.zeros(numbers), work, out)
     if count == 0:
         assert np.linalg.svd(G)[1][-1] < 0.3
         return

@@ -16,16 +16,24 @@ from numba.core.caching import _CacheLocator
 from tests.processes import ROOT, run_python
 from twoloop.kernels.compile import caches as ownership
 from twoloop.kernels.compile import callbacks
-from twoloop.kernels.compile.caches import UNWRITABLE, Files, doubt_of, folder_of, make_own, own_folder, watch
+from twoloop.kernels.compile.caches import (
+    UNWRITABLE,
+    CodeFiles,
+    cache_folder,
+    digests_of,
+    make_trusted_folder,
+    reason_to_distrust,
+    trusted_folder,
+)
 from twoloop.kernels.evaluation import inner_loop as calls
 
 
 def with_kernels(cache):
     """Fill a folder for NUMBA_CACHE_DIR with what every run needs: the inner loop, and what stands for callbacks."""
-    for module, names in ((calls, "calls.inner_loop-*"), (callbacks, "callbacks.stand_in.*")):
+    for module, names in ((calls, "inner_loop.inner_loop-*"), (callbacks, "callbacks.zero_callback.*")):
         folder = cache / _CacheLocator.get_suitable_cache_subpath(module.__file__)
         folder.mkdir(parents=True)
-        for file in folder_of(module).glob(names):
+        for file in cache_folder(module).glob(names):
             shutil.copy(file, folder)
     return cache
 
@@ -204,7 +212,7 @@ def test_what_changes_in_other_files_and_damage_make_machine_code_stale(folder):
 
 
 def test_a_file_with_one_changed_bit_counts_as_missing(tmp_path):
-    files, data = Files(tmp_path, "numbers", "stamp"), np.arange(20.0).tobytes()
+    files, data = CodeFiles(tmp_path, "numbers", "stamp"), np.arange(20.0).tobytes()
     files.save("key", data)
     (path,) = tmp_path.iterdir()
     content = path.read_bytes()
@@ -248,12 +256,12 @@ def test_a_digest_follows_the_values_of_any_type(monkeypatch):
     seen, numbers = set(), [1.0, 1, True, 1j, [1.0], (1.0,), (2.0,), Named(1.0), np.ones(1), 2.0 * np.ones(1)]
     for value in (*numbers, np.ones((1, 1)), "1", {"a": 1.0}, {"a": 2.0}, {1, 2}, None):
         monkeypatch.setitem(globals(), "NAMED", value)
-        stamp = watch(names_a_dictionary.py_func)
-        assert stamp == watch(names_a_dictionary.py_func)
+        stamp = digests_of(names_a_dictionary.py_func)
+        assert stamp == digests_of(names_a_dictionary.py_func)
         seen.add(stamp)
     assert len(seen) == 16 and None not in seen
     monkeypatch.setitem(globals(), "NAMED", object())
-    assert watch(names_a_dictionary.py_func) is None
+    assert digests_of(names_a_dictionary.py_func) is None
 
 
 # --- code is loaded from what no other user can write, as ssh asks of keys; what others can write is compiled anew
@@ -272,10 +280,10 @@ class Planted:
 
 @pytest.fixture(autouse=True)
 def first_warning(monkeypatch):
-    monkeypatch.setattr(ownership, "_said", [])
-    own_folder.cache_clear()
+    monkeypatch.setattr(ownership, "_warnings", [])
+    trusted_folder.cache_clear()
     yield
-    own_folder.cache_clear()
+    trusted_folder.cache_clear()
 
 
 @pytest.fixture
@@ -313,7 +321,7 @@ def test_what_others_can_write_is_not_loaded(user, monkeypatch):
     user.cache.chmod(0o777)  # above the folder of the file
     monkeypatch.setenv("XDG_CACHE_HOME", str(user.home))
     for folder in set(user.cache.iterdir()) - {user.file().parent}:  # of the kernels, which would be compiled again
-        shutil.copytree(folder, own_folder(folder))
+        shutil.copytree(folder, trusted_folder(folder))
     value, hits, said = user()
     assert (value, hits) == (2.0, 0) and not user.planted.exists()
     assert said.count("twoloop: no code is loaded from") == 1 and "set NUMBA_CACHE_DIR to a folder of your own" in said
@@ -359,10 +367,12 @@ DOUBTS += [({"mode": 0o040775, "gid": OTHER}, f"can be written by group {OTHER} 
 @pytest.mark.parametrize("above", [False, True])
 def test_whose_folders_are_in_doubt(tmp_path, monkeypatch, changes, why, above):
     folder = tmp_path / "above" / "folder"
-    make_own(folder)
+    make_trusted_folder(folder)
     at = folder.parent if above else folder
     seen_as(monkeypatch, at, **changes)
-    assert doubt_of(folder) == (f"{at} {why}" if why else "") and (own_folder(folder) == folder) == (not why)
+    assert reason_to_distrust(folder) == (f"{at} {why}" if why else "") and (trusted_folder(folder) == folder) == (
+        not why
+    )
 
 
 @njit
@@ -372,6 +382,6 @@ def takes_an_attribute(x):
 
 def test_an_attribute_is_not_the_global_of_the_same_name(monkeypatch):
     """A callback that calls `math.log` was not kept where its file had something else that is called `log`."""
-    stamp = watch(takes_an_attribute.py_func)
+    stamp = digests_of(takes_an_attribute.py_func)
     monkeypatch.setitem(globals(), "log", object())
-    assert watch(takes_an_attribute.py_func) == stamp is not None
+    assert digests_of(takes_an_attribute.py_func) == stamp is not None

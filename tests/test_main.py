@@ -9,7 +9,7 @@ import pytest
 import twoloop
 from twoloop import kernels
 from twoloop.__main__ import main
-from twoloop.kernels.compile.caches import folder_of
+from twoloop.kernels.compile.caches import cache_folder
 from twoloop.mechanisms import four_bar
 
 pd = pytest.importorskip("pandas")  # not among the oldest versions
@@ -50,7 +50,7 @@ def test_info(capsys):
     text = capsys.readouterr().out
     assert f"twoloop {twoloop.__version__}, Python {sys.version.split()[0]}" in text
     assert f"numpy {np.__version__}" in text
-    assert str(folder_of(kernels)) in text and "compiled functions" in text and "cores" in text
+    assert str(cache_folder(kernels)) in text and "compiled functions" in text and "cores" in text
 
 
 def test_compile_imports_and_names_every_file(monkeypatch, capsys):

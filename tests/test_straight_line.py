@@ -19,11 +19,11 @@ from twoloop.generate.llvm_code import LARGEST_ANGLE
 from twoloop.generate.llvm_text import Module
 from twoloop.generate.program import Program
 from twoloop.generate.symbolic_factors import Factors
-from twoloop.kernels.compile.generated_functions import OwnFunctions, object_code
+from twoloop.kernels.compile.generated_functions import GeneratedFunctions, object_code
 from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.noted import BY_GENERAL
 from twoloop.kernels.evaluation import tasks
-from twoloop.kernels.evaluation.inner_loop import own_inner_loop
+from twoloop.kernels.evaluation.inner_loop import generated_inner_loop
 from twoloop.methods.presets import PRESETS
 from twoloop.run.run import Run
 from twoloop.solve import solve_dae
@@ -53,7 +53,7 @@ def run_from(system, q0, v0, compiled):
     plan = PRESETS["DOP853"].plan(system.n_q, 1e-8, 1e-8, False)
     if compiled:
         own = generated_code(system, 0.0, q0)
-        plan = replace(plan, inner=own_inner_loop, own=(own.shared.functions,), numbers=own.numbers)
+        plan = replace(plan, inner=generated_inner_loop, own=(own.shared.functions,), numbers=own.numbers)
     return Run(system, plan, 0.0, q0, v0, 1e-8, np.full(system.n_q, 1e-8), None)
 
 
@@ -67,7 +67,7 @@ def test_accelerations_off_the_constraints_are_those_of_the_general_inner_loop(m
         v = problem.v0 + 1e-2 * rng.standard_normal(problem.q0.size)
         if general.rank < general.work.Rate.size:  # off the constraints it matters which of redundant rows are kept
             _, q, v, *_ = inner(general, tasks.PROJECT, 0.1, q, v)
-        expected, known = (inner(run, tasks.EVALUATE_THERE, 0.1, q, v) for run in (general, own))
+        expected, known = (inner(run, tasks.EVALUATE_AS_GIVEN, 0.1, q, v) for run in (general, own))
         assert known[0] == expected[0] == DONE
         assert worst(known[3], expected[3]) < 1e-9 * max(1.0, np.abs(expected[3]).max())
 
@@ -197,7 +197,7 @@ def machine_code_of(program, numbers, divided=False):
     module, n = Module(divided), len(program.graph.sizes) + 1 + len(program.arrays)
     write_function(module, "function", ("i1", ["double*"] * n), program, numbers)
     assert ("blockaddress" in str(module)) is divided
-    made = OwnFunctions(["function"], object_code(str(module)))
+    made = GeneratedFunctions(["function"], object_code(str(module)))
     function = ctypes.CFUNCTYPE(ctypes.c_bool, *[ctypes.c_void_p] * n)(made.addresses["function"])
 
     def call(*given, made=made):

@@ -15,7 +15,7 @@ from pathlib import Path
 from twoloop import Result, __version__, kernels, mechanisms, solve_dae
 from twoloop.audit.mjcf import audit_mjcf, check_ending
 from twoloop.checks.optional import needed
-from twoloop.kernels.compile.caches import folder_of
+from twoloop.kernels.compile.caches import cache_folder
 from twoloop.mechanisms.registry import problem_from
 from twoloop.methods.presets import PRESETS
 from twoloop.rows.leaderboard import leaderboard
@@ -48,7 +48,7 @@ def info() -> None:
     print(f"needed:   {', '.join(f'{package} {installed(package)}' for package in NEEDED)}")
     print(f"optional: {', '.join(f'{package} {installed(package)}' for package in OPTIONAL)}")
     rooms = (each.name for each in pkgutil.iter_modules(kernels.__path__, f"{kernels.__name__}.") if each.ispkg)
-    folder, *others = (folder_of(package) for package in (kernels, *map(import_module, rooms)))
+    folder, *others = (cache_folder(package) for package in (kernels, *map(import_module, rooms)))
     if folder is None:
         print("cache:    none: no folder can be written; set NUMBA_CACHE_DIR to one that can, by you alone")
     else:

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numba.core.dispatcher import Dispatcher
 
-from twoloop.kernels.compile.caches import kept_when_called
+from twoloop.kernels.compile.caches import compiled_when_called
 from twoloop.kernels.data.flags import GAMMA_GIVEN
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
@@ -28,7 +28,7 @@ OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "rea
 
 # a closure over callbacks: compiled when it is called, for its argument types, and read from the disk in later
 # processes if callbacks and code are the same
-cached = kept_when_called(**OPTIONS)
+cached = compiled_when_called(**OPTIONS)
 
 
 @cached  # called from Python, too

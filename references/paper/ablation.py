@@ -13,7 +13,7 @@ from numba import njit
 from references.driver import Task, TimeLimit, adapter
 from references.equations.accelerations import cholesky, cholesky_solve, lu_factor, lu_solve
 from twoloop.checks.arguments import check_choice
-from twoloop.kernels.compile.caches import kept_when_called
+from twoloop.kernels.compile.caches import compiled_when_called
 from twoloop.kernels.data.flags import CONSTANT_MASS, GAMMA_GIVEN
 from twoloop.kernels.data.kit import Kit
 from twoloop.kernels.evaluation.partition import full_pivoting
@@ -327,7 +327,7 @@ def _error(n, tol, states):  # type: ignore[no-untyped-def]
     return np.sqrt(total / (2 * n))
 
 
-@kept_when_called(error_model="numpy")
+@compiled_when_called(error_model="numpy")
 def run(  # type: ignore[no-untyped-def]
     f, n, m, s, variant, order, A, b, c, inverse, t0, t1, n_steps, tol, loop_tol, state, where, rows, counters
 ):

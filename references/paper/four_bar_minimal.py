@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
 from twoloop.checks.arguments import check_positive
-from twoloop.kernels.compile.caches import kept_when_called
+from twoloop.kernels.compile.caches import compiled_when_called
 from twoloop.problem.problem import Array
 
 RTOL, ATOL = 1e-13, 1e-14
@@ -130,7 +130,7 @@ def _linkage(*arguments: Any) -> MinimalFourBar:
     return MinimalFourBar(*arguments)
 
 
-@kept_when_called(error_model="numpy")
+@compiled_when_called(error_model="numpy")
 def _rate(L, masses, gravity, state, torque):  # type: ignore[no-untyped-def]
     rate, n, n_s = np.zeros(4), np.zeros(3), np.zeros(3)
     for i in range(3):  # the tangent, and its derivative along itself

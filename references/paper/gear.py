@@ -19,7 +19,7 @@ from references.equations.accelerations import lu_factor, lu_solve
 from references.lines import Line
 from references.scipy.index1 import solve_index1
 from twoloop.checks.arguments import check_choice, check_size, check_times
-from twoloop.kernels.compile.caches import kept_when_called
+from twoloop.kernels.compile.caches import compiled_when_called
 from twoloop.kernels.data.kit import Kit
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
@@ -232,7 +232,7 @@ def _newton(f, w, t, q, forces, q_past, v_past, hb, r, displaced, J, pivots, cou
     return NOT_CONVERGED
 
 
-@kept_when_called(error_model="numpy")
+@compiled_when_called(error_model="numpy")
 def _integrate(  # type: ignore[no-untyped-def]
     f, n, given, past, first, last, t0, h, order, formulas, keep, rows, counters
 ):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from references.driver import Task
 from references.equations.accelerations import cached, compiled_gamma
 from references.equations.rows import accelerations
-from twoloop.kernels.compile.callbacks import stand_in
+from twoloop.kernels.compile.callbacks import zero_callback
 from twoloop.kernels.data.flags import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN
 from twoloop.problem.problem import Array
 
@@ -138,7 +138,7 @@ def iteration_matrix_at(parts: Parts) -> Callable[..., None]:
     """
     index1, mass, force, _, jacobian, _, gamma, tangent, positions, constant_mass = parts
     exact = tangent is not None
-    add_tangent = stand_in("force_by_q") if tangent is None else tangent
+    add_tangent = zero_callback("force_by_q") if tangent is None else tangent
     differenced = residual_at(parts._replace(force=_no_force if exact else force, tangent=None))
     by_velocities = index1 or not exact
 

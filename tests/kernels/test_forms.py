@@ -114,7 +114,7 @@ def chain(n=12, stiffness=1e4, damping=0.0, lumped=False, bandwidth=3):
 def test_other_integers_than_32_bit_are_refused(monkeypatch):
     monkeypatch.setitem(lapack.scipy.linalg.cython_lapack.__pyx_capi__, "dgbtrf", "void (npy_int64 *, npy_int64 *)")
     with pytest.raises(ImportError, match=r"cython_lapack\.dgbtrf must take 32-bit integers; it is 'void \(npy_int64"):
-        lapack.addresses()
+        lapack.lapack_addresses()
 
 
 @pytest.mark.parametrize(("lumped", "damping"), [(False, 20.0), (True, 0.0)])

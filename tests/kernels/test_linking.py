@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numba import types
 
-from twoloop.kernels.compile import linking as own_rules
+from twoloop.kernels.compile import linking
 from twoloop.kernels.compile.linking import KernelCompiler
 from twoloop.kernels.data.common import OPTIONS, compiled, inlined, merged
 
@@ -69,8 +69,8 @@ def _entries(x, n):
 def test_what_makes_compiling_faster_changes_no_code(monkeypatch):
     """Numba's own functions and those in their place give the same machine code, up to names that count."""
     found = []
-    for rules in (own_rules._RULES, [rule for rule in own_rules._RULES if rule[1] == "fix_integer_index"]):
-        monkeypatch.setattr(own_rules, "_RULES", rules)
+    for rules in (linking._RULES, [rule for rule in linking._RULES if rule[1] == "fix_integer_index"]):
+        monkeypatch.setattr(linking, "_RULES", rules)
         kernel = numba.njit("f8(f8[:, ::1], i8)", pipeline_class=KernelCompiler, **OPTIONS)(_entries)
         (code,) = kernel.inspect_llvm().values()
         body = code.split("define ")[1].split("\n}")[0]
@@ -82,8 +82,8 @@ def test_what_makes_compiling_faster_changes_no_code(monkeypatch):
 
 
 def test_numba_has_its_own_functions_after_a_kernel_and_after_a_failure():
-    before = [vars(owner).get(name) for owner, name, _ in own_rules._RULES]
+    before = [vars(owner).get(name) for owner, name, _ in linking._RULES]
     numba.njit("f8(f8)", pipeline_class=KernelCompiler, **OPTIONS)(lambda x: x)
     with pytest.raises(numba.TypingError):
         numba.njit("f8(f8)", pipeline_class=KernelCompiler, **OPTIONS)(lambda x: x + "one")
-    assert [vars(owner).get(name) for owner, name, _ in own_rules._RULES] == before and own_rules._open == [0]
+    assert [vars(owner).get(name) for owner, name, _ in linking._RULES] == before and linking._depth == [0]

@@ -8,7 +8,7 @@ from references.paper import gear
 from references.paper.four_bar_minimal import trajectory
 from references.paper.gear import HIGHEST, STARTS, _formulas, solve_gear
 from tests.problems import force_residual, moving_pivot, moving_pivot_state, pendulum, violations, worst
-from twoloop.kernels.compile.caches import watch
+from twoloop.kernels.compile.caches import digests_of
 from twoloop.mechanisms import four_bar
 from twoloop.run.record import Status
 
@@ -101,10 +101,10 @@ def test_stores_every_step_or_those_asked_for(start):
 
 @pytest.mark.slow
 def test_machine_code_on_disk_follows_the_factorisations_that_it_holds(monkeypatch):
-    before = watch(gear._integrate.py_func)
-    assert before is not None and watch(gear._integrate.py_func) == before
+    before = digests_of(gear._integrate.py_func)
+    assert before is not None and digests_of(gear._integrate.py_func) == before
     monkeypatch.setattr(gear, "lu_factor", njit(lambda A, pivots: True))
-    assert watch(gear._integrate.py_func) != before
+    assert digests_of(gear._integrate.py_func) != before
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from numba import njit
 from twoloop.checks.arguments import Array
 from twoloop.checks.values import MOST
 from twoloop.kernels.compile.callbacks import KINDS
-from twoloop.kernels.compile.dependencies import Rewritten, of_library
+from twoloop.kernels.compile.dependencies import FunctionCopier, is_library
 from twoloop.kernels.compile.private import Dispatcher
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def _index_error(
         try:
             with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore")
-                Rewritten(wrap).value(function)(t, *given, *(np.zeros(array.shape) for array in out))
+                FunctionCopier(wrap).value(function)(t, *given, *(np.zeros(array.shape) for array in out))
         except IndexError as error:
             return error
         except Exception:  # what does not run in Python may run compiled; its own errors come up when it is called
@@ -111,7 +111,7 @@ def place_of(error: BaseException) -> str:
     trace, frames = error.__traceback__, []
     while trace is not None:
         module = trace.tb_frame.f_globals.get("__name__") or ""
-        if module not in OWN and not of_library(module):
+        if module not in OWN and not is_library(module):
             frames.append((trace.tb_frame.f_code.co_filename, trace.tb_lineno))
         trace = trace.tb_next
     if not frames:

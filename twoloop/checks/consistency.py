@@ -16,7 +16,7 @@ from twoloop.checks.scales import EPS, NONE, scales_of
 from twoloop.checks.sparse_rows import largest_in_rows
 from twoloop.checks.values import UNSYMMETRIC, unsymmetric_mass
 from twoloop.checks.violation import ROUNDING, Violation, is_at_rounding, surely_consistent
-from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.compile.linking import entry_point
 
 if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
@@ -109,9 +109,9 @@ class Look:
 
     def __init__(self, system: ConstrainedSystem):
         from twoloop.kernels.evaluation import checks as first_look
-        from twoloop.kernels.evaluation.checks import look, room_size
+        from twoloop.kernels.evaluation.checks import evaluate_start, room_size
 
-        self.flags, self._look = first_look, direct(look)
+        self.flags, self._look = first_look, entry_point(evaluate_start)
         n, n_rows, size = system.n_q, system.n_c + system.n_a, room_size(system.n_q, system.n_c, system.n_a)
         self.system, looked = system, np.zeros(size + n * n + 2 * n_rows * n)
         self._room, mass, rows, pattern = np.split(looked, np.cumsum([size, n * n, n_rows * n]))

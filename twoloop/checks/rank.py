@@ -6,7 +6,7 @@ import numpy as np
 from scipy.linalg import lapack, qr
 
 from twoloop.checks.arguments import Array
-from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.compile.linking import entry_point
 
 RANK_TOLERANCE = 1e-11  # of the largest diagonal entry of R
 SHOWN = 5  # rows that depend on others, of which the equations are written out
@@ -30,7 +30,7 @@ def orthogonalised(rows: Array, least: float) -> tuple[Array, Array, list[int]]:
 
     most, kept = min(rows.shape), np.zeros(len(rows), dtype=np.int64)
     basis, factors = np.zeros((most + 1, rows.shape[1])), np.zeros((most + 1, most + 1))
-    n = direct(independent_rows)(np.ascontiguousarray(rows), least, basis, factors, kept)
+    n = entry_point(independent_rows)(np.ascontiguousarray(rows), least, basis, factors, kept)
     return basis[:n], factors[:n, :n], kept[:n].tolist()
 
 
@@ -46,21 +46,23 @@ def least_solution(rows: Array, values: Array) -> tuple[Array, Array] | None:
     basis, factors, shares = np.zeros((most, n_q)), np.zeros((most, most)), np.zeros((n_rows, most))
     gram, parts = np.zeros((n_rows, n_rows)), np.zeros((2, n_rows))
     room = basis, factors, kept, shares, gram, parts
-    n = direct(independent.least_solution)(np.ascontiguousarray(rows), left, NO_DIRECTION, *room, x)
-    inverse = direct(independent.size_of_inverse)(factors, n, parts[0])
+    n = entry_point(independent.least_solution)(np.ascontiguousarray(rows), left, NO_DIRECTION, *room, x)
+    inverse = entry_point(independent.size_of_inverse)(factors, n, parts[0])
     return (x, left) if WEAK * math.sqrt(n_rows) * inverse < 1.0 else None
 
 
 def surely_above(ratio: float, rows: Array, rank: int) -> bool:
     """Whether so many singular values are above this share of the largest, by bounds that cost less than these."""
-    from twoloop.kernels.linalg.rank import above, size_of_inverse
+    from twoloop.kernels.linalg.rank import singular_values_exceed, size_of_inverse
 
-    if rank == len(rows) > 0 and direct(above)(np.ascontiguousarray(rows), ratio, np.empty((rank, rank))):
+    if rank == len(rows) > 0 and entry_point(singular_values_exceed)(
+        np.ascontiguousarray(rows), ratio, np.empty((rank, rank))
+    ):
         return True
     _, factors, kept = orthogonalised(rows, NO_DIRECTION)
     if len(kept) != rank or rank == 0:
         return False
-    inverse = direct(size_of_inverse)(np.ascontiguousarray(factors), rank, np.zeros(rank))
+    inverse = entry_point(size_of_inverse)(np.ascontiguousarray(factors), rank, np.zeros(rank))
     return bool(ratio * float(np.linalg.norm(rows)) * inverse < 1.0)
 
 
@@ -84,7 +86,7 @@ def in_words(jacobian: Array, redundant: list[int]) -> str:
     lengths, shares = np.zeros(n_rows), np.zeros((len(shown), len(others)))
     order, kept = np.array([*others, *shown]), np.zeros(n_rows, dtype=np.int64)
     room = np.zeros((most, n_q)), np.zeros((most, most)), kept
-    if not direct(shares_of_others)(
+    if not entry_point(shares_of_others)(
         np.ascontiguousarray(jacobian), order, RANK_TOLERANCE, rest, *room, shares, lengths
     ):
         shares[:] = np.linalg.lstsq(rest.T, jacobian[shown].T, rcond=None)[0].T

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from twoloop.checks.arguments import Array
 from twoloop.checks.bounds import check_callback
 from twoloop.checks.sparse_rows import Rows, SparseRows, is_finite
-from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.compile.linking import entry_point
 
 if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
@@ -56,12 +56,12 @@ class Scales:
         Elsewhere the mechanism may be smaller by far. The latest of such positions are kept: the sizes of each, where
         it is, and which entries count there.
         """
-        from twoloop.kernels.evaluation.checks import NEAR, NO_ENTRY
+        from twoloop.kernels.evaluation.checks import NEAR_SHARE, NO_ENTRY
 
         n, size = len(q), np.abs(jacobian)
         entries = (size > NO_ENTRY * size.max(axis=1, initial=0.0)[:, None]).ravel()
         known = system.made.get("sizes", NONE).reshape(-1, 2 * n + entries.size)
-        away = (np.abs(known[:, n : 2 * n] - q) > NEAR * known[:, :n]).any(axis=1)
+        away = (np.abs(known[:, n : 2 * n] - q) > NEAR_SHARE * known[:, :n]).any(axis=1)
         others = known[away | (known[:, 2 * n :] != entries).any(axis=1)][: MOST_PLACES - 1]
         system.made["sizes"] = np.concatenate([self.by_coordinate(self.reach, jacobian), q, entries, others.ravel()])
 
@@ -103,13 +103,13 @@ def _middle(ordered: Array) -> float:
 
 def column_scales(jacobian: Rows, typical: Array) -> Array:
     """Units of the coordinates in which the entries of C_q are of like size; of zero columns, the typical ones."""
-    from twoloop.kernels.evaluation.checks import like_sizes
+    from twoloop.kernels.evaluation.checks import column_units
 
     if isinstance(jacobian, SparseRows):
         return _sparse_column_scales(jacobian, typical)
     n_rows, n = jacobian.shape
     columns, room = np.zeros((2, n))
-    direct(like_sizes)(
+    entry_point(column_units)(
         np.ascontiguousarray(jacobian), typical, columns, *np.zeros((2, n_rows, n)), np.zeros(n_rows), room
     )
     return columns
@@ -134,7 +134,7 @@ def _sparse_column_scales(jacobian: SparseRows, typical: Array) -> Array:
 
 def scales_of(system: ConstrainedSystem, t: float, q: Array, jacobian: Array) -> Scales:
     """Scales at a position, from C_q there and nearby; or from C_q and A, if `jacobian` has the rows of both."""
-    from twoloop.kernels.evaluation.checks import NEGLIGIBLE, reaches
+    from twoloop.kernels.evaluation.checks import NEGLIGIBLE, row_reaches
 
     size, columns = np.abs(q), units(system, t, q, jacobian, typical_sizes(q))
     in_units = np.abs(jacobian) * columns
@@ -145,7 +145,7 @@ def scales_of(system: ConstrainedSystem, t: float, q: Array, jacobian: Array) ->
     radius = lengths / np.maximum(curvature, 1e-300 * np.maximum(lengths, 1.0))
     in_units = np.ascontiguousarray((jacobian != 0.0) * (size / columns))
     reach, negligible = np.ones(len(rows)), NEGLIGIBLE * float(in_units.max(initial=0.0))
-    direct(reaches)(in_units, radius, negligible, np.zeros(len(q)), reach)
+    entry_point(row_reaches)(in_units, radius, negligible, np.zeros(len(q)), reach)
     return Scales(columns, rows, reach)
 
 
@@ -184,7 +184,7 @@ def rows_at(system: ConstrainedSystem, t: float, places: Array) -> tuple[Array, 
     check_callback(system, "jacobian", t, [places[0]])
     n, kit, defined = len(places), system.kit, np.ones(len(places), dtype=bool)
     rows = np.zeros((n, system.n_c + system.n_a, system.n_q))
-    evaluate = direct(first_look.rows_at)
+    evaluate = entry_point(first_look.rows_at)
     try:
         evaluate(kit, t, places, system.n_c, rows.reshape(-1, system.n_q))
     except Exception:  # then one by one

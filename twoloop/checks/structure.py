@@ -11,7 +11,7 @@ from twoloop.checks.arguments import Array
 from twoloop.checks.differences import EPS, as_far_as_they_differ, defined
 from twoloop.checks.scales import generic_factors, generic_velocities, rows_at
 from twoloop.checks.values import SAME, UNSYMMETRIC, unsymmetric_mass, wrong_values
-from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.compile.linking import entry_point
 
 if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
@@ -85,7 +85,7 @@ def _compared(system: ConstrainedSystem, t: float, q: Array, v: Array) -> tuple[
     n, n_c = system.n_q, system.n_c
     fused, given = np.zeros((2, 3 + n, n_c))
     state = np.ascontiguousarray(q), np.ascontiguousarray(v)
-    agree = direct(kinematics_agree)(system.kit, t, *state, fused, given, np.zeros(n_c), SAME, ROUNDED * EPS)
+    agree = entry_point(kinematics_agree)(system.kit, t, *state, fused, given, np.zeros(n_c), SAME, ROUNDED * EPS)
     return bool(agree), given[1], given[3:].reshape((n_c, n))
 
 

@@ -331,12 +331,12 @@ class LaneRuns:
 
         q, v : (n_runs, n, n_t), the last at the end; ends : a and lam there.
         """
-        from twoloop.kernels.evaluation.residuals import disagreement
+        from twoloop.kernels.evaluation.residuals import motion_residuals
 
         n, n_c = self.system.n_q, self.system.n_c
         room, worst = np.zeros(n * (n + 3) + n_c * (n + 3)), np.full(len(which), np.inf)
         rows = np.where(made, which, -1)
-        disagreement(*self.kit, t1, AGREES, atol, rows, self.starts.parameters, q, v, ends, room, worst)
+        motion_residuals(*self.kit, t1, AGREES, atol, rows, self.starts.parameters, q, v, ends, room, worst)
         agreed: Flags = worst <= 1.0
         return agreed
 

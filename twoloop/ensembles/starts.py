@@ -87,12 +87,12 @@ def kit_to_write(system: ConstrainedSystem) -> tuple[Any, NDArray[np.int64]]:
 
 def far_off(kit: tuple[Any, NDArray[np.int64]], starts: Starts) -> NDArray[np.bool_]:
     """Of which starts callbacks say that C or C_q v + C_t is more than what rounding of their terms may leave."""
-    from twoloop.kernels.evaluation.residuals import violation
+    from twoloop.kernels.evaluation.residuals import constraint_residuals
 
     functions, sizes = kit
     room, worst = np.zeros(int(sizes[1] * (sizes[0] + 2))), np.zeros(len(starts.q))
     slow = SLOW * float(np.abs(starts.v).max(initial=0.0))
-    violation(functions, sizes, starts.t0, slow, starts.parameters, starts.q, starts.v, room, worst)
+    constraint_residuals(functions, sizes, starts.t0, slow, starts.parameters, starts.q, starts.v, room, worst)
     return ~(worst <= NEAR * np.finfo(float).eps)
 
 

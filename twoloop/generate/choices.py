@@ -16,7 +16,7 @@ from twoloop.checks.at_position import mass_and_rows
 from twoloop.generate.graph import Untraceable
 from twoloop.generate.trace import Equations
 from twoloop.generate.trace_cache import shared_cache
-from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.compile.linking import entry_point
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -90,11 +90,11 @@ class Dependents:
     def __init__(self, system: ConstrainedSystem, rows: tuple[int, ...]):
         kinds = _kinds(system) if len(rows) >= MOSTLY_ROWS * system.n_q > 0 else None
         if kinds is not None:
-            from twoloop.kernels.linalg.dependent_columns import dependents, room_size
+            from twoloop.kernels.linalg.dependent_columns import choose_dependent_columns, room_size
 
             numbers, integers = room_size(len(rows), system.n_q)
             blocks, room, work = np.zeros(4 * len(rows), np.int64), np.zeros(numbers), np.zeros(integers, np.int64)
-            self.find, self._blocks = direct(dependents), blocks
+            self.find, self._blocks = entry_point(choose_dependent_columns), blocks
             self.arguments = kinds, np.array(rows, np.int64), len(rows), room, work, blocks
 
     def blocks(self, G: Array) -> Blocks:
@@ -129,10 +129,10 @@ class Chooser:
     """Makes the choice for one M and G of a system after another; it is mostly the same."""
 
     def __init__(self, system: ConstrainedSystem):
-        from twoloop.kernels.linalg.rank import choose, room_size
+        from twoloop.kernels.linalg.rank import choose_rows, room_size
 
         n_rows = system.n_c + system.n_a
-        self.system, self._choose = system, direct(choose)
+        self.system, self._choose = system, entry_point(choose_rows)
         self._room, self._chosen = np.zeros(room_size(n_rows, system.n_q)), np.zeros(2 + 3 * n_rows, dtype=np.int64)
         self._key, self._last = (0, b"", 0.0), Choice((), (), 1.0, 0.0)
 

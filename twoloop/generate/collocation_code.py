@@ -27,7 +27,7 @@ from twoloop.generate.lobatto_tables import tables
 from twoloop.generate.lowering import Lowering, lower
 from twoloop.generate.program import Program
 from twoloop.kernels.compile.dependencies import digest_of
-from twoloop.kernels.compile.generated_functions import LaterFunctions, own_functions
+from twoloop.kernels.compile.generated_functions import DeferredFunctions, generated_functions
 from twoloop.kernels.data import collocation as at
 from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL
@@ -600,7 +600,7 @@ class CollocationCode:
 class Collocation(NamedTuple):
     """Hold the functions of a mechanism for collocation steps."""
 
-    functions: LaterFunctions
+    functions: DeferredFunctions
     code: CollocationCode
     numbers: Any  # what they read, or formulas for it
 
@@ -629,11 +629,13 @@ def _compiled(own: SharedCode) -> Collocation:
     def write() -> tuple[list[str], str]:
         module = Module(divided=long)
         for name, emit in parts.items():
-            llvm_code.write(module, name, KIT.own_type(name), emit, partial(LaneEmitter, lanes=LANES))
+            llvm_code.write(module, name, KIT.llvm_type(name), emit, partial(LaneEmitter, lanes=LANES))
         assert len(code.numbers.values) == len(numbers)  # what is read beyond would be anything
         return list(parts), str(module)
 
-    functions = LaterFunctions(lambda: own_functions("collocation", _stamp(), code.structure, write, passes=not long))
+    functions = DeferredFunctions(
+        lambda: generated_functions("collocation", _stamp(), code.structure, write, passes=not long)
+    )
     return Collocation(functions, code, numbers)
 
 

@@ -33,7 +33,7 @@ from twoloop.generate.program import Program
 from twoloop.generate.trace_cache import Evaluator, TraceCache, derive_cached
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.kernels.compile.dependencies import digest_of
-from twoloop.kernels.compile.generated_functions import own_functions
+from twoloop.kernels.compile.generated_functions import generated_functions
 from twoloop.problem.system import ConstrainedSystem
 
 ARRAY = f"{DOUBLE}*"
@@ -400,7 +400,7 @@ class SharedCode:
         structure = repr(list(self._described()))
         self.digest = hashlib.sha256((structure + _stamp()).encode()).hexdigest()
         # passes of LLVM find nothing that makes equations faster, and take up to a quarter of a build
-        self.functions = own_functions("equations", _stamp(), self.digest, self._write, passes=False)
+        self.functions = generated_functions("equations", _stamp(), self.digest, self._write, passes=False)
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "GeneratedCode":
         """Return the code with the coefficients of one of the systems."""
@@ -430,10 +430,10 @@ class SharedCode:
         equations = self.equations
         module = Module(divided=True)
         for name, outputs in self.outputs.items():
-            write_function(module, name, KIT.own_type(name), outputs, self.numbers)
-        parts = [] if self.parts is None else self.parts.write(module, KIT.own_type)
+            write_function(module, name, KIT.llvm_type(name), outputs, self.numbers)
+        parts = [] if self.parts is None else self.parts.write(module, KIT.llvm_type)
         if "own_there" not in parts:
-            write_acceleration_function(module, "own_there", KIT.own_type("own_there"), equations, self.numbers)
+            write_acceleration_function(module, "own_there", KIT.llvm_type("own_there"), equations, self.numbers)
             parts.append("own_there")
         return [*self.outputs, *parts], str(module)
 

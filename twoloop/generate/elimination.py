@@ -29,7 +29,7 @@ from twoloop.generate.program import Program
 from twoloop.generate.symbolic_factors import Block, Factors, solve
 from twoloop.generate.trace import Equations, only
 from twoloop.generate.traced_values import Traced
-from twoloop.kernels.evaluation.partition import CONTRADICTS
+from twoloop.kernels.evaluation.partition import MAX_VIOLATION
 from twoloop.problem.system import ConstrainedSystem
 
 MOST_ELIMINATED = 60_000  # operations with the elimination: enough for 40 bodies on hinges in space
@@ -118,7 +118,7 @@ class Elimination:
         for k in redundant:
             row, rate = self.all_rows[k], rates[k]
             faster = sum((entry * u for entry, u in zip(row, self.v, strict=True)), rate)
-            allowed = sum((entry * entry for entry in row), self.nothing).times(CONTRADICTS**2)
+            allowed = sum((entry * entry for entry in row), self.nothing).times(MAX_VIOLATION**2)
             for what, scale in ((off[k], size), (faster, speed)):
                 conditions.append((allowed * scale, what * what))
         return Program(self.graph, {"": []}, conditions)

@@ -30,7 +30,7 @@ from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.llvm_text import Module
 from twoloop.generate.parameter_expressions import ParameterTape
 from twoloop.kernels.compile.dependencies import digest_of
-from twoloop.kernels.compile.generated_functions import OwnFunctions, are_kept, own_functions
+from twoloop.kernels.compile.generated_functions import GeneratedFunctions, are_cached, generated_functions
 from twoloop.kernels.lanes.lane_room import CODE
 
 Array = NDArray[np.float64]
@@ -59,20 +59,20 @@ class GeneratedLanes(Generic[Code]):
         self.code: Code = code
 
     @cached_property
-    def functions(self) -> OwnFunctions:
+    def functions(self) -> GeneratedFunctions:
         """The code, compiled when it is first asked for."""
-        return own_functions(KIND, _stamp(), self.code.structure, self._write)
+        return generated_functions(KIND, _stamp(), self.code.structure, self._write)
 
     def _write(self) -> tuple[list[str], str]:
         module = Module()
         for name in self.code.tasks:
-            llvm_code.write(module, name, CODE.own_type(name), getattr(self.code, name), LaneEmitter)
+            llvm_code.write(module, name, CODE.llvm_type(name), getattr(self.code, name), LaneEmitter)
         return list(self.code.tasks), str(module)
 
     @property
     def seconds_to_build(self) -> float:
         """About what the code takes to compile, s; 0 where it is there or on the disk."""
-        if are_kept(KIND, _stamp(), self.code.structure):
+        if are_cached(KIND, _stamp(), self.code.structure):
             return 0.0
         return BUILD_SECONDS * self.code.n_quantities
 

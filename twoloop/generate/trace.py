@@ -29,7 +29,7 @@ from twoloop.generate.parameter_expressions import (
     number,
 )
 from twoloop.kernels.compile.callbacks import KINDS
-from twoloop.kernels.compile.dependencies import Rewritten, of_library
+from twoloop.kernels.compile.dependencies import FunctionCopier, is_library
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.problem.system import ConstrainedSystem
 
@@ -81,7 +81,7 @@ def as_forms(graph: Graph, values: Any) -> Any:
     return values
 
 
-class _Traced(Rewritten):
+class _Traced(FunctionCopier):
     """Copies callbacks, with the mathematics of expressions in the place of `math` and `numpy`."""
 
     def copies(self, value: Any) -> bool:
@@ -106,7 +106,7 @@ class _Traced(Rewritten):
             for module in (math, np):
                 if name and getattr(module, name, None) is value:
                     return getattr(_Mathematics(module), name)
-            if of_library(getattr(value, "__module__", None) or ""):
+            if is_library(getattr(value, "__module__", None) or ""):
                 return value
         return super().value(value, names)
 

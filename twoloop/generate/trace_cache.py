@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from twoloop.generate.graph import Untraceable
 from twoloop.generate.parameter_expressions import Parameter, ParameterTape, Powers
 from twoloop.generate.trace import Equations
-from twoloop.kernels.compile.caches import Newest, uncollected
+from twoloop.kernels.compile.caches import BoundedCache, garbage_collection_off
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -26,7 +26,7 @@ Evaluator = Callable[[Any], Array]  # gives the numbers of an array of expressio
 GENERIC = 0.5, 1.5  # range of the parameters with which callbacks are traced: of one size, so that none hides another
 EXTREME = 1e-30  # parameters below it, or above its inverse, keep their values: their powers would leave the range
 
-_CACHES = Newest()
+_CACHES = BoundedCache()
 
 
 class TraceCache:
@@ -116,7 +116,7 @@ class TraceCache:
         if what not in self._made:
             with self._tracing:
                 if what not in self._made:
-                    with uncollected():  # all of it stays in memory
+                    with garbage_collection_off():  # all of it stays in memory
                         self._made[what] = make()
         return self._made[what]
 

@@ -18,7 +18,7 @@ from twoloop.checks.scales import sizes
 from twoloop.generate.graph import Graph, Untraceable
 from twoloop.generate.program import OperationTable
 from twoloop.generate.trace_cache import Evaluator
-from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.compile.linking import entry_point
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -133,7 +133,7 @@ class Traced:
         from twoloop.kernels.evaluation import traced as kernels
 
         called, traced, bounds = np.zeros((3, len(states), len(self.places)))
-        n_different = direct(kernels.compare)(
+        n_different = entry_point(kernels.compare)(
             system.kit,
             self.sizes,
             self.which,

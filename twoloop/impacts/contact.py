@@ -13,7 +13,7 @@ from twoloop.generate.graph import Affine, Derivative, Graph, Untraceable, symbo
 from twoloop.generate.program import AGREES, BETWEEN, STATES, OperationTable
 from twoloop.generate.trace import as_forms, trace
 from twoloop.generate.traced_values import unchecked
-from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import codes, noted
 from twoloop.methods.dop853 import DOP853
 from twoloop.problem.description import Stop
@@ -226,7 +226,7 @@ class Accelerations:
         run, n, key = self._run, self._n, (t, q.tobytes(), v.tobytes())
         if self._last is None or self._last[0] != key:  # the events of all rows ask for the same state
             state = np.concatenate([q, v, np.zeros(len(run.state) - 2 * n)])
-            if direct(run.kernels.start)(run.kit, run.work, t, state) != codes.DONE:
+            if entry_point(run.kernels.start)(run.kit, run.work, t, state) != codes.DONE:
                 state[2 * n :] = np.nan
             self._last = key, state
         state = self._last[1]

@@ -38,14 +38,20 @@ from twoloop.kernels.data.noted import (
     PIVOT,
 )
 from twoloop.kernels.data.tolerances import GAP
-from twoloop.kernels.evaluation.drive_discontinuities import JUMP, RAMP, SMOOTH, find_kink, unexplained
+from twoloop.kernels.evaluation.drive_discontinuities import (
+    JUMP,
+    RAMP,
+    SMOOTH,
+    locate_discontinuity,
+    unexplained_velocity_change,
+)
 from twoloop.kernels.evaluation.inner_loop import (
     accelerations,
+    adopt_midpoint_partition,
     check_redundant,
     find_tangents,
     prepare_mass,
     renew_partition,
-    take_midpoint,
 )
 from twoloop.kernels.evaluation.partition import CHANGED
 from twoloop.kernels.linalg.dense import copy
@@ -75,16 +81,16 @@ def start(f, w, t, state):
 
 @merged
 def _kink(f, w, t, size, tolerances, accepted, state, new_state):
-    """What find_kink says of a step whose velocities change by more than its accelerations explain."""
+    """What `locate_discontinuity` says of a step whose velocities change by more than its accelerations explain."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     if not accepted:
-        return find_kink(f, w, t, t + size, q, v, v, tolerances)
-    if not unexplained(tolerances, size, state, new_state, n) > 1.0:
+        return locate_discontinuity(f, w, t, t + size, q, v, v, tolerances)
+    if not unexplained_velocity_change(tolerances, size, state, new_state, n) > 1.0:
         return SMOOTH, t, t
     for m in range(n):
         w.y[m] = (new_state[m] - state[m]) / size
-    return find_kink(f, w, t, t + size, q, v, w.y, tolerances)
+    return locate_discontinuity(f, w, t, t + size, q, v, w.y, tolerances)
 
 
 @merged
@@ -100,7 +106,7 @@ def _attempt(f, w, options, memory, tolerances, control, clock, t, size, leaps, 
     w.notes[DEFECT] = -1.0
     code, error, factor = f.attempt(f, w, options, memory, t, size, tolerances, state, new_state)
     if code == DONE and np.isfinite(error) and control[at.SYMMETRIC] == 1.0:
-        code = take_midpoint(f, w, t + 0.5 * size, state, new_state)
+        code = adopt_midpoint_partition(f, w, t + 0.5 * size, state, new_state)
         if code == CHANGED:
             f.settle(f, w, options, memory, tolerances, False)
             code, error, factor = f.attempt(f, w, options, memory, t, size, tolerances, state, new_state)

@@ -12,9 +12,9 @@ from twoloop.kernels.control.sudden import N_CHANGES
 from twoloop.kernels.data.common import WORK, Work
 from twoloop.kernels.data.counters import N_COUNTERS
 from twoloop.kernels.data.noted import N_NOTES
-from twoloop.kernels.evaluation.drive_discontinuities import PARTS
+from twoloop.kernels.evaluation.drive_discontinuities import N_PARTS
 from twoloop.kernels.linalg.band import N_ROUTINES
-from twoloop.kernels.linalg.markowitz_lu import N_COUNTS, N_LISTS, WIDEST, index_size, values_size
+from twoloop.kernels.linalg.markowitz_lu import MAX_ENTRIES_PER_LINE, N_COUNTS, N_LISTS, index_size, values_size
 
 MOST_FREE, LARGEST_FREE = 32, 100_000  # workspaces that wait for their next run, and numbers of each of them
 WORD, LINE = 8, 8  # bytes of a number, and numbers in a line of the cache, at which arrays begin
@@ -216,7 +216,7 @@ def _layout(
         "pattern": (n_rows, n_q),
         "mass_pattern": (n_q, n_q) if augmented else (0, 0),
         "Gamma_tried": (2, n_rows),
-        "rates": (PARTS + 1, n_rows),
+        "rates": (N_PARTS + 1, n_rows),
         "changes": (N_CHANGES, n_q + n_rows),
         **dict.fromkeys(("Q", "x", "y"), (n_q,)),
         "C": (n_c,),
@@ -261,7 +261,9 @@ def _layout(
     of_integers, n_integers = _placed(integers)
     of_numbers["entries"], of_numbers["G"] = (0, n_entries, (n_entries,)), (0, n_entries, (rows_of_G, n_q))
     of_numbers["M"] = n_entries, n_entries + side * side, (side, side)
-    lists = (N_COUNTS + N_LISTS * min(r, WIDEST)) * r if static is None else 0  # of `index`, for the time of ordering
+    lists = (
+        (N_COUNTS + N_LISTS * min(r, MAX_ENTRIES_PER_LINE)) * r if static is None else 0
+    )  # of `index`, for the time of ordering
     lasting = of_numbers["matrices"][0], of_integers["index"][1] - lists
     if n_a == 0:
         of_numbers["values_v"] = of_numbers["values"]

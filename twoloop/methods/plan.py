@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import check_choice, check_positive
-from twoloop.kernels.compile.caches import Newest
+from twoloop.kernels.compile.caches import BoundedCache
 
 Array = NDArray[np.float64]
 
@@ -129,7 +129,7 @@ def check_choices(method: Any) -> None:
             check_choice(option.name, getattr(method, option.name), get_args(option.type))
 
 
-_PLANS = Newest()  # of methods that do not look at the system
+_PLANS = BoundedCache()  # of methods that do not look at the system
 
 
 def kept_plan(method: Method, n_q: int, rtol: float, atol: float) -> Plan:

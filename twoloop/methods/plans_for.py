@@ -66,8 +66,8 @@ def _made(
 
 
 def _with_code(plan: Plan, code: GeneratedCode) -> Plan:
-    from twoloop.kernels.evaluation.inner_loop import own_inner_loop
+    from twoloop.kernels.evaluation.inner_loop import generated_inner_loop
 
     substitute = None if plan.substitute is None else _with_code(plan.substitute, code)
     own = code.shared.functions, *plan.own
-    return plan.changed(inner=own_inner_loop, own=own, numbers=code.numbers, substitute=substitute)
+    return plan.changed(inner=generated_inner_loop, own=own, numbers=code.numbers, substitute=substitute)

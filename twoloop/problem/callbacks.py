@@ -16,19 +16,17 @@ from numba import njit, objmode
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import Array, check_call, check_real, shaped, shown
-from twoloop.kernels.compile.caches import named_apart, watch
-from twoloop.kernels.compile.callbacks import KINDS, compile_callback, stand_in
-from twoloop.kernels.compile.dependencies import digest_of, stands_for
+from twoloop.kernels.compile.caches import digests_of, with_unique_name
+from twoloop.kernels.compile.callbacks import KINDS, compile_callback, zero_callback
+from twoloop.kernels.compile.dependencies import digest_as, digest_of
 from twoloop.kernels.compile.private import Dispatcher
 
 Integers = NDArray[np.int64]
 Entries = tuple[Integers, Integers]  # rows and columns
 
 LARGE = 64  # coordinates from which entries are faster than dense matrices; on chains of bars it is 36
-VALUES_OF = {
-    "mass": "mass_values",
-    "jacobian": "jacobian_values",
-}  # kinds that return the values of entries, by their dense kinds
+# kinds that return the values of entries, by their dense kinds
+VALUES_OF = {"mass": "mass_values", "jacobian": "jacobian_values"}
 
 
 def check_entries(name: str, given: Any, shape: tuple[int, int], symmetric: bool) -> Entries:
@@ -74,7 +72,7 @@ def dense_callback(kind: str, values: Dispatcher, entries: Entries) -> Dispatche
         for k in range(n):
             out[rows[k], columns[k]] += entry_values[k]
 
-    return compile_callback(kind, dense, watch(dense))
+    return compile_callback(kind, dense, digests_of(dense))
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,9 +94,8 @@ class DenseFunction:
         return matrix
 
 
-FIRST_DISPLACEMENT = (
-    2.0**-6
-)  # first displacement, relative to max(1, |q|); a power of two, so that q + displacement is exact
+# first displacement, relative to max(1, |q|); a power of two, so that q + displacement is exact
+FIRST_DISPLACEMENT = 2.0**-6
 SHRINKAGE = 0.125  # factor after a displacement over which the constraints bend too much
 N_DISPLACEMENTS = 9
 AGREEMENT = 1e-11  # of the formulas of order 6 and 8, relative to the entry, at which no shorter one is tried
@@ -158,7 +155,7 @@ def differenced_jacobian(constraint: Dispatcher) -> Dispatcher:
                     break
                 h *= SHRINKAGE
 
-    return compile_callback("jacobian", jacobian, watch(jacobian))
+    return compile_callback("jacobian", jacobian, digests_of(jacobian))
 
 
 Address = tuple[int, tuple[int, ...]]  # of a contiguous float64 array, and its shape: numba boxes an array in 0.5 us
@@ -258,7 +255,7 @@ def through_python(kind: str) -> Dispatcher:
 
     callback_function = with_two if len(KINDS[kind].state) == 1 else with_three
     callback = compile_callback(kind, callback_function, ("through Python", str(place)))
-    stands_for(callback, digest_of(f"through Python, {place}", __file__))
+    digest_as(callback, digest_of(f"through Python, {place}", __file__))
     return callback
 
 
@@ -285,7 +282,7 @@ def compile_returning(kind: str, function: Callable[..., Any], takes_p: bool) ->
             f"{kind}: compile=True takes functions made by def or lambda, with numbers that they enclose; given "
             f"{function!r} of type {type(function).__name__}. Write such a function, or leave compile=True out"
         )
-    user = function if isinstance(function, Dispatcher) else njit(named_apart(function, watch(function)))
+    user = function if isinstance(function, Dispatcher) else njit(with_unique_name(function, digests_of(function)))
     message = f"{kind} returned an array of the wrong shape"
 
     def with_two(t, q, p, out):  # type: ignore[no-untyped-def]
@@ -314,7 +311,7 @@ def compile_returning(kind: str, function: Callable[..., Any], takes_p: bool) ->
 
     wrappers: Any = ((with_two, with_two_and_p), (with_three, with_three_and_p))
     in_place = wrappers[len(KINDS[kind].state) > 1][takes_p]
-    watched = watch(in_place)
+    watched = digests_of(in_place)
     code = user.py_func.__code__
     # numba caches machine code beside the file that the code claims to come from: that of the user's function
     in_place.__code__ = in_place.__code__.replace(co_filename=code.co_filename, co_firstlineno=code.co_firstlineno)
@@ -412,7 +409,7 @@ def _is_left_out(kind: str, callbacks: dict[str, Any]) -> bool:
     entry, given = KINDS[kind], callbacks.get(kind)
     if given is None:
         return kind not in callbacks or entry.optional or kind == "mass"  # in whose place are mass_values
-    return entry.optional and entry.absent != "differences" and given is stand_in(kind)
+    return entry.optional and entry.absent != "differences" and given is zero_callback(kind)
 
 
 def checked_entries(callbacks: dict[str, Any], n_q: int, n_c: int, mass: Any, jacobian: Any) -> dict[str, Entries]:
@@ -476,7 +473,7 @@ def plain_functions(
 def substitute(kind: str, given: dict[str, Dispatcher]) -> Dispatcher:
     """Return the callback that stands in for one that is not given."""
     if KINDS[kind].absent != "differences" or "constraint" not in given:
-        return stand_in(kind)
+        return zero_callback(kind)
     return differenced_jacobian(given["constraint"])
 
 

@@ -22,9 +22,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from twoloop.checks.arguments import Array, shown
-from twoloop.kernels.compile.caches import UNWRITABLE, make_own, read_own, say_once, sources_folder, watch, write_own
+from twoloop.kernels.compile.caches import (
+    UNWRITABLE,
+    digests_of,
+    make_trusted_folder,
+    read_trusted,
+    sources_folder,
+    warn_once,
+    write_trusted,
+)
 from twoloop.kernels.compile.callbacks import KINDS, compile_callback
-from twoloop.kernels.compile.dependencies import CannotBeWatched, Digest, found_by, python_function
+from twoloop.kernels.compile.dependencies import Digest, NotDigestible, frozen_values, python_function
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.problem.callbacks import ConstantMatrix
 
@@ -52,7 +60,7 @@ class GeneratedCode:
     def stored(cls, key: str) -> GeneratedCode | None:
         """Read what an earlier process wrote for these equations; None without a file, or if it is damaged."""
         try:
-            digest, _, source = read_own(_path(key)).decode("utf-8").partition("\n")
+            digest, _, source = read_trusted(_path(key)).decode("utf-8").partition("\n")
         except (OSError, UnicodeDecodeError):
             return None
         return cls(key, source) if digest == _head(source) else None
@@ -111,7 +119,7 @@ def module_of(name: str, path: Path, text: str, missing: bool, names: dict[str, 
 @cache
 def _compiled(code: GeneratedCode, kind: str) -> Dispatcher:
     function = code.value(kind)
-    return compile_callback(kind, function, watch(function))
+    return compile_callback(kind, function, digests_of(function))
 
 
 def _path(key: str) -> Path:
@@ -126,11 +134,11 @@ def _write(path: Path, text: str) -> None:
     """Write a file atomically; where none can be written, every process derives and compiles."""
     unfinished = path.with_suffix(f".{uuid.uuid4().hex}")
     try:
-        make_own(path.parent)
-        write_own(unfinished, text.encode("utf-8"))
+        make_trusted_folder(path.parent)
+        write_trusted(unfinished, text.encode("utf-8"))
         unfinished.replace(path)
     except OSError:
-        say_once(UNWRITABLE)
+        warn_once(UNWRITABLE)
         with suppress(OSError):
             unfinished.unlink()
 
@@ -165,7 +173,7 @@ class FrozenValues:
     def __init__(self, callbacks: dict[str, Dispatcher]):
         cells, names, arrays = {}, {}, {}
         for kind, callback in callbacks.items():
-            for (holder, key, name, value), content in found_by(callback):
+            for (holder, key, name, value), content in frozen_values(callback):
                 if content is not None:
                     arrays[id(value), content] = value, content, kind, name
                 if isinstance(holder, CellType):
@@ -206,7 +214,7 @@ def _code_of(helper: Any) -> str:
     digest = Digest()
     try:
         digest.add(helper)
-    except CannotBeWatched:
+    except NotDigestible:
         return f"{id(helper)}"
     return digest.hash.hexdigest()
 

@@ -23,13 +23,13 @@ from twoloop.generate.compile_equations import GeneratedCode
 from twoloop.generate.derived_callbacks import exact_near, with_derived_callbacks
 from twoloop.generate.trace_cache import TraceCache, give_bounds, take_bounds, trace_cache_of
 from twoloop.generate.traced_values import Sample, Traced, farthest, states_around
-from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.control.clock import N_STEP_COLUMNS
 from twoloop.kernels.data import flags, noted
 from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.flags import BANDWIDTH, FORM
 from twoloop.kernels.layout import cached_run, lasting
-from twoloop.kernels.linalg.band import addresses
+from twoloop.kernels.linalg.band import lapack_addresses
 from twoloop.methods.code_for import code_for, may_have_code
 from twoloop.methods.plans_for import plans_for
 from twoloop.methods.presets import identity
@@ -122,7 +122,7 @@ class CachedIntegrator:
         looked = system if self.parametric is None else self.parametric.system
         self.look, self.loops, self.skips = Look(looked), cached_run(), 0
         self.arrays, self.given = arrays_of(run, self.look, code, definite, options, room), looked.kit
-        self._start_and_advance = direct(self.loops.start_and_advance)
+        self._start_and_advance = entry_point(self.loops.start_and_advance)
         # places in the block: where states begin, and the report of a run that has only one
         self.states_from, self.width = self.arrays.report.size, len(run.state)
         self.one_state_from = self.states_from - self.loops.N_HEAD - 1
@@ -358,7 +358,7 @@ def arrays_of(
     """
     from twoloop.kernels.evaluation import checks as first_look
     from twoloop.kernels.linalg import rank as pivots
-    from twoloop.kernels.linalg.dependent_columns import dependents as find
+    from twoloop.kernels.linalg.dependent_columns import choose_dependent_columns as find
 
     loops, system = cached_run(), look.system
     of_mass = 0 if system.constant_mass else first_look.DEFINITE if definite else first_look.INDEFINITE
@@ -389,7 +389,7 @@ def arrays_of(
         **{"state": run.state, "new_state": run.new_state, "lasting": of_work, "lasting_integers": integers},
         **{"saved": np.empty(numbers.size + of_work.size + run.state.size), "saved_integers": integers.copy()},
         **{"constants": np.array([*of_start, *step_fields, run.near, TURNED, WITHIN])},
-        lapack=np.array(addresses() if run.kit.flags[BANDWIDTH] >= 0 else [], dtype=np.int64),
+        lapack=np.array(lapack_addresses() if run.kit.flags[BANDWIDTH] >= 0 else [], dtype=np.int64),
         **{"bounds": BOUNDS, "scratch": np.zeros(pivots.room_size(n_rows, system.n_q)), "expected": expected},
         **{"chosen": np.zeros(2 + 3 * n_rows, dtype=np.int64), "blocks": np.array(blocks, dtype=np.int64).ravel()},
         **dict(zip(("kinds", "counted", "_", "search", "search_places", "found"), search, strict=True)),
@@ -397,7 +397,7 @@ def arrays_of(
         **{"end": np.zeros(1), "t": np.empty(room + 1), "states": states.reshape(room + 1, width)},
         **{"steps": np.empty((room, columns)), "filled": np.zeros(2, dtype=np.int64)},
         **{"report": report_part, "block": block},
-        **{"look": first_look.look, "choose": pivots.choose, "dependents": find},
+        **{"look": first_look.evaluate_start, "choose": pivots.choose_rows, "dependents": find},
         **{"start": run.kernels.start, "advance": run.kernels.advance},
     )
     arrays.table = loops.RUN_ARRAYS.table(arrays)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from twoloop.checks.at_position import pattern_of
 from twoloop.checks.consistency import ConstraintWarning
-from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import codes, noted, tolerances
 from twoloop.kernels.data import intervals as names
 from twoloop.kernels.data.tolerances import ATOL, RTOL
@@ -118,7 +118,7 @@ class Interpolator:
         system, t0, row = self.made_of[:3]
         self.work.notes[noted.GENERATION] = 1.0  # the ranks are known
         state = np.concatenate([row, np.zeros(system.n_c + system.n_a)])
-        direct(advance.start)(self.kit, self.work, t0, state)
+        entry_point(advance.start)(self.kit, self.work, t0, state)
         self.repairs: dict[bool, tuple[Plan, Any]] = {}
 
     def begin(self, system: ConstrainedSystem, t0: float, row: Array, pattern: Array) -> None:
@@ -193,10 +193,10 @@ class Interpolator:
     def _between(self, table: Table, groups: Groups, times: Array, out: Array) -> int:
         known = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups))
         rest = (times, self.nodes, self.room, out)
-        failures = int(direct(self.kernels.between)(self.kit, self.work, INNER_TOL, *known, *rest))
+        failures = int(entry_point(self.kernels.between)(self.kit, self.work, INNER_TOL, *known, *rest))
         if failures > 0 and self.static is not None:
             self._become_dense()
-            failures = int(direct(self.kernels.between)(self.kit, self.work, INNER_TOL, *known, *rest))
+            failures = int(entry_point(self.kernels.between)(self.kit, self.work, INNER_TOL, *known, *rest))
         return failures
 
     def _settle(self, table: Table, groups: Groups) -> None:
@@ -235,7 +235,7 @@ class Interpolator:
             self.rows,
             out,
         )
-        direct(self.kernels.judge)(self.kit, self.work, INNER_TOL, *arrays)
+        entry_point(self.kernels.judge)(self.kit, self.work, INNER_TOL, *arrays)
         return out
 
     def _repair(self, table: Table, group: Groups, worst: float) -> None:
@@ -300,7 +300,7 @@ class Interpolator:
                 break
             rows = parts + 1
             out_t, out = np.empty(rows * len(intervals)), np.empty((rows * len(intervals), 3 * n))
-            direct(self.kernels.fill)(kit, self.work, *vectors, table.t, table.states, intervals, out_t, out)
+            entry_point(self.kernels.fill)(kit, self.work, *vectors, table.t, table.states, intervals, out_t, out)
             times, states = out_t.reshape(-1, rows), out.reshape(-1, rows, 3 * n)
             found = np.isfinite(times[:, 0])
             begins = times[:, 0].tolist()
@@ -335,7 +335,7 @@ class Interpolator:
 
     def complete(self, times: Array, states: Array, out: Array) -> None:
         """Fill rows [a, lam] at rows [q, v] on the constraints."""
-        complete, times, states = direct(self.kernels.complete), *map(np.ascontiguousarray, (times, states))
+        complete, times, states = entry_point(self.kernels.complete), *map(np.ascontiguousarray, (times, states))
         failures = complete(self.kit, self.work, times, states, out)
         if failures > 0 and self.static is not None:
             self._become_dense()

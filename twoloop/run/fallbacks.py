@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import codes, noted, tolerances
 from twoloop.kernels.data.kit import Kit
 from twoloop.kernels.steps.named_step import loaded
@@ -143,7 +143,7 @@ def apply_jump(run: Run, t1: float) -> bool:
         return False
     run.new_state[: 2 * n] = state
     run.work.notes[noted.KINK_AFTER] = t1
-    if direct(run.kernels.start)(run.kit, run.work, end, run.new_state) != codes.DONE:
+    if entry_point(run.kernels.start)(run.kit, run.work, end, run.new_state) != codes.DONE:
         return False
     run.jumps.append(end)
     run.plan.memory[:] = run.memory

@@ -138,7 +138,7 @@ def _rates(kit: Any, work: Any, sample: StiffnessSample, directions: list[Array]
     """Angular frequency of the fastest vibration and the fastest rate of decay, 1/s, as far as they dominate."""
     from twoloop.kernels.evaluation import tasks
 
-    if kit.inner(kit, work, tasks.RENEW, sample.t, sample.q, sample.v, 0.0, work.x, work.lam) != codes.DONE:
+    if kit.inner(kit, work, tasks.RENEW_PARTITION, sample.t, sample.q, sample.v, 0.0, work.x, work.lam) != codes.DONE:
         return 0.0, 0.0
     squared, opposed_q = _largest(kit, work, sample, directions[0], work.independent, False)
     rate, opposed_v = _largest(kit, work, sample, directions[1], work.independent_v, True)

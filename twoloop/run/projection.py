@@ -21,7 +21,7 @@ from twoloop.checks.bounds import check_bounds
 from twoloop.checks.scales import Scales, scales_of, typical_sizes, units
 from twoloop.checks.sparse_rows import SparseRows
 from twoloop.checks.violation import CONSISTENT, Violation, is_at_rounding
-from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import codes, flags, noted
 from twoloop.kernels.evaluation import tasks
 from twoloop.problem.system import ConstrainedSystem, check_system
@@ -51,7 +51,7 @@ class _Metric:
     def ask(self, task: int, q: Array, v: Array, a: Array | None = None, lam: Array | None = None) -> int:
         """What the inner loop says to a task; q and v are changed."""
         a, lam = self.work.x if a is None else a, self.work.lam if lam is None else lam
-        return int(direct(self.kit.inner)(self.kit, self.work, task, self.t, q, v, 0.0, a, lam))
+        return int(entry_point(self.kit.inner)(self.kit, self.work, task, self.t, q, v, 0.0, a, lam))
 
     def nearest(self, way: Array) -> Array:
         """What the constraints, by the factors there are, leave of a displacement."""
@@ -68,7 +68,7 @@ class _Metric:
         """
         zero, change = np.zeros(len(q)), np.zeros(len(q))
         for _ in range(MOST_CORRECTIONS):
-            if self.ask(tasks.TANGENTS, q, zero) != codes.DONE:
+            if self.ask(tasks.FIND_NULL_SPACE, q, zero) != codes.DONE:
                 return None
             self.ask(tasks.SOLVE, zero, self.system.constraint(self.t, q), change)
             q = q - change
@@ -80,10 +80,10 @@ class _Metric:
     def project(self, q: Array, v: Array) -> tuple[Array, Array] | None:
         """q and v on the constraints."""
         q, on_the_way = q.copy(), v.copy()
-        if self.ask(tasks.RENEW, q, v) != codes.DONE or self.ask(tasks.RESTORE, q, on_the_way) != codes.DONE:
+        if self.ask(tasks.RENEW_PARTITION, q, v) != codes.DONE or self.ask(tasks.RESTORE, q, on_the_way) != codes.DONE:
             return None
         v = v.copy()  # the least change of the velocities is that where positions end
-        for task in (tasks.RESTORE, tasks.RESTORE, tasks.TANGENTS):  # twice, to rounding
+        for task in (tasks.RESTORE, tasks.RESTORE, tasks.FIND_NULL_SPACE):  # twice, to rounding
             if self.ask(task, q, v) != codes.DONE:
                 return None
         self.at = q
@@ -105,10 +105,10 @@ def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | No
     if form is None or not isinstance(all_rows, SparseRows):
         return None
     metric, still = _Metric(system, t, q, form), np.zeros_like(q)
-    code = metric.ask(tasks.RENEW, q.copy(), still)
+    code = metric.ask(tasks.RENEW_PARTITION, q.copy(), still)
     if code == codes.RANK_DIFFERS:
         metric = _Metric(system, t, q, form, int(metric.work.notes[noted.RANK]))
-        code = metric.ask(tasks.RENEW, q.copy(), still)
+        code = metric.ask(tasks.RENEW_PARTITION, q.copy(), still)
     if code != codes.DONE or metric.work.notes[noted.PIVOT] < CLEAR:
         return None
     counted, room = set(metric.work.rows_v.tolist()), np.zeros_like(q)
@@ -133,7 +133,7 @@ def project_sparsely(
         return None
     with np.errstate(all="ignore"):
         metric = _Metric(system, t, q, form)
-    code = metric.ask(tasks.RENEW, q.copy(), v.copy())
+    code = metric.ask(tasks.RENEW_PARTITION, q.copy(), v.copy())
     if code == codes.RANK_DIFFERS:
         metric = _Metric(system, t, q, form, int(metric.work.notes[noted.RANK]))
     elif code != codes.DONE:
@@ -142,7 +142,7 @@ def project_sparsely(
     if found is None or metric.work.notes[noted.PIVOT] < CLEAR:
         return None
     there = _Metric(system, t, found[0], form, metric.rank)
-    if there.ask(tasks.RENEW, found[0].copy(), v.copy()) != codes.DONE:  # other rows count on the constraints
+    if there.ask(tasks.RENEW_PARTITION, found[0].copy(), v.copy()) != codes.DONE:  # other rows count on the constraints
         return None
     rows, rate = system.sparse_rows(t, found[0]), system.rates(t, found[0])
     if not is_at_rounding(system.constraint(t, found[0]), rows, found[0]):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import counters, intervals, noted
 from twoloop.kernels.layout import cached_run
 from twoloop.problem.description import Description
@@ -263,7 +263,7 @@ def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
     """Return the fields of a record that have a row a step; `counts`, those before the steps, become those after."""
     n = len(steps)
     h, changes, untested = np.empty(n), np.empty((3, n), dtype=np.int64), np.empty(n, dtype=np.bool_)
-    direct(cached_run().split_steps)(steps, counts, h, changes, untested)
+    entry_point(cached_run().split_steps)(steps, counts, h, changes, untested)
     return dict(zip(OF_STEPS, (h, *changes, untested), strict=True))
 
 

@@ -12,7 +12,7 @@ from twoloop.checks.rank import SHOWN, equations_in_words, in_words
 from twoloop.checks.sparse_rows import Rows, SparseRows, norms
 from twoloop.generate.time_dependence import Sudden, may_be_narrow, may_be_sudden
 from twoloop.generate.traced_values import CheckedRegion
-from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import codes, counters, flags, noted, tolerances
 from twoloop.kernels.data.kit import Kit
 from twoloop.kernels.evaluation.tasks import SOLVE
@@ -141,7 +141,7 @@ class Run:
         state[:n], state[n : 2 * n], state[2 * n :] = q, v, 0.0
         self.plan.memory[:] = self.memory
         self._set_clock(t)
-        code: int = direct(self.kernels.start)(self.kit, self.work, t, state)
+        code: int = entry_point(self.kernels.start)(self.kit, self.work, t, state)
         return code
 
     def _set_clock(self, t: float) -> None:
@@ -175,7 +175,7 @@ class Run:
         """
         plan, control, kit = active or (self.plan, self.control, self.kit)
         arrays = plan.options, plan.memory, self.tolerances, control, self.clock, self.state, self.new_state
-        code: int = direct(self.kernels.advance)(kit, self.work, *arrays, outputs, *buffers, filled)
+        code: int = entry_point(self.kernels.advance)(kit, self.work, *arrays, outputs, *buffers, filled)
         return code
 
     def _copy(self) -> "Run":
@@ -262,16 +262,16 @@ class Run:
             clock[a.H_NEXT], clock[a.H_LIMIT] = clock[a.H_LONG] or clock[a.H_NEXT], self.plan.limit_start
             clock[a.FAILURE_CODE] = codes.DONE
         state = self.state.copy()
-        code = direct(self.kernels.start)(self.kit, self.work, t, state)
+        code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
         if code == codes.RANK_DIFFERS:  # as it does where a start at which rows depend on one another was left
             self.work.notes[noted.GENERATION] = 1.0
-            code = direct(self.kernels.start)(self.kit, self.work, t, state)
+            code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
         if before.notes[noted.PIVOT] > 0.0 and largest > 0.0:  # as if it had been looked at in this way all along
             pivot = self.work.notes[noted.PIVOT]
             self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest / before.notes[noted.PIVOT])
 
     def _begin(self) -> None:
-        start = direct(self.kernels.start)
+        start = entry_point(self.kernels.start)
         code = start(self.kit, self.work, self.t0, self.state)
         if self.static is not None and code == codes.RANK_DIFFERS:
             rank = int(self.work.notes[noted.RANK])
@@ -367,7 +367,7 @@ class Run:
             return in_words(self.system.rows(self.t0, q), rows)
         shares, zero, x = np.zeros((min(SHOWN, len(rows)), len(all_rows))), np.zeros(len(all_rows)), np.zeros_like(q)
         for row, share in zip(rows, shares, strict=False):
-            direct(self.kit.inner)(self.kit, self.work, SOLVE, self.t0, all_rows.row(row), zero, 0.0, x, share)
+            entry_point(self.kit.inner)(self.kit, self.work, SOLVE, self.t0, all_rows.row(row), zero, 0.0, x, share)
         return equations_in_words(rows, counted, shares[:, counted], norms(all_rows))
 
     def set_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
@@ -391,7 +391,7 @@ class Run:
     def first_step(self, t: float, t1: float, state: Array, longest: float = 0.0) -> float:
         """Return the first step from a state, s. With a longest one, let no step skip a hundredth of the run."""
         numbers = self.system.n_q, t, t1, self.least_atol, longest, self.plan.looks_within
-        first: float = direct(cached_run().set_sizes)(self.control, self.tolerances, state, *numbers)
+        first: float = entry_point(cached_run().set_sizes)(self.control, self.tolerances, state, *numbers)
         return first
 
     def defect(self) -> float | None:

@@ -16,7 +16,7 @@ from twoloop.checks.consistency import check_start
 from twoloop.generate.derived_callbacks import exact_near, with_derived_callbacks
 from twoloop.generate.traced_values import Traced
 from twoloop.kernels.compile.callbacks import KINDS
-from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import codes, noted
 from twoloop.methods.auto import Auto
 from twoloop.methods.plan import Method
@@ -227,7 +227,7 @@ class SampledRun:
     def _begin_anew(self, t: float) -> None:
         """Find accelerations with other parameters, and let the method forget the motion before."""
         run, a = self.run, self.run.a
-        code = direct(run.kernels.start)(run.kit, run.work, t, run.state)
+        code = entry_point(run.kernels.start)(run.kit, run.work, t, run.state)
         first = 0
         if run.plan.first is not None:  # of a pair it is kept which of the two is at work
             from twoloop.kernels.control.switching import N_SCALARS

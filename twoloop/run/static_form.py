@@ -7,8 +7,15 @@ from numpy.typing import NDArray
 
 from twoloop.checks.at_position import NEARBY, pattern_of
 from twoloop.kernels.layout import Static
-from twoloop.kernels.linalg.sparse_lu import groups_of, in_groups, newton_program
-from twoloop.kernels.linalg.symbolic_factorization import N_OFF, N_PIVOTS, N_UPDATES, Entries, bodies_of, static_program
+from twoloop.kernels.linalg.sparse_lu import column_groups, grouped_entries, newton_program
+from twoloop.kernels.linalg.symbolic_factorization import (
+    N_OFF,
+    N_PIVOTS,
+    N_UPDATES,
+    Entries,
+    bodies_of,
+    factorization_program,
+)
 from twoloop.methods.plan import Plan
 from twoloop.problem.callbacks import LARGE
 from twoloop.problem.system import ConstrainedSystem
@@ -45,11 +52,11 @@ def newton_form(
         if len(found) > most:
             return None
     places = np.array(sorted(found), dtype=np.int64).reshape(-1, 2)
-    tangents = in_groups((places[:, 0], places[:, 1]), system.n_q)
+    tangents = grouped_entries((places[:, 0], places[:, 1]), system.n_q)
     program = newton_program(system.n_q, system.n_c, mass, jacobian, tangents, together, stiff)
     if program is None or program[N_UPDATES] > NEWTON_SPARSE * system.n_q**3 / 3.0:
         return None
-    return program, int(groups_of(tangents, system.n_q).max(initial=-1)) + 1
+    return program, int(column_groups(tangents, system.n_q).max(initial=-1)) + 1
 
 
 def _entries(system: ConstrainedSystem, t: float, q: Array, v: Array, lam: Array, most: float) -> set[tuple[int, int]]:
@@ -149,7 +156,7 @@ def _made(system: ConstrainedSystem, t0: float, q0: Array) -> StaticForm | None:
         return None
     together = _together(system, mass)
     stiff = _stiff_rows(system, t0, q0, mass, jacobian, together)
-    program = static_program(system.n_q, system.n_c, mass, jacobian, together, stiff)
+    program = factorization_program(system.n_q, system.n_c, mass, jacobian, together, stiff)
     if program is None or program[N_UPDATES] > SPARSE * _dense_work(system.n_q, system.n_c):
         return None
     n_factors = int(program[N_PIVOTS] + program[N_OFF] + 1)

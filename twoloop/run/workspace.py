@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.at_position import has_definite_mass, least_inertia
-from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import common
 from twoloop.kernels.data.flags import (
     AUGMENTED,
@@ -22,7 +22,7 @@ from twoloop.kernels.data.flags import (
 from twoloop.kernels.data.kit import Kit
 from twoloop.kernels.evaluation.operations import N_NODES
 from twoloop.kernels.layout import cached_run, lasting, make_work
-from twoloop.kernels.linalg.band import addresses, banded_pays
+from twoloop.kernels.linalg.band import banded_pays, lapack_addresses
 from twoloop.kernels.linalg.saddle_point import sparse_pays
 from twoloop.kernels.steps.named_step import LOADED, at_hand, loaded
 from twoloop.methods.plan import Plan
@@ -59,7 +59,7 @@ def kit_of(
 
 def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) -> Kit:
     """Make the kit of a system in the static form."""
-    from twoloop.kernels.evaluation.sparse_inner_loop import static_inner_loop
+    from twoloop.kernels.evaluation.sparse_inner_loop import sparse_inner_loop
 
     flags = system.functions.flags.copy()
     flags[FORM] = STATIC
@@ -67,8 +67,8 @@ def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) 
     if form.newton is not None:
         functions = functions._replace(newton_program=form.newton)
     if plan is None:
-        return Kit(functions, static_inner_loop)
-    return Kit(functions, static_inner_loop, *_steps_of(plan), static_inner_loop)
+        return Kit(functions, sparse_inner_loop)
+    return Kit(functions, sparse_inner_loop, *_steps_of(plan), sparse_inner_loop)
 
 
 def _flags_at(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
@@ -182,12 +182,12 @@ def prepare_workspace(
 ) -> common.Work:
     """Prepare a workspace for a run, whatever the one before has left in it."""
     given = map(np.ascontiguousarray, (pattern, q0))
-    direct(cached_run().prepare_workspace)(work, *lasting(work), *given, max(rtol, GAMMA_ACCURACY), reuse)
+    entry_point(cached_run().prepare_workspace)(work, *lasting(work), *given, max(rtol, GAMMA_ACCURACY), reuse)
     if static is not None:
         _fill(work, system, static, q0)
         return work
     if flags[BANDWIDTH] >= 0:
-        work.lapack[:] = addresses()
+        work.lapack[:] = lapack_addresses()
     return work
 
 

@@ -9,7 +9,7 @@ from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from twoloop.kernels.compile.caches import n_made
+from twoloop.kernels.compile.caches import n_compiled
 from twoloop.sweeps.one_run import Row, Work, failure_row, one_run
 
 RENEWED_AFTER = 150  # compiled functions per worker before it is replaced: LLVM keeps some MB of each
@@ -141,7 +141,7 @@ class _Worker:
 def _serve(connection: Connection, work: Work) -> None:
     """Process runs in a worker until there are no more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
-    n_before = n_made()
+    n_before = n_compiled()
     connection.send("ready")
     while True:
         try:
@@ -152,4 +152,4 @@ def _serve(connection: Connection, work: Work) -> None:
             row: Row | None = one_run(work, run)
         except KeyboardInterrupt:
             row = None
-        connection.send((row, n_made() - n_before))
+        connection.send((row, n_compiled() - n_before))

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from twoloop.checks.optional import needed
-from twoloop.kernels.compile.dependencies import LIBRARIES, CannotBeWatched, Digest
+from twoloop.kernels.compile.dependencies import LIBRARIES, Digest, NotDigestible
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.problem.system import ConstrainedSystem
 
@@ -136,7 +136,7 @@ def _fingerprint(name: str, value: Any) -> str:
     fingerprint = _Fingerprint()
     try:
         fingerprint.add(value)
-    except CannotBeWatched as why:
+    except NotDigestible as why:
         raise ValueError(
             f"{name} reaches {why}, whose state cannot be read, so that saved rows cannot be matched with "
             "the functions. Create it inside the function, or omit `out`"
@@ -249,7 +249,7 @@ class _Fingerprint(Digest):
         try:
             parts = value.__reduce_ex__(4)
         except Exception:
-            raise CannotBeWatched(f"an object of type {type(value).__qualname__}") from None
+            raise NotDigestible(f"an object of type {type(value).__qualname__}") from None
         self.add(type(value))
         if isinstance(parts, str):  # the name of a global of a module
             self.hash.update(f"{getattr(value, '__module__', '')}.{parts}".encode())

@@ -34,8 +34,8 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 from numba.misc.appdirs import AppDirs
 
-from twoloop.kernels.compile.dependencies import CannotBeWatched, Digest, enclosed_by, names_reached
-from twoloop.kernels.compile.private import forget_compiled, registered
+from twoloop.kernels.compile.dependencies import Digest, NotDigestible, enclosed_by, names_reached
+from twoloop.kernels.compile.private import forget_compiled, jitable_templates
 
 ADVICE = (
     "Code is loaded only from what belongs to you or root and no other user can write: take that right away (chmod "
@@ -44,11 +44,11 @@ ADVICE = (
 
 
 class Untrusted(OSError):
-    """A file or folder that somebody else could have written; the text says why."""
+    """Refuse a file or folder that somebody else could have written; the text says why."""
 
 
-def read_own(path: Path) -> bytes:
-    """The content of a file in a folder of `own_folder`.
+def read_trusted(path: Path) -> bytes:
+    """Read a file in a folder of `trusted_folder`.
 
     Raises
     ------
@@ -56,44 +56,44 @@ def read_own(path: Path) -> bytes:
         If there is none; `Untrusted` if somebody else could have written it, which is said on stderr.
     """
     with path.open("rb") as file:
-        if why := _doubt(os.fstat(file.fileno())):
-            _say(f"twoloop: {path} {why}, and is not loaded but compiled again. {ADVICE}")
+        if why := _reason_of_mode(os.fstat(file.fileno())):
+            _warn_first(f"twoloop: {path} {why}, and is not loaded but compiled again. {ADVICE}")
             raise Untrusted(f"{path} {why}")
         return file.read()
 
 
-def write_own(path: Path, content: bytes) -> None:
-    """Write a new file, which no other may write, whatever the umask."""
+def write_trusted(path: Path, content: bytes) -> None:
+    """Write a new file, which no other user may write, whatever the umask."""
     with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644), "wb") as file:
         file.write(content)
 
 
-def make_own(folder: Path) -> None:
-    """Make a folder, and those above it that are missing, which no other may write, whatever the umask."""
+def make_trusted_folder(folder: Path) -> None:
+    """Make a folder, and missing ones above it, which no other user may write, whatever the umask."""
     for each in [*reversed(folder.parents), folder]:
         if not each.exists():
             each.mkdir(0o755, exist_ok=True)
 
 
 @cache
-def own_folder(folder: Path) -> Path:
-    """The folder, if only the user can write it and change what stands above it; else one of which this holds.
+def trusted_folder(folder: Path) -> Path:
+    """Return the folder if only the user can write it and change what stands above it; else a replacement.
 
-    That is in the folder of the user's caches, or, where that is in doubt too, one that ends with this process.
+    The replacement is in the folder of the user's caches or, if that is in doubt too, a temporary one of this process.
     """
-    why = doubt_of(folder)
+    why = reason_to_distrust(folder)
     if not why:
         return folder
     subfolder = f"{folder.name}_{hashlib.sha256(str(folder).encode()).hexdigest()[:16]}"
     instead = Path(AppDirs(appname="twoloop", appauthor=False).user_cache_dir) / "code" / subfolder
-    if doubt_of(instead):
-        instead = Path(_ending_with_the_process()) / subfolder
-    _say(f"twoloop: no code is loaded from {folder}: {why}. It is kept in {instead} instead. {ADVICE}")
+    if reason_to_distrust(instead):
+        instead = Path(_temporary_folder()) / subfolder
+    _warn_first(f"twoloop: no code is loaded from {folder}: {why}. It is kept in {instead} instead. {ADVICE}")
     return instead
 
 
-def doubt_of(folder: Path) -> str:
-    """Why a folder, or what stands above it, may have been written by somebody else; "" where it cannot."""
+def reason_to_distrust(folder: Path) -> str:
+    """Return why somebody else may have written a folder, or what stands above it; "" if nobody can."""
     if os.name != "posix":  # rights on other systems are not in the mode
         return ""
     real = Path(os.path.realpath(folder))
@@ -105,31 +105,31 @@ def doubt_of(folder: Path) -> str:
         except OSError as error:
             return f"{each} cannot be looked at ({error.strerror})"
         sticky = each != real and found.st_mode & stat.S_ISVTX  # there only the owner of an entry can replace it
-        why = _doubt_of_owner(found) if sticky else _doubt(found)
+        why = _reason_of_owner(found) if sticky else _reason_of_mode(found)
         if why:
             return f"{each} {why}"
     return ""
 
 
-def _doubt(found: os.stat_result) -> str:
+def _reason_of_mode(found: os.stat_result) -> str:
     if os.name != "posix":
         return ""
-    if why := _doubt_of_owner(found):
+    if why := _reason_of_owner(found):
         return why
     if found.st_mode & stat.S_IWOTH:
         return f"can be written by everybody (mode {stat.S_IMODE(found.st_mode):o})"
-    if found.st_mode & stat.S_IWGRP and not _private(found.st_gid):
+    if found.st_mode & stat.S_IWGRP and not _is_private_group(found.st_gid):
         return f"can be written by group {found.st_gid} (mode {stat.S_IMODE(found.st_mode):o})"
     return ""
 
 
-def _doubt_of_owner(found: os.stat_result) -> str:
+def _reason_of_owner(found: os.stat_result) -> str:
     return "" if found.st_uid in (0, os.geteuid()) else f"belongs to user {found.st_uid}"
 
 
 @cache
-def _private(gid: int) -> bool:
-    """Whether a group has no other member: root's, or the user's own, as distributions with umask 0002 make them."""
+def _is_private_group(gid: int) -> bool:
+    """Return whether a group has no other member: root's, or the user's own, as distributions with umask 0002 make."""
     import grp  # not on Windows
     import pwd
 
@@ -144,28 +144,28 @@ def _private(gid: int) -> bool:
 _temporary: list[tempfile.TemporaryDirectory[str]] = []
 
 
-def _ending_with_the_process() -> str:
+def _temporary_folder() -> str:
     if not _temporary:
         _temporary.append(tempfile.TemporaryDirectory(prefix="twoloop-"))
     return _temporary[0].name
 
 
-_said: list[str] = []
+_warnings: list[str] = []
 
 
-def _say(text: str) -> None:
+def _warn_first(text: str) -> None:
     """Print the first warning of a process on stderr."""
-    if not _said:
-        _said.append(text)
+    if not _warnings:
+        _warnings.append(text)
         print(text, file=sys.stderr, flush=True)
 
 
-MOST_KEPT = 500  # sets of functions made for single mechanisms, of each kind, on disk
+MAX_ON_DISK = 500  # sets of functions made for single mechanisms, of each kind, on disk
 CHECKSUM = hashlib.sha256().digest_size
 
 
-class Files:
-    """The files of one function, one for each key, each behind its checksum, and in the hands of the user alone.
+class CodeFiles:
+    """Store machine code of one function: a file for each key, behind a checksum, that only the user can write.
 
     A file that is damaged or out of date counts as missing. Numba's own keep an index, through which two processes that
     write at the same time may lead one function to the machine code of another.
@@ -176,28 +176,28 @@ class Files:
         self.made_of = numba.__version__, stamp
 
     def save(self, key: Any, data: Any) -> None:
-        """Write what numba made for a key, in the place of what was there."""
+        """Write what numba made for a key, in place of the previous file."""
         content = pickle.dumps((repr((*self.made_of, key)), dumps(data)))
         path = self._path(key)
         unfinished = path.with_suffix(f".{uuid.uuid4().hex}")
-        make_own(self.folder)
+        make_trusted_folder(self.folder)
         try:
-            write_own(unfinished, hashlib.sha256(content).digest() + content)
+            write_trusted(unfinished, hashlib.sha256(content).digest() + content)
             unfinished.replace(path)
         finally:
             unfinished.unlink(missing_ok=True)
         if self.limited:
-            for old in sorted(self._all(), key=_written)[:-MOST_KEPT]:
+            for old in sorted(self._all(), key=_time_written)[:-MAX_ON_DISK]:
                 old.unlink(missing_ok=True)
 
     def has(self, key: Any) -> bool:
-        """Whether there is a file for a key."""
+        """Return whether there is a file for a key."""
         return self._path(key).exists()
 
     def load(self, key: Any) -> Any:
-        """What numba made for a key; None if it is missing."""
+        """Read what numba made for a key; None if it is missing."""
         try:
-            content = read_own(self._path(key))
+            content = read_trusted(self._path(key))
         except OSError:
             return None
         if hashlib.sha256(content[CHECKSUM:]).digest() != content[:CHECKSUM]:
@@ -217,8 +217,8 @@ class Files:
         return self.folder / f"{self.name}.{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.nbc"
 
 
-def _written(path: Path) -> float:
-    """When a file was written; 0 if another process has removed it."""
+def _time_written(path: Path) -> float:
+    """Return when a file was written; 0 if another process has removed it."""
     try:
         return path.stat().st_mtime
     except OSError:
@@ -229,12 +229,12 @@ UNWRITABLE = (
     "twoloop: machine code cannot be kept on disk, so every process compiles again. Set NUMBA_CACHE_DIR to a folder "
     "that only you can write"
 )
-MOST_HELD = 50  # sets of functions made for single mechanisms, of each kind, in memory
+MAX_IN_MEMORY = 50  # sets of functions made for single mechanisms, of each kind, in memory
 # numba 0.61 has it under a private name
 _LOCATOR: Any = vars(caching).get("UserProvidedCacheLocator") or vars(caching)["_UserProvidedCacheLocator"]
 
 
-def compile_kept(
+def compile_cached(
     function: Callable[..., Any],
     signature: Any,
     watched: tuple[str, str] | None,
@@ -251,31 +251,31 @@ def compile_kept(
     signature : numba signature
         The only one that it will have.
     watched : (str, str) or None
-        What the machine code depends on beside the file of the function, see `watch`: when the first changes, all is
-        compiled again; the second tells functions apart that share their source. None: the machine code is not kept.
+        What the machine code depends on beside the file of the function, see `digests_of`: when the first changes, all
+        is compiled again; the second tells functions apart that share their source. None: the machine code is not kept.
     announcement : str
         Said on stderr, once a process, before it compiles.
     **options
         Of numba.njit.
     """
-    dispatcher = njit(**options)(named_apart(function, watched))
+    dispatcher = njit(**options)(with_unique_name(function, watched))
     function = dispatcher.py_func
     if watched is not None:
         try:
             dispatcher._cache = _Cache(function, *watched, announcement)
         except RuntimeError:  # numba finds no folder; there is none for what is typed at a prompt
             if Path(inspect.getfile(function)).exists():
-                say_once(UNWRITABLE)
-    with uncollected():
+                warn_once(UNWRITABLE)
+    with garbage_collection_off():
         dispatcher.compile(signature)
     dispatcher.disable_compile()
-    _N_MADE[0] += 1
+    _N_COMPILED[0] += 1
     return dispatcher
 
 
 @contextmanager
-def uncollected() -> Iterator[None]:
-    """Without the collection of cycles: what numba makes lives until the end, and that takes a sixth of the time."""
+def garbage_collection_off() -> Iterator[None]:
+    """Suspend the collection of cycles, a sixth of the time: what numba makes lives until the end."""
     collecting = gc.isenabled()
     gc.disable()
     try:
@@ -285,25 +285,25 @@ def uncollected() -> Iterator[None]:
             gc.enable()
 
 
-class Newest(dict[Any, Any]):
-    """What was made for single mechanisms, by digests: the newest MOST_HELD, as a sweep makes one for each run."""
+class BoundedCache(dict[Any, Any]):
+    """Cache what was made for single mechanisms, by digests: the newest MAX_IN_MEMORY, as a sweep makes one a run."""
 
     def __setitem__(self, key: Any, made: Any) -> None:
         super().__setitem__(key, made)
-        for old in list(self)[:-MOST_HELD]:
+        for old in list(self)[:-MAX_IN_MEMORY]:
             self.pop(old, None)
 
 
-_N_MADE = [0]
+_N_COMPILED = [0]
 
 
-def n_made() -> int:
-    """How many functions of numba, which stay in memory, this process has compiled, or read from the disk."""
-    return _N_MADE[0]
+def n_compiled() -> int:
+    """Return how many functions of numba, which stay in memory, this process has compiled or read from the disk."""
+    return _N_COMPILED[0]
 
 
-def folder_of(package: types.ModuleType) -> Path | None:
-    """Where numba keeps the machine code of a package; None where no folder can be written."""
+def cache_folder(package: types.ModuleType) -> Path | None:
+    """Return where numba keeps the machine code of a package; None if no folder can be written."""
 
     def anything() -> None:
         pass
@@ -311,13 +311,13 @@ def folder_of(package: types.ModuleType) -> Path | None:
     code = anything.__code__.replace(co_filename=str(package.__file__))
     anything.__code__ = code
     try:
-        return own_folder(Path(FunctionCache(anything).cache_path))
+        return trusted_folder(Path(FunctionCache(anything).cache_path))
     except RuntimeError:
         return None
 
 
-def named_apart(function: Callable[..., Any], watched: tuple[str, str] | None) -> Callable[..., Any]:
-    """A function within a function, or a lambda, under a name that no other has; any other function as it is.
+def with_unique_name(function: Callable[..., Any], watched: tuple[str, str] | None) -> Callable[..., Any]:
+    """Return a copy of a nested function, or a lambda, under a name that no other has; any other function as it is.
 
     Numba's symbols are made of the qualified name and of a number that counts within a process. Two closures of one
     name whose machine code comes from different processes may share a symbol: the one that is loaded first is then
@@ -336,18 +336,18 @@ def named_apart(function: Callable[..., Any], watched: tuple[str, str] | None) -
 
 
 class _Cache(FunctionCache):
-    """Numba's cache of one function, with our stamp; what goes wrong in it costs time and raises nothing."""
+    """Extend numba's cache of one function by our stamp; what goes wrong in it costs time and raises nothing."""
 
     def __init__(self, function: Callable[..., Any], stamp: str, key: str, announcement: str):
         chosen: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
         if chosen:  # numba would make it as the umask has it
             with suppress(OSError):
-                make_own(Path(chosen, _LOCATOR.get_suitable_cache_subpath(inspect.getfile(function))))
+                make_trusted_folder(Path(chosen, _LOCATOR.get_suitable_cache_subpath(inspect.getfile(function))))
         super().__init__(function)
         source = self._cache_file._source_stamp
-        own = own_folder(Path(self._cache_path))
+        own = trusted_folder(Path(self._cache_path))
         self._cache_path = str(own)
-        self._cache_file = Files(own, self._impl.filename_base, (source, stamp))
+        self._cache_file = CodeFiles(own, self._impl.filename_base, (source, stamp))
         self._key, self._announcement = key, announcement
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
@@ -359,40 +359,40 @@ class _Cache(FunctionCache):
         except Exception:  # a file of another installation; it is compiled again and overwritten
             found = None
         if found is None and self._announcement:
-            say_once(self._announcement)
+            warn_once(self._announcement)
         return found
 
     def save_overload(self, sig: Any, data: Any) -> None:
         try:
             super().save_overload(sig, data)
         except OSError:
-            say_once(UNWRITABLE)
+            warn_once(UNWRITABLE)
 
 
 def sources_folder() -> Path:
-    """Where generated source is kept: in NUMBA_CACHE_DIR if there is one, else where the user's caches are.
+    """Return where generated source is kept: NUMBA_CACHE_DIR if it is set, else the folder of the user's caches.
 
-    Where others can write there, it is a folder in which they cannot.
+    If others can write there, it is a folder in which they cannot.
     """
     chosen: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
     folder = chosen or AppDirs(appname="twoloop", appauthor=False).user_cache_dir
-    return own_folder(Path(folder) / "equations")
+    return trusted_folder(Path(folder) / "equations")
 
 
 @cache
-def say_once(text: str) -> None:
+def warn_once(text: str) -> None:
     """Print a line on stderr, once a process."""
     print(text, file=sys.stderr, flush=True)
 
 
-def kept_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
-    """`numba.njit(**options)` for a closure of callbacks, compiled when it is called, with machine code on disk."""
+def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
+    """Decorate a closure of callbacks by `numba.njit(**options)`: compiled when called, with machine code on disk."""
 
     def decorate(function: Callable[..., Any]) -> Dispatcher:
-        watched = watch(function)
-        dispatcher = njit(**options)(named_apart(function, watched))
+        watched = digests_of(function)
+        dispatcher = njit(**options)(with_unique_name(function, watched))
         if watched is not None:
-            _AS_COMPILED[dispatcher] = watched  # so that a closure around it does not compile it again
+            _COMPILED_DIGESTS[dispatcher] = watched  # so that a closure around it does not compile it again
             with suppress(RuntimeError):  # there is no folder that can be written
                 dispatcher._cache = _Cache(dispatcher.py_func, *watched, "")
         return dispatcher
@@ -400,33 +400,33 @@ def kept_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispatche
     return decorate
 
 
-def watch(function: Callable[..., Any]) -> tuple[str, str] | None:
-    """Digests of all that the machine code of a function depends on, and of what it encloses.
+def digests_of(function: Callable[..., Any]) -> tuple[str, str] | None:
+    """Return digests of all that the machine code of a function depends on, and of what it encloses.
 
     The first is of its code, its defaults, and the values of the globals and of the attributes of modules that it
     names; of compiled helpers among them the same, and so on. None: something among it cannot be watched.
     """
-    watched, helpers = _followed(function)
+    watched, helpers = _digests_and_helpers(function)
     for each in helpers:
-        _take_over(each)
+        _put_under_cache(each)
     return watched
 
 
-def _followed(function: Callable[..., Any]) -> tuple[tuple[str, str] | None, list[Any]]:
-    """The digests of `watch`, and the helpers that were met, each after those that it names."""
+def _digests_and_helpers(function: Callable[..., Any]) -> tuple[tuple[str, str] | None, list[Any]]:
+    """Return the digests of `digests_of`, and the helpers that were met, each after those that it names."""
     code, enclosed = Digest(), Digest()
     enclosed.names = names_reached(function)  # of modules among what it encloses
     try:
         code.add_function(function, enclosed=False)
         enclosed.add(enclosed_by(function))
         watched = code.hash.hexdigest(), enclosed.hash.hexdigest()
-    except CannotBeWatched:
+    except NotDigestible:
         watched = None
     return watched, [*code.helpers, *enclosed.helpers]
 
 
 def helper(function: Callable[..., Any]) -> Any:
-    """A decorator for what compiled callbacks call: numba's, with our cache.
+    """Decorate what compiled callbacks call: numba's `njit` with our cache.
 
     Such a function allocates nothing, so that it needs no numba runtime, whose counts of references to arrays take
     longer than a row of C_q.
@@ -434,24 +434,24 @@ def helper(function: Callable[..., Any]) -> Any:
     options: dict[str, Any] = {"_nrt": False, "error_model": "numpy"}
     dispatcher = njit(**options)(function)
     dispatcher.enable_caching()
-    _take_over(dispatcher)
+    _put_under_cache(dispatcher)
     return dispatcher
 
 
-_AS_COMPILED: WeakKeyDictionary[Any, tuple[str, str]] = WeakKeyDictionary()  # what helpers depended on
+_COMPILED_DIGESTS: WeakKeyDictionary[Any, tuple[str, str]] = WeakKeyDictionary()  # what helpers depended on
 
 
-def _take_over(helper: Any) -> None:
-    """Put our cache in the place of numba's, and have numba compile a helper again that names other values now.
+def _put_under_cache(helper: Any) -> None:
+    """Replace numba's cache of a helper by ours, and recompile one that names other values now.
 
     Numba's cache does not see what a helper calls in other files. What numba has compiled, or read, it keeps for all
     functions that call it later; it may have done so before the helper came here, unless the signatures were given.
     """
-    watched, known = _followed(getattr(helper, "py_func", helper))[0], _AS_COMPILED.get(helper)
+    watched, known = _digests_and_helpers(getattr(helper, "py_func", helper))[0], _COMPILED_DIGESTS.get(helper)
     changed = known is not None and known != watched
     if watched is not None:
-        _AS_COMPILED[helper] = watched
-    if registered(helper):
+        _COMPILED_DIGESTS[helper] = watched
+    if jitable_templates(helper):
         if changed or known is None:
             forget_compiled(helper)
         return

@@ -22,47 +22,53 @@ import numba
 from numba import jit
 from numba.core.dispatcher import Dispatcher
 
-from twoloop.kernels.compile.caches import compile_kept, named_apart, watch
-from twoloop.kernels.compile.dependencies import Rewritten, found_by, of_library, places, python_function, stands_for
-from twoloop.kernels.compile.private import also_for, options_of
+from twoloop.kernels.compile.caches import compile_cached, digests_of, with_unique_name
+from twoloop.kernels.compile.dependencies import (
+    FunctionCopier,
+    digest_as,
+    frozen_places,
+    frozen_values,
+    is_library,
+    is_ours,
+    python_function,
+)
+from twoloop.kernels.compile.private import add_signature, options_of
 
-WATCHED = {"boundscheck": True}  # for numba
-OURS, GENERATED = "twoloop", "twoloop_equations_"  # package and generated modules: their functions stay within bounds
+BOUNDS_CHECK = {"boundscheck": True}  # for numba
 SAFE_CALLS = ("len", "min", "max", "abs", "range", "enumerate", "zip", "reversed")  # with arguments that are safe
 
 
-def with_bounds_watched(function: Callable[..., Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
-    """A function, or its copy with helpers whose bounds are watched, and options that numba needs for it."""
-    helpers = [helper for place in places(function) if (helper := python_function(place.value)) is not None]
-    if any(map(computes_indices, helpers)):
-        return Rewritten(_watched).copy_of(function), WATCHED
-    return function, WATCHED if computes_indices(function) else {}
+def with_bounds_checks(function: Callable[..., Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
+    """Return a function, or its copy with helpers whose bounds are checked, and the options that numba needs for it."""
+    helpers = [helper for place in frozen_places(function) if (helper := python_function(place.value)) is not None]
+    if any(map(has_computed_indices, helpers)):
+        return FunctionCopier(_with_bounds_checks).copy_of(function), BOUNDS_CHECK
+    return function, BOUNDS_CHECK if has_computed_indices(function) else {}
 
 
-def _watched(copy: Any, original: Any) -> Any:
-    """What stands in the place of a compiled helper, with the options that it had; the function itself is no helper."""
+def _with_bounds_checks(copy: Any, original: Any) -> Any:
+    """Recompile a copy of a helper with its options and bounds checks; a function that is no helper stays."""
     helper = python_function(original)
     if helper is None:
         return copy
     copy.__qualname__ = f"{helper.__qualname__}.watched"  # numba's symbols are made of it
-    return jit(**{**options_of(original), **WATCHED})(named_apart(copy, watch(helper)))
+    return jit(**{**options_of(original), **BOUNDS_CHECK})(with_unique_name(copy, digests_of(helper)))
 
 
-def computes_indices(function: Callable[..., Any]) -> bool:
-    """Whether an index in the source of a function may depend on more than constants and counters of loops."""
-    module = function.__module__ or ""
-    if module.partition(".")[0] == OURS or module.startswith(GENERATED) or of_library(module):
+def has_computed_indices(function: Callable[..., Any]) -> bool:
+    """Return whether an index in the source of a function may depend on more than constants and counters of loops."""
+    if is_ours(function.__module__ or "") or is_library(function.__module__ or ""):
         return False
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     except (OSError, TypeError, SyntaxError):  # typed at a prompt, or a part of a statement
         return True
-    computed = _computed(tree)
+    computed = _computed_names(tree)
     return any(not _is_safe(node.slice, computed) for node in ast.walk(tree) if isinstance(node, ast.Subscript))
 
 
-def _computed(tree: ast.AST) -> set[str]:
-    """Names that may stand for other numbers than constants and counters of loops."""
+def _computed_names(tree: ast.AST) -> set[str]:
+    """Return the names that may stand for other numbers than constants and counters of loops."""
     found = {node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)}
     while True:
         before = len(found)
@@ -83,7 +89,7 @@ def _computed(tree: ast.AST) -> set[str]:
 
 
 def _is_safe(node: ast.AST | None, computed: set[str]) -> bool:
-    """Whether an expression is of constants, counters of loops and sizes alone."""
+    """Return whether an expression is of constants, counters of loops and sizes alone."""
     if node is None or isinstance(node, ast.Constant):
         return True
     if isinstance(node, ast.Name):
@@ -113,7 +119,7 @@ STATE = {"q": "n_q", "v": "n_q", "lam": "n_c"}  # of the multipliers those of C 
 
 @dataclass(frozen=True)
 class Kind:
-    """What is known of one kind of callback.
+    """Describe one kind of callback.
 
     Attributes
     ----------
@@ -148,27 +154,27 @@ class Kind:
 
     @property
     def optional(self) -> bool:
-        """Whether it may be left out."""
+        """Return whether it may be left out."""
         return self.absent != ""
 
     @cached_property
     def outputs(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
-        """Names and sizes of all arrays that it fills."""
+        """Return names and sizes of all arrays that it fills."""
         return ((self.output, self.shape), *self.more)
 
     @property
     def arguments(self) -> tuple[str, ...]:
-        """Names of the arguments of a callback that works in place."""
+        """Return the names of the arguments of a callback that works in place."""
         return ("t", *self.state, "p", *(name for name, _ in self.outputs))
 
     @cached_property
     def signature(self) -> Any:
-        """With what kernels call a callback."""
+        """Return the signature with which kernels call a callback."""
         return self._signature(VECTOR)
 
     @property
     def reading(self) -> Any:
-        """What numba compiles a callback for: it cannot write to what is not its own."""
+        """Return the signature that numba compiles: a callback cannot write to what is not its own."""
         return self._signature(READ)
 
     def _signature(self, given: Any) -> Any:
@@ -177,7 +183,7 @@ class Kind:
 
     @property
     def size(self) -> str:
-        """The shapes of the arrays, in words."""
+        """Return the shapes of the arrays, in words."""
         return ", ".join(f"({', '.join(shape)}{',' if len(shape) == 1 else ''})" for _, shape in self.outputs)
 
 
@@ -349,7 +355,7 @@ def callback(kind: str, allocates: bool = True) -> Callable[[Callable[..., None]
                 f"{function.__name__} is declared as the callback {kind!r}, whose arguments are "
                 f"({', '.join(wanted)}); it has ({', '.join(given)})"
             )
-        return compile_callback(kind, function, watch(function), allocates=allocates)
+        return compile_callback(kind, function, digests_of(function), allocates=allocates)
 
     return decorate
 
@@ -372,25 +378,25 @@ def compile_callback(
 ) -> Dispatcher:
     """Compile a function that works in place for the signature of its kind, or say in two lines why it cannot be.
 
-    `watched` is that of `compile_kept`; `named` is the function to name in the message, if it is another.
+    `watched` is that of `compile_cached`; `named` is the function to name in the message, if it is another.
     """
-    compiled, more = with_bounds_watched(function)
+    compiled, more = with_bounds_checks(function)
     options = {**_OPTIONS, **more} if allocates else {**_OPTIONS, **more, "_nrt": False}
     if watched is not None:
         watched = f"{watched[0]} {options}", watched[1]
     try:
-        made = compile_kept(compiled, KINDS[kind].reading, watched, **options)
+        made = compile_cached(compiled, KINDS[kind].reading, watched, **options)
     except Exception as error:  # numba lets some of its own assertions through
-        made = _compiled_to_write(kind, compiled, watched, named or function, error, options)
+        made = _compile_writable(kind, compiled, watched, named or function, error, options)
     else:
-        also_for(made, KINDS[kind].signature)
+        add_signature(made, KINDS[kind].signature)
     if watched is not None:
-        stands_for(made, f"{kind} {watched}")  # as it was compiled, whatever becomes of what it names
-    found_by(made, function)
+        digest_as(made, f"{kind} {watched}")  # as it was compiled, whatever becomes of what it names
+    frozen_values(made, function)
     return made
 
 
-def _compiled_to_write(
+def _compile_writable(
     kind: str,
     function: Callable[..., Any],
     watched: tuple[str, str] | None,
@@ -398,12 +404,12 @@ def _compiled_to_write(
     error: Exception,
     options: dict[str, Any],
 ) -> Dispatcher:
-    """The same of a function whose helpers are compiled for arrays that may be written; one that does so is refused."""
+    """Compile a function whose helpers want arrays that may be written; refuse one that writes to them itself."""
     try:
-        made = compile_kept(function, KINDS[kind].signature, watched, **options)
+        made = compile_cached(function, KINDS[kind].signature, watched, **options)
     except Exception as its_own:
-        raise TypeError(_why_not(kind, named, its_own)) from None
-    if _ONLY_A_HELPER.search(plain := _plain(error)) and "setitem" not in plain:
+        raise TypeError(_failure_message(kind, named, its_own)) from None
+    if _ONLY_A_HELPER.search(plain := _without_colours(error)) and "setitem" not in plain:
         return made
     raise TypeError(
         f"{kind}: the function {_named(named)} must not change the arrays that it is given "
@@ -416,8 +422,8 @@ _ONLY_A_HELPER = re.compile(r"Invalid use of type\(CPUDispatcher\(")
 
 
 @cache
-def stand_in(kind: str) -> Dispatcher:
-    """What stands in the place of an optional callback that is not given: it leaves zeros."""
+def zero_callback(kind: str) -> Dispatcher:
+    """Compile the replacement of an optional callback that is not given: it leaves zeros."""
 
     def leaves_zeros(t, q, p, out):
         pass
@@ -432,8 +438,8 @@ def stand_in(kind: str) -> Dispatcher:
     return compile_callback(kind, function, ("leaves zeros", ""))
 
 
-def _why_not(kind: str, function: Callable[..., Any], error: Exception) -> str:
-    """Which function numba cannot compile, and the line of numba's message that says most."""
+def _failure_message(kind: str, function: Callable[..., Any], error: Exception) -> str:
+    """Say which function numba cannot compile, with the line of numba's message that says most."""
     return (
         f"{kind}: numba cannot compile the function {_named(function)}; it must use numbers, numpy arrays of one type "
         f"and of the shape that {kind} asks for, and functions that numba knows (helpers need numba.njit)\n"
@@ -448,19 +454,19 @@ def _named(function: Callable[..., Any]) -> str:
 
 _SOURCE = re.compile(r"^File \".*?^[ ]*\^$", re.MULTILINE | re.DOTALL)  # what numba shows of a file, down to its mark
 # lines of numba's messages that only lead to another
-_LEADING = re.compile(
+_UNINFORMATIVE = re.compile(
     r"Failed in |- Resolution failure|During: |File \"|>>> |There (is|are) \d+ candidate|- Of which|Overload (in|of) |"
     r"With argument|Rejected as|raised from|None$|Tried |This (is usually|error)|<source elided>|Enable logging"
 )
 
 
-def _plain(error: Exception) -> str:
+def _without_colours(error: Exception) -> str:
     return re.sub(r"\x1b\[[0-9;]*m", "", str(error))
 
 
 def _telling_line(error: Exception) -> str:
-    plain = _plain(error)
+    plain = _without_colours(error)
     plain = re.sub(r":\s*>>> ", ": ", _SOURCE.sub("", plain))  # a signature that was not found
     lines = [line.strip() for line in plain.splitlines() if line and not line.startswith("    ")]
-    telling = [line for line in lines if line and not _LEADING.match(line) and not line.startswith("def ")]
+    telling = [line for line in lines if line and not _UNINFORMATIVE.match(line) and not line.startswith("def ")]
     return f"{type(error).__name__}: {telling[-1] if telling else plain.strip()[:200]}"

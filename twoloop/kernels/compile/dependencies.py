@@ -1,7 +1,8 @@
 """What machine code depends on: all that a function names, encloses and freezes; digests and copies of it.
 
 Numba freezes globals, free variables, defaults, attributes of modules, items of tuples and compiled helpers in the
-functions that it compiles. `Digest` hashes them, `places` lists them, `Rewritten` copies a function with other helpers.
+functions that it compiles. `Digest` hashes them, `frozen_places` lists them, and `FunctionCopier` copies a function
+with other helpers.
 """
 
 from __future__ import annotations
@@ -21,42 +22,44 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numba.core.types import Type
 
-from twoloop.kernels.compile.private import Dispatcher, options_of, registered
+from twoloop.kernels.compile.private import Dispatcher, jitable_templates, options_of
 
 # libraries whose functions are told apart by name; the versions of numba and numpy are compared, too
 LIBRARIES = {*sys.stdlib_module_names, "numpy", "numba", "scipy"}
 
-MOST_CODES = 2000  # whose names are kept: to read the operations of helpers again takes most of the time of tracing
+# codes whose names are kept: functions are made again and again from one code, and to read the instructions of helpers
+# again takes most of the time of tracing
+MAX_CODES = 2000
 FORM = 2  # another one for machine code that files of earlier versions may have wrong
 
 
 def digest_of(text: str, *sources: str | types.ModuleType) -> str:
-    """A digest of a text and of the files of modules."""
+    """Return a digest of a text and of the files of modules."""
     digest = hashlib.sha256(text.encode())
     for source in sources:
         digest.update(Path(source if isinstance(source, str) else str(source.__file__)).read_bytes())
     return digest.hexdigest()
 
 
-_STANDS_FOR: WeakKeyDictionary[Dispatcher, str] = WeakKeyDictionary()
+_DIGEST_TEXTS: WeakKeyDictionary[Dispatcher, str] = WeakKeyDictionary()
 
 
-def stands_for(callback: Dispatcher, what: str) -> None:
-    """Let a callback, which cannot be watched as it goes to Python, be known by this to functions that enclose it."""
-    _STANDS_FOR[callback] = what
+def digest_as(callback: Dispatcher, what: str) -> None:
+    """Register a text as the digest of a callback that goes to Python and so cannot be digested itself."""
+    _DIGEST_TEXTS[callback] = what
 
 
 def enclosed_by(function: Any) -> list[Any]:
-    """The values of the closure of a function."""
+    """Return the values of the closure of a function."""
     return [cell.cell_contents for cell in function.__closure__ or ()]
 
 
-class CannotBeWatched(Exception):
-    """A value that may change unseen."""
+class NotDigestible(Exception):
+    """Report a value that may change unseen."""
 
 
 class Digest:
-    """A hash that takes values of many types, and follows functions to whatever they name."""
+    """Hash values of many types, and follow functions to whatever they name."""
 
     def __init__(self) -> None:
         self.hash = hashlib.sha256(f"{FORM} {np.__version__}".encode())
@@ -86,7 +89,7 @@ class Digest:
             self.add([value.co_consts, value.co_names, value.co_freevars])
         elif isinstance(value, types.ModuleType):
             self._add_module(value)
-        elif isinstance(value, Dispatcher) or registered(value):
+        elif isinstance(value, Dispatcher) or jitable_templates(value):
             self._add_helper(value)
         else:
             self._add_name(value)
@@ -102,8 +105,8 @@ class Digest:
         self.names = outer
 
     def _add_helper(self, helper: Any) -> None:
-        if helper in _STANDS_FOR:
-            self.add(_STANDS_FOR[helper])
+        if helper in _DIGEST_TEXTS:
+            self.add(_DIGEST_TEXTS[helper])
         elif self._is_new(helper):
             try:
                 self.add(sorted(options_of(helper).items()))
@@ -113,21 +116,21 @@ class Digest:
 
     def _add_module(self, module: types.ModuleType) -> None:
         self.hash.update(module.__name__.encode())
-        if not of_library(module.__name__):
+        if not is_library(module.__name__):
             for name in sorted(self.names & set(vars(module))):
                 if self._is_new(module, name):
                     self.add([name, vars(module)[name]])
 
     def _add_name(self, value: Any) -> None:
-        """Functions and types of the libraries stand for themselves by their names; nothing else does."""
+        """Add functions and types of the libraries by their names; nothing else may stand for itself."""
         if isinstance(value, type) and hasattr(value, "_fields"):
             self.hash.update(f"{value.__qualname__}{value._fields}".encode())
             return
         module, name = getattr(value, "__module__", None), getattr(value, "__qualname__", None)
         if type(value) is np.ufunc:
             module, name = "numpy", value.__name__
-        if module is None or name is None or not of_library(module):
-            raise CannotBeWatched
+        if module is None or name is None or not is_library(module):
+            raise NotDigestible
         self.hash.update(f"{module}.{name}".encode())
 
     def _is_new(self, value: Any, name: str = "") -> bool:
@@ -140,50 +143,48 @@ class Digest:
 
 
 def names_in(code: types.CodeType) -> set[str]:
-    """Names of globals and attributes in a code and the functions within it."""
+    """Return the names of globals and attributes in a code and the functions within it."""
     inner = [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
     return set(code.co_names).union(*map(names_in, inner))
 
 
 def globals_of(function: Any) -> dict[str, Any]:
-    """The globals that a function, or one within it, loads; an attribute of that name, as in `math.log`, is none."""
-    names = _loaded(function.__code__) & set(function.__globals__)
+    """Return the globals that a function, or one within it, loads; an attribute, as in `math.log`, is none."""
+    names = {each.name for each in _loads(function.__code__) if not each.free} & set(function.__globals__)
     return {name: function.__globals__[name] for name in sorted(names)}
 
 
-@lru_cache(MOST_CODES)
-def _loaded(code: types.CodeType) -> frozenset[str]:
-    inner = [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
-    own = {each.argval for each in dis.get_instructions(code) if each.opname in ("LOAD_GLOBAL", "LOAD_NAME")}
-    return frozenset(own).union(*map(_loaded, inner))
-
-
 def names_reached(function: Any, seen: set[int] | None = None) -> set[str]:
-    """Names in a function and in compiled helpers that it names, to which it may pass a module."""
+    """Return the names in a function and in compiled helpers that it names, to which it may pass a module."""
     seen = set() if seen is None else seen
     seen.add(id(function))
     names = names_in(function.__code__)
     values = [*globals_of(function).values(), *enclosed_by(function)]
-    modules = [value for value in values if isinstance(value, types.ModuleType) and not of_library(value.__name__)]
+    modules = [value for value in values if isinstance(value, types.ModuleType) and not is_library(value.__name__)]
     values += [vars(module)[name] for module in modules for name in names & set(vars(module))]
-    helpers = [value for value in values if isinstance(value, Dispatcher) or registered(value)]
-    functions = [getattr(helper, "py_func", helper) for helper in helpers if helper not in _STANDS_FOR]
+    helpers = [value for value in values if isinstance(value, Dispatcher) or jitable_templates(value)]
+    functions = [getattr(helper, "py_func", helper) for helper in helpers if helper not in _DIGEST_TEXTS]
     return names.union(*(names_reached(each, seen) for each in functions if id(each) not in seen))
 
 
-def of_library(module: str) -> bool:
-    """Whether a module is of Python, or of a package that is told by its version."""
+def is_library(module: str) -> bool:
+    """Return whether a module is of Python, or of a package that is told by its version."""
     return module.partition(".")[0] in LIBRARIES
 
 
-OWN_MODULES = ("twoloop.", "twoloop_equations_")  # our modules, and generated ones: what they name stays as it is
+def is_ours(module: str) -> bool:
+    """Return whether a module is of twoloop or generated by it: what it names stays, and its indices are in bounds."""
+    return f"{module}.".startswith(("twoloop.", "twoloop_equations_"))
+
+
+LOADS_GLOBAL = ("LOAD_GLOBAL", "LOAD_NAME")  # the latter within a class
 LOADS_ATTRIBUTE = ("LOAD_ATTR", "LOAD_METHOD")
-AS_COMPILED = "__as_compiled__"  # the attribute of a compiled callback that holds what it named then
-BETWEEN = ("EXTENDED_ARG", "CACHE", "NOP", "PUSH_NULL")  # these do nothing to what was loaded
+FROZEN_VALUES = "__as_compiled__"  # the attribute of a compiled callback that holds what it named then
+NO_EFFECT = ("EXTENDED_ARG", "CACHE", "NOP", "PUSH_NULL")  # these do nothing to what was loaded
 
 
 class Place(NamedTuple):
-    """Where a function finds a value.
+    """Say where a function finds a value.
 
     Attributes
     ----------
@@ -204,22 +205,22 @@ class Place(NamedTuple):
 
 
 class _Loaded(NamedTuple):
-    """A global, or a free variable, that a code loads, and what attributes are taken of it, one of the other."""
+    """Name a global or a free variable that a code loads, and the attributes that it takes of it, one of the other."""
 
     free: bool
     name: str
     attributes: tuple[str, ...]
 
 
-def found_by(compiled: Any, function: Any = None) -> list[tuple[Place, bytes | None]]:
-    """What `places` gave when this was first asked, each with the bytes of an array.
+def frozen_values(compiled: Any, function: Any = None) -> list[tuple[Place, bytes | None]]:
+    """Return what `frozen_places` gave when this was called first, each with the bytes of an array.
 
     `function` is the one that was compiled, or that of which it was a copy.
     """
-    found: list[tuple[Place, bytes | None]] | None = getattr(compiled, AS_COMPILED, None)
+    found: list[tuple[Place, bytes | None]] | None = getattr(compiled, FROZEN_VALUES, None)
     if found is None:
-        found = [(each, _bytes(each.value)) for each in places(function or compiled.py_func)]
-        setattr(compiled, AS_COMPILED, found)
+        found = [(each, _bytes(each.value)) for each in frozen_places(function or compiled.py_func)]
+        setattr(compiled, FROZEN_VALUES, found)
     return found
 
 
@@ -227,31 +228,31 @@ def _bytes(value: Any) -> bytes | None:
     return value.tobytes() if isinstance(value, (np.ndarray, np.void)) else None
 
 
-def places(function: Any, seen: set[int] | None = None) -> Iterator[Place]:
-    """Where a function and its compiled helpers find what numba may freeze: numbers, arrays, text, functions, modules.
+def frozen_places(function: Any, seen: set[int] | None = None) -> Iterator[Place]:
+    """List where a function and its helpers find what numba freezes: numbers, arrays, text, functions, modules.
 
-    What is ours names nothing that changes; of it, only helpers are followed.
+    Our own modules name nothing that changes; in them, only helpers are followed.
     """
     seen = set() if seen is None else seen
     if id(function) in seen:
         return
     seen.add(id(function))
-    ours = f"{function.__globals__.get('__name__', '')}.".startswith(OWN_MODULES)
-    for found in _named(function):
+    ours = is_ours(function.__globals__.get("__name__", ""))
+    for found in _direct_places(function):
         for place in _with_items(found, seen):
             if not ours and _freezes(place.value):
                 yield place
             helper = python_function(place.value)
             if helper is not None:
-                yield from places(helper, seen)
+                yield from frozen_places(helper, seen)
 
 
 def python_function(value: Any) -> FunctionType | None:
-    """What numba compiles to a helper (by `njit`, `register_jitable`, `vectorize` or `cfunc`); else None."""
+    """Return what numba compiles to a helper (by `njit`, `register_jitable`, `vectorize` or `cfunc`); else None."""
     if isinstance(value, Dispatcher):
         return value.py_func  # type: ignore[no-any-return]
     if isinstance(value, FunctionType):
-        return value if registered(value) else None
+        return value if jitable_templates(value) else None
     if type(value).__module__.startswith("numba."):
         inner = getattr(value, "__wrapped__", None)
         return inner if isinstance(inner, FunctionType) else None
@@ -260,7 +261,7 @@ def python_function(value: Any) -> FunctionType | None:
 
 def _freezes(value: Any) -> bool:
     if isinstance(value, ModuleType):
-        return not of_library(value.__name__)
+        return not is_library(value.__name__)
     if isinstance(value, (np.ndarray, np.void)):
         return not value.dtype.hasobject
     kinds = (type(None), bool, int, float, complex, str, bytes, tuple, np.generic)
@@ -268,7 +269,7 @@ def _freezes(value: Any) -> bool:
 
 
 def _with_items(place: Place, seen: set[int]) -> Iterator[Place]:
-    """A place, and those within it if a tuple is there."""
+    """Yield a place, and those within it if it holds a tuple."""
     yield place
     if not isinstance(place.value, tuple) or id(place.value) in seen:
         return
@@ -280,8 +281,8 @@ def _with_items(place: Place, seen: set[int]) -> Iterator[Place]:
             yield from _with_items(Place(None, "", name, value), seen)
 
 
-def _named(function: FunctionType) -> Iterator[Place]:
-    """Defaults, and the globals and free variables that are loaded, with the attributes that are taken of modules."""
+def _direct_places(function: FunctionType) -> Iterator[Place]:
+    """Yield defaults, and the globals and free variables that are loaded, with the attributes taken of modules."""
     code, space = function.__code__, function.__globals__
     last = code.co_varnames[: code.co_argcount][::-1]
     for name, value in zip(last, (function.__defaults__ or ())[::-1], strict=False):
@@ -293,45 +294,45 @@ def _named(function: FunctionType) -> Iterator[Place]:
         holder, value = (cells[name], cells[name].cell_contents) if free else (space, space[name])
         place = Place(holder, name, name, value)
         yield place
-        if isinstance(value, ModuleType) and not of_library(value.__name__):
-            yield from _of_module(place, attributes, names_reached(function))
+        if isinstance(value, ModuleType) and not is_library(value.__name__):
+            yield from _places_of_module(place, attributes, names_reached(function))
 
 
-def _of_module(place: Place, attributes: tuple[str, ...], names: set[str]) -> Iterator[Place]:
-    """Attributes that are taken of a module of the user, and of modules within it.
+def _places_of_module(place: Place, attributes: tuple[str, ...], names: set[str]) -> Iterator[Place]:
+    """Yield the attributes that are taken of a module of the user, and of modules within it.
 
-    Where the module itself goes elsewhere, as to a local variable or to a helper, these are all that bear `names`.
+    If the module itself goes elsewhere, as to a local variable or to a helper, all that bear `names` are taken.
     """
-    if not isinstance(place.value, ModuleType) or of_library(place.value.__name__):
+    if not isinstance(place.value, ModuleType) or is_library(place.value.__name__):
         return
     space = vars(place.value)
     for attribute in attributes[:1] or sorted(names & set(space)):
         if attribute in space:
             inner = Place(space, attribute, f"{place.name}.{attribute}", space[attribute])
             yield inner
-            yield from _of_module(inner, attributes[1:], names - {attribute})
+            yield from _places_of_module(inner, attributes[1:], names - {attribute})
 
 
-@lru_cache(maxsize=1024)  # functions are made again and again from one code, and every `solve_dae` looks
+@lru_cache(MAX_CODES)
 def _loads(code: CodeType) -> tuple[_Loaded, ...]:
-    """The globals and free variables that a code and the functions within it load."""
+    """Return the globals and free variables that a code and the functions within it load."""
     found: dict[_Loaded, None] = {}
     loaded = None
     for each in dis.get_instructions(code):
         if loaded is not None and each.opname in LOADS_ATTRIBUTE:
             loaded = loaded._replace(attributes=(*loaded.attributes, each.argval))
-        elif each.opname not in BETWEEN:
+        elif each.opname not in NO_EFFECT:
             if loaded is not None:
                 found[loaded] = None
             free = each.opname == "LOAD_DEREF" and each.argval in code.co_freevars
-            loaded = _Loaded(free, each.argval, ()) if free or each.opname == "LOAD_GLOBAL" else None
+            loaded = _Loaded(free, each.argval, ()) if free or each.opname in LOADS_GLOBAL else None
     inner = [one for constant in code.co_consts if isinstance(constant, CodeType) for one in _loads(constant)]
     found.update((one, None) for one in inner if not one.free or one.name in code.co_freevars)
     return tuple(found)
 
 
-class Rewritten:
-    """Copies of functions with other ones in the place of the compiled helpers that they name or enclose."""
+class FunctionCopier:
+    """Copy functions with replacements for the compiled helpers that they name or enclose."""
 
     # wrap(copy, original) -> what stands in the place of the original
     def __init__(self, wrap: Callable[[types.FunctionType, Any], Any]):
@@ -339,23 +340,23 @@ class Rewritten:
         self.known: dict[Any, Any] = {}
 
     def value(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        """What stands in the place of a value; `names` are those that may be taken of a module."""
+        """Return the replacement of a value; `names` are those that may be taken of a module."""
         if self.copies(value):
             if id(value) not in self.known:
                 self._rewrite(value)
             return self.known[id(value)]
         if type(value) is tuple:
             return tuple(self.value(each, names) for each in value)
-        if isinstance(value, types.ModuleType) and not of_library(value.__name__):
+        if isinstance(value, types.ModuleType) and not is_library(value.__name__):
             return self._module(value, names)
         return value
 
     def copies(self, value: Any) -> bool:
-        """Whether a value is a function that is copied."""
-        return isinstance(value, Dispatcher) or bool(registered(value))
+        """Return whether a value is a function that is copied."""
+        return isinstance(value, Dispatcher) or bool(jitable_templates(value))
 
     def _module(self, module: types.ModuleType, names: frozenset[str]) -> types.ModuleType:
-        """A copy of a module with other functions in the place of those of these names."""
+        """Copy a module with replacements for the functions of these names."""
         key = (id(module), names)
         if key not in self.known:
             self.known[key] = copy = types.ModuleType(module.__name__)
@@ -364,7 +365,7 @@ class Rewritten:
         return self.known[key]  # type: ignore[no-any-return]
 
     def copy_of(self, function: Any) -> Any:
-        """What stands in the place of a function that is not one of those by itself."""
+        """Copy a function that is not a compiled helper itself."""
         self._rewrite(function)
         return self.known[id(function)]
 

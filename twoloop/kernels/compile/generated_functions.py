@@ -13,13 +13,13 @@ from typing import Any
 from llvmlite import binding
 from numba.core.registry import cpu_target
 
-from twoloop.kernels.compile.caches import UNWRITABLE, Files, Newest, say_once, sources_folder
+from twoloop.kernels.compile.caches import UNWRITABLE, BoundedCache, CodeFiles, sources_folder, warn_once
 
 SINGLE_PASSES = hasattr(binding.ModulePassManager, "add_reassociate_pass")
 
 
-class OwnFunctions:
-    """Functions in memory, as long as this object lives.
+class GeneratedFunctions:
+    """Load generated functions into memory, as long as this object lives.
 
     Parameters
     ----------
@@ -41,48 +41,48 @@ class OwnFunctions:
         self.addresses: dict[str, int] = {name: int(self._engine.get_function_address(name)) for name in names}
 
 
-class LaterFunctions:
-    """Functions that `make` makes when their addresses are first asked for: of what a run may not come to."""
+class DeferredFunctions:
+    """Generate functions when their addresses are first used: those that a run may not need."""
 
-    def __init__(self, make: Callable[[], OwnFunctions]):
+    def __init__(self, make: Callable[[], GeneratedFunctions]):
         self._make = make
 
     @cached_property
-    def functions(self) -> OwnFunctions:
-        """Themselves, which stay in memory with this object."""
+    def functions(self) -> GeneratedFunctions:
+        """Return the functions, which stay in memory with this object."""
         return self._make()
 
     @property
     def addresses(self) -> dict[str, int]:
-        """By their names."""
+        """Return the addresses by name."""
         return self.functions.addresses
 
 
-_MADE: dict[str, Newest] = defaultdict(Newest)  # by kind
+_IN_MEMORY: dict[str, BoundedCache] = defaultdict(BoundedCache)  # by kind
 
 
-def own_functions(
+def generated_functions(
     kind: str,
     stamp: str,
     key: str,
     write: Callable[[], tuple[list[str], str]],
     passes: bool = True,
-) -> OwnFunctions:
-    """Functions that `write` writes: their names, and the text of a module; from memory or the disk where kept.
+) -> GeneratedFunctions:
+    """Return the functions of a module that `write` writes, from memory or the disk if they are there.
 
     Parameters
     ----------
     kind : str
-        Under which they are kept, the newest MOST_KEPT of each kind.
+        Under which they are kept, the newest MAX_ON_DISK of each kind.
     stamp, key : str
         What the functions depend on: a digest of what writes them, and of their own content.
     write : callable
     passes : bool
         See `object_code`.
     """
-    if (made := _MADE[kind].get(key)) is not None:
+    if (made := _IN_MEMORY[kind].get(key)) is not None:
         return made  # type: ignore[no-any-return]
-    files, place = _files(kind, stamp), _place(key)
+    files, place = _code_files(kind, stamp), _disk_key(key)
     try:
         kept = files.load(place)
     except Exception:  # a file of another installation; it is written anew
@@ -93,27 +93,27 @@ def own_functions(
         try:
             files.save(place, kept)
         except OSError:
-            say_once(UNWRITABLE)
+            warn_once(UNWRITABLE)
     names, content = kept
-    _MADE[kind][key] = made = OwnFunctions(names, content)
+    _IN_MEMORY[kind][key] = made = GeneratedFunctions(names, content)
     return made
 
 
-def are_kept(kind: str, stamp: str, key: str) -> bool:
-    """Whether `own_functions` would find them."""
-    return key in _MADE[kind] or _files(kind, stamp).has(_place(key))
+def are_cached(kind: str, stamp: str, key: str) -> bool:
+    """Return whether `generated_functions` would find them."""
+    return key in _IN_MEMORY[kind] or _code_files(kind, stamp).has(_disk_key(key))
 
 
-def _files(kind: str, stamp: str) -> Files:
-    return Files(sources_folder(), kind, (binding.llvm_version_info, stamp), True)
+def _code_files(kind: str, stamp: str) -> CodeFiles:
+    return CodeFiles(sources_folder(), kind, (binding.llvm_version_info, stamp), True)
 
 
-def _place(key: str) -> Any:
+def _disk_key(key: str) -> Any:
     return (*cpu_target.target_context.codegen().magic_tuple(), key)
 
 
 def object_code(text: str, passes: bool = True) -> bytes:
-    """Machine code for this processor; `passes`: the operations are simplified first."""
+    """Compile a module for this processor; `passes`: the operations are simplified first."""
     machine = _compiler()
     target = f'target triple = "{_triple()}"\ntarget datalayout = "{machine.target_data}"\n'
     module = binding.parse_assembly(target + text)
@@ -131,9 +131,9 @@ def _compiler() -> Any:
 
 @cache
 def _two_passes() -> tuple[Any, Any]:
-    """Those that make code of small mechanisms faster by a tenth; all others together find nothing more.
+    """Make the two passes that speed up small mechanisms by a tenth; all others together find nothing more.
 
-    Made once a process: of passes that are let go some 300 kB stay.
+    They are made once a process: each pass that is let go leaves some 300 kB.
     """
     passes = binding.create_new_module_pass_manager()
     passes.add_reassociate_pass()
@@ -142,7 +142,7 @@ def _two_passes() -> tuple[Any, Any]:
 
 
 def _all_passes() -> tuple[Any, Any]:
-    """Of llvmlite 0.44, whose passes serve one module."""
+    """Make the passes of llvmlite 0.44, which serve one module."""
     builder = _pass_builder()
     return builder.getModulePassManager(), builder
 
@@ -157,13 +157,13 @@ def _triple() -> str:
 
 
 def _machine() -> Any:
-    """The processor as numba sees it, which NUMBA_CPU_NAME may change; an engine keeps the one that it is given."""
+    """Make LLVM's description of the processor as numba sees it (NUMBA_CPU_NAME); an engine keeps the one given."""
     options: dict[str, Any] = {"opt": 1}  # 2 takes a quarter longer and finds nothing more in straight lines
     cpu_target.target_context.codegen()._customize_tm_options(options)
     return binding.Target.from_triple(_triple()).create_target_machine(**options)
 
 
 def has_wide_vectors() -> bool:
-    """Whether vectors of the processor, as numba sees it, hold eight doubles."""
+    """Return whether vectors of the processor, as numba sees it, hold eight doubles."""
     _, _, features = cpu_target.target_context.codegen().magic_tuple()
     return "+avx512f" in features.split(",")

@@ -36,17 +36,10 @@ from numba.core.untyped_passes import InlineClosureLikes
 from numba.np import arrayobj
 
 _index_from_either_end = arrayobj.fix_integer_index
-_OF_KERNELS: list[type] = []  # classes of libraries
-
-
-def of_kernels(library: Any) -> Any:
-    """A decorator of classes of libraries of code: in these, no index counts from the end."""
-    _OF_KERNELS.append(library)
-    return library
 
 
 def _index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
-    if kind.signed and isinstance(context.active_code_library, tuple(_OF_KERNELS)):
+    if kind.signed and isinstance(context.active_code_library, _Linked | _Whole):
         return context.cast(builder, index, kind, types.intp)
     return _index_from_either_end(context, builder, kind, index, size)
 
@@ -55,7 +48,7 @@ _any_indexing: Any = arrayobj.basic_indexing
 
 
 def _indexing(context: Any, builder: Any, kind: Any, array: Any, index_types: Any, indices: Any, **options: Any) -> Any:
-    """The address of one element of a contiguous array, without what only views need."""
+    """Return the address of one element of a contiguous array, without what only views need."""
     of_element = len(indices) == kind.ndim and all(isinstance(each, types.Integer) for each in index_types)
     if kind.layout != "C" or not of_element or options.get("boundscheck"):
         return _any_indexing(context, builder, kind, array, index_types, indices, **options)
@@ -77,7 +70,7 @@ def _text_of(options: Any) -> str:
 
 
 def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
-    """The signature of a call of one of numba's functions, found once for the same types and options.
+    """Return the signature of a call of one of numba's functions, found once for the same types and options.
 
     Numba tries all implementations of an operator at each call, which is a tenth of a compilation.
     """
@@ -94,7 +87,7 @@ _sizes: dict[str, int] = {}
 
 
 def _size_of(self: Any, kind: Any) -> Any:
-    """The size of a type, for which numba has LLVM read a module at each variable."""
+    """Return the size of a type, for which numba has LLVM read a module at each variable."""
     name = str(kind)
     if name not in _sizes:
         _sizes[name] = _found_size(self, kind)
@@ -106,7 +99,7 @@ _inlined: dict[Any, Any] = {}
 
 
 def _inlined_code(self: Any, function: Any, enable_ssa: bool = False) -> Any:
-    """The code of a function that is inlined, which numba copies, and reads anew at each call."""
+    """Return the code of a function that is inlined, which numba copies, and reads anew at each call."""
     if (function, enable_ssa) not in _inlined:
         _inlined[function, enable_ssa] = _inlined_passes(self, function, enable_ssa)
     self.flags.enable_ssa = enable_ssa
@@ -119,7 +112,7 @@ _LEAVES = {ir.Loc, str, int, bool, type(None)}  # of what a statement holds
 
 
 def _variables(self: Any, held: Any) -> list[Any]:
-    """The variables that a statement names; numba calls a function for each thing that it holds."""
+    """Return the variables that a statement names; numba calls a function for each thing that it holds."""
     if isinstance(held, ir.Var):
         return [held]
     if isinstance(held, ir.Inst):
@@ -138,7 +131,7 @@ _load_registries: Any = CPUContext.load_additional_registries
 
 
 def _load_once(self: Any) -> None:
-    """What numba implements of Python's and NumPy's functions, all of which it imports anew at each function.
+    """Install what numba implements of Python's and NumPy's functions, which it imports anew at each function.
 
     An intrinsic that is first met is put into one of the registries that are there; copies of a context share them.
     """
@@ -152,8 +145,8 @@ def _load_once(self: Any) -> None:
 _LOCKS = ("numba:llvm_lock", "numba:compiler_lock")
 
 
-def _but_of_locks(tell: Any) -> Any:
-    """Events are told, but not of locks: some thousand for each kernel, of which each measures all before it."""
+def _ignoring_locks(tell: Any) -> Any:
+    """Report events, but not those of locks: some thousand for each kernel, each of which measures all before it."""
     return lambda kind, *args, **named: None if kind in _LOCKS else tell(kind, *args, **named)
 
 
@@ -166,26 +159,26 @@ _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
     (InlineWorker, "run_untyped_passes", _inlined_code),
     (ir.Inst, "_rec_list_vars", _variables),
     (CPUContext, "load_additional_registries", _load_once),
-    (event, "start_event", _but_of_locks(event.start_event)),
-    (event, "end_event", _but_of_locks(event.end_event)),
+    (event, "start_event", _ignoring_locks(event.start_event)),
+    (event, "end_event", _ignoring_locks(event.end_event)),
 ]
 _NONE = object()
-_open = [0]  # compilations of kernels, one within another
+_depth = [0]  # compilations of kernels, one within another
 
 
 @contextmanager
-def own_rules() -> Iterator[None]:
-    """These in the place of numba's while a kernel is compiled."""
-    if _open[0] == 0:
+def kernel_rules() -> Iterator[None]:
+    """Replace numba's functions by these rules while a kernel is compiled."""
+    if _depth[0] == 0:
         before = [vars(owner).get(name, _NONE) for owner, name, _ in _RULES]
         for owner, name, rule in _RULES:
             setattr(owner, name, rule)
-    _open[0] += 1
+    _depth[0] += 1
     try:
         yield
     finally:
-        _open[0] -= 1
-        if _open[0] == 0:
+        _depth[0] -= 1
+        if _depth[0] == 0:
             for (owner, name, _), numbas in zip(_RULES, before, strict=True):
                 if numbas is _NONE:
                     delattr(owner, name)
@@ -194,7 +187,7 @@ def own_rules() -> Iterator[None]:
 
 
 class _WithoutEnvironment:
-    """The code generator for code that is not loaded: there is no place for the address of its environment."""
+    """Stand for the code generator of code that is not loaded, where the environment has no address."""
 
     def __init__(self, codegen: Any):
         self._codegen = codegen
@@ -203,12 +196,11 @@ class _WithoutEnvironment:
         return getattr(self._codegen, name)
 
     def set_env(self, name: str, environment: Any) -> None:
-        """Nothing to set."""
+        """Ignore the environment."""
 
 
-@of_kernels
 class _Linked(CPUCodeLibrary):
-    """The code of a helper, to be linked into its callers."""
+    """Hold the code of a helper, to be linked into its callers."""
 
     @property
     def codegen(self) -> Any:
@@ -221,7 +213,7 @@ class _Linked(CPUCodeLibrary):
         pass  # its callers do
 
     def _get_module_for_linking(self) -> Any:
-        """The code as it is, which nothing else uses: numba links a copy."""
+        """Return the code as it is, which nothing else uses: numba links a copy."""
         if self._shared_module is None:
             self._ensure_finalized()
             for function in self._final_module.functions:
@@ -234,9 +226,8 @@ class _Linked(CPUCodeLibrary):
         self._finalized = True
 
 
-@of_kernels
 class _Whole(JITCodeLibrary):
-    """The code of a kernel and of all that it calls."""
+    """Hold the code of a kernel and of all that it calls."""
 
     vectorized = False
 
@@ -248,7 +239,7 @@ class _Whole(JITCodeLibrary):
 
 
 class _Vectorized(_Whole):
-    """The same, of loops that are worth it."""
+    """Hold the code of a kernel whose loops are worth vectorizing."""
 
     vectorized = True
 
@@ -256,29 +247,29 @@ class _Vectorized(_Whole):
 # passes over every function that find nothing to do in kernels: functions within functions; whole arrays in an
 # expression, as none is allocated; overloads that are put in the place of calls before lowering; what cannot stand in
 # a compiled function
-_NEEDLESS = {InlineClosureLikes, NopythonRewrites, InlineOverloads, IRLegalization}
+_SKIPPED_PASSES = {InlineClosureLikes, NopythonRewrites, InlineOverloads, IRLegalization}
 
 
 class _Compiler(Compiler):
-    """Numba's compiler without what kernels do not need."""
+    """Compile as numba does, without the passes that kernels do not need."""
 
     def define_pipelines(self) -> list[Any]:
-        """The passes."""
+        """Return the passes."""
         pipelines: list[Any] = super().define_pipelines()
         for pipeline in pipelines:
-            pipeline.passes = [each for each in pipeline.passes if each[0] not in _NEEDLESS]
+            pipeline.passes = [each for each in pipeline.passes if each[0] not in _SKIPPED_PASSES]
         return pipelines
 
 
 class HelperCompiler(_Compiler):
-    """Numba's compiler, but for a function that is called by compiled ones only; from Python the call would crash."""
+    """Compile a function that only compiled functions call; a call from Python would crash."""
 
     def __init__(self, typing_context: Any, target_context: Any, library: Any, *others: Any):
         super().__init__(typing_context, target_context, _Linked(target_context.codegen(), "helper"), *others)
 
 
 class KernelCompiler(_Compiler):
-    """Numba's compiler, but for a function that is optimised together with its helpers, once."""
+    """Compile a function and optimise it together with its helpers, once."""
 
     library: type[_Whole] = _Whole
 
@@ -289,21 +280,21 @@ class KernelCompiler(_Compiler):
 
     def compile_extra(self, function: Any) -> Any:
         """Compile a function and all that it calls."""
-        with own_rules():
+        with kernel_rules():
             return super().compile_extra(function)
 
 
 class VectorizingCompiler(KernelCompiler):
-    """The same for loops long enough to be unrolled and vectorised."""
+    """Compile a kernel whose loops are long enough to be unrolled and vectorised."""
 
     library = _Vectorized
 
 
 @cache
-def direct(function: Dispatcher) -> Any:
-    """What Python calls of a function with one signature, past the look at the types of its arguments: these must fit.
+def entry_point(function: Dispatcher) -> Any:
+    """Return what Python calls of a function with one signature, without a check of the types: these must fit.
 
-    That look costs as much as two steps of a small mechanism.
+    That check costs as much as two steps of a small mechanism.
     """
     compiled: Any = next(iter(function.overloads.values()))
     return compiled.entry_point
@@ -313,7 +304,7 @@ _ADDRESSES: WeakKeyDictionary[Dispatcher, int] = WeakKeyDictionary()  # of funct
 
 
 def machine_code(function: Dispatcher, signature: Any) -> int:
-    """The address of a compiled function; it takes arguments and reports errors as numba's functions do."""
+    """Return the address of a compiled function; it takes arguments and reports errors as numba's functions do."""
     if function not in _ADDRESSES:
         compiled: Any = function.overloads.get(signature.args) or function.get_compile_result(signature)
         _ADDRESSES[function] = int(compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name))

@@ -8,13 +8,13 @@ from numba.core import cgutils
 from numba.core.dispatcher import Dispatcher
 from numba.core.registry import cpu_target
 
-__all__ = ["Dispatcher", "also_for", "cgutils", "forget_compiled", "options_of", "registered"]
+__all__ = ["Dispatcher", "add_signature", "cgutils", "forget_compiled", "jitable_templates", "options_of"]
 
 
-def registered(function: Any) -> list[Any]:
-    """What numba keeps of a function made by `register_jitable`, which it compiles anew in functions that call it.
+def jitable_templates(function: Any) -> list[Any]:
+    """Return what numba keeps of a function made by `register_jitable`, which it compiles anew in its callers.
 
-    Nothing of any other function.
+    An empty list for any other function.
     """
     context: Any = cpu_target.typing_context
     if not isinstance(function, FunctionType):
@@ -29,7 +29,7 @@ def registered(function: Any) -> list[Any]:
     return templates if all(own) else []  # another implementation may stand in its place
 
 
-def also_for(function: Dispatcher, signature: Any) -> None:
+def add_signature(function: Dispatcher, signature: Any) -> None:
     """Let a function of one signature be called with another, whose arguments are the same in memory."""
     own: Any = function
     (compiled,) = own.overloads.values()
@@ -41,11 +41,11 @@ def also_for(function: Dispatcher, signature: Any) -> None:
 
 
 def options_of(helper: Any) -> dict[str, Any]:
-    """Numba's options of a compiled helper, or of a function made by `register_jitable`."""
-    return helper.targetoptions if isinstance(helper, Dispatcher) else registered(helper)[0]._jit_options
+    """Return numba's options of a compiled helper, or of a function made by `register_jitable`."""
+    return helper.targetoptions if isinstance(helper, Dispatcher) else jitable_templates(helper)[0]._jit_options
 
 
 def forget_compiled(function: Any) -> None:
     """Have numba compile a function made by `register_jitable` again where it is called next."""
-    for template in registered(function):
+    for template in jitable_templates(function):
         template._impl_cache.clear()

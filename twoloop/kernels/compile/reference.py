@@ -18,19 +18,19 @@ from numba.extending import NativeValue, lower_builtin, models, register_model, 
 from numba.np.arrayobj import make_array
 from numba.np.numpy_support import as_dtype
 
-from twoloop.kernels.compile.caches import Newest
+from twoloop.kernels.compile.caches import BoundedCache
 from twoloop.kernels.compile.linking import machine_code
 
 _KNOWN: dict[str, Any] = {}
 
 
 def _known(name: str) -> Any:
-    """What numba reads back where it has pickled a reference, whose functions may take that reference."""
+    """Return the reference of a name: numba unpickles it by this, as functions may take that very reference."""
     return _KNOWN[name]
 
 
 class Reference(types.Type):
-    """A pointer to a table: of each array its address and its shape, of each function its address.
+    """Pass a structure by one pointer to a table: of each array its address and shape, of each function its address.
 
     Functions are of numba, or of LLVM (see generated_functions.py): these get addresses of arrays,
     and report no errors.
@@ -49,10 +49,10 @@ class Reference(types.Type):
         self.arrays = dict(arrays)
         self.dtypes = {field: as_dtype(kind.dtype) for field, kind in self.arrays.items()}
         self.functions: dict[str, Signature] = {}
-        self.own_functions: set[str] = set()  # of these, those of LLVM
+        self.llvm_functions: set[str] = set()  # of these, those of LLVM
         self.places: dict[str, int] = {}
         self.n_words = 0
-        self._addresses: Any = Newest()  # of functions of a value, which take long to look up
+        self._addresses: Any = BoundedCache()  # of functions of a value, which take long to look up
         for field, kind in self.arrays.items():
             self.places[field] = self.n_words
             self.n_words += 1 + kind.ndim
@@ -61,10 +61,10 @@ class Reference(types.Type):
         return _known, (self.name,)
 
     def __repr__(self) -> str:
-        """The name, and what tells layouts apart: machine code on disk is kept by it."""
+        """Return the name with a digest of the layout: machine code on disk is kept by it."""
         fields: list[Any] = [(field, str(kind)) for field, kind in self.arrays.items()]
         fields += [
-            (field, str(self.functions[field])) if field in self.own_functions else field for field in self.functions
+            (field, str(self.functions[field])) if field in self.llvm_functions else field for field in self.functions
         ]
         return f"{self.name}-{hashlib.sha256(repr(fields).encode()).hexdigest()[:16]}"
 
@@ -75,29 +75,24 @@ class Reference(types.Type):
         self.n_words += 1
         _define_call(self, field, signature)
 
-    def add_own_functions(self, signatures: Mapping[str, Signature]) -> None:
-        """Add functions of LLVM, which may be called if they are there; arrays are one-dimensional."""
+    def add_llvm_functions(self, signatures: Mapping[str, Signature]) -> None:
+        """Add generated functions, which may be called if they are there; arrays are one-dimensional."""
         for field, signature in signatures.items():
             self.functions[field] = signature
-            self.own_functions.add(field)
+            self.llvm_functions.add(field)
             self.places[field] = self.n_words
             self.n_words += 1
-            _define_own_call(self, field, signature)
+            _define_llvm_call(self, field, signature)
 
-    def own_type(self, field: str) -> tuple[str, list[str]]:
-        """The types of the result and of the arguments of a function of LLVM, as LLVM writes them."""
+    def llvm_type(self, field: str) -> tuple[str, list[str]]:
+        """Return the types of the result and of the arguments of a generated function, as LLVM writes them."""
         signature = self.functions[field]
         return str(_plain(signature.return_type)), [str(_plain(kind)) for kind in signature.args]
 
     def table(self, values: Any) -> Any:
-        """The table, int64, for an object with arrays and functions of these names, which has to outlive it.
+        """Make the table, int64, of an object with arrays and functions of these names, which has to outlive it.
 
-        Functions of LLVM it has by their addresses, 0 for those that are not there.
-
-        Raises
-        ------
-        TypeError
-            If an array is of another type than was declared.
+        Generated functions are given by their addresses, 0 for those that are not there.
         """
         words: list[int] = []
         for field, kind in self.arrays.items():
@@ -114,7 +109,7 @@ class Reference(types.Type):
         return np.array(words, dtype=np.int64)
 
     def _address(self, field: str, function: Any) -> int:
-        if field in self.own_functions:
+        if field in self.llvm_functions:
             return int(function)
         return 0 if function is None else machine_code(function, self.functions[field])
 
@@ -124,7 +119,7 @@ register_model(Reference)(models.OpaqueModel)
 
 @unbox(Reference)
 def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
-    """Python objects that stand for a reference have the address of their table in `address`, or are that number.
+    """Unbox a Python object that stands for a reference: its attribute `address`, or itself if it is a number.
 
     To find an attribute takes a tenth of a microsecond.
     """
@@ -145,7 +140,7 @@ def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
 
 
 def _load(context: Any, builder: Any, pointer: Any, place: int, kind: Any) -> Any:
-    """The word of a table; it never changes, which lets LLVM load it once."""
+    """Load a word of a table; it never changes, which lets LLVM load it once."""
     slot = builder.gep(builder.bitcast(pointer, ir.IntType(64).as_pointer()), [ir.Constant(ir.IntType(64), place)])
     word = builder.load(builder.bitcast(slot, kind.as_pointer()))
     word.set_metadata("invariant.load", builder.module.add_metadata([]))
@@ -220,11 +215,11 @@ _PLAIN = {
 
 
 def _plain(kind: Any) -> Any:
-    """What LLVM's functions get for an argument."""
+    """Return the LLVM type of an argument of a generated function."""
     return _PLAIN[kind.dtype].as_pointer() if isinstance(kind, types.Array) else _PLAIN[kind]
 
 
-def _define_own_call(typ: Reference, field: str, signature: Signature) -> None:
+def _define_llvm_call(typ: Reference, field: str, signature: Signature) -> None:
     place = typ.places[field]
 
     @lower_builtin((typ.name, field), typ, *signature.args)

@@ -4,7 +4,7 @@ import numpy as np
 
 from twoloop.kernels.control import clock as at
 from twoloop.kernels.data.common import merged
-from twoloop.kernels.evaluation.constraints import representable
+from twoloop.kernels.evaluation.constraints import representable_step
 
 NEAR = 4.0  # times that differ by less than so many spacings of floating-point numbers are one
 
@@ -37,7 +37,7 @@ def off_grid(control, t, h, left, leaps):
     size = h
     if h > 0.5 * left and not reaches:
         size = 0.5 * left  # two equal steps rather than a long and a tiny one
-    size = representable(t, size)
+    size = representable_step(t, size)
     if size > control[at.MAX_STEP]:
-        size = representable(t, size - np.spacing(abs(t + size)))
+        size = representable_step(t, size - np.spacing(abs(t + size)))
     return size, reaches

@@ -8,7 +8,7 @@ from twoloop.kernels.data.flags import AUGMENTED, FORM, NULL_SPACE, STATIC, STRA
 from twoloop.kernels.data.noted import BY_GENERAL, NEAR_NOW, NEARLY_SINGULAR, PIVOT, SENSITIVITY
 from twoloop.kernels.evaluation.inner_loop import find_tangents, renew_partition
 from twoloop.kernels.evaluation.partition import least_pivot, partition_is_poor
-from twoloop.kernels.evaluation.sparse_inner_loop import CAREFUL
+from twoloop.kernels.evaluation.sparse_inner_loop import PROJECT_STAGES
 
 SHORT = 0.5  # of the longest of the last steps: a step below it may be near a singular position ...
 COLLAPSED = 0.2  # of it: steps for which the pivots of C_q are looked at anew
@@ -68,7 +68,7 @@ def with_care(f, w, control, clock, size):
         return False
     clock[at.H_NEXT] = LESS * size
     if w.notes[NEARLY_SINGULAR] == 0.0:
-        w.notes[NEARLY_SINGULAR] = CAREFUL
+        w.notes[NEARLY_SINGULAR] = PROJECT_STAGES
         clock[at.H_NEXT] = max(size, clock[at.H_LONG])
     clock[at.H_LIMIT] = max(clock[at.H_LIMIT], clock[at.H_NEXT])
     return True
@@ -93,7 +93,7 @@ def look_at_partition(f, w, control, clock, size, lands, state):
     if f.flags[FORM] == STATIC:
         clock[at.PIVOT_HERE] = w.notes[PIVOT]
         clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.notes[PIVOT])
-        if w.notes[NEARLY_SINGULAR] == CAREFUL and w.notes[PIVOT] >= CARE * clock[at.LARGEST_PIVOT]:
+        if w.notes[NEARLY_SINGULAR] == PROJECT_STAGES and w.notes[PIVOT] >= CARE * clock[at.LARGEST_PIVOT]:
             w.notes[NEARLY_SINGULAR] = 0.0
         return at.GO_ON
     n = w.Q.size

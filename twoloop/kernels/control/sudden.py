@@ -17,7 +17,7 @@ import numpy as np
 from twoloop.kernels.control import clock as at
 from twoloop.kernels.data.common import compiled
 from twoloop.kernels.data.tolerances import GAP, RTOL
-from twoloop.kernels.evaluation.constraints import constraint_rates, representable
+from twoloop.kernels.evaluation.constraints import constraint_rates, representable_step
 
 PLACES = 20  # times ahead that are compared
 LONG = 12.0  # spacings of these times: the shortest way along which it is looked
@@ -260,7 +260,7 @@ def up_to_sudden(f, w, tolerances, control, clock, t, size, last, state):
     if control[at.BY_TIME] == 1.0 and not (at_change and size <= (1.0 + NEARLY) * clock[at.LOOKED_EVERY]):
         known = _ahead(f, w, tolerances, control, clock, known, t, size, last, q, v, a)
         clock[at.SUDDEN] = known
-    size = min(size, representable(t, min(known, along) - t))
+    size = min(size, representable_step(t, min(known, along) - t))
     is_short = size < SHORT * clock[at.H_LONG] or t < clock[at.T_START] + 2.0 * control[at.APART]
     if control[at.BY_TIME] == 1.0 and is_short and size < control[at.APART] and clock[at.COMPARED] < t:
         _keep_brief(f, w, tolerances, control, clock, t, size, last, q, v, a)

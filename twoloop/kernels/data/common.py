@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from numba import njit, types
 from numba.extending import typeof_impl
 
-from twoloop.kernels.compile.caches import compile_kept
+from twoloop.kernels.compile.caches import compile_cached
 from twoloop.kernels.compile.callbacks import KINDS, MATRIX, VECTOR, f8
 from twoloop.kernels.compile.linking import HelperCompiler, KernelCompiler, VectorizingCompiler
 from twoloop.kernels.compile.private import Dispatcher
@@ -200,7 +200,7 @@ OWN_FUNCTIONS = {
     "closer_ends": types.none(*[VECTOR] * 2),
     "nearer_ends": types.none(*[VECTOR] * 2),
 }
-KIT.add_own_functions(OWN_FUNCTIONS)
+KIT.add_llvm_functions(OWN_FUNCTIONS)
 
 
 _FOLDER = Path(__file__).parents[1]  # of the kernels
@@ -257,7 +257,7 @@ def kernel(signature: Any, vectorized: bool = False) -> Callable[[Callable[..., 
     """Compile a function of the integrator, and keep the machine code until a file that it needs changes."""
 
     def compile_now(function: Callable[..., Any]) -> Dispatcher:
-        return compile_kept(
+        return compile_cached(
             function,
             signature,
             (stamp(_module(function)), ""),

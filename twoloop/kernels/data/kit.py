@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numba.extending import typeof_impl
 
-from twoloop.kernels.compile.generated_functions import LaterFunctions, OwnFunctions
+from twoloop.kernels.compile.generated_functions import DeferredFunctions, GeneratedFunctions
 from twoloop.kernels.data.common import KIT, OWN_FUNCTIONS, Step
 
 NONE = np.zeros(0)
@@ -28,7 +28,7 @@ class Kit:
         first: Step | None = None,
         second: Step | None = None,
         general: Any = None,
-        own: tuple[OwnFunctions | LaterFunctions, ...] = (),
+        own: tuple[GeneratedFunctions | DeferredFunctions, ...] = (),
         numbers: Any = None,
         own_numbers: Any = None,
     ):

@@ -25,11 +25,11 @@ from twoloop.kernels.data.noted import FACTORED, GAMMA_SCALE, KNOWN, PIVOT, ROUN
 from twoloop.kernels.evaluation.constraints import constraint_rates, gamma_by_differences, kinematics, row_residual
 from twoloop.kernels.evaluation.partition import (
     CONTRACTION,
-    MAX_INNER,
-    ROUNDING,
+    MAX_ITERATIONS,
+    ROUNDING_OF_CORRECTIONS,
     factor_dependent,
     factor_rows,
-    tangents,
+    find_null_space,
 )
 from twoloop.kernels.evaluation.program import gamma_by_program
 from twoloop.kernels.linalg.band import banded_mass
@@ -39,7 +39,7 @@ from twoloop.kernels.linalg.saddle_point import factor, factor_mass, least_norm,
 
 @merged
 def acceleration_constraint(f, w, t, q, v):
-    """The right-hand side Gamma of G a = Gamma, into w.Gamma; DONE, or why it cannot be had."""
+    """Compute the right-hand side Gamma of G a = Gamma into w.Gamma; return DONE, or why it cannot be had."""
     n_c, n_rows = w.C.size, w.Rate.size
     if w.notes[KNOWN] == 1.0 and n_rows == n_c:
         return DONE
@@ -62,14 +62,14 @@ def acceleration_constraint(f, w, t, q, v):
 
 @merged
 def mass_matrix(f, w, t, q):
-    """M(t, q) into w.M."""
+    """Evaluate M(t, q) into w.M."""
     w.M[:, :] = 0.0
     f.mass(t, q, f.p, w.M)
 
 
 @merged
-def mass_there(f, w, t, q):
-    """M(t, q), and what is needed of it."""
+def factor_mass_at(f, w, t, q):
+    """Evaluate M(t, q), and factor it if the form needs its factors."""
     w.notes[FACTORED] = 0.0
     mass_matrix(f, w, t, q)
     code = factor_mass(f, w) if f.flags[FORM] == MULTIPLIERS or banded_mass(f) else DONE
@@ -77,8 +77,8 @@ def mass_there(f, w, t, q):
 
 
 @merged
-def factor_there(f, w, t, q):
-    """The factors of the linear problem at a state whose rows, factors and w.D stand in w."""
+def factor_at(f, w, t, q):
+    """Factor the linear problem at a state whose rows, factors and w.D stand in w."""
     if f.flags[CONSTANT_MASS] == 0:
         w.notes[FACTORED] = 0.0
         mass_matrix(f, w, t, q)
@@ -90,9 +90,9 @@ def factor_there(f, w, t, q):
 
 @merged
 def accelerate(f, w, t, q, v, a):
-    """The accelerations at a state whose rows, factors and w.D stand in w."""
+    """Compute the accelerations at a state whose rows, factors and w.D stand in w."""
     w.counters[N_EVALUATIONS] += 1
-    code = factor_there(f, w, t, q)
+    code = factor_at(f, w, t, q)
     if code == DONE:
         code = acceleration_constraint(f, w, t, q, v)
     if code != DONE:
@@ -105,13 +105,13 @@ def accelerate(f, w, t, q, v, a):
             source = source_of_acceleration(w)
             return not_finite(w.notes, source if source >= 0 or finite(w.M) else MASS, t, q)
     if f.flags[GAMMA_GIVEN] == 0 or w.Rate.size > w.C.size:
-        _note_scale(w, a)
+        _record_gamma_scale(w, a)
     return DONE
 
 
 @compiled
-def _note_scale(w, a):
-    """The largest sum of terms in G a, by which Gamma by differences is judged."""
+def _record_gamma_scale(w, a):
+    """Record the largest sum of terms in G a, by which Gamma by differences is judged."""
     for i in range(w.Rate.size):
         total = 0.0
         for p in range(w.places[i], w.places[i + 1]):
@@ -121,19 +121,19 @@ def _note_scale(w, a):
 
 @merged
 def equilibrate(f, w, a, lam):
-    """Multipliers of all rows: G^T lam = Q - M a, of least norm where rows are redundant."""
+    """Compute the multipliers of all rows, G^T lam = Q - M a, of least norm if rows are redundant."""
     lam[:] = 0.0
     multipliers(f, w, w.Q, a, lam)
     if w.rows_v.size < lam.size:
         least_norm(w, lam)
 
 
-ABOVE_ROUNDING = 10.0  # of positions: no correction is asked to be smaller
+MIN_CORRECTION = 10.0  # of positions: no correction is asked to be smaller
 
 
 @merged
-def _look(f, w, t, q, v):
-    """Rows, factors and tangents at (q, v), which need not be on the constraints."""
+def _factor_rows_at(f, w, t, q, v):
+    """Evaluate and factor the rows, and find the null space, at (q, v), which need not be on the constraints."""
     if f.flags[KINEMATICS_GIVEN] == 1:
         kinematics(f, w, t, q, v)
         w.notes[KNOWN] = 1.0
@@ -141,20 +141,20 @@ def _look(f, w, t, q, v):
     else:
         code = factor_dependent(f, w, t, q)
     if code == DONE and f.flags[FORM] == NULL_SPACE:
-        tangents(f, w, t, q)
+        find_null_space(f, w, t, q)
     return code
 
 
 @merged
-def accelerate_there(f, w, t, q, v, a):
-    """Accelerations at (q, v)."""
-    code = _look(f, w, t, q, v)
+def accelerate_at(f, w, t, q, v, a):
+    """Compute the accelerations at (q, v), which need not be on the constraints."""
+    code = _factor_rows_at(f, w, t, q, v)
     return accelerate(f, w, t, q, v, a) if code == DONE else code
 
 
 @merged
-def _move(f, w, x):
-    """Move x by the least correction in the metric of M that takes -w.g away from G x; the largest entry of it."""
+def _correct(f, w, x):
+    """Add the least correction in the metric of M to x that takes -w.g away from G x; return its largest entry."""
     w.Q[:] = 0.0
     solve(f, w, w.Q, w.g, w.y)
     largest = 0.0
@@ -167,21 +167,21 @@ def _move(f, w, x):
 
 
 @merged
-def _move_both(f, w, q, v):
-    """Correct q and v by the factors at q; the largest correction of a position, and of a velocity."""
+def _correct_both(f, w, q, v):
+    """Correct q and v by the factors at q; return the largest correction of a position, and of a velocity."""
     rows, n_c = w.rows_v, w.C.size
     for i in range(rows.size):
         w.g[rows[i]] = -w.C[rows[i]] if rows[i] < n_c else 0.0
-    moved = _move(f, w, q)
+    moved = _correct(f, w, q)
     row_residual(w, v, rows)
     for i in range(rows.size):
         w.g[rows[i]] = -w.z[i]
-    return moved, _move(f, w, v)
+    return moved, _correct(f, w, v)
 
 
 @merged
-def to_constraints(f, w, t, q, v, theta, a, lam):
-    """(q, v) put on the constraints, then accelerations and multipliers there.
+def project_state(f, w, t, q, v, theta, a, lam):
+    """Move (q, v) to the constraints, then compute accelerations and multipliers there.
 
     Rows of A hold for velocities alone; positions are moved in directions that they allow.
 
@@ -189,11 +189,11 @@ def to_constraints(f, w, t, q, v, theta, a, lam):
     at most theta times the smallest pivot, by whose inverse tangents turn, velocities are right after the same pass.
     """
     before = np.inf
-    theta = max(theta, ABOVE_ROUNDING * w.notes[ROUNDED])
-    for _ in range(MAX_INNER):
-        code = _look(f, w, t, q, v)
+    theta = max(theta, MIN_CORRECTION * w.notes[ROUNDED])
+    for _ in range(MAX_ITERATIONS):
+        code = _factor_rows_at(f, w, t, q, v)
         if code == DONE:
-            code = factor_there(f, w, t, q)
+            code = factor_at(f, w, t, q)
         if code != DONE:
             return code
         if f.flags[KINEMATICS_GIVEN] == 0:
@@ -202,7 +202,7 @@ def to_constraints(f, w, t, q, v, theta, a, lam):
         w.counters[N_INNER] += 1
         if f.flags[KINEMATICS_GIVEN] == 0 and f.flags[FORM] != NULL_SPACE:  # whose tangents needed them
             constraint_rates(f, w, t, q, w.Rate)
-        moved, faster = _move_both(f, w, q, v)
+        moved, faster = _correct_both(f, w, q, v)
         if not np.isfinite(moved):
             return not_finite(w.notes, CONSTRAINT, t, q)
         if moved <= theta and faster <= theta * max(1.0, largest_of(v)):
@@ -211,7 +211,7 @@ def to_constraints(f, w, t, q, v, theta, a, lam):
             w.notes[KNOWN] = 0.0  # the tangents are those of the end, but Gamma belongs to the velocities before
             break
         if moved > CONTRACTION * before:
-            if not moved <= ROUNDING * largest_of(q):
+            if not moved <= ROUNDING_OF_CORRECTIONS * largest_of(q):
                 return INNER_DIVERGED
             break
         before = max(moved, theta)

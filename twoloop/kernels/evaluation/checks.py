@@ -19,10 +19,10 @@ from twoloop.kernels.data.flags import (
     NONHOLONOMIC_GAMMA_GIVEN,
     REACTION_BY_Q_GIVEN,
 )
-from twoloop.kernels.linalg.dense import ldl_factor
+from twoloop.kernels.linalg.dense import largest_of, ldl_factor
 
 NO_ENTRY = 1e-12  # of the largest in a row: what rounding has left
-TURNS = 20  # of the least squares by turns, at most
+MAX_SWEEPS = 20  # of the least squares by turns, at most
 NEGLIGIBLE = 1e-6  # of the largest coordinate: smaller ones are zero by chance and are no size
 
 
@@ -38,7 +38,7 @@ def _sort(values):
 
 @exact
 def _columns_from(rows, columns, counts, logs):
-    """The units that fit best to norms of the rows; whether they are those from before."""
+    """Fit units of the columns to norms of the rows; return whether they are those from before."""
     same = True
     for j in range(columns.size):
         total, n = 0.0, 0
@@ -64,22 +64,20 @@ def _rows_from(columns, rows, counts, logs):
 
 
 @kernel(types.void(MATRIX, VECTOR, VECTOR, MATRIX, MATRIX, VECTOR, VECTOR))
-def like_sizes(matrix, typical, columns, counts, logs, rows, room):
-    """Units of the columns, by least squares of log|entry| + column - row; of zero columns, the typical ones.
+def column_units(matrix, typical, columns, counts, logs, rows, room):
+    """Compute units of the columns, by least squares of log|entry| + column - row; of zero columns, the typical ones.
 
     The unit of the whole, which is free, is the median of the typical ones. The other arrays are scratch.
     """
     n_used, shift = 0, 0.0
     for i in range(rows.size):
-        largest = 0.0
-        for j in range(columns.size):
-            largest = max(largest, abs(matrix[i, j]))
+        largest = largest_of(matrix[i])
         for j in range(columns.size):
             counts[i, j] = 1.0 if abs(matrix[i, j]) > NO_ENTRY * largest else 0.0
             logs[i, j] = math.log(abs(matrix[i, j])) if counts[i, j] != 0.0 else 0.0
     for j in range(columns.size):
         columns[j] = 0.0
-    for _ in range(TURNS):
+    for _ in range(MAX_SWEEPS):
         _rows_from(columns, rows, counts, logs)
         if _columns_from(rows, columns, counts, logs):
             break
@@ -100,8 +98,8 @@ def like_sizes(matrix, typical, columns, counts, logs, rows, room):
 
 
 @kernel(types.void(MATRIX, VECTOR, f8, VECTOR, VECTOR))
-def reaches(in_units, radius, negligible, room, reach):
-    """How far each row stays what it is: its radius, or the values of its coordinates where it is straight beside them.
+def row_reaches(in_units, radius, negligible, room, reach):
+    """Compute how far each row stays what it is: its radius, or the values of its coordinates if these are smaller.
 
     Of these it is the smaller half that counts, so that an offset does not; values that are negligible do not.
     """
@@ -124,13 +122,13 @@ def reaches(in_units, radius, negligible, room, reach):
 # flags of what is found: all is finite, M symmetric, no row empty; the state on the rows but for rounding; an M that
 # varies definite, or not
 IN_ORDER, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
-NEAR = 0.5  # of how far the coordinates move until they matter: where these are still of that size
-LEFT = 2.0**-52  # of the largest coordinate: one as small is rounding of zero
-SURELY = 2.0  # times what counts as no eigenvalue: what rounding does not reach
+NEAR_SHARE = 0.5  # of how far the coordinates move until they matter: where these are still of that size
+ROUNDING_OF_ZERO = 2.0**-52  # of the largest coordinate: one as small is rounding of zero
+EIGENVALUE_MARGIN = 2.0  # times what counts as no eigenvalue: what rounding does not reach
 
 
 def room_size(n: int, n_c: int, n_a: int) -> int:
-    """How many numbers callbacks fill, beside M and the rows, and scratch."""
+    """Return how many numbers callbacks fill, beside M and the rows, and scratch."""
     return n + 2 * (n_c + n_a) + n_c * (n + 4) + n * max(n, n_c + n_a + 1)
 
 
@@ -143,19 +141,16 @@ def _clear(A):
 
 @exact
 def _empty(rows):
-    """Whether there is a row without entries."""
+    """Return whether there is a row without entries."""
+    empty = False
     for i in range(len(rows)):
-        largest = 0.0
-        for j in range(rows.shape[1]):
-            largest = max(largest, abs(rows[i, j]))
-        if largest == 0.0:
-            return True
-    return False
+        empty = empty or largest_of(rows[i]) == 0.0
+    return empty
 
 
 @exact
 def _symmetric(mass, allowed):
-    """Whether no entry differs from its counterpart by more than this share of the largest."""
+    """Return whether no entry differs from its counterpart by more than this share of the largest."""
     largest, off, same = 0.0, 0.0, True
     for i in range(len(mass)):
         for j in range(i):
@@ -169,16 +164,8 @@ def _symmetric(mass, allowed):
 
 
 @exact
-def _largest(state):
-    largest = 0.0
-    for x in state:
-        largest = max(largest, abs(x))
-    return largest
-
-
-@exact
 def _rounding(value, row, state, sizes, least, rate, allowed):
-    """Whether a value is no more than this share of the terms that it is the sum of, no state being below its size."""
+    """Return whether a value is at most this share of the terms in its sum, no state counting below its size."""
     size = abs(rate)
     for j in range(state.size):
         size += abs(row[j]) * max(abs(state[j]), sizes[j], least)
@@ -187,46 +174,44 @@ def _rounding(value, row, state, sizes, least, rate, allowed):
 
 @exact
 def _is_near(q, sizes, place):
-    """Whether a position is near another, of which these are the sizes, so that they are its own, too."""
+    """Return whether a position is near another, of which these are the sizes, so that they are its own, too."""
     near = True
     for j in range(q.size):
-        near = near and abs(q[j] - place[j]) <= NEAR * sizes[j]
+        near = near and abs(q[j] - place[j]) <= NEAR_SHARE * sizes[j]
     return near
 
 
 @exact
-def _has(rows, entries):
-    """Whether these entries of rows count, and no others: where one vanishes by its position, sizes say little."""
+def _has_entries(rows, entries):
+    """Return whether these entries of rows count, and no others: sizes say little if one vanishes there."""
     same, n = True, rows.shape[1]
     for i in range(entries.size // n):
-        largest = 0.0
-        for j in range(n):
-            largest = max(largest, abs(rows[i, j]))
+        largest = largest_of(rows[i])
         for j in range(n):
             same = same and (abs(rows[i, j]) > NO_ENTRY * largest) == (entries[i * n + j] != 0.0)
     return same
 
 
 @exact
-def _known(q, rows, n_c, sizes):
-    """Where the sizes begin that are known of a position near this one; -1 where there are none."""
+def _find_known_sizes(q, rows, n_c, sizes):
+    """Return the place of the sizes known of a position near this one; -1: there are none."""
     n = q.size
     width = 2 * n + n_c * n
     for k in range(0, sizes.size, width):
-        if _is_near(q, sizes[k : k + n], sizes[k + n : k + 2 * n]) and _has(rows, sizes[k + 2 * n : k + width]):
+        if _is_near(q, sizes[k : k + n], sizes[k + n : k + 2 * n]) and _has_entries(rows, sizes[k + 2 * n : k + width]):
             return k
     return -1
 
 
 @exact
 def _consistent(C, rate, rows, q, v, sizes, allowed):
-    """Whether positions and velocities are on the rows but for rounding, of velocities of the fastest coordinate.
+    """Return whether positions and velocities are on the rows up to rounding, of velocities of the fastest coordinate.
 
     No coordinate counts as less than its size, where that is known, or than what rounding leaves of the largest: of
     coordinates that are zero but for rounding, as in a plane, a constraint is not zero to rounding of its terms.
     """
-    fastest, nothing = _largest(v), LEFT * _largest(q)
-    begin = _known(q, rows, C.size, sizes)
+    fastest, nothing = largest_of(v), ROUNDING_OF_ZERO * largest_of(q)
+    begin = _find_known_sizes(q, rows, C.size, sizes)
     known = q if begin < 0 else sizes[begin : begin + q.size]
     for i in range(len(rows)):
         speed = 0.0
@@ -248,10 +233,8 @@ def _note_entries(rows, pattern):
 
 @exact
 def _note_entries_near(f, t, q, ways, place, rows, n_c, pattern):
-    """Put 1 where rows have entries at positions that lie so many times the size of q from it."""
-    largest = 0.0
-    for j in range(q.size):
-        largest = max(largest, abs(q[j]))
+    """Add entries of rows to the pattern at positions that lie so many times the size of q from it."""
+    largest = largest_of(q)
     for k in range(len(ways)):
         for j in range(q.size):
             place[j] = q[j] + max(abs(q[j]), largest) * ways[k, j]
@@ -263,7 +246,7 @@ def _note_entries_near(f, t, q, ways, place, rows, n_c, pattern):
 
 @exact
 def _definite(mass, least, factors):
-    """Whether no eigenvalue is below this share of the largest entry."""
+    """Return whether no eigenvalue is below this share of the largest entry."""
     n, largest = len(mass), 0.0
     for i in range(n):
         for j in range(n):
@@ -275,13 +258,14 @@ def _definite(mass, least, factors):
 
 
 @kernel(i8(KIT, f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR), vectorized=True)
-def look(f, t, q, v, sizes, lam, room, mass, rows, ways, pattern, least):
-    """Flags of what is found at (t, q, v); arrays are full of zeros, but for `lam`, and these.
+def evaluate_start(f, t, q, v, sizes, lam, room, mass, rows, ways, pattern, least):
+    """Evaluate all callbacks at (t, q, v); return flags of what is found.
 
-    `least` are relative: what counts as rounding of a state, as the asymmetry of M, and as an eigenvalue of M. In what
-    counts as rounding, no coordinate is less than its size near one of some positions (`keep` of checks/scales.py).
-    `ways` say how far from q, over its size, rows are looked at, too. `mass` and `rows` become M, and C_q with A,
-    `pattern` 1 where rows have entries; `room`, of `room_size` numbers, begins with the force, C, and C_t with b.
+    Arrays are full of zeros, but for `lam`, and these. `least` are relative: what counts as rounding of a state, as the
+    asymmetry of M, and as an eigenvalue of M. In what counts as rounding, no coordinate is less than its size near one
+    of some positions (`keep` of checks/scales.py). `ways` say how far from q, over its size, rows are evaluated, too.
+    `mass` and `rows` become M, and C_q with A, `pattern` 1 where rows have entries; `room`, of `room_size` numbers,
+    begins with the force, C, and C_t with b.
     """
     n, n_c, n_rows, flags = q.size, lam.size, rows.shape[0], f.flags
     force, C, rate, gamma = n, n + n_c, n + n_c + n_rows, n + n_c + 2 * n_rows  # where they end
@@ -324,9 +308,9 @@ def look(f, t, q, v, sizes, lam, room, mass, rows, ways, pattern, least):
         if _consistent(room[force:C], room[C:rate], rows, q, v, sizes, least[0]):
             found |= CONSISTENT
     if flags[CONSTANT_MASS] == 0:  # beyond doubt
-        if _definite(mass, SURELY * least[2], scratch):
+        if _definite(mass, EIGENVALUE_MARGIN * least[2], scratch):
             found |= DEFINITE
-        elif not _definite(mass, least[2] / SURELY, scratch):
+        elif not _definite(mass, least[2] / EIGENVALUE_MARGIN, scratch):
             found |= INDEFINITE
     _note_entries(rows, pattern)
     near = room[end : end + n_rows * n].reshape((n_rows, n))
@@ -336,7 +320,7 @@ def look(f, t, q, v, sizes, lam, room, mass, rows, ways, pattern, least):
 
 @kernel(types.void(KIT, f8, MATRIX, i8, MATRIX))
 def rows_at(f, t, places, n_c, rows):
-    """C_q, of n_c rows, and A at each of these positions, one below the other; `rows` has zeros."""
+    """Evaluate C_q, of n_c rows, and A at each of these positions, one below the other; `rows` has zeros."""
     n_rows = len(rows) // len(places)
     for k in range(len(places)):
         begin = k * n_rows
@@ -345,8 +329,8 @@ def rows_at(f, t, places, n_c, rows):
 
 
 @exact
-def _as_given(fused, given, allowed, more):
-    """Whether no number differs by more than this share of the largest, and what a row may more."""
+def _agree(fused, given, allowed, more):
+    """Return whether no number differs by more than this share of the largest, and what a row may more."""
     largest = 0.0
     for i in range(given.shape[0]):
         for j in range(given.shape[1]):
@@ -360,7 +344,7 @@ def _as_given(fused, given, allowed, more):
 
 @kernel(types.boolean(KIT, f8, VECTOR, VECTOR, MATRIX, MATRIX, VECTOR, f8, f8))
 def kinematics_agree(f, t, q, v, fused, given, more, allowed, rounding):
-    """Whether the fused callback gives what the separate ones give, but for a share of the largest number of each.
+    """Return whether the fused callback gives what the separate ones give, up to a share of the largest number of each.
 
     Constraints may be off by rounding of their terms, too. Arrays are full of zeros: `fused` and `given` have the rows
     C, C_t and gamma, and C_q below, (3 + n_q, n_c); `more` has n_c numbers.
@@ -372,12 +356,10 @@ def kinematics_agree(f, t, q, v, fused, given, more, allowed, rounding):
     f.jacobian(t, q, f.p, by_others)
     f.constraint_rate(t, q, f.p, given[1])
     f.gamma(t, q, v, f.p, given[2])
-    agree = _as_given(by_one, by_others, allowed, more)
+    agree = _agree(by_one, by_others, allowed, more)
     for k in range(1, 3):
-        agree = agree and _as_given(
-            fused[k : k + 1].reshape((n_c, 1)), given[k : k + 1].reshape((n_c, 1)), allowed, more
-        )
+        agree = agree and _agree(fused[k : k + 1].reshape((n_c, 1)), given[k : k + 1].reshape((n_c, 1)), allowed, more)
     for i in range(n_c):
         for j in range(n):
             more[i] += rounding * abs(by_others[i, j]) * abs(q[j])
-    return agree and _as_given(fused[:1].reshape((n_c, 1)), given[:1].reshape((n_c, 1)), allowed, more)
+    return agree and _agree(fused[:1].reshape((n_c, 1)), given[:1].reshape((n_c, 1)), allowed, more)

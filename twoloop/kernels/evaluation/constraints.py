@@ -13,12 +13,12 @@ from twoloop.kernels.data.common import compiled, exact, merged
 from twoloop.kernels.data.flags import AUGMENTED, CONSTRAINT_RATE_GIVEN, FORM, NONHOLONOMIC_RATE_GIVEN
 from twoloop.kernels.data.noted import GAMMA_ACCURACY, GAMMA_REQUIRED, GAMMA_SCALE, GAMMA_SHARE, KINK_AFTER, KINK_BEFORE
 from twoloop.kernels.evaluation.program import jacobian_by_program
-from twoloop.kernels.linalg.dense import copy
+from twoloop.kernels.linalg.dense import copy, largest_of
 
 
 @merged
 def constraint_rows(f, w, t, q, G):
-    """C_q and A at (t, q) into G, which is w.G or w.Gx, full of zeros."""
+    """Evaluate C_q and A at (t, q) into G, which is w.G or w.Gx, full of zeros."""
     n_c, n_rows = w.C.size, w.Rate.size
     if n_c > 0 and not jacobian_by_program(f, w, t, q, G):
         f.jacobian(t, q, f.p, G[:n_c])
@@ -35,9 +35,9 @@ def _clear_places(w):
 
 @merged
 def clear_rows(f, w):
-    """Make w.G full of zeros.
+    """Set w.G to zero.
 
-    Where it is large, at the places of its entries alone. One at another place is found at the end of a step.
+    If it is large, only at the places of its entries. One at another place is found at the end of a step.
     """
     if f.flags[FORM] == AUGMENTED:
         _clear_places(w)
@@ -47,7 +47,7 @@ def clear_rows(f, w):
 
 @merged
 def row_residual(w, v, rows):
-    """G v + (C_t, b) of these rows, into w.z."""
+    """Compute G v + (C_t, b) of these rows into w.z."""
     for k in range(rows.size):
         row = rows[k]
         total = w.Rate[row]
@@ -58,7 +58,7 @@ def row_residual(w, v, rows):
 
 @merged
 def constraint_rates(f, w, t, q, rate):
-    """C_t and b at (t, q)."""
+    """Evaluate C_t and b at (t, q)."""
     n_c, n_rows = w.C.size, w.Rate.size
     rate[:] = 0.0
     if f.flags[CONSTRAINT_RATE_GIVEN] == 1:
@@ -69,7 +69,7 @@ def constraint_rates(f, w, t, q, rate):
 
 @merged
 def kinematics(f, w, t, q, v):
-    """C, C_q and A, C_t and b, and Gamma of the rows of C at (t, q, v), by the fused callback."""
+    """Evaluate C, C_q and A, C_t and b, and Gamma of the rows of C at (t, q, v), by the fused callback."""
     n_c, n_rows = w.C.size, w.Rate.size
     clear_rows(f, w)
     w.C[:] = 0.0
@@ -84,7 +84,7 @@ def kinematics(f, w, t, q, v):
 
 @merged
 def gather_independent_columns(G, rate, rows, independent, D):
-    """Right-hand sides for the rows of w.D."""
+    """Gather the right-hand sides for the rows of w.D."""
     for j in range(independent.size):
         column = independent[j]
         for k in range(rows.size):
@@ -93,42 +93,39 @@ def gather_independent_columns(G, rate, rows, independent, D):
         D[independent.size, k] = -rate[rows[k]]
 
 
-LENGTH, SHORTEST = 2e-4, 1e-4  # see longest_difference
+MAX_DIFFERENCE, MIN_SHARE = 2e-4, 1e-4  # see longest_difference
 LEVELS = 12  # lengths tried by _choose_length, each a quarter of the one before
-CERTAIN = 1e-9  # relative disagreement below which nothing but rounding is left
-LENGTHEN = 1e-11  # relative disagreement below which a longer length loses nothing and has less rounding
+ROUNDING_DISAGREEMENT = 1e-9  # relative disagreement below which nothing but rounding is left
+# relative disagreement below which a longer length loses nothing and has less rounding
+LENGTHENING_DISAGREEMENT = 1e-11
 # of values at 0, e, 2 e and 4 e: derivatives of order 2 over e and over 2 e
 ONE_SIDED, ONE_SIDED_TWICE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
 ONE_SIDED_LENGTH = 1.0 / 16.0  # their error is of lower order: a shorter length, so that none has to be looked for
-ROUNDING = 1e-14  # of the terms of G v over the longest length: where they cancel, Gamma cannot be had better
-ENOUGH = 0.01  # of the required accuracy: a change by less ends the search for a length
+ROUNDING_OF_TERMS = 1e-14  # of the terms of G v over the longest length: where they cancel, Gamma cannot be had better
+CONVERGED_SHARE = 0.01  # of the required accuracy: a change by less ends the search for a length
 
 
 @exact
-def representable(t, h):
-    """The difference of t + h and t as floating-point numbers: times near 1e9 s have spacings of 2e-7 s."""
+def representable_step(t, h):
+    """Return the difference of t + h and t as floating-point numbers: times near 1e9 s have spacings of 2e-7 s."""
     return (t + h) - t
 
 
 @merged
 def longest_difference(q, v):
-    """Seconds over which to difference along the motion: LENGTH, or until q moves by LENGTH max|q|.
+    """Return the time, s, over which to difference: MAX_DIFFERENCE, or until q moves by that share of max|q|.
 
-    But at least LENGTH SHORTEST.
+    But at least the share MIN_SHARE of it.
     """
-    size = 0.0
-    speed = 0.0
-    for j in range(v.size):
-        size = max(size, abs(q[j]))
-        speed = max(speed, abs(v[j]))
+    size, speed = largest_of(q), largest_of(v)
     if speed <= size:
-        return LENGTH
-    return LENGTH * max(size / speed, SHORTEST)  # where all coordinates pass through zero
+        return MAX_DIFFERENCE
+    return MAX_DIFFERENCE * max(size / speed, MIN_SHARE)  # where all coordinates pass through zero
 
 
 @merged
-def _side(notes, t, e):
-    """On which side of t differences may be taken for the sake of a known jump of C_t or b; 0: on both."""
+def _one_sided_direction(notes, t, e):
+    """Return the side of t on which to difference because of a known jump of C_t or b; 0: on both."""
     before, after = t - notes[KINK_BEFORE], notes[KINK_AFTER] - t
     if min(before, after) >= 2.0 * e:
         return 0.0
@@ -137,10 +134,10 @@ def _side(notes, t, e):
 
 @compiled
 def _differences(f, w, t, q, v, e, first, last):
-    """Gamma by differences over e and 2 e; its largest entry, the largest disagreement and the largest G v."""
+    """Difference Gamma over e and 2 e; return its largest entry, the largest disagreement and the largest G v."""
     twice = w.Gamma_tried[0]
-    side = _side(w.notes, t, e)
-    shorter = representable(t, ONE_SIDED_LENGTH * e)
+    side = _one_sided_direction(w.notes, t, e)
+    shorter = representable_step(t, ONE_SIDED_LENGTH * e)
     if side != 0.0 and shorter > 0.0:
         e = shorter
     terms = 0.0
@@ -177,21 +174,21 @@ def _differences(f, w, t, q, v, e, first, last):
 
 
 @merged
-def _limit(notes):
-    """Largest disagreement that needs no other length: the result is better by far, were it not for rounding."""
-    return max(notes[GAMMA_REQUIRED], CERTAIN) * notes[GAMMA_SCALE]
+def _max_disagreement(notes):
+    """Return the largest disagreement that needs no other length: the result is better by far, up to rounding."""
+    return max(notes[GAMMA_REQUIRED], ROUNDING_DISAGREEMENT) * notes[GAMMA_SCALE]
 
 
 @compiled
 def _choose_length(f, w, t, q, v, longest, first, last):
-    """Difference over ever shorter lengths until the result no longer changes, else keep the one that changed it least.
+    """Difference over ever shorter lengths until the result no longer changes, or keep the one that changed it least.
 
-    DONE, or GAMMA_INACCURATE where it changed by more than is allowed.
+    Returns DONE, or GAMMA_INACCURATE if it changed by more than is allowed.
     """
     best = np.inf
     share = 1.0
     for level in range(LEVELS):
-        e = representable(t, share * longest)
+        e = representable_step(t, share * longest)
         if e <= 0.0:
             break
         copy(w.Gamma, w.Gamma_tried[1])
@@ -202,20 +199,20 @@ def _choose_length(f, w, t, q, v, longest, first, last):
         change = 0.0
         for i in range(first, last):
             change = max(change, abs(w.Gamma[i] - w.Gamma_tried[1, i]))
-        if level > 0 and change < best and disagreement <= _limit(w.notes):
+        if level > 0 and change < best and disagreement <= _max_disagreement(w.notes):
             best = change
             w.notes[GAMMA_SHARE] = share
-            if change <= ENOUGH * w.notes[GAMMA_REQUIRED] * w.notes[GAMMA_SCALE]:
+            if change <= CONVERGED_SHARE * w.notes[GAMMA_REQUIRED] * w.notes[GAMMA_SCALE]:
                 break
         share *= 0.25
     w.notes[GAMMA_ACCURACY] = best / w.notes[GAMMA_SCALE]
-    _differences(f, w, t, q, v, representable(t, w.notes[GAMMA_SHARE] * longest), first, last)
+    _differences(f, w, t, q, v, representable_step(t, w.notes[GAMMA_SHARE] * longest), first, last)
     return DONE if w.notes[GAMMA_ACCURACY] <= w.notes[GAMMA_REQUIRED] else GAMMA_INACCURATE
 
 
 @compiled
 def gamma_by_differences(f, w, t, q, v, first, last):
-    """Rows first to last of Gamma by differences, into w.Gamma, or GAMMA_INACCURATE where no length will do.
+    """Compute rows first to last of Gamma by differences; return GAMMA_INACCURATE if no length will do.
 
     Gamma = -d/de [G v + (C_t, b)](t + e, q + e v) at e = 0.
 
@@ -223,15 +220,15 @@ def gamma_by_differences(f, w, t, q, v, first, last):
     longest_difference, found by trial where the two differences disagree: a drive of kilohertz needs a short one.
     """
     longest = longest_difference(q, v)
-    e = representable(t, w.notes[GAMMA_SHARE] * longest)
+    e = representable_step(t, w.notes[GAMMA_SHARE] * longest)
     if e > 0.0:
         largest, disagreement, terms = _differences(f, w, t, q, v, e, first, last)
         if np.isnan(largest) or disagreement == 0.0 or w.notes[GAMMA_SCALE] == 0.0:
             return DONE  # what is not finite is found where it is used; without a scale nothing can be judged
-        rounding = ROUNDING * terms / longest
+        rounding = ROUNDING_OF_TERMS * terms / longest
         w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], largest, rounding / w.notes[GAMMA_REQUIRED])
-        if disagreement < LENGTHEN * w.notes[GAMMA_SCALE]:
+        if disagreement < LENGTHENING_DISAGREEMENT * w.notes[GAMMA_SCALE]:
             w.notes[GAMMA_SHARE] = min(1.0, 2.0 * w.notes[GAMMA_SHARE])
-        if disagreement <= _limit(w.notes):
+        if disagreement <= _max_disagreement(w.notes):
             return DONE
     return _choose_length(f, w, t, q, v, longest, first, last)

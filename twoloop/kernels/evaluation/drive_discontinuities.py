@@ -16,23 +16,23 @@ from twoloop.kernels.data.tolerances import ATOL, RTOL, allowed
 from twoloop.kernels.evaluation.constraints import constraint_rates
 from twoloop.kernels.linalg.symbolic_factorization import jacobian_of
 
-PARTS = 12
+N_PARTS = 12
 # the twelfth difference
 BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.0, 66.0, -12.0, 1.0)
 HALVINGS = 60
-ROUNDING = 1e-11  # of C_t: what that may be for rounding's sake
-BY_TIME = 5e3  # the same, times the rounding of t and the slope
-STEEP = 4.0  # times the mean slope over the step: a ramp that the step is too long for, unless it is at most ...
-SHORT = 0.125  # ... this share of it
-NEAREST = 8.0  # spacings of floating-point numbers: no interval is halved below this length
+RATE_ROUNDING = 1e-11  # of C_t: what that may be for rounding's sake
+TIME_ROUNDING = 5e3  # the same, times the rounding of t and the slope
+STEEPNESS = 4.0  # times the mean slope over the step: a ramp that the step is too long for, unless it is at most ...
+MAX_RAMP_SHARE = 0.125  # ... this share of it
+MIN_SPACINGS = 8.0  # spacings of floating-point numbers: no interval is halved below this length
 SMOOTH, RAMP, JUMP = range(3)
 
 
 @compiled
 def _sample(f, w, t, q, way, begin, end):
-    """C_t and b at thirteen times from begin to end, on the line q + way (time - t), into w.rates."""
-    for k in range(PARTS + 1):
-        time = end if k == PARTS else begin + (end - begin) * (k / PARTS)
+    """Evaluate C_t and b at thirteen times from begin to end, on the line q + way (time - t), into w.rates."""
+    for k in range(N_PARTS + 1):
+        time = end if k == N_PARTS else begin + (end - begin) * (k / N_PARTS)
         for m in range(q.size):
             w.x[m] = q[m] + (time - t) * way[m]
         constraint_rates(f, w, time, w.x, w.rates[k])
@@ -41,19 +41,19 @@ def _sample(f, w, t, q, way, begin, end):
 
 
 @compiled
-def _bend(w, row):
+def _twelfth_difference(w, row):
     total = 0.0
-    for k in range(PARTS + 1):
+    for k in range(N_PARTS + 1):
         total += BINOMIAL[k] * w.rates[k, row]
     return abs(total)
 
 
 @compiled
 def _slope_and_size(w, row, length):
-    """Mean slope of a row over the samples, its sign left out, and its largest value."""
+    """Return the mean slope of a row over the samples, its sign left out, and its largest value."""
     change = 0.0
     largest = abs(w.rates[0, row])
-    for k in range(PARTS):
+    for k in range(N_PARTS):
         change += abs(w.rates[k + 1, row] - w.rates[k, row])
         largest = max(largest, abs(w.rates[k + 1, row]))
     return change / length, largest
@@ -61,7 +61,7 @@ def _slope_and_size(w, row, length):
 
 @compiled
 def _allowed(f, w, tolerances, x, row):
-    """What a row may be off for the tolerances of coordinates, or velocities, x."""
+    """Return the error that the tolerances of coordinates, or velocities, x allow in a row."""
     largest = 0.0
     if f.flags[FORM] == STATIC:
         rows, columns, _ = jacobian_of(f.static_program)
@@ -77,8 +77,8 @@ def _allowed(f, w, tolerances, x, row):
 
 
 @compiled
-def unexplained(tolerances, h, state, new_state, n):
-    """Largest change of a velocity that the accelerations at both ends do not explain, over the tolerances."""
+def unexplained_velocity_change(tolerances, h, state, new_state, n):
+    """Return the largest change of a velocity that accelerations at both ends do not explain, over the tolerances."""
     largest = 0.0
     for m in range(n):
         v, v1, a, a1 = state[n + m], new_state[n + m], state[2 * n + m], new_state[2 * n + m]
@@ -88,8 +88,8 @@ def unexplained(tolerances, h, state, new_state, n):
 
 
 @compiled
-def find_kink(f, w, t, end, q, v, way, tolerances):
-    """SMOOTH, RAMP or JUMP, and the interval in which the row that is least smooth rises, from t to `end`.
+def locate_discontinuity(f, w, t, end, q, v, way, tolerances):
+    """Return SMOOTH, RAMP or JUMP, and the interval from t to `end` in which the least smooth row rises.
 
     RAMP: a step of at most that length is next. Methods whose accelerations at both ends are zero see nothing of a ramp
     that fills their step.
@@ -99,24 +99,26 @@ def find_kink(f, w, t, end, q, v, way, tolerances):
     _sample(f, w, t, q, way, begin, end)
     row, limit, mean, most = -1, 0.0, 0.0, 1.0
     for i in range(w.Rate.size):
-        bend = _bend(w, i)
+        bend = _twelfth_difference(w, i)
         if bend == 0.0:  # of a row that does not depend on time
             continue
         slope, size = _slope_and_size(w, i, h)
-        least = max(_allowed(f, w, tolerances, v, i), ROUNDING * size, BY_TIME * slope * np.spacing(abs(end)))
+        least = max(
+            _allowed(f, w, tolerances, v, i), RATE_ROUNDING * size, TIME_ROUNDING * slope * np.spacing(abs(end))
+        )
         if bend > most * least:
             row, limit, mean, most = i, least, slope, bend / least
     if row < 0:
         return SMOOTH, t, end
     steepest, low, high = 0.0, begin, end
     for _ in range(HALVINGS):
-        if end - begin <= NEAREST * np.spacing(abs(end)):
+        if end - begin <= MIN_SPACINGS * np.spacing(abs(end)):
             break
         middle = begin + 0.5 * (end - begin)
         _sample(f, w, t, q, way, middle, end)
-        above = _bend(w, row)
+        above = _twelfth_difference(w, row)
         _sample(f, w, t, q, way, begin, middle)
-        below = _bend(w, row)
+        below = _twelfth_difference(w, row)
         if not max(above, below) > limit:
             break
         if above > below:
@@ -125,13 +127,13 @@ def find_kink(f, w, t, end, q, v, way, tolerances):
         else:
             end = middle
         slope, _ = _slope_and_size(w, row, end - begin)
-        if slope > steepest and end - begin <= SHORT * h and slope * (end - begin) > limit:
+        if slope > steepest and end - begin <= MAX_RAMP_SHARE * h and slope * (end - begin) > limit:
             steepest, low, high = slope, begin, end
-    if end - begin <= NEAREST * np.spacing(abs(end)):
+    if end - begin <= MIN_SPACINGS * np.spacing(abs(end)):
         _sample(f, w, t, q, way, begin, end)
-        if abs(w.rates[PARTS, row] - w.rates[0, row]) > limit:
+        if abs(w.rates[N_PARTS, row] - w.rates[0, row]) > limit:
             return JUMP, begin, end
-    if steepest > STEEP * mean:
+    if steepest > STEEPNESS * mean:
         return RAMP, low, high
     if end - begin < h:  # half the step is not smooth either: a ramp as long as the step, or a kink
         return RAMP, t, t + 0.5 * h

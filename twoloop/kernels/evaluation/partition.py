@@ -38,7 +38,7 @@ from twoloop.kernels.evaluation.constraints import (
     kinematics,
     row_residual,
 )
-from twoloop.kernels.linalg.dense import copy_matrix, note_pattern
+from twoloop.kernels.linalg.dense import contains, copy_matrix, largest_of, note_pattern
 from twoloop.kernels.linalg.markowitz_lu import (
     SIZE,
     columns_of,
@@ -52,17 +52,15 @@ from twoloop.kernels.linalg.markowitz_lu import (
 
 RANK_TOLERANCE = 1e-11  # a pivot below this counts as zero; rows are scaled to 1
 CHANGED = -1  # returned beside DONE: there is another partition now
-MANY = 200  # rows, which are not eliminated only to see how near a singular position is
-WORSE = 3.0  # a partition is renewed when max|C_qd^-1 C_qi| exceeds this multiple of what it was at first
+MAX_ROWS_ELIMINATED = 200  # rows, which are not eliminated only to see how near a singular position is
+SENSITIVITY_GROWTH = 3.0  # a partition is renewed when max|C_qd^-1 C_qi| exceeds this multiple of what it was at first
 
 
 @compiled
 def scale_rows(A):
     """Divide each row by a power of two, so that its largest entry is about 1."""
     for i in range(A.shape[0]):
-        top = 0.0
-        for j in range(A.shape[1]):
-            top = max(top, abs(A[i, j]))
+        top = largest_of(A[i])
         if top > 0.0 and top < np.inf:
             scale = 2.0 ** -np.round(np.log2(top))
             for j in range(A.shape[1]):
@@ -73,14 +71,14 @@ def scale_rows(A):
 def _largest_from(row, first):
     largest = 0.0
     for j in range(first, row.size):
-        if abs(row[j]) > largest:
+        if abs(row[j]) > largest:  # false for NaN
             largest = abs(row[j])
     return largest
 
 
 @compiled
 def full_pivoting(A, order, row_order, largest, first, last, most):
-    """Gauss elimination of A with full pivoting, in place: pivots `first`, first + 1, ... from rows up to `last`.
+    """Eliminate A by Gauss with full pivoting, in place: pivots `first`, first + 1, ... from rows up to `last`.
 
     At most until there are `most` pivots. `order` and `row_order` become the order of columns and rows. Returns the
     number of pivots there are then, the numerical rank. `largest` is scratch: the largest entry of each row, looked for
@@ -122,12 +120,12 @@ def full_pivoting(A, order, row_order, largest, first, last, most):
 
 @compiled
 def least_pivot(f, w, t, q):
-    """The smallest of the pivots at a position, over the largest, of the rows as they are; the partition stays.
+    """Return the smallest over the largest of the pivots at a position, of the rows as they are; the partition stays.
 
     Nothing is scaled: a row, or a column, may be short as the position is singular. That of factors, or of too many
     rows, is the smallest of the last partition.
     """
-    if f.flags[FORM] == STATIC or w.rows_v.size > MANY:
+    if f.flags[FORM] == STATIC or w.rows_v.size > MAX_ROWS_ELIMINATED:
         return w.notes[PIVOT]
     if w.rows_v.size == 0:
         return 1.0
@@ -184,8 +182,8 @@ def _insert_sorted(source, target):
 
 
 @compiled
-def _take_order(w):
-    """Make what `_eliminate` found the partition; False: C_qd is singular by its pattern."""
+def _adopt_order(w):
+    """Make the order that `_eliminate` found the partition; return False if C_qd is singular by its pattern."""
     rank, rank_v = w.rows.size, w.rows_v.size
     # ascending, so that the same set is always the same partition
     _insert_sorted(w.row_order[:rank], w.rows)
@@ -208,8 +206,8 @@ def _take_order(w):
 
 @compiled
 def write_programs(w):
-    """Choose the order of elimination for the numbers in w.G; False: singular."""
-    _note_places(w)
+    """Choose the order of elimination for the numbers in w.G; return False if they are singular."""
+    _record_places(w)
     w.notes[FACTORED] = 0.0
     done = make_program(w.G, w.pattern, w.rows, w.dependent, w.index, w.values)
     if done and w.Rate.size > w.C.size:
@@ -218,8 +216,8 @@ def write_programs(w):
 
 
 @compiled
-def _note_places(w):
-    """Where the entries of the rows are, see Work."""
+def _record_places(w):
+    """Record where the entries of the rows are, see Work."""
     n_rows = w.Rate.size
     place = n_rows + 1
     for i in range(n_rows):
@@ -232,8 +230,8 @@ def _note_places(w):
 
 
 @compiled
-def note_entries(w):
-    """Note the entries of w.G; whether there are new ones, so that its programs are to be written anew."""
+def record_entries(w):
+    """Record the entries of w.G; return whether there are new ones, so that its programs must be written anew."""
     if not note_pattern(w.G, w.pattern):
         return False
     w.index_a[SIZE] = 0
@@ -241,7 +239,7 @@ def note_entries(w):
 
 
 @compiled
-def partition(f, w, t, q):
+def choose_partition(f, w, t, q):
     """Choose dependent and independent coordinates at (t, q), and the rows that count.
 
     SINGULAR where the rank is less than that of the partition before; RANK_DIFFERS, with the ranks in w.notes, where
@@ -249,7 +247,7 @@ def partition(f, w, t, q):
     """
     w.entries[:] = 0.0
     constraint_rows(f, w, t, q, w.G)
-    note_entries(w)
+    record_entries(w)
     copy_matrix(w.G, w.Gx)
     w.counters[N_FACTORIZATIONS] += 1
     w.counters[N_PARTITIONS] += 1
@@ -261,12 +259,12 @@ def partition(f, w, t, q):
         return RANK_DIFFERS
     if rank < w.rows.size or rank_v < w.rows_v.size:
         return SINGULAR
-    return DONE if _take_order(w) else SINGULAR
+    return DONE if _adopt_order(w) else SINGULAR
 
 
 @compiled
 def partition_of_midpoint(f, w, t_mid, state, new_state):
-    """Take the partition that full pivoting finds in the middle of a step; DONE (= 0) where it is the present one.
+    """Adopt the partition that full pivoting finds in the middle of a step; return DONE (= 0) if it is the present one.
 
     Both directions of a step have the same middle, so that the choice, and with it the map of a symmetric tableau,
     is symmetric in time: where the partition changes, no direction is preferred, as it is by waiting until it has to be
@@ -280,7 +278,7 @@ def partition_of_midpoint(f, w, t_mid, state, new_state):
         w.x[j] = 0.5 * (state[j] + new_state[j])
     w.entries[:] = 0.0
     constraint_rows(f, w, t_mid, w.x, w.G)
-    new = note_entries(w)
+    new = record_entries(w)
     copy_matrix(w.G, w.Gx)
     rank, rank_v = w.rows.size, w.rows_v.size
     w.counters[N_FACTORIZATIONS] += 1
@@ -291,24 +289,21 @@ def partition_of_midpoint(f, w, t_mid, state, new_state):
     if same and not new and _same_set(w.independent_v, w.order[rank_v:]):
         return DONE
     w.counters[N_PARTITIONS] += 1
-    return CHANGED if _take_order(w) else SINGULAR
+    return CHANGED if _adopt_order(w) else SINGULAR
 
 
 @merged
 def _same_set(a, b):
     same = True
-    for m in a:
-        found = False
-        for k in b:
-            found = found or k == m
-        same = same and found
+    for number in a:
+        same = same and contains(b, number)
     return same
 
 
 @compiled
-def renew(f, w, t, q):
+def choose_oriented_partition(f, w, t, q):
     """Choose a partition at an accepted state, and note the sign of det C_qd that its motion has to keep."""
-    code = partition(f, w, t, q)
+    code = choose_partition(f, w, t, q)
     w.notes[ORIENTATION] = 0.0
     if code != DONE:
         return code
@@ -320,25 +315,13 @@ def renew(f, w, t, q):
 
 
 @compiled
-def _largest(D, n_dof):
-    largest = 0.0
-    for j in range(n_dof):
-        for k in range(D.shape[1]):
-            largest = max(largest, abs(D[j, k]))
-    return largest
-
-
-@compiled
 def _largest_share(w):
-    """Of the rows that count in a redundant one, all scaled to 1, as the last multipliers left them in w.minimum."""
+    """Return the largest share of a row that counts in a redundant one, all scaled to 1, from w.minimum."""
     rows = rows_of(w.index_v)
     largest = 0.0
     place = 0
     for row in range(w.Rate.size):
-        counts = False
-        for k in w.rows_v:
-            counts = counts or k == row
-        if counts:
+        if contains(w.rows_v, row):
             continue
         size = _largest_from(w.G[row], 0)
         for k in range(rows.size):
@@ -351,35 +334,37 @@ def _largest_share(w):
 
 @compiled
 def partition_is_poor(w):
-    """Whether dependents move much faster per independent than when the partition was chosen.
+    """Return whether dependents move much faster per independent than when the partition was chosen.
 
     Measures max|C_qd^-1 C_qi|, which is in w.D. Full pivoting leaves it near 1; it grows without bound where the
     independent coordinates stop being valid. So does the share that rows which count have in a redundant one, where
     they come to depend on each other: C_qd is singular there, but not C_q.
     """
-    largest = _largest(w.D, w.independent_v.size)
+    largest = 0.0
+    for j in range(w.independent_v.size):
+        largest = max(largest, largest_of(w.D[j]))
     if w.notes[SENSITIVITY] == 0.0:  # first look at a new partition
         w.notes[SENSITIVITY] = max(largest, 1.0)
-    if not largest <= WORSE * w.notes[SENSITIVITY]:
+    if not largest <= SENSITIVITY_GROWTH * w.notes[SENSITIVITY]:
         return True
     if w.rows_v.size == w.Rate.size or w.factors.size > 0:  # whose rows that count are chosen at every state
         return False
     share = _largest_share(w)
     if w.notes[LEANING] == 0.0:
         w.notes[LEANING] = max(share, 1.0)
-    return not share <= WORSE * w.notes[LEANING]
+    return not share <= SENSITIVITY_GROWTH * w.notes[LEANING]
 
 
-MAX_INNER = 25  # Newton iterations; quadratic convergence needs 2 to 5
+MAX_ITERATIONS = 25  # Newton iterations; quadratic convergence needs 2 to 5
 CONTRACTION = 0.5  # each correction must be at most this times the one before
-ROUNDING = 1e-12  # relative to the largest value: changes of this size no longer shrink
-CONTRADICTS = 1e-7  # relative to the mechanism's size: what a redundant row may be violated by
+ROUNDING_OF_CORRECTIONS = 1e-12  # relative to the largest value: changes of this size no longer shrink
+MAX_VIOLATION = 1e-7  # relative to the mechanism's size: what a redundant row may be violated by
 
 
 @compiled
 def _factor_anew(w, t, q):
-    """The factors by another order of elimination, or why there are none."""
-    note_entries(w)
+    """Factor by another order of elimination, or return why there are no factors."""
+    record_entries(w)
     if not finite(w.G):
         return not_finite(w.notes, JACOBIAN, t, q)
     if not write_programs(w):
@@ -390,7 +375,7 @@ def _factor_anew(w, t, q):
 
 @merged
 def factor_rows(w, t, q):
-    """The factors of the dependent columns of w.G."""
+    """Factor the dependent columns of w.G."""
     w.notes[FACTORED] = 0.0
     ratio = factor(w.entries, w.index, w.values)
     w.counters[N_FACTORIZATIONS] += 1
@@ -403,7 +388,7 @@ def factor_rows(w, t, q):
 
 @merged
 def factor_dependent(f, w, t, q):
-    """C_q and A at (t, q), and the factors of the dependent columns."""
+    """Evaluate C_q and A at (t, q), and factor the dependent columns."""
     w.notes[KNOWN] = 0.0
     clear_rows(f, w)
     constraint_rows(f, w, t, q, w.G)
@@ -411,8 +396,8 @@ def factor_dependent(f, w, t, q):
 
 
 @merged
-def positions(f, w, t, q, v, tolerance, reuse):
-    """Eq. (15): Newton on the dependent positions of q, update first, then test the correction.
+def restore_positions(f, w, t, q, v, tolerance, reuse):
+    """Solve eq. (15) by Newton's method for the dependent positions: update first, then test the correction.
 
     Leaves rows and factors at q in w, or those before a last correction of at most `reuse`; by the fused callback also
     w.Rate and w.Gamma at v, which is not restored yet.
@@ -420,7 +405,7 @@ def positions(f, w, t, q, v, tolerance, reuse):
     before = np.inf
     converged = w.C.size == 0
     fused = f.flags[KINEMATICS_GIVEN] == 1
-    for _ in range(MAX_INNER):
+    for _ in range(MAX_ITERATIONS):
         if fused:
             kinematics(f, w, t, q, v)
             code = factor_rows(w, t, q)
@@ -448,10 +433,7 @@ def positions(f, w, t, q, v, tolerance, reuse):
         if not converged and correction > CONTRACTION * before:
             # at large coordinates rounding may stand above the tolerance; else this is no longer Newton's region,
             # and to go on could end on another assembly of the mechanism
-            largest = 0.0
-            for j in range(q.size):
-                largest = max(largest, abs(q[j]))
-            converged = correction <= ROUNDING * largest
+            converged = correction <= ROUNDING_OF_CORRECTIONS * largest_of(q)
             if not converged:
                 return INNER_DIVERGED
         before = correction
@@ -459,8 +441,8 @@ def positions(f, w, t, q, v, tolerance, reuse):
 
 
 @merged
-def tangents(f, w, t, q):
-    """The velocities that the constraints allow into w.D, from the rows and factors in w."""
+def find_null_space(f, w, t, q):
+    """Compute the velocities that the constraints allow into w.D, from the rows and factors in w."""
     if f.flags[KINEMATICS_GIVEN] == 0 or w.notes[KNOWN] == 0.0:
         constraint_rates(f, w, t, q, w.Rate)
     gather_independent_columns(w.G, w.Rate, rows_of(w.index_v), w.independent_v, w.D)
@@ -469,8 +451,8 @@ def tangents(f, w, t, q):
 
 
 @merged
-def velocities(f, w, t, q, v, reuse):
-    """Eq. (14): the dependent velocities of v, G_d v_d = -(C_t, b) - G_i v_i, from the rows and factors in w.
+def restore_velocities(f, w, t, q, v, reuse):
+    """Solve eq. (14) for the dependent velocities, G_d v_d = -(C_t, b) - G_i v_i, by the rows and factors in w.
 
     After the fused callback w.Gamma is known where they change by at most `reuse`.
     """
@@ -478,7 +460,7 @@ def velocities(f, w, t, q, v, reuse):
     n_dof = w.independent_v.size
     w.notes[KNOWN] = float(f.flags[KINEMATICS_GIVEN])
     if f.flags[FORM] == NULL_SPACE:
-        tangents(f, w, t, q)
+        find_null_space(f, w, t, q)
         for k in range(rows.size):
             w.z[k] = w.D[n_dof, k]
         for j in range(n_dof):
@@ -502,21 +484,16 @@ def velocities(f, w, t, q, v, reuse):
 
 @compiled
 def redundant_rows_hold(f, w, t, q, v):
-    """Whether the rows that were left out hold at an accepted state; needs C_q and A there in w.G."""
+    """Check whether the rows that were left out hold at an accepted state; needs C_q and A there in w.G."""
     w.C[:] = 0.0
     f.constraint(t, q, f.p, w.C)
-    size, speed = 1.0, 1.0
-    for j in range(q.size):
-        size = max(size, abs(q[j]))
-        speed = max(speed, abs(v[j]))
+    size, speed = max(1.0, largest_of(q)), max(1.0, largest_of(v))
     for i in range(w.Rate.size):
-        largest = 0.0
-        total = w.Rate[i]
+        largest, total = largest_of(w.G[i]), w.Rate[i]
         for j in range(q.size):
-            largest = max(largest, abs(w.G[i, j]))
             total += w.G[i, j] * v[j]
-        off = abs(w.C[i]) > CONTRADICTS * size * largest if i < w.C.size else False
-        if off or abs(total) > CONTRADICTS * speed * largest:
+        off = abs(w.C[i]) > MAX_VIOLATION * size * largest if i < w.C.size else False
+        if off or abs(total) > MAX_VIOLATION * speed * largest:
             w.notes[CONTRADICTION] = i
             return ROWS_CONTRADICT
     return DONE

@@ -11,8 +11,8 @@ TABLE, STATES = types.float64[:, ::1], types.float64[:, :, ::1]
 
 
 @compiled
-def _off(value, allowed):
-    """A residual over what is allowed."""
+def _relative_residual(value, allowed):
+    """Divide a residual by what is allowed."""
     if not np.isfinite(value):
         return np.inf
     if value == 0.0:
@@ -21,8 +21,8 @@ def _off(value, allowed):
 
 
 @kernel(types.void(KIT, INTEGERS, f8, f8, f8, INTEGERS, TABLE, STATES, STATES, TABLE, VECTOR, VECTOR))
-def disagreement(f, sizes, t, share, atol, runs, parameters, states_q, states_v, ends, room, worst):
-    """Of each run the largest residual of C = 0, C_q v + C_t = 0, C_q a = gamma and M a + C_q^T lam = Q over `share`.
+def motion_residuals(f, sizes, t, share, atol, runs, parameters, states_q, states_v, ends, room, worst):
+    """Compute each run's largest residual of C = 0, C_q v + C_t = 0, C_q a = gamma, M a + C_q^T lam = Q over `share`.
 
     That is a share of the terms of a row, beside which positions and velocities may be off by `atol`.
     runs : of each row its run, -1: it is left out; parameters : of all runs, (., n_p), from sizes[2] on in p; states_q,
@@ -63,10 +63,10 @@ def disagreement(f, sizes, t, share, atol, runs, parameters, states_q, states_v,
                 faster += G[i, j] * v[j]
                 off += G[i, j] * a[j]
                 terms += abs(G[i, j] * a[j])
-            largest = max(largest, _off(C[i], row * (share * far + atol)))
-            largest = max(largest, _off(faster, row * (share * fast + atol) + share * abs(rate[i])))
+            largest = max(largest, _relative_residual(C[i], row * (share * far + atol)))
+            largest = max(largest, _relative_residual(faster, row * (share * fast + atol) + share * abs(rate[i])))
             if gamma_given:
-                largest = max(largest, _off(off, share * terms + row * atol))
+                largest = max(largest, _relative_residual(off, share * terms + row * atol))
         size, apart = 0.0, 0.0
         for j in range(n):
             total, most = -Q[j], abs(Q[j])
@@ -78,13 +78,13 @@ def disagreement(f, sizes, t, share, atol, runs, parameters, states_q, states_v,
                 total, most = total + term, max(most, abs(term))
             size = max(size, most)
             apart = max(apart, abs(total)) if np.isfinite(total) else np.inf
-        largest = max(largest, _off(apart, share * size))
+        largest = max(largest, _relative_residual(apart, share * size))
         worst[k] = largest
 
 
 @kernel(types.void(KIT, INTEGERS, f8, f8, TABLE, TABLE, TABLE, VECTOR, VECTOR))
-def violation(f, sizes, t, slow, parameters, q, v, room, worst):
-    """Of each state the largest |C| and |C_q v + C_t| over the sum of a row of |C_q| times the largest entry of q or v.
+def constraint_residuals(f, sizes, t, slow, parameters, q, v, room, worst):
+    """Compute each state's largest |C| and |C_q v + C_t|, relative to the row of |C_q| and the largest entry of q or v.
 
     slow : speed below which velocities count as if one of them were as large; room : (n_c (n + 2),).
     """
@@ -105,4 +105,6 @@ def violation(f, sizes, t, slow, parameters, q, v, room, worst):
             for j in range(n):
                 row += abs(G[i, j])
                 faster += G[i, j] * v[k, j]
-            worst[k] = max(worst[k], _off(C[i], row * far), _off(faster, row * fast + abs(rate[i])))
+            worst[k] = max(
+                worst[k], _relative_residual(C[i], row * far), _relative_residual(faster, row * fast + abs(rate[i]))
+            )

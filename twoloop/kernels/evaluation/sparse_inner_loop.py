@@ -36,24 +36,24 @@ from twoloop.kernels.data.noted import (
     SMALLEST,
 )
 from twoloop.kernels.evaluation import tasks
-from twoloop.kernels.evaluation.accelerations import ABOVE_ROUNDING
+from twoloop.kernels.evaluation.accelerations import MIN_CORRECTION
 from twoloop.kernels.evaluation.constraints import constraint_rates
-from twoloop.kernels.evaluation.partition import CONTRACTION, CONTRADICTS, MAX_INNER, ROUNDING
+from twoloop.kernels.evaluation.partition import CONTRACTION, MAX_ITERATIONS, MAX_VIOLATION, ROUNDING_OF_CORRECTIONS
 from twoloop.kernels.evaluation.program import gamma_by_program, jacobian_by_program
 from twoloop.kernels.linalg.dense import copy, has_new_entries, largest_of
-from twoloop.kernels.linalg.sparse_ldl import factor, load, refined, solve
+from twoloop.kernels.linalg.sparse_ldl import factor, load, solve, solve_refined
 from twoloop.kernels.linalg.symbolic_factorization import N_OFF, N_PIVOTS, jacobian_of, mass_of, order_of
 
-SUSPECT = 1e-6  # a pivot below this share of its size is looked at: that of a redundant row is rounding
-LEAST = 1e-10  # ... and one below this share no factors with pivots of one row can do with
+SUSPECT_PIVOT = 1e-6  # a pivot below this share of its size is looked at: that of a redundant row is rounding
+MIN_PIVOT = 1e-10  # ... and one below this share no factors with pivots of one row can do with
 DEPENDENT = 1e-11  # sine of the angle to the other rows, found without cancellation, up to which a row is redundant
-CAREFUL = 2.0  # of NEARLY_SINGULAR: stages are put on the constraints, as it matters how well they keep to these
-ONCE, TWICE = 1e-3, 1e-7  # the smallest share, below which solutions are refined, and refined again
+PROJECT_STAGES = 2.0  # of NEARLY_SINGULAR: stages are put on the constraints, as it matters how well they keep to these
+REFINED_ONCE, REFINED_TWICE = 1e-3, 1e-7  # the smallest share, below which solutions are refined, and refined again
 
 
 @compiled
-def mass_values_there(f, w, t, q):
-    """The entries of M into w.mass_values; of a constant dense M they stand there from the beginning."""
+def fill_mass_values(f, w, t, q):
+    """Evaluate the entries of M into w.mass_values; those of a constant dense M stand there from the beginning."""
     if f.flags[MASS_VALUES_GIVEN] == 1:
         w.mass_values[:] = 0.0
         f.mass_values(t, q, f.p, w.mass_values)
@@ -67,8 +67,8 @@ def mass_values_there(f, w, t, q):
 
 
 @compiled
-def jacobian_values_there(f, w, t, q):
-    """The entries of C_q into w.jacobian_values."""
+def fill_jacobian_values(f, w, t, q):
+    """Evaluate the entries of C_q into w.jacobian_values."""
     if f.flags[JACOBIAN_VALUES_GIVEN] == 1:
         w.jacobian_values[:] = 0.0
         f.jacobian_values(t, q, f.p, w.jacobian_values)
@@ -84,7 +84,7 @@ def jacobian_values_there(f, w, t, q):
 
 @compiled
 def _factor(f, w, least):
-    """The factors for the values there are; the smallest pivot over its size, see sparse_ldl.py."""
+    """Factor the current values; return the smallest pivot over its size, see sparse_ldl.py."""
     w.counters[N_FACTORIZATIONS] += 1
     stiffness = w.solutions[3 * f.static_program[N_PIVOTS] :]
     load(f.static_program, w.mass_values, w.jacobian_values, w.counts, w.factors, stiffness, w.pivot_sizes)
@@ -96,7 +96,7 @@ def _factor(f, w, least):
 
 @compiled
 def _factor_fault(w, t, q):
-    """Which values are not finite; where all are, whether M is singular, as dense forms may accept, or the rows are."""
+    """Return which values are not finite; else whether M is singular, as dense forms may accept, or the rows."""
     if not finite_vector(w.mass_values):
         return not_finite(w.notes, MASS, t, q)
     if not finite_vector(w.jacobian_values):
@@ -105,31 +105,27 @@ def _factor_fault(w, t, q):
 
 
 @compiled
-def factors_there(f, w, t, q):
-    """The factors at (t, q), of the rows that count."""
+def factor_at(f, w, t, q):
+    """Factor at (t, q), with the rows that count."""
     if f.flags[CONSTANT_MASS] == 0:
-        mass_values_there(f, w, t, q)
-    jacobian_values_there(f, w, t, q)
-    smallest = _factor(f, w, LEAST)
+        fill_mass_values(f, w, t, q)
+    fill_jacobian_values(f, w, t, q)
+    smallest = _factor(f, w, MIN_PIVOT)
     if not smallest > 0.0:
         return _factor_fault(w, t, q)
-    return DONE if _number(w.counts) == w.rows_v.size else _choose_again(f, w, t, q)
-
-
-@compiled
-def _choose_again(f, w, t, q):
-    """Rows that count have come to depend on one another: others may do in their place."""
-    w.counters[N_PARTITIONS] += 1
-    code = _choose(f, w, t, q)
-    return _take(w) if code == DONE else code
+    if _count(w.counts) == w.rows_v.size:
+        return DONE
+    w.counters[N_PARTITIONS] += 1  # rows that count have come to depend on one another: others may do in their place
+    code = _choose_rows(f, w, t, q)
+    return _adopt_rows(w) if code == DONE else code
 
 
 @compiled
 def solve_values(f, w, times):
-    """Solve for the right-hand side in w.unknowns, in its place, refined so many times."""
+    """Solve for the right-hand side in w.unknowns, in its place, refined `times` times."""
     n = f.static_program[N_PIVOTS]
     scratch = w.solutions
-    return refined(
+    return solve_refined(
         f.static_program,
         w.mass_values,
         w.jacobian_values,
@@ -145,43 +141,30 @@ def solve_values(f, w, times):
 
 
 @compiled
-def refinements(w):
-    """How often solutions with these factors are to be refined."""
+def n_refinements(w):
+    """Return how often solutions with these factors are to be refined."""
     smallest = w.notes[SMALLEST]
-    return 0 if smallest > ONCE else 1 if smallest > TWICE else 2
-
-
-@compiled
-def _row_as_force(f, w, row):
-    """[g, 0] into w.unknowns for a row g of G."""
-    w.unknowns[:] = 0.0
-    rows, columns, _ = jacobian_of(f.static_program)
-    for k in range(rows.size):
-        if rows[k] == row:
-            w.unknowns[columns[k]] += w.jacobian_values[k]
-
-
-@compiled
-def _squared_in_mass(f, w, x):
-    """x^T M x."""
-    rows, columns, _ = mass_of(f.static_program)
-    total = 0.0
-    for k in range(rows.size):
-        total += x[rows[k]] * w.mass_values[k] * x[columns[k]]
-    return total
+    return 0 if smallest > REFINED_ONCE else 1 if smallest > REFINED_TWICE else 2
 
 
 @compiled
 def _sine(f, w, row, size):
-    """The sine of the angle of a row that does not count to those that do; `size` is g M^-1 g^T."""
-    _row_as_force(f, w, row)
+    """Return the sine of the angle of a row that does not count to those that do; `size` is g M^-1 g^T."""
+    x, part = w.unknowns, 0.0
+    x[:] = 0.0
+    rows, columns, _ = jacobian_of(f.static_program)
+    for k in range(rows.size):  # x = [g, 0] for the row g
+        if rows[k] == row:
+            x[columns[k]] += w.jacobian_values[k]
     solve_values(f, w, 2)
-    part = _squared_in_mass(f, w, w.unknowns[: w.Q.size])
+    rows, columns, _ = mass_of(f.static_program)
+    for k in range(rows.size):  # x^T M x
+        part += x[rows[k]] * w.mass_values[k] * x[columns[k]]
     return np.sqrt(part / size) if size > 0.0 else 0.0
 
 
 @compiled
-def _number(counts):
+def _count(counts):
     number = 0
     for i in range(counts.size):
         number += int(counts[i])
@@ -189,14 +172,14 @@ def _number(counts):
 
 
 @compiled
-def _choose(f, w, t, q):
-    """Which rows count, into w.counts, and the factors of these; DONE, or why that cannot be said.
+def _choose_rows(f, w, t, q):
+    """Choose the rows that count, into w.counts, and factor with them; return DONE, or why that cannot be said.
 
     Rows with small pivots are left out at first, and taken one after another if they are independent of those that
     count by then.
     """
     w.counts[:] = 1.0
-    if not _factor(f, w, SUSPECT) > 0.0:
+    if not _factor(f, w, SUSPECT_PIVOT) > 0.0:
         return _factor_fault(w, t, q)
     order, n_q = order_of(f.static_program), w.Q.size
     copy(w.counts, w.z)  # 0 for rows to look at
@@ -207,18 +190,18 @@ def _choose(f, w, t, q):
         sine = _sine(f, w, row, w.pivot_sizes[k])
         if sine <= DEPENDENT:
             continue
-        number = _number(w.counts)
+        number = _count(w.counts)
         w.counts[row] = 1.0
-        smallest = _factor(f, w, LEAST) if sine * sine > LEAST else 0.0
-        if not smallest > 0.0 or _number(w.counts) != number + 1:
+        smallest = _factor(f, w, MIN_PIVOT) if sine * sine > MIN_PIVOT else 0.0
+        if not smallest > 0.0 or _count(w.counts) != number + 1:
             return _factor_fault(w, t, q)
     return DONE
 
 
 @compiled
-def _take(w):
+def _adopt_rows(w):
     """Make the rows that count those of the workspace, which has room for so many."""
-    if _number(w.counts) != w.rows_v.size:
+    if _count(w.counts) != w.rows_v.size:
         return SINGULAR
     place = 0
     for i in range(w.counts.size):
@@ -230,30 +213,30 @@ def _take(w):
 
 @compiled
 def choose_rows(f, w, t, q):
-    """Choose the rows that count at (t, q); RANK_DIFFERS where the workspace is made for another number of them."""
+    """Choose the rows that count at (t, q); return RANK_DIFFERS if the workspace is made for another number of them."""
     w.counters[N_PARTITIONS] += 1
-    mass_values_there(f, w, t, q)
-    jacobian_values_there(f, w, t, q)
-    code = _choose(f, w, t, q)
+    fill_mass_values(f, w, t, q)
+    fill_jacobian_values(f, w, t, q)
+    code = _choose_rows(f, w, t, q)
     if code != DONE:
         return code
-    number = _number(w.counts)
+    number = _count(w.counts)
     if w.notes[GENERATION] == 0.0 and number != w.rows_v.size:
         w.notes[RANK] = w.notes[RANK_V] = number
         return RANK_DIFFERS
     w.notes[GENERATION] += 1.0
-    return _take(w)
+    return _adopt_rows(w)
 
 
-SHARE = 1e-11  # of the squares of a column of G: W
-ENOUGH = 1e-14  # of the largest force: what may be left of b
-ALLOWED = 1e-9  # ... and what may be left where it no longer shrinks
-MOST = 30  # solutions
+REGULARIZATION = 1e-11  # of the squares of a column of G: W
+CONVERGED_RESIDUAL = 1e-14  # of the largest force: what may be left of b
+MAX_RESIDUAL = 1e-9  # ... and what may be left where it no longer shrinks
+MAX_SOLUTIONS = 30  # solutions
 
 
 @compiled
 def _load(program, jacobian, n_q, weights, values):
-    """The numbers of the matrix into their slots; `weights` is room for n_q numbers."""
+    """Put the numbers of the matrix into their slots; `weights` is room for n_q numbers."""
     rows, columns, slots = jacobian_of(program)
     for j in range(n_q):
         weights[j] = 0.0
@@ -265,14 +248,16 @@ def _load(program, jacobian, n_q, weights, values):
     for s in range(n + program[N_OFF]):
         values[s] = 0.0
     for k in range(n):
-        values[k] = SHARE * (weights[order[k]] if weights[order[k]] > 0.0 else largest) if order[k] < n_q else -1.0
+        values[k] = (
+            REGULARIZATION * (weights[order[k]] if weights[order[k]] > 0.0 else largest) if order[k] < n_q else -1.0
+        )
     for k in range(rows.size):
         values[slots[k]] += jacobian[k]
 
 
 @compiled
 def _residual(program, jacobian, force, x, r):
-    """[b - G^T lam, lam - G x] for x = [x, lam]; the largest of its forces over the largest of b."""
+    """Compute [b - G^T lam, lam - G x] for x = [x, lam]; return the largest of its forces over the largest of b."""
     n_q, largest, left = force.size, 0.0, 0.0
     copy(force, r[:n_q])
     for i in range(n_q, x.size):
@@ -289,7 +274,7 @@ def _residual(program, jacobian, force, x, r):
 
 @compiled
 def least_norm(f, w, lam):
-    """The multipliers of least norm with the same G^T lam, in the place of lam; NEEDS_DENSE if they are not found."""
+    """Replace lam by the multipliers of least norm with the same G^T lam; return NEEDS_DENSE if they are not found."""
     program, n_q = f.static_program, w.Q.size
     n = program[N_PIVOTS]
     n_factors = n + program[N_OFF] + 1
@@ -309,8 +294,8 @@ def least_norm(f, w, lam):
     for i in range(n):
         x[i] = 0.0
     before = _residual(program, w.jacobian_values, force, x, change)
-    for _ in range(MOST):
-        if before <= ENOUGH:
+    for _ in range(MAX_SOLUTIONS):
+        if before <= CONVERGED_RESIDUAL:
             break
         solve(program, values, without, change, y)
         for i in range(n):
@@ -320,14 +305,14 @@ def least_norm(f, w, lam):
             before = left
             break
         before = left
-    if not before <= ALLOWED:
+    if not before <= MAX_RESIDUAL:
         return NEEDS_DENSE
     copy(x[n_q:], lam)
     return DONE
 
 
 @compiled
-def _rows_times(f, w, x, out):
+def _add_jacobian_times(f, w, x, out):
     """Add G x to out."""
     rows, columns, _ = jacobian_of(f.static_program)
     for k in range(rows.size):
@@ -336,7 +321,7 @@ def _rows_times(f, w, x, out):
 
 @compiled
 def _gamma(f, w, t, q, v):
-    """The right-hand side of the acceleration constraints, into w.Gamma."""
+    """Compute the right-hand side of the acceleration constraints into w.Gamma."""
     w.Gamma[:] = 0.0
     if f.flags[GAMMA_GIVEN] == 1:
         f.gamma(t, q, v, f.p, w.Gamma)
@@ -346,7 +331,7 @@ def _gamma(f, w, t, q, v):
 
 @compiled
 def _acceleration_fault(w, t, q):
-    """Which callback gave an acceleration that is not finite."""
+    """Return which callback gave an acceleration that is not finite."""
     if not finite_vector(w.Gamma):
         return not_finite(w.notes, GAMMA, t, q)
     if not finite_vector(w.Q):
@@ -356,7 +341,7 @@ def _acceleration_fault(w, t, q):
 
 @compiled
 def _accelerate(f, w, t, q, v, a):
-    """The accelerations by the factors there are; multipliers go into w.z."""
+    """Compute the accelerations by the current factors; multipliers go into w.z."""
     w.counters[N_EVALUATIONS] += 1
     code = _gamma(f, w, t, q, v)
     if code != DONE:
@@ -366,7 +351,7 @@ def _accelerate(f, w, t, q, v, a):
     n = a.size
     copy(w.Q, w.unknowns[:n])
     copy(w.Gamma, w.unknowns[n:])
-    solve_values(f, w, refinements(w))
+    solve_values(f, w, n_refinements(w))
     copy(w.unknowns[:n], a)
     copy(w.unknowns[n:], w.z)
     return DONE if finite_vector(a) else _acceleration_fault(w, t, q)
@@ -374,14 +359,14 @@ def _accelerate(f, w, t, q, v, a):
 
 @compiled
 def _equilibrate(f, w, lam):
-    """Multipliers of all rows, of least norm where rows are redundant."""
+    """Compute the multipliers of all rows, of least norm if rows are redundant."""
     copy(w.z, lam)
     return least_norm(f, w, lam) if w.rows_v.size < lam.size else DONE
 
 
 @compiled
 def _move(f, w, x):
-    """Move x by the least correction in the metric of M that takes -w.g away from G x; the largest entry of it."""
+    """Add the least correction in the metric of M to x that takes -w.g away from G x; return its largest entry."""
     n = x.size
     w.unknowns[:n] = 0.0
     copy(w.g, w.unknowns[n:])
@@ -397,11 +382,11 @@ def _move(f, w, x):
 
 @compiled
 def _to_constraints(f, w, t, q, v, theta):
-    """(q, v) put on the constraints, as accelerations.py says; the factors are those before the last correction."""
+    """Move (q, v) to the constraints as accelerations.py does; the factors are those before the last correction."""
     before = np.inf
-    theta = max(theta, ABOVE_ROUNDING * w.notes[ROUNDED])
-    for _ in range(MAX_INNER):
-        code = factors_there(f, w, t, q)
+    theta = max(theta, MIN_CORRECTION * w.notes[ROUNDED])
+    for _ in range(MAX_ITERATIONS):
+        code = factor_at(f, w, t, q)
         if code != DONE:
             return code
         w.C[:] = 0.0
@@ -414,7 +399,7 @@ def _to_constraints(f, w, t, q, v, theta):
             return not_finite(w.notes, CONSTRAINT, t, q)
         constraint_rates(f, w, t, q, w.Rate)
         copy(w.Rate, w.g)
-        _rows_times(f, w, v, w.g)
+        _add_jacobian_times(f, w, v, w.g)
         for i in range(w.g.size):
             w.g[i] = -w.g[i]
         faster = _move(f, w, v)
@@ -425,32 +410,32 @@ def _to_constraints(f, w, t, q, v, theta):
         if moved <= w.notes[PIVOT] * theta:
             return DONE
         if moved > CONTRACTION * before:
-            return DONE if moved <= ROUNDING * largest_of(q) else INNER_DIVERGED
+            return DONE if moved <= ROUNDING_OF_CORRECTIONS * largest_of(q) else INNER_DIVERGED
         before = max(moved, theta)
     return INNER_DIVERGED
 
 
 @compiled
-def _is_as_planned(w):
-    """Whether a dense mass matrix has its entries where the program expects them; the Jacobian's are seen to."""
+def _mass_pattern_holds(w):
+    """Return whether a dense mass matrix has its entries where the program expects them."""
     return w.M.size == 0 or not has_new_entries(w.M, w.mass_pattern)
 
 
 @compiled
 def _redundant_rows_hold(f, w, t, q, v):
-    """Whether the rows that were left out hold at an accepted state, whose entries stand in w."""
+    """Check whether the rows that were left out hold at an accepted state, whose entries stand in w."""
     w.C[:] = 0.0
     f.constraint(t, q, f.p, w.C)
     size, speed = max(1.0, largest_of(q)), max(1.0, largest_of(v))
     copy(w.Rate, w.g)
-    _rows_times(f, w, v, w.g)
+    _add_jacobian_times(f, w, v, w.g)
     rows, _, _ = jacobian_of(f.static_program)
     largest = w.solutions[: w.g.size]
     largest[:] = 0.0
     for k in range(rows.size):
         largest[rows[k]] = max(largest[rows[k]], abs(w.jacobian_values[k]))
     for i in range(w.g.size):
-        if abs(w.C[i]) > CONTRADICTS * size * largest[i] or abs(w.g[i]) > CONTRADICTS * speed * largest[i]:
+        if abs(w.C[i]) > MAX_VIOLATION * size * largest[i] or abs(w.g[i]) > MAX_VIOLATION * speed * largest[i]:
             w.notes[CONTRADICTION] = i
             return ROWS_CONTRADICT
     return DONE
@@ -458,11 +443,11 @@ def _redundant_rows_hold(f, w, t, q, v):
 
 @compiled
 def _solve(f, w, r, c, a, lam):
-    """The solution for any right-hand side, by the factors there are."""
+    """Solve for any right-hand side, by the current factors."""
     n = r.size
     copy(r, w.unknowns[:n])
     copy(c, w.unknowns[n:])
-    solve_values(f, w, refinements(w))
+    solve_values(f, w, n_refinements(w))
     copy(w.unknowns[:n], a)
     copy(w.unknowns[n:], lam)
     return DONE
@@ -470,14 +455,14 @@ def _solve(f, w, r, c, a, lam):
 
 @compiled
 def _other_task(f, w, task, t, q, v, a, lam):
-    if task == tasks.TANGENTS:
-        return factors_there(f, w, t, q)
-    if task == tasks.RENEW:
+    if task == tasks.FIND_NULL_SPACE:
+        return factor_at(f, w, t, q)
+    if task == tasks.RENEW_PARTITION:
         return choose_rows(f, w, t, q)
-    if task == tasks.MASS_TASK:
-        mass_values_there(f, w, t, q)
+    if task == tasks.PREPARE_MASS:
+        fill_mass_values(f, w, t, q)
         return DONE if finite_vector(w.mass_values) else not_finite(w.notes, MASS, t, q)
-    if task == tasks.REDUNDANT:
+    if task == tasks.CHECK_REDUNDANT:
         return _redundant_rows_hold(f, w, t, q, v)
     if task == tasks.SOLVE:
         return _solve(f, w, q, v, a, lam)
@@ -485,18 +470,18 @@ def _other_task(f, w, task, t, q, v, a, lam):
 
 
 @kernel(INNER)
-def static_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
-    """What the names of the tasks say, at (t, q, v), see inner_loop.py; of SOLVE, q and v are the right-hand side."""
-    if task in (tasks.EVALUATE, tasks.EVALUATE_THERE):
+def sparse_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
+    """Do a task at (t, q, v), see inner_loop.py; of SOLVE, q and v are the right-hand side."""
+    if task in (tasks.EVALUATE, tasks.EVALUATE_AS_GIVEN):
         code = DONE
-        if task == tasks.EVALUATE and w.notes[NEARLY_SINGULAR] == CAREFUL:
+        if task == tasks.EVALUATE and w.notes[NEARLY_SINGULAR] == PROJECT_STAGES:
             code = _to_constraints(f, w, t, q, v, tolerance)
         if code == DONE:
-            code = factors_there(f, w, t, q)
+            code = factor_at(f, w, t, q)
         return _accelerate(f, w, t, q, v, a) if code == DONE else code
     if task == tasks.MULTIPLIERS:
         return _equilibrate(f, w, lam)
-    if task >= tasks.TANGENTS:
+    if task >= tasks.FIND_NULL_SPACE:
         return _other_task(f, w, task, t, q, v, a, lam)
     code = DONE
     if task != tasks.ACCELERATIONS:
@@ -507,4 +492,4 @@ def static_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     if code != DONE:
         return code
     code = _equilibrate(f, w, lam)
-    return code if _is_as_planned(w) else NEEDS_DENSE
+    return code if _mass_pattern_holds(w) else NEEDS_DENSE

@@ -6,7 +6,7 @@ from numba import types
 from numba.extending import typeof_impl
 
 from twoloop.kernels.compile.callbacks import VECTOR
-from twoloop.kernels.compile.generated_functions import OwnFunctions, has_wide_vectors
+from twoloop.kernels.compile.generated_functions import GeneratedFunctions, has_wide_vectors
 from twoloop.kernels.compile.reference import Reference
 from twoloop.kernels.data.common import INTEGERS, merged
 
@@ -70,7 +70,7 @@ TASKS_OF_SERIES = (
 )
 CODE = Reference("LaneKit", {})
 ALL_TASKS = (*TASKS, *TASKS_OF_STARTS, *TASKS_OF_STAGES, *TASKS_OF_EXPLICIT, *TASKS_OF_SERIES)
-CODE.add_own_functions(dict.fromkeys(ALL_TASKS, types.none(types.int64, VECTOR, VECTOR)))
+CODE.add_llvm_functions(dict.fromkeys(ALL_TASKS, types.none(types.int64, VECTOR, VECTOR)))
 # of a method, (code, settings, control, options, room, status, n_steps, within): a step H of each lane that runs, and
 # whether it is ACCEPTED, with its end in NEW, A and LAM; or, `within` the step that was just accepted, NEW, X seconds
 # after its beginning, of the lanes that FINE names, off the constraints as yet
@@ -90,7 +90,7 @@ SHORTEST = 1e-13  # step, of the time
 class LaneKit:
     """The functions made for a mechanism and the step of a method, as kernels get them."""
 
-    def __init__(self, own: OwnFunctions, step: Any = None):
+    def __init__(self, own: GeneratedFunctions, step: Any = None):
         self.__dict__.update(dict.fromkeys(ALL_TASKS, 0))
         self.__dict__.update(own.addresses)
         self.own, self.step = own, step

@@ -4,8 +4,8 @@ A band is kept as LAPACK wants it, entry (i, j) at [j, top + i - j] of a C-order
 of M, 2 b for an LU, whose row exchanges fill another b diagonals. b is the bandwidth that the system declares.
 
 The routines are those of the library that SciPy brings. Addresses differ from process to process and kernels are kept
-on disk, so no address is compiled in: `addresses` are put into the workspace once a run, and `call` takes one of them.
-(Numba has LAPACK only for dense matrices and with allocation.)
+on disk, so no address is compiled in: a run puts `lapack_addresses` into its workspace, and `call_lapack` takes one of
+them. (Numba has LAPACK only for dense matrices and with allocation.)
 """
 
 import numpy as np
@@ -20,15 +20,15 @@ from twoloop.kernels.data.common import compiled, inlined, merged
 from twoloop.kernels.data.flags import BANDWIDTH, DIAGONAL_MASS
 from twoloop.kernels.linalg.dense import lu_factor, lu_solve
 
-# places in `addresses`: Cholesky of a banded matrix and its solve, LU with row exchanges real and complex
+# places in `lapack_addresses`: Cholesky of a banded matrix and its solve, LU with row exchanges real and complex
 ROUTINES = ("dpbtrf", "dpbtrs", "dgbtrf", "dgbtrs", "zgbtrf", "zgbtrs")
 DPBTRF, DPBTRS, DGBTRF, DGBTRS, ZGBTRF, ZGBTRS, N_ROUTINES = range(7)
 
 UPPER, NO_TRANSPOSE = ord("U"), ord("N")
 
 
-def addresses() -> list[int]:
-    """Where the ROUTINES are in this process.
+def lapack_addresses() -> list[int]:
+    """Return the addresses of the ROUTINES in this process.
 
     Raises
     ------
@@ -43,7 +43,7 @@ def addresses() -> list[int]:
 
 
 @intrinsic
-def call(typing_context, address, arguments):
+def call_lapack(typing_context, address, arguments):
     """Call the routine at `address` with Fortran's conventions; its last argument, `info`, is added and returned.
 
     `arguments` is a tuple of arrays, given by their first element, and of integers, given by a 32-bit copy, which
@@ -76,13 +76,13 @@ BANDED_FROM = 56
 
 
 def banded_pays(n_q: int, n_c: int, bandwidth: int) -> bool:
-    """Whether banded linear algebra is faster than dense, and fits into the memory that is there for the dense."""
+    """Return whether banded linear algebra is faster than dense, and fits into the memory of the dense matrices."""
     return n_q >= max(BANDED_FROM, 3 * bandwidth + 2 + 2 * n_c)
 
 
 @merged
 def banded_mass(f):
-    """Whether M is factored as a band (a diagonal M is simpler still)."""
+    """Return whether M is factored as a band (a diagonal M is simpler still)."""
     return f.flags[BANDWIDTH] >= 0 and f.flags[DIAGONAL_MASS] == 0
 
 
@@ -94,14 +94,14 @@ def _mass_band(w, b):
 
 @inlined
 def _mass_diagonals(w, b):
-    """Entry (i, i + k) of M at [k, i]; behind the factor."""
+    """Return the memory behind the factor, with entry (i, i + k) of M at [k, i]."""
     n = w.Q.size
     return w.L.reshape(n * n)[n * (b + 1) : 2 * n * (b + 1)].reshape((b + 1, n))
 
 
 @compiled
 def factor_banded_mass(f, w):
-    """The Cholesky factor of w.M and its diagonals, kept in the memory of w.L."""
+    """Factor w.M by Cholesky; its factor and its diagonals stand in the memory of w.L."""
     n = w.Q.size
     b = f.flags[BANDWIDTH]
     band = _mass_band(w, b)
@@ -112,20 +112,20 @@ def factor_banded_mass(f, w):
     for k in range(b + 1):
         for i in range(n - k):
             diagonals[k, i] = w.M[i, i + k]
-    return DONE if call(w.lapack[DPBTRF], (UPPER, n, b, band, b + 1)) == 0 else MASS_NOT_DEFINITE
+    return DONE if call_lapack(w.lapack[DPBTRF], (UPPER, n, b, band, b + 1)) == 0 else MASS_NOT_DEFINITE
 
 
 @merged
 def solve_banded_mass(f, w, x):
-    """x becomes M^-1 x."""
+    """Replace x by M^-1 x."""
     n = w.Q.size
     b = f.flags[BANDWIDTH]
-    call(w.lapack[DPBTRS], (UPPER, n, b, 1, _mass_band(w, b), b + 1, x, n))
+    call_lapack(w.lapack[DPBTRS], (UPPER, n, b, 1, _mass_band(w, b), b + 1, x, n))
 
 
 @compiled
 def add_banded_mass_times(f, w, x, y):
-    """y += M x, along the diagonals: rows of a band are too short to be fast."""
+    """Add M x to y along the diagonals: rows of a band are too short to be fast."""
     n = w.Q.size
     for i in range(n):
         y[i] += w.M[i, i] * x[i]
@@ -146,7 +146,7 @@ def add_banded_mass_times(f, w, x, y):
 
 @inlined
 def lu_band(numbers, n, b):
-    """The part of `numbers` that holds B, and then its LU: entry (i, j) at [j, 2 b + i - j]."""
+    """Return the part of `numbers` that holds B, and then its LU: entry (i, j) at [j, 2 b + i - j]."""
     return numbers[: n * (3 * b + 1)].reshape((n, 3 * b + 1))
 
 
@@ -170,17 +170,17 @@ def _scratch(numbers, n, n_c, b):
 
 @compiled
 def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
-    """Factor the system whose B stands in lu_band(numbers); the routines are xGBTRF and xGBTRS of its kind."""
+    """Factor the system whose B stands in lu_band(numbers) by xGBTRF and xGBTRS of its kind."""
     n_c, n = Cq.shape
     band = lu_band(numbers, n, b)
     rows = pivots[: n - n_c].view(np.int32)
-    if call(w.lapack[factorize], (n, n, b, b, band, 3 * b + 1, rows)) != 0:
+    if call_lapack(w.lapack[factorize], (n, n, b, b, band, 3 * b + 1, rows)) != 0:
         return SINGULAR
     border = _border(numbers, n, n_c, b)
     for i in range(n_c):
         for j in range(n):
             border[i, j] = Cq[i, j]
-    call(w.lapack[substitute], (NO_TRANSPOSE, n, b, b, n_c, band, 3 * b + 1, rows, border, n))
+    call_lapack(w.lapack[substitute], (NO_TRANSPOSE, n, b, b, n_c, band, 3 * b + 1, rows, border, n))
     S = _complement(numbers, n, n_c, b)
     for i in range(n_c):
         for k in range(n_c):
@@ -195,7 +195,7 @@ def solve_bordered(w, b, Cq, numbers, pivots, substitute, x):
     """Solve with the factors of `factor_bordered`; x (n_q) is overwritten."""
     n_c, n = Cq.shape
     band, rows = lu_band(numbers, n, b), pivots[: n - n_c].view(np.int32)
-    call(w.lapack[substitute], (NO_TRANSPOSE, n, b, b, 1, band, 3 * b + 1, rows, x, n))
+    call_lapack(w.lapack[substitute], (NO_TRANSPOSE, n, b, b, 1, band, 3 * b + 1, rows, x, n))
     mu = _scratch(numbers, n, n_c, b)
     for i in range(n_c):
         mu[i] = 0.0

@@ -8,14 +8,14 @@ from twoloop.kernels.data.common import compiled, merged
 
 @merged
 def copy(source, target):
-    """Element by element: numba's slice assignment allocates."""
+    """Copy element by element: numba's slice assignment allocates."""
     for i in range(source.size):
         target[i] = source[i]
 
 
 @merged
 def copy_matrix(source, target):
-    """Row by row, as far as both have them."""
+    """Copy row by row, as far as both have rows."""
     for i in range(min(source.shape[0], target.shape[0])):
         for j in range(source.shape[1]):
             target[i, j] = source[i, j]
@@ -23,22 +23,31 @@ def copy_matrix(source, target):
 
 @merged
 def largest_of(x):
-    """max|x_i| of a vector; 0 of an empty one."""
-    found = 0.0
+    """Return max|x_i| of a vector; 0 of an empty one."""
+    largest = 0.0
     for j in range(x.size):
-        found = max(found, abs(x[j]))
+        largest = max(largest, abs(x[j]))
+    return largest
+
+
+@merged
+def contains(numbers, number):
+    """Return whether a number is among others."""
+    found = False
+    for each in numbers:
+        found = found or each == number
     return found
 
 
 @merged
-def _size(x):
-    """|x|, or of a complex number the sum of its parts' as LAPACK has it: no square root."""
+def _magnitude(x):
+    """Return |x|, or |Re x| + |Im x| of a complex number as LAPACK does: no square root."""
     return abs(x.real) + abs(x.imag)
 
 
 @merged
 def lu_factor(A, pivots):
-    """LU factors of A, real or complex, with row exchanges, in place, 1/u_kk on the diagonal.
+    """Factor A, real or complex, into L U with row exchanges, in place; 1/u_kk stands on the diagonal.
 
     Returns min|u_kk| / max|u_kk|; 0 for a singular matrix or one with values that are not finite.
     """
@@ -47,9 +56,9 @@ def lu_factor(A, pivots):
     largest = 0.0
     for k in range(n):
         p = k
-        top = _size(A[k, k])
+        top = _magnitude(A[k, k])
         for i in range(k + 1, n):
-            size = _size(A[i, k])
+            size = _magnitude(A[i, k])
             if size > top:
                 top = size
                 p = i
@@ -74,7 +83,7 @@ def lu_factor(A, pivots):
 
 @merged
 def lu_sign(A, pivots):
-    """Sign of the determinant of a real matrix, from the factors of `lu_factor`."""
+    """Return the sign of the determinant of a real matrix from the factors of `lu_factor`."""
     sign = 1.0
     for k in range(A.shape[0]):
         if (A[k, k] < 0.0) != (pivots[k] != k):
@@ -104,7 +113,7 @@ def lu_solve(A, pivots, x):
 
 @merged
 def ldl_factor(A):
-    """Factors U^T D^-1 U of a symmetric A from its upper triangle, in place: 1/d_k on the diagonal, U above it.
+    """Factor a symmetric A into U^T D^-1 U from its upper triangle, in place: 1/d_k on the diagonal, U above it.
 
     Returns False if A is not positive definite or has values that are not finite.
     """
@@ -124,7 +133,7 @@ def ldl_factor(A):
 
 @merged
 def invert_definite(A):
-    """A symmetric positive definite A becomes its inverse, by Gauss and Jordan's elimination.
+    """Replace a symmetric positive definite A by its inverse, by Gauss-Jordan elimination.
 
     Returns False if A is not positive definite or has values that are not finite.
     """
@@ -182,7 +191,7 @@ def ldl_solve_rows(A, B):
 
 @merged
 def has_new_entries(G, pattern):
-    """Whether an entry of G is not zero for the first time."""
+    """Return whether an entry of G outside its pattern is not zero."""
     entries, seen = G.reshape(G.size), pattern.reshape(pattern.size)
     unseen = 0.0  # a sum without a branch: there is nothing new at nearly every look
     for i in range(seen.size):
@@ -192,7 +201,7 @@ def has_new_entries(G, pattern):
 
 @compiled
 def note_pattern(G, pattern):
-    """Note the entries of G that are not zero; whether there are new ones."""
+    """Add the entries of G that are not zero to its pattern; return whether there are new ones."""
     if not has_new_entries(G, pattern):
         return False
     new = False

@@ -7,24 +7,24 @@ enough, those with the least fill are taken, not the largest ones, so that neigh
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, i8, kernel
 
 NONE, NUMBER, VARIES = 0, 1, 2  # kinds of entries
-SHORTEST = 4  # rows, of which two are searched for a block: with all of them it takes milliseconds for 60 rows
+ROWS_SEARCHED = 4  # rows, of which two are searched for a block: with all of them it takes milliseconds for 60 rows
 # Limits of a block: the sum of squares of what the other coordinates, each moved by 1, do to its own; and the square of
 # the sine between its columns, or of one pivot over its column of G. With the first ones pivots stay large for most of
 # a turn (spatial four-bar: 98 % of the time, 34 % with the second ones); the last ones are far enough from LEAST of
 # generate/null_space.py
-LARGEST, PARALLEL = (4.0, 20.0, 200.0), (0.2**2, 0.1**2, 0.04**2)
+MAX_SQUARES, MIN_SINE_SQUARES = (4.0, 20.0, 200.0), (0.2**2, 0.1**2, 0.04**2)
 SMALL = 1e-3  # of the largest entry of its row: a number that is not divided by
-ROUNDING = 1e-12  # what is left of numbers that cancel
+CANCELLATION = 1e-12  # what is left of numbers that cancel
 
 
 def room_size(n_rows: int, n: int) -> tuple[int, int]:
-    """How many numbers, and integers, `dependents` takes for scratch."""
+    """Return how many numbers, and integers, `choose_dependent_columns` takes for scratch."""
     return n_rows * n + n, n_rows * n + 3 * n_rows + 2 * n
 
 
 @compiled
-def _constant(R, K, row_left, row_sizes, column_sizes):
-    """The place, n times the row plus the column, of the number with the least fill; -1: there is none."""
+def _find_constant_pivot(R, K, row_left, row_sizes, column_sizes):
+    """Return the place, n times the row plus the column, of the constant entry with the least fill; -1: none."""
     best, best_fill, best_size, (m, n) = -1, 0, 0, R.shape
     for i in range(m):
         if not row_left[i]:
@@ -44,8 +44,8 @@ def _constant(R, K, row_left, row_sizes, column_sizes):
 
 
 @compiled
-def _suits(R, column_left, squares, i, k, j, l, largest, parallel):
-    """Whether the entries of rows i and k, or of row i alone, in columns j and l, may be pivots."""
+def _is_pivot_block(R, column_left, squares, i, k, j, l, largest, parallel):
+    """Return whether the entries of rows i and k, or of row i alone, in columns j and l, may be pivots."""
     n, total = R.shape[1], 0.0
     if i == k:
         square = R[i, j] * R[i, j]
@@ -66,8 +66,8 @@ def _suits(R, column_left, squares, i, k, j, l, largest, parallel):
 
 
 @compiled
-def _varying(R, K, row_left, column_left, squares, rows, column_sizes, found):
-    """Whether there are pivots among entries that vary; `found` gets two rows and two columns, or one of each twice."""
+def _find_varying_pivots(R, K, row_left, column_left, squares, rows, column_sizes, found):
+    """Find pivots among entries that vary: `found` gets two rows and two columns, or one of each twice."""
     m, n = R.shape
     n_rows = 0
     column_sizes[:] = 0
@@ -84,8 +84,8 @@ def _varying(R, K, row_left, column_left, squares, rows, column_sizes, found):
                 place -= 1
             rows[place], rows[m + place] = i, size
             n_rows += 1
-    n_searched = min(n_rows, SHORTEST)
-    for tier in range(len(LARGEST)):
+    n_searched = min(n_rows, ROWS_SEARCHED)
+    for tier in range(len(MAX_SQUARES)):
         for size in (2, 1):
             best = -1
             for x in range(n_searched):
@@ -107,7 +107,9 @@ def _varying(R, K, row_left, column_left, squares, rows, column_sizes, found):
                             fill *= n_columns - size
                             if best >= 0 and fill >= best:
                                 continue
-                            if _suits(R, column_left, squares, i, k, j, l, LARGEST[tier], PARALLEL[tier]):
+                            if _is_pivot_block(
+                                R, column_left, squares, i, k, j, l, MAX_SQUARES[tier], MIN_SINE_SQUARES[tier]
+                            ):
                                 best = fill
                                 found[0], found[1], found[2], found[3] = i, k, j, l
             if best >= 0:
@@ -117,7 +119,7 @@ def _varying(R, K, row_left, column_left, squares, rows, column_sizes, found):
 
 @compiled
 def _subtract(R, K, column_left, row_sizes, column_sizes, r, j, i):
-    """Take row i, solved for column j, times its entry there from row r, which has none there then."""
+    """Subtract row i, solved for column j, from row r, so that row r has no entry there."""
     factor, kind = R[r, j], K[r, j]
     R[r, j], K[r, j] = 0.0, NONE
     if kind == NONE:
@@ -128,7 +130,7 @@ def _subtract(R, K, column_left, row_sizes, column_sizes, r, j, i):
             change = factor * R[i, c]
             left, had_one = R[r, c] - change, K[r, c] != NONE
             K[r, c] = max(K[r, c], kind, K[i, c])
-            if K[r, c] == NUMBER and abs(left) <= ROUNDING * abs(change):
+            if K[r, c] == NUMBER and abs(left) <= CANCELLATION * abs(change):
                 left, K[r, c] = 0.0, NONE
             R[r, c] = left
             more = (K[r, c] != NONE) - had_one
@@ -137,7 +139,7 @@ def _subtract(R, K, column_left, row_sizes, column_sizes, r, j, i):
 
 @compiled
 def _eliminate(R, K, row_left, column_left, row_sizes, column_sizes, i, k, j, l):
-    """Solve rows i and k for columns j and l, or one for one, and take these out of the other rows.
+    """Solve rows i and k for columns j and l, or one for one, and eliminate these from the other rows.
 
     `row_sizes` and `column_sizes` are kept of single rows: how many entries there are.
     """
@@ -169,8 +171,8 @@ def _eliminate(R, K, row_left, column_left, row_sizes, column_sizes, i, k, j, l)
 
 
 @kernel(i8(MATRIX, INTEGERS, INTEGERS, i8, VECTOR, INTEGERS, INTEGERS))
-def dependents(G, kinds, rows, n_kept, room, work, out):
-    """How many blocks there are, 0 where no coordinates will do: of the rows `rows` of G, the first `n_kept` of them.
+def choose_dependent_columns(G, kinds, rows, n_kept, room, work, out):
+    """Choose dependent columns for the first `n_kept` of the rows `rows` of G; return the number of blocks, 0: none.
 
     kinds : of the entries of G, row by row. out : of each block two rows, as places in `rows`, and two columns, or one
     of each twice.
@@ -197,7 +199,7 @@ def dependents(G, kinds, rows, n_kept, room, work, out):
     n_left, n_blocks = n_kept, 0
     while n_left > 0:
         found = out[4 * n_blocks : 4 * n_blocks + 4]
-        place = _constant(R, K, row_left, row_sizes, column_sizes)
+        place = _find_constant_pivot(R, K, row_left, row_sizes, column_sizes)
         if place < 0:
             break
         found[0] = found[1] = place // n
@@ -206,7 +208,7 @@ def dependents(G, kinds, rows, n_kept, room, work, out):
         n_left, n_blocks = n_left - 1, n_blocks + 1
     while n_left > 0:
         found = out[4 * n_blocks : 4 * n_blocks + 4]
-        if not _varying(R, K, row_left, column_left, squares, both, column_sizes, found):
+        if not _find_varying_pivots(R, K, row_left, column_left, squares, both, column_sizes, found):
             return 0
         _eliminate(R, K, row_left, column_left, row_sizes, column_sizes, found[0], found[1], found[2], found[3])
         n_left, n_blocks = n_left - (1 if found[0] == found[1] else 2), n_blocks + 1

@@ -21,8 +21,8 @@ THRESHOLD = 0.1  # of the largest entry in its column, which a pivot must have
 FULL = 0.5  # of the subtractions of a full matrix, from which on factors are dense
 SMALL = 3  # rows up to which they never are
 ZERO = 1e-11  # a pivot below this fraction of the largest one counts as zero
-LONGEST, PER_ROW = 2000, 100  # a list has at most LONGEST + PER_ROW r subtractions: what memory there is
-WIDEST = 64  # entries that a row or a column of the factors may have
+MIN_SUBTRACTIONS, PER_ROW = 2000, 100  # a list has at most LONGEST + PER_ROW r subtractions: what memory there is
+MAX_ENTRIES_PER_LINE = 64  # entries that a row or a column of the factors may have
 
 ORDERED, SINGULAR_MATRIX, TOO_MANY = range(3)  # what `order` finds; the last: too many entries to be worth it
 
@@ -39,75 +39,75 @@ COLUMNS, SOURCES, ROWS, N_LISTS = range(4)  # of a row: columns and sources of i
 
 
 def index_size(r: int) -> int:
-    """Length of `index` for r rows."""
-    return N_HEAD + 6 * r + 1 + (3 + N_LISTS) * r * min(r, WIDEST) + longest_list(r) + N_COUNTS * r
+    """Return the length of `index` for r rows."""
+    return N_HEAD + 6 * r + 1 + (3 + N_LISTS) * r * min(r, MAX_ENTRIES_PER_LINE) + max_subtractions(r) + N_COUNTS * r
 
 
 def values_size(r: int, may_be_dense: bool = True) -> int:
-    """Length of `values` for r rows."""
-    return r * (r if may_be_dense else min(r, WIDEST)) + r
+    """Return the length of `values` for r rows."""
+    return r * (r if may_be_dense else min(r, MAX_ENTRIES_PER_LINE)) + r
 
 
-def longest_list(r: int) -> int:
-    """How many subtractions a program may have."""
-    return min(r * r * (r + 1) // 2, LONGEST + PER_ROW * r)
+def max_subtractions(r: int) -> int:
+    """Return how many subtractions a program may have: what memory there is."""
+    return min(r * r * (r + 1) // 2, MIN_SUBTRACTIONS + PER_ROW * r)
 
 
 @inlined
 def rows_of(index):
-    """Rows of the matrix in the order of elimination."""
+    """Return the rows of the matrix in the order of elimination."""
     return index[N_HEAD : N_HEAD + index[SIZE]]
 
 
 @inlined
 def columns_of(index):
-    """Columns of the matrix in the order of elimination."""
+    """Return the columns of the matrix in the order of elimination."""
     return index[N_HEAD + index[SIZE] : N_HEAD + 2 * index[SIZE]]
 
 
 @inlined
 def pivots_of(index):
-    """Row exchanges of dense factors."""
+    """Return the row exchanges of dense factors."""
     return index[N_HEAD + 2 * index[SIZE] : N_HEAD + 3 * index[SIZE]]
 
 
 @merged
 def begin_upper(r):
-    """Where it stands where the rows of U begin."""
+    """Return the place in `index` of the places where the rows of U begin."""
     return N_HEAD + 3 * r
 
 
 @merged
 def end_upper(r):
-    """... where they end."""
+    """Return the place in `index` of the places where the rows of U end."""
     return N_HEAD + 4 * r
 
 
 @merged
 def begin_lower(r):
-    """... where the rows of L begin, and the last one ends."""
+    """Return the place in `index` of the places where the rows of L begin, and where the last one ends."""
     return N_HEAD + 5 * r
 
 
 @merged
-def slots(r):
-    """Where rows, columns and sources of the entries stand."""
+def begin_entries(r):
+    """Return the place in `index` where rows, columns and sources of the entries stand."""
     return N_HEAD + 6 * r + 1
 
 
 @inlined
 def lists_of(index, values):
-    """Where a matrix to be ordered stands: (N_COUNTS, r), (N_LISTS, r, entries), and the entries of each column."""
+    """Return the lists of a matrix to be ordered: (N_COUNTS, r), (N_LISTS, r, entries), and the entries by column."""
     r = index[SIZE]
-    width = min(r, WIDEST)
+    width = min(r, MAX_ENTRIES_PER_LINE)
     counts = index[index.size - N_COUNTS * r :].reshape((N_COUNTS, r))
     lists = index[index.size - (N_COUNTS + N_LISTS * width) * r : index.size - N_COUNTS * r]
     return counts, lists.reshape((N_LISTS, r, width)), values[r : r + r * width].reshape((r, width))
 
 
 @compiled
-def begin(index, r):
-    """Empty lists for a matrix of r rows."""
+def clear_lists(index, r):
+    """Empty the lists for a matrix of r rows."""
     index[SIZE] = r
     index[DENSE] = 0
     for k in range(index.size - N_COUNTS * r, index.size):
@@ -115,8 +115,8 @@ def begin(index, r):
 
 
 @compiled
-def put(matrix, i, j, number, source):
-    """Add entry (i, j), which is not there yet; False: there is no room."""
+def put_entry(matrix, i, j, number, source):
+    """Add entry (i, j), which is not in the lists yet; return whether there was room."""
     counts, lists, numbers = matrix
     n, m = counts[ROW_SIZE, i], counts[COLUMN_SIZE, j]
     if n == numbers.shape[1] or m == numbers.shape[1]:
@@ -131,7 +131,7 @@ def put(matrix, i, j, number, source):
 
 @compiled
 def _choose_pivot(matrix, rows, columns, k):
-    """Row and column of pivot k: that with the least fill among those large enough; (-1, -1): none.
+    """Return row and column of pivot k: the one with the least fill among those large enough; (-1, -1): none.
 
     Among equals it is the largest, then the first in the order so far.
     """
@@ -162,7 +162,7 @@ def _choose_pivot(matrix, rows, columns, k):
 
 @merged
 def _exchange(order, place, k, chosen):
-    """Bring what is chosen to place k; -1, or 1 where it is there already."""
+    """Move `chosen` to place k; return -1, or 1 if it is there already: the sign of the permutation."""
     p, other = place[chosen], order[k]
     order[k], order[p] = chosen, other
     place[chosen], place[other] = k, p
@@ -171,7 +171,7 @@ def _exchange(order, place, k, chosen):
 
 @compiled
 def _subtract(matrix, row, column, pivot, j, nothing):
-    """Subtract the row of the pivot from the others in column j, and take it away there; False: there is no room."""
+    """Subtract the pivot's row from the others in column j, and remove it from there; return whether there was room."""
     counts, lists, numbers = matrix
     for m in range(counts[COLUMN_SIZE, j]):
         counts[FOUND, lists[ROWS, j, m]] = m + 1
@@ -186,7 +186,7 @@ def _subtract(matrix, row, column, pivot, j, nothing):
         if found > 0:
             numbers[j, found - 1] -= change
         else:
-            done = done and put(matrix, i, j, -change, nothing)
+            done = done and put_entry(matrix, i, j, -change, nothing)
     last = counts[COLUMN_SIZE, j] - 1
     for m in range(last + 1):
         counts[FOUND, lists[ROWS, j, m]] = 0
@@ -197,9 +197,9 @@ def _subtract(matrix, row, column, pivot, j, nothing):
 
 @compiled
 def order(index, matrix, nothing, zero):
-    """Eliminate the entries in the lists with full freedom of choice, and write the program of that order.
+    """Eliminate the entries in the lists with free choice of pivots, and write the program of that order.
 
-    What comes in is gathered from `nothing`, where there is a zero. A pivot of at most `zero` of the largest counts as
+    Fill-in is gathered from place `nothing`, where there is a zero. A pivot of at most `zero` of the largest counts as
     none. Returns ORDERED, with rows and columns of the matrix in `index`, SINGULAR_MATRIX or TOO_MANY.
     """
     counts, lists, numbers = matrix
@@ -242,9 +242,9 @@ def _sort(columns, sources, size, place):
 
 @compiled
 def _size_of_program(rows, counts, lists):
-    """How many entries the factors have, and how many subtractions make them; sorts the lists of the rows.
+    """Return how many entries the factors have, and how many subtractions make them; sort the lists of the rows.
 
-    Leaves how many entries of U are in the row at each place in counts[ROW_LEFT].
+    Leaves the number of entries of U of the row at each place in counts[ROW_LEFT].
     """
     place = counts[COLUMN_PLACE]
     entries, subtractions = 0, 0
@@ -262,14 +262,14 @@ def _size_of_program(rows, counts, lists):
 
 @compiled
 def _write(index, counts, lists):
-    """Write the program; False: one for a full matrix would be quicker, or it is too long."""
+    """Write the program; return whether it is short enough: False if that of a full matrix would be quicker."""
     r = index[SIZE]
     rows = rows_of(index)
     n_slots, subtractions = _size_of_program(rows, counts, lists)
     full = (r * (r - 1) * (2 * r - 1)) / 6.0
-    if subtractions > LONGEST + PER_ROW * r or (r > SMALL and subtractions > FULL * full):
+    if subtractions > MIN_SUBTRACTIONS + PER_ROW * r or (r > SMALL and subtractions > FULL * full):
         return False
-    in_row, in_column = slots(r), slots(r) + n_slots
+    in_row, in_column = begin_entries(r), begin_entries(r) + n_slots
     source, target = in_column + n_slots, in_column + 2 * n_slots
     slot = r
     for k in range(r - 1, -1, -1):
@@ -308,10 +308,10 @@ GROWTH = 1e3  # largest multiplier before the order of elimination is chosen ane
 def make_program(G, pattern, rows, columns, index, values):
     """Choose the order of elimination of G[rows][:, columns], whose entries are where `pattern` is not zero.
 
-    False: the matrix is singular.
+    Returns False for a singular matrix.
     """
     r, width = rows.size, G.shape[1]
-    begin(index, r)
+    clear_lists(index, r)
     matrix = lists_of(index, values)
     index[WIDTH] = width
     code = ORDERED
@@ -319,7 +319,7 @@ def make_program(G, pattern, rows, columns, index, values):
         for k in range(r):
             if pattern[rows[i], columns[k]] != 0.0:
                 number, source = G[rows[i], columns[k]], rows[i] * width + columns[k]
-                if code == ORDERED and not put(matrix, i, k, number, source):
+                if code == ORDERED and not put_entry(matrix, i, k, number, source):
                     code = TOO_MANY
     if code == ORDERED:
         code = order(index, matrix, pattern.size, ZERO)
@@ -336,7 +336,7 @@ def make_program(G, pattern, rows, columns, index, values):
 
 @merged
 def factor(entries, index, values):
-    """Factor G[rows][:, columns]; 1/pivots on the diagonal. `entries` are those of G (n, n_q), whose last row is zero.
+    """Factor G[rows][:, columns]; 1/pivots stand on the diagonal. `entries` are those of G (n, n_q), last row zero.
 
     Returns the ratio of the smallest to the largest pivot; negative where a pivot is zero or not finite, or multipliers
     have grown, and the order must be chosen anew.
@@ -349,17 +349,17 @@ def factor(entries, index, values):
             for k in range(r):
                 A[i, k] = entries[rows[i] * index[WIDTH] + columns[k]]
         return lu_factor(A, pivots_of(index))
-    source = slots(r) + 2 * index[N_SLOTS]
+    source = begin_entries(r) + 2 * index[N_SLOTS]
     for s in range(index[N_SLOTS]):
         values[s] = entries[index[source + s]]
-    return run(index, values)
+    return run_program(index, values)
 
 
 @merged
-def run(index, values):
-    """Run down the program with the entries in `values`; returns what `factor` does."""
+def run_program(index, values):
+    """Run the program with the entries in `values`; return what `factor` does."""
     r, n_slots = index[SIZE], index[N_SLOTS]
-    in_column = slots(r) + n_slots
+    in_column = begin_entries(r) + n_slots
     target = in_column + 2 * n_slots
     upper, end, lower = begin_upper(r), end_upper(r), begin_lower(r)
     smallest, largest, growth = 1e300, 0.0, 0.0
@@ -380,7 +380,7 @@ def run(index, values):
         values[i] = 1.0 / values[i]
     if not growth <= GROWTH:
         return -1.0
-    in_row = slots(r)
+    in_row = begin_entries(r)
     for u in range(r, index[FIRST_LOWER]):  # rows of U with 1 on the diagonal are quicker to solve with
         values[u] *= values[index[in_row + u]]
     return smallest / largest if r > 0 else 1.0
@@ -388,7 +388,7 @@ def run(index, values):
 
 @merged
 def sign_of(index, values):
-    """Sign of the determinant, rows and columns ascending, from the factors."""
+    """Return the sign of the determinant, rows and columns ascending, from the factors."""
     r = index[SIZE]
     if index[DENSE] == 1:
         return lu_sign(values[: r * r].reshape((r, r)), pivots_of(index))
@@ -406,7 +406,7 @@ def solve(index, values, x):
     if index[DENSE] == 1:
         lu_solve(values[: r * r].reshape((r, r)), pivots_of(index), x)
         return
-    in_row, in_column = slots(r), slots(r) + n_slots
+    in_row, in_column = begin_entries(r), begin_entries(r) + n_slots
     for s in range(first_lower, n_slots):
         x[index[in_row + s]] -= values[s] * x[index[in_column + s]]
     for i in range(r):
@@ -441,7 +441,7 @@ def solve_transposed(index, values, x):
                 x[k], x[p] = x[p], x[k]
         return
     n_slots, first_lower = index[N_SLOTS], index[FIRST_LOWER]
-    in_row, in_column = slots(r), slots(r) + n_slots
+    in_row, in_column = begin_entries(r), begin_entries(r) + n_slots
     for s in range(first_lower - 1, r - 1, -1):
         x[index[in_column + s]] -= values[s] * x[index[in_row + s]]
     for i in range(r):

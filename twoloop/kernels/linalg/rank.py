@@ -7,8 +7,9 @@ from numba import types
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, f8, i8, kernel, merged
 from twoloop.kernels.linalg.dense import copy_matrix, ldl_factor, ldl_solve, ldl_solve_rows
 
-ROUNDED = 4.0 * 2.0**-52  # of the sum of squares of all entries, a row: what rounding may add to a product of rows
-MOST_OF_IT = 0.5  # of the square of a row's length: with more left, what is left is orthogonal to rounding
+# what rounding adds to a product of rows, over the sum of squares of all entries, for each row
+ROUNDING_OF_SQUARES = 4.0 * 2.0**-52
+MOST_OF_SQUARE = 0.5  # of the square of a row's length: with more left, what is left is orthogonal to rounding
 
 
 @compiled
@@ -21,7 +22,7 @@ def _dot(x, y):
 
 @compiled
 def _without_parts(basis, n, rest, parts):
-    """Take the parts that n orthonormal rows have in a row out of it; the square of the length that is left."""
+    """Subtract a row's parts along n orthonormal rows; return the square of the length that is left."""
     for i in range(n):
         part = _dot(basis[i], rest)
         if part != 0.0:
@@ -32,13 +33,13 @@ def _without_parts(basis, n, rest, parts):
 
 
 @merged
-def first_rows(G, least, basis, factors, kept):
-    """Put down the first rows that no rows before add up to, and return how many they are.
+def select_rows(G, least, basis, factors, kept):
+    """Select the first rows that are independent of those before, into `kept`; return how many they are.
 
-    Such a row keeps more than the share `least` of its length without its part in those before, by Gram and Schmidt's
-    orthogonalisation, repeated where most of the row is lost. It is the combination of the rows of `basis`, of length
-    1, that a row of the lower triangle `factors` says; these two have as many rows as can be independent, and one more
-    for scratch.
+    Such a row keeps more than the share `least` of its length without its part in those before, by Gram-Schmidt
+    orthogonalisation, repeated if most of the row is lost. `basis` gets orthonormal rows, and `factors` the lower
+    triangle that makes the selected rows of them. Both have as many rows as can be independent, and one more for
+    scratch.
     """
     n_kept = 0
     for k in range(len(G)):
@@ -51,7 +52,7 @@ def first_rows(G, least, basis, factors, kept):
             parts[i] = 0.0
         length = _dot(G[k], G[k])
         square = _without_parts(basis, n_kept, rest, parts)
-        if square < MOST_OF_IT * length:
+        if square < MOST_OF_SQUARE * length:
             square = _without_parts(basis, n_kept, rest, parts)
         if square > least**2 * length:
             parts[n_kept] = math.sqrt(square)
@@ -64,13 +65,13 @@ def first_rows(G, least, basis, factors, kept):
 
 @kernel(i8(MATRIX, f8, MATRIX, MATRIX, INTEGERS), vectorized=True)
 def independent_rows(G, least, basis, factors, kept):
-    """The same, for Python."""
-    return first_rows(G, least, basis, factors, kept)
+    """Call `select_rows` from Python."""
+    return select_rows(G, least, basis, factors, kept)
 
 
 @merged
 def _find_shares(n, basis, factors, row, shares):
-    """Which combination of n rows that count another row is, by least squares where it is none."""
+    """Express a row as a combination of n selected rows, by least squares if it is none."""
     for k in range(n):
         shares[k] = _dot(basis[k], row)
     for k in range(n - 1, -1, -1):
@@ -81,7 +82,7 @@ def _find_shares(n, basis, factors, row, shares):
 
 @kernel(types.float64(MATRIX, i8, VECTOR))
 def size_of_inverse(factors, n, column):
-    """The root of the sum of squares of the entries of the inverse of a lower triangle of n rows; `column` is scratch.
+    """Return the Frobenius norm of the inverse of a lower triangle of n rows; `column` is scratch.
 
     Solutions of least norm with independent rows, or with these and others that depend on them, are at most so many
     times as large as the right-hand side.
@@ -99,10 +100,10 @@ def size_of_inverse(factors, n, column):
 
 @kernel(types.boolean(MATRIX, INTEGERS, f8, MATRIX, MATRIX, MATRIX, INTEGERS, MATRIX, VECTOR), vectorized=True)
 def shares_of_others(rows, order, least, others, basis, factors, kept, shares, lengths):
-    """Whether `others` are independent; then which combination of these each of some rows is, by least squares.
+    """Return whether `others` are independent; then express some rows as combinations of them, by least squares.
 
     `order` has the places among all `rows` of those to put into `others`, then of those to find the shares of;
-    `lengths` become those of all rows, and the rest is as in `first_rows`.
+    `lengths` become those of all rows, and the rest is as in `select_rows`.
     """
     n = len(others)
     for i in range(len(rows)):
@@ -110,7 +111,7 @@ def shares_of_others(rows, order, least, others, basis, factors, kept, shares, l
     for k in range(n):
         for j in range(rows.shape[1]):
             others[k, j] = rows[order[k], j]
-    if first_rows(others, least, basis, factors, kept) < n:
+    if select_rows(others, least, basis, factors, kept) < n:
         return False
     for i in range(len(shares)):
         _find_shares(n, basis, factors, rows[order[n + i]], shares[i])
@@ -119,12 +120,12 @@ def shares_of_others(rows, order, least, others, basis, factors, kept, shares, l
 
 @kernel(i8(MATRIX, VECTOR, f8, MATRIX, MATRIX, INTEGERS, MATRIX, MATRIX, MATRIX, VECTOR), vectorized=True)
 def least_solution(rows, values, least, basis, factors, kept, shares, gram, parts, x):
-    """The x of least norm that gives rows these values, by least squares; how many rows count, as in `first_rows`.
+    """Compute the x of least norm that gives rows these values, by least squares; return how many rows count.
 
     Where S are the shares that the rows y that count have in the others, of values b, these are least squares for
     y + S^T z with (1 + S S^T) z = b - S y. `values` become what x leaves of them; `parts` has room for y and z.
     """
-    n, m = first_rows(rows, least, basis, factors, kept), 0
+    n, m = select_rows(rows, least, basis, factors, kept), 0
     y, z = parts[0], parts[1]
     for i in range(len(rows)):
         if i - m < n and kept[i - m] == i:
@@ -154,10 +155,10 @@ def least_solution(rows, values, least, basis, factors, kept, shares, gram, part
 
 
 @kernel(types.boolean(MATRIX, f8, MATRIX), vectorized=True)
-def above(rows, ratio, gram):
-    """Whether all singular values are above this share of the largest, by G G^T less its square.
+def singular_values_exceed(rows, ratio, gram):
+    """Return whether all singular values are above this share of the largest, by factoring G G^T less its square.
 
-    The root of the sum of squares of the entries stands for the largest; `gram` is scratch.
+    The Frobenius norm stands for the largest; `gram` is scratch.
     """
     n, total = len(rows), 0.0
     for i in range(n):
@@ -165,31 +166,31 @@ def above(rows, ratio, gram):
             gram[j, i] = _dot(rows[i], rows[j])  # its upper triangle is what counts
         total += gram[i, i]
     for i in range(n):
-        gram[i, i] -= (ratio * ratio + ROUNDED * n) * total
+        gram[i, i] -= (ratio * ratio + ROUNDING_OF_SQUARES * n) * total
     return math.isfinite(total) and ldl_factor(gram)
 
 
-ROUNDING = 1e-12  # relative: what a bound may be missed by
+BOUND_ROUNDING = 1e-12  # relative: what a bound may be missed by
 NOT_DEFINITE, STAYS_SINGULAR = -1, -2
 TINY = 1e-300
 # smallest over largest eigenvalue of M, from which on pivots that keep one of the bounds, 1e-5 at least, say that all
 # rows count and none has to help M: what is left of a row is 1e-6 of it then, where 1e-9 would do
-LIKE = 1e-7
+SIMILAR_EIGENVALUES = 1e-7
 # largest share that a row which counts has in a redundant one, both scaled to length 1: above it the two change places.
 # Where the share passes zero on the way, the rows that count depend on one another, as at each dead centre of the
 # slider-crank with two rods; so it is to be far from zero. Above 1, as rows often have equal shares
-EXCHANGED = 1.5
+MAX_SHARE = 1.5
 
 
 def room_size(n_rows: int, n: int) -> int:
-    """How many numbers `choose` takes for scratch."""
+    """Return how many numbers `choose_rows` takes for scratch."""
     most = min(n_rows, n) + 1
     return most * (n + most) + 2 * n * n + n_rows * (2 * n + 2 * n_rows + 1) + n
 
 
 @merged
-def _n_weak(A):
-    """Factors of a symmetric A as of `ldl_factor`, and how many of its eigenvalues are negative."""
+def _factor_and_count_negative(A):
+    """Factor a symmetric A as `ldl_factor` does; return how many of its eigenvalues are negative."""
     n, count = len(A), 0
     for k in range(n):
         if not A[k, k] > 0.0:
@@ -207,7 +208,7 @@ def _n_weak(A):
 
 @compiled
 def _count_weak(mass, weak, A):
-    """How many eigenvalues of M are below this share of the largest, or of what bounds it; and factors without it."""
+    """Count eigenvalues of M below a share of the largest, or of what bounds it; leave the factors without it in A."""
     largest = 0.0
     for i in range(len(mass)):
         total = 0.0
@@ -217,24 +218,24 @@ def _count_weak(mass, weak, A):
     copy_matrix(mass, A)
     for i in range(len(mass)):
         A[i, i] -= weak * largest
-    return _n_weak(A)
+    return _factor_and_count_negative(A)
 
 
 @compiled
 def _dominates(mass):
-    """Whether the diagonal of M shows that its eigenvalues are of like size, by Gershgorin's circles."""
+    """Return whether Gershgorin's circles show that the eigenvalues of M are of similar size."""
     least, largest = math.inf, 0.0
     for i in range(len(mass)):
         beside = 0.0
         for j in range(len(mass)):
             beside += abs(mass[i, j])
         least, largest = min(least, 2.0 * mass[i, i] - beside), max(largest, beside)
-    return least > LIKE * largest
+    return least > SIMILAR_EIGENVALUES * largest
 
 
 @merged
 def _scale(mass, G):
-    """The power of two that brings G^T G to the size of M."""
+    """Return the power of two that brings G^T G to the size of M."""
     largest, longest = 0.0, 0.0
     for i in range(len(mass)):
         for j in range(len(mass)):
@@ -247,7 +248,7 @@ def _scale(mass, G):
 
 @merged
 def _sort_by_entries(G, order, counts):
-    """Places of the rows, those of few entries first."""
+    """Sort the places of the rows, those of few entries first."""
     for k in range(len(G)):
         count, i = 0.0, k
         for j in range(G.shape[1]):
@@ -259,8 +260,8 @@ def _sort_by_entries(G, order, counts):
 
 
 @merged
-def _helps(A, g, scale, x):
-    """Whether an eigenvalue less is negative with g g^T: by the sign of the determinant that this brings."""
+def _removes_weak_eigenvalue(A, g, scale, x):
+    """Return whether adding g g^T makes one eigenvalue less negative, by the sign of the determinant."""
     for j in range(x.size):
         x[j] = g[j]
     ldl_solve(A, x)
@@ -272,12 +273,12 @@ def _helps(A, g, scale, x):
 
 @merged
 def _add_rows(mass, G, weak, scale, A, x, order, added):
-    """Add rows to M until no eigenvalue is weak, and put them down; how many, or STAYS_SINGULAR."""
+    """Add rows to M until no eigenvalue is weak, and record them; return how many, or STAYS_SINGULAR."""
     n_added = 0
     while _count_weak(mass, weak, A) > 0:
         found = -1
         for k in range(len(G)):
-            if order[k] >= 0 and _helps(A, G[order[k]], scale, x):
+            if order[k] >= 0 and _removes_weak_eigenvalue(A, G[order[k]], scale, x):
                 found = k
                 break
         if found < 0:
@@ -297,22 +298,18 @@ def _exchange_rows(G, n_kept, basis, factors, kept, order, shares, others):
     """Exchange rows that count for redundant ones in which they have large shares, so that they stay independent.
 
     An exchange multiplies the volume that the rows which count span by the share. `basis`, `factors` and `kept` are as
-    `first_rows` left them; `order` and `shares` (n_rows each) and `others` (n, n) are scratch.
+    `select_rows` left them; `order` and `shares` (n_rows each) and `others` (n, n) are scratch.
     """
     for _ in range(2 * (len(G) - n_kept)):
-        largest, leaves, enters, place = EXCHANGED, -1, -1, 0
+        largest, leaves, enters, place = MAX_SHARE, -1, -1, 0
         for i in range(len(G)):
             if place < n_kept and kept[place] == i:
                 place += 1
                 continue
             _find_shares(n_kept, basis, factors, G[i], shares)
-            length = 0.0
-            for j in range(G.shape[1]):
-                length += G[i, j] * G[i, j]
+            length = _dot(G[i], G[i])
             for k in range(n_kept):
-                square = 0.0
-                for j in range(G.shape[1]):
-                    square += G[kept[k], j] * G[kept[k], j]
+                square = _dot(G[kept[k]], G[kept[k]])
                 share = abs(shares[k]) * math.sqrt(square / max(length, TINY))
                 if share > largest:
                     largest, leaves, enters = share, k, i
@@ -329,15 +326,15 @@ def _exchange_rows(G, n_kept, basis, factors, kept, order, shares, others):
         for i in range(n_kept):
             for j in range(G.shape[1]):
                 others[i, j] = G[kept[i], j]
-        first_rows(others[:n_kept], 0.0, basis, factors, order)
+        select_rows(others[:n_kept], 0.0, basis, factors, order)
 
 
 @merged
 def _first_bound_kept(mass, G, kept, n_rows, bounds, factors, solved_room, S_room, sizes):
-    """Place of the first bound that no pivot is below, each over what it is without the other rows; how many, if none.
+    """Return the place of the first bound below all pivots, each relative to its size without the other rows.
 
-    No pivot is below the least eigenvalue of S = G M^-1 G^T with a diagonal of 1, and that is above a bound where S
-    less the bound is definite. NOT_DEFINITE: M is not.
+    No pivot is below the least eigenvalue of S = G M^-1 G^T with a diagonal of 1, and that is above a bound if S less
+    the bound is definite. Returns the number of bounds if none is kept, and NOT_DEFINITE if M is not.
     """
     copy_matrix(mass, factors)
     if not ldl_factor(factors):
@@ -364,20 +361,20 @@ def _first_bound_kept(mass, G, kept, n_rows, bounds, factors, solved_room, S_roo
         for i in range(n_rows):
             for k in range(i, n_rows):  # its upper triangle is what counts
                 less[i, k] = S[i, k]
-            less[i, i] -= bounds[place] * (1.0 - ROUNDING)
+            less[i, i] -= bounds[place] * (1.0 - BOUND_ROUNDING)
         if ldl_factor(less):
             return place
     return bounds.size
 
 
 @kernel(i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS), vectorized=True)
-def choose(given, G, least, weak, bounds, room, chosen):
-    """What a Choice (generate/choices.py) says of M and G, and the place of the first of these bounds that is kept.
+def choose_rows(given, G, least, weak, bounds, room, chosen):
+    """Choose the rows of G that count and those that help M to an inverse; return the place of the first bound kept.
 
-    Rows of G count as `independent_rows` has it for `least`, but for exchanges. Others help M where eigenvalues of it
-    are below the share `weak` of the largest, 0 where that is known not to be. `chosen`, of 2 + 3 n_rows numbers,
-    begins with how many count and how many help, then has these, and those, each in n_rows places; `room` begins with
-    their factor.
+    Rows of G count as in `select_rows` for `least`, but for exchanges; others help M if eigenvalues of it are below the
+    share `weak` of the largest, 0 if that is known not to be. `chosen`, of 2 + 3 n_rows numbers, begins with how many
+    count and how many help, then has these, and those, each in n_rows places; `room` begins with their factor. See
+    generate/choices.py.
     """
     n_rows, n = G.shape
     most = min(n_rows, n) + 1
@@ -396,7 +393,7 @@ def choose(given, G, least, weak, bounds, room, chosen):
         if 0 <= place < bounds.size:  # no row is nearly a sum of others, and M has an inverse
             chosen[0], chosen[1], room[0] = n_rows, 0, 1.0
             return place
-    n_kept = first_rows(G, least, basis, factors, kept)
+    n_kept = select_rows(G, least, basis, factors, kept)
     if n_kept < n_rows:
         _exchange_rows(G, n_kept, basis, factors, kept, order, sizes, A)
     copy_matrix(given, mass)

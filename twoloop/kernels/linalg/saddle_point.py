@@ -22,17 +22,25 @@ from twoloop.kernels.data.flags import (
 from twoloop.kernels.data.noted import FACTORED, MASS_SCALE
 from twoloop.kernels.linalg import markowitz_lu as at
 from twoloop.kernels.linalg.band import banded_mass, factor_banded_mass, solve_banded_mass
-from twoloop.kernels.linalg.dense import copy, copy_matrix, invert_definite, ldl_factor, ldl_solve, note_pattern
+from twoloop.kernels.linalg.dense import (
+    contains,
+    copy,
+    copy_matrix,
+    invert_definite,
+    ldl_factor,
+    ldl_solve,
+    note_pattern,
+)
 from twoloop.kernels.linalg.markowitz_lu import (
-    begin,
+    begin_entries,
+    clear_lists,
     columns_of,
     lists_of,
     order,
-    put,
+    put_entry,
     rows_of,
-    run,
+    run_program,
     sign_of,
-    slots,
     solve_rows,
     solve_transposed,
 )
@@ -40,8 +48,8 @@ from twoloop.kernels.linalg.markowitz_lu import solve as solve_dependent
 
 
 @compiled
-def directions(w):
-    """D from the rows and factors in w."""
+def find_null_space(w):
+    """Compute D, the velocities that the constraints allow, from the rows and factors in w."""
     rows, independent = rows_of(w.index_v), w.independent_v
     for j in range(independent.size):
         for k in range(rows.size):
@@ -51,7 +59,7 @@ def directions(w):
 
 @merged
 def _reduce_diagonal(columns, independent, M, D, A, m):
-    """T^T M T of a diagonal M, upper triangle into A; m is scratch."""
+    """Compute the upper triangle of T^T M T of a diagonal M into A; m is scratch."""
     for k in range(columns.size):
         m[k] = M[columns[k], columns[k]]
     for i in range(independent.size):
@@ -65,7 +73,7 @@ def _reduce_diagonal(columns, independent, M, D, A, m):
 
 @merged
 def _reduce_dense(columns, independent, M, D, A, MT):
-    """T^T M T of any M, upper triangle into A; MT is scratch."""
+    """Compute the upper triangle of T^T M T of any M into A; MT is scratch."""
     n, n_dof = M.shape[0], independent.size
     for i in range(n):
         for j in range(n_dof):
@@ -87,7 +95,7 @@ def _reduce_dense(columns, independent, M, D, A, MT):
 
 @merged
 def factor_reduced(f, w):
-    """The factors of T^T M T, into w.A; needs w.D."""
+    """Factor T^T M T into w.A; needs w.D."""
     columns = columns_of(w.index_v)
     if f.flags[DIAGONAL_MASS] == 1:
         _reduce_diagonal(columns, w.independent_v, w.M, w.D, w.A, w.x)
@@ -101,7 +109,7 @@ def factor_reduced(f, w):
 
 @merged
 def solve_reduced(f, w, r, c, a):
-    """a of M a + G^T lam = r and G a = c."""
+    """Solve M a + G^T lam = r and G a = c for a."""
     rows, columns, independent = rows_of(w.index_v), columns_of(w.index_v), w.independent_v
     n_dof, z, x, D, M = independent.size, w.z, w.x, w.D, w.M
     for k in range(rows.size):
@@ -132,7 +140,7 @@ def solve_reduced(f, w, r, c, a):
 
 @merged
 def reduced_multipliers(f, w, r, a, lam):
-    """The multipliers of the rows that count: G^T lam = r - M a in the dependent columns."""
+    """Compute the multipliers of the rows that count: G^T lam = r - M a in the dependent columns."""
     rows, columns, z = rows_of(w.index_v), columns_of(w.index_v), w.z
     for k in range(columns.size):
         m = columns[k]
@@ -150,7 +158,7 @@ def reduced_multipliers(f, w, r, a, lam):
 
 @merged
 def factor_mass(f, w):
-    """What is needed of w.M: of a constant M its inverse, quicker to apply, else its factors."""
+    """Invert a constant w.M, which is quicker to apply, or factor one that varies."""
     if banded_mass(f):
         definite = factor_banded_mass(f, w) == DONE
     else:
@@ -163,7 +171,7 @@ def factor_mass(f, w):
 
 @merged
 def _times_inverse_mass(f, w, x, y):
-    """y = M^-1 x; they may be one array unless M is constant, dense and not diagonal."""
+    """Compute y = M^-1 x; they may be one array unless M is constant, dense and not diagonal."""
     n = x.size
     if f.flags[DIAGONAL_MASS] == 1:
         for i in range(n):
@@ -193,7 +201,7 @@ def _equal(A, B):
 
 @merged
 def factor_schur(f, w):
-    """S = G M^-1 G^T of the rows that count, and its factors; with a constant M only if G has changed."""
+    """Compute and factor S = G M^-1 G^T of the rows that count; with a constant M only if G has changed."""
     keep = f.flags[CONSTANT_MASS] == 1
     if keep and _equal(w.G, w.G_of_S):
         return DONE
@@ -219,7 +227,7 @@ def factor_schur(f, w):
 
 @merged
 def solve_schur(f, w, r, c, a):
-    """a of M a + G^T lam = r and G a = c; the multipliers of the rows that count go into w.z."""
+    """Solve M a + G^T lam = r and G a = c for a; the multipliers of the rows that count go into w.z."""
     rows, solved = w.rows_v, w.W
     _times_inverse_mass(f, w, r, a)
     for i in range(rows.size):
@@ -233,13 +241,14 @@ def solve_schur(f, w, r, c, a):
             a[j] -= solved[i, j] * w.z[i]
 
 
-MANY = 8  # rows, and degrees of freedom, from which on this is the fastest form of a chain: measured, about 7
-LARGE = 32  # coordinates, from which on it is with few degrees of freedom, too, unless M is diagonal: about 30
+MIN_ROWS = 8  # rows, and degrees of freedom, from which on this is the fastest form of a chain: measured, about 7
+# coordinates, from which on it is with few degrees of freedom, too, unless M is diagonal: about 30
+MIN_COORDINATES = 32
 
 
 def sparse_pays(n_q: int, n_rows: int, diagonal: bool) -> bool:
-    """Whether this form is faster than the dense ones, for a sparse pattern; `diagonal`: M is constant and diagonal."""
-    return n_rows >= MANY and (n_q - n_rows >= MANY or (n_q >= LARGE and not diagonal))
+    """Return whether this form is faster than the dense ones for a sparse pattern; `diagonal`: M is and stays so."""
+    return n_rows >= MIN_ROWS and (n_q - n_rows >= MIN_ROWS or (n_q >= MIN_COORDINATES and not diagonal))
 
 
 @compiled
@@ -256,38 +265,38 @@ def _make_program(w):
     """Choose the order of elimination for the numbers in w.M and w.G."""
     n, rows, index, values = w.Q.size, w.rows_v, w.index_a, w.values_a
     note_pattern(w.M, w.mass_pattern)
-    begin(index, n + rows.size)
+    clear_lists(index, n + rows.size)
     matrix = lists_of(index, values)
     scale = 2.0 ** np.round(np.log2(_largest(w.G) / _largest(w.M))) if rows.size > 0 else 1.0
     w.notes[MASS_SCALE] = scale
     for i in range(n):
         for j in range(n):
             source = w.entries.size + i * n + j
-            if w.mass_pattern[i, j] != 0.0 and not put(matrix, i, j, scale * w.M[i, j], source):
+            if w.mass_pattern[i, j] != 0.0 and not put_entry(matrix, i, j, scale * w.M[i, j], source):
                 return at.TOO_MANY
     for k in range(rows.size):
         for j in range(n):
             if w.pattern[rows[k], j] != 0.0:
                 number, source = w.G[rows[k], j], rows[k] * n + j
-                if not (put(matrix, n + k, j, number, source) and put(matrix, j, n + k, number, source)):
+                if not (put_entry(matrix, n + k, j, number, source) and put_entry(matrix, j, n + k, number, source)):
                     return at.TOO_MANY
     return order(index, matrix, w.pattern.size, 0.0)
 
 
 @compiled
 def _factor(w):
-    """Factors by the program that there is; False: it does not suit these numbers."""
+    """Factor by the current program; return whether it suits these numbers."""
     index, values, scale, first_of_mass = w.index_a, w.values_a, w.notes[MASS_SCALE], w.entries.size
-    source = slots(index[at.SIZE]) + 2 * index[at.N_SLOTS]
+    source = begin_entries(index[at.SIZE]) + 2 * index[at.N_SLOTS]
     for s in range(index[at.N_SLOTS]):
         place = index[source + s]
         values[s] = w.augmented[place] * (scale if place >= first_of_mass else 1.0)
-    return run(index, values) > 0.0
+    return run_program(index, values) > 0.0
 
 
 @compiled
 def factor_sparse(f, w):
-    """Factors for the w.M and w.G that there are; f.flags[FORM] is another one on return where they are not sparse."""
+    """Factor for the current w.M and w.G; f.flags[FORM] becomes the dense form if the factors are not sparse."""
     w.counters[N_FACTORIZATIONS] += 1
     new = f.flags[CONSTANT_MASS] == 0 and note_pattern(w.M, w.mass_pattern)
     if w.index_a[at.SIZE] == 0 or new or not _factor(w):
@@ -307,7 +316,7 @@ def factor_sparse(f, w):
 
 @compiled
 def solve_sparse(w, r, c, a):
-    """a of M a + G^T lam = r and G a = c; the multipliers of the rows that count go into w.z."""
+    """Solve M a + G^T lam = r and G a = c for a; the multipliers of the rows that count go into w.z."""
     n, size, scale = r.size, w.index_a[at.SIZE], w.notes[MASS_SCALE]
     x, y = w.right[:size], w.right[size:]
     for j in range(n):
@@ -328,10 +337,10 @@ def solve_sparse(w, r, c, a):
 
 @compiled
 def _factor_sparse(f, w):
-    """The factors of the sparse matrix, or what the dense form needs where they are not sparse."""
+    """Factor the sparse matrix, or prepare what the dense form needs if the factors are not sparse."""
     code = factor_sparse(f, w)
     if code == DONE and f.flags[FORM] == NULL_SPACE:
-        directions(w)
+        find_null_space(w)
     elif code == DONE and f.flags[FORM] == MULTIPLIERS and f.flags[CONSTANT_MASS] == 1:
         code = factor_mass(f, w)
     return code
@@ -339,7 +348,7 @@ def _factor_sparse(f, w):
 
 @merged
 def factor(f, w):
-    """Factor for the w.M that there is, and the rows, factors and tangents of G; DONE, or why it cannot be done."""
+    """Factor for the current w.M and the rows, factors and null space of G; return DONE, or why it cannot be done."""
     if w.notes[FACTORED] == 1.0:
         return DONE
     code = _factor_sparse(f, w) if f.flags[FORM] == AUGMENTED else DONE
@@ -358,7 +367,7 @@ def factor(f, w):
 
 @merged
 def solve(f, w, r, c, a):
-    """a for any right-hand side, by the factors; r, c and a are three arrays."""
+    """Solve for a with any right-hand side; r, c and a are three arrays."""
     if f.flags[FORM] == NULL_SPACE:
         solve_reduced(f, w, r, c, a)
     elif f.flags[FORM] == MULTIPLIERS:
@@ -369,7 +378,7 @@ def solve(f, w, r, c, a):
 
 @merged
 def multipliers(f, w, r, a, lam):
-    """Those that belong to the a found just before; entries of rows that do not count are left as they are."""
+    """Compute the multipliers that belong to the a just found; those of rows that do not count stay as they are."""
     if f.flags[FORM] == NULL_SPACE:
         reduced_multipliers(f, w, r, a, lam)
     else:
@@ -379,16 +388,17 @@ def multipliers(f, w, r, a, lam):
 
 @merged
 def solve_both(f, w, r, c, a, lam):
-    """Solution and multipliers for any right-hand side."""
+    """Solve for a and multipliers with any right-hand side."""
     solve(f, w, r, c, a)
     multipliers(f, w, r, a, lam)
 
 
 @compiled
 def least_norm(w, lam):
-    """Take away from lam what the null space of G^T has of it: redundant row i is sum_k Z[i, k] of the rows that count.
+    """Remove from lam its part in the null space of G^T, so that its norm is least.
 
-    The null space is spanned by n_i = e_i - sum_k Z[i, k] e_k, and lam -= N (N^T N)^-1 N^T lam.
+    Redundant row i is sum_k Z[i, k] of the rows that count. The null space is spanned by n_i = e_i - sum_k Z[i, k] e_k,
+    and lam -= N (N^T N)^-1 N^T lam.
     """
     rows, columns = rows_of(w.index_v), columns_of(w.index_v)
     r, n_red = rows.size, lam.size - rows.size
@@ -397,10 +407,7 @@ def least_norm(w, lam):
     part = w.minimum[n_red * (r + n_red) :]
     i = 0
     for row in range(lam.size):
-        counts = False
-        for k in w.rows_v:
-            counts = counts or k == row
-        if counts:
+        if contains(w.rows_v, row):
             continue
         for k in range(r):
             Z[i, k] = w.G[row, columns[k]]
@@ -419,10 +426,7 @@ def least_norm(w, lam):
     ldl_solve(gram, part)
     i = 0
     for row in range(lam.size):
-        counts = False
-        for k in w.rows_v:
-            counts = counts or k == row
-        if not counts:
+        if not contains(w.rows_v, row):
             lam[row] -= part[i]
             for k in range(r):
                 lam[rows[k]] += part[i] * Z[i, k]

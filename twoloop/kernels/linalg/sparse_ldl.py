@@ -28,7 +28,7 @@ NOT_DEFINITE = -1.0  # what stands for the smallest pivot where one of M is not 
 
 @compiled
 def _find_stiffness(program, mass, jacobian, counts, stiffness, scratch):
-    """How much each row stiffens M: as much as the largest entry on its diagonal, of the rows that count."""
+    """Compute how much each row stiffens M: as much as the largest entry on its diagonal, of the rows that count."""
     n_q = program[N_COORDINATES]
     for k in range(program[N_PIVOTS]):
         scratch[k] = 0.0
@@ -54,7 +54,7 @@ def _find_stiffness(program, mass, jacobian, counts, stiffness, scratch):
 
 @merged
 def load(program, mass, jacobian, counts, values, stiffness, scratch):
-    """The numbers of M and G into their slots."""
+    """Put the numbers of M and G into their slots."""
     for s in range(values.size):
         values[s] = 0.0
     _, _, slots = mass_of(program)
@@ -72,9 +72,9 @@ def load(program, mass, jacobian, counts, values, stiffness, scratch):
 
 @compiled
 def factor(program, counts, values, sizes, least):
-    """The factors in the place of the numbers, 1 / pivot on the diagonal; the smallest pivot of a row over its size.
+    """Factor the numbers in their place, 1/pivot on the diagonal; return the smallest pivot of a row over its size.
 
-    NOT_DEFINITE where M is not positive definite on what the rows so far allow. `counts` is 0 for rows that do not
+    Returns NOT_DEFINITE if M is not positive definite on what the rows so far allow. `counts` is 0 for rows that do not
     count, and becomes 0 for those whose pivot is below `least` of its size; these are not among the smallest.
     `sizes` is scratch.
     """
@@ -115,7 +115,7 @@ def factor(program, counts, values, sizes, least):
 
 @compiled
 def solve(program, values, stiffness, x, y):
-    """The solution for x = [r, c] in its place, by the factors; y is scratch."""
+    """Solve for x = [r, c] in its place, by the factors; y is scratch."""
     n, order, n_q = program[N_PIVOTS], order_of(program), program[N_COORDINATES]
     # of M + s g g^T: the right-hand side is r + s g c, and the multiplier less by s c, so that r serves
     begin, row_of = columns_of(program)
@@ -137,7 +137,7 @@ def solve(program, values, stiffness, x, y):
 
 @compiled
 def subtract_product(program, mass, jacobian, counts, x, b):
-    """b - [M x_q + G^T x_c, G x_q] in the place of b; rows that do not count stay zero."""
+    """Subtract [M x_q + G^T x_c, G x_q] from b; rows that do not count stay zero."""
     n_q = program[N_COORDINATES]
     rows, columns, _ = mass_of(program)
     for k in range(rows.size):
@@ -153,10 +153,10 @@ def subtract_product(program, mass, jacobian, counts, x, b):
 
 
 @compiled
-def refined(program, mass, jacobian, counts, values, stiffness, x, times, right, residual, y):
-    """Solve for x = [r, c] in its place, and refine the solution so many times; the rest is scratch.
+def solve_refined(program, mass, jacobian, counts, values, stiffness, x, times, right, residual, y):
+    """Solve for x = [r, c] in its place and refine the solution `times` times; the rest is scratch.
 
-    Returns the largest of the last correction over the largest of the solution; 0 without any.
+    Returns the largest of the last correction over the largest of the solution; 0 without refinement.
     """
     n_q, change = program[N_COORDINATES], 0.0
     for k in range(x.size):

@@ -21,9 +21,9 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     N_PIVOTS,
     Entries,
     Integers,
-    behind,
     columns_of,
     elimination_order,
+    end_of_sections,
     jacobian_of,
     mass_of,
     order_of,
@@ -32,7 +32,7 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     targets_of,
 )
 
-LEAST = 1e-11  # of what it is the difference of: a smaller pivot is rounding
+MIN_PIVOT = 1e-11  # of what it is the difference of: a smaller pivot is rounding
 
 
 def newton_program(
@@ -44,11 +44,11 @@ def newton_program(
     together: Iterable[Sequence[int]],
     stiff_rows: Sequence[int],
 ) -> NDArray[np.int32] | None:
-    """The program, `tangents` being the entries of K and D, both triangles; None where there would be too many updates.
+    """Return the program for Newton's matrix; None if there would be too many updates.
 
-    The tangents must be in the order of `in_groups`.
+    `tangents` are the entries of K and D, both triangles, in the order of `grouped_entries`.
     """
-    groups = groups_of(tangents, n_q)[tangents[1]]
+    groups = column_groups(tangents, n_q)[tangents[1]]
     begins = np.searchsorted(groups, np.arange(groups.max(initial=-1) + 2))
     order = elimination_order(n_q, n_rows, mass, jacobian, together, stiff_rows, tangents)
     entries = np.concatenate([mass[0], tangents[0]]), np.concatenate([mass[1], tangents[1]])
@@ -56,14 +56,14 @@ def newton_program(
     return None if program is None else np.concatenate([program, begins]).astype(np.int32)
 
 
-def in_groups(tangents: Entries, n_q: int) -> Entries:
-    """The entries, those of a group together."""
-    sequence = np.argsort(groups_of(tangents, n_q)[tangents[1]], kind="stable")
+def grouped_entries(tangents: Entries, n_q: int) -> Entries:
+    """Sort the entries by group."""
+    sequence = np.argsort(column_groups(tangents, n_q)[tangents[1]], kind="stable")
     return tangents[0][sequence], tangents[1][sequence]
 
 
-def groups_of(entries: Entries, n_q: int) -> Integers:
-    """The group of each column."""
+def column_groups(entries: Entries, n_q: int) -> Integers:
+    """Return the group of each column."""
     rows_of: list[list[int]] = [[] for _ in range(n_q)]
     for i, j in zip(*(each.tolist() for each in entries), strict=True):
         rows_of[j].append(i)
@@ -79,8 +79,8 @@ def groups_of(entries: Entries, n_q: int) -> Integers:
 
 @inlined
 def tangents_of(program):
-    """Rows and columns of the entries of K and D, and where each group of them begins, and the last one ends."""
-    begins = program[behind(program) :]
+    """Return rows and columns of the entries of K and D, where each group begins, and where the last one ends."""
+    begins = program[end_of_sections(program) :]
     rows, columns, _ = mass_of(program)
     n_mass = rows.size - begins[begins.size - 1]
     return rows[n_mass:], columns[n_mass:], begins
@@ -88,7 +88,7 @@ def tangents_of(program):
 
 @compiled
 def load(program, mass, jacobian, K, D, z, stiffness, values):
-    """The numbers of the matrix for z into their slots."""
+    """Put the numbers of the matrix for z into their slots."""
     for s in range(values.size):
         values[s] = 0.0
     off = program[N_OFF]
@@ -111,7 +111,7 @@ def load(program, mass, jacobian, K, D, z, stiffness, values):
 
 @compiled
 def factor(program, counts, values, sizes):
-    """The factors in the place of the numbers, 1 / pivot on the diagonal; whether all pivots were large enough.
+    """Factor the numbers in their place, 1/pivot on the diagonal; return whether all pivots were large enough.
 
     Rows that do not count, 0 in `counts`, have 0 there and no part in it. `sizes` is scratch, real numbers.
     """
@@ -130,7 +130,7 @@ def factor(program, counts, values, sizes):
                 values[s + off] = 0.0
             u += (last - first) * (last - first + 1) // 2
             continue
-        if not abs(values[k]) > LEAST * sizes[k]:  # also true for NaN
+        if not abs(values[k]) > MIN_PIVOT * sizes[k]:  # also true for NaN
             return False
         inverse = 1.0 / values[k]
         values[k] = inverse
@@ -152,7 +152,7 @@ def factor(program, counts, values, sizes):
 
 @compiled
 def solve(program, values, x, y):
-    """The solution for x = [r, c] in its place, by the factors; y is scratch."""
+    """Solve for x = [r, c] in its place, by the factors; y is scratch."""
     n, off, order = program[N_PIVOTS], program[N_OFF], order_of(program)
     begin, row_of = columns_of(program)
     for k in range(n):

@@ -24,13 +24,13 @@ from numpy.typing import NDArray
 
 from twoloop.kernels.data.common import inlined
 
-MOST_JOINTS = 4  # of a body that comes before its joints
+MAX_JOINTS = 4  # of a body that comes before its joints
 
 Integers = NDArray[np.int64]
 
 
-class _Sets:
-    """Disjoint sets of the numbers below n."""
+class _DisjointSets:
+    """Hold disjoint sets of the numbers below n (union-find)."""
 
     def __init__(self, n: int):
         self.parent = list(range(n))
@@ -47,19 +47,19 @@ class _Sets:
         return min(i, j)
 
 
-class _Holds:
-    """What holds the parts that eliminated bodies and joints make up: the ground, and hubs that are to come."""
+class _Supports:
+    """Track what supports the parts that eliminated bodies and joints make up: the ground, and hubs still to come."""
 
     def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int], lone: AbstractSet[int]):
         self.joints, self.hubs = joints, set(hubs)  # those that are left
         self.lone = lone  # single coordinates, of whose body nothing else is known: no part of these is surely free
-        self.parts = _Sets(n_bodies)
+        self.parts = _DisjointSets(n_bodies)
         self.grounded = [False] * n_bodies
         self.hangs: list[set[int]] = [set() for _ in range(n_bodies)]
         self.hanging: dict[int, list[int]] = {hub: [] for hub in hubs}  # bodies whose parts hang, or hung, on a hub
 
     def lets(self, joint: int) -> bool:
-        """Whether a joint may be eliminated."""
+        """Return whether a joint may be eliminated."""
         bodies = self.joints[joint]
         parts = {self.parts.find(body) for body in bodies if body not in self.hubs}
         if not bodies & self.lone and any(not self.grounded[part] and not self.hangs[part] for part in parts):
@@ -73,7 +73,7 @@ class _Holds:
         self._join((body for body in bodies if body not in self.hubs), grounded, bodies & self.hubs)
 
     def eliminate_hub(self, hub: int) -> None:
-        """Join the parts that hang on a hub, and the hub."""
+        """Join a hub and the parts that hang on it."""
         self.hubs.discard(hub)
         hanging = self.hanging.pop(hub)
         for body in hanging:
@@ -104,7 +104,7 @@ def elimination_order(
     first: Sequence[int] = (),
     couplings: tuple[Integers, Integers] | None = None,
 ) -> Integers:
-    """Coordinates j, and rows i as n_q + i, in the order of elimination.
+    """Return the order of elimination: coordinates j, and rows i as n_q + i.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def elimination_order(
     for k, joint in enumerate(joints):
         for body in joint:
             joints_of[body].append(k)
-    hubs = {body for body in range(n_q) if len(joints_of[body]) > MOST_JOINTS}
+    hubs = {body for body in range(n_q) if len(joints_of[body]) > MAX_JOINTS}
     if couplings is not None:
         hubs = set(body_of)
     coordinates: dict[int, list[int]] = {}
@@ -160,7 +160,7 @@ def elimination_order(
 
 
 def bodies_of(n_q: int, mass_entries: tuple[Integers, Integers], together: Iterable[Sequence[int]]) -> list[int]:
-    """Of each coordinate, the first of its body."""
+    """Return the first coordinate of the body of each coordinate."""
     pairs = np.array([(first, other) for first, *others in together for other in others], dtype=np.int64).reshape(-1, 2)
     ones, others = (np.concatenate([entries, column]) for entries, column in zip(mass_entries, pairs.T, strict=True))
     first_of, before = np.arange(n_q), np.full(n_q, -1)
@@ -182,9 +182,9 @@ def _minimum_degree(
     pairs: Iterable[tuple[int, int]],
     lone: AbstractSet[int],
 ) -> list[int]:
-    """Joints, and hubs as len(joints) + their place: each time, of those that may come, one with fewest neighbours.
+    """Order joints, and hubs as len(joints) + their place: each time one with fewest neighbours of those allowed.
 
-    `pairs`: of hubs that are coupled beside their joints. `lone`: see _Holds.
+    `pairs`: hubs that are coupled beside their joints. `lone`: see `_Supports`.
     """
     n_joints = len(joints)
     place = {hub: n_joints + k for k, hub in enumerate(hubs)}
@@ -202,7 +202,7 @@ def _minimum_degree(
         near[place[other]].add(place[one])
     for k, others in enumerate(near):
         others.discard(k)
-    holds = _Holds(joints, n_bodies, set(hubs), lone)
+    holds = _Supports(joints, n_bodies, set(hubs), lone)
 
     def degree(node: int) -> int:
         return sum(sizes[other] for other in near[node])
@@ -235,12 +235,12 @@ Entries = tuple[Integers, Integers]  # rows and columns
 
 # places in the program; then what `_sections` names
 N_COORDINATES, N_PIVOTS, N_OFF, N_UPDATES, N_OF_MASS, N_OF_JACOBIAN, N_STIFFENED, N_HEAD = range(8)
-FEW_UPDATES = 3_000_000  # multiplications of a program: up to here, it pays for any matrix of this kind ...
-SPARSE = 1e-3  # ... and beyond, where they are at most this share of n^3 ...
-MOST_UPDATES = 30_000_000  # ... and no more than this, for their memory: four bytes each
+ALWAYS_ALLOWED_UPDATES = 3_000_000  # multiplications of a program: up to here, it pays for any matrix of this kind ...
+MAX_UPDATE_SHARE = 1e-3  # ... and beyond, where they are at most this share of n^3 ...
+MAX_UPDATES = 30_000_000  # ... and no more than this, for their memory: four bytes each
 
 
-def static_program(
+def factorization_program(
     n_q: int,
     n_rows: int,
     mass: Entries,
@@ -248,7 +248,7 @@ def static_program(
     together: Iterable[Sequence[int]] = (),
     stiff_rows: Sequence[int] = (),
 ) -> NDArray[np.int32] | None:
-    """The program for M and G with these entries; None where there would be too many updates.
+    """Return the program for M and G with these entries; None if there would be too many updates.
 
     Parameters
     ----------
@@ -267,7 +267,7 @@ def static_program(
 def program_in_order(
     order: Integers, n_q: int, mass: Entries, jacobian: Entries, stiff_rows: Sequence[int], both: bool = False
 ) -> NDArray[np.int32] | None:
-    """The same for an order. `both`: of unsymmetric factors, whose rows of U stand N_OFF behind the columns of L."""
+    """Return the program for a given order. `both`: of unsymmetric factors, with U N_OFF places behind L."""
     n = len(order)
     position = np.empty(n, dtype=np.int64)
     position[order] = np.arange(n)
@@ -276,7 +276,7 @@ def program_in_order(
     low, high = np.minimum(rows, columns), np.maximum(rows, columns)
     below = _columns_of_factors(n, low, high)
     sizes = np.array([len(each) for each in below], dtype=np.int64)
-    if (sizes * (sizes + 1) // 2).sum() > max(FEW_UPDATES, min(MOST_UPDATES, SPARSE * n**3)):
+    if (sizes * (sizes + 1) // 2).sum() > max(ALWAYS_ALLOWED_UPDATES, min(MAX_UPDATES, MAX_UPDATE_SHARE * n**3)):
         return None
     begin = np.concatenate([[0], np.cumsum(sizes)])
     row_of = np.concatenate([np.zeros(0, np.int64), *below])
@@ -306,7 +306,7 @@ def program_in_order(
 
 
 def _products(rows: Integers, chosen: Sequence[int]) -> tuple[Integers, Integers, Integers]:
-    """All products of two entries of one of these rows: the row, and where the entries are."""
+    """Return all products of two entries of one of these rows: the row, and where the entries are."""
     parts: list[tuple[Integers, Integers, Integers]] = [(rows[:0], rows[:0], rows[:0])]
     where = np.argsort(rows, kind="stable")
     ordered = rows[where]
@@ -322,14 +322,14 @@ _PAIRS: dict[int, Entries] = {}
 
 
 def _pairs(m: int) -> Entries:
-    """First and second of all pairs of m things, each with itself too."""
+    """Return first and second of all pairs of m things, each with itself too."""
     if m not in _PAIRS:
         _PAIRS[m] = tuple(each.astype(np.int64) for each in np.triu_indices(m))  # type: ignore[assignment]
     return _PAIRS[m]
 
 
 def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]:
-    """The rows below the diagonal of each column of L, ascending: a column passes its own on to the first of them."""
+    """Return the rows below the diagonal of each column of L: a column passes its rows on to the first of them."""
     below: list[set[int]] = [set() for _ in range(n)]
     for column, row in zip(low.tolist(), high.tolist(), strict=True):
         below[column].add(row)
@@ -345,21 +345,21 @@ def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]
 
 
 @inlined
-def behind(program):
-    """Where what stands behind these sections begins."""
+def end_of_sections(program):
+    """Return the place behind the sections of a program."""
     first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_UPDATES]
     return first + 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN]) + 4 * program[N_STIFFENED]
 
 
 @inlined
 def order_of(program):
-    """Which coordinate, or n_q + which row, each pivot is of."""
+    """Return the coordinate, or n_q + the row, of each pivot."""
     return program[N_HEAD : N_HEAD + program[N_PIVOTS]]
 
 
 @inlined
 def columns_of(program):
-    """Where the columns of L begin, and the last one ends; and the place of each entry among the pivots."""
+    """Return where the columns of L begin, and the last one ends; and the place of each entry among the pivots."""
     first = N_HEAD + program[N_PIVOTS]
     middle = first + program[N_PIVOTS] + 1
     return program[first:middle], program[middle : middle + program[N_OFF]]
@@ -367,14 +367,14 @@ def columns_of(program):
 
 @inlined
 def targets_of(program):
-    """The slots that the updates change, pivot by pivot."""
+    """Return the slots that the updates change, pivot by pivot."""
     first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF]
     return program[first : first + program[N_UPDATES]]
 
 
 @inlined
 def mass_of(program):
-    """Rows, columns and slots of the values of M."""
+    """Return rows, columns and slots of the values of M."""
     n = program[N_OF_MASS]
     first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_UPDATES]
     return program[first : first + n], program[first + n : first + 2 * n], program[first + 2 * n : first + 3 * n]
@@ -382,7 +382,7 @@ def mass_of(program):
 
 @inlined
 def jacobian_of(program):
-    """Rows, columns and slots of the values of G."""
+    """Return rows, columns and slots of the values of G."""
     n = program[N_OF_JACOBIAN]
     first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_UPDATES] + 3 * program[N_OF_MASS]
     return program[first : first + n], program[first + n : first + 2 * n], program[first + 2 * n : first + 3 * n]
@@ -390,7 +390,7 @@ def jacobian_of(program):
 
 @inlined
 def stiffened_of(program):
-    """Rows, two entries of each, and slots of the products that M is stiffened by."""
+    """Return rows, two entries of each, and slots of the products that stiffen M."""
     n = program[N_STIFFENED]
     first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_UPDATES]
     first += 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN])

@@ -18,7 +18,7 @@ from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, inlined, kernel, merged
 from twoloop.kernels.data.counters import N_OUTER
 from twoloop.kernels.data.tolerances import ATOL, RTOL
-from twoloop.kernels.evaluation.inner_loop import evaluate_there, project
+from twoloop.kernels.evaluation.inner_loop import evaluate_as_given, project
 
 HIGHEST = 12  # order; with orders above 13 the nodes below would not do
 N_TERMS = HIGHEST + 2  # differences that a step makes, and coefficients g and G
@@ -279,7 +279,7 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
     _coefficients(memory, h, k)
     _predict(memory, h, k, old, new, state, q1, v1, n)
     memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # if the evaluation fails
-    code = evaluate_there(f, w, t + h, q1, v1, a1)
+    code = evaluate_as_given(f, w, t + h, q1, v1, a1)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
     per_v, per_q = _scratch(memory, n)

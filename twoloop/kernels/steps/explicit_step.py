@@ -16,7 +16,7 @@ from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, inline
 from twoloop.kernels.data.counters import N_OUTER
 from twoloop.kernels.data.noted import NEARLY_SINGULAR
 from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL, times_gap
-from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, evaluate_there, project
+from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_as_given, evaluate_state, project
 from twoloop.kernels.linalg.dense import copy
 
 # places in `options`: scalars, then A (s, s), b (s), c (s) and the weights of the two estimates (s each)
@@ -169,7 +169,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
         v_stage, a_stage = slopes[j, :n], slopes[j, n : 2 * n]
         copy(stage[n : 2 * n], v_stage)
         if free:
-            code = evaluate_there(f, w, t + c[j] * h, stage[:n], v_stage, a_stage)
+            code = evaluate_as_given(f, w, t + c[j] * h, stage[:n], v_stage, a_stage)
         else:
             code = evaluate(f, w, t + c[j] * h, stage[:n], v_stage, options[INNER_TOL], a_stage)
         if code != DONE:

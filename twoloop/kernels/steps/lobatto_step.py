@@ -35,7 +35,7 @@ from twoloop.kernels.data.counters import (
 )
 from twoloop.kernels.data.noted import BY_GENERAL, DEFECT, NEAR_NOW, NEARLY_SINGULAR, ORIENTATION_NEW, PIVOT, ROUNDED
 from twoloop.kernels.data.tolerances import ESTIMATE, LEAST, LOOK, ROUNDING, allowed
-from twoloop.kernels.evaluation.accelerations import ABOVE_ROUNDING
+from twoloop.kernels.evaluation.accelerations import MIN_CORRECTION
 from twoloop.kernels.evaluation.inner_loop import check_redundant, project, renew_partition
 from twoloop.kernels.linalg.dense import copy
 
@@ -223,7 +223,7 @@ def _project_all(f, w, options, room, n, n_ends, out_t, out_state):
         for i in range(2 * n):
             room[ends + LANES * (1 + i) + k] = out_state[row, i]
         room[room_at.FINE + k] = 1.0
-    least = max(options[THETA], ABOVE_ROUNDING * w.notes[ROUNDED])
+    least = max(options[THETA], MIN_CORRECTION * w.notes[ROUNDED])
     f.closer_ends(room, f.own_numbers)
     for _ in range(4):
         f.nearer_ends(room, f.own_numbers)

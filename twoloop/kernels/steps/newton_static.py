@@ -16,7 +16,7 @@ from twoloop.kernels.data.codes import DONE, NEEDS_DENSE, NOT_FINITE, SINGULAR
 from twoloop.kernels.data.common import compiled, inlined
 from twoloop.kernels.data.counters import N_EVALUATIONS, N_FACTORIZATIONS, N_JACOBIANS
 from twoloop.kernels.data.finite import finite_vector
-from twoloop.kernels.evaluation.sparse_inner_loop import jacobian_values_there
+from twoloop.kernels.evaluation.sparse_inner_loop import fill_jacobian_values
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.linalg.sparse_lu import factor as factor_lu
 from twoloop.kernels.linalg.sparse_lu import load, tangents_of
@@ -93,7 +93,7 @@ def _unbalanced(f, w, t, q, v, moved, out):
     out[:] = 0.0
     f.force(t, q, v, f.p, out)
     if moved:
-        jacobian_values_there(f, w, t, q)
+        fill_jacobian_values(f, w, t, q)
     largest = 0.0
     for j in range(out.size):
         largest = max(largest, abs(out[j]))

@@ -25,8 +25,8 @@ from twoloop.kernels.data.counters import N_OUTER
 from twoloop.kernels.data.flags import STRAIGHT
 from twoloop.kernels.data.noted import BY_GENERAL, DEFECT, NEAR_NOW, NEARLY_SINGULAR
 from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, LOOK, ROUNDING, RTOL, times_gap
-from twoloop.kernels.evaluation.inner_loop import evaluate_there, project
-from twoloop.kernels.evaluation.tasks import EVALUATE_THERE
+from twoloop.kernels.evaluation.inner_loop import evaluate_as_given, project
+from twoloop.kernels.evaluation.tasks import EVALUATE_AS_GIVEN
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps import recurrences as at
 from twoloop.kernels.steps.recurrences import accelerations_found, expand, series_of
@@ -49,7 +49,7 @@ def _find_series(f, w, options, memory, t, state, unit, which):
     memory[at.TARGET] = which
     if f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0:  # code made for the mechanism leaves no factors in w
         q, v, a = state[:n], state[n : 2 * n], accelerations_found(memory, n)
-        code = f.general(f, w, EVALUATE_THERE, t, q, v, 0.0, a, w.lam)
+        code = f.general(f, w, EVALUATE_AS_GIVEN, t, q, v, 0.0, a, w.lam)
         if code != DONE:
             return code
     return expand(f, w, options, memory, t, state, unit)
@@ -114,7 +114,7 @@ def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
     """The defect within the step, at the share s of it, over what is allowed; infinite where there is none."""
     found = accelerations_found(memory, q.size)
     _evaluate(series, memory[at.UNIT], order, s * h / memory[at.UNIT], q, v, found)
-    if evaluate_there(f, w, t + s * h, q, v, a) != DONE:
+    if evaluate_as_given(f, w, t + s * h, q, v, a) != DONE:
         return np.inf
     return excess(tolerances, h, order, found, a, q, v)
 
