@@ -67,7 +67,7 @@ engines: .venv/engines ## the physics engines of the study engines, where they a
 table3: install ## the paper's Table 3 into reports/, about three minutes; ARGS=--full takes twenty
 	@echo "[3/3] Compiling the paper's steps and those of the default (once), then 32 cells, IDA and Exudyn"
 	@$(RUN) -c "from twoloop.kernels.steps import explicit_step, lobatto_step; from twoloop.kernels.control import switching" & \
-	$(RUN) -c "from twoloop.kernels.steps import newmark_step, paper_step; from twoloop.kernels import interpolation" && wait $$!
+	$(RUN) -c "from twoloop.kernels.paper import newmark_step, paper_step; from twoloop.kernels import interpolation" && wait $$!
 	$(RUN) -m studies.table3 $(ARGS)
 
 reports: install ## all studies into reports/
@@ -84,15 +84,16 @@ compile: install ## compile the kernels, and the callbacks of bodies, mechanisms
 	$(RUN) -c "from twoloop.kernels import advance, interpolation, cached_run; \
 	from twoloop.kernels.linalg import dependent_columns, rank; from twoloop.kernels.control import switching; \
 	from twoloop.kernels.evaluation import checks, residuals, traced; \
-	from twoloop.kernels.lanes import lane_dop853, lane_runs, lane_starts, lane_taylor; \
-	from twoloop.kernels.steps import adams_step, asking_step, bdf_step, crossing_step, explicit_step, lobatto_step, \
-	fixed_point_step, newmark_step, paper_step, taylor_step; from twoloop.bodies.planar import callbacks, programs; \
+	from twoloop.kernels.lanes import advance as lanes, explicit, starts; \
+	from twoloop.kernels.steps import adams_step, crossing_step, explicit_step, lazy, lobatto_step, taylor_step; \
+	from twoloop.kernels.paper import bdf_step, fixed_point_step, newmark_step, paper_step; \
+	from twoloop.bodies.planar import callbacks, programs; \
 	from twoloop.mechanisms import *; from studies.honesty import traps; $(CALLBACKS_OF_MORE_TESTS)" && wait $$!
 
 # kernels that slow tests alone need
 compile-all: compile
 	@echo "Compiling the steps of implicit methods in lanes"
-	@$(RUN) -c "from twoloop.kernels.lanes import lane_implicit"
+	@$(RUN) -c "from twoloop.kernels.lanes import newton"
 
 # files in the order of tests/conftest.py: sorted by how many tests they have, long ones with few tests would come last
 SHARED := -n 2 --dist loadfile --no-loadscope-reorder

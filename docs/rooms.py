@@ -7,7 +7,7 @@ from pathlib import Path
 FOLDER = Path(__file__).resolve().parents[1] / "twoloop"
 ROOMS = (  # from the lowest: each imports from itself and from those before it
     *("kernels.compile", "kernels.data", "kernels.linalg", "kernels.evaluation", "kernels.control", "kernels.steps"),
-    *("kernels.lanes", "kernels", "checks", "problem", "generate", "methods", "run"),
+    *("kernels.paper", "kernels.lanes", "kernels", "checks", "problem", "generate", "methods", "run"),
     *("bodies", "mechanisms", "symbolic"),
     *("result", "solve", "impacts", "ensembles", "sweeps", "testing", "rows", "audit"),
 )

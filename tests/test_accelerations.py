@@ -21,7 +21,7 @@ from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.llvm_text import BIT, Module
 from twoloop.generate.null_space import LEAST
 from twoloop.kernels.compile.generated_functions import GeneratedFunctions, object_code
-from twoloop.kernels.lanes.lane_room import LANES
+from twoloop.kernels.lanes.layout import LANES
 from twoloop.kernels.linalg.dependent_columns import NONE, NUMBER, VARIES, choose_dependent_columns, room_size
 
 pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")

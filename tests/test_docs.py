@@ -15,7 +15,7 @@ import pytest
 
 from tests.marks import slow
 from tests.test_rooms import documentation
-from twoloop import Status, mechanisms, solve_dae
+from twoloop import Status, ensemble, mechanisms, solve_dae
 from twoloop.bodies import PlanarModel, SpatialModel
 from twoloop.mechanisms import four_bar, pendulum
 from twoloop.methods.presets import PRESETS
@@ -191,6 +191,17 @@ def test_the_method_of_the_page_has_order_five_and_keeps_tolerance_and_constrain
     system, result = four_bar().system, page["result"]
     assert result.success and result.method == "DormandPrince5" and page["error"] < 1e-6
     assert max(np.abs(system.constraint(t, q)).max() for t, q in zip(result.t, result.q.T, strict=True)) < 1e-13
+
+
+def test_one_line_gives_the_method_of_the_page_a_name(names, monkeypatch):
+    page, problem = names("add_a_method"), pendulum()
+    run = problem.system, (0.0, 1.0), problem.q0, problem.v0
+    monkeypatch.setitem(PRESETS, "DormandPrince5", page["DormandPrince5"]())
+    result, dense = solve_dae(*run, "DormandPrince5"), solve_dae(*run, "DormandPrince5", dense_output=True)
+    assert result.method == "DormandPrince5" and np.abs(result.q[:, -1] - problem.motion(1.0)[0]).max() < 1e-5
+    assert np.abs(dense.sol(0.7).q - problem.motion(0.7)[0]).max() < 1e-4
+    runs = ensemble(*run[:2], np.tile(run[2], (3, 1)), run[3], method="DormandPrince5")
+    assert runs.success.all() and runs.singly.all() and np.abs(runs.q[:, :, -1] - result.q[:, -1]).max() == 0.0
 
 
 def test_the_solver_of_the_page_has_order_two_and_is_a_line_of_the_benchmark(names):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import DOP853
 
-from twoloop.methods import dop853_tableau
+from twoloop.methods import dop853
 from twoloop.methods.tableaux import gauss, lobatto_iiie, radau_iia, sun_radau_iib
 
 FAMILIES = {"gauss": gauss, "radau_iia": radau_iia, "sun_radau_iib": sun_radau_iib, "lobatto_iiie": lobatto_iiie}
@@ -189,4 +189,4 @@ def test_sun_damps_nothing_and_radau_iia_everything_stiff(s):
 @pytest.mark.parametrize("name", ["A", "B", "C", "E3", "E5"])
 def test_dop853_is_that_of_scipy(name):
     known = getattr(DOP853, name)
-    assert np.array_equal(getattr(dop853_tableau, name), known[:12]) and not np.any(known[12:])
+    assert np.array_equal(getattr(dop853, name), known[:12]) and not np.any(known[12:])

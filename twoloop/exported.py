@@ -8,12 +8,12 @@ from twoloop.ensembles.integrator import Integrator as Integrator
 from twoloop.impacts.motion import solve_with_friction as solve_with_friction
 from twoloop.impacts.motion import solve_with_stops as solve_with_stops
 from twoloop.kernels.compile.callbacks import callback as callback
-from twoloop.methods.bdf import BDF as BDF
 from twoloop.methods.dop853 import DOP853 as DOP853
-from twoloop.methods.esdirk import ESDIRK as ESDIRK
-from twoloop.methods.newmark import Newmark as Newmark
-from twoloop.methods.presets import paper_irk as paper_irk
-from twoloop.methods.presets import paper_newmark as paper_newmark
+from twoloop.methods.paper import BDF as BDF
+from twoloop.methods.paper import Newmark as Newmark
+from twoloop.methods.paper import paper_irk as paper_irk
+from twoloop.methods.paper import paper_newmark as paper_newmark
+from twoloop.methods.runge_kutta import ESDIRK as ESDIRK
 from twoloop.methods.runge_kutta import RungeKutta as RungeKutta
 from twoloop.methods.taylor import Taylor as Taylor
 from twoloop.problem.description import Drawing as Drawing

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from twoloop.checks.arguments import check_span, check_times, check_vector, is_vector
 from twoloop.checks.consistency import ConstraintWarning
 from twoloop.kernels.layout import give_back
-from twoloop.methods.code_for import Compiled
 from twoloop.methods.plan import Method
+from twoloop.methods.preparation import Compiled
 from twoloop.problem.events import check_events
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result

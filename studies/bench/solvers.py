@@ -20,8 +20,8 @@ from references.scipy.index1 import baumgarte
 from studies.bench.collector import Case, NotApplicable, Solver
 from twoloop import Result, RungeKutta, paper_irk, paper_newmark, solve_dae
 from twoloop.methods.auto import LOOSE, TIGHTEST
-from twoloop.methods.code_for import Compiled
 from twoloop.methods.plan import Method
+from twoloop.methods.preparation import Compiled
 from twoloop.methods.tableaux import sun_radau_iib
 
 TOLERANCES = tuple(float(f"1e-{k}") for k in range(3, 14))  # of all solvers that have one: no gap of over a decade

@@ -15,7 +15,7 @@ from studies.bench.store import Array
 from twoloop import ConstrainedSystem, Result, callback, mechanisms
 from twoloop.generate import lobatto_tables
 from twoloop.mechanisms import Problem
-from twoloop.methods import dop853_tableau, tableaux
+from twoloop.methods import dop853, tableaux
 from twoloop.methods import presets as methods
 from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import Plan
@@ -210,9 +210,9 @@ def in_tableau() -> Iterator[Fault]:
     plain = partial(patch.object, tableaux, "_symplectic_average", lambda A, b: A)
     yield Fault("the symplectic average left out", "tableau", plain, (TABLEAUX,))
     for name in ("A", "B", "C", "E3", "E5"):
-        array = getattr(dop853_tableau, name).copy()
+        array = getattr(dop853, name).copy()
         array[np.unravel_index(np.flatnonzero(array)[1], array.shape)] += 1e-6
-        plant = partial(patch.object, dop853_tableau, name, array)
+        plant = partial(patch.object, dop853, name, array)
         yield Fault(f"a number of DOP853's {name} off by 1e-6", "tableau", plant, (EXPLICIT,))
     off_twice = _changed(lobatto_tables, "tables", lambda all_: all_._replace(positions=all_.positions + 1e-9))
     yield Fault("double integrals of Lobatto16 off by 1e-9", "tableau", off_twice, (LOBATTO,))
@@ -220,7 +220,7 @@ def in_tableau() -> Iterator[Fault]:
 
 def in_options() -> Iterator[Fault]:
     """The plan of a method: what its compiled step and the step-size control read."""
-    from twoloop.kernels.steps import newmark_step as newmark
+    from twoloop.kernels.paper import newmark_step as newmark
 
     sound, pendulum = mechanisms.andrews(), mechanisms.projection_pendulum()
 

@@ -32,6 +32,7 @@ TESTS = {  # of a kernel whose change compiles nothing but itself, and what is r
     ),
     "newmark": ("tests/kernels/test_newmark.py", "tests/kernels/test_orders.py", "tests/test_fixed_step.py"),
 }
+OF_PAPER = ("bdf", "newmark")  # kernels in twoloop/kernels/paper/; the others are in twoloop/kernels/steps/
 FOLDERS = ("twoloop", "references", "studies", "tests", "pyproject.toml", "docs", "reports")
 SEED, N_EACH, QUICK_EACH = 2016, 10, 1
 TIME_LIMIT = 900.0  # s of the tests of a mutant, longer than they take on a busy machine; none has to end
@@ -47,7 +48,7 @@ SIGNS |= {ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
 class Mutant:
     """One change of one place of a file: characters `begin` to `end` of a line become `new`."""
 
-    kernel: str  # whose file is twoloop/kernels/steps/KERNEL_step.py
+    kernel: str  # whose file is KERNEL_step.py, see `file_of`
     line: int
     begin: int
     end: int
@@ -69,7 +70,7 @@ class Mutant:
 
 def file_of(folder: Path, kernel: str) -> Path:
     """The file of a kernel in a folder with the project."""
-    return folder / "twoloop" / "kernels" / "steps" / f"{kernel}_step.py"
+    return folder / "twoloop" / "kernels" / ("paper" if kernel in OF_PAPER else "steps") / f"{kernel}_step.py"
 
 
 def mutants_of(kernel: str, source: str) -> Iterator[Mutant]:

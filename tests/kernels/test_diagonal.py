@@ -9,7 +9,7 @@ from twoloop import ESDIRK, RungeKutta, solve_dae
 from twoloop.kernels.steps.diagonal_step import FILTERED
 from twoloop.mechanisms import moderately_stiff_beam
 from twoloop.mechanisms.ancf_beam import tip_height
-from twoloop.methods.esdirk import FORMULAS
+from twoloop.methods.runge_kutta import FORMULAS
 from twoloop.methods.tableaux import radau_iia
 
 TIMES = np.linspace(0.1, 1.0, 10)

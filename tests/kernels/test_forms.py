@@ -9,7 +9,7 @@ from tests.problems import pendulum, some_of, violations, without_tangent, worst
 from twoloop import ConstrainedSystem, consistent_state, solve_dae
 from twoloop.kernels.linalg import band as lapack
 from twoloop.mechanisms.ancf_beam import very_flexible_beam
-from twoloop.methods.newmark import Newmark
+from twoloop.methods.paper import Newmark
 from twoloop.methods.runge_kutta import RungeKutta
 from twoloop.methods.tableaux import radau_iia
 

@@ -294,6 +294,6 @@ print(solve_dae(problem.system, (0.0, 0.5), problem.q0, problem.v0).success, *sy
 """
     success, *modules = run_python(source).stdout.split()
     assert success == "True" and "twoloop.kernels.steps.explicit_step" in modules
-    unused = ("newton_step", "diagonal_step", "fixed_point_step", "paper_step")
-    assert not {*modules} & {f"twoloop.kernels.steps.{name}" for name in unused}
+    unused = ("steps.newton_step", "steps.diagonal_step", "paper.fixed_point_step", "paper.paper_step")
+    assert not {*modules} & {f"twoloop.kernels.{name}" for name in unused}
     assert not {*modules} & {"twoloop.bodies.model_problem", "twoloop.bodies.assembly", "scipy.optimize"}

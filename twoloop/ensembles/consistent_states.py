@@ -18,8 +18,7 @@ from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.run.projection import ConsistentState, consistent_state
 
 if TYPE_CHECKING:
-    from twoloop.generate.generated_lanes import GeneratedLanes
-    from twoloop.generate.lane_constraints import LaneConstraints
+    from twoloop.generate.lane_code import GeneratedLanes, LaneConstraints
 
 MOST_ROWS = 200  # whose factors in lanes have no zeros
 SINGLY = 0.01  # about what `consistent_state` takes, s
@@ -123,8 +122,7 @@ class _InLanes:
         generic, varying = generic_parameters(starts.parameters)
 
         def make() -> GeneratedLanes[LaneConstraints]:
-            from twoloop.generate.generated_lanes import GeneratedLanes
-            from twoloop.generate.lane_constraints import LaneConstraints
+            from twoloop.generate.lane_code import GeneratedLanes, LaneConstraints
 
             record = ParameterTape(generic.tolist(), varying)
             return GeneratedLanes(record, LaneConstraints(system, record.parameters))
@@ -135,23 +133,24 @@ class _InLanes:
 
     def put(self, starts: Starts, moves: Integers, n_redundant: int) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Positions and velocities put on the constraints, so many of which are redundant; which may be taken."""
-        from twoloop.kernels.lanes import lane_room, lane_starts
+        from twoloop.kernels.lanes import layout
+        from twoloop.kernels.lanes import starts as kernels
 
         own, code, q, v = self._own, self._own.code, starts.q.copy(), starts.v.copy()
         fine = np.zeros(len(q), dtype=np.int64)
         n, n_rows = code.n, code.n_rows
-        kit = lane_room.LaneKit(own.functions)
+        kit = layout.LaneKit(own.functions)
         settings = np.array([n, n_rows, 0, 0, code.n_numbers, n_redundant], dtype=np.int64)
-        control = np.concatenate([[starts.t0], np.zeros(lane_room.ATOL - 1 + n), code.numbers.values])
+        control = np.concatenate([[starts.t0], np.zeros(layout.ATOL - 1 + n), code.numbers.values])
         places = (
-            lane_room.places(n, n_rows, code.n_numbers)[-1]
-            + lane_starts.places_of_starts(n, n_rows, len(code.pattern) - n_rows - 1, n_redundant)[-1]
+            layout.places(n, n_rows, code.n_numbers)[-1]
+            + kernels.places_of_starts(n, n_rows, len(code.pattern) - n_rows - 1, n_redundant)[-1]
         )
 
         def block(rows: slice) -> None:
-            room, numbers = aligned(places, lane_room.LANES), own.numbers(starts.parameters[rows])
+            room, numbers = aligned(places, layout.LANES), own.numbers(starts.parameters[rows])
             given = code.pattern, moves, numbers, q[rows], v[rows]
-            lane_starts.start_lanes(kit, settings, control, *given, fine[rows], room)
+            kernels.start_lanes(kit, settings, control, *given, fine[rows], room)
 
         in_blocks(block, len(q), threads_of(None))
         return q, v, fine == 1

@@ -23,9 +23,9 @@ from twoloop.generate.time_dependence import BY_TIME, TIME, may_be_narrow, may_b
 from twoloop.generate.trace import Equations
 from twoloop.kernels.control.sudden import FLOOR, LEAST, SHARE, STEEPER  # what counts as sudden in single runs
 from twoloop.kernels.control.sudden import PLACES as N_PLACES
-from twoloop.kernels.lanes import lane_ends
+from twoloop.kernels.lanes import layout
 from twoloop.kernels.layout import cached_run
-from twoloop.methods import dop853_tableau as tableau
+from twoloop.methods import dop853
 from twoloop.methods.auto import TIGHTEST
 from twoloop.methods.dop853 import COARSE_SHARE, UNSEEN
 from twoloop.methods.plan import Method, least_tolerance
@@ -36,8 +36,7 @@ from twoloop.methods.taylor import order_in_lanes
 from twoloop.problem.system import ConstrainedSystem
 
 if TYPE_CHECKING:
-    from twoloop.generate.generated_lanes import GeneratedLanes
-    from twoloop.generate.lane_code import LaneCode
+    from twoloop.generate.lane_code import GeneratedLanes, LaneCode
 
 AT_ONCE = 30_000  # numbers that are compared together
 
@@ -172,7 +171,7 @@ def lane_methods(name: str, stiff: bool, n: int, rtol: float, atol: float, invol
 
 def _taylor(rtol: float, atol: float) -> LaneMethod:
     def step() -> Any:
-        from twoloop.kernels.lanes.lane_taylor import step_by_series
+        from twoloop.kernels.lanes.explicit import step_by_series
 
         return step_by_series
 
@@ -182,28 +181,28 @@ def _taylor(rtol: float, atol: float) -> LaneMethod:
 
 def _dop853(n: int, rtol: float, atol: float) -> LaneMethod:
     def step() -> Any:
-        from twoloop.kernels.lanes.lane_dop853 import step_by_dop853
+        from twoloop.kernels.lanes.explicit import step_by_dop853
 
         return step_by_dop853
 
     def memory(code: LaneCode) -> int:
-        from twoloop.kernels.lanes.lane_dop853 import memory_size
+        from twoloop.kernels.lanes.explicit import memory_size
 
-        return memory_size(len(tableau.B), n)
+        return memory_size(len(dop853.B), n)
 
-    weights = tableau.A, tableau.B, tableau.C, tableau.E5, COARSE_SHARE * tableau.E3
-    stages, options = len(tableau.B), _options(PRESETS["DOP853"], n, rtol, atol)
+    weights = dop853.A, dop853.B, dop853.C, dop853.E5, COARSE_SHARE * dop853.E3
+    stages, options = len(dop853.B), _options(PRESETS["DOP853"], n, rtol, atol)
     return LaneMethod("DOP853", False, 8, stages - 1, options, step, memory, weights, UNSEEN)
 
 
 def _newton(name: str, tested: Literal["all", "positions"], n: int, rtol: float, atol: float) -> LaneMethod:
     def step() -> Any:
-        from twoloop.kernels.lanes.lane_implicit import step_by_newton
+        from twoloop.kernels.lanes.newton import step_by_newton
 
         return step_by_newton
 
     def memory(code: LaneCode) -> int:
-        from twoloop.kernels.lanes.lane_newton import memory_size
+        from twoloop.kernels.lanes.newton import memory_size
 
         return memory_size(radau.stages, n)
 
@@ -214,7 +213,7 @@ def _newton(name: str, tested: Literal["all", "positions"], n: int, rtol: float,
 
 
 def _options(method: Method, n: int, rtol: float, atol: float) -> Array:
-    """What a step reads, behind what lane_control.py reads."""
+    """What a step reads, behind what explicit.py reads."""
     plan = method.plan(n, rtol, atol, False)
     return np.concatenate([plan.rule, [plan.rough, cached_run().FIRST_STEP, least_tolerance(rtol, atol)], plan.options])
 
@@ -227,16 +226,16 @@ OF_SUDDEN = 20  # ... times as many where a force may act for a short time: lane
 SMALLEST, LARGEST = 128, 4096  # runs of a block; numbers of all of a block's runs are made at once
 FOR_EACH = 3  # blocks for each of several threads, so that all end at about the same time
 LOOKS = PLACES * OF_SUDDEN
-SHORT = min(lane_ends.NO_START, lane_ends.UNLIKE) - 1  # beside what lane_ends.py says
+SHORT = min(layout.NO_START, layout.UNLIKE) - 1  # beside what layout.py says
 AGREES = 1e-7  # of the terms of an equation: what rounding may leave of it at the end of a run
 
-WHY = {  # a run is left to a run of its own, by what lane_ends.py says of it
-    lane_ends.NO_START: "the code made for the first run does not hold at the start",
-    lane_ends.NO_STATE: "a state at t_eval could not be put on the constraints",
-    lane_ends.NO_VALUES: "the equations have no values in a step (constraints lose rank, a root of a negative number)",
-    lane_ends.OFTEN_REFUSED: "steps are refused again and again (a sudden force, stiff motion, a singular position)",
-    lane_ends.MANY_STEPS: "it takes more than 100,000 steps in lanes (stiff, or very fast motion)",
-    lane_ends.UNLIKE: "the callbacks do not agree with the code at the end (they branch)",
+WHY = {  # a run is left to a run of its own, by what layout.py says of it
+    layout.NO_START: "the code made for the first run does not hold at the start",
+    layout.NO_STATE: "a state at t_eval could not be put on the constraints",
+    layout.NO_VALUES: "the equations have no values in a step (constraints lose rank, a root of a negative number)",
+    layout.OFTEN_REFUSED: "steps are refused again and again (a sudden force, stiff motion, a singular position)",
+    layout.MANY_STEPS: "it takes more than 100,000 steps in lanes (stiff, or very fast motion)",
+    layout.UNLIKE: "the callbacks do not agree with the code at the end (they branch)",
     SHORT: "forces or drives change for so short a time that lanes may miss others",
 }
 
@@ -268,8 +267,7 @@ class LaneRuns:
         kind = ("lanes", method.series, method.tableau is None, choice, tuple(varying))  # of which the latest is kept
 
         def make() -> GeneratedLanes[LaneCode]:
-            from twoloop.generate.generated_lanes import GeneratedLanes
-            from twoloop.generate.lane_code import LaneCode  # compiled, or read from the cache, at the first ensemble
+            from twoloop.generate.lane_code import GeneratedLanes, LaneCode  # loads kernels: at the first ensemble
 
             record = ParameterTape(generic.tolist(), varying)
             return GeneratedLanes(record, LaneCode(system, choice, record.parameters, method.series, method.tableau))
@@ -287,7 +285,7 @@ class LaneRuns:
         out_q: Array,
         out_v: Array,
     ) -> tuple[Integers, Integers, Integers, Array]:
-        """Make these runs: what became of each, as lane_ends.py has it, steps, evaluations, a and lam at the end."""
+        """Make these runs: what became of each, as layout.py has it, steps, evaluations, a and lam at the end."""
         n_runs = len(which)
         status, n_steps, n_evaluations = np.zeros((3, n_runs), dtype=np.int64)
         n_evaluations += 1  # at the start
@@ -311,20 +309,20 @@ class LaneRuns:
         out: tuple[Array, Array, Array],
         told: tuple[Integers, Integers, Integers],
     ) -> None:
-        from twoloop.kernels.lanes import lane_room, lane_runs
+        from twoloop.kernels.lanes import advance
 
         starts, code, method = self.starts, self.own.code, self.method
         n, n_rows = code.n, code.n_rows
         numbers = self.own.numbers(starts.parameters[which])
-        begin = lane_room.places(n, n_rows, code.n_numbers)[-1]
-        room = aligned(begin + method.memory(code), lane_room.LANES)
-        kit = lane_room.LaneKit(self.own.functions, method.step())
+        begin = layout.places(n, n_rows, code.n_numbers)[-1]
+        room = aligned(begin + method.memory(code), layout.LANES)
+        kit = layout.LaneKit(self.own.functions, method.step())
         redundant = bool(code.equations.redundant.conditions)
         settings = np.array([n, n_rows, method.order, redundant, code.n_numbers, method.evaluations], dtype=np.int64)
         control = np.concatenate([[starts.t0, t1, (t1 - starts.t0) / self.places, rtol], atol, code.numbers.values])
         given = np.ascontiguousarray(starts.q[which]), np.ascontiguousarray(starts.v[which])
         arrays = times, numbers, *given, *out, *told, room
-        lane_runs.advance_lanes(kit, settings, control, method.options, *arrays)
+        advance.advance_lanes(kit, settings, control, method.options, *arrays)
 
     def agree(self, which: Integers, made: Flags, t1: float, atol: float, q: Array, v: Array, ends: Array) -> Flags:
         """Of which of these runs, of those that were made, callbacks say that the equations hold at their end.
@@ -352,12 +350,12 @@ class LaneRuns:
         ends: Array,
     ) -> Flags:
         """Of which of these runs all states were found and agree; the status of others says why not."""
-        made = status == lane_ends.ENDED
+        made = status == layout.ENDED
         found = np.isfinite(q).all(axis=(1, 2))
         fine = made & found
-        status[made & ~found] = lane_ends.NO_STATE
+        status[made & ~found] = layout.NO_STATE
         agreed = self.agree(which, fine, t1, atol, q, v, ends)
-        status[fine & ~agreed] = lane_ends.UNLIKE
+        status[fine & ~agreed] = layout.UNLIKE
         fine &= agreed
         if self.looks is not None:
             times, runs = np.linspace(self.starts.t0, t1, LOOKS + 1), np.flatnonzero(fine)

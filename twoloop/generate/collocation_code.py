@@ -17,10 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.generate import lane_emitter, lane_memory, llvm_code, lobatto_tables
+from twoloop.generate import lane_emitter, llvm_code, lobatto_tables
 from twoloop.generate.compile_equations import GeneratedCode, SharedCode, call_accelerations
-from twoloop.generate.lane_emitter import LaneEmitter
-from twoloop.generate.lane_memory import column, load_lanes, over, place_of, store_lanes, two_sums
+from twoloop.generate.lane_emitter import LaneEmitter, column, load_lanes, over, place_of, store_lanes, two_sums
 from twoloop.generate.llvm_code import Emitter
 from twoloop.generate.llvm_text import BIT, DOUBLE, INTEGER, NOTHING, Module, Value, constant, constants, integer
 from twoloop.generate.lobatto_tables import tables
@@ -642,4 +641,4 @@ def _compiled(own: SharedCode) -> Collocation:
 @cache
 def _stamp() -> str:
     """Return a digest of the writers of the functions; what these share with the equations' code is in the key."""
-    return digest_of("", __file__, lane_emitter, lane_memory, lobatto_tables, at)
+    return digest_of("", __file__, lane_emitter, lobatto_tables, at)

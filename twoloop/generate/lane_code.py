@@ -1,13 +1,33 @@
-"""Code for many runs of one mechanism at once: every number is a vector, with one run in each of its lanes.
+"""Machine code of one mechanism for many runs at once: every number is a vector, with one run in each of its lanes.
 
 The operations are those of `series`, `elimination` and `compile_equations`. Coefficients are read, a vector each, so
-that runs may have parameters of their own.
+that runs may have parameters of their own. Step control of a series is made as code, too. What stands where in memory
+is in kernels/lanes/layout.py. The code is kept on disk by the structure of the equations.
 """
 
 import hashlib
 import math
-from typing import Any
+from collections.abc import Iterator
+from functools import cache, cached_property
+from itertools import chain
+from typing import Any, Generic, NamedTuple, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.generate import (
+    coefficients,
+    compile_equations,
+    elimination,
+    lane_emitter,
+    lane_series,
+    llvm_code,
+    llvm_text,
+    lowering,
+    null_space,
+    series,
+    symbolic_factors,
+)
 from twoloop.generate.choices import Choice
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.compile_equations import write_accelerations
@@ -15,17 +35,416 @@ from twoloop.generate.elimination import Elimination, Solution
 from twoloop.generate.graph import Untraceable, is_zero
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.lane_series import LaneSeries
-from twoloop.generate.lane_stages import LaneStages, Tableau
-from twoloop.generate.lane_steps import LaneSteps, Places, common, is_set, keep_fine, store_mask
-from twoloop.generate.lane_turns import turned
-from twoloop.generate.llvm_text import Value, integer
+from twoloop.generate.llvm_text import Module, Value, integer
 from twoloop.generate.lowering import lower
+from twoloop.generate.parameter_expressions import ParameterTape
 from twoloop.generate.program import Program
 from twoloop.generate.series import series_program
 from twoloop.generate.trace import Equations
-from twoloop.kernels.lanes import lane_projection
-from twoloop.kernels.lanes import lane_room as lanes
+from twoloop.kernels.compile.dependencies import digest_of
+from twoloop.kernels.compile.generated_functions import GeneratedFunctions, are_cached, generated_functions
+from twoloop.kernels.control.defect import ROUNDING
+from twoloop.kernels.control.predictor import FLOOR, LEAST, SHARE_OF_MOTION, SHARE_THROUGH_ZERO
+from twoloop.kernels.lanes import layout as lanes
+from twoloop.kernels.lanes.layout import CODE
 from twoloop.problem.system import ConstrainedSystem
+
+# a step by series, as in kernels/steps/taylor_step.py
+ALLOWED = 0.3  # of the tolerances: how far off the constraints the end of a step is aimed to be before it is projected
+MOST_SHORTENED, SHORTENED, GROWTH = 0.1, 0.9, 5.0  # factors of step sizes: the smallest, a safety factor, the largest
+MOST_REFUSED = 10  # steps, one after another
+FIRST_UNIT = 0.01  # of the span: the unit of time of the first series
+# a projection ends with a correction of so much: absolute (unit of q), and of the largest position
+LARGEST_MOVE, OF_POSITIONS = 1e-14, 1e-14
+CONTRACTION = 0.5  # of a correction by the next, or the projection does not converge
+AT_ONCE = 3  # coordinates whose Horner schemes run side by side: of each three numbers are carried, in 16 registers
+
+
+class Places(NamedTuple):
+    """Hold the order, and pointers to `work` and to its parts, see kernels/lanes/layout.py."""
+
+    order: Value
+    work: Value
+    state: Value
+    new: Value
+    predicted: Value
+    found: Value
+    a: Value
+    lam: Value
+    series: Value
+    scratch: Value
+
+
+class LaneSteps:
+    """Write step control for a mechanism of n coordinates and n_rows multipliers."""
+
+    n_numbers: int  # that depend on parameters
+
+    def __init__(self, n: int, n_rows: int):
+        self.n, self.n_rows = n, n_rows
+
+    def unit(self, emit: LaneEmitter, control: Value, work: Value) -> Value:
+        """Return UNIT: of new runs, and after accepted steps."""
+        select, unit = emit.builder.select, emit.load(work, lanes.UNIT)
+        fresh, accepted = (is_set(emit, work, field) for field in (lanes.FRESH, lanes.ACCEPTED))
+        span = emit.subtract(common(emit, control, lanes.T1), common(emit, control, lanes.T0))
+        following = emit.smaller(
+            emit.multiply(emit.load(work, lanes.LENGTH), unit),
+            emit.multiply(emit.constant(GROWTH), emit.load(work, lanes.H)),
+        )
+        first = emit.multiply(emit.constant(FIRST_UNIT), span)
+        unit = select(fresh, first, select(accepted, following, unit))
+        emit.store(unit, work, lanes.UNIT)
+        for field, value in ((lanes.LONGEST, math.inf), (lanes.SHIFT, 0.0)):
+            emit.store(select(fresh, emit.constant(value), emit.load(work, field)), work, field)
+        return unit
+
+    def lengths(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+        """Choose steps by the last two terms of positions and velocities over the tolerances."""
+        builder, n, at = emit.builder, self.n, self.places(emit, order, control, work)
+        unit, (rtol, atol) = emit.load(work, lanes.UNIT), self.tolerances(emit, control)
+        one, found = emit.constant(1.0), []
+        scales = []
+        for j in range(n):
+            q, v = (emit.function("fabs", emit.load(at.series, i)) for i in (j, n + j))
+            of_q, of_v = (
+                emit.add(atol[j], emit.multiply(rtol, q)),
+                emit.add(emit.multiply(atol[j], unit), emit.multiply(rtol, v)),
+            )
+            scales.append(emit.divide(one, emit.smaller(of_q, emit.divide(of_v, emit.number(order)))))
+        for back in (0, 1):
+            power = builder.sub(order, integer(back))
+            row, largest = emit.pointer(at.series, builder.mul(power, integer(n))), emit.constant(0.0)
+            for j, scale in enumerate(scales):
+                largest = emit.larger(emit.multiply(emit.function("fabs", emit.load(row, j)), scale), largest)
+            found.append(largest)
+        logarithms = [
+            emit.divide(emit.logarithm(value), emit.number(power))
+            for value, power in zip(found, (order, builder.sub(order, integer(1))), strict=True)
+        ]
+        length = emit.exponential(emit.negative(emit.larger(*logarithms)))
+        emit.store(length, work, lanes.LENGTH)
+        t, t1 = emit.load(work, lanes.T), common(emit, control, lanes.T1)
+        left, zero = emit.subtract(t1, t), emit.constant(0.0)
+        h = emit.smallest_of(emit.multiply(length, unit), emit.load(work, lanes.LONGEST))
+        h = builder.select(builder.compare("fcmp oge", h, left), left, h)
+        largest = emit.larger(emit.function("fabs", t), emit.function("fabs", t1))
+        goes = builder.compare("fcmp ogt", h, emit.multiply(emit.constant(lanes.SHORTEST), largest))
+        for field in (lanes.RUNNING, lanes.FINE):
+            goes = builder.both(goes, is_set(emit, work, field))
+        h = builder.select(goes, h, zero)
+        emit.store(h, work, lanes.H)
+        emit.store(emit.divide(h, unit), work, lanes.X)
+        for field in (lanes.RUNNING, lanes.FINE):
+            store_mask(emit, work, field, goes)
+
+    def evaluate(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+        """Evaluate the state and its accelerations by the series, X units of time on."""
+        at = self.places(emit, order, control, work)
+        for j, q in enumerate(self.positions(emit, at, emit.load(work, lanes.X))):
+            emit.store(q, at.predicted, j)
+
+    def positions(self, emit: LaneEmitter, at: Places, x: Value) -> list[Value]:
+        """Evaluate them by Horner's scheme; return the positions."""
+        positions: list[Value] = []
+        builder, n, order = emit.builder, self.n, at.order
+        unit, zero = emit.load(at.work, lanes.UNIT), emit.constant(0.0)
+        per_unit = emit.divide(emit.constant(1.0), unit)
+        twice = emit.multiply(emit.constant(2.0), emit.multiply(per_unit, per_unit))
+        last = emit.pointer(at.series, builder.mul(order, integer(n)))
+        for begin in range(0, n, AT_ONCE):
+            some = range(begin, min(begin + AT_ONCE, n))
+            initial = [each for j in some for each in (emit.load(last, j), zero, zero)]
+            with emit.loop(integer(0), order, initial) as (m, carried, new):
+                power = builder.sub(builder.sub(order, integer(1)), m)
+                row = emit.pointer(at.series, builder.mul(power, integer(n)))
+                for j, (q, v, a) in zip(some, _threes(carried), strict=True):
+                    a = emit.add(emit.multiply(a, x), v)  # first, so that each takes the register of the one before
+                    v = emit.add(emit.multiply(v, x), q)
+                    new += [emit.add(emit.multiply(q, x), emit.load(row, j)), v, a]
+            for j, (q, v, a) in zip(some, _threes(new), strict=True):
+                positions.append(q)
+                emit.store(q, at.new, j)
+                emit.store(emit.multiply(v, per_unit), at.new, n + j)
+                emit.store(emit.multiply(a, twice), at.found, j)
+        return positions
+
+    def defect(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+        """Compute the defect of a step at its end."""
+        at = self.places(emit, order, control, work)
+        a = [emit.load(at.a, j) for j in range(self.n)]
+        emit.store(self.defect_of(emit, control, at, a), work, lanes.DEFECT)
+
+    def defect_of(self, emit: LaneEmitter, control: Value, at: Places, a: list[Value]) -> Value:
+        """Return how far accelerations by the series are from those at NEW, over the tolerances (control/defect.py)."""
+        n, (rtol, atol) = self.n, self.tolerances(emit, control)
+        steps, h = emit.number(at.order), emit.load(at.work, lanes.H)
+        share, per_share = emit.divide(h, steps), emit.divide(steps, h)  # infinite where h is 0: of q nothing is asked
+        largest = worst = emit.constant(0.0)
+        for each in a:
+            largest = emit.larger(emit.function("fabs", each), largest)
+        floor = emit.multiply(emit.constant(ROUNDING), largest)
+        for j, each in enumerate(a):
+            defect = emit.function("fabs", emit.subtract(emit.load(at.found, j), each))
+            of_q, of_v = (
+                emit.add(atol[j], emit.multiply(rtol, emit.function("fabs", emit.load(at.new, place))))
+                for place in (j, n + j)
+            )
+            allowed = emit.smallest_of(of_v, emit.multiply(of_q, per_share))
+            worst = emit.largest_of(emit.divide(emit.subtract(defect, floor), allowed), worst)
+        return emit.multiply(share, worst)
+
+    def departure(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+        """Compute how far the prediction of a step was off, see control/predictor.py."""
+        n, at, (rtol, atol) = self.n, self.places(emit, order, control, work), self.tolerances(emit, control)
+        h = emit.load(work, lanes.H)
+
+        def size(base: Value, place: int) -> Value:
+            return emit.function("fabs", emit.load(base, place))
+
+        def apart(one: Value, other: Value, place: int) -> Value:
+            return emit.function("fabs", emit.subtract(emit.load(one, place), emit.load(other, place)))
+
+        motion = off = emit.constant(0.0)
+        for j in range(n):
+            way = emit.larger(emit.multiply(h, size(at.state, n + j)), apart(at.new, at.state, j))
+            motion = emit.larger(way, motion)
+        turned, least = self.turned(emit, at), emit.multiply(emit.constant(SHARE_THROUGH_ZERO), motion)
+        motion = emit.multiply(emit.constant(SHARE_OF_MOTION), motion)
+        for j in range(n):
+            scale = emit.add(atol[j], emit.multiply(rtol, emit.larger(size(at.new, j), size(at.state, j))))
+            allowed = emit.add(motion, emit.multiply(emit.constant(FLOOR), scale))
+            allowed = emit.smaller(scale, allowed)
+            if turned is not None:
+                allowed = emit.builder.select(turned, emit.smaller(scale, least), allowed)
+            allowed = emit.larger(allowed, emit.constant(LEAST))
+            off = emit.largest_of(emit.divide(apart(at.predicted, at.new, j), allowed), off)
+        emit.store(off, work, lanes.OFF)
+
+    def turned(self, emit: LaneEmitter, at: Places) -> Value | None:
+        """Return where a step from STATE to NEW may have passed a singular position; None: not checked here."""
+        return None
+
+    def judge(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+        """Accept steps, or shorten them by as much as they are off; too many rejections, or no values, end a run."""
+        builder, one = emit.builder, emit.constant(1.0)
+        select, per_order = builder.select, emit.divide(one, emit.number(order))
+        off, *defects = (emit.load(work, field) for field in (lanes.OFF, lanes.WORST, lanes.DEFECT))
+        fine = is_set(emit, work, lanes.FINE)
+        for value in (off, *defects):
+            size = emit.function("fabs", value)
+            fine = builder.both(fine, builder.compare("fcmp olt", size, emit.constant(math.inf)))
+        defect, shortest = emit.larger(*defects), emit.constant(MOST_SHORTENED)
+
+        def root(x: Value) -> Value:
+            return emit.exponential(emit.multiply(emit.logarithm(x), per_order))
+
+        nearer = root(emit.divide(emit.constant(ALLOWED), off))
+        factor = select(builder.compare("fcmp ogt", off, one), nearer, one)
+        truer = emit.multiply(emit.constant(SHORTENED), root(emit.divide(one, defect)))
+        truer = emit.smaller(factor, emit.larger(shortest, truer))
+        factor = select(builder.compare("fcmp ogt", defect, one), truer, factor)
+        factor = select(fine, factor, shortest)
+        running, refused = is_set(emit, work, lanes.RUNNING), builder.compare("fcmp olt", factor, one)
+        accepted = builder.both(running, builder.compare("fcmp oge", factor, one))
+        store_mask(emit, work, lanes.ACCEPTED, accepted)
+        times = emit.load(work, lanes.REFUSED)
+        times = select(builder.both(running, refused), emit.add(times, one), times)
+        # shorter steps could pass over a place at which the equations have no values
+        times = select(fine, times, emit.constant(math.inf))
+        emit.store(times, work, lanes.REFUSED)
+        grown = emit.multiply(emit.load(work, lanes.H), select(refused, factor, emit.constant(GROWTH)))
+        emit.store(select(running, grown, emit.load(work, lanes.LONGEST)), work, lanes.LONGEST)
+        few = builder.compare("fcmp ole", times, emit.constant(float(MOST_REFUSED)))
+        store_mask(emit, work, lanes.RUNNING, builder.both(running, few))
+
+    def commit(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+        """Make the end of an accepted step the state."""
+        at = self.places(emit, order, control, work)
+        accepted = is_set(emit, work, lanes.ACCEPTED)
+        for k in range(2 * self.n):
+            emit.store(emit.builder.select(accepted, emit.load(at.new, k), emit.load(at.state, k)), at.state, k)
+
+    def tolerances(self, emit: LaneEmitter, control: Value) -> tuple[Value, list[Value]]:
+        """Return rtol, and atol of each coordinate."""
+        return common(emit, control, lanes.RTOL), [common(emit, control, lanes.ATOL + j) for j in range(self.n)]
+
+    def places(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> Places:
+        """Return where everything stands; numbers and constants are read from there, too."""
+        *fixed, series = lanes.places(self.n, self.n_rows, self.n_numbers)
+        emit.numbers = emit.pointer(work, fixed.pop())
+        emit.constants = emit.builder.gep(control, integer(lanes.ATOL + self.n))
+        begin = emit.pointer(work, series)
+        following = emit.builder.add(order, integer(1))
+        scratch = emit.pointer(begin, emit.builder.mul(following, integer(self.n)))
+        state, new, predicted, found, a, lam = (emit.pointer(work, place) for place in fixed)
+        return Places(order, work, state, new, predicted, found, a, lam, begin, scratch)
+
+
+def _threes(values: list[Value]) -> Iterator[tuple[Value, Value, Value]]:
+    return zip(values[::3], values[1::3], values[2::3], strict=True)
+
+
+def common(emit: LaneEmitter, control: Value, place: int) -> Value:
+    """Return a number of `control`, for all lanes."""
+    return emit.splat(emit.builder.load(emit.builder.gep(control, integer(place))))
+
+
+def is_set(emit: LaneEmitter, work: Value, field: int) -> Value:
+    """Return in which lanes a field is not 0."""
+    return emit.builder.compare("fcmp one", emit.load(work, field), emit.constant(0.0))
+
+
+def store_mask(emit: LaneEmitter, work: Value, field: int, mask: Value) -> None:
+    """Set a field to 1 in the lanes of a mask, and to 0 in others."""
+    emit.store(emit.builder.select(mask, emit.constant(1.0), emit.constant(0.0)), work, field)
+
+
+def keep_fine(emit: LaneEmitter, work: Value, holds: Value) -> None:
+    """Clear FINE where a condition does not hold."""
+    store_mask(emit, work, lanes.FINE, emit.builder.both(is_set(emit, work, lanes.FINE), holds))
+
+
+Rows = list[dict[int, Value]]  # entries that are not zero
+
+
+def turned(emit: LaneEmitter, before: Rows, after: Rows) -> Value:
+    """Return in which lanes a step may have passed a singular position: det G1 G0^T is not positive.
+
+    G0 and G1 are the rows of the constraints at both ends of the step. The determinant is the inner product of their
+    maximal minors, and near the square of these while a step turns little. A step straight through a position at which
+    the rows lose rank, which leads to another assembly, changes the signs of all of them: they pass through zero. No
+    partition of the coordinates is needed. Lanes count, too, in which the determinant needs a search for pivots.
+    """
+    matrix: list[dict[int, Value]] = [{} for _ in before]
+    for i, row in enumerate(after):
+        for k, other in enumerate(before):
+            total: Value | None = None
+            for j in sorted(row.keys() & other.keys()):
+                term = emit.multiply(row[j], other[j])
+                total = term if total is None else emit.add(total, term)
+            if total is not None:
+                matrix[i][k] = total
+    one, zero, select, compare = emit.constant(1.0), emit.constant(0.0), emit.builder.select, emit.builder.compare
+    left, sign = set(range(len(matrix))), one
+    while left:
+        i = min(left, key=lambda each: (len(matrix[each]), each))  # rows and columns have the same pattern
+        left.remove(i)
+        pivot = matrix[i].pop(i)
+        below = select(compare("fcmp olt", pivot, zero), emit.negative(sign), zero)
+        sign = select(compare("fcmp ogt", pivot, zero), sign, below)
+        inverse = emit.divide(one, pivot)
+        for k in sorted(left):
+            if i in matrix[k]:
+                multiple = emit.multiply(matrix[k].pop(i), inverse)
+                for j, value in matrix[i].items():
+                    change = emit.multiply(multiple, value)
+                    old = matrix[k].get(j)
+                    matrix[k][j] = emit.negative(change) if old is None else emit.subtract(old, change)
+    return compare("fcmp ule", sign, zero)
+
+
+Array = NDArray[np.float64]
+
+NOTHING = 1e-13  # of products of weights, what rounding leaves of zero
+
+
+# A, b and c of an explicit method whose first stage is the state itself, and weights of two estimates of its error
+Tableau = tuple[Array, Array, Array, Array, Array]
+
+
+class LaneStages:
+    """Write the stages of an explicit Runge-Kutta method, and estimates of its error, for n coordinates.
+
+    Velocities of stages are sums of accelerations, so that positions are such sums, too, with the weights A A: both are
+    made of the same accelerations, which are read once. Weights stand in the code, and those that are zero do not.
+    """
+
+    def __init__(self, tableau: Tableau, n: int):
+        self.tableau, self.n = tableau, n
+
+    @property
+    def structure(self) -> list[bytes]:
+        """Return what the code depends on."""
+        return [np.asarray(each).tobytes() for each in self.tableau]
+
+    def write(self, emit: LaneEmitter, arguments: tuple[Value, Value, Value], at: Places) -> None:
+        """Write NEW, X after the beginning of the step, and ERROR, if that is the whole step; FINE on success."""
+        A, b, c, fine, coarse = self.tableau
+        _, control, work = arguments
+        x, t = emit.load(work, lanes.X), emit.load(work, lanes.T)
+        for i in range(1, len(b)):
+            ahead = emit.add(t, emit.multiply(emit.constant(c[i]), x))
+            emit.store(ahead, work, lanes.AHEAD)
+            with emit.loop(integer(0), integer(self.n), []) as (j, _, _):
+                own = _Coordinate(self, emit, at, j, i)
+                own.move(A[i], A[i] @ A, x)
+            emit.builder.run("accelerate", arguments)
+        rtol, zero = common(emit, control, lanes.RTOL), emit.constant(0.0)
+        with emit.loop(integer(0), integer(self.n), [zero, zero, zero]) as (j, (e, d, total), new):
+            own = _Coordinate(self, emit, at, j, len(b))
+            moved = own.move(b, b @ A, x)
+            place = emit.builder.gep(control, emit.builder.add(j, integer(lanes.ATOL)))
+            atol = emit.splat(emit.builder.load(place))
+            shares = [own.share(atol, rtol, *each) for each in zip(own.before, moved, strict=True)]
+            for largest, weights in ((e, fine), (d, coarse)):
+                of_q, of_v = emit.multiply(x, own.sum(weights @ A)), own.sum(weights)
+                for off, share in zip((of_q, of_v), shares, strict=True):
+                    largest = emit.larger(emit.multiply(emit.function("fabs", off), share), largest)
+                    total = emit.add(total, emit.multiply(zero, off))
+                new.append(largest)
+            for each in moved:
+                total = emit.add(total, emit.multiply(zero, each))
+            new.append(total)
+        e, d, total = (*(emit.multiply(x, each) for each in new[:2]), new[2])
+        ratio = emit.divide(d, e)
+        error = emit.divide(e, emit.function("sqrt", emit.add(emit.constant(1.0), emit.multiply(ratio, ratio))))
+        select, compare = emit.builder.select, emit.builder.compare
+        error = select(compare("fcmp ogt", e, zero), error, zero)
+        error = select(compare("fcmp oeq", total, zero), error, emit.constant(math.inf))  # a NaN is no maximum
+        emit.store(error, work, lanes.ERROR)
+
+
+class _Coordinate:
+    """Hold one coordinate, in the loop over them, with the accelerations of the stages so far."""
+
+    def __init__(self, stages: LaneStages, emit: LaneEmitter, at: Places, j: Value, count: int):
+        n, self.emit, self.new, self.n = stages.n, emit, emit.pointer(at.new, j), stages.n
+        memory = emit.pointer(at.series, j)
+        self.before = tuple(emit.load(memory, lanes.BEGIN * n + place) for place in (0, n))
+        self._slopes = [(memory, (lanes.SLOPES + k) * n) for k in range(count)]
+        self._loaded: dict[int, Value] = {}
+        if count > 1:  # the last one was just found
+            self._loaded[count - 1] = emit.load(emit.pointer(at.a, j))
+            emit.store(self._loaded[count - 1], *self._slopes[count - 1])
+
+    def sum(self, weights: Array) -> Value:
+        """Return the sum of weights times accelerations."""
+        total: Value | None = None
+        for k, weight in enumerate(weights.tolist()):
+            if abs(weight) > NOTHING:
+                if k not in self._loaded:
+                    self._loaded[k] = self.emit.load(*self._slopes[k])
+                term = self.emit.multiply(self.emit.constant(weight), self._loaded[k])
+                total = term if total is None else self.emit.add(total, term)
+        return self.emit.constant(0.0) if total is None else total
+
+    def share(self, atol: Value, rtol: Value, one: Value, other: Value) -> Value:
+        """Return 1 over the allowed error of a number that changed from `one` to `other`."""
+        emit = self.emit
+        size = emit.larger(emit.function("fabs", one), emit.function("fabs", other))
+        return emit.divide(emit.constant(1.0), emit.add(atol, emit.multiply(rtol, size)))
+
+    def move(self, weights: Array, twice: Array, x: Value) -> tuple[Value, Value]:
+        """Write NEW: the velocity by weights of accelerations, the position by those and `twice`."""
+        emit, (q, v) = self.emit, self.before
+        drift = emit.multiply(emit.constant(float(weights.sum())), v)
+        q = emit.add(q, emit.multiply(x, emit.add(drift, emit.multiply(x, self.sum(twice)))))
+        v = emit.add(v, emit.multiply(x, self.sum(weights)))
+        for value, place in ((q, 0), (v, self.n)):
+            emit.store(value, self.new, place)
+        return q, v
+
 
 GOLDEN = 0.6180339887498949
 MOST_PARTS = 1000.0  # of a step, between places that are looked at
@@ -33,7 +452,7 @@ LARGEST = 1500  # operations of a series, which take some seconds to compile
 
 
 class LaneCode(LaneSteps):
-    """Writes the code of a mechanism, step control included, whose numbers depend on parameters as `record` has it.
+    """Write the code of a mechanism, step control included, whose numbers depend on parameters.
 
     Parameters
     ----------
@@ -80,14 +499,14 @@ class LaneCode(LaneSteps):
 
     @property
     def tasks(self) -> tuple[str, ...]:
-        """What there is code for."""
+        """Return the names of the functions that there is code for."""
         if self.recurrences is not None:
             return *lanes.TASKS, *lanes.TASKS_OF_SERIES
         explicit = () if self.explicit is None else lanes.TASKS_OF_EXPLICIT
         return *lanes.TASKS, *lanes.TASKS_OF_STAGES, *explicit
 
     def series_size(self, order: int) -> int:
-        """Length of the memory that a series of an order takes and works in, in vectors."""
+        """Return the length of the memory that a series of an order takes and works in, in vectors."""
         assert self.recurrences is not None
         return (order + 1) * self.n + self.recurrences.scratch_size(order)
 
@@ -108,11 +527,11 @@ class LaneCode(LaneSteps):
 
     # what is emitted
 
-    def series(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
-        """Coefficients of q up to an order, in units of time, about the state of each lane."""
-        builder, n, at = emit.builder, self.n, self.places(emit, order, control, room)
-        unit, out, scratch = self.unit(emit, control, room), at.series, at.scratch
-        inputs = [emit.load(room, lanes.T), *(emit.load(at.state, i) for i in range(2 * n))]
+    def series(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+        """Compute coefficients of q up to an order, in units of time, about the state of each lane."""
+        builder, n, at = emit.builder, self.n, self.places(emit, order, control, work)
+        unit, out, scratch = self.unit(emit, control, work), at.series, at.scratch
+        inputs = [emit.load(work, lanes.T), *(emit.load(at.state, i) for i in range(2 * n))]
         written, (kept,) = lower(emit, self.solution.kept, inputs, self.numbers)
         holds = written.holds(self.solution.kept, kept)
         for i, value in enumerate(kept):
@@ -128,23 +547,23 @@ class LaneCode(LaneSteps):
         for j in range(n):
             total = emit.add(total, emit.multiply(emit.constant(0.0), emit.load(last, j)))
         holds = builder.both(holds, builder.compare("fcmp oeq", total, emit.constant(0.0)))
-        store_mask(emit, room, lanes.FINE, holds)
+        store_mask(emit, work, lanes.FINE, holds)
 
-    def look(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
-        """WORST, the largest defect at places within the step, none further than the gap from the next, or an end.
+    def check_within(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+        """Compute WORST, the largest defect at places within the step, each at most the gap from the next, or an end.
 
         AHEAD is the time of the place, and then of the end.
         SHIFT, multiples of the golden section less their integers, moves the places as far as the gap allows.
         """
-        builder, at = emit.builder, self.places(emit, order, control, room)
-        h, gap = emit.load(room, lanes.H), common(emit, control, lanes.GAP)
+        builder, at = emit.builder, self.places(emit, order, control, work)
+        h, gap = emit.load(work, lanes.H), common(emit, control, lanes.GAP)
         zero, one, two = (emit.constant(x) for x in (0.0, 1.0, 2.0))
         parts = emit.function("ceil", emit.divide(h, gap))
         parts = emit.larger(emit.smaller(parts, emit.constant(MOST_PARTS)), one)
         part = emit.divide(h, parts)
-        shift = emit.add(emit.load(room, lanes.SHIFT), emit.constant(GOLDEN))
+        shift = emit.add(emit.load(work, lanes.SHIFT), emit.constant(GOLDEN))
         shift = emit.subtract(shift, builder.select(builder.compare("fcmp oge", shift, one), one, zero))
-        emit.store(shift, room, lanes.SHIFT)
+        emit.store(shift, work, lanes.SHIFT)
         moved = emit.multiply(
             emit.subtract(emit.multiply(two, shift), one), emit.larger(emit.subtract(gap, part), zero)
         )
@@ -152,49 +571,49 @@ class LaneCode(LaneSteps):
             number = emit.number(place)
             looks = builder.compare("fcmp olt", number, parts)
             x = builder.select(looks, emit.add(emit.multiply(number, part), moved), zero)
-            emit.store(emit.add(emit.load(room, lanes.T), x), room, lanes.AHEAD)
-            self.positions(emit, at, emit.divide(x, emit.load(room, lanes.UNIT)))
-            holds, a = self._there(emit, room, at)
+            emit.store(emit.add(emit.load(work, lanes.T), x), work, lanes.AHEAD)
+            self.positions(emit, at, emit.divide(x, emit.load(work, lanes.UNIT)))
+            holds, a = self._there(emit, work, at)
             defect = builder.select(holds, self.defect_of(emit, control, at, a), emit.constant(math.inf))
             new.append(emit.largest_of(builder.select(looks, defect, zero), worst))
-        emit.store(new[0], room, lanes.WORST)
-        t, t1 = emit.load(room, lanes.T), common(emit, control, lanes.T1)
+        emit.store(new[0], work, lanes.WORST)
+        t, t1 = emit.load(work, lanes.T), common(emit, control, lanes.T1)
         last = builder.compare("fcmp oeq", h, emit.subtract(t1, t))
-        emit.store(builder.select(last, t1, emit.add(t, h)), room, lanes.AHEAD)
+        emit.store(builder.select(last, t1, emit.add(t, h)), work, lanes.AHEAD)
 
-    def closer(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
+    def approach(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Move positions of lanes that FINE names towards the constraints."""
-        act, _ = self._project(emit, self.equations.closer, lanes.FINE, self.places(emit, order, control, room))
+        act, _ = self._project(emit, self.equations.closer, lanes.FINE, self.places(emit, order, control, work))
         for field in (lanes.FINE, lanes.LEFT_TO_MOVE):
-            store_mask(emit, room, field, act)
-        emit.store(emit.constant(math.inf), room, lanes.MOVED_BEFORE)
+            store_mask(emit, work, field, act)
+        emit.store(emit.constant(math.inf), work, lanes.MOVED_BEFORE)
 
-    def nearer(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
-        """The same and velocities, and accelerations and multipliers there, until a move is no more than rounding."""
-        builder, at = emit.builder, self.places(emit, order, control, room)
-        fine, left = (is_set(emit, room, field) for field in (lanes.FINE, lanes.LEFT_TO_MOVE))
+    def refine(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+        """Move positions and velocities, and compute accelerations and multipliers, until a move is only rounding."""
+        builder, at = emit.builder, self.places(emit, order, control, work)
+        fine, left = (is_set(emit, work, field) for field in (lanes.FINE, lanes.LEFT_TO_MOVE))
         act, moved = self._project(emit, self.equations.nearest, lanes.LEFT_TO_MOVE, at)
         largest = emit.constant(0.0)
         for j in range(self.n):
             largest = emit.larger(emit.function("fabs", emit.load(at.new, j)), largest)
-        least = emit.multiply(emit.constant(lane_projection.OF_POSITIONS), largest)
-        least = emit.larger(least, emit.constant(lane_projection.LARGEST_MOVE))
+        least = emit.multiply(emit.constant(OF_POSITIONS), largest)
+        least = emit.larger(least, emit.constant(LARGEST_MOVE))
         there = builder.both(act, builder.compare("fcmp ole", moved, least))
-        before = emit.multiply(emit.constant(lane_projection.CONTRACTION), emit.load(room, lanes.MOVED_BEFORE))
+        before = emit.multiply(emit.constant(CONTRACTION), emit.load(work, lanes.MOVED_BEFORE))
         goes_on = builder.both(act, builder.compare("fcmp ole", moved, before))
         goes_on = builder.both(goes_on, builder.compare("fcmp ogt", moved, least))
-        emit.store(emit.larger(moved, least), room, lanes.MOVED_BEFORE)
-        store_mask(emit, room, lanes.LEFT_TO_MOVE, goes_on)
+        emit.store(emit.larger(moved, least), work, lanes.MOVED_BEFORE)
+        store_mask(emit, work, lanes.LEFT_TO_MOVE, goes_on)
         waited = builder.operation("xor", fine, builder.both(fine, left))
-        store_mask(emit, room, lanes.FINE, builder.operation("or", waited, there))
+        store_mask(emit, work, lanes.FINE, builder.operation("or", waited, there))
 
     def _project(self, emit: LaneEmitter, outputs: Program, which: int, at: Places) -> tuple[Value, Value]:
-        """Which of some lanes could be moved, and how far they were."""
-        select, room = emit.builder.select, at.room
-        inputs = self._new(emit, room, at)
+        """Return which lanes could be moved, and how far they were."""
+        select, work = emit.builder.select, at.work
+        inputs = self._new(emit, work, at)
         written, arrays = lower(emit, outputs, inputs, self.numbers)
         made = dict(zip(outputs.arrays, arrays, strict=True))
-        act = emit.builder.both(is_set(emit, room, which), written.holds(outputs, arrays[0]))
+        act = emit.builder.both(is_set(emit, work, which), written.holds(outputs, arrays[0]))
         largest = emit.constant(0.0)
         for value in made["moved"]:
             largest = emit.larger(emit.function("fabs", value), largest)
@@ -205,20 +624,20 @@ class LaneCode(LaneSteps):
                 emit.store(select(act, value, emit.load(base, k)), base, k)
         return act, largest
 
-    def there(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
-        """Accelerations at a state as it stands."""
-        at = self.places(emit, order, control, room)
-        holds, a = self._there(emit, room, at)
+    def accelerate(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+        """Compute accelerations at a state as it stands."""
+        at = self.places(emit, order, control, work)
+        holds, a = self._there(emit, work, at)
         for k, value in enumerate(a):
             emit.store(value, at.a, k)
-        keep_fine(emit, room, holds)
+        keep_fine(emit, work, holds)
 
-    def _there(self, emit: LaneEmitter, room: Value, at: Places) -> tuple[Value, list[Value]]:
-        a, holds = write_accelerations(emit, self.equations, self._new(emit, room, at), self.numbers)
+    def _there(self, emit: LaneEmitter, work: Value, at: Places) -> tuple[Value, list[Value]]:
+        a, holds = write_accelerations(emit, self.equations, self._new(emit, work, at), self.numbers)
         return holds, a
 
     def turned(self, emit: LaneEmitter, at: Places) -> Value | None:
-        """Where det G1 G0^T is not positive, see lane_turns.py; series have their defects for that."""
+        """Return where det G1 G0^T is not positive, see `turned`; series are checked by their defects instead."""
         if self.recurrences is not None or len(self.equations.rows) == 0:
             return None
         return turned(emit, *(self._rows(emit, at, time, base) for time, base in self._ends(at)))
@@ -227,24 +646,125 @@ class LaneCode(LaneSteps):
         return [(lanes.T, at.state), (lanes.AHEAD, at.new)]
 
     def _rows(self, emit: LaneEmitter, at: Places, time: int, base: Value) -> list[dict[int, Value]]:
-        """The entries of G that are not zero, row by row, at a state."""
-        inputs = [emit.load(at.room, time), *(emit.load(base, i) for i in range(2 * self.n))]
+        """Return the entries of G that are not zero, row by row, at a state."""
+        inputs = [emit.load(at.work, time), *(emit.load(base, i) for i in range(2 * self.n))]
         _, (entries,) = lower(emit, self._rows_at, inputs, self.numbers)
         rows: list[dict[int, Value]] = [{} for _ in self.equations.rows]
         for (k, j), value in zip(self._entries, entries, strict=True):
             rows[k][j] = value
         return rows
 
-    def stages(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
-        """NEW and ERROR by the stages of a step."""
+    def stages(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+        """Compute NEW and ERROR by the stages of a step."""
         assert self.explicit is not None
-        self.explicit.write(emit, (order, control, room), self.places(emit, order, control, room))
+        self.explicit.write(emit, (order, control, work), self.places(emit, order, control, work))
 
-    def redundant(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
-        """Whether the rows that do not count hold, too."""
-        at, outputs = self.places(emit, order, control, room), self.equations.redundant
-        written, (none,) = lower(emit, outputs, self._new(emit, room, at), self.numbers)
-        keep_fine(emit, room, written.holds(outputs, none))
+    def redundant(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+        """Check whether the redundant rows hold, too."""
+        at, outputs = self.places(emit, order, control, work), self.equations.redundant
+        written, (none,) = lower(emit, outputs, self._new(emit, work, at), self.numbers)
+        keep_fine(emit, work, written.holds(outputs, none))
 
-    def _new(self, emit: LaneEmitter, room: Value, at: Places) -> list[Value]:
-        return [emit.load(room, lanes.AHEAD), *(emit.load(at.new, i) for i in range(2 * self.n))]
+    def _new(self, emit: LaneEmitter, work: Value, at: Places) -> list[Value]:
+        return [emit.load(work, lanes.AHEAD), *(emit.load(at.new, i) for i in range(2 * self.n))]
+
+
+class LaneConstraints(LaneSteps):
+    """Write C, C_t and the entries of C_q of a system, whose numbers depend on parameters.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+        Without nonholonomic rows.
+    parameters : array of Parameter
+
+    Attributes
+    ----------
+    pattern : ndarray of int
+        Where in it the columns of the entries of each row begin, and end, and these columns.
+
+    Raises
+    ------
+    Untraceable
+        Saying why the constraints cannot be had.
+    """
+
+    tasks = lanes.TASKS_OF_STARTS
+
+    def __init__(self, system: ConstrainedSystem, parameters: Any):
+        super().__init__(system.n_q, system.n_c)
+        equations, self.numbers = Equations(system, parameters), Coefficients(apart=True)
+        G, self._graph = equations.of("jacobian"), equations.graph
+        columns = [[j for j, entry in enumerate(row) if not is_zero(entry)] for row in G]
+        begins = np.cumsum([len(columns) + 1, *map(len, columns)])
+        self.pattern = np.array([*begins, *chain(*columns)], dtype=np.int64)
+        entries = [G[i, j] for i, row in enumerate(columns) for j in row]
+        values = {kind: list(equations.of(kind)) for kind in ("constraint", "constraint_rate")}
+        self._rows = Program(self._graph, {**values, "entries": entries})
+        told = self.n, self.pattern.tolist(), *self.numbers.structure(self._rows)
+        self.structure = hashlib.sha256(repr(told).encode()).hexdigest()
+        self.n_numbers, self.n_quantities = self.numbers.n_varying, len(self._rows.quantities())
+
+    def rows(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
+        """Compute C, C_t and entries of C_q at NEW and AHEAD, in the memory of the method; FINE: they have values."""
+        at = self.places(emit, order, control, work)
+        inputs = [emit.load(work, lanes.AHEAD), *(emit.load(at.new, i) for i in range(2 * self.n))]
+        written, arrays = lower(emit, self._rows, inputs, self.numbers)
+        values = [value for array in arrays for value in array]
+        for k, value in enumerate(values):
+            emit.store(value, at.series, k)
+        keep_fine(emit, work, written.holds(self._rows, values))
+
+
+BUILD_SECONDS = 3e-4  # for a quantity, about
+ELIMINATION = (elimination, symbolic_factors, null_space, compile_equations)
+WRITERS = (series, *ELIMINATION, coefficients, lowering, lane_series, lane_emitter, llvm_code, llvm_text)
+
+Code = TypeVar("Code", LaneCode, LaneConstraints)
+KIND = "lanes"  # of files on the disk
+
+
+class GeneratedLanes(Generic[Code]):
+    """Compile the code of a mechanism for lanes, and compute the numbers that it reads for any parameters.
+
+    Parameters
+    ----------
+    record : ParameterTape
+        Of the parameters that `code` was made for.
+    code : LaneCode or LaneConstraints
+    """
+
+    def __init__(self, record: ParameterTape, code: Code):
+        self.record = record
+        self.code: Code = code
+
+    @cached_property
+    def functions(self) -> GeneratedFunctions:
+        """Return the code, compiled when it is first used."""
+        return generated_functions(KIND, _stamp(), self.code.structure, self._write)
+
+    def _write(self) -> tuple[list[str], str]:
+        module = Module()
+        for name in self.code.tasks:
+            llvm_code.write(module, name, CODE.llvm_type(name), getattr(self.code, name), LaneEmitter)
+        return list(self.code.tasks), str(module)
+
+    @property
+    def seconds_to_build(self) -> float:
+        """Estimate the time to compile the code, s; 0 if it is compiled or on the disk."""
+        if are_cached(KIND, _stamp(), self.code.structure):
+            return 0.0
+        return BUILD_SECONDS * self.code.n_quantities
+
+    def numbers(self, parameters: Array) -> Array:
+        """Return the numbers that the code reads for parameters (n_runs, n_p)."""
+        return self.code.numbers.for_parameters(self.record, parameters)
+
+
+@cache
+def _stamp() -> str:
+    """Return a digest of what writes the code, and of the kernels that it goes with."""
+    from twoloop.kernels.data import common
+
+    kernels = ("lanes.explicit", "control.defect", "control.predictor")
+    return digest_of("".join(map(common.stamp, kernels)), __file__, *WRITERS)

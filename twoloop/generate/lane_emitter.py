@@ -1,9 +1,17 @@
-"""Arithmetic of many runs at once as LLVM code: every number is a vector, with one run in each of its lanes."""
+"""Arithmetic of many runs at once as LLVM code: every number is a vector, with one run in each of its lanes.
+
+Steps by collocation have a stage in each lane instead. The places of their vectors in memory are counted in numbers.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
 
 from twoloop.generate.coefficients import Coefficient
 from twoloop.generate.llvm_code import INTRINSICS, Emitter
 from twoloop.generate.llvm_text import BIT, DOUBLE, INTEGER, Builder, Value, integer, undefined, vector_of
-from twoloop.kernels.lanes.lane_room import LANES
+from twoloop.kernels.data.collocation import LANES as STAGES
+from twoloop.kernels.lanes.layout import LANES
 
 # log2 on [1, 2] and 2^x on [-1/2, 1/2], fitted by least squares at Chebyshev points: good to 2e-06 and 1e-07, for the
 # lengths of steps
@@ -13,7 +21,7 @@ LARGEST_POWER, SMALLEST = 1000.0, 1e-300
 
 
 class LaneEmitter(Emitter):
-    """Appends operations on vectors of one number for each lane; places in memory are counted in such vectors."""
+    """Append operations on vectors of one number for each lane; places in memory are counted in such vectors."""
 
     constants: Value  # where numbers stand that all lanes have in common
 
@@ -23,33 +31,33 @@ class LaneEmitter(Emitter):
         self.double, self.whole_number, self.bit = (vector_of(kind, lanes) for kind in (DOUBLE, INTEGER, BIT))
 
     def like(self, builder: Builder) -> "LaneEmitter":
-        """One of as many lanes, for another function."""
+        """Make an emitter of as many lanes for another function."""
         return LaneEmitter(builder, self.lanes)
 
     def splat(self, value: Value) -> Value:
-        """A number of all lanes."""
+        """Return a number in all lanes."""
         if self.lanes == 1:
             return value
         vector = self.builder.insert(undefined(vector_of(value.type, self.lanes)), value, 0)
         return self.builder.first_everywhere(vector)
 
     def far(self, value: float) -> Value:
-        """A number of all lanes that is loaded where it is used."""
+        """Return a number in all lanes that is loaded where it is used."""
         return self.splat(super().far(value))
 
     def known(self, number: float) -> Value:
-        """A number that is known, or read: of all lanes, or one for each."""
+        """Return a number that is constant, or is read: for all lanes, or one for each."""
         if not isinstance(number, Coefficient) or number.varies:
             return super().known(number)
         place = self.builder.gep(self.constants, integer(number.place))
         return self.splat(self.builder.load(place, constant=True))
 
     def number(self, whole: Value) -> Value:
-        """An integer as a number."""
+        """Convert an integer to a number."""
         return self.splat(super().number(whole))
 
     def pointer(self, base: Value, *places: Value | int) -> Value:
-        """A pointer some vectors further on."""
+        """Return a pointer some vectors further on."""
         for place in places:
             scaled = (
                 integer(place * self.lanes) if isinstance(place, int) else self.builder.mul(place, integer(self.lanes))
@@ -58,16 +66,16 @@ class LaneEmitter(Emitter):
         return base
 
     def load(self, base: Value, place: int = 0, constant: bool = False) -> Value:
-        """The vector at a place."""
+        """Load the vector at a place."""
         pointer = self.builder.convert("bitcast", self.pointer(base, place), f"{self.double}*")
         return self.builder.load(pointer, constant=constant)
 
     def store(self, value: Value, base: Value, place: int = 0) -> None:
-        """Put a vector at a place."""
+        """Store a vector at a place."""
         self.builder.store(value, self.builder.convert("bitcast", self.pointer(base, place), f"{self.double}*"))
 
     def function(self, name: str, x: Value) -> Value:
-        """A function of LLVM, of all lanes, or of libm, lane by lane."""
+        """Call a function of LLVM, of all lanes, or of libm, lane by lane."""
         if name in INTRINSICS:
             return super().function(name, x)
         made, one = undefined(self.double), Emitter(self.builder)
@@ -76,7 +84,7 @@ class LaneEmitter(Emitter):
         return made
 
     def largest_lane(self, x: Value) -> Value:
-        """The largest number of all lanes; LLVM's own reduction takes one after another, for the sake of NaN."""
+        """Return the largest number of all lanes; LLVM's own reduction is sequential, for the sake of NaN."""
         width = self.lanes
         while width > 2:
             width //= 2
@@ -84,11 +92,11 @@ class LaneEmitter(Emitter):
         return x if width == 1 else self.larger(*(self.builder.extract(x, k) for k in (0, 1)))
 
     def largest_whole(self, x: Value) -> Value:
-        """The largest number of all lanes, which is whole, as an integer."""
+        """Return the largest number of all lanes, which is whole, as an integer."""
         return self.builder.convert("fptosi", self.largest_lane(x), INTEGER)
 
     def logarithm(self, x: Value) -> Value:
-        """log2 x to a hundredth of a per cent of 1, of what is not negative, as if none were below SMALLEST."""
+        """Return log2 x to within 1e-4, of numbers that are not negative; below SMALLEST, that of SMALLEST."""
         builder = self.builder
         bits = builder.convert("bitcast", self.larger(x, self.constant(SMALLEST)), self.whole_number)
         exponent = builder.sub(builder.operation("lshr", bits, self.whole(52)), self.whole(1023))
@@ -99,7 +107,7 @@ class LaneEmitter(Emitter):
         )
 
     def exponential(self, x: Value) -> Value:
-        """2^x to a hundredth of a per cent."""
+        """Return 2^x to a hundredth of a per cent."""
         builder = self.builder
         x = self.larger(self.smaller(x, self.constant(LARGEST_POWER)), self.constant(-LARGEST_POWER))
         whole = self.function("rint", x)
@@ -111,9 +119,58 @@ class LaneEmitter(Emitter):
         )
 
     def smallest_of(self, a: Value, b: Value) -> Value:
-        """The smaller of two numbers; the first where one is NaN, which stays."""
+        """Return the smaller of two numbers; the first where one is NaN, which stays."""
         return self.builder.select(self.builder.compare("fcmp ult", a, b), a, b)
 
     def largest_of(self, a: Value, b: Value) -> Value:
-        """The larger of two numbers; the first where it is NaN, which stays."""
+        """Return the larger of two numbers; the first where it is NaN, which stays."""
         return self.builder.select(self.builder.compare("fcmp ugt", a, b), a, b)
+
+
+def place_of(emit: LaneEmitter, k: Value) -> Value:
+    """Return the place of vector k."""
+    return emit.builder.mul(k, integer(STAGES))
+
+
+def load_lanes(emit: LaneEmitter, base: Value, place: int = 0) -> Value:
+    """Load a vector at a place, which is counted in numbers."""
+    return Emitter(emit.builder).load_vector(base, place, STAGES)
+
+
+def store_lanes(emit: LaneEmitter, value: Value, base: Value, place: int = 0) -> None:
+    """Store a vector at a place."""
+    Emitter(emit.builder).store_vector(value, base, place)
+
+
+def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
+    """Return the sums of the numbers of two vectors, which are added side by side."""
+    builder, half = emit.builder, STAGES // 2
+    lower, upper = ([*range(k, k + half), *range(STAGES + k, STAGES + k + half)] for k in (0, half))
+    total = emit.add(builder.shuffle(a, b, lower), builder.shuffle(a, b, upper))
+    for distance in (2, 1):
+        total = emit.add(total, builder.shuffle(total, total, [k ^ distance for k in range(STAGES)]))
+    return [builder.extract(total, k) for k in (0, half)]
+
+
+def column(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value:
+    """Return one lane of each of some vectors, side by side."""
+    builder, places = emit.builder, [lane, STAGES + lane]
+    if len(vectors) == 1:
+        return builder.extract(vectors[0], lane)
+    while len(vectors) > 1:
+        pairs = zip(vectors[::2], vectors[1::2], strict=True)
+        vectors = [builder.shuffle(*pair, places) for pair in pairs]
+        places = list(range(2 * len(places)))
+    return vectors[0]
+
+
+@contextmanager
+def over(
+    emit: LaneEmitter, coordinates: Sequence[int], carried: Sequence[Value] = ()
+) -> Iterator[tuple[Value, Value, list[Any], list[Any]]]:
+    """Loop over some coordinates: yield how many came before, which it is, and the values of `Emitter.loop`."""
+    builder = emit.builder
+    table = None if list(coordinates) == list(range(len(coordinates))) else builder.module.table(coordinates)
+    with emit.loop(integer(0), integer(len(coordinates)), carried) as (k, values, new):
+        i = k if table is None else builder.convert("sext", builder.load(builder.gep(table, k), 4), INTEGER)
+        yield k, i, values, new

@@ -23,14 +23,14 @@ from twoloop.kernels.evaluation.operations import (
     SINE,
     SQUARE_ROOT,
 )
-from twoloop.kernels.lanes.lane_room import LANES
+from twoloop.kernels.lanes.layout import LANES
 
 ZEROS = -1  # the row before that of order 0
 AT_ONCE = 12 if LANES == 8 else 6  # sums in one loop: with more, what is carried does not stay in 32, or 16, registers
 
 
 class Operation(NamedTuple):
-    """One of a series' program; of sines and cosines both: two results."""
+    """Hold an operation of a series' program; sine and cosine are one, with two results."""
 
     kind: int
     results: tuple[int, ...]
@@ -39,7 +39,7 @@ class Operation(NamedTuple):
 
 
 class LaneSeries:
-    """Writes the recurrences of a program.
+    """Write the recurrences of a program.
 
     `scratch` holds, lane vectors each: what the factors keep; r; the divisors of inverse functions; sums that are
     carried to the next order; a row of zeros; and rows of factors of order 0, 1 and so on.
@@ -69,12 +69,12 @@ class LaneSeries:
         self.table = self.zeros + self.width
 
     def scratch_size(self, order: int) -> int:
-        """Length of `scratch`, in vectors."""
+        """Return the length of `scratch`, in vectors."""
         return self.table + self.width * (order + 1)
 
     @property
     def structure(self) -> list[Any]:
-        """What the code depends on."""
+        """Return what the code depends on."""
         return [self.n, self.n_rows, self.early, self.late, self.rows, self.balance, self.slots]
 
     def _forms(self, sums: Sums, rows: Sequence[int]) -> list[tuple[Terms, float]]:
@@ -101,11 +101,11 @@ class LaneSeries:
         return made
 
     def _slot(self, *key: Any) -> int:
-        """The place in a row of a factor: a form, or ("scaled", form), which is multiplied by its order."""
+        """Return the place in a row of a factor: a form, or ("scaled", form), which is multiplied by its order."""
         return self.slots.setdefault(key, len(self.slots))
 
     def _shared_sums(self) -> dict[int, tuple[int, int]]:
-        """Pairs of factors of sines by the result of a product of a cosine, or a sine, and the rate of its angle.
+        """Find pairs of factors of sines by the result of a product of a cosine, or sine, and the rate of its angle.
 
         (cos x) x' is the derivative of sin x, so that what is known of the product's coefficient of one order is the
         sum for the sine of the next, over the unit of time.
@@ -122,7 +122,7 @@ class LaneSeries:
         return {result: pair for result, pair in known.items() if pair is not None}
 
     def _factors(self, operation: Operation) -> list[tuple[int, int]]:
-        """Places of the factors X and Y of the products that are summed up for each result."""
+        """Return the places of the factors X and Y of the products that are summed up for each result."""
         kind, results, first, second = operation
         if results[0] in self._carried:
             return []
@@ -139,7 +139,7 @@ class LaneSeries:
         return [(x, own[1]), (x, own[0])] if kind == SINE else [(x, own[0])]
 
     def begin(self, emit: LaneEmitter, inputs: Sequence[Value], scratch: Value) -> None:
-        """Order 0, at t, q and v; what the factors keep is there."""
+        """Write order 0, at t, q and v, for which the kept factors are there."""
         for place in (*range(self.r, self.divisors), *range(self.carried, self.table)):
             emit.store(emit.constant(0.0), scratch, place)
         row = _Row(self, emit, emit.pointer(scratch, self.table))
@@ -150,7 +150,7 @@ class LaneSeries:
             emit.store(known.sum(*form), scratch, self.r + place)
 
     def order(self, emit: LaneEmitter, k: Value, unit: Value, out: Value, scratch: Value) -> None:
-        """From coefficients below an order to those of velocities of this order and of positions of the next."""
+        """Write velocities of this order and positions of the next from the coefficients below."""
         builder, n = emit.builder, self.n
         following = builder.add(k, integer(1))
         q = emit.pointer(out, builder.mul(k, integer(n)))
@@ -202,7 +202,7 @@ class LaneSeries:
     def _begin(
         self, emit: LaneEmitter, known: Quantities, operations: list[Operation], row: "_Row", scratch: Value
     ) -> None:
-        """Order 0: the functions themselves; late factors that wait are stored when they are known."""
+        """Write order 0: the functions themselves; late factors are stored when they are known."""
         one, zero = emit.constant(1.0), emit.constant(0.0)
         for operation in operations:
             kind, results, first, second = operation
@@ -238,7 +238,7 @@ class LaneSeries:
                 row.store((((result, 1.0),), 0.0), value, "if used")
 
     def _sums(self, emit: LaneEmitter, scratch: Value, k: Value) -> dict[tuple[tuple[int, int], bool], Value]:
-        """Of pairs of factors, the sum of X[j] Y[k - j] over 1 < j < k; of those ahead, that of X[j] Y[k + 1 - j].
+        """Sum X[j] Y[k - j] over 1 < j < k for pairs of factors; for those ahead, X[j] Y[k + 1 - j].
 
         What they miss is added when it is known: so all of them are in one loop, which waits for nothing of the order
         before, and have the rows in common that they load.
@@ -276,7 +276,7 @@ class LaneSeries:
         order: Value,
         inverse: Value,
     ) -> None:
-        """An order that is not 0; of what waits, what is known before."""
+        """Write an order that is not 0; of pending products, the part that is known before."""
         pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
         sums = {}
         for pair in pairs:
@@ -325,26 +325,26 @@ class LaneSeries:
 
 
 class _Row:
-    """Factors of one order, stored where they are used."""
+    """Hold factors of one order, stored where they are used."""
 
     def __init__(self, code: LaneSeries, emit: LaneEmitter, base: Value):
         self.code, self.emit, self.base = code, emit, base
         self._stored: dict[int, Value] = {}
 
     def store(self, key: Any, value: Value, when: str = "") -> None:
-        """Put a factor in its place; "if used": it may have none."""
+        """Store a factor in its place; "if used": it may have none."""
         place = self.code.slots.get(tuple(key)) if when else self.code.slots[tuple(key)]
         if place is not None and place not in self._stored:
             self._stored[place] = value
             self.emit.store(value, self.base, place)
 
     def load(self, place: int) -> Value:
-        """What stands in a place."""
+        """Return the factor in a place."""
         return self._stored[place] if place in self._stored else self.emit.load(self.base, place)
 
 
 class _Edges(NamedTuple):
-    """What the sums of an order k miss; `first` is the row of order 1, of zeros where k is 1 itself."""
+    """Hold what the sums of an order k miss; `first` is the row of order 1, of zeros where k is 1 itself."""
 
     sums: dict[tuple[tuple[int, int], bool], Value]
     first: Value
@@ -352,12 +352,12 @@ class _Edges(NamedTuple):
     before: _Row  # of order k - 1
 
     def now(self, pair: tuple[int, int]) -> Value:
-        """The sum of X[j] Y[k - j] over 0 < j < k."""
+        """Return the sum of X[j] Y[k - j] over 0 < j < k."""
         emit, (x, y) = self.before.emit, pair
         return emit.add(self.sums[pair, False], emit.multiply(emit.load(self.first, x), self.before.load(y)))
 
     def ahead(self, pair: tuple[int, int], row: _Row) -> Value:
-        """The sum of X[j] Y[k + 1 - j] over 0 < j <= k, from the row of order k."""
+        """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k, from the row of order k."""
         emit, (x, y) = self.before.emit, pair
         total = emit.add(self.sums[pair, True], emit.multiply(row.load(x), emit.load(self.first, y)))
         return emit.add(total, emit.multiply(emit.load(self.one, x), row.load(y)))

@@ -52,11 +52,11 @@ class Adams:
 
     @property
     def name(self) -> str:
-        """Shown in messages and tables."""
+        """Return the name for messages and tables."""
         return "Adams"
 
     def takes_code(self, fixed: bool) -> bool:
-        """Whether its steps may be run with code made for the mechanism."""
+        """Return whether its steps may run with generated code."""
         return True
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:

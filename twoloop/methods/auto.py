@@ -36,7 +36,7 @@ MATRIX_COST = 3.0  # of a Newton matrix for few coordinates, in evaluations; and
 
 
 def switching(first: Plan, second: Plan, limit: float, n_q: int, looks: int = 1, dearer: float = 1.0) -> Plan:
-    """The plan that goes from `first`, explicit or by fixed point, to `second`, Newton's method, and back.
+    """Return the plan that goes from `first`, explicit or by fixed point, to `second`, Newton's method, and back.
 
     `limit`: h rho, rho being the largest rate of the motion, from which on `second` is tried, if it is found at so many
     `looks` in a row. `dearer`: what an evaluation of `second` costs, in those of `first`.
@@ -60,7 +60,7 @@ def switching(first: Plan, second: Plan, limit: float, n_q: int, looks: int = 1,
 
 
 def with_matrix_cost(plan: Plan, cost: float) -> Plan:
-    """A plan of `switching` to which a Newton matrix costs so many evaluations."""
+    """Return a plan of `switching` for which a Newton matrix costs so many evaluations."""
     from twoloop.kernels.control import switching as kernels
 
     options = plan.options.copy()
@@ -143,18 +143,18 @@ class Auto:
 
     @property
     def name(self) -> str:
-        """Shown in messages and tables."""
+        """Return the name for messages and tables."""
         return "auto"
 
     @property
     def tested(self) -> str:
-        """What the error estimate of implicit steps is taken over."""
+        """Return what the error estimate of implicit steps is taken over."""
         return "positions"
 
     def for_system(
         self, system: ConstrainedSystem, code: GeneratedCode | None = None, check: Check = unchecked
     ) -> "Auto":
-        """The same for the operations of a system, without `series` where they cannot be seen, or not be relied on."""
+        """Return the method for a system, without `series` if its operations are not known, or not reliable."""
         sparse = len(system.entries) == 2 and system.n_a == 0
         chosen = replace(self, n_rows=system.n_c + system.n_a, series=None, lanes=None, sparse=sparse)
         if code is not None:
@@ -171,7 +171,7 @@ class Auto:
         return replace(chosen, series=series, narrow=may_be_narrow(system, ran_on_symbols=True))
 
     def _series_pays(self, n_q: int, tolerance: float) -> bool:
-        """Whether a step of the series costs less than the steps of the others that it replaces."""
+        """Return whether a step of the series costs less than the steps that it replaces."""
         assert self.series is not None and self.series.program is not None
         operations = self.series.program.n_operations / n_q
         if self.dearer is not None:  # near singular positions, to which it comes then, a series is more exact
@@ -181,7 +181,7 @@ class Auto:
         return operations <= SIMPLE and n_q >= MANY
 
     def takes_code(self, fixed: bool) -> bool:
-        """Whether its steps may be run with code made for the mechanism."""
+        """Return whether its steps may run with generated code."""
         return not fixed  # by which it is implicit
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
@@ -196,7 +196,7 @@ class Auto:
         return plan.changed(substitute=others, traced=traced, within_newton=others.within_newton)
 
     def _others(self, n_q: int, rtol: float, atol: float) -> Plan:
-        """The plan of steps one at a time."""
+        """Return the plan of steps one at a time."""
         tolerance = least_tolerance(rtol, atol)
         implicit = self.loose if tolerance >= LOOSE else self.tight if tolerance >= TIGHTEST else self.tightest
         second = kept_plan(implicit, n_q, rtol, atol)
@@ -214,7 +214,7 @@ class Auto:
         return chosen.changed(substitute=explicit, provisional=not pays)
 
     def _explicit(self, n_q: int, rtol: float, atol: float, second: Plan, dearer: float) -> Plan:
-        """The plan without a series."""
+        """Return the plan without a series."""
         many = n_q >= VERY_MANY and not self.sparse
         if n_q >= MANY and self.dearer is None:
             many = many or self.n_rows <= CONSTRAINED * n_q or least_tolerance(rtol, atol) < TIGHT_MANY
@@ -227,7 +227,7 @@ class Auto:
 
 
 def _dearer(system: ConstrainedSystem) -> float:
-    """What an implicit method's evaluation costs, in evaluations by code made for the mechanism."""
+    """Return the cost of an implicit method's evaluation, in evaluations by generated code."""
     try:
         return DEARER_HEAVY if series_for(system).n_operations >= HEAVY * system.n_q else DEARER
     except Untraceable:

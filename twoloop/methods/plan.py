@@ -1,4 +1,4 @@
-"""What a method hands to a run: its plan; and what the methods share."""
+"""Plan: what a method hands to a run; and rules that the methods share."""
 
 from dataclasses import dataclass, fields
 from typing import Any, Literal, Protocol, get_args, get_origin
@@ -23,7 +23,7 @@ LEAST_TOLERANCE = 1e-14  # what smaller tolerances count as where a loop has to 
 
 @dataclass(frozen=True)
 class Plan:
-    """A method made ready for one run: the compiled step, its parameter block, its memory, its controller."""
+    """Hold a method prepared for one run: the compiled step, its parameter block, its memory, its controller."""
 
     step: Any  # a Step of kernels/data/common.py, or the name of one
     options: Array
@@ -62,52 +62,52 @@ class Plan:
 
     @property
     def rule(self) -> list[float]:
-        """Of step-size control, see kernels/control/controller.py."""
+        """Return the numbers of step-size control, see kernels/control/controller.py."""
         return [self.safety, self.exponent, self.factor_min, self.factor_max, self.least_error]
 
     @property
     def substitutes(self) -> list["Plan"]:
-        """What takes over, and what from that."""
+        """Return the substitute, its own substitute, and so on."""
         return [] if self.substitute is None else [self.substitute, *self.substitute.substitutes]
 
     def fresh(self) -> "Plan":
-        """The same for another run, with memory of its own; not so the plans that it holds."""
+        """Return the plan for another run, with a memory of its own; plans that it holds are shared."""
         return self.changed(memory=self.memory.copy())
 
     def changed(self, **changes: Any) -> "Plan":
-        """The same with other values of some fields."""
+        """Return the plan with other values of some fields."""
         other = object.__new__(Plan)  # `replace` takes ten times as long
         vars(other).update(vars(self), **changes)
         return other
 
 
 def takes_code(method: Any, fixed: bool) -> bool:
-    """Whether steps of a method, of one size or not, ask the inner loop only for what can be code for the mechanism."""
+    """Return whether steps of a method call the inner loop only for what generated code can do."""
     said = getattr(method, "takes_code", None)
     return said is not None and bool(said(fixed))
 
 
 def needs_code(method: Any) -> bool:
-    """Whether steps of a method cannot do without code for the mechanism."""
+    """Return whether a method needs generated code."""
     return bool(getattr(method, "needs_code", False))
 
 
 def least_tolerance(rtol: float, atol: float) -> float:
-    """The smaller of the two, but not below rounding."""
+    """Return the smaller of the two, but not below rounding."""
     return max(min(rtol, atol), LEAST_TOLERANCE)
 
 
 def outer_tolerance(rtol: float, atol: float, fixed: bool) -> float:
-    """Where the outer loop stops unless a method has its own rule."""
+    """Return where the outer loop stops unless a method has its own rule."""
     return OUTER_TOL_FIXED if fixed else OUTER_SHARE * least_tolerance(rtol, atol)
 
 
 class Method(Protocol):
-    """What solve_dae needs of a method."""
+    """Define what solve_dae needs of a method."""
 
     @property
     def name(self) -> str:
-        """Shown in messages and tables."""
+        """Return the name for messages and tables."""
         ...
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
@@ -133,7 +133,7 @@ _PLANS = BoundedCache()  # of methods that do not look at the system
 
 
 def kept_plan(method: Method, n_q: int, rtol: float, atol: float) -> Plan:
-    """The plan of a method that does not look at the system: a part of others, which have memories of their own."""
+    """Return the cached plan of a method that does not depend on the system: a part of others with own memories."""
     key = (id(method), n_q, rtol, atol)
     known: tuple[Method, Plan] | None = _PLANS.get(key)
     if known is None:

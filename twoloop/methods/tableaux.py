@@ -80,23 +80,23 @@ class Tableau:
 
     @property
     def content(self) -> tuple[object, ...]:
-        """What it holds now, for comparisons."""
+        """Return its present content, for comparisons."""
         return self.name, self.order, self.A.tobytes(), self.b.tobytes(), self.c.tobytes()
 
     @property
     def stages(self) -> int:
-        """Number of stages s."""
+        """Return the number of stages s."""
         return len(self.b)
 
     @property
     def symplectic(self) -> bool:
-        """Whether b_i a_ij + b_j a_ji = b_i b_j (Sanz-Serna 1988), to rounding."""
+        """Return whether b_i a_ij + b_j a_ji = b_i b_j (Sanz-Serna 1988), to rounding."""
         bA = self.b[:, None] * self.A
         return bool(np.abs(bA + bA.T - np.outer(self.b, self.b)).max() < 1e-14)
 
 
 def _nodes(polynomial: Legendre) -> Array:
-    """Roots of a Legendre series on [0, 1], polished by Newton."""
+    """Return the roots of a Legendre series on [0, 1], polished by Newton's method."""
     x = np.sort(np.real(polynomial.roots()))
     slope = polynomial.deriv()
     for _ in range(3):
@@ -105,7 +105,7 @@ def _nodes(polynomial: Legendre) -> Array:
 
 
 def _collocation(c: Array) -> tuple[Array, Array]:
-    """A and b of the collocation method at the nodes c, by the Legendre basis (well conditioned)."""
+    """Return A and b of the collocation method at the nodes c, by the Legendre basis (well conditioned)."""
     s = len(c)
     x = 2.0 * c - 1.0
     basis = [Legendre.basis(k) for k in range(s)]

@@ -26,7 +26,7 @@ PADDED = 8  # operations of a table are a multiple of this
 
 
 def order_in_lanes(rtol: float, atol: float) -> int:
-    """The order that tolerances ask for of code for lanes."""
+    """Return the order of code for lanes at these tolerances."""
     return _order(rtol, atol, LEAST_IN_LANES, PER_DIGIT_IN_LANES)
 
 
@@ -86,13 +86,13 @@ class Taylor:
 
     @property
     def name(self) -> str:
-        """Shown in messages and tables."""
+        """Return the name for messages and tables."""
         return "Taylor" if self.order is None else f"Taylor(order={self.order})"
 
     def for_system(
         self, system: ConstrainedSystem, code: GeneratedCode | None = None, check: Check = unchecked
     ) -> "Taylor":
-        """The method with the operations of this system, of which what is compiled for it makes no use.
+        """Return the method with the operations of this system; generated code makes no use of them.
 
         Raises
         ------
@@ -108,7 +108,7 @@ class Taylor:
         return replace(self, program=program)
 
     def takes_code(self, fixed: bool) -> bool:
-        """Whether its steps may be run with code made for the mechanism."""
+        """Return whether its steps may run with generated code."""
         return True
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
@@ -145,7 +145,7 @@ class Taylor:
 
 
 def _options(program: SeriesProgram, highest: int, widths: list[int]) -> Array:
-    """The parameter block that the step reads, integers by their bits."""
+    """Return the parameter block that the step reads, integers by their bits."""
     from twoloop.kernels.steps import recurrences as series
 
     tables = [[table.groups.ravel(), *table.first, *table.second] for table in (program.early, program.late)]

@@ -30,8 +30,7 @@ from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.flags import BANDWIDTH, FORM
 from twoloop.kernels.layout import cached_run, lasting
 from twoloop.kernels.linalg.band import lapack_addresses
-from twoloop.methods.code_for import code_for, may_have_code
-from twoloop.methods.plans_for import plans_for
+from twoloop.methods.preparation import code_for, may_have_code, plans_for
 from twoloop.methods.presets import identity
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.comparison import checked_region_of, compare_callbacks_at, find_nondeterminism

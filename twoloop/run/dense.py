@@ -14,7 +14,7 @@ from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import codes, noted, tolerances
 from twoloop.kernels.data import intervals as names
 from twoloop.kernels.data.tolerances import ATOL, RTOL
-from twoloop.kernels.steps.named_step import loaded
+from twoloop.kernels.steps.lazy import loaded
 from twoloop.methods.plan import INNER_TOL, Plan
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.static_form import static_form

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import codes, noted, tolerances
 from twoloop.kernels.data.kit import Kit
-from twoloop.kernels.steps.named_step import loaded
+from twoloop.kernels.steps.lazy import loaded
 from twoloop.methods.plan import INNER_TOL, LARGEST_MOVE, Plan
 from twoloop.methods.tableaux import gauss
 from twoloop.run.discontinuities import state_behind_jump

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from twoloop.checks.arguments import check_flag, check_positive, check_size, check_tolerance, shown
 from twoloop.kernels.data import noted
-from twoloop.methods.code_for import Compiled, check_compiled
 from twoloop.methods.plan import Method
+from twoloop.methods.preparation import Compiled, check_compiled
 from twoloop.methods.presets import PRESETS, identity, is_preset
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.run import Run

@@ -21,9 +21,8 @@ from twoloop.generate.trace_cache import ParameterArrays, give_bounds, trace_cac
 from twoloop.generate.traced_values import CheckedRegion, refuse_wrong, unchecked
 from twoloop.kernels.data.flags import AUGMENTED, BANDWIDTH, DIAGONAL_MASS, FORM
 from twoloop.kernels.data.kit import Kit
-from twoloop.methods.code_for import Compiled, code_for
 from twoloop.methods.plan import Method, Plan
-from twoloop.methods.plans_for import plans_for
+from twoloop.methods.preparation import Compiled, code_for, plans_for
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.run import Run
 from twoloop.run.workspace import is_diagonal, kit_with

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twoloop.kernels.data import codes, noted
-from twoloop.methods import dop853_tableau
+from twoloop.methods import dop853
 from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import Method
 from twoloop.methods.runge_kutta import RungeKutta
@@ -32,7 +32,7 @@ def tighter(tolerance: ArrayLike) -> Array:
 
 def explicit() -> tuple[Method, Array]:
     """Return the method for motion that is not stiff, and its nodes."""
-    return DOP853(), dop853_tableau.C
+    return DOP853(), dop853.C
 
 
 def implicit(velocities: bool) -> tuple[Method, Array]:

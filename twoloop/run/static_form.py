@@ -109,7 +109,7 @@ class StaticForm(NamedTuple):
     def n_matrices(self, matrices: int) -> int:
         """Numbers of Newton's matrices, of a plan with so many dense ones."""
         from twoloop.kernels.steps.newton_memory import SYSTEMS
-        from twoloop.kernels.steps.newton_static import matrices_size
+        from twoloop.kernels.steps.newton_systems import matrices_size
 
         if self.newton is None or matrices == 0:
             return 0

@@ -24,7 +24,7 @@ from twoloop.kernels.evaluation.operations import N_NODES
 from twoloop.kernels.layout import cached_run, lasting, make_work
 from twoloop.kernels.linalg.band import banded_pays, lapack_addresses
 from twoloop.kernels.linalg.saddle_point import sparse_pays
-from twoloop.kernels.steps.named_step import LOADED, at_hand, loaded
+from twoloop.kernels.steps.lazy import LOADED, loaded, without_loading
 from twoloop.methods.plan import Plan
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.static_form import StaticForm
@@ -133,7 +133,7 @@ def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
 
 def _steps_of(plan: Plan) -> tuple[Any, Any, Any]:
     """Return the step that is called, and the two between which it chooses: the second one may stay unused."""
-    return loaded(plan.step), loaded(plan.first), at_hand(plan.second)
+    return loaded(plan.step), loaded(plan.first), without_loading(plan.second)
 
 
 def _with_own_flags(kit: Kit) -> Kit:

@@ -96,7 +96,7 @@ class Work(NamedTuple):
     predicted: Any  # (r) dependent positions that the integration formula gives, before the constraints restore them
     notes: Any  # (N_NOTES) see noted.py
     nodes: Any  # what the operations of a program make
-    matrices: Any  # of Newton's method, see steps/newton_memory.py and steps/newton_static.py
+    matrices: Any  # of Newton's method, see steps/newton_memory.py and steps/newton_systems.py
     # of the static form alone; there N is n_q + n_c, and what is of no use to it is empty
     mass_values: Any  # entries of M, see linalg/symbolic_factorization.py
     jacobian_values: Any  # entries of G

@@ -35,7 +35,7 @@ REST = WEIGHTS * (1.0 - NODES)
 
 
 def _equal_steps():
-    """|g_k - g_k+1| of equal steps, by the orders k from 0: what the error of velocities is of h times a difference."""
+    """Return |g_k - g_k+1| of equal steps by the order k: the error of velocities over h times a difference."""
     made = np.ones(HIGHEST + 1)
     for k in range(1, HIGHEST + 1):
         made[k] = -np.sum(made[:k] / np.arange(k + 1.0, 1.0, -1.0))
@@ -61,7 +61,7 @@ PSI, NEW_PSI, BETA, SPEED, PLACE, NODE, N_ROWS = range(7)  # SPEED holds g, PLAC
 
 
 def memory_size(n_q: int) -> int:
-    """Length of `memory` for n_q coordinates."""
+    """Return the length of `memory` for n_q coordinates."""
     return N_SCALARS + N_ROWS * (N_TERMS + 2) + 2 * (N_TERMS + 1) * _padded(n_q) + 2 * _padded(n_q)
 
 
@@ -77,7 +77,7 @@ def _row(memory, which):
 
 @inlined
 def _table(memory, n, which):
-    """Rows phi_i - d of one of the two tables, and d itself in the last (N_TERMS + 1, n padded)."""
+    """Return rows phi_i - d of one of the two tables, and d in the last row (N_TERMS + 1, n padded)."""
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + int(which) * (N_TERMS + 1) * width
     return memory[start : start + (N_TERMS + 1) * width].reshape((N_TERMS + 1, width))
@@ -85,7 +85,7 @@ def _table(memory, n, which):
 
 @inlined
 def _scratch(memory, n):
-    """Two rows of velocities and of positions: means over the step, then 1 over the tolerances."""
+    """Return two rows, of velocities and of positions: means over the step, then 1 over the tolerances."""
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + 2 * (N_TERMS + 1) * width
     return memory[start : start + width], memory[start + width : start + 2 * width]
@@ -93,7 +93,7 @@ def _scratch(memory, n):
 
 @kernel(SETTLE)
 def settle_adams(f, w, options, memory, tolerances, accepted):
-    """Make an attempt the history, if it was accepted; else note that it failed."""
+    """Make an accepted attempt the history; else note that it failed."""
     if not accepted:
         memory[FAILED] += 1.0
         memory[AGE] = 0.0
@@ -115,7 +115,7 @@ def settle_adams(f, w, options, memory, tolerances, accepted):
 
 @merged
 def _begin(memory, n, state):
-    """A history of one acceleration."""
+    """Begin a history of one acceleration."""
     table = _table(memory, n, memory[WHICH])
     table[:, :] = 0.0
     for m in range(n):
@@ -128,7 +128,7 @@ def _begin(memory, n, state):
 
 @merged
 def _coefficients(memory, h, k):
-    """beta_1 ... beta_k+1, and g and G up to the term k + 2, for a step of h."""
+    """Compute beta_1 ... beta_k+1, and g and G up to the term k + 2, for a step of h."""
     psi, new_psi, beta = _row(memory, PSI), _row(memory, NEW_PSI), _row(memory, BETA)
     g, G, c = _row(memory, SPEED), _row(memory, PLACE), _row(memory, NODE)
     new_psi[0] = h
@@ -157,7 +157,7 @@ def _coefficients(memory, h, k):
 
 @merged
 def _predict(memory, h, k, old, new, state, q1, v1, n):
-    """The prediction (q1, v1), and what the differences would be if it were exact, into `new`."""
+    """Compute the prediction (q1, v1), and in `new` what the differences would be if it were exact."""
     beta, g, G = _row(memory, BETA), _row(memory, SPEED), _row(memory, PLACE)
     in_v, in_q = _scratch(memory, n)
     for m in range(0, old.shape[1], 4):
@@ -213,13 +213,13 @@ def _predict(memory, h, k, old, new, state, q1, v1, n):
 
 @merged
 def _error(g, G, h, order, largest_v, largest_q):
-    """The local error of an order from the largest of its difference over the tolerances."""
+    """Return the local error of an order from the largest of its difference over the tolerances."""
     return max(h * abs(g[order - 1] - g[order]) * largest_v, h * h * abs(G[order - 1] - G[order]) * largest_q)
 
 
 @merged
 def _next(memory, h, k, table, d, n):
-    """The largest error of this attempt over the tolerances, and the step factor; choose the next order.
+    """Return the largest error of the attempt over the tolerances and the step factor; choose the next order.
 
     Order rules as in STEP: lower where the error would not be larger, higher where it would be smaller, after k + 1
     steps at order k; while the method starts, higher with every step.
@@ -267,7 +267,7 @@ def _next(memory, h, k, table, d, n):
 
 @kernel(ATTEMPT, vectorized=True)
 def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """One attempt, with the step factor of the order that it chooses."""
+    """Attempt a step, and choose the order and size of the next one."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]

@@ -1,7 +1,19 @@
 """Diagonally implicit Runge-Kutta steps with an explicit first stage (ESDIRK), for stiff problems and few digits.
 
-One stage after another is found as in diagonal_stage.py, with v_j = v + h sum_k a_jk a_k and q_j = q + h sum_k a_jk V_k
-over the stages before.
+The stages are found one after another. Newton's method finds the accelerations a of the independent coordinates at
+stage j, z = gamma h:
+
+    F(t_j, Q, V) - a = 0,  V = v_j + z a,  Q = q_j + z V,
+    v_j = v + h sum_k a_jk a_k,  q_j = q + h sum_k a_jk V_k over the stages before.
+
+The corrections d solve (I - z^2 J_q - z J_v) d = F - a with the derivatives of the right-hand side F. Where the
+system gives tangents, they are those of each iterate: stiff directions turn as the body moves, and after the turn of a
+large step an older matrix no longer contracts. Methods whose stages are solved together, as in newton_step.py, share
+one matrix.
+
+The dense matrix of one iteration from tangents is factored as it stands, T^T (M - z^2 K - z D) T: no inverse of T^T M T
+is applied to the derivatives, as newton_systems.py does for many systems. This is half the work where a matrix serves
+one iteration only.
 
 With step-size control TR-BDF2 goes on from its embedded formula of order 3, the difference to it filtered three times,
 which leaves the method L-stable: so the errors of many short steps add up to the tolerance, and not to their number
@@ -11,29 +23,277 @@ times it.
 import numpy as np
 
 from twoloop.kernels.control.predictor import departure, keep_predicted
-from twoloop.kernels.data.codes import DONE
-from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, kernel
-from twoloop.kernels.data.flags import FORCE_BY_Q_GIVEN
+from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED, SINGULAR
+from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, inlined, kernel, merged
+from twoloop.kernels.data.counters import N_FACTORIZATIONS, N_JACOBIANS, N_OUTER
+from twoloop.kernels.data.flags import BANDWIDTH, FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, FORM, STATIC
 from twoloop.kernels.data.noted import GENERATION
 from twoloop.kernels.data.tolerances import ESTIMATE, allowed
-from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, multipliers
-from twoloop.kernels.linalg.dense import copy
+from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, find_tangents, multipliers
+from twoloop.kernels.linalg.dense import copy, ldl_factor, ldl_solve, lu_factor, lu_solve
 from twoloop.kernels.steps import newton_memory as at
-from twoloop.kernels.steps.diagonal_stage import (
-    KEPT_WHILE,
-    PLACE,
-    TAIL,
-    gamma_of,
-    has_dense_tangents,
-    one_stage_of,
-    solve_stage,
-    stages_of,
+from twoloop.kernels.steps.newton_memory import PLACE, TAIL, block, pivots_of, space, square, vector
+from twoloop.kernels.steps.newton_systems import (
+    SAME_STEP,
+    correct,
+    derivatives_at,
+    factor_filter,
+    factor_systems,
+    filter_error,
+    reduce,
+    tangent_by_q,
+    tangent_by_v,
 )
-from twoloop.kernels.steps.iteration_matrix import factor_again, filter_by_iteration
-from twoloop.kernels.steps.lasting import STEPS, derivatives_fit, lasting_error, over_velocities, own_time
-from twoloop.kernels.steps.newton_memory import block, vector
-from twoloop.kernels.steps.newton_operator import derivatives_at, factor_filter, factor_systems, filter_error
-from twoloop.kernels.steps.stages import INNER_TOL
+from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TOL, STAGES
+from twoloop.kernels.steps.velocity_errors import (
+    STEPS_TO_DECAY,
+    derivatives_agree,
+    filtered_velocity_error,
+    motion_time,
+    velocity_error,
+)
+
+ASYMMETRY = 1e-12  # of the largest entry: what counts as rounding
+
+
+@compiled
+def _symmetric(A):
+    largest, off = 0.0, 0.0
+    for i in range(A.shape[0]):
+        largest = max(largest, abs(A[i, i]))
+        for j in range(i):
+            off = max(off, abs(A[i, j] - A[j, i]))
+    return off <= ASYMMETRY * largest
+
+
+@compiled
+def _fill(w, memory, n, m, z, H):
+    """Compute T^T M T - z^2 T^T K T - z T^T D T into H."""
+    N, Kr, Dr = space(w, n, at.SYSTEMS), space(w, n, at.BY_Q), space(w, n, at.BY_V)
+    square = z * z
+    if memory[at.DAMPED] == 1.0:
+        for i in range(m * m):
+            H[i] = N[i] - square * Kr[i] - z * Dr[i]
+    else:
+        for i in range(m * m):
+            H[i] = N[i] - square * Kr[i]
+
+
+@compiled
+def factor_again(w, memory, z):
+    """Factor the matrix at the last state for another z."""
+    n, m = w.Q.size, w.independent.size
+    numbers = space(w, n, at.FILTER)
+    H = square(numbers, m)
+    w.counters[N_FACTORIZATIONS] += 1
+    _fill(w, memory, n, m, z, numbers)
+    memory[at.SYMMETRIC] = 0.0
+    if _symmetric(H):
+        if ldl_factor(H):
+            memory[at.SYMMETRIC] = 1.0
+            return DONE
+        _fill(w, memory, n, m, z, numbers)  # not definite, as of a compressed beam
+    return DONE if lu_factor(H, pivots_of(memory, 1, n, 0)) > 0.0 else SINGULAR
+
+
+@compiled
+def factor_iteration(f, w, memory, t, q, v, z):
+    """Factor the matrix at a state that was evaluated just before, with its multipliers in w.lam."""
+    n = q.size
+    m = w.independent.size
+    w.counters[N_JACOBIANS] += 1
+    numbers = space(w, n, at.FILTER)
+    K, R = numbers.reshape((n, n)), space(w, n, at.SYSTEMS).reshape((n, n))
+    AT = space(w, n, at.SYSTEMS + 1)[: n * m].reshape((n, m))
+    code = tangent_by_q(f, w, t, q, v, n - 1, vector(memory, 1, n, at.Q_MOVED), K, R)
+    if code == DONE:
+        code = find_tangents(f, w, t, q)
+    if code != DONE:
+        return code
+    reduce(w, K, AT, square(space(w, n, at.BY_Q), m))
+    memory[at.DAMPED] = f.flags[FORCE_BY_V_GIVEN]
+    code = tangent_by_v(f, t, q, v, n - 1, K)
+    if code != DONE:
+        return code
+    if memory[at.DAMPED] == 1.0:
+        reduce(w, K, AT, square(space(w, n, at.BY_V), m))
+    reduce(w, w.M, AT, square(space(w, n, at.SYSTEMS), m))
+    return factor_again(w, memory, z)
+
+
+@compiled
+def _solve_iteration(w, memory, x):
+    m = x.size
+    H = square(space(w, w.Q.size, at.FILTER), m)
+    if memory[at.SYMMETRIC] == 1.0:
+        ldl_solve(H, x)
+    else:
+        lu_solve(H, pivots_of(memory, 1, w.Q.size, 0), x)
+
+
+@compiled
+def solve_iteration(w, memory, residual, a):
+    """Add the correction to the independents of a; it replaces the residual (n_q)."""
+    n = w.Q.size
+    m = w.independent.size
+    N, x = square(space(w, n, at.SYSTEMS), m), vector(memory, 1, n, at.V_MOVED)[:m]
+    for i in range(m):
+        total = 0.0
+        for j in range(m):
+            total += N[i, j] * residual[w.independent[j]]
+        x[i] = total
+    _solve_iteration(w, memory, x)
+    for i in range(m):
+        residual[w.independent[i]] = x[i]
+        a[w.independent[i]] += x[i]
+
+
+@compiled
+def filter_by_iteration(w, memory, z, e_q, e_v):
+    """Replace e_v (n_dof) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q)."""
+    n = w.Q.size
+    m = e_q.size
+    N, Kr = square(space(w, n, at.SYSTEMS), m), square(space(w, n, at.BY_Q), m)
+    x = vector(memory, 1, n, at.V_MOVED)[:m]
+    for i in range(m):
+        total = 0.0
+        for j in range(m):
+            total += N[i, j] * e_v[j] + z * Kr[i, j] * e_q[j]
+        x[i] = total
+    _solve_iteration(w, memory, x)
+    copy(x, e_v)
+
+
+MAX_ITERATIONS = 8
+GROWTH = 2.0  # of a correction, from which the iteration is given up
+SHARE_IF_LINEAR = 0.01  # of the tolerance of the outer loop, where it does not converge quadratically
+KEPT_WHILE = 0.1  # contraction up to which derivatives that were differenced serve on
+SHARE_OF_VELOCITY = 0.1  # what a correction counts as by the position that its velocity leads to
+
+
+@inlined
+def stages_of(memory, s, n):
+    """Return views: velocities and accelerations of the stages, accelerations at the end of the last step."""
+    last = memory.size - n
+    return (
+        memory[last - 2 * s * n : last - s * n].reshape((s, n)),
+        memory[last - s * n : last].reshape((s, n)),
+        memory[last:],
+    )
+
+
+@merged
+def gamma_of(options):
+    """Return the diagonal entry of A."""
+    s = int(options[TAIL])
+    return options[TAIL + s * s]
+
+
+@merged
+def _place(z, q_bar, v_bar, a, Q, V):
+    """Set the independents of Q and V from the acceleration a of the stage, and where Newton starts for the others."""
+    for m in range(Q.size):
+        V[m] = v_bar[m] + z * a[m]
+        Q[m] = q_bar[m] + z * V[m]
+
+
+@merged
+def has_dense_tangents(f, w):
+    """Return whether each iteration has a matrix of its own, which is factored as it stands."""
+    return (
+        f.flags[FORCE_BY_Q_GIVEN] == 1
+        and f.flags[BANDWIDTH] < 0
+        and w.Rate.size == w.C.size
+        and f.flags[FORM] != STATIC
+    )
+
+
+@merged
+def one_stage_of(options):
+    """Return 1 as a number unknown to the compiler, so that functions of newton_systems.py are compiled once."""
+    return int(options[STAGES])
+
+
+@compiled
+def _prepare(f, w, options, memory, t, h, Q, V, F):
+    """Prepare factors for an iteration at (Q, V), evaluated just before with accelerations F: DONE, or why not."""
+    if f.flags[FORCE_BY_Q_GIVEN] == 1 or memory[at.HAS_JACOBIAN] == 0.0:
+        multipliers(f, w, t, Q, V, F, w.lam)
+        memory[at.HAS_JACOBIAN] = 1.0
+        memory[at.FRESH] = 1.0
+        memory[at.H_FACTORED] = 0.0
+        if has_dense_tangents(f, w):
+            return factor_iteration(f, w, memory, t, Q, V, h * gamma_of(options))
+        code = derivatives_at(f, w, options, memory, one_stage_of(options), t, Q, V, F)
+        if code != DONE:
+            return code
+    if abs(memory[at.H_FACTORED] - h) > SAME_STEP * h:
+        return factor_systems(f, w, options, memory, one_stage_of(options), h)
+    return DONE
+
+
+@compiled
+def solve_stage(f, w, options, memory, t, h, A_stage):
+    """Solve one stage by Newton's method from A_stage (1, n_q): DONE, or why not; (Q, V) in Q_MID, V_MID."""
+    n = w.Q.size
+    z = h * gamma_of(options)
+    q_bar, v_bar = block(memory, 1, n, at.PREVIOUS)[0], block(memory, 1, n, at.TRIAL)[0]
+    Q, V, F = vector(memory, 1, n, at.Q_MID), vector(memory, 1, n, at.V_MID), vector(memory, 1, n, at.A_MID)
+    residual = block(memory, 1, n, at.RESIDUAL)
+    a = A_stage[0]
+    tangents_given = f.flags[FORCE_BY_Q_GIVEN] == 1
+    before = 0.0
+    for iteration in range(MAX_ITERATIONS):
+        w.counters[N_OUTER] += 1
+        _place(z, q_bar, v_bar, a, Q, V)
+        code = evaluate(f, w, t, Q, V, options[INNER_TOL], F)
+        if code != DONE:
+            return code
+        scale_q, scale_v = 1.0, 1.0
+        for m in range(n):
+            residual[0, m] = F[m] - a[m]
+        for m in w.independent:
+            scale_q = max(scale_q, abs(Q[m]))
+            scale_v = max(scale_v, abs(V[m]))
+        if f.flags[FORM] != STATIC:  # where none is dependent
+            for m in w.dependent:
+                a[m] = F[m]
+        code = _prepare(f, w, options, memory, t, h, Q, V, F)
+        if code != DONE:
+            memory[at.HAS_JACOBIAN] = 0.0
+            return code
+        if has_dense_tangents(f, w):
+            solve_iteration(w, memory, residual[0], a)
+        else:
+            correct(f, w, options, memory, one_stage_of(options), residual, A_stage)
+        change = 0.0
+        share = max(z / scale_q, SHARE_OF_VELOCITY * min(memory[at.DURATION] / scale_q, 1.0 / scale_v))
+        for m in w.independent:
+            change = max(change, z * abs(residual[0, m]) * share)
+        if not np.isfinite(change):
+            return OUTER_DIVERGED
+        contraction = 0.0
+        if iteration > 0 and before > 0.0:
+            contraction = change / before
+            memory[at.CONTRACTION] = contraction
+        if tangents_given and change <= options[OUTER_TOL]:
+            break
+        if iteration > 0:
+            if contraction > GROWTH:
+                return OUTER_DIVERGED
+            share = 1.0 if tangents_given else SHARE_IF_LINEAR
+            if contraction < 1.0 and contraction / (1.0 - contraction) * change <= share * options[OUTER_TOL]:
+                break
+            if contraction > KEPT_WHILE and memory[at.FRESH] == 0.0:
+                memory[at.HAS_JACOBIAN] = 0.0
+        if iteration == MAX_ITERATIONS - 1:
+            return OUTER_DIVERGED
+        before = change
+    for m in w.independent:
+        V[m] = v_bar[m] + z * a[m]
+        Q[m] = q_bar[m] + z * V[m]
+    return DONE
+
 
 FILTERED = 3  # times: with fewer the extrapolated method is unstable for vibrations, see tests/kernels/test_diagonal.py
 
@@ -42,7 +302,7 @@ AT_JUMP = 0.174  # of the width of accelerations that jump: when `lower` misses 
 
 @compiled
 def _filter(f, w, options, memory, h, e_q, e_v):
-    """(I - z J)^-1 (e_q, e_v) by the last factors, J being the Jacobian of (v, F); all n_dof numbers in (n_q)."""
+    """Apply (I - z J)^-1 to (e_q, e_v) by the last factors, J being the Jacobian of (v, F); n_dof numbers each."""
     z = h * gamma_of(options)
     count = w.independent.size
     if has_dense_tangents(f, w):
@@ -55,7 +315,7 @@ def _filter(f, w, options, memory, h, e_q, e_v):
 
 @compiled
 def _factor_filter(f, w, options, memory, h):
-    """Factors with which `_filter` is that of steps of h."""
+    """Compute the factors of `_filter` for steps of h."""
     if has_dense_tangents(f, w):
         return factor_again(w, memory, h * gamma_of(options))
     return factor_filter(f, w, options, memory, one_stage_of(options), h)
@@ -63,7 +323,7 @@ def _factor_filter(f, w, options, memory, h):
 
 @compiled
 def _difference(w, h, V_stage, A_stage, weights, share, e_q, e_v):
-    """The stages' difference by such weights, times `share`, of the independents; all n_dof numbers in (n_q)."""
+    """Compute `share` times the weighted sum of the stages for the independents; n_dof numbers each."""
     for i in range(w.independent.size):
         j = w.independent[i]
         in_q, in_v = 0.0, 0.0
@@ -76,7 +336,7 @@ def _difference(w, h, V_stage, A_stage, weights, share, e_q, e_v):
 
 @compiled
 def _renew(f, w, options, memory, t, h, new_state):
-    """Derivatives at the end of the step, and their factors."""
+    """Compute derivatives at the end of the step, and their factors."""
     n = w.Q.size
     Q, V, F = vector(memory, 1, n, at.Q_MID), vector(memory, 1, n, at.V_MID), vector(memory, 1, n, at.A_MID)
     copy(new_state[:n], Q)
@@ -97,7 +357,7 @@ def _renew(f, w, options, memory, t, h, new_state):
 
 @compiled
 def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, weights, share):
-    """Largest component, over atol + rtol |value|, of the stages' difference by such weights, times `share`.
+    """Return the largest component of `share` times the weighted sum of stages, over atol + rtol |value|.
 
     It is filtered by the last factors (Hosea and Shampine 1996): what is stiff has no part in it.
     """
@@ -110,7 +370,7 @@ def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A
     _difference(w, h, V_stage, A_stage, weights, share, e_q, e_v)
     copy(e_v, raw)
     _filter(f, w, options, memory, h, e_q, e_v)
-    if f.flags[FORCE_BY_Q_GIVEN] == 0 and not derivatives_fit(
+    if f.flags[FORCE_BY_Q_GIVEN] == 0 and not derivatives_agree(
         f, w, options, memory, 1, t + h, z, tolerances, raw, e_q, e_v, state, new_state, A_stage[-1]
     ):
         memory[at.CHANGED] = 1.0
@@ -129,12 +389,12 @@ def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A
             error = max(error, abs(e_v[i]) / scale)
     copy(e_v, once)
     _filter(f, w, options, memory, h, e_q, e_v)
-    return max(error, lasting_error(w, memory, tolerances, z, raw, once, e_v, state, new_state, A_stage[-1]))
+    return max(error, filtered_velocity_error(w, memory, tolerances, z, raw, once, e_v, state, new_state, A_stage[-1]))
 
 
 @compiled
 def _extrapolate(f, w, options, memory, h, q1, v1):
-    """From the end of the step by the formula to that of the embedded one; its difference was filtered twice."""
+    """Go from the end of the step to that of the embedded formula; the difference was filtered twice already."""
     e_q, e_v = vector(memory, 1, w.Q.size, at.E_Q), vector(memory, 1, w.Q.size, at.E_V)
     for _ in range(2, FILTERED):
         _filter(f, w, options, memory, h, e_q, e_v)
@@ -145,29 +405,29 @@ def _extrapolate(f, w, options, memory, h, q1, v1):
 
 @compiled
 def _slow_error(f, w, options, memory, h, tolerances, state, new_state, A_stage):
-    """What an error of the velocities, in E_V, leaves in directions that are slow beside the step, as newton_step."""
+    """Return what an error of the velocities, in E_V, leaves in slow directions, as in newton_step.py."""
     n = w.Q.size
     e_q, e_v = vector(memory, 1, n, at.E_Q), vector(memory, 1, n, at.E_V)
-    longest = own_time(w, tolerances, state, state[2 * n :])
+    longest = motion_time(w, tolerances, state, state[2 * n :])
     if memory[at.CHANGED] == 1.0:
-        longest = max(longest, own_time(w, tolerances, state, A_stage[-1]))
-    error = over_velocities(w, tolerances, e_v, longest, state, new_state)
+        longest = max(longest, motion_time(w, tolerances, state, A_stage[-1]))
+    error = velocity_error(w, tolerances, e_v, longest, state, new_state)
     if error <= 1.0:
         return 0.0
     for i in range(w.independent.size):
         e_q[i] = 0.0
-    longer = STEPS * h / gamma_of(options)
+    longer = STEPS_TO_DECAY * h / gamma_of(options)
     if _factor_filter(f, w, options, memory, longer) == DONE:
         _filter(f, w, options, memory, longer, e_q, e_v)
         # where the motion is unstable the system may be nearly singular, and the solution large
-        error = min(error, over_velocities(w, tolerances, e_v, longest, state, new_state))
+        error = min(error, velocity_error(w, tolerances, e_v, longest, state, new_state))
     memory[at.H_FACTORED] = 0.0
     return error
 
 
 @compiled
 def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, lower):
-    """The error by `lower`, the weights of another embedded formula, for accelerations that jump within the step.
+    """Return the error by `lower`, weights of another embedded formula, for jumps of accelerations.
 
     Those of the first one are so small at the stages of the first half that a jump there hardly shows. `lower` is exact
     for accelerations quadratic in time; where these are smooth, what it misses of their width is small, and its
@@ -195,7 +455,7 @@ def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V
 
 @kernel(SETTLE)
 def settle_diagonal(f, w, options, memory, tolerances, accepted):
-    """The last stage of an accepted step is the first of the next one."""
+    """Keep the last stage of an accepted step, which is the first of the next one."""
     if accepted:
         s = int(options[TAIL])
         _, A_stage, a_end = stages_of(memory, s, w.Q.size)
@@ -205,7 +465,7 @@ def settle_diagonal(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT, vectorized=True)
 def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """One attempt: the stages one after another, the last of which is the end of the step."""
+    """Attempt a step: solve the stages one after another; the last one is the end of the step."""
     s = int(options[TAIL])
     o = TAIL + 1
     A = options[o : o + s * s].reshape((s, s))

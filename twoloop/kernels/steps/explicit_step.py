@@ -36,7 +36,7 @@ def options_array(
     free: bool = False,
     theta: float = 0.0,
 ) -> NDArray[np.float64]:
-    """The parameter block that the step reads; see `_error` for `fine` and `coarse`, `project` for theta."""
+    """Return the parameter block that the step reads; see `_error` for `fine` and `coarse`, `project` for theta."""
     A, b, c, fine, coarse = (np.asarray(x, dtype=float) for x in (A, b, c, fine, coarse))
     s = b.size
     if A.shape != (s, s) or not c.size == fine.size == coarse.size == s:
@@ -48,7 +48,7 @@ def options_array(
 
 
 def memory_size(s: int, n_q: int) -> int:
-    """Length of `memory` for s stages and n_q coordinates."""
+    """Return the length of `memory` for s stages and n_q coordinates."""
     return (N_VECTORS + s) * (-(-2 * n_q // BLOCK) * BLOCK)
 
 
@@ -59,7 +59,7 @@ def _width(n):
 
 @inlined
 def tableau_of(options):
-    """Views of the parameter block: s, A, b, c, and the weights of the two estimates."""
+    """Return views of the parameter block: s, A, b, c, and the weights of the two estimates."""
     s = int(options[STAGES])
     o = N_SCALARS
     A = options[o : o + s * s].reshape((s, s))
@@ -74,14 +74,14 @@ def _vector(memory, n, which):
 
 @inlined
 def _slopes(memory, s, n):
-    """Velocities and accelerations of the stages, side by side."""
+    """Return velocities and accelerations of the stages, side by side."""
     begin = N_VECTORS * _width(n)
     return memory[begin : begin + s * _width(n)].reshape((s, _width(n)))
 
 
 @compiled
 def _weighted(weights, slopes, total):
-    """The sum of weights[k] slopes[k], block by block, each in registers."""
+    """Compute the sum of weights[k] slopes[k], block by block, each in registers."""
     for m in range(0, total.size, BLOCK):
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
         for k in range(weights.size):
@@ -106,7 +106,7 @@ def _weighted(weights, slopes, total):
 
 @compiled
 def _move(y, h, weights, slopes, total, y1):
-    """y1 = y + h times the weighted sum: added at last, so that not every stage rounds y."""
+    """Compute y1 = y + h times the weighted sum; y is added last, so that not every stage rounds it."""
     _weighted(weights, slopes, total)
     for m in range(y.size):
         y1[m] = y[m] + h * total[m]
@@ -114,7 +114,7 @@ def _move(y, h, weights, slopes, total, y1):
 
 @compiled
 def largest_error(tolerances, y, y1, one, other, strict):
-    """e^2 / sqrt(e^2 + d^2) of the largest components of both estimates, of q and v, dependents too.
+    """Return e^2 / sqrt(e^2 + d^2) of the largest components of both estimates, of q and v, dependents too.
 
     Each is an estimate over atol + rtol |y|. Taken component by component e^2 / sqrt(e^2 + d^2) would be e, of low
     order, where d passes through zero: up to 30 % more evaluations. If `strict`, e^(3/2) / (e^2 + d^2)^(1/4): near a
@@ -138,7 +138,7 @@ def largest_error(tolerances, y, y1, one, other, strict):
 
 @compiled
 def _error(tolerances, h, fine, coarse, y, y1, slopes, one, other, strict):
-    """The error of a step that is finished; `one` and `other` are room for the two estimates."""
+    """Return the error of a finished step; `one` and `other` are scratch for the two estimates."""
     _weighted(fine, slopes, one)
     _weighted(coarse, slopes, other)
     for m in range(y.size):
@@ -149,7 +149,7 @@ def _error(tolerances, h, fine, coarse, y, y1, slopes, one, other, strict):
 
 @kernel(ATTEMPT, vectorized=True)
 def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """One attempt; one that the estimate refuses ends without the accelerations at its end."""
+    """Attempt a step; if the estimate rejects it, the accelerations at its end are not computed."""
     s, A, b, c, fine, coarse = tableau_of(options)
     n = w.Q.size
     q, v, y, y1 = state[:n], state[n : 2 * n], state[: 2 * n], new_state[: 2 * n]

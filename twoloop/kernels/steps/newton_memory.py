@@ -3,10 +3,10 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from twoloop.kernels.data.common import inlined, merged
-from twoloop.kernels.steps.stages import N_SCALARS
+from twoloop.kernels.steps.stages import N_SCALARS, options_array
 
 # `options` is that of stages.py, then these scalars, the weights e (s) of the estimate and for each eigenvalue
 # its real and imaginary part, the row of T^-1 and the column of T that belong to it (s real, s imaginary parts each)
@@ -26,7 +26,7 @@ N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
     CONTRACTION,  # of the last iteration
     DAMPED,  # 0: no derivative by v
     SYMMETRIC,  # 1: the matrix of diagonal_step.py was factored as a symmetric one
-    LASTING,  # s, of diagonal_step.py: how long an error of velocity lasts; 0: not known
+    DURATION,  # s: how long an error of velocity lasts; 0: not known
     CHANGED,  # 1: in diagonal_step.py: derivatives were renewed at the end of the step
     N_MEMORY_SCALARS,
 ) = range(14)
@@ -39,18 +39,11 @@ BY_Q, BY_V, FILTER, SYSTEMS = range(4)
 def newton_options(
     A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], velocities: bool
 ) -> NDArray[np.float64]:
-    """The part of `options` that Newton's method needs besides stages.options_array; `velocities`: those are tested.
+    """Return what `options` holds behind those of stages.py; A has a basis of eigenvectors.
 
-    Raises
-    ------
-    ValueError
-        If A has too few eigenvectors.
+    velocities : whether the error of velocities is tested.
     """
     values, T = np.linalg.eig(A)
-    if np.linalg.cond(T) > 1e8:
-        raise ValueError(
-            "A of the tableau must have a basis of eigenvectors for Newton's method. Take outer='fixed-point'"
-        )
     inverse = np.linalg.inv(T)
     real = [k for k in range(len(b)) if values[k].imag == 0.0]
     pairs = [k for k in range(len(b)) if values[k].imag > 0.0]
@@ -63,7 +56,7 @@ def newton_options(
 
 
 def _estimate_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: float) -> NDArray[np.float64]:
-    """Weights e: gamma0 f(y_n) + sum_j e_j f(Y_j) is a quadrature of order s less the method's own.
+    """Return weights e: gamma0 f(y_n) + sum_j e_j f(Y_j) is a quadrature of order s less the method's own.
 
     Hairer & Wanner II, (IV.8.16). With c_1 = 0 the stages hold f(y_n) already: then the last stage is left out.
     """
@@ -80,57 +73,93 @@ def _estimate_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: fl
 
 
 def memory_size(n_eigenvalues: int, s: int, n_q: int) -> int:
-    """Length of `memory`: scalars, stage blocks, vectors, pivots, two complex vectors, weights."""
+    """Return the length of `memory`: scalars, blocks, vectors, pivots, two complex vectors, weights."""
     return N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + 5 + n_eigenvalues) * n_q + s
 
 
 def n_matrices(n_eigenvalues: int) -> int:
-    """How many spaces of n_q^2 numbers there are to be in w.matrices."""
+    """Return how many spaces of n_q^2 numbers w.matrices needs."""
     return SYSTEMS + 2 * n_eigenvalues
+
+
+# `options` are those of a Newton method of one stage, A = [[gamma]]; then this method's stages, A, c and b - b^, and 1
+# if steps with an error estimate go on from the embedded formula
+PLACE = N_SCALARS + 2 + 5
+TAIL = PLACE + N_EIGEN_SCALARS + 1 + 2 + 4
+
+
+def diagonal_options(
+    A: ArrayLike,
+    c: ArrayLike,
+    weights: ArrayLike,
+    lower: ArrayLike,
+    inner_tol: float,
+    outer_tol: float,
+    velocities: bool,
+    embedded: bool,
+) -> NDArray[np.float64]:
+    """Return the parameter block: A (s, s) has zeros in its first row, then gamma on the diagonal; b is its last row.
+
+    `lower`: weights of the estimate where accelerations jump.
+    `embedded`: the embedded formula is the one of higher order, from which steps go on.
+    """
+    A, c, weights, lower = (np.asarray(x, dtype=np.float64) for x in (A, c, weights, lower))
+    gamma = A[-1, -1]
+    one_stage = options_array([[gamma]], [1.0], [1.0], inner_tol, outer_tol, 0.0)
+    newton = np.array([1.0, 0.0, gamma, float(velocities), 0.0, gamma, 0.0, 1.0, 0.0, 1.0, 0.0])
+    return np.concatenate([one_stage, newton, [float(c.size)], A.ravel(), c, weights, lower, [float(embedded)]])
+
+
+def diagonal_memory(s: int, n_q: int) -> NDArray[np.float64]:
+    """Make `memory`: that of a Newton method of one stage, then velocities and accelerations (s, n_q).
+
+    Last come the accelerations (n_q) that the last stage of the last accepted step ended with.
+    """
+    return np.zeros(memory_size(1, 1, n_q) + (2 * s + 1) * n_q)
 
 
 @merged
 def eigen_place(s):
-    """First place of the eigenvalue scalars."""
+    """Return the first place of the eigenvalue scalars."""
     return N_SCALARS + 2 * s * s + 5 * s
 
 
 @merged
 def count_eigenvalues(options, s):
-    """Number of systems: one for each real eigenvalue and one for each pair."""
+    """Return the number of systems: one for each real eigenvalue and one for each pair."""
     place = eigen_place(s)
     return int(options[place + N_REAL] + options[place + N_PAIRS])
 
 
 @inlined
 def block(memory, s, n, which):
-    """One of the stage blocks, (s, n)."""
+    """Return a view of a stage block, (s, n)."""
     start = N_MEMORY_SCALARS + which * s * n
     return memory[start : start + s * n].reshape((s, n))
 
 
 @inlined
 def vector(memory, s, n, which):
-    """One of the vectors, (n)."""
+    """Return a view of a vector, (n)."""
     start = N_MEMORY_SCALARS + (N_BLOCKS * s + which) * n
     return memory[start : start + n]
 
 
 @inlined
 def space(w, n, which):
-    """The space of one matrix, (n^2)."""
+    """Return the space of one matrix, (n^2)."""
     return w.matrices[which * n * n : (which + 1) * n * n]
 
 
 @inlined
 def square(numbers, m):
-    """The first m^2 numbers of a space as a matrix."""
+    """Return the first m^2 numbers of a space as a matrix."""
     return numbers[: m * m].reshape((m, m))
 
 
 @inlined
 def system_space(w, n, k):
-    """The space of the k-th eigenvalue's system, complex (n^2)."""
+    """Return the space of the k-th eigenvalue's system, complex (n^2)."""
     start = (SYSTEMS + 2 * k) * n * n
     return w.matrices[start : start + 2 * n * n].view(np.complex128)
 
@@ -143,11 +172,11 @@ def _tail(memory, s, n, k):
 
 @inlined
 def pivots_of(memory, s, n, k):
-    """Integers (n) for the row exchanges of the filter (k = 0) or of the (k - 1)-th eigenvalue's system."""
+    """Return integers (n) for the row exchanges of the filter (k = 0) or of the (k - 1)-th eigenvalue's system."""
     return _tail(memory, s, n, k)[:n].view(np.int64)
 
 
 @inlined
 def complex_vector(memory, s, n, n_eigen, which):
-    """Complex scratch (n), `which` being 0 or 1."""
+    """Return complex scratch (n), `which` being 0 or 1."""
     return _tail(memory, s, n, 1 + n_eigen + 2 * which).view(np.complex128)

@@ -23,9 +23,8 @@ from twoloop.kernels.data.tolerances import ESTIMATE, LEAST, allowed
 from twoloop.kernels.evaluation.inner_loop import accelerations, evaluate, multipliers
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps import newton_memory as at
-from twoloop.kernels.steps.lasting import STEPS, lasting_error, over_velocities, own_time
 from twoloop.kernels.steps.newton_memory import block, eigen_place, vector
-from twoloop.kernels.steps.newton_operator import (
+from twoloop.kernels.steps.newton_systems import (
     MAX_ITERATIONS,
     SAME_STEP,
     STAGNATION,
@@ -36,6 +35,7 @@ from twoloop.kernels.steps.newton_operator import (
     filter_error,
 )
 from twoloop.kernels.steps.stages import FARTHEST, INNER_TOL, OUTER_TOL, STAGES, interpolate, middle_node, tableau_of
+from twoloop.kernels.steps.velocity_errors import STEPS_TO_DECAY, filtered_velocity_error, motion_time, velocity_error
 
 SLOW = 0.05  # contraction above which the derivatives are renewed before the next step
 STAGNATION_FIXED = 1e-9  # as STAGNATION, for fixed steps, relative to max(1, |value|)
@@ -43,7 +43,7 @@ STAGNATION_FIXED = 1e-9  # as STAGNATION, for fixed steps, relative to max(1, |v
 
 @compiled
 def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
-    """Newton's method for the stage accelerations, predicted in A_stage: DONE, or why not."""
+    """Solve for the stage accelerations, predicted in A_stage, by Newton's method: DONE, or why not."""
     s, A, A2, _, _, c = tableau_of(options)
     n = q.size
     residual = block(memory, s, n, at.RESIDUAL)
@@ -114,7 +114,7 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
 
 @compiled
 def _filter(f, w, options, memory, h, e_q, e_v):
-    """(I - z J)^-1 (e_q, e_v), z = h gamma0, J being the Jacobian of (v, F); all n_dof numbers in (n_q)."""
+    """Apply (I - z J)^-1 to (e_q, e_v), z = h gamma0, J being the Jacobian of (v, F); n_dof numbers each."""
     s = int(options[STAGES])
     m = w.independent.size
     filter_error(f, w, options, memory, s, h, e_q, e_v)
@@ -124,7 +124,7 @@ def _filter(f, w, options, memory, h, e_q, e_v):
 
 @compiled
 def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
-    """Largest component, over atol + rtol |value|, of the embedded error estimate, filtered for stiff components."""
+    """Return the largest component of the filtered embedded error estimate over atol + rtol |value|."""
     s, A, _, _, _, _ = tableau_of(options)
     n = w.Q.size
     q, v, a, q1, v1 = state[:n], state[n : 2 * n], state[2 * n : 3 * n], new_state[:n], new_state[n : 2 * n]
@@ -157,7 +157,7 @@ def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
         return error
     copy(e_v, once)
     _filter(f, w, options, memory, h, e_q, e_v)
-    error = max(error, lasting_error(w, memory, tolerances, h * gamma0, raw, once, e_v, state, new_state, a))
+    error = max(error, filtered_velocity_error(w, memory, tolerances, h * gamma0, raw, once, e_v, state, new_state, a))
     if error <= 1.0:
         error = max(error, _slow_error(f, w, options, memory, h, tolerances, state, new_state))
     return error
@@ -165,16 +165,16 @@ def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
 
 @compiled
 def _slow_error(f, w, options, memory, h, tolerances, state, new_state):
-    """What an error of the velocities, in E_V, leaves in directions that are slow beside the step, over the tolerances.
+    """Return what an error of the velocities, in E_V, leaves in directions that are slow beside the step.
 
     How long all of it lasts is known from its fastest part. What is left of it a few steps later lasts as long as
     the motion itself.
     """
     s, n = int(options[STAGES]), w.Q.size
-    z = STEPS * h / options[eigen_place(s) + at.GAMMA0]
+    z = STEPS_TO_DECAY * h / options[eigen_place(s) + at.GAMMA0]
     e_q, e_v = vector(memory, s, n, at.E_Q), vector(memory, s, n, at.E_V)
-    longest = own_time(w, tolerances, state, state[2 * n :])
-    error = over_velocities(w, tolerances, e_v, longest, state, new_state)
+    longest = motion_time(w, tolerances, state, state[2 * n :])
+    error = velocity_error(w, tolerances, e_v, longest, state, new_state)
     if error <= 1.0:
         return 0.0
     for i in range(w.independent.size):
@@ -182,7 +182,7 @@ def _slow_error(f, w, options, memory, h, tolerances, state, new_state):
     if factor_filter(f, w, options, memory, s, z) == DONE:
         filter_error(f, w, options, memory, s, z, e_q, e_v)
         # where the motion is unstable the system may be nearly singular, and the solution large
-        error = min(error, over_velocities(w, tolerances, e_v, longest, state, new_state))
+        error = min(error, velocity_error(w, tolerances, e_v, longest, state, new_state))
     if factor_filter(f, w, options, memory, s, h) != DONE:
         memory[at.H_FACTORED] = 0.0
     return error
@@ -190,7 +190,7 @@ def _slow_error(f, w, options, memory, h, tolerances, state, new_state):
 
 @kernel(SETTLE)
 def settle_newton(f, w, options, memory, tolerances, accepted):
-    """The stages of an accepted step are what the next one is predicted from; its state is another than the last."""
+    """Keep the stages of an accepted step, from which the next ones are predicted."""
     s, n = int(options[STAGES]), w.Q.size
     if accepted:
         memory[at.FRESH] = 0.0
@@ -204,7 +204,7 @@ def settle_newton(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """One attempt with Newton's method as the outer loop and an embedded estimate of the error."""
+    """Attempt a step with Newton's method as the outer loop and an embedded estimate of the error."""
     s, _, _, b, bA, c = tableau_of(options)
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]

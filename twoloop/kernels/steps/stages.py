@@ -1,4 +1,4 @@
-"""What implicit Runge-Kutta steps share, whatever their outer loop: the parameter block, the prediction of stages."""
+"""Parameter block, prediction of stages and error at jumps, which all implicit Runge-Kutta steps share."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -7,7 +7,7 @@ from twoloop.kernels.data.common import compiled, inlined, merged
 from twoloop.kernels.data.tolerances import allowed
 
 FARTHEST = 3.0  # largest step ratio over which the old stage polynomial is extrapolated
-SHARE_BESIDE = 0.01  # of end_error, beside Richardson's estimate: it is there for jumps between ends and stages
+END_ERROR_WEIGHT = 0.01  # of `end_error` beside Richardson's estimate: it is there for jumps between ends and stages
 
 # places in `options`: scalars, then A (s, s), A A (s, s), b (s), b A (s), c (s) and two rows (s) for `end_error`
 # EXTRAPOLATION: 1 / (2^order - 1), or 0 without; POWER: order - 1
@@ -24,7 +24,7 @@ def options_array(
     outer_test: float = 1.0,
     power: float = 0.0,
 ) -> NDArray[np.float64]:
-    """The parameter block that `tableau_of` reads; `outer_test` 1: (32) over dependent coordinates too."""
+    """Return the parameter block that `tableau_of` reads; `outer_test` 1: (32) over dependent coordinates too."""
     A, b, c = np.asarray(A), np.asarray(b), np.asarray(c)
     scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation, outer_test, power])
     rows = (b, b @ A, c, _lagrange(c, 0.0), _lagrange(c, 1.0))
@@ -32,7 +32,7 @@ def options_array(
 
 
 def _lagrange(nodes: NDArray[np.float64], x: float) -> NDArray[np.float64]:
-    """Weights by which the polynomial through values at distinct nodes has its value at x."""
+    """Return the weights of values at distinct nodes in their interpolating polynomial at x."""
     factors = (x - nodes[None, :]) / (nodes[:, None] - nodes[None, :] + np.eye(len(nodes)))
     np.fill_diagonal(factors, 1.0)
     return np.asarray(factors.prod(axis=1))
@@ -40,7 +40,7 @@ def _lagrange(nodes: NDArray[np.float64], x: float) -> NDArray[np.float64]:
 
 @inlined
 def tableau_of(options):
-    """Views of the parameter block: s, A, A A, b, b A, c."""
+    """Return views of the parameter block: s, A, A A, b, b A, c."""
     s = int(options[STAGES])
     o = N_SCALARS
     A = options[o : o + s * s].reshape((s, s))
@@ -51,17 +51,17 @@ def tableau_of(options):
 
 @merged
 def middle_node(c):
-    """The node next to the middle."""
-    found = 0
+    """Return the node next to the middle."""
+    nearest = 0
     for j in range(c.size):
-        if abs(c[j] - 0.5) < abs(c[found] - 0.5):
-            found = j
-    return c[found]
+        if abs(c[j] - 0.5) < abs(c[nearest] - 0.5):
+            nearest = j
+    return c[nearest]
 
 
 @compiled
 def interpolate(c, theta, A_stage, weights, a):
-    """The polynomial through (c_j, A_stage_j) at theta."""
+    """Evaluate the polynomial through (c_j, A_stage_j) at theta."""
     s = c.size
     for j in range(s):
         product = 1.0
@@ -78,7 +78,7 @@ def interpolate(c, theta, A_stage, weights, a):
 
 @compiled
 def end_error(tolerances, options, h, state, new_state, A_stage):
-    """Error of a step as the stage polynomial of the accelerations shows it, over (26).
+    """Estimate the error of a step from the polynomial through the stage accelerations, over (26).
 
     The accelerations of the stages differ by w, a term of order h. The polynomial through them misses that at an end of
     the step by a term of order h^s. If terms fall evenly, by a factor f an order, that of the method's own order makes

@@ -44,7 +44,7 @@ TOO_SHORT = 2.0  # the error of a first step that is not made, as the series all
 
 @merged
 def _find_series(f, w, options, memory, t, state, unit, which):
-    """The series about a state that was projected just before, into one of the two places."""
+    """Compute the series about a state that was projected just before, into one of the two places."""
     n = w.Q.size
     memory[at.TARGET] = which
     if f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0:  # code made for the mechanism leaves no factors in w
@@ -57,7 +57,7 @@ def _find_series(f, w, options, memory, t, state, unit, which):
 
 @merged
 def _length(tolerances, series, unit, order, n):
-    """The step, in units, at which the last two terms, of positions and velocities, are within the tolerances."""
+    """Return the step, in units, at which the last two terms of positions and velocities are within the tolerances."""
     rtol, last, before = tolerances[RTOL], 0.0, 0.0
     row, row_before = order * n, (order - 1) * n
     for j in range(n):
@@ -76,7 +76,7 @@ def _length(tolerances, series, unit, order, n):
 
 @merged
 def _evaluate(series, unit, order, x, q, v, a):
-    """q, v and a at x units of time, by Horner's scheme; four coordinates at once, or two, some of the last ones twice.
+    """Evaluate q, v and a at x units of time by Horner's scheme; four coordinates at once, or two.
 
     The recurrence of the second derivative gives half of it.
     """
@@ -111,7 +111,7 @@ def _evaluate(series, unit, order, x, q, v, a):
 
 @compiled
 def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
-    """The defect within the step, at the share s of it, over what is allowed; infinite where there is none."""
+    """Return the defect at the share s of the step over what is allowed; infinite if there is none."""
     found = accelerations_found(memory, q.size)
     _evaluate(series, memory[at.UNIT], order, s * h / memory[at.UNIT], q, v, found)
     if evaluate_as_given(f, w, t + s * h, q, v, a) != DONE:
@@ -121,7 +121,7 @@ def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
 
 @compiled
 def _is_noise(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
-    """Whether a defect is that of rounding in the equations: near the beginning, where the series is exact, as well."""
+    """Return whether a defect is rounding: it is as large near the beginning, where the series is exact."""
     if defect > LOUDEST:
         return False
     noise = 0.0
@@ -132,7 +132,7 @@ def _is_noise(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
 
 @compiled
 def _refused_within(f, w, memory, t, h, tolerances, series, order, q, v, a):
-    """The defect for which the step is refused before its end is looked at; 0: for none. Notes the largest found.
+    """Return the defect for which the step is rejected before its end is evaluated, or 0. Note the largest one.
 
     The places looked at are not the same in each attempt, but for the last at which a step was refused.
     """
@@ -156,13 +156,13 @@ def _refused_within(f, w, memory, t, h, tolerances, series, order, q, v, a):
 
 @merged
 def _shortened(defect, order):
-    """The factor for a step that was refused for its defect."""
+    """Return the factor for a step that was rejected for its defect."""
     return max(MOST_SHORTENED, 0.9 * defect ** (-1.0 / order))
 
 
 @kernel(SETTLE)
 def settle_taylor(f, w, options, memory, tolerances, accepted):
-    """The series about the end of an accepted step is that about the beginning of the next."""
+    """Keep the series about the end of an accepted step for the next one."""
     if accepted and memory[at.TRIED] == 1.0:
         memory[at.WHICH] = 1.0 - memory[at.WHICH]
         memory[at.UNIT], memory[at.LENGTH] = memory[at.NEXT_UNIT], memory[at.NEXT_LENGTH]
@@ -171,7 +171,7 @@ def settle_taylor(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """One attempt, by the series about its beginning; then the series about its end, which sets the next step."""
+    """Attempt a step by the series about its beginning; the series about its end then sets the next step."""
     n, order, estimated = w.Q.size, int(options[at.ORDER]), tolerances[ESTIMATE] == 1.0
     q, v = state[:n], state[n : 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]

@@ -2,20 +2,18 @@
 
 import numpy as np
 
-from twoloop.kernels.control.richardson import conclude
 from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, kernel
 from twoloop.kernels.data.tolerances import ESTIMATE
 from twoloop.kernels.evaluation.inner_loop import accelerations
 from twoloop.kernels.linalg.dense import copy
-from twoloop.kernels.steps import fixed_point_memory as at
-from twoloop.kernels.steps.fixed_point_loops import iterate_accelerations
-from twoloop.kernels.steps.fixed_point_memory import block, keep_rest, rests_of, vector
+from twoloop.kernels.paper import iterations as at
+from twoloop.kernels.paper.iterations import block, conclude, iterate_accelerations, keep_rest, rests_of, vector
 from twoloop.kernels.steps.stages import (
+    END_ERROR_WEIGHT,
     EXTRAPOLATION,
     FARTHEST,
     INNER_TOL,
-    SHARE_BESIDE,
     STAGES,
     end_error,
     interpolate,
@@ -25,7 +23,7 @@ from twoloop.kernels.steps.stages import (
 
 @kernel(SETTLE)
 def settle_runge_kutta(f, w, options, memory, tolerances, accepted):
-    """The stages of an accepted step are what the next one is predicted from."""
+    """Keep the stages of an accepted step, from which the next ones are predicted."""
     s, n = int(options[STAGES]), w.Q.size
     if accepted and memory[at.HAS_TRIAL] == 1.0:
         previous, trial = block(memory, s, n, at.PREVIOUS), block(memory, s, n, at.TRIAL)
@@ -39,7 +37,7 @@ def settle_runge_kutta(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """One attempt, a fixed-point iteration on the accelerations; to estimate the error, a step of h and two of h/2.
+    """Attempt a step by fixed-point iteration; to estimate the error, a step of h and two of h/2.
 
     The result is that of the half steps, or with EXTRAPOLATION = 1 / (2^order - 1) their extrapolation with the whole
     step, put back on the constraints. Stages are predicted from the polynomial through the stage accelerations of the
@@ -96,7 +94,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     memory[at.HAS_TRIAL] = 1.0
     memory[at.H_TRIAL] = h
     if code == DONE and tolerances[ESTIMATE] == 1.0:
-        error = max(error, SHARE_BESIDE * end_error(tolerances, options, h, state, new_state, trial))
+        error = max(error, END_ERROR_WEIGHT * end_error(tolerances, options, h, state, new_state, trial))
     return Attempt(code, max(error, off), 0.0)
 
 

@@ -17,7 +17,7 @@ from twoloop.kernels.data.counters import N_OUTER
 from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL
 from twoloop.kernels.evaluation.inner_loop import accelerations, evaluate_state, rounding_floor
 from twoloop.kernels.linalg.dense import copy
-from twoloop.kernels.steps.fixed_point_loops import iterate_accelerations
+from twoloop.kernels.paper.iterations import iterate_accelerations
 from twoloop.kernels.steps.stages import options_array as gauss_options
 
 MAX_ORDER = 5
@@ -50,13 +50,13 @@ SPANS, NEW_SPANS, ERROR_CONSTANTS, N_ROWS = range(4)
 
 
 def options_array(max_order: int, inner_tol: float, outer_tol: float, starter: Any) -> NDArray[np.float64]:
-    """The parameter block that the step reads; `starter`: the Gauss tableau of STARTER_STAGES stages."""
+    """Return the parameter block that the step reads; `starter`: the Gauss tableau of STARTER_STAGES stages."""
     gauss = gauss_options(starter.A, starter.b, starter.c, inner_tol, outer_tol, 0.0)
     return np.concatenate([[float(max_order), inner_tol, outer_tol], gauss])
 
 
 def memory_size(n_q: int) -> int:
-    """Length of `memory` for n_q coordinates."""
+    """Return the length of `memory` for n_q coordinates."""
     return N_MEMORY_SCALARS + N_ROWS * N_DIFFERENCES + (4 * N_DIFFERENCES + 4 + 3 * STARTER_STAGES) * n_q
 
 
@@ -68,7 +68,7 @@ def _coefficients(memory, row):
 
 @inlined
 def _blocks(memory, n):
-    """Differences and trial differences (N_DIFFERENCES, 2 n), prediction and its rate (2 n), scratch."""
+    """Return differences and trial differences (N_DIFFERENCES, 2 n), prediction and its rate (2 n), scratch."""
     o = N_MEMORY_SCALARS + N_ROWS * N_DIFFERENCES
     size = N_DIFFERENCES * 2 * n
     differences = memory[o : o + size].reshape((N_DIFFERENCES, 2 * n))
@@ -79,7 +79,7 @@ def _blocks(memory, n):
 
 @kernel(SETTLE)
 def settle_bdf(f, w, options, memory, tolerances, accepted):
-    """Make the trial differences the history, if the attempt was accepted."""
+    """Make the trial differences the history if the attempt was accepted."""
     differences, trial, _, _, _ = _blocks(memory, w.Q.size)
     left = memory[HAS_TRIAL]
     memory[HAS_TRIAL] = 0.0
@@ -139,7 +139,7 @@ def _predict(memory, differences, trial, h, prediction, rate):
 
 @merged
 def _spread(h, k):
-    """c = h / (1 + 1/2 + ... + 1/k)."""
+    """Return c = h / (1 + 1/2 + ... + 1/k)."""
     leading = 0.0
     for j in range(k):
         leading += 1.0 / (j + 1.0)
@@ -185,7 +185,7 @@ def _correct(f, w, options, t, c, prediction, rate, new_state, a_new):
 
 @compiled
 def _norm(tolerances, y, y1, d, sign, difference):
-    """Largest component of d + sign * difference over atol + rtol |y|."""
+    """Return the largest component of d + sign * difference over atol + rtol |y|."""
     n_q = d.size // 2
     largest = 0.0
     for m in range(d.size):
@@ -233,7 +233,7 @@ def _judge(options, memory, tolerances, trial, y, y1, d):
 
 @compiled
 def _extend(memory, trial, y1, d):
-    """Make the scaled differences those at the end of the step."""
+    """Update the scaled differences to those at the end of the step."""
     k = int(memory[ORDER])
     memory[NEXT_DEPTH] = k + 1
     if memory[DEPTH] > k and k < MAX_ORDER:
@@ -249,7 +249,7 @@ def _extend(memory, trial, y1, d):
 
 @compiled
 def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
-    """A step of the starter, of order 6."""
+    """Make a step of the starter, of order 6."""
     s, n = STARTER_STAGES, w.Q.size
     q1, v1 = new_state[:n], new_state[n : 2 * n]
     A_stage = scratch[: s * n].reshape((s, n))
@@ -280,7 +280,7 @@ def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
 
 @kernel(ATTEMPT)
 def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """One attempt: predict from the history, correct, and choose the order and the size of the next step.
+    """Attempt a step: predict from the history, correct, and choose the order and the size of the next step.
 
     Fixed steps are of the highest order; the history that it needs comes from as many Gauss steps.
     """

@@ -1,13 +1,12 @@
-"""What an error of the velocities makes of the positions, for estimates that pass over vibrations.
+"""Estimates of what an error of the velocities adds to the positions, for methods that pass over vibrations.
 
-It moves the positions for as long as it lasts: J J e, J being the Jacobian of (v, F), shows the square of the rate at
-which it turns back or decays. So what a force leaves that jumps within a step is found, and vibrations that do not
-matter are passed over.
+An error e of the velocities moves the positions until it turns back or decays. J J e, J being the Jacobian of (v, F),
+shows the square of the rate at which it does. So the error of a force that jumps within a step is found, and vibrations
+that do not matter are passed over.
 
-That is the rate of its fastest part. Where a stiff damper acts beside a contact, what the step leaves in the slow
-directions lasts much longer: it is what the system solved for some steps at once leaves of the error.
-
-J that was differenced before a contact began or ended says another rate, while Newton's method still contracts with it.
+- This is the rate of the fastest part of the error. If a stiff damper acts beside a contact, the part in slow
+  directions lasts much longer: it is what the filter for some steps at once leaves of the error.
+- If J was differenced before a contact began or ended, it has another rate, though Newton's method still contracts.
 """
 
 import numpy as np
@@ -19,21 +18,21 @@ from twoloop.kernels.evaluation.inner_loop import evaluate
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps import newton_memory as at
 from twoloop.kernels.steps.newton_memory import block, vector
-from twoloop.kernels.steps.newton_tangents import DIFFERENCE
+from twoloop.kernels.steps.newton_systems import DIFFERENCE
 from twoloop.kernels.steps.stages import INNER_TOL
 
-# An error that turns back as slowly as the motion itself does is none of a vibration, and those of the next steps go
-# the same way: it counts as if it lasted so many times as long
-TURNS = 10.0
-OF_RUN = 10.0  # times GAP: longer than that nothing is taken to last
-STEPS = 10.0  # after which nothing is left of an error that is fast beside the step
-FAST = 20.0  # steps: an error of the velocities that lasts shorter is fast
+# An error that turns back as slowly as the motion itself is not that of a vibration, and errors of the next steps go
+# the same way: its duration counts so many times
+SLOW_FACTOR = 10.0
+LONGEST_GAPS = 10.0  # times GAP: the longest duration of an error
+STEPS_TO_DECAY = 10.0  # steps, after which nothing is left of an error that is fast beside the step
+FAST = 20.0  # steps: an error of the velocities of a shorter duration is fast
 UNLIKE = 0.3  # relative difference of accelerations, from which derivatives are not those of a state
 
 
 @compiled
-def lasting_error(w, memory, tolerances, z, raw, once, twice, state, new_state, a_end):
-    """Largest component of the error that was filtered by (I - z J)^-1 `once` and `twice`, over the tolerances.
+def filtered_velocity_error(w, memory, tolerances, z, raw, once, twice, state, new_state, a_end):
+    """Return the largest component of an error, filtered by (I - z J)^-1 `once` and `twice`, over the tolerances.
 
     Over that of a position where it has turned back or decayed before it is off by more, else over that of a velocity.
     `a_end`: accelerations at the end, where a contact that begins in the step shows how fast the motion changes.
@@ -48,62 +47,62 @@ def lasting_error(w, memory, tolerances, z, raw, once, twice, state, new_state, 
         largest = max(largest, abs(twice[i]))
         turn = max(turn, abs(twice[i] - 2.0 * once[i] + raw[i]))  # (z J)^2 e
     if largest > 0.0:
-        memory[at.LASTING] = z * np.sqrt(largest / turn)
-    lasting = memory[at.LASTING]
-    if lasting * change * TURNS > fastest:
-        lasting *= min(TURNS, lasting * change * TURNS / fastest) if fastest > 0.0 else TURNS
-    return over_velocities(w, tolerances, twice, lasting, state, new_state)
+        memory[at.DURATION] = z * np.sqrt(largest / turn)
+    duration = memory[at.DURATION]
+    if duration * change * SLOW_FACTOR > fastest:
+        duration *= min(SLOW_FACTOR, duration * change * SLOW_FACTOR / fastest) if fastest > 0.0 else SLOW_FACTOR
+    return velocity_error(w, tolerances, twice, duration, state, new_state)
 
 
 @compiled
-def over_velocities(w, tolerances, e_v, lasting, state, new_state):
-    """Largest component of an error of the velocities that lasts so long, over the tolerances."""
+def velocity_error(w, tolerances, e_v, duration, state, new_state):
+    """Return the largest component of an error of the velocities of some duration, over the tolerances."""
     n = w.Q.size
     error = 0.0
     for i in range(w.independent.size):
         j = w.independent[i]
         scale_q = allowed(tolerances, j, state[j], new_state[j])
         scale_v = allowed(tolerances, j, state[n + j], new_state[n + j])
-        error = max(error, abs(e_v[i]) * min(lasting / scale_q, 1.0 / scale_v))
+        error = max(error, abs(e_v[i]) * min(duration / scale_q, 1.0 / scale_v))
     return error
 
 
 @compiled
-def own_time(w, tolerances, state, a):
-    """The time in which accelerations like these change the velocities of the motion, s."""
+def motion_time(w, tolerances, state, a):
+    """Return the time in which accelerations like these change the velocities of the motion, s."""
     n = w.Q.size
     fastest = change = 0.0
     for j in w.independent:
         fastest = max(fastest, abs(state[n + j]))
         change = max(change, abs(a[j]))
-    longest = OF_RUN * tolerances[GAP]
+    longest = LONGEST_GAPS * tolerances[GAP]
     return fastest / change if fastest < longest * change else longest
 
 
 @compiled
-def _may_mislead(w, memory, tolerances, z, raw, longest, state, new_state):
-    """Whether it matters if J is not that of the end of the step.
+def _derivatives_matter(w, memory, tolerances, z, raw, longest, state, new_state):
+    """Return whether it matters if J is not that of the end of the step.
 
     It does where an error of the velocities, `raw`, would count if it lasted longer than J says, and where J has
     directions that are fast beside the step while Newton's method, which it serves, contracts no better than if they
     were slow.
     """
-    lasting = memory[at.LASTING]
-    if lasting < min(longest, FAST * z) and memory[at.CONTRACTION] * lasting * lasting > UNLIKE * z * z:
+    duration = memory[at.DURATION]
+    if duration < min(longest, FAST * z) and memory[at.CONTRACTION] * duration * duration > UNLIKE * z * z:
         return True
-    return over_velocities(w, tolerances, raw, longest, state, new_state) > 1.0
+    return velocity_error(w, tolerances, raw, longest, state, new_state) > 1.0
 
 
 @compiled
-def derivatives_fit(f, w, options, memory, s, t, z, tolerances, raw, e_q, e_v, state, new_state, a_end):
-    """Whether J is that of the end of the step, at time t, as far as it matters.
+def derivatives_agree(f, w, options, memory, s, t, z, tolerances, raw, e_q, e_v, state, new_state, a_end):
+    """Return whether J is that of the end of the step, at time t, as far as it matters.
 
     (e_q, e_v) is (I - z J)^-1 of the error, and `raw` its velocities; J times it is compared with a difference of
     accelerations.
     """
     n = w.Q.size
-    longest = max(own_time(w, tolerances, state, state[2 * n :]), own_time(w, tolerances, state, a_end))
-    if not _may_mislead(w, memory, tolerances, z, raw, longest, state, new_state):
+    longest = max(motion_time(w, tolerances, state, state[2 * n :]), motion_time(w, tolerances, state, a_end))
+    if not _derivatives_matter(w, memory, tolerances, z, raw, longest, state, new_state):
         return True
     q1, v1 = new_state[:n], new_state[n : 2 * n]
     Q, V = vector(memory, s, n, at.Q_MOVED), vector(memory, s, n, at.V_MOVED)

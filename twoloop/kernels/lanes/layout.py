@@ -1,4 +1,7 @@
-"""What lanes have in memory, and what kernels call: functions made for a mechanism, and the step of a method."""
+"""Layout of the memory that runs in lanes work in, what kernels call, and how a run in a lane may end.
+
+What kernels call are functions made for a mechanism, and the step of a method.
+"""
 
 from typing import Any
 
@@ -10,9 +13,14 @@ from twoloop.kernels.compile.generated_functions import GeneratedFunctions, has_
 from twoloop.kernels.compile.reference import Reference
 from twoloop.kernels.data.common import INTEGERS, merged
 
+# how a run ends: it reaches the end of the span, or is left to a run of its own for one of these reasons
+UNDECIDED, ENDED = 0, 1
+NO_START, NO_STATE, NO_VALUES, OFTEN_REFUSED, MANY_STEPS, UNLIKE = range(-6, 0)
+
+
 LANES = 8 if has_wide_vectors() else 4  # runs side by side: of two vectors each number would take two registers
 
-# vectors in `room`, one number for each lane; behind them STATE, NEW, PREDICTED, ... as `places` has it
+# vectors in `work`, one number for each lane; behind them STATE, NEW, PREDICTED, ... as `places` has it
 (
     T,
     AHEAD,
@@ -24,11 +32,11 @@ LANES = 8 if has_wide_vectors() else 4  # runs side by side: of two vectors each
     OFF,
     LENGTH,
     LONGEST,  # that the step may be, s
-    ASKED,  # 1: the lanes that begin a run, or in which a state is wanted
+    REQUESTED,  # 1: the lanes that begin a run, or in which a state is wanted
     WORST,  # defect within the step
     REFUSED,  # steps, one after another
     RUNNING,
-    WHICH,  # run
+    RUN,  # run
     REACHED,  # of the times at which states are wanted
     LEFT_TO_MOVE,
     MOVED_BEFORE,
@@ -46,24 +54,24 @@ LANES = 8 if has_wide_vectors() else 4  # runs side by side: of two vectors each
     _MORE_PAST,
     N_FIELDS,
 ) = range(31)
-# functions made for a mechanism, (order, control, room), on what lies in `room`
+# functions made for a mechanism, (order, control, work), on what lies in `work`
 TASKS = (
-    "closer",  # positions of NEW, at AHEAD, moved towards the constraints, of the lanes that are FINE
-    "nearer",  # the same of those that are LEFT_TO_MOVE, and velocities, and A and LAM there; FINE: there by now
+    "approach",  # positions of NEW, at AHEAD, moved towards the constraints, of the lanes that are FINE
+    "refine",  # the same of those that are LEFT_TO_MOVE, and velocities, and A and LAM there; FINE: there by now
     "redundant",  # whether rows that do not count hold at NEW
     "departure",  # OFF: of a step H from STATE by PREDICTED to NEW
-    "take",  # NEW becomes STATE where ACCEPTED
+    "commit",  # NEW becomes STATE where ACCEPTED
 )
 TASKS_OF_STARTS = (
     "rows",
 )  # C, C_t, entries of C_q at NEW and AHEAD, in the memory of the method; FINE: where they have values
-TASKS_OF_STAGES = ("there",)  # A at NEW as it stands
+TASKS_OF_STAGES = ("accelerate",)  # A at NEW as it stands
 # NEW, X after the BEGIN of the step, and ERROR, if that is the whole step; FINE stays where it could be done
 TASKS_OF_EXPLICIT = ("stages",)
 TASKS_OF_SERIES = (
     "series",  # coefficients about STATE at T, in units of time UNIT
     "lengths",  # LENGTH in units, H and X of the steps of the lanes that can go on, which are FINE
-    "look",  # WORST: the largest defect within a step H; AHEAD: its end
+    "check_within",  # WORST: the largest defect within a step H; AHEAD: its end
     "evaluate",  # NEW, PREDICTED and FOUND: the state and its accelerations by the series, X units of time on
     "defect",  # DEFECT: of A at NEW, the end of a step H
     "judge",  # ACCEPTED: the steps that are, and how long the next one may be
@@ -71,7 +79,7 @@ TASKS_OF_SERIES = (
 CODE = Reference("LaneKit", {})
 ALL_TASKS = (*TASKS, *TASKS_OF_STARTS, *TASKS_OF_STAGES, *TASKS_OF_EXPLICIT, *TASKS_OF_SERIES)
 CODE.add_llvm_functions(dict.fromkeys(ALL_TASKS, types.none(types.int64, VECTOR, VECTOR)))
-# of a method, (code, settings, control, options, room, status, n_steps, within): a step H of each lane that runs, and
+# of a method, (code, settings, control, options, work, status, n_steps, within): a step H of each lane that runs, and
 # whether it is ACCEPTED, with its end in NEW, A and LAM; or, `within` the step that was just accepted, NEW, X seconds
 # after its beginning, of the lanes that FINE names, off the constraints as yet
 STEP = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[INTEGERS] * 2, types.boolean)
@@ -88,7 +96,7 @@ SHORTEST = 1e-13  # step, of the time
 
 
 class LaneKit:
-    """The functions made for a mechanism and the step of a method, as kernels get them."""
+    """Hold the functions made for a mechanism and the step of a method, as kernels get them."""
 
     def __init__(self, own: GeneratedFunctions, step: Any = None):
         self.__dict__.update(dict.fromkeys(ALL_TASKS, 0))
@@ -104,7 +112,7 @@ def _type_of_kit(value: Any, context: Any) -> Any:
 
 
 def places(n, n_rows, n_numbers):
-    """Where in `room` stand STATE, NEW, PREDICTED, FOUND, A, LAM, the numbers of the code, the memory of the method.
+    """Return where STATE, NEW, PREDICTED, FOUND, A, LAM, the numbers of the code and the memory of the method begin.
 
     Counted in vectors.
     """
@@ -122,14 +130,14 @@ places_of = merged(places)
 
 
 @merged
-def fill_field(room, field, value):
-    """The same number in all lanes."""
+def fill_field(work, field, value):
+    """Set a field to the same number in all lanes."""
     for k in range(LANES):
-        room[field * LANES + k] = value
+        work[field * LANES + k] = value
 
 
 @merged
-def leave(room, status, k, reason):
+def leave_run(work, status, k, reason):
     """Leave the run of a lane to a run of its own."""
-    room[RUNNING * LANES + k] = 0.0
-    status[int(room[WHICH * LANES + k])] = reason
+    work[RUNNING * LANES + k] = 0.0
+    status[int(work[RUN * LANES + k])] = reason

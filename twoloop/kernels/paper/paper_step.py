@@ -3,23 +3,21 @@
 import numpy as np
 
 from twoloop.kernels.control.controller import nothing_to_settle
-from twoloop.kernels.control.richardson import conclude
 from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, kernel
 from twoloop.kernels.data.tolerances import ESTIMATE
 from twoloop.kernels.evaluation.inner_loop import accelerations
 from twoloop.kernels.linalg.dense import copy
-from twoloop.kernels.steps import fixed_point_memory as at
-from twoloop.kernels.steps.fixed_point_loops import iterate_first_order
-from twoloop.kernels.steps.fixed_point_memory import block, vector
-from twoloop.kernels.steps.stages import EXTRAPOLATION, INNER_TOL, SHARE_BESIDE, end_error, tableau_of
+from twoloop.kernels.paper import iterations as at
+from twoloop.kernels.paper.iterations import block, conclude, iterate_first_order, vector
+from twoloop.kernels.steps.stages import END_ERROR_WEIGHT, EXTRAPOLATION, INNER_TOL, end_error, tableau_of
 
-SUDDEN = 10.0  # what `end_error` has to be before it counts: the procedure has no such estimate
+SUDDEN = 10.0  # value of `end_error` from which on it counts; the paper's procedure has no such estimate
 
 
 @kernel(ATTEMPT)
 def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """One attempt in the manner of the paper (Sects. 3.1-3.3): a step of h, two of h/2, their difference the error."""
+    """Attempt a step as in Sects. 3.1-3.3: a step of h, two of h/2, their difference is the error."""
     s, _, _, _, _, _ = tableau_of(options)
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
@@ -58,7 +56,7 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
             return Attempt(code, np.inf, 0.0)
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
     if code == DONE and tolerances[ESTIMATE] == 1.0:
-        beside = SHARE_BESIDE * end_error(tolerances, options, h, state, new_state, A_full)
+        beside = END_ERROR_WEIGHT * end_error(tolerances, options, h, state, new_state, A_full)
         if error <= 1.0 and beside > SUDDEN:
             error = beside
     return Attempt(code, error, 0.0)

@@ -1,19 +1,66 @@
-"""Two outer loops of implicit Runge-Kutta steps by fixed point, compiled in the steps that call them.
+"""Where the parts of the `memory` of fixed_point_step.py and paper_step.py are.
+
+Two outer loops of implicit Runge-Kutta steps by fixed point, compiled in the steps that call them.
 
 `iterate_accelerations` iterates on the stage accelerations alone (the tableau applied twice to q'' = a),
 `iterate_first_order` is the paper's loop on y_i = [v_i, q_i]. Equation numbers are the paper's.
+
+Richardson's estimate: the difference of one step and two half steps is the error, and may improve the result.
 """
 
 import numpy as np
 
 from twoloop.kernels.control.predictor import restore_predicted
 from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED
-from twoloop.kernels.data.common import compiled, exact, merged
+from twoloop.kernels.data.common import compiled, exact, inlined, merged
 from twoloop.kernels.data.counters import N_OUTER
+from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate, restore, rounding_floor
 from twoloop.kernels.linalg.dense import copy
-from twoloop.kernels.steps.fixed_point_memory import N_RESTS
 from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TEST, OUTER_TOL, tableau_of
+
+# rows of REST, for the compensated sums of fixed steps: what rounding took from q and from v, at the last accepted step
+# and in this attempt. Without them the energy of a symmetric method wanders with the number of steps
+N_RESTS = 4
+
+# scalars, then stage blocks (s, n_q) and vectors (n_q)
+HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(5)
+PREVIOUS, TRIAL, HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
+Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, REST, N_VECTORS = (*range(8), 7 + N_RESTS)
+
+
+def memory_size(s: int, n_q: int) -> int:
+    """Return the length of `memory` for s stages and n_q coordinates."""
+    return N_MEMORY_SCALARS + N_BLOCKS * s * n_q + N_VECTORS * n_q + s
+
+
+@inlined
+def block(memory, s, n, which):
+    """Return a view of a block of the stages, (s, n)."""
+    start = N_MEMORY_SCALARS + which * s * n
+    return memory[start : start + s * n].reshape((s, n))
+
+
+@inlined
+def vector(memory, s, n, which):
+    """Return a view of a vector of the coordinates, (n)."""
+    start = N_MEMORY_SCALARS + N_BLOCKS * s * n + which * n
+    return memory[start : start + n]
+
+
+@inlined
+def rests_of(memory, s, n, tolerances):
+    """Return the rows of REST; none with step-size control, whose errors exceed rounding."""
+    start, count = N_MEMORY_SCALARS + (N_BLOCKS * s + REST) * n, N_RESTS if tolerances[ESTIMATE] == 0.0 else 0
+    return memory[start : start + count * n].reshape((count, n))
+
+
+@merged
+def keep_rest(rest):
+    """Keep the rests of an accepted attempt for the next step."""
+    for i in range(rest.shape[0] // 2):
+        copy(rest[rest.shape[0] // 2 + i], rest[i])
+
 
 MAX_ITERATIONS = 60
 MAX_ITERATIONS_PAPER = 200  # the paper names no limit; (33) ends a divergent loop long before
@@ -24,7 +71,7 @@ UNDECIDED, CONVERGED, DIVERGED = range(3)
 
 @merged
 def _judge(change, before, first, iteration, tolerance, q):
-    """Judge an iteration by its largest change, those of the last and the first one, and the rounding of q."""
+    """Decide whether an iteration has converged, from its changes (last, before, first) and the rounding of q."""
     if change <= tolerance:
         return CONVERGED
     if not change <= GROWTH * first:
@@ -39,7 +86,7 @@ def _judge(change, before, first, iteration, tolerance, q):
 
 @exact
 def _compensated(x, rest, increment):
-    """The sum of the three, and what rounding takes from it (W. Kahan, Commun. ACM 8 (1965), 40)."""
+    """Return the sum of the three, and what rounding takes from it (W. Kahan, Commun. ACM 8 (1965), 40)."""
     increment += rest
     total = x + increment
     return total, increment - (total - x)
@@ -55,7 +102,7 @@ def _forget(coordinates, rest):
 
 @compiled
 def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1, rest):
-    """One step of size h from (q, v), a fixed-point iteration on the stage accelerations.
+    """Make a step of size h from (q, v) by a fixed-point iteration on the stage accelerations.
 
     A_stage holds their prediction on entry.
     Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k have the same solution as (17); for
@@ -132,7 +179,7 @@ def _largest_change(coordinates, q, v, q_old, v_old):
 
 @compiled
 def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1):
-    """One step of size h by the paper's outer loop on y_i = [v_i, q_i]: explicit Euler start, tests (32) and (33).
+    """Make a step of size h by the paper's outer loop on y_i = [v_i, q_i]: Euler start, tests (32) and (33).
 
     `a` is the acceleration at (t, q, v); K_j = [a_j; v_j] are the rows of A_stage and V_stage. An iteration goes from
     stage to stage with the latest K, in the manner of Gauss and Seidel. On return (q1, v1) is the end of the step, on
@@ -192,3 +239,33 @@ def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage,
             return OUTER_DIVERGED
         norm_before = norm
     return OUTER_DIVERGED
+
+
+@compiled
+def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
+    """Return the difference of one step and two half steps over (26), for all positions and velocities.
+
+    Its largest component, or the root mean square (27).
+    """
+    rtol = tolerances[RTOL]
+    total = 0.0
+    top = 0.0
+    for m in range(q.size):
+        atol = tolerances[ATOL + m]
+        in_q = (q_full[m] - q1[m]) / (atol + rtol * max(abs(q[m]), abs(q_full[m])))
+        in_v = (v_full[m] - v1[m]) / (atol + rtol * max(abs(v[m]), abs(v_full[m])))
+        total += in_q * in_q + in_v * in_v
+        top = max(top, abs(in_q), abs(in_v))
+    return top if largest else np.sqrt(total / (2 * q.size))
+
+
+@compiled
+def conclude(f, w, share, inner_tol, t, tolerances, q, v, q_full, v_full, q1, v1):
+    """Return the error of two half steps and, if a share is given, extrapolate them with the whole step."""
+    error = _richardson_error(tolerances, share > 0.0, q, v, q_full, v_full, q1, v1)
+    if not (share > 0.0 and error <= 1.0):
+        return DONE, error
+    for m in range(q.size):
+        q1[m] += share * (q1[m] - q_full[m])
+        v1[m] += share * (v1[m] - v_full[m])
+    return restore(f, w, t, q1, v1, inner_tol), error

@@ -31,7 +31,7 @@ def _largest(x, least):
 
 @compiled
 def _rate(memory, gap, q, v, a, q1, v1, a1):
-    """Reciprocal of the time in which velocities and accelerations change the coordinates as a whole.
+    """Return 1 / the time in which velocities and accelerations change the coordinates as a whole.
 
     Of the largest of each so far: at one time alone, coordinates are near zero wherever the origin is. Where most of
     their size comes of this step, as from rest at the origin, it says nothing of that time, which is `gap` then.
@@ -48,7 +48,7 @@ def _rate(memory, gap, q, v, a, q1, v1, a1):
 
 @compiled
 def _error(options, tolerances, rate, h, q, v, a, a1):
-    """Of e = |beta - 1/6| h^2 |a1 - a|, the leading local error of q for any beta and gamma = 1/2.
+    """Return e = |beta - 1/6| h^2 |a1 - a|, the leading local error of q for gamma = 1/2, over the tolerances.
 
     The largest component of e / h over rate * atol + rtol |v|: the error per unit step, of order h^2 like the error of
     the run. With ERROR_TOL > 0 the 2-norm of e over ERROR_TOL (the paper's err_out).
@@ -65,7 +65,7 @@ def _error(options, tolerances, rate, h, q, v, a, a1):
 
 @kernel(ATTEMPT)
 def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """One attempt: (12) for the independent coordinates, inner loop, accelerations, until these stop changing."""
+    """Attempt a step: (12) for the independents, inner loop, accelerations, until these stop changing."""
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]

@@ -1,0 +1,187 @@
+"""The course of runs in lanes: each lane has steps of its own, and takes the next run when its own has ended.
+
+What lanes cannot do is left to a run of its own: a condition of the code that does not hold, a step that is refused
+again and again. How a step is made is the kit's.
+"""
+
+import numpy as np
+from numba import types
+
+from twoloop.kernels.compile.callbacks import VECTOR
+from twoloop.kernels.data.common import INTEGERS, compiled, kernel
+from twoloop.kernels.lanes.layout import (
+    ACCEPTED,
+    AHEAD,
+    CODE,
+    ENDED,
+    EVALUATED,
+    FINE,
+    FRESH,
+    LANES,
+    N_EVALUATIONS,
+    N_ROWS,
+    NO_START,
+    NO_VALUES,
+    OFTEN_REFUSED,
+    ORDER,
+    REACHED,
+    REFUSED,
+    REQUESTED,
+    RUN,
+    RUNNING,
+    T0,
+    T1,
+    UNDECIDED,
+    UNIT,
+    H,
+    N,
+    T,
+    X,
+    fill_field,
+    leave_run,
+    places_of,
+)
+from twoloop.kernels.lanes.operations import project_lanes
+
+TABLE, STATES = types.float64[:, ::1], types.float64[:, :, ::1]
+
+
+@compiled
+def _refill(code, order, control, work, n, n_rows, numbers, q0, v0, next_run, status):
+    """Give new runs to lanes that have none; return the number of the next run, and how many run."""
+    state, new, _, _, _, _, own, _ = places_of(n, n_rows, numbers.shape[1])
+    n_fresh, n_running = 0, 0
+    for k in range(LANES):
+        last = int(work[RUN * LANES + k])
+        if work[RUNNING * LANES + k] == 0.0 and last >= 0 and status[last] == UNDECIDED:  # as a series leaves it
+            status[last] = OFTEN_REFUSED if work[REFUSED * LANES + k] < np.inf else NO_VALUES
+        work[FINE * LANES + k] = work[FRESH * LANES + k] = 0.0
+        if work[RUNNING * LANES + k] == 0.0 and next_run < numbers.shape[0]:
+            work[FINE * LANES + k] = work[FRESH * LANES + k] = work[RUNNING * LANES + k] = 1.0
+            work[T * LANES + k] = work[AHEAD * LANES + k] = control[T0]
+            work[REFUSED * LANES + k] = work[REACHED * LANES + k] = 0.0
+            work[RUN * LANES + k] = next_run
+            for j in range(n):
+                work[(new + j) * LANES + k], work[(new + n + j) * LANES + k] = q0[next_run, j], v0[next_run, j]
+            for i in range(numbers.shape[1]):
+                work[(own + i) * LANES + k] = numbers[next_run, i]
+            next_run += 1
+            n_fresh += 1
+        n_running += int(work[RUNNING * LANES + k])
+    if n_fresh > 0:
+        for k in range(LANES):
+            work[REQUESTED * LANES + k] = work[FINE * LANES + k]
+        project_lanes(code, order, control, work)
+        for k in range(LANES):
+            if work[REQUESTED * LANES + k] == 1.0:
+                for j in range(2 * n):
+                    work[(state + j) * LANES + k] = work[(new + j) * LANES + k]
+                if work[FINE * LANES + k] == 0.0:
+                    leave_run(work, status, k, NO_START)
+                    n_running -= 1
+    return next_run, n_running
+
+
+@compiled
+def _write_within_steps(code, settings, control, options, work, n, new, times, out_q, out_v, status, n_steps):
+    """Write the states that are requested within the accepted steps."""
+    while True:
+        n_wanted = 0
+        for k in range(LANES):
+            wanted = int(work[REACHED * LANES + k])
+            work[FINE * LANES + k] = work[X * LANES + k] = 0.0
+            if work[ACCEPTED * LANES + k] == 1.0 and wanted < times.size:
+                end = work[T * LANES + k] + work[H * LANES + k]
+                if times[wanted] < end and times[wanted] < control[T1]:
+                    work[FINE * LANES + k], n_wanted = 1.0, n_wanted + 1
+                    work[X * LANES + k] = times[wanted] - work[T * LANES + k]
+                    work[AHEAD * LANES + k] = times[wanted]
+            work[REQUESTED * LANES + k] = work[FINE * LANES + k]
+        if n_wanted == 0:
+            return
+        code.step(code, settings, control, options, work, status, n_steps, True)
+        project_lanes(code, settings[ORDER], control, work)
+        for k in range(LANES):
+            if work[REQUESTED * LANES + k] == 1.0:
+                run, wanted = int(work[RUN * LANES + k]), int(work[REACHED * LANES + k])
+                work[REACHED * LANES + k] += 1.0
+                for j in range(n):
+                    fine = work[FINE * LANES + k] == 1.0
+                    out_q[run, j, wanted] = work[(new + j) * LANES + k] if fine else np.nan
+                    out_v[run, j, wanted] = work[(new + n + j) * LANES + k] if fine else np.nan
+
+
+@compiled
+def _write_ends(work, control, n, n_rows, new, a, last, out_q, out_v, out_a, status):
+    """Write the ends of runs whose last steps were accepted."""
+    for k in range(LANES):
+        if work[ACCEPTED * LANES + k] == 0.0 or work[H * LANES + k] != control[T1] - work[T * LANES + k]:
+            continue
+        run = int(work[RUN * LANES + k])
+        work[RUNNING * LANES + k], status[run] = 0.0, ENDED
+        for j in range(n):
+            out_q[run, j, last], out_v[run, j, last] = work[(new + j) * LANES + k], work[(new + n + j) * LANES + k]
+        for j in range(n + n_rows):  # LAM is behind A
+            out_a[run, j] = work[(a + j) * LANES + k]
+
+
+@compiled
+def _count(settings, work, n_evaluations):
+    """Count evaluations of steps, accepted or not, and one at their ends; runs that are left out do not count."""
+    for k in range(LANES):
+        if work[RUNNING * LANES + k] == 1.0:
+            made = settings[N_EVALUATIONS] + int(work[EVALUATED * LANES + k])
+            n_evaluations[int(work[RUN * LANES + k])] += made + 1
+
+
+@compiled
+def _advance_time(work, control, n_steps):
+    """Advance time in the lanes whose steps were accepted."""
+    for k in range(LANES):
+        if work[ACCEPTED * LANES + k] == 1.0:
+            h, t = work[H * LANES + k], work[T * LANES + k]
+            n_steps[int(work[RUN * LANES + k])] += 1
+            work[T * LANES + k] = control[T1] if h == control[T1] - t else t + h
+            work[REFUSED * LANES + k] = 0.0
+
+
+_ADVANCE = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[TABLE] * 3, *[STATES] * 2, TABLE, *[INTEGERS] * 3, VECTOR)
+
+
+@kernel(_ADVANCE)
+def advance_lanes(
+    code, settings, control, options, times, numbers, q0, v0, out_q, out_v, out_a, status, n_steps, n_evaluations, work
+):
+    """Integrate runs, one for each row of `numbers`, from t0 to t1.
+
+    times : (n_t,) at which states are wanted, the last of them t1; out_q, out_v : (n_runs, n, n_t); out_a : (n_runs,
+    n + n_rows), accelerations and multipliers at t1. n_evaluations : counts go on from what is there. options : of the
+    method.
+    """
+    n, n_rows, order = settings[N], settings[N_ROWS], settings[ORDER]
+    _, new, _, _, a, _, _, _ = places_of(n, n_rows, numbers.shape[1])
+    next_run, are_fresh = 0, False
+    for field in (T, AHEAD, H, X, RUNNING, ACCEPTED):
+        fill_field(work, field, 0.0)
+    fill_field(work, UNIT, 1.0)
+    fill_field(work, RUN, -1.0)
+    while True:
+        n_running = 0.0
+        for k in range(LANES):
+            n_running += work[RUNNING * LANES + k]
+        if n_running < LANES or are_fresh:
+            before = next_run
+            next_run, left = _refill(code, order, control, work, n, n_rows, numbers, q0, v0, next_run, status)
+            are_fresh = next_run > before
+            if left == 0:
+                if next_run == numbers.shape[0]:
+                    return
+                continue
+        fill_field(work, EVALUATED, 0.0)
+        code.step(code, settings, control, options, work, status, n_steps, False)
+        _count(settings, work, n_evaluations)
+        code.commit(order, control, work)
+        _write_ends(work, control, n, n_rows, new, a, times.size - 1, out_q, out_v, out_a, status)
+        if times.size > 1:
+            _write_within_steps(code, settings, control, options, work, n, new, times, out_q, out_v, status, n_steps)
+        _advance_time(work, control, n_steps)

@@ -1,0 +1,589 @@
+"""Steps of implicit Runge-Kutta methods in lanes by Newton's method, as `newton_step` has them, for stiff motion.
+
+The unknowns are the accelerations a_j of all coordinates at the stages,
+
+    F(t_j, Q_j, V_j) - a_j = 0,  Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k,  V_j = v + h sum_k A_jk a_k,
+
+F being the accelerations at a state as it stands: stages are off the constraints by the error of the formula, and the
+end of the step alone is put on them. Derivatives are differences, made for all lanes at once and anew for each step.
+"""
+
+import numpy as np
+
+from twoloop.kernels.data.common import compiled, kernel, merged
+from twoloop.kernels.lanes.explicit import LEAST, N_HEAD, begin_control, choose_steps, end_steps, judge_steps, set_end
+from twoloop.kernels.lanes.layout import (
+    ACCEPTED,
+    AHEAD,
+    ATOL,
+    ERROR,
+    EVALUATED,
+    FINE,
+    FRESH,
+    GAP,
+    LANES,
+    N_NUMBERS,
+    N_ROWS,
+    ORDER,
+    RTOL,
+    RUNNING,
+    STEP,
+    H,
+    N,
+    T,
+    X,
+    fill_field,
+    places_of,
+)
+from twoloop.kernels.lanes.operations import (
+    add_product,
+    copy_vectors,
+    enlarge,
+    factor_lanes,
+    solve_lanes,
+    sum_rows,
+    table,
+    vectors,
+)
+from twoloop.kernels.steps.newton_memory import (
+    GAMMA0,
+    N_EIGEN_SCALARS,
+    N_REAL,
+    VELOCITIES,
+    count_eigenvalues,
+    eigen_place,
+)
+from twoloop.kernels.steps.newton_systems import DIFFERENCE, MAX_ITERATIONS, STAGNATION
+from twoloop.kernels.steps.stages import FARTHEST, OUTER_TOL, middle_node, tableau_of
+from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STEPS_TO_DECAY
+
+# of the method's memory, in vectors: one number for each lane, ...
+(
+    TO_GO,  # 1: lanes in which the iteration has not ended
+    DONE,  # 1: it has converged
+    BEFORE,  # the correction before
+    SCALE_Q,
+    SCALE_V,
+    LARGEST_Q,  # of the corrections
+    LARGEST_V,
+    H_PREVIOUS,  # step that PREVIOUS belongs to; 0: none
+    CONSTANT,  # 1: the stages are predicted as the accelerations at the beginning
+    DURATION,  # s: how long an error of velocity lasts; 0: not known
+    N_OF_LANES,
+) = range(11)
+# ... then n for each of these: accelerations at STATE; q, v and a at the beginning of the step; sums; a state in the
+# middle of the step, and its accelerations; the estimate of the error, and that of velocities as it was and filtered
+# once; and a vector whose imaginary part follows
+(
+    START,
+    BEGIN_Q,
+    BEGIN_V,
+    BEGIN_A,
+    SUMS,
+    MIDDLE_Q,
+    MIDDLE_V,
+    MIDDLE_A,
+    E_Q,
+    E_V,
+    RAW,
+    ONCE,
+    ONE,
+    _IMAGINARY,
+    N_VECTORS,
+) = range(15)
+STAGES, PREVIOUS, RESIDUAL, CHANGES, N_BLOCKS = range(5)  # (s, n) each; then weights (s, s)
+BY_Q, BY_V, SYSTEMS = range(3)  # (n, n) each; of a system the real and the imaginary parts, then all pivots
+
+
+def memory_size(s: int, n: int) -> int:
+    """Return the length of the method's memory, in vectors, for s stages; a system for each eigenvalue or pair."""
+    n_systems = (s + 1) // 2
+    return N_OF_LANES + (N_VECTORS + N_BLOCKS * s + n_systems) * n + s * s + (SYSTEMS + 2 * n_systems) * n * n
+
+
+@merged
+def vector_at(memory, n, which):
+    """Return the place of a vector (n)."""
+    return memory + N_OF_LANES + which * n
+
+
+@merged
+def block_at(memory, n, s, which):
+    """Return the place of a block (s, n)."""
+    return memory + N_OF_LANES + (N_VECTORS + which * s) * n
+
+
+@merged
+def _weights_at(memory, n, s):
+    return memory + N_OF_LANES + (N_VECTORS + N_BLOCKS * s) * n
+
+
+@merged
+def matrix_at(memory, n, s, which):
+    """Return the place of a matrix (n, n); that of system k is SYSTEMS + 2 k."""
+    return _weights_at(memory, n, s) + s * s + which * n * n
+
+
+@merged
+def pivots_at(memory, n, s, n_systems, k):
+    """Return the place of the pivots of system k."""
+    return matrix_at(memory, n, s, SYSTEMS + 2 * n_systems) + k * n
+
+
+@compiled
+def _middle(code, settings, control, c, work, new, a, memory):
+    """Compute the state in the middle of the step, near the constraints, and its accelerations."""
+    n, order = settings[N], settings[ORDER]
+    share, begin = middle_node(c), vector_at(memory, n, BEGIN_Q)
+    for k in range(LANES):
+        x = share * work[X * LANES + k]
+        work[AHEAD * LANES + k] = work[T * LANES + k] + x
+        for j in range(n):
+            at = (begin + j) * LANES + k
+            q, v, a0 = work[at], work[at + n * LANES], work[at + 2 * n * LANES]
+            work[(new + j) * LANES + k] = q + x * (v + 0.5 * x * a0)
+            work[(new + n + j) * LANES + k] = v + x * a0
+    code.approach(order, control, work)
+    code.accelerate(order, control, work)
+    copy_vectors(work, new, vector_at(memory, n, MIDDLE_Q), 2 * n)
+    copy_vectors(work, a, vector_at(memory, n, MIDDLE_A), n)
+
+
+@compiled
+def find_derivatives(code, settings, control, c, work):
+    """Difference the accelerations by positions and velocities, in the middle of the step, of lanes that are FINE.
+
+    At the time of a stage, so that they see nothing of a force that the stages do not see.
+    """
+    n, order = settings[N], settings[ORDER]
+    _, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
+    s = c.size
+    _middle(code, settings, control, c, work, new, a, memory)
+    middle, middle_a = vector_at(memory, n, MIDDLE_Q), vector_at(memory, n, MIDDLE_A)
+    for column in range(2 * n):
+        copy_vectors(work, middle, new, 2 * n)
+        for k in range(LANES):
+            at = (new + column) * LANES + k
+            work[at] += DIFFERENCE * max(1.0, abs(work[at]))
+        code.accelerate(order, control, work)
+        matrix = matrix_at(memory, n, s, BY_Q if column < n else BY_V) + column % n
+        for k in range(LANES):
+            inverse = 1.0 / (work[(new + column) * LANES + k] - work[(middle + column) * LANES + k])
+            for i in range(n):
+                change = work[(a + i) * LANES + k] - work[(middle_a + i) * LANES + k]
+                work[(matrix + i * n) * LANES + k] = change * inverse
+
+
+@compiled
+def factor_systems_of_lanes(settings, own, s, work):
+    """Factor I - (X l)^2 J_q - X l J_v for each eigenvalue l."""
+    n = settings[N]
+    memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
+    n_systems, place = count_eigenvalues(own, s), eigen_place(s)
+    n_real = int(own[place + N_REAL])
+    place += N_EIGEN_SCALARS + s
+    by_q, by_v = matrix_at(memory, n, s, BY_Q), matrix_at(memory, n, s, BY_V)
+    for system in range(n_systems):
+        re, im = own[place], own[place + 1]
+        place += 2 + 4 * s
+        matrix, apart = matrix_at(memory, n, s, SYSTEMS + 2 * system), n * n * LANES
+        for i in range(n * n):
+            diagonal = 1.0 if i % (n + 1) == 0 else 0.0
+            for k in range(LANES):
+                x = work[X * LANES + k]
+                q, v = x * x * work[(by_q + i) * LANES + k], x * work[(by_v + i) * LANES + k]
+                work[(matrix + i) * LANES + k] = diagonal - (re * re - im * im) * q - re * v
+                work[(matrix + i) * LANES + k + apart] = -2.0 * re * im * q - im * v
+        pivots = pivots_at(memory, n, s, n_systems, system)
+        factor_lanes(work, matrix, pivots, n, 0 if system < n_real else n * n)
+
+
+@compiled
+def predict_stages(settings, c, work, begins):
+    """Predict stages by the polynomial of the step before, or constant; `begins` 0: by that of the step itself."""
+    n = settings[N]
+    memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
+    s = c.size
+    weights, stages = _weights_at(memory, n, s), block_at(memory, n, s, STAGES)
+    previous, a = block_at(memory, n, s, PREVIOUS), vector_at(memory, n, BEGIN_A)
+    for k in range(LANES):
+        before = work[(memory + H_PREVIOUS) * LANES + k]
+        ratio = work[X * LANES + k] / before if before > 0.0 else np.inf
+        known = 1.0 if ratio <= FARTHEST else 0.0
+        work[(memory + CONSTANT) * LANES + k] = 1.0 - known
+        for j in range(s):
+            theta = begins + ratio * c[j] if known == 1.0 else 0.0
+            for i in range(s):
+                product = known
+                for l in range(s):
+                    if l != i:
+                        product *= (theta - c[l]) / (c[i] - c[l])
+                work[(weights + j * s + i) * LANES + k] = product
+    for j in range(s):
+        for m in range(n):
+            place = stages + j * n + m
+            for k in range(LANES):
+                work[place * LANES + k] = 0.0
+            add_product(work, place, memory + CONSTANT, a + m, 1.0)
+            for i in range(s):
+                add_product(work, place, weights + j * s + i, previous + i * n + m, 1.0)
+
+
+@compiled
+def _residuals(code, settings, control, A, A2, c, work):
+    """Compute the residuals of the stages; FINE where they have values, and the largest entries."""
+    n, order = settings[N], settings[ORDER]
+    _, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
+    s = c.size
+    stages, sums = block_at(memory, n, s, STAGES), vector_at(memory, n, SUMS)
+    begin, residual = vector_at(memory, n, BEGIN_Q), block_at(memory, n, s, RESIDUAL)
+    known, total = table(work, stages, s, n), vectors(work, sums, n)
+    fill_field(work, memory + SCALE_Q, 1.0)
+    fill_field(work, memory + SCALE_V, 1.0)
+    for j in range(s):
+        sum_rows(A2[j], known, total)
+        for m in range(n):
+            for k in range(LANES):
+                x, at = work[X * LANES + k], (begin + m) * LANES + k
+                way = x * c[j] * work[at + n * LANES] + x * x * work[(sums + m) * LANES + k]
+                work[(new + m) * LANES + k] = work[at] + way
+        sum_rows(A[j], known, total)
+        for m in range(n):
+            for k in range(LANES):
+                v = work[(begin + n + m) * LANES + k] + work[X * LANES + k] * work[(sums + m) * LANES + k]
+                work[(new + n + m) * LANES + k] = v
+                q_most, v_most = (memory + SCALE_Q) * LANES + k, (memory + SCALE_V) * LANES + k
+                work[q_most] = max(work[q_most], abs(work[(new + m) * LANES + k]))
+                work[v_most] = max(work[v_most], abs(v))
+        for k in range(LANES):
+            work[AHEAD * LANES + k] = work[T * LANES + k] + c[j] * work[X * LANES + k]
+        code.accelerate(order, control, work)
+        for i in range(n * LANES):
+            work[(residual + j * n) * LANES + i] = work[a * LANES + i] - work[(stages + j * n) * LANES + i]
+
+
+@compiled
+def _correct(settings, own, s, work):
+    """Compute corrections of the stages into CHANGES; add them in lanes in which the iteration goes on."""
+    n = settings[N]
+    memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
+    n_systems, place = count_eigenvalues(own, s), eigen_place(s)
+    n_real = int(own[place + N_REAL])
+    place += N_EIGEN_SCALARS + s
+    one, changes = vector_at(memory, n, ONE), block_at(memory, n, s, CHANGES)
+    residual, stages = block_at(memory, n, s, RESIDUAL), block_at(memory, n, s, STAGES)
+    left, width = table(work, residual, s, n), n * LANES
+    for i in range(s * width):
+        work[changes * LANES + i] = 0.0
+    for system in range(n_systems):
+        row, column = place + 2, place + 2 + 2 * s
+        place += 2 + 4 * s
+        sum_rows(own[row : row + s], left, vectors(work, one, n))
+        sum_rows(own[row + s : row + 2 * s], left, vectors(work, one + n, n))
+        matrix, pivots = matrix_at(memory, n, s, SYSTEMS + 2 * system), pivots_at(memory, n, s, n_systems, system)
+        imaginary = 0 if system < n_real else n * n
+        solve_lanes(work, matrix, pivots, n, imaginary, one)
+        twice = 1.0 if system < n_real else 2.0
+        for j in range(s):
+            re, im = twice * own[column + j], twice * own[column + s + j]
+            for i in range(width):
+                change = re * work[one * LANES + i] - im * work[one * LANES + width + i]
+                work[(changes + j * n) * LANES + i] += change
+    for i in range(s * width):
+        if work[(memory + TO_GO) * LANES + i % LANES] == 1.0:
+            work[stages * LANES + i] += work[changes * LANES + i]
+
+
+@merged
+def _enlarge(work, most, sums, n):
+    """Raise `most` to the largest entries of n vectors; NaN counts as largest."""
+    for i in range(n * LANES):
+        size, at = abs(work[sums * LANES + i]), most * LANES + i % LANES
+        if size > work[at] or size != size:
+            work[at] = size
+
+
+@compiled
+def _largest_corrections(settings, A, A2, work):
+    """Compute the largest corrections of positions and velocities of the stages, for a step of 1."""
+    n = settings[N]
+    memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
+    s = A.shape[0]
+    sums, known = vector_at(memory, n, SUMS), table(work, block_at(memory, n, s, CHANGES), s, n)
+    fill_field(work, memory + LARGEST_Q, 0.0)
+    fill_field(work, memory + LARGEST_V, 0.0)
+    for j in range(s):
+        sum_rows(A2[j], known, vectors(work, sums, n))
+        _enlarge(work, memory + LARGEST_Q, sums, n)
+        sum_rows(A[j], known, vectors(work, sums, n))
+        _enlarge(work, memory + LARGEST_V, sums, n)
+
+
+@merged
+def _end_iteration(options, work, memory, iteration, k):
+    """Return whether the iteration of a lane ends; DONE: whether it has converged."""
+    x, tolerance = work[X * LANES + k], options[N_HEAD + OUTER_TOL]
+    floor = STAGNATION * options[LEAST]
+    fast = x * work[(memory + LARGEST_V) * LANES + k] / work[(memory + SCALE_V) * LANES + k]
+    far = x * x * work[(memory + LARGEST_Q) * LANES + k] / work[(memory + SCALE_Q) * LANES + k]
+    change, before = max(fast, far), work[(memory + BEFORE) * LANES + k]
+    work[(memory + BEFORE) * LANES + k] = change
+    if not np.isfinite(fast + far) or work[FINE * LANES + k] == 0.0:
+        return True
+    left = MAX_ITERATIONS - 1 - iteration
+    contraction = change / before if iteration > 0 and before > 0.0 else 0.0
+    if iteration == 0:
+        converged = change <= 1e-3 * tolerance
+        ended = converged
+    elif contraction >= 0.9:
+        converged, ended = change <= floor, True
+    elif contraction / (1.0 - contraction) * change <= tolerance:
+        converged, ended = True, True
+    else:
+        late = change * contraction**left / (1.0 - contraction) > max(tolerance, floor)
+        converged, ended = left == 0 and not late and change <= floor, late or left == 0
+    work[(memory + DONE) * LANES + k] = 1.0 if converged else 0.0
+    return ended
+
+
+@compiled
+def solve_stages(code, settings, control, options, own, A, A2, c, work):
+    """Solve the stages of a step X, predicted, in lanes that are FINE; FINE where they converged."""
+    n = settings[N]
+    memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
+    to_go, done = memory + TO_GO, memory + DONE
+    for k in range(LANES):
+        work[to_go * LANES + k] = work[FINE * LANES + k]
+        work[done * LANES + k] = 0.0
+    for iteration in range(MAX_ITERATIONS):
+        left = 0.0
+        for k in range(LANES):
+            work[FINE * LANES + k] = work[to_go * LANES + k]
+            left += work[to_go * LANES + k]
+            work[EVALUATED * LANES + k] += c.size * work[to_go * LANES + k]
+        if left == 0.0:
+            break
+        _residuals(code, settings, control, A, A2, c, work)
+        _correct(settings, own, c.size, work)
+        _largest_corrections(settings, A, A2, work)
+        for k in range(LANES):
+            if work[to_go * LANES + k] == 1.0 and _end_iteration(options, work, memory, iteration, k):
+                work[to_go * LANES + k] = 0.0
+    for k in range(LANES):
+        work[FINE * LANES + k] = work[done * LANES + k]
+
+
+@compiled
+def end_of_stages(settings, b, bA, work):
+    """Compute NEW, X after the beginning of the step, from its stages."""
+    n = settings[N]
+    _, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
+    s = b.size
+    begin, sums = vector_at(memory, n, BEGIN_Q), vector_at(memory, n, SUMS)
+    known, total = table(work, block_at(memory, n, s, STAGES), s, n), vectors(work, sums, n)
+    sum_rows(bA, known, total)
+    for i in range(n * LANES):
+        x, at = work[X * LANES + i % LANES], begin * LANES + i
+        work[new * LANES + i] = work[at] + (x * work[at + n * LANES] + x * x * work[sums * LANES + i])
+    sum_rows(b, known, total)
+    for i in range(n * LANES):
+        x, at = work[X * LANES + i % LANES], (begin + n) * LANES + i
+        work[(new + n) * LANES + i] = work[at] + x * work[sums * LANES + i]
+
+
+@merged
+def _allowed(control, work, state, new, j, place, k):
+    """Return the allowed error of entry `place` of a state, of coordinate j."""
+    size = max(abs(work[(state + place) * LANES + k]), abs(work[(new + place) * LANES + k]))
+    return control[ATOL + j] + control[RTOL] * size
+
+
+@compiled
+def _embedded(settings, own, A, work, memory):
+    """Compute the embedded estimate of the error, not filtered, into E_Q and E_V."""
+    n, s = settings[N], A.shape[0]
+    place = eigen_place(s)
+    gamma0, e = own[place + GAMMA0], own[place + N_EIGEN_SCALARS : place + N_EIGEN_SCALARS + s]
+    known, begin = table(work, block_at(memory, n, s, STAGES), s, n), vector_at(memory, n, BEGIN_V)
+    e_q, e_v, sums = vector_at(memory, n, E_Q), vector_at(memory, n, E_V), vector_at(memory, n, SUMS)
+    total = 0.0
+    for i in range(s):
+        total += e[i]
+    for i in range(n * LANES):
+        work[e_q * LANES + i] = (gamma0 + total) * work[begin * LANES + i]
+    for j in range(s):  # velocities of the stages
+        sum_rows(A[j], known, vectors(work, sums, n))
+        for i in range(n * LANES):
+            work[e_q * LANES + i] += e[j] * work[H * LANES + i % LANES] * work[sums * LANES + i]
+    sum_rows(e, known, vectors(work, sums, n))
+    for i in range(n * LANES):
+        h = work[H * LANES + i % LANES]
+        work[e_q * LANES + i] *= h
+        work[e_v * LANES + i] = h * (gamma0 * work[(begin + n) * LANES + i] + work[sums * LANES + i])
+
+
+@compiled
+def _filter(settings, own, s, work, memory):
+    """Apply (I - z J)^-1 to (E_Q, E_V), z = gamma0 H, J being the Jacobian of (v, F)."""
+    n = settings[N]
+    gamma0 = own[eigen_place(s) + GAMMA0]
+    e_q, e_v, one = vector_at(memory, n, E_Q), vector_at(memory, n, E_V), vector_at(memory, n, ONE)
+    by_q = matrix_at(memory, n, s, BY_Q)
+    for i in range(n):
+        for k in range(LANES):
+            total = 0.0
+            for j in range(n):
+                total += work[(by_q + i * n + j) * LANES + k] * work[(e_q + j) * LANES + k]
+            work[(one + i) * LANES + k] = work[(e_v + i) * LANES + k] + gamma0 * work[H * LANES + k] * total
+    pivots = pivots_at(memory, n, s, count_eigenvalues(own, s), 0)
+    solve_lanes(work, matrix_at(memory, n, s, SYSTEMS), pivots, n, 0, one)
+    copy_vectors(work, one, e_v, n)
+    for i in range(n * LANES):
+        work[e_q * LANES + i] += gamma0 * work[H * LANES + i % LANES] * work[e_v * LANES + i]
+
+
+@compiled
+def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
+    """Return what an error of the velocities adds to the positions, see velocity_errors.py."""
+    raw, once, twice = vector_at(memory, n, RAW), vector_at(memory, n, ONCE), vector_at(memory, n, E_V)
+    begin = vector_at(memory, n, BEGIN_V)
+    largest = turn = fastest = change = 0.0
+    for j in range(n):
+        fastest = max(fastest, abs(work[(begin + j) * LANES + k]))
+        change = max(change, abs(work[(begin + n + j) * LANES + k]))
+        largest = max(largest, abs(work[(twice + j) * LANES + k]))
+        bend = work[(twice + j) * LANES + k] - 2.0 * work[(once + j) * LANES + k] + work[(raw + j) * LANES + k]
+        turn = max(turn, abs(bend))  # (z J)^2 e
+    if largest > 0.0:
+        work[(memory + DURATION) * LANES + k] = z * np.sqrt(largest / turn)
+    duration = work[(memory + DURATION) * LANES + k]
+    if duration * change * SLOW_FACTOR > fastest:
+        duration *= min(SLOW_FACTOR, duration * change * SLOW_FACTOR / fastest) if fastest > 0.0 else SLOW_FACTOR
+    return _velocity_error(control, work, n, twice, duration, state, new, k)
+
+
+@compiled
+def _velocity_error(control, work, n, error_v, duration, state, new, k):
+    """Return the largest component of an error of the velocities of some duration, over the tolerances."""
+    error = 0.0
+    for j in range(n):
+        share_q = duration / _allowed(control, work, state, new, j, j, k)
+        share_v = 1.0 / _allowed(control, work, state, new, j, n + j, k)
+        error = max(error, abs(work[(error_v + j) * LANES + k]) * min(share_q, share_v))
+    return error
+
+
+@merged
+def _motion_time(control, work, n, memory, k):
+    """Return the time in which the motion changes its velocities, s, see velocity_errors.py."""
+    begin = vector_at(memory, n, BEGIN_V)
+    fastest = change = 0.0
+    for j in range(n):
+        fastest = max(fastest, abs(work[(begin + j) * LANES + k]))
+        change = max(change, abs(work[(begin + n + j) * LANES + k]))
+    longest = LONGEST_GAPS * control[GAP]
+    return fastest / change if fastest < longest * change else longest
+
+
+@compiled
+def _slow_error(settings, control, own, s, work):
+    """Raise ERROR to what an error of the velocities, in E_V, leaves in slow directions, as in newton_step.py."""
+    n = settings[N]
+    state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
+    e_v, most, fine = vector_at(memory, n, E_V), memory + LARGEST_V, memory + TO_GO
+    anywhere = False
+    for k in range(LANES):
+        error = 0.0
+        if work[ERROR * LANES + k] <= 1.0:
+            long = _motion_time(control, work, n, memory, k)
+            error = _velocity_error(control, work, n, e_v, long, state, new, k)
+        work[most * LANES + k], work[fine * LANES + k] = error, work[FINE * LANES + k]
+        anywhere = anywhere or error > 1.0
+    if not anywhere:
+        return
+    by_q, by_v = matrix_at(memory, n, s, BY_Q), matrix_at(memory, n, s, BY_V)
+    matrix = matrix_at(memory, n, s, SYSTEMS)
+    for i in range(n * n):
+        for k in range(LANES):
+            z = STEPS_TO_DECAY * work[H * LANES + k]
+            entry = -z * z * work[(by_q + i) * LANES + k] - z * work[(by_v + i) * LANES + k]
+            work[(matrix + i) * LANES + k] = entry + (1.0 if i % (n + 1) == 0 else 0.0)
+    pivots = pivots_at(memory, n, s, count_eigenvalues(own, s), 0)
+    factor_lanes(work, matrix, pivots, n, 0)
+    solve_lanes(work, matrix, pivots, n, 0, e_v)
+    for k in range(LANES):
+        error = work[most * LANES + k]
+        if work[FINE * LANES + k] == 1.0:  # where the motion is unstable the solution may be large
+            long = _motion_time(control, work, n, memory, k)
+            error = min(error, _velocity_error(control, work, n, e_v, long, state, new, k))
+        work[FINE * LANES + k] = work[fine * LANES + k]
+        if work[most * LANES + k] > 1.0:
+            work[ERROR * LANES + k] = max(work[ERROR * LANES + k], error)
+
+
+@compiled
+def _estimate(settings, control, own, A, work):
+    """Compute ERROR: the embedded estimate, filtered for stiff components, over the tolerances."""
+    n, s = settings[N], A.shape[0]
+    state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
+    place = eigen_place(s)
+    e_q, e_v = vector_at(memory, n, E_Q), vector_at(memory, n, E_V)
+    _embedded(settings, own, A, work, memory)
+    copy_vectors(work, e_v, vector_at(memory, n, RAW), n)
+    _filter(settings, own, s, work, memory)
+    tests_velocities = own[place + VELOCITIES] == 1.0
+    fill_field(work, ERROR, 0.0)
+    for j in range(n):
+        atol, rtol = control[ATOL + j], control[RTOL]
+        enlarge(work, ERROR, e_q + j, RUNNING, state + j, new + j, atol, rtol)
+        if tests_velocities:
+            enlarge(work, ERROR, e_v + j, RUNNING, state + n + j, new + n + j, atol, rtol)
+    if tests_velocities:
+        return
+    copy_vectors(work, e_v, vector_at(memory, n, ONCE), n)
+    _filter(settings, own, s, work, memory)
+    for k in range(LANES):
+        z = own[place + GAMMA0] * work[H * LANES + k]
+        error = _filtered_velocity_error(control, work, n, memory, z, state, new, k)
+        work[ERROR * LANES + k] = max(work[ERROR * LANES + k], error)
+    _slow_error(settings, control, own, s, work)
+
+
+@compiled
+def _keep_stages(work, memory, n, s):
+    """Keep the stages of accepted steps, from which the next ones and states within the step are predicted."""
+    stages, previous = block_at(memory, n, s, STAGES), block_at(memory, n, s, PREVIOUS)
+    for k in range(LANES):
+        if work[ACCEPTED * LANES + k] == 1.0:
+            work[(memory + H_PREVIOUS) * LANES + k] = work[H * LANES + k]
+            for i in range(s * n):
+                work[(previous + i) * LANES + k] = work[(stages + i) * LANES + k]
+
+
+@kernel(STEP, vectorized=True)
+def step_by_newton(code, settings, control, options, work, status, n_steps, within):
+    """Make a step, at most the gap without evaluations, or states within one by shorter steps."""
+    n = settings[N]
+    state, _, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
+    own = options[N_HEAD:]
+    s, A, A2, b, bA, c = tableau_of(own)
+    start, begin = vector_at(memory, n, START), vector_at(memory, n, BEGIN_Q)
+    if not within:
+        begin_control(options, control, work, n, state, a, start)
+        for k in range(LANES):
+            if work[FRESH * LANES + k] == 1.0:
+                work[(memory + H_PREVIOUS) * LANES + k] = work[(memory + DURATION) * LANES + k] = 0.0
+        choose_steps(work, control, status, n_steps)
+        copy_vectors(work, state, begin, 2 * n)
+        copy_vectors(work, start, begin + 2 * n, n)
+        find_derivatives(code, settings, control, c, work)
+    factor_systems_of_lanes(settings, own, s, work)
+    predict_stages(settings, c, work, 0.0 if within else 1.0)
+    solve_stages(code, settings, control, options, own, A, A2, c, work)
+    end_of_stages(settings, b, bA, work)
+    set_end(work, control)
+    if not within:
+        _estimate(settings, control, own, A, work)
+        end_steps(code, settings, control, work, vector_at(memory, n, SUMS))
+        judge_steps(options, work, n, a, start, status)
+        _keep_stages(work, memory, n, s)

@@ -1,0 +1,833 @@
+"""Linear algebra of Newton's method for implicit steps: the systems I - z^2 J_q - z J_v, z = h l, of each eigenvalue l.
+
+J_q and J_v are the derivatives of the two-loop right-hand side by the independent positions and velocities. The
+corrections x of the independent accelerations solve (I - z^2 J_q - z J_v) x = r. Multiplied by T^T M T, where
+v = T v_i are the velocities that the constraints allow, T = [I; -Cqd^-1 Cqi], this is
+
+    T^T (M - z^2 K - z D) T x = T^T M T r,    K, D = derivatives by q, v of Q - Cq^T lam, lam held
+
+but for how T and M change with the position and Q_d with the velocity. That term, zero for linear constraints, has no
+stiffness, and a simplified Newton may leave it out: at a tolerance the steps are the same, but fixed steps in which a
+body turns by some 0.4 rad on its constraints may fail where differences of the right-hand side converge. X = T x is
+also the solution of a matrix with a border,
+
+    [[M - z^2 K - z D, Cq^T], [Cq, 0]] [X; mu] = [M T r; 0].
+
+Three storages serve:
+
+- dense: J_q and J_v, (n_dof, n_dof), from the tangents K and D that the system gives, else by differences of the
+  right-hand side;
+- banded, where the system has a bandwidth b: K and D with the border, at a cost in proportion to n_q. Without tangents,
+  K and D are differenced in groups of columns that share no row, 2 b + 1 of them for every n_q (Curtis, Powell and Reid
+  1974, doi 10.1093/imamat/13.1.117). On the beam of 32 elements, sparse factors take 2.5 to 7 times as long;
+- sparse, for large systems, of which all coordinates count as independent: static factors of the matrix with the
+  border, its right-hand side [M r; G r]. K and D are differenced in groups of columns. Each time, the change that they
+  predict is compared with a displacement of all coordinates at once: if entries are missing, which no position showed
+  when the pattern was made, another storage has to go on.
+"""
+
+import numpy as np
+
+from twoloop.kernels.data.codes import DONE, NEEDS_DENSE, NOT_FINITE, SINGULAR
+from twoloop.kernels.data.common import compiled, inlined
+from twoloop.kernels.data.counters import N_EVALUATIONS, N_FACTORIZATIONS, N_JACOBIANS
+from twoloop.kernels.data.finite import finite_vector
+from twoloop.kernels.data.flags import (
+    BANDWIDTH,
+    FORCE_BY_Q_GIVEN,
+    FORCE_BY_V_GIVEN,
+    FORM,
+    REACTION_BY_Q_GIVEN,
+    STATIC,
+)
+from twoloop.kernels.evaluation.constraints import constraint_rows
+from twoloop.kernels.evaluation.inner_loop import evaluate, find_tangents
+from twoloop.kernels.evaluation.sparse_inner_loop import fill_jacobian_values
+from twoloop.kernels.linalg.band import (
+    DGBTRF,
+    DGBTRS,
+    ZGBTRF,
+    ZGBTRS,
+    add_banded_mass_times,
+    factor_bordered,
+    lu_band,
+    solve_bordered,
+)
+from twoloop.kernels.linalg.dense import copy, copy_matrix, ldl_factor, ldl_solve_rows, lu_factor, lu_solve
+from twoloop.kernels.linalg.markowitz_lu import columns_of
+from twoloop.kernels.linalg.sparse_lu import factor as factor_lu
+from twoloop.kernels.linalg.sparse_lu import load, tangents_of
+from twoloop.kernels.linalg.sparse_lu import solve as solve_lu
+from twoloop.kernels.linalg.symbolic_factorization import N_OF_MASS, N_OFF, N_PIVOTS, jacobian_of, mass_of
+from twoloop.kernels.steps.newton_memory import (
+    A_NEW,
+    BY_Q,
+    BY_V,
+    DAMPED,
+    FILTER,
+    GAMMA0,
+    H_FACTORED,
+    N_EIGEN_SCALARS,
+    N_REAL,
+    Q_MOVED,
+    Q_STAGE,
+    SYSTEMS,
+    V_MOVED,
+    block,
+    complex_vector,
+    count_eigenvalues,
+    eigen_place,
+    pivots_of,
+    space,
+    square,
+    system_space,
+    vector,
+)
+from twoloop.kernels.steps.stages import INNER_TOL
+
+MAX_ITERATIONS = 15
+SAME_STEP = 1e-9  # relative: steps are differences of times, and the same step is rounded otherwise at another time
+STAGNATION = 0.1  # of the step tolerance: corrections of this size that no longer shrink are rounding
+
+DIFFERENCE = 1e-7  # displacement for derivatives, relative to max(1, |value|)
+# factors by which displacements differ that are made at a time, so that their effects do not cancel
+UNEQUAL, N_UNEQUAL = 0.37, 7
+
+# --- tangents: K and D, of which only the band |i - j| <= b counts
+
+
+@inlined
+def displaced_with_all(value, place):
+    """Displace a coordinate or velocity while all are displaced, unlike its neighbours, so that nothing cancels."""
+    return value + DIFFERENCE * max(1.0, abs(value)) * (1.0 + UNEQUAL * (place % N_UNEQUAL))
+
+
+@compiled
+def _clear(A, b):
+    for i in range(A.shape[0]):
+        for j in range(max(0, i - b), min(A.shape[0], i + b + 1)):
+            A[i, j] = 0.0
+
+
+@compiled
+def _finite(A, b):
+    for i in range(A.shape[0]):
+        for j in range(max(0, i - b), min(A.shape[0], i + b + 1)):
+            if not np.isfinite(A[i, j]):
+                return NOT_FINITE
+    return DONE
+
+
+@compiled
+def _constraints_bend(f, w, t, q):
+    """Return whether C_q at q, which is left in w.Gx, differs from w.G."""
+    w.Gx[:, :] = 0.0
+    constraint_rows(f, w, t, q, w.Gx)
+    for i in range(w.C.size):
+        for j in range(q.size):
+            if w.Gx[i, j] != w.G[i, j]:
+                return True
+    return False
+
+
+@compiled
+def _subtract_reaction_differences(f, w, t, q, moved, b, K):
+    """Subtract d(Cq^T lam)/dq from K, by displacing coordinates j, j + 2 b + 1, ... at a time."""
+    n = q.size
+    for j in range(n):
+        moved[j] = displaced_with_all(q[j], j)
+    if not _constraints_bend(f, w, t, moved):
+        return
+    width = min(n, 2 * b + 1)
+    for group in range(width):
+        copy(q, moved)
+        for j in range(group, n, width):
+            moved[j] += DIFFERENCE * max(1.0, abs(q[j]))
+        if not _constraints_bend(f, w, t, moved):
+            continue
+        for j in range(group, n, width):
+            size = moved[j] - q[j]
+            for i in range(max(0, j - b), min(n, j + b + 1)):
+                for k in range(w.C.size):
+                    K[i, j] -= (w.Gx[k, i] - w.G[k, i]) * w.lam[k] / size
+
+
+@compiled
+def tangent_by_q(f, w, t, q, v, b, moved, K, R):
+    """Compute the band |i - j| <= b of K (n_q, n_q), at a state that was evaluated just before."""
+    _clear(K, b)
+    f.force_by_q(t, q, v, f.p, K)
+    if f.flags[REACTION_BY_Q_GIVEN] == 1:
+        _clear(R, b)
+        f.reaction_by_q(t, q, w.lam, f.p, R)
+        for i in range(q.size):
+            for j in range(max(0, i - b), min(q.size, i + b + 1)):
+                K[i, j] -= R[i, j]
+    else:
+        _subtract_reaction_differences(f, w, t, q, moved, b, K)
+    return _finite(K, b)
+
+
+@compiled
+def tangent_by_v(f, t, q, v, b, D):
+    """Compute the band of D (n_q, n_q); it is left alone if the force does not depend on v."""
+    if f.flags[FORCE_BY_V_GIVEN] == 0:
+        return DONE
+    _clear(D, b)
+    f.force_by_v(t, q, v, f.p, D)
+    return _finite(D, b)
+
+
+# --- dense storage
+
+
+@compiled
+def reduce(w, A, AT, B):
+    """Compute B = T^T A T with T = [I; w.D^T]; AT (n_q, n_dof) is scratch."""
+    n, m = AT.shape
+    columns = columns_of(w.index)
+    for i in range(n):
+        for k in range(m):
+            AT[i, k] = A[i, w.independent[k]]
+        for c in range(columns.size):
+            factor = A[i, columns[c]]
+            if factor != 0.0:
+                for k in range(m):
+                    AT[i, k] += factor * w.D[k, c]
+    for l in range(m):
+        copy(AT[w.independent[l]], B[l])
+        for c in range(columns.size):
+            factor = w.D[l, c]
+            if factor != 0.0:
+                row = AT[columns[c]]
+                for k in range(m):
+                    B[l, k] += factor * row[k]
+
+
+@compiled
+def _dense_from_tangents(f, w, memory, s, t, q, v):
+    """Compute J_q and J_v from the tangents of the system, at a state that was evaluated just before."""
+    n = q.size
+    m = w.independent.size
+    w.counters[N_JACOBIANS] += 1
+    # factors are not needed any more: their spaces hold K or D, then T^T M T and T^T A
+    K, R = square(space(w, n, FILTER), n), square(space(w, n, SYSTEMS), n)
+    code = tangent_by_q(f, w, t, q, v, n - 1, vector(memory, s, n, Q_MOVED), K, R)
+    if code != DONE:
+        return code
+    AT = space(w, n, SYSTEMS + 1)[: n * m].reshape((n, m))
+    code = find_tangents(f, w, t, q)
+    if code != DONE:
+        return code
+    Jq, Jv = square(space(w, n, BY_Q), m), square(space(w, n, BY_V), m)
+    N = square(space(w, n, SYSTEMS), m)
+    reduce(w, w.M, AT, N)
+    if not ldl_factor(N):
+        return SINGULAR
+    reduce(w, K, AT, Jq)
+    ldl_solve_rows(N, Jq)
+    memory[DAMPED] = f.flags[FORCE_BY_V_GIVEN]
+    code = tangent_by_v(f, t, q, v, n - 1, K)
+    if code == DONE and memory[DAMPED] == 1.0:
+        reduce(w, K, AT, Jv)
+        ldl_solve_rows(N, Jv)
+    return code
+
+
+@compiled
+def _dense_derivatives(f, w, options, memory, s, t, q, v, a):
+    """Compute J_q and J_v at (t, q, v), whose accelerations a were evaluated just before."""
+    if f.flags[FORCE_BY_Q_GIVEN] == 1 and w.Rate.size == w.C.size:
+        return _dense_from_tangents(f, w, memory, s, t, q, v)
+    n = q.size
+    m = w.independent.size
+    Jq, Jv = square(space(w, n, BY_Q), m), square(space(w, n, BY_V), m)
+    q_moved, v_moved = vector(memory, s, n, Q_MOVED), vector(memory, s, n, V_MOVED)
+    a_new = vector(memory, s, n, A_NEW)
+    w.counters[N_JACOBIANS] += 1
+    for column in range(m):
+        j = w.independent[column]
+        copy(q, q_moved)
+        copy(v, v_moved)
+        q_moved[j] += DIFFERENCE * max(1.0, abs(q[j]))
+        size = q_moved[j] - q[j]
+        code = evaluate(f, w, t, q_moved, v_moved, options[INNER_TOL], a_new)
+        if code != DONE:
+            return code
+        for row in range(m):
+            i = w.independent[row]
+            Jq[row, column] = (a_new[i] - a[i]) / size
+    # one displacement of all velocities tells whether there is anything to difference
+    copy(q, q_moved)
+    for column in range(m):
+        j = w.independent[column]
+        v_moved[j] = displaced_with_all(v[j], column)
+    code = evaluate(f, w, t, q_moved, v_moved, options[INNER_TOL], a_new)
+    if code != DONE:
+        return code
+    memory[DAMPED] = 0.0
+    for i in w.independent:
+        if a_new[i] != a[i]:
+            memory[DAMPED] = 1.0
+    if memory[DAMPED] == 0.0:
+        return DONE
+    for column in range(m):
+        j = w.independent[column]
+        copy(q, q_moved)
+        copy(v, v_moved)
+        v_moved[j] += DIFFERENCE * max(1.0, abs(v[j]))
+        size = v_moved[j] - v[j]
+        code = evaluate(f, w, t, q_moved, v_moved, options[INNER_TOL], a_new)
+        if code != DONE:
+            return code
+        for row in range(m):
+            i = w.independent[row]
+            Jv[row, column] = (a_new[i] - a[i]) / size
+    return DONE
+
+
+@compiled
+def _factor_dense(w, memory, s, which, z, matrix):
+    """Factor I - z^2 J_q - z J_v; `which`: the pivots, see `pivots_of`."""
+    n, m = w.Q.size, w.independent.size
+    Jq, Jv = square(space(w, n, BY_Q), m), square(space(w, n, BY_V), m)
+    damped = memory[DAMPED] == 1.0
+    for i in range(m):
+        for j in range(m):
+            matrix[i, j] = -z * z * Jq[i, j]
+            if damped:
+                matrix[i, j] -= z * Jv[i, j]
+        matrix[i, i] += 1.0
+    return DONE if lu_factor(matrix, pivots_of(memory, s, n, which)) > 0.0 else SINGULAR
+
+
+@compiled
+def _filter_dense(w, options, memory, s, h, e_q, e_v):
+    n = w.Q.size
+    m = e_q.size
+    gamma0 = options[eigen_place(s) + GAMMA0]
+    Jq = square(space(w, n, BY_Q), m)
+    for i in range(m):
+        total = 0.0
+        for j in range(m):
+            total += Jq[i, j] * e_q[j]
+        e_v[i] += h * gamma0 * total
+    lu_solve(square(space(w, n, FILTER), m), pivots_of(memory, s, n, 0), e_v)
+
+
+# --- banded storage
+
+
+@inlined
+def _band(numbers, n, b):
+    """Return the space of K or D as a band: entry (i, j) at [i, b + j - i]."""
+    return numbers[: n * (2 * b + 1)].reshape((n, 2 * b + 1))
+
+
+@inlined
+def _border(w, n, r, b):
+    """Return what stands behind K: rows of C_q that count, w.D, and the columns of its entries, at the same state."""
+    numbers = space(w, n, BY_Q)
+    start = n * (2 * b + 1)
+    Cq = numbers[start : start + r * n].reshape((r, n))
+    start += r * n
+    D = numbers[start : start + r * (n - r + 1)].reshape((n - r + 1, r))
+    start += r * (n - r + 1)
+    return Cq, D, numbers[start : start + r].view(np.int64)
+
+
+@compiled
+def _banded_residual(f, w, t, q, v):
+    """Compute Q - C_q^T lam into w.Q, with the multipliers in w.lam."""
+    w.counters[N_EVALUATIONS] += 1
+    w.Q[:] = 0.0
+    f.force(t, q, v, f.p, w.Q)
+    w.Gx[:, :] = 0.0
+    constraint_rows(f, w, t, q, w.Gx)
+    for i in range(w.lam.size):
+        for j in range(q.size):
+            w.Q[j] -= w.Gx[i, j] * w.lam[i]
+
+
+@compiled
+def _difference_groups(f, w, t, q, v, by_v, base, moved, b, band):
+    """Difference columns j, j + 2 b + 1, ... at a time: DONE, or NOT_FINITE."""
+    n = q.size
+    given = v if by_v else q
+    for group in range(2 * b + 1):
+        copy(given, moved)
+        for j in range(group, n, 2 * b + 1):
+            moved[j] += DIFFERENCE * max(1.0, abs(given[j]))
+        if by_v:
+            _banded_residual(f, w, t, q, moved)
+        else:
+            _banded_residual(f, w, t, moved, v)
+        for j in range(group, n, 2 * b + 1):
+            size = moved[j] - given[j]
+            for i in range(max(0, j - b), min(n, j + b + 1)):
+                band[i, b + j - i] = (w.Q[i] - base[i]) / size
+                if not np.isfinite(band[i, b + j - i]):
+                    return NOT_FINITE
+    return DONE
+
+
+@compiled
+def _copy_band(A, b, band):
+    n = A.shape[0]
+    for i in range(n):
+        for j in range(max(0, i - b), min(n, i + b + 1)):
+            band[i, b + j - i] = A[i, j]
+
+
+@compiled
+def _band_from_tangents(f, w, memory, s, t, q, v, b):
+    n = q.size
+    K, R = space(w, n, FILTER).reshape((n, n)), space(w, n, SYSTEMS).reshape((n, n))
+    code = tangent_by_q(f, w, t, q, v, b, vector(memory, s, n, Q_MOVED), K, R)
+    if code != DONE:
+        return code
+    _copy_band(K, b, _band(space(w, n, BY_Q), n, b))
+    memory[DAMPED] = f.flags[FORCE_BY_V_GIVEN]
+    code = tangent_by_v(f, t, q, v, b, K)
+    if memory[DAMPED] == 1.0:
+        _copy_band(K, b, _band(space(w, n, BY_V), n, b))
+    return code
+
+
+@compiled
+def _banded_derivatives(f, w, memory, s, t, q, v):
+    """Compute K and D at a state that was evaluated just before."""
+    n = q.size
+    b = f.flags[BANDWIDTH]
+    w.counters[N_JACOBIANS] += 1
+    Cq, D, columns = _border(w, n, w.rows.size, b)
+    for i in range(w.rows.size):
+        copy(w.G[w.rows[i]], Cq[i])
+    code = find_tangents(f, w, t, q)
+    if code != DONE:
+        return code
+    copy_matrix(w.D, D)
+    copy(columns_of(w.index), columns)
+    if f.flags[FORCE_BY_Q_GIVEN] == 1:
+        return _band_from_tangents(f, w, memory, s, t, q, v, b)
+    base, moved = vector(memory, s, n, A_NEW), vector(memory, s, n, Q_MOVED)
+    _banded_residual(f, w, t, q, v)
+    copy(w.Q, base)
+    code = _difference_groups(f, w, t, q, v, False, base, moved, b, _band(space(w, n, BY_Q), n, b))
+    if code != DONE:
+        return code
+    # one displacement of all velocities tells whether there is anything to difference
+    for j in range(n):
+        moved[j] = displaced_with_all(v[j], j)
+    _banded_residual(f, w, t, q, moved)
+    memory[DAMPED] = 0.0
+    for i in range(n):
+        if w.Q[i] != base[i]:
+            memory[DAMPED] = 1.0
+    if memory[DAMPED] == 0.0:
+        return DONE
+    return _difference_groups(f, w, t, q, v, True, base, moved, b, _band(space(w, n, BY_V), n, b))
+
+
+@compiled
+def _factor_banded(w, memory, s, b, which, z, numbers, factorize, substitute):
+    """Factor M - z^2 K - z D with its border; `which`: the pivots, see `pivots_of`."""
+    n = w.Q.size
+    K, D = _band(space(w, n, BY_Q), n, b), _band(space(w, n, BY_V), n, b)
+    damped = memory[DAMPED] == 1.0
+    target = lu_band(numbers, n, b)
+    for i in range(n):
+        for j in range(max(0, i - b), min(n, i + b + 1)):
+            value = w.M[i, j] - z * z * K[i, b + j - i]
+            if damped:
+                value -= z * D[i, b + j - i]
+            target[j, 2 * b + i - j] = value
+    Cq, _, _ = _border(w, n, w.rows.size, b)
+    return factor_bordered(w, b, Cq, numbers, pivots_of(memory, s, n, which), factorize, substitute)
+
+
+@compiled
+def _all_coordinates(w, b, x, X):
+    """Compute X = T x; of x (n_q) the first n_dof numbers count, the others are scratch."""
+    n_dof = w.independent.size
+    _, D, columns = _border(w, w.Q.size, w.rows.size, b)
+    for i in columns:
+        X[i] = 0.0
+    for k in range(n_dof):
+        X[w.independent[k]] = x[k]
+        for i in range(columns.size):
+            X[columns[i]] += D[k, i] * x[k]
+
+
+@compiled
+def _solve_for_independents(w, b, numbers, pivots, substitute, x):
+    """Solve with the full right-hand side x (n_q); its first n_dof numbers become the independents of the solution."""
+    Cq, _, _ = _border(w, x.size, w.rows.size, b)
+    solve_bordered(w, b, Cq, numbers, pivots, substitute, x)
+    for k in range(w.independent.size):  # ascending, so that none is overwritten before its turn
+        x[k] = x[w.independent[k]]
+
+
+@compiled
+def _solve_banded(f, w, b, numbers, pivots, substitute, X, x):
+    """Solve for the independents; x (n_q): the first n_dof numbers count, the others and X (n_q) are scratch."""
+    _all_coordinates(w, b, x, X)
+    x[:] = 0.0
+    add_banded_mass_times(f, w, X, x)
+    _solve_for_independents(w, b, numbers, pivots, substitute, x)
+
+
+@compiled
+def _filter_banded(f, w, options, memory, s, h, e_q, e_v):
+    """Replace e_v by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0: n_dof numbers of each (n_q)."""
+    n = w.Q.size
+    b = f.flags[BANDWIDTH]
+    z = h * options[eigen_place(s) + GAMMA0]
+    K, X = _band(space(w, n, BY_Q), n, b), vector(memory, s, n, Q_MOVED)
+    _all_coordinates(w, b, e_v, X)
+    e_v[:] = 0.0
+    add_banded_mass_times(f, w, X, e_v)
+    _all_coordinates(w, b, e_q, X)
+    for i in range(n):
+        for j in range(max(0, i - b), min(n, i + b + 1)):
+            e_v[i] += z * K[i, b + j - i] * X[j]
+    pivots = pivots_of(memory, s, n, 0)
+    _solve_for_independents(w, b, space(w, n, FILTER), pivots, DGBTRS, e_v)
+
+
+# --- sparse storage, of all coordinates
+MISSED = 0.2  # of the change that the entries of a row predict: a larger difference shows that entries are missing
+NOISE = 1e-13  # of the largest force: what rounding may add to a difference
+N_SPARSE_VECTORS = 3  # of all coordinates: the force, the same displaced, and what is displaced
+
+
+def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_eigenvalues: int) -> int:
+    """Return how many numbers w.matrices has: see _sparse_state, _sparse_vectors and _sparse_factors."""
+    n = int(program[N_PIVOTS])
+    n_tangents = int(program[N_OF_MASS]) - n_mass
+    one = n + 2 * int(program[N_OFF])
+    return n_mass + n_jacobian + 2 * n_tangents + (N_SPARSE_VECTORS + 7) * n + (1 + 2 * n_eigenvalues) * one
+
+
+@inlined
+def _sparse_state(f, w):
+    """Return numbers of M, G, K and D, and of each row whether it counted and what it stiffens M by."""
+    n_mass, n_jacobian, n_rows = w.mass_values.size, w.jacobian_values.size, w.counts.size
+    a = n_mass + n_jacobian
+    b = a + mass_of(f.newton_program)[0].size - n_mass
+    c = b + b - a
+    numbers = w.matrices
+    return (
+        numbers[:n_mass],
+        numbers[n_mass:a],
+        numbers[a:b],
+        numbers[b:c],
+        numbers[c : c + n_rows],
+        numbers[c + n_rows : c + 2 * n_rows],
+    )
+
+
+@inlined
+def _sparse_vectors(f, w):
+    """Return N_SPARSE_VECTORS vectors (n_q), sizes of pivots (N), and two complex vectors (N)."""
+    n, begin = f.newton_program[N_PIVOTS], w.mass_values.size + w.jacobian_values.size
+    begin += 2 * (mass_of(f.newton_program)[0].size - w.mass_values.size) + 2 * n
+    n_q, numbers = w.Q.size, w.matrices
+    middle = begin + N_SPARSE_VECTORS * n
+    return (
+        numbers[begin : begin + n_q],
+        numbers[begin + n : begin + n + n_q],
+        numbers[begin + 2 * n : begin + 2 * n + n_q],
+        numbers[middle : middle + n],
+        numbers[middle + n : middle + 3 * n].view(np.complex128),
+        numbers[middle + 3 * n : middle + 5 * n].view(np.complex128),
+    )
+
+
+@inlined
+def _sparse_factors(f, w, k):
+    """Return the factors for gamma0, k = 0, or the complex ones of the (k - 1)-th eigenvalue, as real numbers."""
+    n = f.newton_program[N_PIVOTS]
+    one = n + 2 * f.newton_program[N_OFF]
+    begin = w.mass_values.size + w.jacobian_values.size + (N_SPARSE_VECTORS + 7) * n
+    begin += 2 * (mass_of(f.newton_program)[0].size - w.mass_values.size)
+    if k == 0:
+        return w.matrices[begin : begin + one]
+    return w.matrices[begin + (2 * k - 1) * one : begin + (2 * k + 1) * one]
+
+
+@compiled
+def _sparse_residual(f, w, t, q, v, moved, out):
+    """Compute Q - G^T lam into `out`; `moved`: evaluate G anew. Return the largest number added."""
+    w.counters[N_EVALUATIONS] += 1
+    out[:] = 0.0
+    f.force(t, q, v, f.p, out)
+    if moved:
+        fill_jacobian_values(f, w, t, q)
+    largest = 0.0
+    for j in range(out.size):
+        largest = max(largest, abs(out[j]))
+    rows, columns, _ = jacobian_of(f.newton_program)
+    for k in range(rows.size):
+        part = w.jacobian_values[k] * w.lam[rows[k]]
+        largest = max(largest, abs(part))
+        out[columns[k]] -= part
+    return largest
+
+
+@compiled
+def _sparse_differences(f, w, t, q, v, by_v, base, other, moved, entries):
+    """Difference the entries of K, or of D, group by group: DONE, or NOT_FINITE."""
+    rows, columns, begins = tangents_of(f.newton_program)
+    given = v if by_v else q
+    for group in range(begins.size - 1):
+        copy(given, moved)
+        first, last = begins[group], begins[group + 1]
+        for k in range(first, last):
+            j = columns[k]
+            moved[j] = given[j] + DIFFERENCE * max(1.0, abs(given[j]))
+        if by_v:
+            _sparse_residual(f, w, t, q, moved, False, other)
+        else:
+            _sparse_residual(f, w, t, moved, v, True, other)
+        for k in range(first, last):
+            i, j = rows[k], columns[k]
+            entries[k] = (other[i] - base[i]) / (moved[j] - given[j])
+    return DONE if finite_vector(entries) else NOT_FINITE
+
+
+@compiled
+def _explains(f, base, other, given, moved, largest, entries, predicted):
+    """Return whether these entries explain the change from base to other; `predicted` is scratch."""
+    rows, columns, _ = tangents_of(f.newton_program)
+    predicted[:] = 0.0
+    for k in range(rows.size):
+        i, j = rows[k], columns[k]
+        part = entries[k] * (moved[j] - given[j])
+        other[i] -= part
+        predicted[i] += abs(part)
+    worst = 0.0
+    for i in range(base.size):
+        worst = max(worst, abs(other[i] - base[i]) - MISSED * predicted[i])
+    return worst <= NOISE * largest
+
+
+@compiled
+def _sparse_derivatives(f, w, memory, t, q, v):
+    """Compute K and D at a state that was evaluated just before; NEEDS_DENSE: entries are missing."""
+    if f.newton_program.size == 0:
+        return NEEDS_DENSE
+    w.counters[N_JACOBIANS] += 1
+    mass, jacobian, K, D, counts, stiffness = _sparse_state(f, w)
+    base, other, moved, sizes, _, _ = _sparse_vectors(f, w)
+    copy(w.mass_values, mass)
+    copy(w.jacobian_values, jacobian)
+    copy(w.counts, counts)
+    copy(w.solutions[w.solutions.size - counts.size :], stiffness)
+    largest = _sparse_residual(f, w, t, q, v, False, base)
+    code = _sparse_differences(f, w, t, q, v, False, base, other, moved, K)
+    if code != DONE:
+        return code
+    for j in range(q.size):
+        moved[j] = displaced_with_all(q[j], j)
+    _sparse_residual(f, w, t, moved, v, True, other)
+    complete = _explains(f, base, other, q, moved, largest, K, sizes[: q.size])
+    copy(jacobian, w.jacobian_values)
+    for j in range(q.size):
+        moved[j] = displaced_with_all(v[j], j)
+    _sparse_residual(f, w, t, q, moved, False, other)
+    memory[DAMPED] = 0.0
+    for i in range(q.size):
+        if other[i] != base[i]:
+            memory[DAMPED] = 1.0
+    if memory[DAMPED] == 0.0:
+        D[:] = 0.0
+        return DONE if complete else NEEDS_DENSE
+    code = _sparse_differences(f, w, t, q, v, True, base, other, moved, D)
+    if code != DONE:
+        return code
+    for j in range(q.size):
+        moved[j] = displaced_with_all(v[j], j)
+    _sparse_residual(f, w, t, q, moved, False, other)
+    complete = _explains(f, base, other, v, moved, largest, D, sizes[: q.size]) and complete
+    return DONE if complete else NEEDS_DENSE
+
+
+@compiled
+def _factor_sparse(f, w, z, values):
+    mass, jacobian, K, D, counts, stiffness = _sparse_state(f, w)
+    _, _, _, sizes, _, _ = _sparse_vectors(f, w)
+    load(f.newton_program, mass, jacobian, K, D, z, stiffness, values)
+    return DONE if factor_lu(f.newton_program, counts, values, sizes) else SINGULAR
+
+
+@compiled
+def _sparse_right_side(f, w, r, right):
+    """Compute [M r; G r]."""
+    mass, jacobian, _, _, _, _ = _sparse_state(f, w)
+    right[:] = 0.0
+    rows, columns, _ = mass_of(f.newton_program)
+    for k in range(mass.size):
+        right[rows[k]] += mass[k] * r[columns[k]]
+    rows, columns, _ = jacobian_of(f.newton_program)
+    for k in range(rows.size):
+        right[w.Q.size + rows[k]] += jacobian[k] * r[columns[k]]
+
+
+@compiled
+def _filter_sparse(f, w, options, s, h, e_q, e_v):
+    """Replace e_v by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0."""
+    _, _, K, _, _, _ = _sparse_state(f, w)
+    _, _, _, _, right, y = _sparse_vectors(f, w)
+    z, n = h * options[eigen_place(s) + GAMMA0], y.size
+    x = right.view(np.float64)[:n]
+    _sparse_right_side(f, w, e_v, x)
+    rows, columns, _ = tangents_of(f.newton_program)
+    for k in range(rows.size):
+        x[rows[k]] += z * K[k] * e_q[columns[k]]
+    solve_lu(f.newton_program, _sparse_factors(f, w, 0), x, y.view(np.float64)[:n])
+    copy(x[: e_v.size], e_v)
+
+
+# --- what steps call, whatever the storage
+
+
+@compiled
+def derivatives_at(f, w, options, memory, s, t, q, v, a):
+    """Compute derivatives at a state (q, v) that was evaluated just before, with a as its accelerations."""
+    if f.flags[FORM] == STATIC:
+        return _sparse_derivatives(f, w, memory, t, q, v)
+    if f.flags[BANDWIDTH] >= 0:
+        return _banded_derivatives(f, w, memory, s, t, q, v)
+    return _dense_derivatives(f, w, options, memory, s, t, q, v, a)
+
+
+@compiled
+def factor_filter(f, w, options, memory, s, h):
+    """Factor the system of z = h gamma0, which is real."""
+    n, z = w.Q.size, h * options[eigen_place(s) + GAMMA0]
+    w.counters[N_FACTORIZATIONS] += 1
+    if f.flags[FORM] == STATIC:
+        return _factor_sparse(f, w, z, _sparse_factors(f, w, 0))
+    if f.flags[BANDWIDTH] >= 0:
+        return _factor_banded(w, memory, s, f.flags[BANDWIDTH], 0, z, space(w, n, FILTER), DGBTRF, DGBTRS)
+    return _factor_dense(w, memory, s, 0, z, square(space(w, n, FILTER), w.independent.size))
+
+
+@compiled
+def _factor_system(f, w, memory, s, k, z):
+    """Factor the system of the k-th eigenvalue, which is complex."""
+    n = w.Q.size
+    w.counters[N_FACTORIZATIONS] += 1
+    if f.flags[FORM] == STATIC:
+        return _factor_sparse(f, w, z, _sparse_factors(f, w, 1 + k).view(np.complex128))
+    if f.flags[BANDWIDTH] >= 0:
+        return _factor_banded(w, memory, s, f.flags[BANDWIDTH], 1 + k, z, system_space(w, n, k), ZGBTRF, ZGBTRS)
+    return _factor_dense(w, memory, s, 1 + k, z, square(system_space(w, n, k), w.independent.size))
+
+
+@compiled
+def factor_systems(f, w, options, memory, s, h):
+    """Factor the systems for steps of h, of gamma0 and of every eigenvalue."""
+    place = eigen_place(s)
+    n_eigen, n_real = count_eigenvalues(options, s), int(options[place + N_REAL])
+    code = factor_filter(f, w, options, memory, s, h)
+    place += N_EIGEN_SCALARS + s
+    for k in range(n_eigen):
+        if code == DONE and (k > 0 or n_real == 0):  # a real eigenvalue is gamma0
+            code = _factor_system(f, w, memory, s, k, h * complex(options[place], options[place + 1]))
+        place += 2 + 4 * s
+    memory[H_FACTORED] = h
+    return code
+
+
+@compiled
+def _solve_real(f, w, memory, s, x):
+    """Solve the system of gamma0; the first n_dof numbers of x (n_q) are overwritten."""
+    n, m = w.Q.size, w.independent.size
+    if f.flags[FORM] == STATIC:
+        _, _, _, _, right, y = _sparse_vectors(f, w)
+        size = y.size
+        _sparse_right_side(f, w, x, right.view(np.float64)[:size])
+        solve_lu(f.newton_program, _sparse_factors(f, w, 0), right.view(np.float64)[:size], y.view(np.float64)[:size])
+        copy(right.view(np.float64)[:n], x)
+    elif f.flags[BANDWIDTH] >= 0:
+        X, pivots = vector(memory, s, n, Q_MOVED), pivots_of(memory, s, n, 0)
+        _solve_banded(f, w, f.flags[BANDWIDTH], space(w, n, FILTER), pivots, DGBTRS, X, x)
+    else:
+        lu_solve(square(space(w, n, FILTER), m), pivots_of(memory, s, n, 0), x[:m])
+
+
+@compiled
+def _solve_complex(f, w, options, memory, s, k, x):
+    """Solve the k-th eigenvalue's system; the first n_dof numbers of x (n_q) are overwritten."""
+    n, m = w.Q.size, w.independent.size
+    if f.flags[FORM] == STATIC:
+        _, _, _, _, right, y = _sparse_vectors(f, w)
+        _sparse_right_side(f, w, x, right)
+        solve_lu(f.newton_program, _sparse_factors(f, w, 1 + k).view(np.complex128), right, y)
+        copy(right[:n], x)
+    elif f.flags[BANDWIDTH] >= 0:
+        X, pivots = complex_vector(memory, s, n, count_eigenvalues(options, s), 1), pivots_of(memory, s, n, 1 + k)
+        _solve_banded(f, w, f.flags[BANDWIDTH], system_space(w, n, k), pivots, ZGBTRS, X, x)
+    else:
+        lu_solve(square(system_space(w, n, k), m), pivots_of(memory, s, n, 1 + k), x[:m])
+
+
+@compiled
+def solve_system(f, w, options, memory, s, k, x):
+    """Solve the k-th eigenvalue's system; the first n_dof numbers of x (n_q) are overwritten."""
+    if k == 0 and options[eigen_place(s) + N_REAL] > 0.0:  # a real eigenvalue is gamma0
+        real = vector(memory, s, w.Q.size, V_MOVED)
+        for i in range(x.size):
+            real[i] = x[i].real
+        _solve_real(f, w, memory, s, real)
+        for i in range(x.size):
+            x[i] = real[i]
+    else:
+        _solve_complex(f, w, options, memory, s, k, x)
+
+
+@compiled
+def filter_error(f, w, options, memory, s, h, e_q, e_v):
+    """Replace e_v by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0: n_dof numbers of each (n_q)."""
+    m = w.independent.size
+    if f.flags[FORM] == STATIC:
+        _filter_sparse(f, w, options, s, h, e_q, e_v)
+    elif f.flags[BANDWIDTH] >= 0:
+        _filter_banded(f, w, options, memory, s, h, e_q, e_v)
+    else:
+        _filter_dense(w, options, memory, s, h, e_q[:m], e_v[:m])
+
+
+@compiled
+def correct(f, w, options, memory, s, residual, A_stage):
+    """Solve for the corrections of the stage accelerations and add them; `residual` becomes the corrections."""
+    n = w.Q.size
+    m = w.independent.size
+    place = eigen_place(s)
+    n_real = int(options[place + N_REAL])
+    n_eigen = count_eigenvalues(options, s)
+    x = complex_vector(memory, s, n, n_eigen, 0)
+    place += N_EIGEN_SCALARS + s
+    d = block(memory, s, n, Q_STAGE)  # free between two evaluations
+    d[:, :] = 0.0
+    for k in range(n_eigen):
+        row = place + 2
+        column = row + 2 * s
+        place += 2 + 4 * s
+        for i in range(m):
+            total = complex(0.0, 0.0)
+            for j in range(s):
+                total += complex(options[row + j], options[row + s + j]) * residual[j, w.independent[i]]
+            x[i] = total
+        solve_system(f, w, options, memory, s, k, x)
+        twice = 1.0 if k < n_real else 2.0
+        for j in range(s):
+            re, im = options[column + j], options[column + s + j]
+            for i in range(m):
+                d[j, w.independent[i]] += twice * (re * x[i].real - im * x[i].imag)
+    for j in range(s):
+        for i in w.independent:
+            residual[j, i] = d[j, i]
+            A_stage[j, i] += d[j, i]

@@ -1,0 +1,279 @@
+"""Methods of the paper: Newmark and BDF in the two-loop procedure, and its two procedures to the letter."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from twoloop.checks.arguments import check_number, check_positive, check_size
+from twoloop.methods.plan import INNER_TOL, Plan, check_tolerances, outer_tolerance
+from twoloop.methods.runge_kutta import RungeKutta
+from twoloop.methods.tableaux import gauss, sun_radau_iib
+
+NO_ESTIMATE = 0.02  # of |beta - 1/6|, below which Newmark's estimate sees no error
+OUTER_SHARE_OF_ERROR = 1e-3  # of err_out; its fixed-point iterations converge so fast that this costs next to nothing
+
+
+@dataclass(frozen=True)
+class Newmark:
+    """Two-loop procedure with Newmark's method, the outer loop by fixed point on the independent accelerations.
+
+    Parameters
+    ----------
+    beta, gamma : float
+        Parameters of (12), in which beta = 1/4 is the average-acceleration method. Other gamma than 1/2, and beta
+        near 1/6, for which the error estimate vanishes, go with fixed steps only.
+    error_tol : float, optional
+        err_out of the paper: a step is accepted when e = |beta - 1/6| h^2 ||a_{n+1} - a_n||_2 is at most this, and the
+        error of a run goes with error_tol^(2/3); steps are shortened to end at output times. None: when the largest
+        component of e / h, the error per unit step, is at most r atol + rtol |v|, so that the error of a run is
+        proportional to the tolerance. 1 / r is the time in which the largest velocity, or acceleration, so far would
+        change a coordinate by the largest value so far. r is not in the paper; it does not become zero, whatever the
+        origin of the coordinates.
+    inner_tol : float, optional
+        Newton on the positions stops when its largest correction, just made, is at most this. None: 1e-8.
+    outer_tol : float, optional
+        The outer loop stops when no independent velocity or position would change by more than this, relative to
+        max(|value|, 1). None: 1e-3 error_tol or 0.01 min(rtol, atol); with fixed steps 1e-14.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a parameter is out of range.
+
+    Examples
+    --------
+    >>> from twoloop import Newmark, solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> run = problem.system, (0.0, 1.0), problem.q0, problem.v0
+    >>> result = solve_dae(*run, method=Newmark(beta=0.25), rtol=1e-4, atol=1e-4)
+    >>> result.success
+    True
+    """
+
+    beta: float = 0.25
+    gamma: float = 0.5
+    error_tol: float | None = None
+    inner_tol: float | None = None
+    outer_tol: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("beta", "gamma"):
+            value = check_number(name, getattr(self, name))
+            if not 0.0 <= value <= 1.0:
+                raise ValueError(f"{name} must be between 0 and 1; given {value!r}")
+        check_tolerances(self, "error_tol", "inner_tol", "outer_tol")
+
+    @property
+    def name(self) -> str:
+        """Return the name for messages and tables."""
+        return f"Newmark(beta={self.beta:g}, gamma={self.gamma:g})"
+
+    def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
+        """Make the method ready for a run of n_q coordinates."""
+        from twoloop.kernels.paper import newmark_step as kernels
+
+        if not fixed and (abs(self.beta - 1.0 / 6.0) < NO_ESTIMATE or self.gamma != 0.5):
+            raise ValueError(
+                f"Newmark with beta = {self.beta:g}, gamma = {self.gamma:g} has no error estimate: |beta - 1/6| h^2 "
+                f"|da| needs gamma = 1/2 and |beta - 1/6| >= {NO_ESTIMATE:g}. Give step_size for fixed steps, or take "
+                "beta = 1/4, gamma = 1/2"
+            )
+        if self.outer_tol is not None:
+            outer_tol = self.outer_tol
+        elif self.error_tol is not None and not fixed:
+            outer_tol = OUTER_SHARE_OF_ERROR * self.error_tol
+        else:
+            outer_tol = outer_tolerance(rtol, atol, fixed)
+        options = np.zeros(kernels.N_OPTIONS)
+        options[kernels.BETA] = self.beta
+        options[kernels.GAMMA] = self.gamma
+        options[kernels.INNER_TOL] = INNER_TOL if self.inner_tol is None else self.inner_tol
+        options[kernels.OUTER_TOL] = outer_tol
+        options[kernels.ERROR_TOL] = 0.0 if self.error_tol is None else self.error_tol
+        return Plan(
+            kernels.NEWMARK,
+            options,
+            np.zeros(kernels.N_MEMORY_SCALARS + n_q),
+            exponent=1.0 / 2.0 if self.error_tol is None else 1.0 / 3.0,
+            factor_min=0.5,
+            limit_start=1.0 if self.error_tol is not None else np.inf,
+            lands=self.error_tol is not None,
+            apart=True,
+        )
+
+
+BDF_HIGHEST = 5  # order; the formula of order 6 is next to unstable, those beyond are
+
+
+@dataclass(frozen=True)
+class BDF:
+    """Two-loop procedure with backward differentiation formulas of variable step and order (the paper's outlook).
+
+    Of y' = f(y), y = [q_i, v_i], each step solves y = p + c (f(y) - p'), where p extrapolates the last k + 1 points and
+    c = h / (1 + 1/2 + ... + 1/k). The outer loop is a fixed-point iteration on the independent accelerations; every
+    evaluation has the inner loop within it. Two to three evaluations make a step. At equal tolerance errors are larger
+    than those of `RungeKutta`: compare at equal error. It is for few digits.
+
+    With step-size control a run begins with order 1 and a small step. A step is accepted when the largest component of
+    the estimated local error of q and v, dependents too, is within the tolerance. Fixed steps have the order
+    max_order from the first on; 3-stage Gauss steps make the history that it needs.
+
+    What to expect of undamped motion: small oscillations lose energy with orders 1, 2 and 5 and gain it with 3 and 4,
+    at the rate of the truncation error; large ones may do either from order 3 on. The fixed point limits h to about
+    the reciprocal of the largest frequency or rate of decay: stiff problems need small steps.
+
+    The matrices are sparse where systems are large: then all coordinates are integrated, and the end of each step is
+    put on the constraints.
+
+    Parameters
+    ----------
+    max_order : int
+        Highest order, 1 to 5.
+    inner_tol : float, optional
+        Newton on the positions stops when its largest correction, just made, is at most this (unit of q). None: 1e-8.
+    outer_tol : float, optional
+        The outer loop stops when no independent velocity or position would change by more than this, relative to
+        max(|value|, 1), but not before one correction. None: 0.01 min(rtol, atol); with fixed steps 1e-14.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If max_order is not an int from 1 to 5, or a tolerance is not positive.
+
+    Notes
+    -----
+    Sect. 5 of the paper proposes BDF as further work and leaves its form open; all of it is chosen here. Modified
+    divided differences with fixed leading coefficient, and their error estimate: Brenan, Campbell and Petzold,
+    Numerical Solution of Initial-Value Problems in DAEs (1996), on DASSL. Unlike the backward differences on an
+    equidistant history of Shampine and Reichelt (1997) they need no interpolation when the step size changes. The order
+    is that of the largest next step, as in VODE. Stability and error constants: Hairer, Norsett and Wanner, Solving
+    ODEs I (1993), chapter III.
+
+    Examples
+    --------
+    >>> from twoloop import BDF, solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> run = problem.system, (0.0, 1.0), problem.q0, problem.v0
+    >>> result = solve_dae(*run, method=BDF(max_order=4), rtol=1e-5, atol=1e-5)
+    >>> result.success
+    True
+    """
+
+    max_order: int = 5
+    inner_tol: float | None = None
+    outer_tol: float | None = None
+
+    def __post_init__(self) -> None:
+        check_size("max_order", self.max_order, 1)
+        if self.max_order > BDF_HIGHEST:
+            raise ValueError(f"max_order must be at most {BDF_HIGHEST}; given {self.max_order!r}")
+        check_tolerances(self, "inner_tol", "outer_tol")
+
+    @property
+    def name(self) -> str:
+        """Return the name for messages and tables."""
+        return f"BDF(max_order={self.max_order})"
+
+    def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
+        """Make the method ready for a run of n_q coordinates."""
+        from twoloop.kernels.paper import bdf_step as kernels
+
+        inner_tol = INNER_TOL if self.inner_tol is None else self.inner_tol
+        outer_tol = outer_tolerance(rtol, atol, fixed) if self.outer_tol is None else self.outer_tol
+        return Plan(
+            kernels.BDF,
+            kernels.options_array(self.max_order, inner_tol, outer_tol, gauss(kernels.STARTER_STAGES)),
+            np.zeros(kernels.memory_size(n_q)),
+            exponent=1.0,  # not used: the order varies, and with it the factor, which the step returns
+            projects=True,
+            apart=True,
+        )
+
+
+def paper_irk(inner_tol: float = 1e-9, outer_tol: float = 1e-9) -> RungeKutta:
+    """The paper's procedure with Sun's 3-stage Radau IIB; run it with rtol = atol = 1e-5 to follow Sect. 4.1.
+
+    As printed: coordinate partitioning by LU; eqs. (14), (15) for the dependents at every stage; explicit Euler
+    prediction; the outer loop ends by (32), is given up by (33); the error is (26), (27), the difference of one step
+    and two half steps undivided; the next step by (31), (34) with fac = 0.9, facmax = 5, facmin = 0.5 and h_max = 1 s
+    at the beginning of each step; after (33) h_max = h and the step is halved.
+
+    Where this differs from the printed text, and why:
+
+    - (32): the printed denominator max(Delta(y_i), 1) compares a difference with itself; max(|y_i|, 1) is used. Sect.
+      3.1 and 3.2 base the criterion on y_i and y_d, Sect. 3.3 on y_i only. The former is followed: counts then grow
+      along the tolerance of (32) as the printed times do along err_in (reports/table3.md), and at 1e-3 the solution
+      is still usable. `outer_test="independent"` is the other reading.
+    - (26): "Rotol" is read as Rtol. (27): n is 2 n_q, because z holds positions and velocities.
+    - (28)-(34): the undefined q is the order 5, so the exponent is 1/6.
+    - Sect. 3.1 says that y_{n+1} is iterated; a Runge-Kutta method iterates the K_i, and so does this. Its step 2
+      predicts K_i = f(t_n + c_i h, y_{n+1}); here one K, at (t_{n+1}, y_{n+1}), predicts all.
+    - Left open by the text and chosen: the K_i are calculated one after another with the latest of the others, as the
+      loop is printed; the accepted state is that of the two half steps; Newton starts from the last iterate of the
+      same stage; err_in bounds the largest correction; 200 iterations at the most; the first step size, by solve_dae;
+      c_3 = 1, b_3 = 1/9 and a_33 = 1/18, lost in print.
+    - A step also ends as after (33) when the inner loop does not converge: 25 iterations, a correction of more than
+      half the one before, or a singular C_qd.
+    - "Once in a time step or several time steps": the partition is looked at after every step, and chosen anew when
+      max|C_qd^-1 C_qi| has grown to three times what it was, or when a step failed in the inner loop.
+    - Steps are shortened to end at output times and at the end of the run.
+    - A step is refused as well where the force jumps between its start and the first stage: the step and its halves
+      do not see that, and were off by 1e5 tolerances.
+
+    Parameters
+    ----------
+    inner_tol, outer_tol : float
+        err_in (largest Newton correction of a position) and err_out (epsilon_tol of (32)).
+
+    Examples
+    --------
+    >>> from twoloop import paper_irk, solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> run = problem.system, (0.0, 1.0), problem.q0, problem.v0
+    >>> result = solve_dae(*run, method=paper_irk(1e-9, 1e-7), rtol=1e-5, atol=1e-5)
+    >>> result.success
+    True
+    """
+    return RungeKutta(sun_radau_iib(3), "paper", "richardson-paper", inner_tol, outer_tol)
+
+
+def paper_newmark(inner_tol: float = 1e-9, outer_tol: float = 1e-9, beta: float = 0.5) -> Newmark:
+    """The two-loop procedure with Newmark's method that the paper compares with; beta = 1/2 as printed.
+
+    As printed: (12) with beta = gamma = 1/2; the outer loop by (11) and (12) with the inner loop between them.
+
+    Where this differs from the printed text, and why:
+
+    - beta = 1/2 is not the average-acceleration method in the form (12), 1/4 is: the leading error is four times
+      larger. Both can be chosen; the printed one is the default.
+    - The paper refers to Hussein and Shabana for error control and convergence. err_out is taken as the tolerance
+      of the local error |beta - 1/6| h^2 ||a_{n+1} - a_n||_2 (Zienkiewicz and Xie 1991), with the step factor
+      0.9 (err_out / error)^(1/3) between 0.5 and 5 and h_max = 1 s: only so does the cost grow as in Table 3. After a
+      step that did not converge h is halved, and h_max is 0.7 h for ten steps.
+    - The outer loop stops when y_i would change by less than err_out / 1000, relative to max(|y_i|, 1); it is given
+      up when the differences grow.
+    - Newton starts from the Taylor polynomial of the dependents, not from the last position.
+    - The partition is renewed as in `paper_irk`; steps are shortened to end at output times, too.
+
+    Parameters
+    ----------
+    inner_tol, outer_tol : float
+        err_in (largest Newton correction of a position) and err_out (tolerance of the step error, unit of q).
+    beta : float
+        Parameter of (12).
+
+    Examples
+    --------
+    >>> from twoloop import paper_newmark, solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> run = problem.system, (0.0, 1.0), problem.q0, problem.v0
+    >>> result = solve_dae(*run, method=paper_newmark(1e-9, 1e-5), rtol=1e-5, atol=1e-5)
+    >>> result.success
+    True
+    """
+    check_positive("outer_tol", outer_tol)
+    return Newmark(beta=beta, gamma=0.5, error_tol=outer_tol, inner_tol=inner_tol)
