@@ -14,7 +14,7 @@ from twoloop import ConstrainedSystem, Result, solve_dae
 from twoloop.kernels.compile.caches import compile_cached, compiled_when_called
 from twoloop.kernels.compile.linking import KernelCompiler
 from twoloop.kernels.data.common import OPTIONS, stamp
-from twoloop.kernels.data.flags import FORCE_BY_Q_GIVEN
+from twoloop.kernels.data.indices import FORCE_BY_Q_GIVEN
 from twoloop.mechanisms import Problem, four_bar
 
 G = 9.81

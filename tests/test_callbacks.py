@@ -14,7 +14,7 @@ from tests.problems import pendulum, quick
 from twoloop import ConstrainedSystem, Status, callback, solve_dae
 from twoloop.kernels.compile.callbacks import KINDS, OPTIONAL
 from twoloop.kernels.data.common import KIT, Functions
-from twoloop.kernels.data.flags import GIVEN
+from twoloop.kernels.data.indices import GIVEN
 from twoloop.mechanisms import four_bar
 from twoloop.problem.callbacks import PythonFunctions
 

@@ -11,8 +11,8 @@ from tests.problems import assert_same, quick, some_of
 from tests.problems import pendulum as bare_pendulum
 from tests.test_bounds import FAR
 from twoloop import ConstrainedSystem, Integrator, callback, consistent_state, mechanisms, solve_dae
+from twoloop.checks.consistency import Violation, surely_consistent
 from twoloop.checks.scales import scales_of
-from twoloop.checks.violation import Violation, surely_consistent
 
 METHODS = ["auto", "Taylor", "DOP853", "Adams", "RadauIIA5", "BDF"]
 NAMES = ["four_bar", "redundant_slider_crank", "heavy_top", "knife_edge", "driven_crank", "n_four_bar"]

@@ -20,8 +20,7 @@ from twoloop.generate.llvm_text import Module
 from twoloop.generate.program import Program
 from twoloop.generate.symbolic_factors import Factors
 from twoloop.kernels.compile.generated_functions import GeneratedFunctions, object_code
-from twoloop.kernels.data.codes import DONE
-from twoloop.kernels.data.noted import BY_GENERAL
+from twoloop.kernels.data.indices import BY_GENERAL, DONE
 from twoloop.kernels.evaluation import tasks
 from twoloop.kernels.evaluation.inner_loop import generated_inner_loop
 from twoloop.methods.presets import PRESETS

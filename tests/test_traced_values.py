@@ -13,8 +13,8 @@ from twoloop import ConstrainedSystem, Status, consistent_state, mechanisms, sol
 from twoloop.generate.derived_callbacks import with_derived_callbacks
 from twoloop.generate.series import series_program
 from twoloop.generate.traced_values import unchecked
-from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.common import KIT, VECTOR, WORK, f8, i8
+from twoloop.kernels.data.indices import DONE
 from twoloop.kernels.evaluation.accelerations import acceleration_constraint
 from twoloop.kernels.evaluation.constraints import constraint_rows
 from twoloop.run.workspace import kit_of, workspace

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from twoloop import Result, __version__, kernels, mechanisms, solve_dae
 from twoloop.audit.mjcf import audit_mjcf, check_ending
-from twoloop.checks.optional import needed
+from twoloop.checks.arguments import needed
 from twoloop.kernels.compile.caches import cache_folder
 from twoloop.mechanisms.registry import problem_from
 from twoloop.methods.presets import PRESETS

@@ -15,7 +15,7 @@ from numba import njit
 from numba.core.dispatcher import Dispatcher
 
 from twoloop.kernels.compile.caches import compiled_when_called
-from twoloop.kernels.data.flags import GAMMA_GIVEN
+from twoloop.kernels.data.indices import GAMMA_GIVEN
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
 

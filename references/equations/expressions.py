@@ -17,7 +17,7 @@ from references.lines import CannotRun
 from twoloop.generate.graph import Affine, Derivative, Graph, Untraceable, symbols
 from twoloop.generate.trace import Equations, only
 from twoloop.generate.traced_values import Traced
-from twoloop.kernels.data.flags import GAMMA_GIVEN
+from twoloop.kernels.data.indices import GAMMA_GIVEN
 from twoloop.kernels.evaluation import operations
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem, check_system

@@ -14,8 +14,8 @@ from references.driver import Task, TimeLimit, adapter
 from references.equations.accelerations import cholesky, cholesky_solve, lu_factor, lu_solve
 from twoloop.checks.arguments import check_choice
 from twoloop.kernels.compile.caches import compiled_when_called
-from twoloop.kernels.data.flags import CONSTANT_MASS, GAMMA_GIVEN
-from twoloop.kernels.data.kit import Kit
+from twoloop.kernels.data.common import Kit
+from twoloop.kernels.data.indices import CONSTANT_MASS, GAMMA_GIVEN
 from twoloop.kernels.evaluation.partition import full_pivoting
 from twoloop.methods.tableaux import Tableau
 from twoloop.result.result import Result

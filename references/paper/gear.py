@@ -20,7 +20,7 @@ from references.lines import Line
 from references.scipy.index1 import solve_index1
 from twoloop.checks.arguments import check_choice, check_size, check_times
 from twoloop.kernels.compile.caches import compiled_when_called
-from twoloop.kernels.data.kit import Kit
+from twoloop.kernels.data.common import Kit
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result

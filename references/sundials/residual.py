@@ -19,7 +19,7 @@ from references.driver import Task
 from references.equations.accelerations import cached, compiled_gamma
 from references.equations.rows import accelerations
 from twoloop.kernels.compile.callbacks import zero_callback
-from twoloop.kernels.data.flags import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN
+from twoloop.kernels.data.indices import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN
 from twoloop.problem.problem import Array
 
 FORMS = {

@@ -13,8 +13,8 @@ from references.sundials.ida import solve_ida, solve_ida_c
 from studies.bench.solvers import GIVEN
 from studies.honesty.traps import FORCE, INPUT, LINKAGE, MISTAKE, SHORT, SINGULAR, Trap
 from twoloop import Result, solve_dae
-from twoloop.kernels.control.sudden import PLACES
-from twoloop.kernels.data.tolerances import LONGEST_UNSEEN
+from twoloop.kernels.control.force_discontinuities import N_SAMPLES
+from twoloop.kernels.data.indices import LONGEST_UNSEEN
 
 OWN = (GIVEN, "Taylor", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
 IDA, IDA_C, CVODE_C, HEYOKA = "IDA, stabilised", "IDA from C", "CVODE from C, Adams", "heyoka, Taylor"
@@ -42,7 +42,7 @@ OWN_OF = {  # groups of many runs, which fewer methods make
     LINKAGE: (GIVEN, "DOP853"),
     FORCE: (*OWN, *OF_FORCES),
 }
-LOOK = LONGEST_UNSEEN / PLACES  # of a run: longest time between two evaluations of a force that changes with time
+LOOK = LONGEST_UNSEEN / N_SAMPLES  # of a run: longest time between two evaluations of a force that changes with time
 LIMITED = ", max_step"  # of other solvers whose largest step is that time
 
 KINDS = {  # kinds of solvers, in words

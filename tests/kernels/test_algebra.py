@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.problems import called, entry
-from twoloop.checks.rank import least_solution
+from twoloop.checks.structure import least_solution
 from twoloop.generate.choices import BOUNDS, LEAST, RANK, SINGULAR_MASS
 from twoloop.kernels.lanes import operations
 from twoloop.kernels.lanes.layout import FINE, LANES, N_FIELDS

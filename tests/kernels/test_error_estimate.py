@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from twoloop.kernels.data.tolerances import ATOL, RTOL
+from twoloop.kernels.data.indices import ATOL, RTOL
 from twoloop.kernels.steps.explicit_step import largest_error
 
 N = 3

@@ -12,9 +12,9 @@ from tests.large_systems import spatial_chain, started_run
 from tests.marks import slow
 from tests.problems import worst
 from twoloop import ConstrainedSystem, solve_dae
-from twoloop.checks.values import MOST
+from twoloop.checks.callbacks import MOST
 from twoloop.kernels import advance
-from twoloop.kernels.data import codes, noted
+from twoloop.kernels.data import indices
 from twoloop.kernels.linalg import symbolic_factorization as static_program
 from twoloop.run.static_form import static_form
 from twoloop.run.workspace import kit_of, workspace
@@ -32,9 +32,9 @@ class Started:
             self.work = workspace(system, self.kit, np.zeros((0, 0)), q, 1e-8, 0.0, ranks, form)
             state = np.concatenate([q, v, np.zeros(n + system.n_c)])
             self.code = advance.start(self.kit, self.work, 0.0, state)
-            if self.code != codes.RANK_DIFFERS:
+            if self.code != indices.RANK_DIFFERS:
                 break
-            ranks = (int(self.work.notes[noted.RANK]),) * 2
+            ranks = (int(self.work.notes[indices.RANK]),) * 2
         self.a, self.lam, self.rank = state[2 * n : 3 * n], state[3 * n :], len(self.work.rows_v)
 
 
@@ -43,9 +43,9 @@ def compare(assembly):
     system = assembly.system("random")
     v = assembly.v(system)
     exact, started = dense_solution(system, assembly.q, v), Started(system, assembly.q, v)
-    if started.code == codes.NEEDS_DENSE:
+    if started.code == indices.NEEDS_DENSE:
         return None
-    assert started.code == codes.DONE and started.rank == exact.rank
+    assert started.code == indices.DONE and started.rank == exact.rank
     return exact.error(started.a, started.lam)
 
 

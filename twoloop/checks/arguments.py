@@ -1,9 +1,10 @@
-"""Checks of what a user gives: each says which argument is wrong, what was given, what was expected, what to do."""
+"""Check arguments; each message says which is wrong, what was given, what is expected, and what to do."""
 
 import inspect
 import math
 import os
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from pathlib import Path
 from types import FunctionType
 from typing import Any, TypeGuard
@@ -306,3 +307,17 @@ def _check_each(times: Array, t0: float, t1: float, spacing: float) -> None:
                 f"t_eval must not come within rounding of the end {end!r} of t_span; given "
                 f"{float(times[beside][0])!r}: give that end itself"
             )
+
+
+def needed(module: str, package: str, what: str) -> Any:
+    """Import a module of a package that is not among the dependencies.
+
+    Raises
+    ------
+    ImportError
+        If it is not installed; says what needs it and how to install it.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise ImportError(f"{what} needs the package {package}: pip install {package}") from error

@@ -1,25 +1,220 @@
-"""The check of a start: consistent, of full rank, finite."""
+"""Check the state at the start: consistent, of full rank, finite.
 
-from __future__ import annotations  # ArrayLike stays a word in help()
+A violation is measured by the correction that would put the state right.
+"""
+
+from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.linalg import lapack
 
 from twoloop.checks.arguments import Array
-from twoloop.checks.at_position import SINGULAR_MASS, not_finite, place_of_mass, ways
-from twoloop.checks.bounds import check_bounds
+from twoloop.checks.callbacks import UNSYMMETRIC, check_bounds, unsymmetric_mass
 from twoloop.checks.derivatives import check_derivatives
-from twoloop.checks.scales import EPS, NONE, scales_of
-from twoloop.checks.sparse_rows import largest_in_rows
-from twoloop.checks.values import UNSYMMETRIC, unsymmetric_mass
-from twoloop.checks.violation import ROUNDING, Violation, is_at_rounding, surely_consistent
+from twoloop.checks.differences import defined
+from twoloop.checks.scales import EPS, NONE, Scales, generic_factors, scales_of, signs
+from twoloop.checks.sparse_rows import Rows, SparseRows, largest_in_rows
+from twoloop.checks.structure import SINGULAR_MASS, least_solution, not_finite, place_of_mass, ways
 from twoloop.kernels.compile.linking import entry_point
 
 if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
+
+
+CONSISTENT = 1e-8  # correction that an initial state may need, relative to the size of the mechanism
+SURELY = 0.1  # of that: where no more is needed, there is no doubt
+TIED = 1e-6  # relative: corrections that exceed what is allowed by as much, of which the first is named
+NEIGHBOURS = 4  # of a position, at which constraints are looked at for rounding
+MOST_NOISE = 1e-11  # of the largest coordinate: what counts as rounding of a constraint
+NO_INERTIA = 1e-12  # of the largest: singular values of M in such units that are rounding of zero
+ROUNDING = 64.0  # times the spacing of floating-point numbers: what rounding of the state may add to it
+
+
+def surely_consistent(
+    system: ConstrainedSystem,
+    t: float,
+    q: Array,
+    v: Array,
+    mass: Array,
+    force: Array,
+    rows: Array,
+    C: Array,
+    rates: Array,
+) -> bool:
+    """Whether `Violation` would accept a state beyond doubt, without singular values.
+
+    Corrections are the same; they must be less than a share of what is accepted, without what rounding explains, and
+    with the least that accelerations M^-1 Q can be.
+    """
+    scales = scales_of(system, t, q, rows)
+    fastest = np.where(rows != 0.0, np.abs(v) / scales.columns, 0.0).max(axis=1)
+    speeds = np.maximum(fastest, np.abs(rates) / scales.rows)
+    if lapack.dpotrf(mass)[1] == 0:
+        pull = float((np.abs(force) / (np.abs(mass) @ scales.columns)).max())
+        speeds = np.maximum(speeds, np.sqrt(scales.reach * pull))
+    if not _surely_small(rows, rows @ v + rates, scales, speeds):
+        return False
+    if system.n_a > 0:
+        if system.n_c == 0:
+            return True
+        rows = rows[: system.n_c]
+        scales = scales_of(system, t, q, rows)
+    consistent = _surely_small(rows, C, scales, scales.reach)
+    if consistent:
+        scales.keep(system, q, rows)
+    return consistent
+
+
+def _surely_small(rows: Array, values: Array, scales: Scales, per_row: Array) -> bool:
+    """Whether the correction that values ask for, and what it leaves, are far below what is accepted."""
+    found = least_solution(scales.scaled(rows), values / scales.rows)
+    if found is None:
+        return False
+    x, left = found
+    allowed = SURELY * CONSISTENT * scales.by_coordinate(per_row, rows)
+    small = np.abs(scales.columns * x) <= allowed
+    return bool(small.all() and (np.abs(left) <= SURELY * CONSISTENT * per_row).all())
+
+
+def is_at_rounding(values: Array, rows: Rows, state: Array, rate: Array | float = 0.0) -> bool:
+    """Whether values are no more than rounding of their terms, which needs no scales to be accepted.
+
+    For rows by their entries, whose scales take full matrices, of entries as well, as large as the largest of a row.
+    """
+    if isinstance(rows, SparseRows):
+        terms = rows.largest() * (rows.pattern() @ np.abs(state)) + np.abs(rate)
+        return bool((np.abs(values) <= ROUNDING * EPS * terms).all())
+    return bool((np.abs(values) <= ROUNDING * EPS * (abs(rows) @ np.abs(state) + np.abs(rate))).all())
+
+
+def _noise(q: Array, change: Callable[[Array], Array], rows: Array, largest: float) -> Array:
+    """What rounding of a position q changes in values of constraints, by what they change to its neighbours, (n_rows,).
+
+    `largest`: of the coordinates or velocities that the rows are multiplied by.
+    """
+    noise = np.zeros(len(rows))
+    for k in range(NEIGHBOURS):
+        noise = np.maximum(noise, np.abs(change(q * (1.0 + EPS * np.roll(signs(len(q)), k)))))
+    most = MOST_NOISE * largest * np.abs(rows).max(axis=1, initial=0.0)
+    return np.where(np.isfinite(noise), np.minimum(noise, most), 0.0)
+
+
+def _without_constraints(system: ConstrainedSystem, t: float, q: Array, v: Array, columns: Array) -> Array:
+    """Accelerations M^-1 Q; none in directions without inertia, which the constraints exclude, as of Euler parameters.
+
+    Rounding may leave such an M an inverse of 1e16, so it is cut off, in units in which the largest inertia of each
+    coordinate, here or a unit away, is 1.
+    """
+    mass, inertia = system.mass(t, q), np.zeros(len(q))
+    for each in (mass, defined(lambda: system.mass(t, q + columns * generic_factors(len(q))))):
+        if each is not None:
+            inertia = np.maximum(inertia, np.abs(np.diag(each)))
+    units = np.divide(1.0, np.sqrt(inertia), out=np.zeros(len(q)), where=inertia > 0.0)
+    force = system.force(t, q, v)
+    found: Array = units * np.linalg.lstsq(units[:, None] * mass * units, units * force, rcond=NO_INERTIA)[0]
+    return found
+
+
+class Violation:
+    """What a state violates, as the change of coordinates (or velocities) that would put it right.
+
+    Attributes
+    ----------
+    correction : ndarray (n_q,)
+        The Newton correction, by least squares with C_q, coordinates weighted by their scales.
+    allowed : ndarray (n_q,)
+        How much of it is accepted: 1e-8 of the mechanism's size, and rounding.
+    left : ndarray (n_c,)
+        What the correction leaves, where rows of C_q depend on one another or are zero; `allowed_left` with it.
+    """
+
+    def __init__(
+        self,
+        system: ConstrainedSystem,
+        t: float,
+        equation: str,
+        values: Array,
+        terms: Array,
+        jacobian: Array,
+        scales: Scales,
+        per_row: Array,
+        spacing: Array,
+    ):
+        self.system, self.t, self.equation, self.values = system, t, equation, values
+        scaled = scales.scaled(jacobian)
+        inverse = np.linalg.pinv(scaled, rcond=1e-10)
+        self.correction = -scales.columns * (inverse @ (values / scales.rows))
+        by_rounding = scales.columns * (np.abs(inverse) @ (terms / scales.rows)) + spacing
+        self.allowed = CONSISTENT * scales.by_coordinate(per_row, jacobian) + ROUNDING * EPS * by_rounding
+        self.left = np.abs(values + jacobian @ self.correction) / scales.rows
+        self.allowed_left = CONSISTENT * per_row + ROUNDING * EPS * terms / scales.rows
+
+    @classmethod
+    def of_position(cls, system: ConstrainedSystem, t: float, q: Array, jacobian: Array, scales: Scales) -> Violation:
+        """C(t, q) at a position."""
+        values, size = system.constraint(t, q), np.abs(q)
+
+        def change(beside: Array) -> Array:  # C may be a difference of terms that its derivatives do not show
+            return system.constraint(t, beside) - values - jacobian @ (beside - q)
+
+        noise = _noise(q, change, jacobian, float(size.max(initial=0.0)))
+        terms = np.maximum(np.abs(jacobian) @ size, noise / EPS)
+        return cls(system, t, "C(t, q)", values, terms, jacobian, scales, scales.reach, np.abs(q))
+
+    @classmethod
+    def of_velocity(
+        cls, system: ConstrainedSystem, t: float, q: Array, v: Array, jacobian: Array, scales: Scales
+    ) -> Violation:
+        """C_q v + C_t and A v + b, beside what is fast there: velocities, drives, what forces can bring about."""
+        rate = system.rates(t, q)
+        fastest = np.where(jacobian != 0.0, np.abs(v) / scales.columns, 0.0).max(axis=1)
+        pull = _without_constraints(system, t, q, v, scales.columns)
+        falling = np.sqrt(scales.reach * float(np.abs(pull / scales.columns).max()))
+        speeds = np.maximum(np.maximum(fastest, np.abs(rate) / scales.rows), falling)
+        equation, values = "C_q v + C_t" if system.n_a == 0 else "(C_q v + C_t, A v + b)", jacobian @ v + rate
+
+        def change(beside: Array) -> Array:  # rows turn
+            return system.rows(t, beside) @ v + system.rates(t, beside) - values
+
+        noise = _noise(q, change, jacobian, float(np.abs(v).max(initial=0.0)))
+        terms = np.maximum(np.abs(jacobian) @ np.abs(v) + np.abs(rate), noise / EPS)
+        return cls(system, t, equation, values, terms, jacobian, scales, speeds, np.abs(v))
+
+    @property
+    def excess(self) -> float:
+        """The largest correction over what is accepted; at most 1 where the state is consistent."""
+        parts = [(np.abs(self.correction), self.allowed), (self.left, self.allowed_left)]
+        return max(float((part[part > 0.0] / allowed[part > 0.0]).max(initial=0.0)) for part, allowed in parts)
+
+    def refuse(self, name: str) -> None:
+        """Raise unless the state is consistent."""
+        with np.errstate(divide="ignore"):
+            excess = self.excess
+        if excess <= 1.0:
+            return
+        row = int(np.abs(self.values).argmax())
+        raise ValueError(
+            f"{name} is not consistent with the constraints of {self.system.name!r}: max|{self.equation}| is "
+            f"{abs(self.values[row]):.3g} (row {row}) at t = {self.t:g}; {self._remedy(name)}"
+        )
+
+    def _remedy(self, name: str) -> str:
+        excesses = np.abs(self.correction) / np.maximum(self.allowed, 1e-300)
+        if excesses.max(initial=0.0) <= 1.0:
+            return (
+                "no small change puts it right, as rows of C_q are zero there or depend on one another. Take another "
+                "guess, and project it with twoloop.consistent_state(system, t, q, v)"
+            )
+        j = int(np.flatnonzero(excesses >= (1.0 - TIED) * excesses.max())[0])
+        of = "coordinate" if name == "q0" else "the velocity of coordinate"
+        return (
+            f"to put it right {of} {j} has to change by {abs(self.correction[j]):.3g}, and at most "
+            f"{self.allowed[j]:.1g} is accepted. Project it with twoloop.consistent_state(system, t, q, v)"
+        )
 
 
 LEAST = np.array([ROUNDING * EPS, UNSYMMETRIC, SINGULAR_MASS])  # as the kernel takes them

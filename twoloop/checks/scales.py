@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import Array
-from twoloop.checks.bounds import check_callback
+from twoloop.checks.callbacks import check_callback
 from twoloop.checks.sparse_rows import Rows, SparseRows, is_finite
 from twoloop.kernels.compile.linking import entry_point
 

@@ -1,20 +1,209 @@
-"""What a system says of its callbacks as a whole: M constant, a bandwidth, `kinematics` in the place of others."""
+"""Check M and the rows of C_q and A at a position: rank, pattern, definite and constant M, bandwidth, `kinematics`."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.linalg import lapack, null_space, qr
 
 from twoloop.checks.arguments import Array
+from twoloop.checks.callbacks import SAME, UNSYMMETRIC, unsymmetric_mass, wrong_values
 from twoloop.checks.differences import EPS, as_far_as_they_differ, defined
-from twoloop.checks.scales import generic_factors, generic_velocities, rows_at
-from twoloop.checks.values import SAME, UNSYMMETRIC, unsymmetric_mass, wrong_values
+from twoloop.checks.scales import generic_factors, generic_velocities, rows_at, scales_of
+from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.kernels.compile.linking import entry_point
 
 if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
+
+
+RANK_TOLERANCE = 1e-11  # of the largest diagonal entry of R
+SHOWN = 5  # rows that depend on others, of which the equations are written out
+MOST_TERMS, MOST_NAMED = 3, 8  # rows on which another depends: named with their coefficients, and named at all
+WEAK = 1e-9  # of the largest singular value: directions that a pseudo-inverse has beyond doubt
+NO_DIRECTION = 1e-12  # of a row: what rounding leaves of it without its part in others that it depends on
+
+
+def eigenvalues(matrix: Array) -> Array:
+    """Of a symmetric matrix, in order: LAPACK called at once takes a fifth of the time where it is small."""
+    values: Array = lapack.dsyevd(matrix, compute_v=0)[0]
+    return values
+
+
+def orthogonalised(rows: Array, least: float) -> tuple[Array, Array, list[int]]:
+    """Rows of length 1, the lower triangle that makes those rows of them that count, and which these are.
+
+    A row counts if more of it than the share `least` is no combination of those before.
+    """
+    from twoloop.kernels.linalg.rank import independent_rows
+
+    most, kept = min(rows.shape), np.zeros(len(rows), dtype=np.int64)
+    basis, factors = np.zeros((most + 1, rows.shape[1])), np.zeros((most + 1, most + 1))
+    n = entry_point(independent_rows)(np.ascontiguousarray(rows), least, basis, factors, kept)
+    return basis[:n], factors[:n, :n], kept[:n].tolist()
+
+
+def least_solution(rows: Array, values: Array) -> tuple[Array, Array] | None:
+    """What the pseudo-inverse of rows, of length 1 or less, makes of values, and what that leaves of these.
+
+    None where a direction is so weak that it may count or not.
+    """
+    from twoloop.kernels.linalg import rank as independent
+
+    n_rows, n_q = rows.shape
+    most, kept, x, left = min(n_rows, n_q) + 1, np.zeros(n_rows, dtype=np.int64), np.zeros(n_q), values.copy()
+    basis, factors, shares = np.zeros((most, n_q)), np.zeros((most, most)), np.zeros((n_rows, most))
+    gram, parts = np.zeros((n_rows, n_rows)), np.zeros((2, n_rows))
+    room = basis, factors, kept, shares, gram, parts
+    n = entry_point(independent.least_solution)(np.ascontiguousarray(rows), left, NO_DIRECTION, *room, x)
+    inverse = entry_point(independent.size_of_inverse)(factors, n, parts[0])
+    return (x, left) if WEAK * math.sqrt(n_rows) * inverse < 1.0 else None
+
+
+def surely_above(ratio: float, rows: Array, rank: int) -> bool:
+    """Whether so many singular values are above this share of the largest, by bounds that cost less than these."""
+    from twoloop.kernels.linalg.rank import singular_values_exceed, size_of_inverse
+
+    if rank == len(rows) > 0 and entry_point(singular_values_exceed)(
+        np.ascontiguousarray(rows), ratio, np.empty((rank, rank))
+    ):
+        return True
+    _, factors, kept = orthogonalised(rows, NO_DIRECTION)
+    if len(kept) != rank or rank == 0:
+        return False
+    inverse = entry_point(size_of_inverse)(np.ascontiguousarray(factors), rank, np.zeros(rank))
+    return bool(ratio * float(np.linalg.norm(rows)) * inverse < 1.0)
+
+
+def redundant_rows(scaled: Array) -> list[int]:
+    """Rows of a Jacobian, scaled to like size, that depend on the others, by QR with pivoting."""
+    if scaled.size == 0:
+        return []
+    R, order = qr(scaled.T, mode="r", pivoting=True)
+    diagonal = np.abs(np.diagonal(R))
+    rank = int((diagonal > RANK_TOLERANCE * diagonal.max()).sum())
+    return sorted(order[rank:].tolist())
+
+
+def in_words(jacobian: Array, redundant: list[int]) -> str:
+    """Which rows depend on which others, with the coefficients where these are few: many differ from start to start."""
+    from twoloop.kernels.linalg.rank import shares_of_others
+
+    (n_rows, n_q), shown = jacobian.shape, redundant[:SHOWN]
+    others = [i for i in range(n_rows) if i not in redundant]
+    most, rest = min(len(others), n_q) + 1, np.empty((len(others), n_q))
+    lengths, shares = np.zeros(n_rows), np.zeros((len(shown), len(others)))
+    order, kept = np.array([*others, *shown]), np.zeros(n_rows, dtype=np.int64)
+    room = np.zeros((most, n_q)), np.zeros((most, most)), kept
+    if not entry_point(shares_of_others)(
+        np.ascontiguousarray(jacobian), order, RANK_TOLERANCE, rest, *room, shares, lengths
+    ):
+        shares[:] = np.linalg.lstsq(rest.T, jacobian[shown].T, rcond=None)[0].T
+    return equations_in_words(redundant, others, shares, lengths)
+
+
+def equations_in_words(redundant: list[int], others: list[int], shares: Array, lengths: Array) -> str:
+    """The same from the shares (SHOWN, n) that the others have in the first rows, and the lengths of all rows."""
+    equations = []
+    counts = np.abs(shares) * lengths[others] > 1e-9 * lengths[redundant[: len(shares)], None]
+    for i, factors, which in zip(redundant, shares.tolist(), counts, strict=False):
+        of = which.nonzero()[0].tolist()
+        if len(of) > MOST_TERMS:
+            named = ", ".join(str(others[k]) for k in of[:MOST_NAMED])
+            also = f" and {len(of) - MOST_NAMED} more" if len(of) > MOST_NAMED else ""
+            equations.append(f"row {i} on rows {named}{also}")
+            continue
+        terms = " + ".join([f"{factors[k]:.4g} row {others[k]}" for k in of])
+        equations.append(f"row {i} = {terms.replace('+ -', '- ') or '0'}")
+    more = ", ..." if len(redundant) > SHOWN else ""
+    return f"row(s) {redundant} depend on the others ({', '.join(equations)}{more})"
+
+
+NEARBY = (0.0, 1e-3, 1e-2, 3e-2)  # of the coordinates: where the pattern of C_q is looked at
+SINGULAR_MASS = 1e-12  # smallest eigenvalue over largest entry, below which M may have no inverse
+
+
+def pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
+    """1 where C_q or A has an entry at a position or near it, (n_c + n_a, n_q); not to be written to."""
+    return system.remembered_at("pattern", (t, q.tobytes()), lambda: _pattern_of(system, t, q))
+
+
+def _pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
+    size = np.maximum(np.abs(q), np.abs(q).max())
+    rows, defined = rows_at(system, t, q + size * ways(system.n_q))  # what is missed is found on the way
+    return (rows[defined] != 0.0).any(axis=0).astype(float)
+
+
+@cache
+def ways(n_q: int) -> Array:
+    """How far positions near one are from it, (len(NEARBY), n_q), over its size: always the same."""
+    return np.array(NEARBY)[:, None] * np.random.default_rng(4).uniform(-1.0, 1.0, (len(NEARBY), n_q))
+
+
+def mass_and_rows(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array]:
+    """M, and C_q with A, at a position; not to be written to."""
+    return system.remembered_at("mass and rows", (t, q.tobytes()), lambda: (system.mass(t, q), system.rows(t, q)))
+
+
+def has_definite_mass(system: ConstrainedSystem, t: float, q: Array) -> bool:
+    """Whether M has an inverse at a position, and not only on velocities that the constraints allow."""
+    return system.remembered_at("definite mass", place_of_mass(system, t, q), lambda: is_definite(system.mass(t, q)))
+
+
+def is_definite(mass: Array) -> bool:
+    """Whether M has an inverse."""
+    return bool(eigenvalues(mass)[0] > SINGULAR_MASS * np.abs(mass).max())
+
+
+def place_of_mass(system: ConstrainedSystem, t: float, q: Array) -> Any:
+    """What a mass matrix depends on."""
+    return None if system.constant_mass else (t, q.tobytes())
+
+
+def parts_of(value: Array | tuple[Array, ...]) -> tuple[Array, ...]:
+    """The arrays that a callback fills, of which "kinematics" has several."""
+    return value if isinstance(value, tuple) else (value,)
+
+
+def not_finite(system: ConstrainedSystem, t: float, q: Array, v: Array) -> str | None:
+    """Which callbacks give values that are not finite at (t, q, v); None: all are."""
+    state = {"q": q, "v": v, "lam": np.ones(system.n_c)}
+    looked = [kind for kind in system.given if kind not in system.entries]  # whose values are looked at
+    values = {kind: system.evaluate(kind, t, *[state[name] for name in KINDS[kind].state]) for kind in looked}
+    wrong = [kind for kind, value in values.items() if not all(np.isfinite(part).all() for part in parts_of(value))]
+    return f"{' and '.join(wrong)} of {system.name!r} returned values that are not finite" if wrong else None
+
+
+def dependent_rows(system: ConstrainedSystem, t: float, q: Array) -> str:
+    """Which rows of C_q(t, q) depend on the others, in words."""
+    jacobian = system.rows(t, q)
+    rows = redundant_rows(scales_of(system, t, q, jacobian).scaled(jacobian))
+    if rows:
+        return in_words(jacobian, rows)
+    values = np.linalg.svd(jacobian, compute_uv=False)
+    return (
+        "or so nearly that Newton cannot tell: its smallest singular value at the last state is "
+        f"{values[-1] / values[0]:.1g} of the largest"
+    )
+
+
+def least_inertia(system: ConstrainedSystem, t: float, q: Array) -> tuple[float, str]:
+    """Smallest over largest eigenvalue of T^T M T, and which coordinates move in the motion that it belongs to."""
+    mass, rows = system.mass(t, q), system.rows(t, q)
+    free = null_space(rows) if len(rows) > 0 else np.eye(system.n_q)
+    if free.shape[1] == 0:
+        return 1.0, "the constraints allow no motion"
+    energies, motions = np.linalg.eigh(free.T @ mass @ free)
+    motion = np.abs(free @ motions[:, 0])
+    coordinates = np.flatnonzero(motion > 0.1 * motion.max()).tolist()
+    return float(energies[0] / max(energies[-1], np.finfo(np.float64).tiny)), (
+        f"a motion of coordinate(s) {coordinates}, which the constraints allow, has next to no inertia, or a negative "
+        f"one: the smallest eigenvalue of T^T M T is {energies[0]:.3g}, the largest {energies[-1]:.3g}"
+    )
 
 
 NEAR = 1e-3  # of the coordinates: also looked at a little off the start, where symmetry hides terms

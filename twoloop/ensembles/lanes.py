@@ -21,8 +21,8 @@ from twoloop.generate.program import Arrays, Program
 from twoloop.generate.series import series_for
 from twoloop.generate.time_dependence import BY_TIME, TIME, may_be_narrow, may_be_sudden
 from twoloop.generate.trace import Equations
-from twoloop.kernels.control.sudden import FLOOR, LEAST, SHARE, STEEPER  # what counts as sudden in single runs
-from twoloop.kernels.control.sudden import PLACES as N_PLACES
+from twoloop.kernels.control.force_discontinuities import FLOOR, LEAST, SHARE, STEEPER
+from twoloop.kernels.control.force_discontinuities import N_SAMPLES as N_PLACES
 from twoloop.kernels.lanes import layout
 from twoloop.kernels.layout import cached_run
 from twoloop.methods import dop853
@@ -221,11 +221,11 @@ def _options(method: Method, n: int, rtol: float, atol: float) -> Array:
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-PLACES = 100  # of a run, at least as many at which the equations are looked at ...
+N_SAMPLES = 100  # of a run, at least as many at which the equations are looked at ...
 OF_SUDDEN = 20  # ... times as many where a force may act for a short time: lanes do not look ahead
 SMALLEST, LARGEST = 128, 4096  # runs of a block; numbers of all of a block's runs are made at once
 FOR_EACH = 3  # blocks for each of several threads, so that all end at about the same time
-LOOKS = PLACES * OF_SUDDEN
+LOOKS = N_SAMPLES * OF_SUDDEN
 SHORT = min(layout.NO_START, layout.UNLIKE) - 1  # beside what layout.py says
 AGREES = 1e-7  # of the terms of an equation: what rounding may leave of it at the end of a run
 
@@ -261,7 +261,7 @@ class LaneRuns:
         of_all = generic_system(system, starts)
         sudden = may_be_sudden(of_all, ran_on_symbols=True)
         unseen = 1.0 if may_be_narrow(of_all, ran_on_symbols=True) else method.unseen
-        self.places = LOOKS if any(sudden) else PLACES * unseen
+        self.places = LOOKS if any(sudden) else N_SAMPLES * unseen
         self.looks = ShortLooks(system, generic, varying) if sudden.by_time else None
         choice = Choice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
         kind = ("lanes", method.series, method.tableau is None, choice, tuple(varying))  # of which the latest is kept

@@ -79,7 +79,7 @@ def generic_system(system: ConstrainedSystem, starts: Starts) -> ConstrainedSyst
 
 def kit_to_write(system: ConstrainedSystem) -> tuple[Any, NDArray[np.int64]]:
     """The callbacks with parameters of their own that a kernel may write, and n_q, n_c and the place of the first."""
-    from twoloop.kernels.data.kit import Kit
+    from twoloop.kernels.data.common import Kit
 
     own = system.with_parameters(system.parameters) if system.parameters.size else system
     return Kit(own.functions), np.array([system.n_q, system.n_c, int(system.called_in_python)], dtype=np.int64)

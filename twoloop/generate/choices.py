@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.at_position import mass_and_rows
+from twoloop.checks.structure import mass_and_rows
 from twoloop.generate.graph import Untraceable
 from twoloop.generate.trace import Equations
 from twoloop.generate.trace_cache import shared_cache

@@ -29,7 +29,7 @@ from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.generated_functions import DeferredFunctions, generated_functions
 from twoloop.kernels.data import collocation as at
 from twoloop.kernels.data.collocation import LANES
-from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL
+from twoloop.kernels.data.indices import ATOL, ESTIMATE, RTOL
 
 Array = NDArray[np.float64]
 LONGEST = 5000  # operations of the equations: code of as many takes 2 s to compile

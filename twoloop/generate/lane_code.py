@@ -43,8 +43,7 @@ from twoloop.generate.series import series_program
 from twoloop.generate.trace import Equations
 from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.generated_functions import GeneratedFunctions, are_cached, generated_functions
-from twoloop.kernels.control.defect import ROUNDING
-from twoloop.kernels.control.predictor import FLOOR, LEAST, SHARE_OF_MOTION, SHARE_THROUGH_ZERO
+from twoloop.kernels.control.step_size import FLOOR, LEAST, ROUNDING, SHARE_OF_MOTION, SHARE_THROUGH_ZERO
 from twoloop.kernels.lanes import layout as lanes
 from twoloop.kernels.lanes.layout import CODE
 from twoloop.problem.system import ConstrainedSystem
@@ -766,5 +765,5 @@ def _stamp() -> str:
     """Return a digest of what writes the code, and of the kernels that it goes with."""
     from twoloop.kernels.data import common
 
-    kernels = ("lanes.explicit", "control.defect", "control.predictor")
+    kernels = ("lanes.explicit", "control.step_size")
     return digest_of("".join(map(common.stamp, kernels)), __file__, *WRITERS)

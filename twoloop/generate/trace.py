@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.checks.bounds import place_of
+from twoloop.checks.callbacks import place_of
 from twoloop.generate.graph import FUNCTIONS, Affine, Derivative, Graph, Untraceable, symbols
 from twoloop.generate.parameter_expressions import (
     OPERATORS,

@@ -14,7 +14,7 @@ from twoloop.generate.program import AGREES, BETWEEN, STATES, OperationTable
 from twoloop.generate.trace import as_forms, trace
 from twoloop.generate.traced_values import unchecked
 from twoloop.kernels.compile.linking import entry_point
-from twoloop.kernels.data import codes, noted
+from twoloop.kernels.data import indices
 from twoloop.methods.dop853 import DOP853
 from twoloop.problem.description import Stop
 from twoloop.problem.system import ConstrainedSystem
@@ -217,7 +217,7 @@ class Accelerations:
         # any explicit method would do: only the accelerations at the start of its steps are used
         plan = DOP853().plan(system.n_q, 1e-8, 1e-8, False)
         self._run = Run(derived, plan, t, q, v, 1e-8, atol, None)
-        self._run.work.notes[noted.GENERATION] = 1.0  # the run has determined the ranks
+        self._run.work.notes[indices.GENERATION] = 1.0  # the run has determined the ranks
         self._n = system.n_q
         self._last: tuple[tuple[float, bytes, bytes], Array] | None = None
 
@@ -226,7 +226,7 @@ class Accelerations:
         run, n, key = self._run, self._n, (t, q.tobytes(), v.tobytes())
         if self._last is None or self._last[0] != key:  # the events of all rows ask for the same state
             state = np.concatenate([q, v, np.zeros(len(run.state) - 2 * n)])
-            if entry_point(run.kernels.start)(run.kit, run.work, t, state) != codes.DONE:
+            if entry_point(run.kernels.start)(run.kit, run.work, t, state) != indices.DONE:
                 state[2 * n :] = np.nan
             self._last = key, state
         state = self._last[1]

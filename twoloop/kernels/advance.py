@@ -5,39 +5,44 @@
 
 import numpy as np
 
-from twoloop.kernels.control import clock as at
-from twoloop.kernels.control.controller import EXPONENT, FACTOR_MIN, SAFETY, factor_of, remember
-from twoloop.kernels.control.landing import NEAR, off_grid, on_grid
-from twoloop.kernels.control.progress import count_step
-from twoloop.kernels.control.singular import (
+from twoloop.kernels.control import loop_state as at
+from twoloop.kernels.control.force_discontinuities import limit_to_discontinuity
+from twoloop.kernels.control.loop_state import EXPONENT, FACTOR_MIN, SAFETY
+from twoloop.kernels.control.singular_positions import (
     SHORT,
+    check_partition,
     ends_at_singular,
-    look_at_partition,
-    lost_at_singular,
+    fails_at_singular,
     near_singular,
-    note_output,
-    with_care,
+    record_pivot_at_output,
+    retry_with_care,
 )
-from twoloop.kernels.control.sudden import up_to_sudden
-from twoloop.kernels.data.codes import DONE, INNER_DIVERGED, NEEDS_DENSE, NOT_FINITE, NOT_LOADED, SINGULAR, UNSUITED
+from twoloop.kernels.control.step_size import NEAR, count_step, factor_of, off_grid, on_grid, record_accepted
 from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, WORK, f8, i8, kernel, merged
-from twoloop.kernels.data.counters import (
+from twoloop.kernels.data.indices import (
+    DEFECT,
+    DONE,
+    FAULT_KIND,
+    FORM,
+    GAMMA_GIVEN,
+    GAP,
+    INNER_DIVERGED,
+    KINK_AFTER,
+    KINK_BEFORE,
     N_ACCEPTED,
     N_REJECTED_CONVERGENCE,
     N_REJECTED_ERROR,
-)
-from twoloop.kernels.data.flags import FORM, GAMMA_GIVEN, STATIC
-from twoloop.kernels.data.noted import (
-    DEFECT,
-    FAULT_KIND,
-    KINK_AFTER,
-    KINK_BEFORE,
+    NEEDS_DENSE,
+    NOT_FINITE,
+    NOT_LOADED,
     ORIENTATION,
     ORIENTATION_NEW,
     PIVOT,
+    SINGULAR,
+    STATIC,
+    UNSUITED,
 )
-from twoloop.kernels.data.tolerances import GAP
 from twoloop.kernels.evaluation.drive_discontinuities import (
     JUMP,
     RAMP,
@@ -139,15 +144,15 @@ def _failed(f, w, control, clock, t, size, code, retried, state):
     """
     n = w.Q.size
     poor = code in (SINGULAR, INNER_DIVERGED)
-    if code == NEEDS_DENSE or lost_at_singular(f, clock, size):
-        return at.HAS_TO_BE_DENSE
+    if code == NEEDS_DENSE or fails_at_singular(f, clock, size):
+        return at.NEEDS_DENSE
     w.counters[N_REJECTED_CONVERGENCE] += 1
-    if with_care(f, w, control, clock, size):
-        return at.GO_ON
+    if retry_with_care(f, w, control, clock, size):
+        return at.CONTINUE
     clock[at.FAILURE_CODE] = code
     clock[at.H_FAILED] = size
-    if code in (NOT_FINITE, UNSUITED) and control[at.GIVES_WAY] == 1.0:
-        return at.HAS_TO_GIVE_WAY
+    if code in (NOT_FINITE, UNSUITED) and control[at.MAY_SWITCH] == 1.0:
+        return at.SWITCH_METHOD
     if control[at.FIXED_STEP] > 0.0:
         if not poor or t == retried:
             return at.NEAR_SINGULAR if near_singular(f, w, control, clock, t, state[:n]) else at.FIXED_STEP_FAILED
@@ -158,8 +163,8 @@ def _failed(f, w, control, clock, t, size, code, retried, state):
         clock[at.LIMIT_AGE] = 0.0
         clock[at.H_NEXT] = 0.5 * size
     if poor and renew_partition(f, w, t, state[:n]) != DONE:
-        return at.HAS_TO_BE_DENSE if f.flags[FORM] == STATIC else at.RANK_LOST
-    return at.GO_ON
+        return at.NEEDS_DENSE if f.flags[FORM] == STATIC else at.RANK_LOST
+    return at.CONTINUE
 
 
 @merged
@@ -168,20 +173,20 @@ def _refused(f, w, control, clock, t, size, proposal, state):
     n = w.Q.size
     w.counters[N_REJECTED_ERROR] += 1
     clock[at.FAILURE_CODE] = DONE
-    if with_care(f, w, control, clock, size):
-        return at.GO_ON
+    if retry_with_care(f, w, control, clock, size):
+        return at.CONTINUE
     clock[at.H_NEXT] = min(proposal, REFUSED * size, size - np.spacing(abs(t + size)))
-    if lost_at_singular(f, clock, size):
-        return at.HAS_TO_BE_DENSE
+    if fails_at_singular(f, clock, size):
+        return at.NEEDS_DENSE
     if size < SHORT * clock[at.H_LONG] and near_singular(f, w, control, clock, t, state[:n]):
         return at.NEAR_SINGULAR
-    return at.GO_ON
+    return at.CONTINUE
 
 
 @merged
 def _may_go_on(control, clock):
     """Whether the method makes steps in a row, and nothing else has to be looked at before each of them."""
-    if control[at.IN_A_ROW] == 0.0 or control[at.FIXED_STEP] > 0.0 or clock[at.LEAPS] == 1.0:
+    if control[at.MAKES_MANY] == 0.0 or control[at.FIXED_STEP] > 0.0 or clock[at.APPLIES_JUMP] == 1.0:
         return False
     if control[at.SPACING] > 0.0 or clock[at.T] == clock[at.JUMP_FROM]:
         return False
@@ -191,7 +196,7 @@ def _may_go_on(control, clock):
 @merged
 def _was_last(f, w, clock, outputs, state):
     """Go on to the next output time from one that was reached; whether there is none."""
-    note_output(f, w, clock, state)
+    record_pivot_at_output(f, w, clock, state)
     clock[at.NEXT_OUTPUT] += 1.0
     return int(clock[at.NEXT_OUTPUT]) == outputs.size
 
@@ -240,15 +245,15 @@ def advance(
                 attempts += made
                 if lands and _was_last(f, w, clock, outputs, state):
                     return at.ALL_OUTPUT_DONE
-                end = look_at_partition(f, w, control, clock, out_steps[filled[1] - 1, at.H], lands, state)
-                if end != at.GO_ON:
+                end = check_partition(f, w, control, clock, out_steps[filled[1] - 1, at.H], lands, state)
+                if end != at.CONTINUE:
                     return end
                 continue
         attempts += 1.0
         t = clock[at.T]
-        leaps = clock[at.LEAPS] == 1.0
+        leaps = clock[at.APPLIES_JUMP] == 1.0
         if t == clock[at.JUMP_FROM] and not leaps:
-            return at.AT_JUMP
+            return at.AT_DISCONTINUITY
         target = outputs[int(clock[at.NEXT_OUTPUT])]
         goal = min(target, clock[at.JUMP_TO] if leaps else clock[at.JUMP_FROM])
         h = control[at.FIXED_STEP] if fixed else min(clock[at.H_NEXT], clock[at.H_LIMIT], control[at.MAX_STEP])
@@ -262,9 +267,9 @@ def advance(
         if reaches:
             size = goal - t
         may_look = control[at.SPACING] > 0.0 and (control[at.BY_TIME] == 1.0 or size > control[at.SPACING])
-        if (may_look or t < clock[at.ALONG] < t + size) and not leaps:
+        if (may_look or t < clock[at.DISCONTINUITY_OF_MOTION] < t + size) and not leaps:
             whole, last = size, outputs[outputs.size - 1]
-            size = up_to_sudden(f, w, tolerances, control, clock, t, whole, last, state)
+            size = limit_to_discontinuity(f, w, tolerances, control, clock, t, whole, last, state, new_state)
             if size < whole:
                 reaches, lands, shortened = False, False, True
         if not reaches and size <= max(NEAR * np.spacing(abs(t)), control[at.SHORTEST]):
@@ -273,14 +278,14 @@ def advance(
             f, w, options, memory, tolerances, control, clock, t, size, leaps, state, new_state
         )
         if code == NOT_LOADED:
-            return at.HAS_TO_LOAD
+            return at.NEEDS_COMPILATION
         # at a jump the embedded formula may agree by chance: until the place is passed, the estimate has to be smaller
         strict = control[at.ROUGH] if t < clock[at.ROUGH_TO] else 1.0
         accepted = code == DONE and error * strict <= 1.0
         if accepted and not reaches and ends_at_singular(f, w, control, clock):
             f.settle(f, w, options, memory, tolerances, False)
             w.counters[N_REJECTED_ERROR] += 1
-            if not with_care(f, w, control, clock, size):
+            if not retry_with_care(f, w, control, clock, size):
                 clock[at.H_NEXT], clock[at.PIVOT_HERE] = 0.5 * size, w.notes[PIVOT]
             continue
         driven = control[at.DRIVEN] == 1.0 and not leaps
@@ -293,7 +298,7 @@ def advance(
             f.settle(f, w, options, memory, tolerances, accepted)
         if code != DONE:
             end = _failed(f, w, control, clock, t, size, code, retried, state)
-            if end != at.GO_ON:
+            if end != at.CONTINUE:
                 return end
             if fixed:
                 retried = t
@@ -311,7 +316,7 @@ def advance(
             continue
         if not accepted:
             end = _refused(f, w, control, clock, t, size, proposal, state)
-            if end != at.GO_ON:
+            if end != at.CONTINUE:
                 return end
             continue
         if w.rows_v.size < w.Rate.size and check_redundant(f, w, t + size, new_state[:n], new_state[n : 2 * n]) != DONE:
@@ -319,14 +324,14 @@ def advance(
             return at.ROWS_VIOLATED
         count_step(w, tolerances, control, clock, size, out_steps[filled[1]])
         filled[1] += 1
-        remember(control, clock, size, error)
+        record_accepted(control, clock, size, error)
         clock[at.N_FIXED] += in_grid
         if reaches:
             clock[at.T] = goal
         else:
             clock[at.T] = clock[at.T_START] + clock[at.N_FIXED] * h if fixed else t + size
         if leaps:
-            clock[at.JUMP_FROM], clock[at.LEAPS] = np.inf, 0.0
+            clock[at.JUMP_FROM], clock[at.APPLIES_JUMP] = np.inf, 0.0
         copy(new_state, state)
         if lands or control[at.STORE_ALL] == 1.0:
             out_t[filled[0]] = clock[at.T]
@@ -341,13 +346,13 @@ def advance(
         if lands and _was_last(f, w, clock, outputs, state):
             return at.ALL_OUTPUT_DONE
         if fixed and not lands:
-            note_output(f, w, clock, state)
-        if FIRST_JUDGED <= w.counters[N_ACCEPTED] <= control[at.PROVISIONAL] and clock[at.H_NEXT] <= tolerances[GAP]:
+            record_pivot_at_output(f, w, clock, state)
+        if FIRST_JUDGED <= w.counters[N_ACCEPTED] <= control[at.TRIAL_STEPS] and clock[at.H_NEXT] <= tolerances[GAP]:
             clock[at.H_FAILED] = clock[at.H_NEXT]
-            return at.HAS_TO_GIVE_WAY
+            return at.SWITCH_METHOD
         if leaps:
             return at.PAUSED
         if control[at.SYMMETRIC] == 0.0:
-            end = look_at_partition(f, w, control, clock, size, lands, state)
-            if end != at.GO_ON:
+            end = check_partition(f, w, control, clock, size, lands, state)
+            if end != at.CONTINUE:
                 return end

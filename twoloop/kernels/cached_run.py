@@ -16,14 +16,23 @@ import numpy as np
 from numba import types
 
 from twoloop.kernels.compile.reference import Reference
-from twoloop.kernels.control import clock as at
-from twoloop.kernels.control.sudden import PLACES
-from twoloop.kernels.data import codes, noted
-from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, WORK, exact, f8, i8, kernel, merged
-from twoloop.kernels.data.counters import N_ACCEPTED, N_COUNTERS
-from twoloop.kernels.data.finite import finite_vector
-from twoloop.kernels.data.flags import FORM
-from twoloop.kernels.data.tolerances import GAP, LONGEST_UNSEEN, LOOK
+from twoloop.kernels.control import loop_state as at
+from twoloop.kernels.control.force_discontinuities import N_SAMPLES
+from twoloop.kernels.data import indices
+from twoloop.kernels.data.common import (
+    INTEGERS,
+    KIT,
+    MATRIX,
+    VECTOR,
+    WORK,
+    exact,
+    f8,
+    finite_vector,
+    i8,
+    kernel,
+    merged,
+)
+from twoloop.kernels.data.indices import FORM, GAP, LONGEST_UNSEEN, LOOK, N_ACCEPTED, N_COUNTERS
 from twoloop.kernels.evaluation.checks import CONSISTENT, DEFINITE, IN_ORDER, INDEFINITE
 
 ROUNDING = 1e-15  # of the largest coordinate: corrections of this size are rounding
@@ -45,9 +54,9 @@ def prepare_work(w, numbers, integers, pattern, q, accuracy, reuse):
     rounded = 0.0
     for j in range(q.size):
         rounded = max(rounded, ROUNDING * abs(q[j]))
-    w.notes[noted.ROUNDED], w.notes[noted.REUSE] = rounded, max(reuse, rounded)
-    w.notes[noted.GAMMA_REQUIRED], w.notes[noted.GAMMA_SHARE] = accuracy, 1.0
-    w.notes[noted.KINK_BEFORE], w.notes[noted.KINK_AFTER] = -math.inf, math.inf
+    w.notes[indices.ROUNDED], w.notes[indices.REUSE] = rounded, max(reuse, rounded)
+    w.notes[indices.GAMMA_REQUIRED], w.notes[indices.GAMMA_SHARE] = accuracy, 1.0
+    w.notes[indices.KINK_BEFORE], w.notes[indices.KINK_AFTER] = -math.inf, math.inf
 
 
 @kernel(types.void(WORK, VECTOR, INTEGERS, MATRIX, VECTOR, f8, f8))
@@ -88,8 +97,8 @@ def _limit_steps(control, tolerances, span, longest, within):
     """Let no hundredth of a run pass unseen. `within`: its steps look within, and may be as long as that is."""
     gap = LONGEST_UNSEEN * span
     tolerances[GAP], tolerances[LOOK] = gap, gap / (SHARPER if control[at.BY_STATE] > 0.0 else 1.0)
-    control[at.MAX_STEP] = longest if within else min(longest, gap / control[at.UNSEEN])
-    control[at.APART] = gap / PLACES
+    control[at.MAX_STEP] = longest if within else min(longest, gap / control[at.MAX_EVALUATION_GAP])
+    control[at.APART] = gap / N_SAMPLES
     control[at.SPACING] = control[at.APART] if control[at.BY_TIME] + control[at.BY_STATE] > 0.0 else 0.0
 
 
@@ -251,12 +260,12 @@ def _start_run(f, given, w, b, t, t1, q, v, sizes, sure):
     b.clock[at.T] = b.clock[at.T_START] = t
     prepare_work(w, b.lasting, b.lasting_integers, b.pattern, q, b.constants[ACCURACY], b.constants[REUSE])
     _copy(b.lapack, w.lapack[: b.lapack.size])
-    w.notes[noted.NEARLY_SINGULAR] = b.constants[NEARLY_SINGULAR]
-    if b.start(f, w, t, b.state) != codes.DONE or not _left_out_rows_hold(w, b, n):
+    w.notes[indices.NEARLY_SINGULAR] = b.constants[NEARLY_SINGULAR]
+    if b.start(f, w, t, b.state) != indices.DONE or not _left_out_rows_hold(w, b, n):
         return REFUSED
-    if w.notes[noted.PIVOT] < b.constants[LEAST_PIVOT]:
+    if w.notes[indices.PIVOT] < b.constants[LEAST_PIVOT]:
         return REFUSED
-    w.notes[noted.KINK_AFTER] = t1
+    w.notes[indices.KINK_AFTER] = t1
     if b.control[at.FIXED_STEP] == 0.0:
         span, first, within = t1 - t, b.constants[FIRST], b.constants[LOOKS_WITHIN] > 0.0
         _limit_steps(b.control, b.tolerances, span, b.constants[LONGEST], within)
@@ -328,14 +337,14 @@ def _write_report(w, b, box, n_rows, n_steps, code, is_new):
     turned = n_rows > 0 and _velocities_turned(b, n_rows, w.Q.size)
     inside = box.shape[1] > 0 and _all_within(b.t[: 1 + n_rows], b.states, box)
     near = b.clock[at.PIVOT_AT_OUTPUT] < b.constants[NEAR]
-    missed = b.clock[at.BRIEFEST] < b.constants[LOOKS] * b.clock[at.WIDEST_LOOK]
+    missed = b.clock[at.SHORTEST_CHANGE] < b.constants[LOOKS] * b.clock[at.WIDEST_SAMPLING]
     plain, width = not (turned or near or missed), b.steps.shape[1]
     begin = b.report.size - N_HEAD - 1 - n_rows - width * n_steps
     report = b.report[begin:]
     report[N_STATES], report[N_STEPS], report[PLAIN] = 1 + n_rows, n_steps, plain
     report[TURNED], report[INSIDE], report[CODE], report[IS_NEW] = turned, inside, code, is_new
-    report[CHECKED] = w.counters[N_ACCEPTED] > 0 and w.notes[noted.UNCHECKED] == 0.0
-    report[DEFECT], report[WIDEST] = w.notes[noted.LARGEST_DEFECT], w.notes[noted.WIDEST_GAP]
+    report[CHECKED] = w.counters[N_ACCEPTED] > 0 and w.notes[indices.UNCHECKED] == 0.0
+    report[DEFECT], report[WIDEST] = w.notes[indices.LARGEST_DEFECT], w.notes[indices.WIDEST_GAP]
     for k in range(N_COUNTERS):
         report[N_REPORT + k] = w.counters[k]
     _copy(b.t[: 1 + n_rows], report[N_HEAD : N_HEAD + 1 + n_rows])

@@ -7,12 +7,19 @@ computed first, by steps of the method, and a polynomial goes through those of o
 import numpy as np
 from numba import types
 
-from twoloop.kernels.data import intervals as kinds
-from twoloop.kernels.data.codes import DONE, GAMMA_INACCURATE, SINGULAR
+from twoloop.kernels.data import indices as kinds
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, WORK, compiled, f8, i8, kernel, merged
-from twoloop.kernels.data.flags import FORM, NULL_SPACE
-from twoloop.kernels.data.noted import GAMMA_REQUIRED
-from twoloop.kernels.data.tolerances import ATOL, RTOL, UNTRUE
+from twoloop.kernels.data.indices import (
+    ATOL,
+    DONE,
+    FORM,
+    GAMMA_INACCURATE,
+    GAMMA_REQUIRED,
+    NULL_SPACE,
+    RTOL,
+    SINGULAR,
+    UNTRUE,
+)
 from twoloop.kernels.evaluation.inner_loop import accelerations, find_tangents, renew_partition, restore
 from twoloop.kernels.evaluation.partition import least_pivot, partition_is_poor
 from twoloop.kernels.linalg.dense import copy, largest_of

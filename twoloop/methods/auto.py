@@ -41,7 +41,7 @@ def switching(first: Plan, second: Plan, limit: float, n_q: int, looks: int = 1,
     `limit`: h rho, rho being the largest rate of the motion, from which on `second` is tried, if it is found at so many
     `looks` in a row. `dearer`: what an evaluation of `second` costs, in those of `first`.
     """
-    from twoloop.kernels.control import switching as kernels
+    from twoloop.kernels.control import stiffness as kernels
 
     plans = (first, second)
     each = [[*plan.rule, plan.reuse] for plan in plans]
@@ -61,7 +61,7 @@ def switching(first: Plan, second: Plan, limit: float, n_q: int, looks: int = 1,
 
 def with_matrix_cost(plan: Plan, cost: float) -> Plan:
     """Return a plan of `switching` for which a Newton matrix costs so many evaluations."""
-    from twoloop.kernels.control import switching as kernels
+    from twoloop.kernels.control import stiffness as kernels
 
     options = plan.options.copy()
     options[kernels.MATRIX_COST] = cost

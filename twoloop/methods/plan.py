@@ -62,7 +62,7 @@ class Plan:
 
     @property
     def rule(self) -> list[float]:
-        """Return the numbers of step-size control, see kernels/control/controller.py."""
+        """Return the numbers of step-size control, see kernels/control/loop_state.py."""
         return [self.safety, self.exponent, self.factor_min, self.factor_max, self.least_error]
 
     @property

@@ -10,7 +10,7 @@ from twoloop.generate.compile_equations import GeneratedCode, generated_code
 from twoloop.generate.graph import Untraceable
 from twoloop.generate.series import is_quick, series_for
 from twoloop.generate.traced_values import Check
-from twoloop.kernels.data.intervals import ACCELERATIONS, APART, VELOCITIES
+from twoloop.kernels.data.indices import ACCELERATIONS, APART, VELOCITIES
 from twoloop.methods.plan import Method, Plan, needs_code, takes_code
 from twoloop.methods.presets import identity
 from twoloop.problem.system import ConstrainedSystem

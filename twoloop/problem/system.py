@@ -14,13 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from twoloop.checks.arguments import Array, check_flag, check_number, check_real, check_size, check_text, shaped, shown
-from twoloop.checks.bounds import check_callback
+from twoloop.checks.callbacks import check_callback
 from twoloop.checks.sparse_rows import Rows, SparseRows
 from twoloop.kernels.compile.callbacks import KINDS, STATE
 from twoloop.kernels.compile.private import Dispatcher
-from twoloop.kernels.data.common import PROGRAMS, Functions
-from twoloop.kernels.data.flags import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS
-from twoloop.kernels.data.kit import Kit
+from twoloop.kernels.data.common import PROGRAMS, Functions, Kit
+from twoloop.kernels.data.indices import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS
 from twoloop.problem.callbacks import (
     VALUES_OF,
     DenseFunction,

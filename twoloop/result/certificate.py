@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twoloop.checks.arguments import Array, check_positive, check_tolerance
-from twoloop.kernels.data.intervals import APART
+from twoloop.kernels.data.indices import APART
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.record import Record
 from twoloop.run.rerun import IndependentRerun, RerunPiece, explicit, implicit, tighter

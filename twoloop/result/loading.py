@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import Array, check_path, shown
-from twoloop.kernels.data import intervals
+from twoloop.kernels.data import indices
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.result.storage import COUNTS, EVENT_FIELDS, FORMAT, METADATA_FILE, NUMBERS, OPTIONAL, REQUIRED, checksum
@@ -21,7 +21,7 @@ from twoloop.run.dense_solution import DenseSolution
 from twoloop.run.record import Statistics, Status
 from twoloop.run.recorder import read
 
-KINDS = (intervals.APART, intervals.VELOCITIES, intervals.ACCELERATIONS, intervals.ACROSS)
+KINDS = (indices.APART, indices.VELOCITIES, indices.ACCELERATIONS, indices.ACROSS)
 INTEGER_LIMIT = 2**63  # of counts
 BLOCK = 1024  # rows of an array checked at a time
 MIN_INTERIOR = 2  # smallest number of states within an interval: its two ends

@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.checks.arguments import Array, check_path, check_positive
-from twoloop.checks.optional import needed
+from twoloop.checks.arguments import Array, check_path, check_positive, needed
 from twoloop.problem.description import name_and_unit
 from twoloop.run.record import Record
 

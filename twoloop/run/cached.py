@@ -16,18 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import check_vector
-from twoloop.checks.at_position import has_definite_mass
 from twoloop.checks.consistency import Look, check_start
+from twoloop.checks.structure import has_definite_mass
 from twoloop.generate.choices import BOUNDS, LEAST, RANK, SINGULAR_MASS, Choice, Dependents
 from twoloop.generate.compile_equations import GeneratedCode
 from twoloop.generate.derived_callbacks import exact_near, with_derived_callbacks
 from twoloop.generate.trace_cache import TraceCache, give_bounds, take_bounds, trace_cache_of
 from twoloop.generate.traced_values import Sample, Traced, farthest, states_around
 from twoloop.kernels.compile.linking import entry_point
-from twoloop.kernels.control.clock import N_STEP_COLUMNS
-from twoloop.kernels.data import flags, noted
+from twoloop.kernels.control.loop_state import N_STEP_COLUMNS
+from twoloop.kernels.data import indices
 from twoloop.kernels.data.collocation import LANES
-from twoloop.kernels.data.flags import BANDWIDTH, FORM
+from twoloop.kernels.data.indices import BANDWIDTH, FORM
 from twoloop.kernels.layout import cached_run, lasting
 from twoloop.kernels.linalg.band import lapack_addresses
 from twoloop.methods.preparation import code_for, may_have_code, plans_for
@@ -143,7 +143,7 @@ class CachedIntegrator:
         """Return whether arrays that serve from start to start can give an output."""
         if output.dense and (output.between is not None or shared is not None):
             return False  # both have the same states within steps; what belongs to kin takes other parameters
-        return output.between is None or not (run.lands or run.kit.flags[FORM] == flags.AUGMENTED)
+        return output.between is None or not (run.lands or run.kit.flags[FORM] == indices.AUGMENTED)
 
     def integrate(
         self,
@@ -375,7 +375,7 @@ def arrays_of(
     of_start: tuple[float, ...]
     of_start = max(run.rtol, GAMMA_ACCURACY), run.reuse, 0.0 if run.plan.watchful else 1.0
     of_start += np.array_equal(search[0] != 0, run.work.pattern.ravel() != 0.0), RANK, weak, scale, CONTRADICTS
-    of_start += of_mass, NEARER * run.work.notes[noted.PIVOT], run.kit.flags[FORM]
+    of_start += of_mass, NEARER * run.work.notes[indices.PIVOT], run.kit.flags[FORM]
     step_fields = options.first_step or 0.0, run.least_atol, options.max_step, run.plan.looks_within
     columns, width = run.a.N_STEP_COLUMNS, len(run.state)
     block = np.empty(loops.N_HEAD + 1 + (1 + columns) * room + width * (1 + room))

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.at_position import pattern_of
 from twoloop.checks.consistency import ConstraintWarning
+from twoloop.checks.structure import pattern_of
 from twoloop.kernels.compile.linking import entry_point
-from twoloop.kernels.data import codes, noted, tolerances
-from twoloop.kernels.data import intervals as names
-from twoloop.kernels.data.tolerances import ATOL, RTOL
+from twoloop.kernels.data import indices
+from twoloop.kernels.data import indices as names
+from twoloop.kernels.data.indices import ATOL, RTOL
 from twoloop.kernels.steps.lazy import loaded
 from twoloop.methods.plan import INNER_TOL, Plan
 from twoloop.problem.system import ConstrainedSystem
@@ -37,7 +37,7 @@ class Table(NamedTuple):
 
     t: Array
     states: Array
-    kinds: NDArray[np.int64]  # see kernels/data/intervals.py
+    kinds: NDArray[np.int64]  # see kernels/data/indices.py
 
 
 def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: float) -> tuple[int, int]:
@@ -47,9 +47,9 @@ def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: floa
     kit = kit_of(system, t, q)
     work = workspace(system, kit, pattern_of(system, t, q), q, rtol, 0.0)
     state = np.concatenate([q, v, np.zeros(system.n_q + system.n_c + system.n_a)])
-    if advance.start(kit, work, t, state) != codes.RANK_DIFFERS:
+    if advance.start(kit, work, t, state) != indices.RANK_DIFFERS:
         return system.n_c, system.n_c + system.n_a
-    return int(work.notes[noted.RANK]), int(work.notes[noted.RANK_V])
+    return int(work.notes[indices.RANK]), int(work.notes[indices.RANK_V])
 
 
 class Interpolator:
@@ -116,7 +116,7 @@ class Interpolator:
         from twoloop.kernels import advance
 
         system, t0, row = self.made_of[:3]
-        self.work.notes[noted.GENERATION] = 1.0  # the ranks are known
+        self.work.notes[indices.GENERATION] = 1.0  # the ranks are known
         state = np.concatenate([row, np.zeros(system.n_c + system.n_a)])
         entry_point(advance.start)(self.kit, self.work, t0, state)
         self.repairs: dict[bool, tuple[Plan, Any]] = {}
@@ -411,6 +411,6 @@ class OutputInterpolation:
 
 def interpolator_of(run: "Run", row: Array) -> Interpolator:
     """Make the interpolator of a run, which starts with this row [q, v, a]."""
-    ranks, atol = (len(run.work.rows), len(run.work.rows_v)), run.tolerances[tolerances.ATOL :]
+    ranks, atol = (len(run.work.rows), len(run.work.rows_v)), run.tolerances[indices.ATOL :]
     interiors = {kind: plan.fresh() for kind, plan in run.interiors.items()}
     return Interpolator(run.system, run.t0, row, run.rtol, atol, ranks, interiors)

@@ -25,13 +25,13 @@ MOST = 2  # runs that are made again
 def may_have_missed_changes(run: "Run", looks: float = WITHIN) -> bool:
     """Return whether something changed for so short a time that the next such change may have been passed over."""
     a, clock = run.a, run.clock
-    return bool(clock[a.BRIEFEST] < looks * clock[a.WIDEST_LOOK])
+    return bool(clock[a.SHORTEST_CHANGE] < looks * clock[a.WIDEST_SAMPLING])
 
 
 def closer(run: "Run") -> float:
     """Return the time between evaluations, s, with which a repeated run meets what this one may have missed."""
     a, clock = run.a, run.clock
-    return float(max(clock[a.BRIEFEST] / CLOSER, clock[a.WIDEST_LOOK] / MOST_CLOSER))
+    return float(max(clock[a.SHORTEST_CHANGE] / CLOSER, clock[a.WIDEST_SAMPLING] / MOST_CLOSER))
 
 
 def warn_of_missed_changes(run: "Run") -> str:
@@ -40,9 +40,9 @@ def warn_of_missed_changes(run: "Run") -> str:
         return ""
     a, clock = run.a, run.clock
     said = (
-        f"forces, constraint_rate or nonholonomic_rate change suddenly for {clock[a.BRIEFEST]:.2g} s, and were looked "
-        f"at every {clock[a.WIDEST_LOOK]:.2g} s only, where steps are long: other changes as short may have been "
-        f"missed. Give max_step, at most {clock[a.BRIEFEST]:.2g}"
+        f"forces, constraint_rate or nonholonomic_rate change suddenly for {clock[a.SHORTEST_CHANGE]:.2g} s, and were "
+        f"looked at every {clock[a.WIDEST_SAMPLING]:.2g} s only, where steps are long: other changes as short may have "
+        f"been missed. Give max_step, at most {clock[a.SHORTEST_CHANGE]:.2g}"
     )
     return warn_user(said)
 

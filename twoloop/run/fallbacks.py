@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.kernels.compile.linking import entry_point
-from twoloop.kernels.data import codes, noted, tolerances
-from twoloop.kernels.data.kit import Kit
+from twoloop.kernels.data import indices
+from twoloop.kernels.data.common import Kit
 from twoloop.kernels.steps.lazy import loaded
 from twoloop.methods.plan import INNER_TOL, LARGEST_MOVE, Plan
 from twoloop.methods.tableaux import gauss
@@ -25,11 +25,11 @@ CLEAR = 0.3  # of the largest pivot that C_q had, from which on the run's own st
 def may_cross(run: Run, code: int) -> bool:
     """Return whether steps across follow: near a singular position, also where the method is not suited to it."""
     a, notes = run.a, run.work.notes
-    if code == a.HAS_TO_GIVE_WAY:
+    if code == a.SWITCH_METHOD:
         from twoloop.kernels.steps.lobatto_step import TIGHT
 
-        near = notes[noted.NEARLY_SINGULAR] == notes[noted.NEAR_NOW] == 1.0
-        return bool(near and run.control[a.BRIDGE] == 1.0 and run.tolerances[tolerances.LEAST] >= TIGHT)
+        near = notes[indices.NEARLY_SINGULAR] == notes[indices.NEAR_NOW] == 1.0
+        return bool(near and run.control[a.BRIDGE] == 1.0 and run.tolerances[indices.LEAST] >= TIGHT)
     return code == a.NEAR_SINGULAR
 
 
@@ -42,7 +42,7 @@ def switch_method(run: Run) -> None:
     run.substituted = True
     run.control_by(run.plan)
     run.limit_steps()
-    run.clock[run.a.FAILURE_CODE] = codes.DONE
+    run.clock[run.a.FAILURE_CODE] = indices.DONE
     run.clock[run.a.H_NEXT] = run.clock[run.a.H_FAILED]
     run.clock[: run.a.N_PAST] = 0.0
 
@@ -72,10 +72,10 @@ def cross_singularity(run: Run) -> tuple[Plan, Array]:
     control = run.control.copy()
     control[: a.N_RULE] = plan.rule
     control[a.SYMMETRIC], control[a.BRIDGE], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
-    control[a.GIVES_WAY] = control[a.IN_A_ROW] = 0.0
+    control[a.MAY_SWITCH] = control[a.MAKES_MANY] = 0.0
     if control[a.FIXED_STEP] == 0.0:
-        control[a.UNSEEN] = 1.0 if run.narrow else UNSEEN
-        control[a.MAX_STEP] = min(run.max_step, run.tolerances[tolerances.GAP] / control[a.UNSEEN])
+        control[a.MAX_EVALUATION_GAP] = 1.0 if run.narrow else UNSEEN
+        control[a.MAX_STEP] = min(run.max_step, run.tolerances[indices.GAP] / control[a.MAX_EVALUATION_GAP])
     clock[a.H_LIMIT], clock[a.LIMIT_AGE] = np.inf, 0.0
     run.lengths = lengths_across(float(clock[a.H_LONG]), float(control[a.MAX_STEP]))
     clock[a.H_NEXT] = run.lengths.pop(0)
@@ -120,7 +120,7 @@ def after_crossing(run: Run, plan: Plan, control: Array, code: int, accepted: in
     if code == a.PAUSED and accepted == 0 and run.lengths:
         run.clock[a.H_NEXT], run.clock[a.H_LIMIT] = run.lengths.pop(0), np.inf
         return plan, control, code
-    if code == a.PAUSED and accepted > 0 and (run.work.notes[noted.PIVOT] < CLEAR * run.clock[a.LARGEST_PIVOT]):
+    if code == a.PAUSED and accepted > 0 and (run.work.notes[indices.PIVOT] < CLEAR * run.clock[a.LARGEST_PIVOT]):
         run.lengths = lengths_across(float(run.clock[a.H_LONG]), float(control[a.MAX_STEP]))
         return plan, control, code
     if code not in (a.PAUSED, a.STEP_TOO_SMALL, a.FIXED_STEP_FAILED, a.RANK_LOST):
@@ -128,7 +128,7 @@ def after_crossing(run: Run, plan: Plan, control: Array, code: int, accepted: in
     if accepted == 0:  # there is no way across: the run's own steps go on as far as they can
         run.control[a.BRIDGE] = 0.0
     run.crossings[-1].append((float(run.clock[a.T]), run.state.copy()))
-    run.work.notes[noted.NEAR_NOW] = 0.0
+    run.work.notes[indices.NEAR_NOW] = 0.0
     run.plan.memory[:] = run.memory
     run.clock[: a.N_PAST] = 0.0
     return run.plan, run.control, a.PAUSED
@@ -142,12 +142,12 @@ def apply_jump(run: Run, t1: float) -> bool:
     if state is None:
         return False
     run.new_state[: 2 * n] = state
-    run.work.notes[noted.KINK_AFTER] = t1
-    if entry_point(run.kernels.start)(run.kit, run.work, end, run.new_state) != codes.DONE:
+    run.work.notes[indices.KINK_AFTER] = t1
+    if entry_point(run.kernels.start)(run.kit, run.work, end, run.new_state) != indices.DONE:
         return False
     run.jumps.append(end)
     run.plan.memory[:] = run.memory
-    clock[a.LEAPS] = 1.0
+    clock[a.APPLIES_JUMP] = 1.0
     clock[a.H_LIMIT], clock[a.LIMIT_AGE] = run.plan.limit_start, 0.0
     if end < t1:
         clock[a.H_NEXT] = min(clock[a.H_NEXT], run.first_step(end, t1, run.new_state))

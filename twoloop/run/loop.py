@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.generate.traced_values import Sample
-from twoloop.kernels.data import intervals, noted, tolerances
+from twoloop.kernels.data import indices
 from twoloop.kernels.data.collocation import LANES
-from twoloop.kernels.data.tolerances import LONGEST_UNSEEN
+from twoloop.kernels.data.indices import LONGEST_UNSEEN
 from twoloop.problem.callbacks import PythonFunctions
 from twoloop.problem.events import SAMPLES, Event
 from twoloop.problem.system import ConstrainedSystem
@@ -233,7 +233,7 @@ class IntegrationLoop:
         a, clock = run.a, run.clock
         buffers, copied = self._buffers(), True
         while self.code == a.PAUSED:
-            across, leaps = self.plan is not run.plan, clock[a.LEAPS] == 1.0
+            across, leaps = self.plan is not run.plan, clock[a.APPLIES_JUMP] == 1.0
             began = time.process_time()
             self._advance(buffers)
             n_rows, n_steps = self.filled.tolist()
@@ -282,8 +282,10 @@ class IntegrationLoop:
         except KeyboardInterrupt:
             self.code = INTERRUPTED
         except Exception as error:  # of a callback; beyond a terminal event it does not matter
-            if run.clock[a.LOOKING] == 1.0 and not self.interrupts.asked:  # at a state to which the run may not come
-                run.clock[a.LOOKING] = self.control[a.AHEAD] = 0.0
+            if (
+                run.clock[a.SAMPLES_MOTION] == 1.0 and not self.interrupts.asked
+            ):  # at a state to which the run may not come
+                run.clock[a.SAMPLES_MOTION] = self.control[a.SAMPLE_MOTION] = 0.0
             else:
                 self.code, self.raised = INTERRUPTED, None if self.interrupts.asked else error
                 if not run.system.called_in_python:
@@ -319,32 +321,32 @@ class IntegrationLoop:
                 self.code = STAGNATED
         if spent < CHUNK_TIME:
             run.chunk = min(2 * run.chunk, self.largest_chunk)
-        if self.code in (a.PAUSED, a.HAS_TO_LOAD) and time.monotonic() > self.deadline:
+        if self.code in (a.PAUSED, a.NEEDS_COMPILATION) and time.monotonic() > self.deadline:
             self.code = OUT_OF_TIME
-        if self.code in (a.PAUSED, a.HAS_TO_LOAD) and (self.interrupts.asked or self.recorder.interrupted):
+        if self.code in (a.PAUSED, a.NEEDS_COMPILATION) and (self.interrupts.asked or self.recorder.interrupted):
             self.code = INTERRUPTED
 
     def _go_on(self, across: bool, n_steps: int) -> None:
         """Choose what makes the next steps, where it is not what made the last ones."""
         run, a = self.run, self.run.a
-        if self.code == a.HAS_TO_BE_DENSE or run.is_lost_without_dense(self.code):
+        if self.code == a.NEEDS_DENSE or run.is_lost_without_dense(self.code):
             run.change_form()
             self.plan, self.kit, self.code = run.plan, run.kit, a.PAUSED
         elif may_cross(run, self.code):
             self.plan, self.control = cross_singularity(run)
             self.kit = crossing_kit(run.kit)
             self.code = a.PAUSED
-        elif self.code == a.HAS_TO_GIVE_WAY or self._stalls(across):
+        elif self.code == a.SWITCH_METHOD or self._stalls(across):
             switch_method(run)
             if self.code == a.STEP_TOO_SMALL:
                 run.clock[a.H_NEXT] = run.first_step(float(run.clock[a.T]), self.t1, run.state)
             self.plan, self.control, self.kit, self.code = run.plan, run.control, run.kit, a.PAUSED
-        elif self.code == a.HAS_TO_LOAD:
+        elif self.code == a.NEEDS_COMPILATION:
             began = time.monotonic()
             load(run)
             self.deadline += time.monotonic() - began  # compilation does not count
             self.kit, self.code = run.kit, a.PAUSED
-        elif self.code == a.AT_JUMP and not across and apply_jump(run, self.t1):
+        elif self.code == a.AT_DISCONTINUITY and not across and apply_jump(run, self.t1):
             self.code = a.PAUSED
         elif self.plan is not run.plan and self.code != a.ALL_OUTPUT_DONE:
             self.plan, self.control, self.code = after_crossing(run, self.plan, self.control, self.code, n_steps)
@@ -354,8 +356,8 @@ class IntegrationLoop:
     def _stalls(self, across: bool) -> bool:
         """Return whether a method that has a substitute takes no step, though no singular position is near."""
         run, a = self.run, self.run.a
-        stalls = self.code == a.STEP_TOO_SMALL and run.control[a.GIVES_WAY] == 1.0
-        return stalls and not across and run.work.notes[noted.NEARLY_SINGULAR] != 1.0
+        stalls = self.code == a.STEP_TOO_SMALL and run.control[a.MAY_SWITCH] == 1.0
+        return stalls and not across and run.work.notes[indices.NEARLY_SINGULAR] != 1.0
 
     def _record(self, check_derivatives: bool) -> Record:
         run, recorder, code = self.run, self.recorder, self.code
@@ -410,7 +412,7 @@ class IntegrationLoop:
         run = self.run
         if self.request.times is not None or self.recorder.ended is not None:
             return []
-        if run.plan.watchful and run.work.notes[noted.NEARLY_SINGULAR] != 1.0:
+        if run.plan.watchful and run.work.notes[indices.NEARLY_SINGULAR] != 1.0:
             return []
         return [(float(t[-2]), table[-2])] if turned_last(t, table, run.system.n_q) else []
 
@@ -436,7 +438,7 @@ class IntegrationLoop:
         run, n = self.run, self.run.system.n_q
         interpolator = interpolator_of(run, self.start[: 3 * n]) if self.request.between_steps else None
         apart = LONGEST_UNSEEN * (self.t1 - run.t0) / SAMPLES
-        every = float(run.tolerances[tolerances.LOOK]) if run.sudden.by_state else apart
+        every = float(run.tolerances[indices.LOOK]) if run.sudden.by_state else apart
         return Recorder(self.request, interpolator, n, run.t0, self.start, every)
 
     def _kinds(self, steps: Array, across: bool, leaps: bool) -> NDArray[np.int64]:
@@ -445,9 +447,9 @@ class IntegrationLoop:
         if not self.request.between_steps:
             return NO_KINDS
         if leaps:
-            return np.full(len(steps), intervals.JUMP)
+            return np.full(len(steps), indices.JUMP)
         if across:
-            return np.full(len(steps), intervals.ACROSS)
+            return np.full(len(steps), indices.ACROSS)
         return interval_kinds(run, steps)
 
 

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.at_position import dependent_rows, least_inertia, not_finite
 from twoloop.checks.consistency import ConstraintWarning
-from twoloop.checks.rank import in_words, surely_above
-from twoloop.kernels.data import codes, noted, tolerances
+from twoloop.checks.structure import dependent_rows, in_words, least_inertia, not_finite, surely_above
+from twoloop.kernels.data import indices
 from twoloop.run.monitors import INTERRUPTED, OUT_OF_TIME, STAGNATED, STAGNATION_STEPS, StallDetector
 from twoloop.run.record import Later, Status
 from twoloop.run.singular_positions import (
@@ -37,12 +36,12 @@ CROSSINGS = "\0"  # stands for what is said of singular positions that were cros
 NEXT_TO_END = 1e-3  # of the run: where it stops so close to its end, that is said
 
 _REASONS = {
-    codes.DONE: "the error estimate stayed above the tolerances",
-    codes.OUTER_DIVERGED: "the outer loop (stages) did not converge",
-    codes.INNER_DIVERGED: "the inner loop (Newton on the positions) did not converge",
-    codes.SINGULAR: "the dependent columns of the constraint Jacobian became singular",
-    codes.MASS_NOT_DEFINITE: "the mass matrix was not positive definite",
-    codes.GAMMA_INACCURATE: "gamma by differences missed the tolerance",
+    indices.DONE: "the error estimate stayed above the tolerances",
+    indices.OUTER_DIVERGED: "the outer loop (stages) did not converge",
+    indices.INNER_DIVERGED: "the inner loop (Newton on the positions) did not converge",
+    indices.SINGULAR: "the dependent columns of the constraint Jacobian became singular",
+    indices.MASS_NOT_DEFINITE: "the mass matrix was not positive definite",
+    indices.GAMMA_INACCURATE: "gamma by differences missed the tolerance",
 }
 
 
@@ -86,7 +85,7 @@ def reject_turned_velocities(
     if last_step:
         crossings.append(last_step)
     if crossings and not turned:
-        rtol, atol = float(run.tolerances[tolerances.RTOL]), run.tolerances[tolerances.ATOL :]
+        rtol, atol = float(run.tolerances[indices.RTOL]), run.tolerances[indices.ATOL :]
         turned = describe_turn(run.system, crossings, now, run.rank, rtol, atol)
     return (Status.RANK_LOST, turned) if turned else (status, message)
 
@@ -136,7 +135,7 @@ def outcome(run: "Run", code: int, t1: float, pace: StallDetector) -> tuple[Stat
         )
     if code == STAGNATED:
         return Status.STAGNATED, f"{stopped}: {_standstill(run, t1, pace)}"
-    if code == a.AT_JUMP:
+    if code == a.AT_DISCONTINUITY:
         return (
             Status.RATE_JUMPS,
             f"{stopped}: constraint_rate or nonholonomic_rate jumps there, and no impulse gives velocities that "
@@ -144,9 +143,9 @@ def outcome(run: "Run", code: int, t1: float, pace: StallDetector) -> tuple[Stat
         )
     if code == a.ROWS_VIOLATED:
         return Status.ROWS_CONTRADICT, _contradiction(run)
-    if failure == codes.NOT_FINITE:
+    if failure == indices.NOT_FINITE:
         return (Status.NOT_FINITE, f"{stopped}: {describe_not_finite(run)}. The result holds what was computed before.")
-    if code == a.RANK_LOST or failure == codes.SINGULAR:
+    if code == a.RANK_LOST or failure == indices.SINGULAR:
         rows = dependent_rows(run.system, t, run.state[: run.system.n_q])
         return (
             Status.RANK_LOST,
@@ -154,8 +153,8 @@ def outcome(run: "Run", code: int, t1: float, pace: StallDetector) -> tuple[Stat
             "coordinates exists at this singular position, and no step led across: end t_span before, take another "
             f"method, or change the geometry.{_end_is_near(run, t1)}",
         )
-    if failure == codes.GAMMA_INACCURATE:
-        reached, required = run.work.notes[noted.GAMMA_ACCURACY], run.work.notes[noted.GAMMA_REQUIRED]
+    if failure == indices.GAMMA_INACCURATE:
+        reached, required = run.work.notes[indices.GAMMA_ACCURACY], run.work.notes[indices.GAMMA_REQUIRED]
         return (
             Status.NOT_CONVERGED,
             f"{stopped}: gamma by differences of C_q and C_t is good to a relative error of {reached:.1g} there, "
@@ -194,7 +193,7 @@ def _standstill(run: "Run", t1: float, pace: StallDetector) -> str:
 
 def _contradiction(run: "Run") -> str:
     """Describe which row that was left out is violated, and which rows it depended on."""
-    t, n, row = float(run.clock[run.a.T]), run.system.n_q, int(run.work.notes[noted.CONTRADICTION])
+    t, n, row = float(run.clock[run.a.T]), run.system.n_q, int(run.work.notes[indices.CONTRADICTION])
     words = in_words(run.system.rows(t, run.state[:n]), [row])
     return (
         f"Stopped at t = {t:.10g}: constraint row {row} depended on others at the start, was left out, and does "
@@ -219,7 +218,7 @@ def warn_of_singular_end(run: "Run") -> str:
         )
     else:
         over = _over_allowed(run, t, q, v)
-        if over <= tolerances.UNTRUE:
+        if over <= indices.UNTRUE:
             return ""
         said = (
             f"the run ends where the constraints nearly lose rank ({_measured(run, t, q)}): rounding of positions "
@@ -240,7 +239,7 @@ def warn_user(text: str) -> str:
 
 def _over_allowed(run: "Run", t: float, q: Array, v: Array) -> float:
     """Estimate the errors of velocities that rounding of positions makes, over the tolerances."""
-    allowed = run.tolerances[tolerances.ATOL :] + run.rtol * np.abs(v).max()
+    allowed = run.tolerances[indices.ATOL :] + run.rtol * np.abs(v).max()
     return float((velocity_rounding_errors(run.system, t, q, v, run.rank) / allowed).max())
 
 
@@ -282,7 +281,7 @@ def _near_massless(run: "Run") -> str:
 
 def describe_not_finite(run: "Run") -> str:
     """Describe which callback returned a value that is not finite, and when, as far as it is known."""
-    kind, at = int(run.work.notes[noted.FAULT_KIND]), float(run.work.notes[noted.FAULT_TIME])
+    kind, at = int(run.work.notes[indices.FAULT_KIND]), float(run.work.notes[indices.FAULT_TIME])
     if kind >= 0:
         name = run.functions._fields[kind]
         return f"{name} of {run.system.name!r} returned a value that is not finite at t = {at:.10g}"

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.kernels.control.directions import DISPLACEMENT, INNER_TOL, first_direction
-from twoloop.kernels.data import codes
+from twoloop.kernels.control.loop_state import DISPLACEMENT, INNER_TOL, initial_direction
+from twoloop.kernels.data import indices
 from twoloop.methods.plan import Plan
 
 Array = NDArray[np.float64]
@@ -112,7 +112,7 @@ def describe_stiffness(looks: StiffnessMonitor, kit: Any, work: Any) -> str:
     """Return a sentence if stability limited the steps, else nothing. What stands in the workspace is lost."""
     if not looks.samples or looks.n_steps < MANY:
         return ""
-    start = first_direction(work.Q.size)
+    start = initial_direction(work.Q.size)
     directions = [np.zeros_like(start), np.zeros_like(start)]
     found = []
     for sample in looks.samples:
@@ -138,7 +138,7 @@ def _rates(kit: Any, work: Any, sample: StiffnessSample, directions: list[Array]
     """Angular frequency of the fastest vibration and the fastest rate of decay, 1/s, as far as they dominate."""
     from twoloop.kernels.evaluation import tasks
 
-    if kit.inner(kit, work, tasks.RENEW_PARTITION, sample.t, sample.q, sample.v, 0.0, work.x, work.lam) != codes.DONE:
+    if kit.inner(kit, work, tasks.RENEW_PARTITION, sample.t, sample.q, sample.v, 0.0, work.x, work.lam) != indices.DONE:
         return 0.0, 0.0
     squared, opposed_q = _largest(kit, work, sample, directions[0], work.independent, False)
     rate, opposed_v = _largest(kit, work, sample, directions[1], work.independent_v, True)
@@ -158,7 +158,7 @@ def _largest(
     for _ in range(ITERATIONS):
         Q, V = sample.q.copy(), sample.v.copy()
         (V if by_v else Q)[places] += size * direction[places]
-        if kit.inner(kit, work, tasks.EVALUATE, sample.t, Q, V, INNER_TOL, a, work.lam) != codes.DONE:
+        if kit.inner(kit, work, tasks.EVALUATE, sample.t, Q, V, INNER_TOL, a, work.lam) != indices.DONE:
             return 0.0, False
         image = (a - sample.a)[places]
         longest = float(np.abs(image).max(initial=0.0))

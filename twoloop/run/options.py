@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import check_flag, check_positive, check_size, check_tolerance, shown
-from twoloop.kernels.data import noted
+from twoloop.kernels.data import indices
 from twoloop.methods.plan import Method
 from twoloop.methods.preparation import Compiled, check_compiled
 from twoloop.methods.presets import PRESETS, identity, is_preset
@@ -58,7 +58,7 @@ class Options:
 
     def set_sizes(self, run: Run, t1: float) -> None:
         """Set the first and the largest step of a run to t1, unless its steps are constant, and where kinks may be."""
-        run.work.notes[noted.KINK_AFTER] = t1
+        run.work.notes[indices.KINK_AFTER] = t1
         if self.step_size is None:
             run.set_sizes(self.first_step, self.max_step, t1)
 

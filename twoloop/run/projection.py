@@ -16,13 +16,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import qr
 
 from twoloop.checks.arguments import check_finite, check_flag, check_indices, check_vector
-from twoloop.checks.at_position import not_finite
-from twoloop.checks.bounds import check_bounds
+from twoloop.checks.callbacks import check_bounds
+from twoloop.checks.consistency import CONSISTENT, Violation, is_at_rounding
 from twoloop.checks.scales import Scales, scales_of, typical_sizes, units
 from twoloop.checks.sparse_rows import SparseRows
-from twoloop.checks.violation import CONSISTENT, Violation, is_at_rounding
+from twoloop.checks.structure import not_finite
 from twoloop.kernels.compile.linking import entry_point
-from twoloop.kernels.data import codes, flags, noted
+from twoloop.kernels.data import indices
 from twoloop.kernels.evaluation import tasks
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.run.static_form import static_form
@@ -42,7 +42,7 @@ class _Metric:
         self.system, self.t, self.rank = system, t, rank
         self.form = form._replace(static=form.static._replace(dense_mass=False), mass_pattern=np.zeros((0, 0)))
         self.kit = kit_of(system, t, q, None, self.form)
-        self.kit.flags[flags.CONSTANT_MASS], self.kit.flags[flags.MASS_VALUES_GIVEN] = 1, 0
+        self.kit.flags[indices.CONSTANT_MASS], self.kit.flags[indices.MASS_VALUES_GIVEN] = 1, 0
         self.work = workspace(system, self.kit, np.zeros((0, 0)), q, 1e-8, 0.0, (rank, rank), self.form)
         rows, columns = form.mass
         diagonal = np.where(rows == columns, 1.0, 0.0)
@@ -68,7 +68,7 @@ class _Metric:
         """
         zero, change = np.zeros(len(q)), np.zeros(len(q))
         for _ in range(MOST_CORRECTIONS):
-            if self.ask(tasks.FIND_NULL_SPACE, q, zero) != codes.DONE:
+            if self.ask(tasks.FIND_NULL_SPACE, q, zero) != indices.DONE:
                 return None
             self.ask(tasks.SOLVE, zero, self.system.constraint(self.t, q), change)
             q = q - change
@@ -80,11 +80,14 @@ class _Metric:
     def project(self, q: Array, v: Array) -> tuple[Array, Array] | None:
         """q and v on the constraints."""
         q, on_the_way = q.copy(), v.copy()
-        if self.ask(tasks.RENEW_PARTITION, q, v) != codes.DONE or self.ask(tasks.RESTORE, q, on_the_way) != codes.DONE:
+        if (
+            self.ask(tasks.RENEW_PARTITION, q, v) != indices.DONE
+            or self.ask(tasks.RESTORE, q, on_the_way) != indices.DONE
+        ):
             return None
         v = v.copy()  # the least change of the velocities is that where positions end
         for task in (tasks.RESTORE, tasks.RESTORE, tasks.FIND_NULL_SPACE):  # twice, to rounding
-            if self.ask(task, q, v) != codes.DONE:
+            if self.ask(task, q, v) != indices.DONE:
                 return None
         self.at = q
         return q, v
@@ -106,10 +109,10 @@ def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | No
         return None
     metric, still = _Metric(system, t, q, form), np.zeros_like(q)
     code = metric.ask(tasks.RENEW_PARTITION, q.copy(), still)
-    if code == codes.RANK_DIFFERS:
-        metric = _Metric(system, t, q, form, int(metric.work.notes[noted.RANK]))
+    if code == indices.RANK_DIFFERS:
+        metric = _Metric(system, t, q, form, int(metric.work.notes[indices.RANK]))
         code = metric.ask(tasks.RENEW_PARTITION, q.copy(), still)
-    if code != codes.DONE or metric.work.notes[noted.PIVOT] < CLEAR:
+    if code != indices.DONE or metric.work.notes[indices.PIVOT] < CLEAR:
         return None
     counted, room = set(metric.work.rows_v.tolist()), np.zeros_like(q)
     shares: dict[int, Array] = {}
@@ -134,15 +137,17 @@ def project_sparsely(
     with np.errstate(all="ignore"):
         metric = _Metric(system, t, q, form)
     code = metric.ask(tasks.RENEW_PARTITION, q.copy(), v.copy())
-    if code == codes.RANK_DIFFERS:
-        metric = _Metric(system, t, q, form, int(metric.work.notes[noted.RANK]))
-    elif code != codes.DONE:
+    if code == indices.RANK_DIFFERS:
+        metric = _Metric(system, t, q, form, int(metric.work.notes[indices.RANK]))
+    elif code != indices.DONE:
         return None
     found = metric.project(q, v)
-    if found is None or metric.work.notes[noted.PIVOT] < CLEAR:
+    if found is None or metric.work.notes[indices.PIVOT] < CLEAR:
         return None
     there = _Metric(system, t, found[0], form, metric.rank)
-    if there.ask(tasks.RENEW_PARTITION, found[0].copy(), v.copy()) != codes.DONE:  # other rows count on the constraints
+    if (
+        there.ask(tasks.RENEW_PARTITION, found[0].copy(), v.copy()) != indices.DONE
+    ):  # other rows count on the constraints
         return None
     rows, rate = system.sparse_rows(t, found[0]), system.rates(t, found[0])
     if not is_at_rounding(system.constraint(t, found[0]), rows, found[0]):

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.kernels.compile.linking import entry_point
-from twoloop.kernels.data import counters, intervals, noted
+from twoloop.kernels.data import indices
 from twoloop.kernels.layout import cached_run
 from twoloop.problem.description import Description
 from twoloop.problem.system import ConstrainedSystem
@@ -255,7 +255,7 @@ for _field in fields(Record):  # behind the decorator, which would take it for a
 Integers = NDArray[np.int64]
 
 COUNTED = [each.name for each in fields(Statistics) if each.name != "cpu_time"]
-COUNTERS = itemgetter(*(getattr(counters, name.upper()) for name in COUNTED))
+COUNTERS = itemgetter(*(getattr(indices, name.upper()) for name in COUNTED))
 BEFORE = np.array([0, 0, 1])  # rejections and partitions before all steps: the first partition is not a renewal
 
 
@@ -279,7 +279,7 @@ def of_run(run: "Run", t: Array, table: Array) -> dict[str, Any]:
         "rank": run.rank,
         "redundant": run.redundant.copy(),  # runs of one start share it
         "defect": run.defect(),
-        "widest_gap": float(run.work.notes[noted.WIDEST_GAP]),
+        "widest_gap": float(run.work.notes[indices.WIDEST_GAP]),
     }
 
 
@@ -298,6 +298,6 @@ def state_fields(n: int, t: Array, table: Array) -> dict[str, Array]:
 def interval_kinds(run: "Run", steps: Array) -> Integers:
     """Return the kind of interval of each step that the plan of the run made, for the solution within them."""
     if run.plan.apart:
-        return np.full(len(steps), intervals.APART)
-    explicit = intervals.ACROSS if run.substituted else intervals.ACCELERATIONS
-    return np.where(steps[:, run.a.JACOBIANS] > 0.0, intervals.VELOCITIES, explicit)
+        return np.full(len(steps), indices.APART)
+    explicit = indices.ACROSS if run.substituted else indices.ACCELERATIONS
+    return np.where(steps[:, run.a.JACOBIANS] > 0.0, indices.VELOCITIES, explicit)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.kernels.data.intervals import WINDOW
+from twoloop.kernels.data.indices import WINDOW
 from twoloop.problem.events import Event, EventSearch
 from twoloop.run.dense import Interpolator, Table
 from twoloop.run.dense_solution import DenseSolution

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.kernels.data import codes, noted
+from twoloop.kernels.data import indices
 from twoloop.methods import dop853
 from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import Method
@@ -83,7 +83,7 @@ class IndependentRerun:
         a, control = self.run.a, self.run.control
         control[a.MAX_STEP], control[a.BRIDGE], control[a.STORE_ALL] = max_step, 0.0, 0.0
         control[a.MAX_ATTEMPTS] = CHUNK
-        self.run.work.notes[noted.GAMMA_REQUIRED] = np.inf  # the run has judged its differences
+        self.run.work.notes[indices.GAMMA_REQUIRED] = np.inf  # the run has judged its differences
         rows = (np.empty(len(RerunPiece._fields)), np.empty((len(RerunPiece._fields), len(self.run.state))))
         self.buffers, self.filled = (*rows, np.empty((CHUNK, a.N_STEP_COLUMNS))), np.zeros(2, dtype=np.int64)
         self.next_step = np.inf
@@ -92,10 +92,10 @@ class IndependentRerun:
         """Start from a state [q, v] at t0; None if t1 is not reached within so many attempts at steps."""
         run, a, n = self.run, self.run.a, len(state)
         first_step, self.next_step = self.next_step, np.inf
-        if run.restart(t0, state[: n // 2], state[n // 2 :]) != codes.DONE:
+        if run.restart(t0, state[: n // 2], state[n // 2 :]) != indices.DONE:
             return None
         run.clock[a.H_NEXT] = first_step if first_step < np.inf else FIRST_TRY * (t1 - t0)
-        run.work.notes[noted.KINK_AFTER] = t1
+        run.work.notes[indices.KINK_AFTER] = t1
         times = np.array([between, t1] if t0 < between < t1 else [t1])
         found: list[Array] = []
         longest = 0.0
@@ -108,6 +108,6 @@ class IndependentRerun:
             if code == a.ALL_OUTPUT_DONE:
                 self.next_step = float(run.clock[a.H_NEXT])
                 return RerunPiece(found[0], found[-1], longest)
-            if code != a.PAUSED and not (code == a.AT_JUMP and apply_jump(run, t1)):
+            if code != a.PAUSED and not (code == a.AT_DISCONTINUITY and apply_jump(run, t1)):
                 break
         return None

@@ -7,14 +7,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.at_position import dependent_rows, least_inertia, mass_and_rows, pattern_of
-from twoloop.checks.rank import SHOWN, equations_in_words, in_words
 from twoloop.checks.sparse_rows import Rows, SparseRows, norms
+from twoloop.checks.structure import (
+    SHOWN,
+    dependent_rows,
+    equations_in_words,
+    in_words,
+    least_inertia,
+    mass_and_rows,
+    pattern_of,
+)
 from twoloop.generate.time_dependence import Sudden, may_be_narrow, may_be_sudden
 from twoloop.generate.traced_values import CheckedRegion
 from twoloop.kernels.compile.linking import entry_point
-from twoloop.kernels.data import codes, counters, flags, noted, tolerances
-from twoloop.kernels.data.kit import Kit
+from twoloop.kernels.data import indices
+from twoloop.kernels.data.common import Kit
 from twoloop.kernels.evaluation.tasks import SOLVE
 from twoloop.kernels.layout import cached_run, copy_of, empty
 from twoloop.methods.auto import with_matrix_cost
@@ -58,9 +65,9 @@ class Run:
         interiors: Mapping[int, Plan] = MappingProxyType({}),
     ):
         from twoloop.kernels import advance  # compiled, or read from the cache, at the first run of a process
-        from twoloop.kernels.control import clock
+        from twoloop.kernels.control import loop_state
 
-        self.kernels, self.a = advance, clock
+        self.kernels, self.a = advance, loop_state
         self.system, self.plan, self.t0 = system, plan, t0
         self.memory = plan.memory.copy()
         self.rtol, self.reuse, self.interiors, self.traced = rtol, plan.reuse, interiors, plan.traced
@@ -75,21 +82,21 @@ class Run:
         # ranks are found anew at every start: those of the last one are a guess, which spares a second workspace
         self.work = self._workspace(*(system.made.get("ranks", ()) if self.static is None else ()))
         self.new_state = np.zeros_like(self.state)
-        self.tolerances = np.zeros(tolerances.ATOL + system.n_q)
-        self.tolerances[tolerances.RTOL] = rtol
-        self.tolerances[tolerances.ESTIMATE] = step_size is None
-        self.tolerances[tolerances.LEAST] = least_tolerance(rtol, self.least_atol)
-        self.tolerances[tolerances.ATOL :] = atol
-        self.control = np.zeros(clock.N_CONTROL)
-        self.control[clock.MAX_STEP], self.control[clock.UNSEEN] = np.inf, 1.0
-        self.control[clock.FIXED_STEP] = 0.0 if step_size is None else step_size
-        self.control[clock.MAX_STEPS] = np.inf
-        self.control[clock.BRIDGE], self.control[clock.AHEAD] = self.static is None, 1.0
+        self.tolerances = np.zeros(indices.ATOL + system.n_q)
+        self.tolerances[indices.RTOL] = rtol
+        self.tolerances[indices.ESTIMATE] = step_size is None
+        self.tolerances[indices.LEAST] = least_tolerance(rtol, self.least_atol)
+        self.tolerances[indices.ATOL :] = atol
+        self.control = np.zeros(loop_state.N_CONTROL)
+        self.control[loop_state.MAX_STEP], self.control[loop_state.MAX_EVALUATION_GAP] = np.inf, 1.0
+        self.control[loop_state.FIXED_STEP] = 0.0 if step_size is None else step_size
+        self.control[loop_state.MAX_STEPS] = np.inf
+        self.control[loop_state.BRIDGE], self.control[loop_state.SAMPLE_MOTION] = self.static is None, 1.0
         rates = system.given.keys() & {"constraint_rate", "nonholonomic_rate"}  # C_t of kinematics alone is zero
-        self.control[clock.DRIVEN] = bool(rates)
+        self.control[loop_state.DRIVEN] = bool(rates)
         first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
         self.chunk = max(1, first_chunk // max(1, system.n_q // SMALL))  # attempts in one call of advance, at most
-        self.clock = np.zeros(clock.N_CLOCK)
+        self.clock = np.zeros(loop_state.N_CLOCK)
         self._set_clock(t0)
         self.control_by(plan)
         self.substituted = False  # whether another plan has taken over, for good
@@ -98,7 +105,7 @@ class Run:
         changes = system.remembered(("changes", ran), lambda: (may_be_sudden(system, ran), may_be_narrow(system, ran)))
         sudden, narrow = (Sudden(False, False), True) if step_size is not None else changes
         self.sudden: Sudden = sudden
-        self.control[[clock.BY_TIME, clock.BY_STATE]] = self.sudden
+        self.control[[loop_state.BY_TIME, loop_state.BY_STATE]] = self.sudden
         self.narrow = narrow or plan.unseen == 1.0
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and behind steps across singular positions
         self.lengths: list[float] = []  # of steps across such a position that are still to be tried
@@ -127,9 +134,9 @@ class Run:
         other.t0, other.compared_until = t0, [-np.inf]
         work = empty(self.work.sizes)
         prepare_workspace(work, self.system, self.kit.flags, other._pattern(q0), q0, self.rtol, self.reuse)
-        work.notes[noted.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
+        work.notes[indices.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
         other.work = work
-        if other.restart(t0, q0, v0) != codes.DONE:
+        if other.restart(t0, q0, v0) != indices.DONE:
             return None
         other.redundant, other.rows_warning = other.redundant_rows()
         other.start_warning = other._start_warning()
@@ -149,8 +156,18 @@ class Run:
         a, clock = self.a, self.clock
         clock[:] = 0.0
         clock[a.T] = clock[a.T_START] = t
-        clock[[a.JUMP_FROM, a.JUMP_TO, a.PIVOT_AT_OUTPUT, a.BRIEFEST]] = np.inf
-        clock[[a.ROUGH_TO, a.LOOKED_TO, a.ALONG_TO, a.SUDDEN, a.ALONG, a.COMPARED, a.FLANK]] = -np.inf
+        clock[[a.JUMP_FROM, a.JUMP_TO, a.PIVOT_AT_OUTPUT, a.SHORTEST_CHANGE]] = np.inf
+        clock[
+            [
+                a.ROUGH_TO,
+                a.SAMPLED_TO,
+                a.MOTION_SAMPLED_TO,
+                a.DISCONTINUITY,
+                a.DISCONTINUITY_OF_MOTION,
+                a.COMPARED,
+                a.LAST_CHANGE,
+            ]
+        ] = -np.inf
         clock[a.H_LIMIT] = self.plan.limit_start
 
     def advance(
@@ -191,7 +208,7 @@ class Run:
             crossings=[],
             jumps=[],
         )
-        if self.static is None and self.kit.flags[flags.FORM] == flags.AUGMENTED:  # which a run may change
+        if self.static is None and self.kit.flags[indices.FORM] == indices.AUGMENTED:  # which a run may change
             other.kit = kit_with(self.system, self.kit.flags, other.plan)
             other.functions = other.kit.functions
         return other
@@ -208,9 +225,9 @@ class Run:
         control[a.LIMIT_START], control[a.LIMIT_FACTOR] = plan.limit_start, plan.limit_factor
         control[a.LIMIT_MEMORY], control[a.SYMMETRIC] = plan.limit_memory, plan.symmetric
         control[a.ROUGH] = plan.rough
-        control[a.GIVES_WAY] = plan.substitute is not None
-        control[a.IN_A_ROW] = getattr(plan.step, "many", None) is not None
-        control[a.PROVISIONAL] = PROVISIONAL if plan.provisional else -1.0
+        control[a.MAY_SWITCH] = plan.substitute is not None
+        control[a.MAKES_MANY] = getattr(plan.step, "many", None) is not None
+        control[a.TRIAL_STEPS] = PROVISIONAL if plan.provisional else -1.0
         self.clock[a.H_LIMIT] = plan.limit_start
 
     def _workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
@@ -219,7 +236,7 @@ class Run:
         pattern = self._pattern(q0) if self.static is None else NONE
         ranks = rank, rank_v
         work = workspace(self.system, self.kit, pattern, q0, self.rtol, self.reuse, ranks, self.static, self.matrices)
-        work.notes[noted.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
+        work.notes[indices.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
         return work
 
     def _pattern(self, q: Array) -> Array:
@@ -229,7 +246,7 @@ class Run:
 
     def is_lost_without_dense(self, code: int) -> bool:
         """Return whether the static form found no step, however short, and others may."""
-        reasons = (codes.INNER_DIVERGED, codes.SINGULAR, codes.MASS_NOT_DEFINITE)
+        reasons = (indices.INNER_DIVERGED, indices.SINGULAR, indices.MASS_NOT_DEFINITE)
         return (
             self.static is not None
             and code in (self.a.STEP_TOO_SMALL, self.a.FIXED_STEP_FAILED, self.a.RANK_LOST)
@@ -254,31 +271,31 @@ class Run:
         self.functions = self.kit.functions
         self.work = self._workspace(rank, rank)
         self.work.counters[:] = before.counters
-        kept = [noted.LARGEST_DEFECT, noted.UNCHECKED, noted.WIDEST_GAP, noted.KINK_BEFORE, noted.KINK_AFTER]
+        kept = [indices.LARGEST_DEFECT, indices.UNCHECKED, indices.WIDEST_GAP, indices.KINK_BEFORE, indices.KINK_AFTER]
         self.work.notes[kept] = before.notes[kept]
         self.control[self.a.BRIDGE] = self.static is None
         clock, a = self.clock, self.a
-        if clock[a.FAILURE_CODE] != codes.DONE:
+        if clock[a.FAILURE_CODE] != indices.DONE:
             clock[a.H_NEXT], clock[a.H_LIMIT] = clock[a.H_LONG] or clock[a.H_NEXT], self.plan.limit_start
-            clock[a.FAILURE_CODE] = codes.DONE
+            clock[a.FAILURE_CODE] = indices.DONE
         state = self.state.copy()
         code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
-        if code == codes.RANK_DIFFERS:  # as it does where a start at which rows depend on one another was left
-            self.work.notes[noted.GENERATION] = 1.0
+        if code == indices.RANK_DIFFERS:  # as it does where a start at which rows depend on one another was left
+            self.work.notes[indices.GENERATION] = 1.0
             code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
-        if before.notes[noted.PIVOT] > 0.0 and largest > 0.0:  # as if it had been looked at in this way all along
-            pivot = self.work.notes[noted.PIVOT]
-            self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest / before.notes[noted.PIVOT])
+        if before.notes[indices.PIVOT] > 0.0 and largest > 0.0:  # as if it had been looked at in this way all along
+            pivot = self.work.notes[indices.PIVOT]
+            self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest / before.notes[indices.PIVOT])
 
     def _begin(self) -> None:
         start = entry_point(self.kernels.start)
         code = start(self.kit, self.work, self.t0, self.state)
-        if self.static is not None and code == codes.RANK_DIFFERS:
-            rank = int(self.work.notes[noted.RANK])
+        if self.static is not None and code == indices.RANK_DIFFERS:
+            rank = int(self.work.notes[indices.RANK])
             self.work = self._workspace(rank, rank)
             code = start(self.kit, self.work, self.t0, self.state)
-        if self.static is not None and code not in (codes.DONE, codes.NOT_FINITE):
-            if self.work.notes[noted.SMALLEST] < 0.0:  # M is not definite, nor will it be at another start
+        if self.static is not None and code not in (indices.DONE, indices.NOT_FINITE):
+            if self.work.notes[indices.SMALLEST] < 0.0:  # M is not definite, nor will it be at another start
                 self.system.made["static form"] = None
             self.static = None
             self.kit = kit_of(self.system, self.t0, self.state[: self.system.n_q], self.plan)
@@ -286,24 +303,24 @@ class Run:
             self.control[self.a.BRIDGE] = 1.0
             self.work = self._workspace()
             code = start(self.kit, self.work, self.t0, self.state)
-        if code == codes.RANK_DIFFERS:
-            self.system.made["ranks"] = ranks = int(self.work.notes[noted.RANK]), int(self.work.notes[noted.RANK_V])
+        if code == indices.RANK_DIFFERS:
+            self.system.made["ranks"] = ranks = int(self.work.notes[indices.RANK]), int(self.work.notes[indices.RANK_V])
             self.work = self._workspace(*ranks)
             code = start(self.kit, self.work, self.t0, self.state)
-        if code == codes.GAMMA_INACCURATE:  # the first step says so, too, and that run has a result
-            required = self.work.notes[noted.GAMMA_REQUIRED]
-            self.work.notes[noted.GAMMA_REQUIRED] = np.inf
+        if code == indices.GAMMA_INACCURATE:  # the first step says so, too, and that run has a result
+            required = self.work.notes[indices.GAMMA_REQUIRED]
+            self.work.notes[indices.GAMMA_REQUIRED] = np.inf
             code = start(self.kit, self.work, self.t0, self.state)
-            self.work.notes[noted.GAMMA_REQUIRED] = required
-        if code == codes.DONE:
+            self.work.notes[indices.GAMMA_REQUIRED] = required
+        if code == indices.DONE:
             return
         n = self.system.n_q
-        if code == codes.MASS_NOT_DEFINITE:
+        if code == indices.MASS_NOT_DEFINITE:
             raise ValueError(
                 f"mass of {self.system.name!r} must be positive definite on the velocities that the constraints allow; "
                 f"at t = {self.t0!r} {least_inertia(self.system, self.t0, self.state[:n])[1]}"
             )
-        if code == codes.SINGULAR:
+        if code == indices.SINGULAR:
             raise ValueError(
                 f"the accelerations of {self.system.name!r} cannot be found at t = {self.t0!r}: the constraint "
                 f"Jacobian has lost rank there ({dependent_rows(self.system, self.t0, self.state[:n])}). Start from "
@@ -337,9 +354,9 @@ class Run:
 
     def _start_warning(self) -> str:
         """Describe a start beside a singular position, where pivots are small: those of static factors vary."""
-        if self.work.notes[noted.PIVOT] > (MARGIN * WEAK if self.static is None else LEAST):
+        if self.work.notes[indices.PIVOT] > (MARGIN * WEAK if self.static is None else LEAST):
             return ""
-        atol, q = self.tolerances[tolerances.ATOL :], self.state[: self.system.n_q]
+        atol, q = self.tolerances[indices.ATOL :], self.state[: self.system.n_q]
         return describe_singular_start(self.system, self.t0, q, self.rank, self.rtol, atol)
 
     def contradicting(self, rows: Rows) -> NDArray[np.int64]:
@@ -385,8 +402,8 @@ class Run:
         Where something may be narrow, one stage that meets it may say too little: no step is longer then.
         """
         unseen = 1.0 if self.narrow else self.plan.unseen
-        longest = np.inf if self.plan.looks_within else self.tolerances[tolerances.GAP] / unseen
-        self.control[self.a.MAX_STEP], self.control[self.a.UNSEEN] = min(self.max_step, longest), unseen
+        longest = np.inf if self.plan.looks_within else self.tolerances[indices.GAP] / unseen
+        self.control[self.a.MAX_STEP], self.control[self.a.MAX_EVALUATION_GAP] = min(self.max_step, longest), unseen
 
     def first_step(self, t: float, t1: float, state: Array, longest: float = 0.0) -> float:
         """Return the first step from a state, s. With a longest one, let no step skip a hundredth of the run."""
@@ -397,8 +414,8 @@ class Run:
     def defect(self) -> float | None:
         """Return the largest defect of the steps, if all of them found theirs."""
         notes = self.work.notes
-        checked = self.work.counters[counters.N_ACCEPTED] > 0 and notes[noted.UNCHECKED] == 0.0
-        return float(notes[noted.LARGEST_DEFECT]) if checked else None
+        checked = self.work.counters[indices.N_ACCEPTED] > 0 and notes[indices.UNCHECKED] == 0.0
+        return float(notes[indices.LARGEST_DEFECT]) if checked else None
 
     def passed_near_singular(self) -> bool:
         """Return whether steps had to end so near a singular position that rounding may have made velocities."""
@@ -408,4 +425,4 @@ class Run:
     def attempts(self) -> int:
         """Return the number of steps that were tried so far."""
         c = self.work.counters
-        return int(c[counters.N_ACCEPTED] + c[counters.N_REJECTED_ERROR] + c[counters.N_REJECTED_CONVERGENCE])
+        return int(c[indices.N_ACCEPTED] + c[indices.N_REJECTED_ERROR] + c[indices.N_REJECTED_CONVERGENCE])

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import check_finite, check_real, shown
-from twoloop.checks.at_position import parts_of
 from twoloop.checks.consistency import check_start
+from twoloop.checks.structure import parts_of
 from twoloop.generate.derived_callbacks import exact_near, with_derived_callbacks
 from twoloop.generate.traced_values import Traced
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.kernels.compile.linking import entry_point
-from twoloop.kernels.data import codes, noted
+from twoloop.kernels.data import indices
 from twoloop.methods.auto import Auto
 from twoloop.methods.plan import Method
 from twoloop.methods.taylor import Taylor
@@ -119,7 +119,7 @@ class SampledRun:
 
     def _run_from(self, t: float, q: Array, v: Array) -> Run:
         run = Run(self._derived, self._plan.fresh(), t, q, v, *self._tolerances, None)
-        run.work.notes[noted.GENERATION] = 1.0  # the ranks are known
+        run.work.notes[indices.GENERATION] = 1.0  # the ranks are known
         run.set_sizes(None, self.max_step, t + 1.0)
         run.control[run.a.STORE_ALL] = 0.0
         return run
@@ -219,7 +219,7 @@ class SampledRun:
             rank=run.rank,
             redundant=run.redundant.copy(),
             untested=steps[:, a.JACOBIANS] > 0.0,
-            widest_gap=float(run.work.notes[noted.WIDEST_GAP]),
+            widest_gap=float(run.work.notes[indices.WIDEST_GAP]),
             system=self.system,
             changes=CHANGED,
         )
@@ -230,12 +230,12 @@ class SampledRun:
         code = entry_point(run.kernels.start)(run.kit, run.work, t, run.state)
         first = 0
         if run.plan.first is not None:  # of a pair it is kept which of the two is at work
-            from twoloop.kernels.control.switching import N_SCALARS
+            from twoloop.kernels.control.stiffness import N_SCALARS
 
             first = N_SCALARS + 2 * run.system.n_q
         run.plan.memory[first:] = run.memory[first:]
         run.clock[: a.N_PAST] = 0.0
-        if code != codes.DONE:
+        if code != indices.DONE:
             raise RuntimeError(
                 f"the accelerations of {self.system.name!r} cannot be found at t = {t:.10g} with the inputs given: the "
                 "forces are not finite, or the constraints have lost rank"
@@ -263,7 +263,7 @@ class SampledRun:
             record = IntegrationLoop(run, end, wanted, lambda t: None, None, interrupts).to_end(False)
         finally:
             interrupts.leave()
-        run.control[run.a.STORE_ALL], run.work.notes[noted.KINK_AFTER] = 0.0, np.inf
+        run.control[run.a.STORE_ALL], run.work.notes[indices.KINK_AFTER] = 0.0, np.inf
         steps = np.zeros((len(record.h), run.a.N_STEP_COLUMNS))
         steps[:, run.a.H], steps[:, run.a.JACOBIANS] = record.h, record.untested
         self.steps.append(steps)

@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.rank import surely_above
 from twoloop.checks.scales import signs
-from twoloop.kernels.data.tolerances import UNTRUE
+from twoloop.checks.structure import surely_above
+from twoloop.kernels.data.indices import UNTRUE
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.at_position import NEARBY, pattern_of
+from twoloop.checks.structure import NEARBY, pattern_of
 from twoloop.kernels.layout import Static
 from twoloop.kernels.linalg.sparse_lu import column_groups, grouped_entries, newton_program
 from twoloop.kernels.linalg.symbolic_factorization import (

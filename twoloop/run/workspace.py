@@ -5,10 +5,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.at_position import has_definite_mass, least_inertia
+from twoloop.checks.structure import has_definite_mass, least_inertia
 from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import common
-from twoloop.kernels.data.flags import (
+from twoloop.kernels.data.common import Kit
+from twoloop.kernels.data.indices import (
     AUGMENTED,
     BANDWIDTH,
     DENSE_FORM,
@@ -19,7 +20,6 @@ from twoloop.kernels.data.flags import (
     STATIC,
     STRAIGHT,
 )
-from twoloop.kernels.data.kit import Kit
 from twoloop.kernels.evaluation.operations import N_NODES
 from twoloop.kernels.layout import cached_run, lasting, make_work
 from twoloop.kernels.linalg.band import banded_pays, lapack_addresses

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.checks.optional import needed
+from twoloop.checks.arguments import needed
 from twoloop.kernels.compile.dependencies import LIBRARIES, Digest, NotDigestible
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.problem.system import ConstrainedSystem

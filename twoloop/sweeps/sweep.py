@@ -10,8 +10,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Any
 
-from twoloop.checks.arguments import check_choice, check_flag, check_path, check_positive, check_size, check_span
-from twoloop.checks.optional import needed
+from twoloop.checks.arguments import (
+    check_choice,
+    check_flag,
+    check_path,
+    check_positive,
+    check_size,
+    check_span,
+    needed,
+)
 from twoloop.result.result import Result
 from twoloop.run.options import check_method
 from twoloop.solve import solve_dae

@@ -1,7 +1,7 @@
-"""What every kernel shares: signatures, the workspace, return codes, counters and the compiling decorator.
+"""What all kernels share: types and compiling decorators, the workspace, the table of callbacks, the tolerances.
 
-Every callback of a mechanism has one fixed signature and works in place, so that the integrator is compiled once
-and takes any mechanism (and any method) as a first-class function.
+Every callback of a mechanism has one fixed signature and works in place. The integrator is compiled once, and takes any
+mechanism and any method as first-class functions.
 """
 
 import hashlib
@@ -13,15 +13,17 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from numba import njit, types
 from numba.extending import typeof_impl
 
 from twoloop.kernels.compile.caches import compile_cached
 from twoloop.kernels.compile.callbacks import KINDS, MATRIX, VECTOR, f8
+from twoloop.kernels.compile.generated_functions import DeferredFunctions, GeneratedFunctions
 from twoloop.kernels.compile.linking import HelperCompiler, KernelCompiler, VectorizingCompiler
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.kernels.compile.reference import Reference
-from twoloop.kernels.data.flags import GIVEN
+from twoloop.kernels.data.indices import ATOL, ESTIMATE, FAULT_KIND, FAULT_TIME, GAP, GIVEN, NOT_FINITE, RTOL
 
 i8 = types.int64
 INTEGERS = types.int64[::1]
@@ -65,7 +67,7 @@ class Work(NamedTuple):
     places: Any  # where the entries of each row of G begin (n_c + n_a + 1), counted in what follows: their columns
     Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences over a double length, and with the length tried before
     rates: Any  # (13, n_c + n_a) C_t and b at times within a step, see drive_discontinuities.py
-    changes: Any  # (8, n_q + n_c + n_a) of forces, C_t and b with time, see sudden.py
+    changes: Any  # (8, n_q + n_c + n_a) of forces, C_t and b with time, see force_discontinuities.py
     Q: Any  # (n_q) force
     x: Any  # (n_q) scratch
     y: Any  # (n_q) scratch
@@ -91,12 +93,12 @@ class Work(NamedTuple):
     right: Any  # (2 (n_q + r_v)) right-hand side of the augmented matrix, and scratch
     order: Any  # (n_q) scratch: column order of the full pivoting
     row_order: Any  # (n_c + n_a) scratch: row order
-    counters: Any  # (N_COUNTERS) see counters.py
+    counters: Any  # (N_COUNTERS) see indices.py
     lapack: Any  # addresses of lapack.ROUTINES; 0 where linear algebra is dense
     predicted: Any  # (r) dependent positions that the integration formula gives, before the constraints restore them
-    notes: Any  # (N_NOTES) see noted.py
+    notes: Any  # (N_NOTES) see indices.py
     nodes: Any  # what the operations of a program make
-    matrices: Any  # of Newton's method, see steps/newton_memory.py and steps/newton_systems.py
+    matrices: Any  # of Newton's method, see steps/newton_memory.py and steps/newton_static.py
     # of the static form alone; there N is n_q + n_c, and what is of no use to it is empty
     mass_values: Any  # entries of M, see linalg/symbolic_factorization.py
     jacobian_values: Any  # entries of G
@@ -292,3 +294,123 @@ compiled = _helper(forceinline=False)  # a helper that kernels call; one copy, u
 inlined = _helper(inline="always")  # one that vanishes in its caller; only such a one can return views of arrays
 # the same later, by LLVM, and so typed once: for what is short, or called in every evaluation; each call is a copy
 merged = _helper(forceinline=True)
+
+
+NONE = np.zeros(0)
+
+
+class Kit:
+    """What kernels get of a system and a method, one reference: the callbacks, the inner loop and the step.
+
+    The latter two are compiled once, and not again in what calls them; None where they are not called. A step that
+    chooses between two others has these as `first` and `second`. An inner loop that calls functions made for the
+    mechanism leaves to `general` what these do not do. `own` are sets of such functions; `numbers` is what those of the
+    inner loop read, `own_numbers` what those of collocation read.
+    """
+
+    def __init__(
+        self,
+        functions: Any,
+        inner: Any = None,
+        step: Step | None = None,
+        first: Step | None = None,
+        second: Step | None = None,
+        general: Any = None,
+        own: tuple[GeneratedFunctions | DeferredFunctions, ...] = (),
+        numbers: Any = None,
+        own_numbers: Any = None,
+    ):
+        self.__dict__.update(functions._asdict())
+        self.functions, self.inner, self.general, self.own = functions, inner, general, own
+        self.numbers = NONE if numbers is None else numbers
+        self.own_numbers = NONE if own_numbers is None else own_numbers
+        self.attempt, self.settle, self.attempt_many = step or Step()
+        self.attempt_first, self.settle_first, _ = first or Step()
+        self.attempt_second, self.settle_second, _ = second or Step()
+        self.__dict__.update(dict.fromkeys(OWN_FUNCTIONS, 0))
+        for each in own:
+            self.__dict__.update(each.addresses)
+        self.table = KIT.table(self)
+        self.address = self.table.ctypes.data
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.functions, name)
+
+
+@typeof_impl.register(Kit)
+def _type_of_kit(value: Any, context: Any) -> Any:
+    return KIT
+
+
+MASS, FORCE, CONSTRAINT, JACOBIAN, RATE, GAMMA = (
+    Functions._fields.index(kind) for kind in ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")
+)
+NONHOLONOMIC, NONHOLONOMIC_RATE, NONHOLONOMIC_GAMMA = (
+    Functions._fields.index(f"nonholonomic{part}") for part in ("", "_rate", "_gamma")
+)
+
+
+@compiled
+def finite_vector(x):
+    """Return whether all entries are finite."""
+    all_finite = True
+    for j in range(x.size):
+        all_finite = all_finite and np.isfinite(x[j])
+    return all_finite
+
+
+@compiled
+def finite(A):
+    """Return whether all entries of a matrix are finite."""
+    all_finite = True
+    for i in range(A.shape[0]):
+        all_finite = all_finite and finite_vector(A[i])
+    return all_finite
+
+
+@compiled
+def not_finite(notes, kind, t, q):
+    """Note which callback gave a value that is not finite, for the message; none where q itself is not finite."""
+    notes[FAULT_KIND] = kind if finite_vector(q) else -1.0
+    notes[FAULT_TIME] = t
+    return NOT_FINITE
+
+
+@compiled
+def source_of_acceleration(w):
+    """Return the place in Functions of the callback that gave an acceleration that is not finite; -1: none of these."""
+    n_c = w.C.size
+    if not finite_vector(w.Rate[:n_c]):
+        return RATE
+    if not finite_vector(w.Gamma[:n_c]):
+        return GAMMA
+    if not finite(w.G[n_c:]):
+        return NONHOLONOMIC
+    if not finite_vector(w.Rate[n_c:]):
+        return NONHOLONOMIC_RATE
+    if not finite_vector(w.Gamma[n_c:]):
+        return NONHOLONOMIC_GAMMA
+    return FORCE if not finite_vector(w.Q) else -1
+
+
+SLACK = 1e-9  # relative: a step may be longer than GAP by rounding
+
+
+@merged
+def allowed(tolerances, m, x, x1):
+    """Return the error allowed of coordinate m, or of its velocity, in a step from x to x1."""
+    return tolerances[ATOL + m] + tolerances[RTOL] * max(abs(x), abs(x1))
+
+
+@merged
+def is_beyond_gap(tolerances, h):
+    """Return whether a step is longer than GAP."""
+    return h > tolerances[GAP] * (1.0 + SLACK)
+
+
+@merged
+def times_gap(tolerances, h):
+    """Return the length of a step over GAP, or 0 where it is no longer than GAP or its size is fixed."""
+    if tolerances[ESTIMATE] == 1.0 and is_beyond_gap(tolerances, h):
+        return h / tolerances[GAP]
+    return 0.0

@@ -8,20 +8,25 @@ accelerations to the correction itself: one that is not near rounding is followe
 
 import numpy as np
 
-from twoloop.kernels.data.codes import DONE, INNER_DIVERGED
-from twoloop.kernels.data.common import compiled, merged
-from twoloop.kernels.data.counters import N_EVALUATIONS, N_INNER
-from twoloop.kernels.data.finite import CONSTRAINT, MASS, finite, not_finite, source_of_acceleration
-from twoloop.kernels.data.flags import (
+from twoloop.kernels.data.common import CONSTRAINT, MASS, compiled, finite, merged, not_finite, source_of_acceleration
+from twoloop.kernels.data.indices import (
     CONSTANT_MASS,
+    DONE,
+    FACTORED,
     FORM,
     GAMMA_GIVEN,
+    GAMMA_SCALE,
+    INNER_DIVERGED,
     KINEMATICS_GIVEN,
+    KNOWN,
     MULTIPLIERS,
+    N_EVALUATIONS,
+    N_INNER,
     NONHOLONOMIC_GAMMA_GIVEN,
     NULL_SPACE,
+    PIVOT,
+    ROUNDED,
 )
-from twoloop.kernels.data.noted import FACTORED, GAMMA_SCALE, KNOWN, PIVOT, ROUNDED
 from twoloop.kernels.evaluation.constraints import constraint_rates, gamma_by_differences, kinematics, row_residual
 from twoloop.kernels.evaluation.partition import (
     CONTRACTION,

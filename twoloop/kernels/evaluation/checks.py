@@ -8,9 +8,8 @@ import math
 
 from numba import types
 
-from twoloop.kernels.data.common import KIT, MATRIX, VECTOR, exact, f8, i8, kernel
-from twoloop.kernels.data.finite import finite, finite_vector
-from twoloop.kernels.data.flags import (
+from twoloop.kernels.data.common import KIT, MATRIX, VECTOR, exact, f8, finite, finite_vector, i8, kernel
+from twoloop.kernels.data.indices import (
     CONSTANT_MASS,
     FORCE_BY_Q_GIVEN,
     FORCE_BY_V_GIVEN,

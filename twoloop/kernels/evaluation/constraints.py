@@ -8,10 +8,21 @@ differences, over a length e and over 2 e, give the derivative to order 4, and t
 
 import numpy as np
 
-from twoloop.kernels.data.codes import DONE, GAMMA_INACCURATE
 from twoloop.kernels.data.common import compiled, exact, merged
-from twoloop.kernels.data.flags import AUGMENTED, CONSTRAINT_RATE_GIVEN, FORM, NONHOLONOMIC_RATE_GIVEN
-from twoloop.kernels.data.noted import GAMMA_ACCURACY, GAMMA_REQUIRED, GAMMA_SCALE, GAMMA_SHARE, KINK_AFTER, KINK_BEFORE
+from twoloop.kernels.data.indices import (
+    AUGMENTED,
+    CONSTRAINT_RATE_GIVEN,
+    DONE,
+    FORM,
+    GAMMA_ACCURACY,
+    GAMMA_INACCURATE,
+    GAMMA_REQUIRED,
+    GAMMA_SCALE,
+    GAMMA_SHARE,
+    KINK_AFTER,
+    KINK_BEFORE,
+    NONHOLONOMIC_RATE_GIVEN,
+)
 from twoloop.kernels.evaluation.program import jacobian_by_program
 from twoloop.kernels.linalg.dense import copy, largest_of
 

@@ -9,10 +9,8 @@ is the jump, in one of the halves, however short they are.
 
 import numpy as np
 
-from twoloop.kernels.data.common import compiled
-from twoloop.kernels.data.finite import finite_vector
-from twoloop.kernels.data.flags import FORM, STATIC
-from twoloop.kernels.data.tolerances import ATOL, RTOL, allowed
+from twoloop.kernels.data.common import allowed, compiled, finite_vector
+from twoloop.kernels.data.indices import ATOL, FORM, RTOL, STATIC
 from twoloop.kernels.evaluation.constraints import constraint_rates
 from twoloop.kernels.linalg.symbolic_factorization import jacobian_of
 

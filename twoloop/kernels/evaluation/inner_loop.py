@@ -5,10 +5,18 @@ A step gets a `Kit`, the callbacks and this function; the helpers here name its 
 
 import numpy as np
 
-from twoloop.kernels.data.codes import DONE, INNER_DIVERGED, SINGULAR
 from twoloop.kernels.data.common import INNER, compiled, kernel, merged
-from twoloop.kernels.data.counters import N_EVALUATIONS, N_FACTORIZATIONS, N_INNER
-from twoloop.kernels.data.noted import BY_GENERAL, REUSE, ROUNDED
+from twoloop.kernels.data.indices import (
+    BY_GENERAL,
+    DONE,
+    INNER_DIVERGED,
+    N_EVALUATIONS,
+    N_FACTORIZATIONS,
+    N_INNER,
+    REUSE,
+    ROUNDED,
+    SINGULAR,
+)
 from twoloop.kernels.evaluation import tasks
 from twoloop.kernels.evaluation.accelerations import (
     MIN_CORRECTION,

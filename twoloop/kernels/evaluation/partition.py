@@ -6,29 +6,32 @@ Equation numbers are those of Zhang & Zhang (2016), doi 10.1007/s11071-016-2682-
 
 import numpy as np
 
-from twoloop.kernels.data.codes import DONE, INNER_DIVERGED, RANK_DIFFERS, ROWS_CONTRADICT, SINGULAR
-from twoloop.kernels.data.common import compiled, merged
-from twoloop.kernels.data.counters import N_FACTORIZATIONS, N_INNER, N_PARTITIONS
-from twoloop.kernels.data.finite import CONSTRAINT, JACOBIAN, finite, not_finite
-from twoloop.kernels.data.flags import (
+from twoloop.kernels.data.common import CONSTRAINT, JACOBIAN, compiled, finite, merged, not_finite
+from twoloop.kernels.data.indices import (
     CONSTRAINT_RATE_GIVEN,
-    FORM,
-    KINEMATICS_GIVEN,
-    NONHOLONOMIC_RATE_GIVEN,
-    NULL_SPACE,
-    STATIC,
-)
-from twoloop.kernels.data.noted import (
     CONTRADICTION,
+    DONE,
     FACTORED,
+    FORM,
     GENERATION,
+    INNER_DIVERGED,
+    KINEMATICS_GIVEN,
     KNOWN,
     LEANING,
+    N_FACTORIZATIONS,
+    N_INNER,
+    N_PARTITIONS,
+    NONHOLONOMIC_RATE_GIVEN,
+    NULL_SPACE,
     ORIENTATION,
     PIVOT,
     RANK,
+    RANK_DIFFERS,
     RANK_V,
+    ROWS_CONTRADICT,
     SENSITIVITY,
+    SINGULAR,
+    STATIC,
 )
 from twoloop.kernels.evaluation.constraints import (
     clear_rows,

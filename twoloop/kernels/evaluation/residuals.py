@@ -5,7 +5,7 @@ from numba import types
 
 from twoloop.kernels.compile.callbacks import VECTOR, f8
 from twoloop.kernels.data.common import INTEGERS, KIT, compiled, kernel
-from twoloop.kernels.data.flags import GAMMA_GIVEN
+from twoloop.kernels.data.indices import GAMMA_GIVEN
 
 TABLE, STATES = types.float64[:, ::1], types.float64[:, :, ::1]
 

@@ -20,19 +20,41 @@ small by s, over the columns' own size, loses the factor 1 + s^2 / SHARE each ti
 
 import numpy as np
 
-from twoloop.kernels.data.codes import DONE, INNER_DIVERGED, NEEDS_DENSE, RANK_DIFFERS, ROWS_CONTRADICT, SINGULAR
-from twoloop.kernels.data.common import INNER, compiled, kernel
-from twoloop.kernels.data.counters import N_EVALUATIONS, N_FACTORIZATIONS, N_INNER, N_PARTITIONS
-from twoloop.kernels.data.finite import CONSTRAINT, FORCE, GAMMA, JACOBIAN, MASS, RATE, finite_vector, not_finite
-from twoloop.kernels.data.flags import CONSTANT_MASS, GAMMA_GIVEN, JACOBIAN_VALUES_GIVEN, MASS_VALUES_GIVEN
-from twoloop.kernels.data.noted import (
+from twoloop.kernels.data.common import (
+    CONSTRAINT,
+    FORCE,
+    GAMMA,
+    INNER,
+    JACOBIAN,
+    MASS,
+    RATE,
+    compiled,
+    finite_vector,
+    kernel,
+    not_finite,
+)
+from twoloop.kernels.data.indices import (
+    CONSTANT_MASS,
     CONTRADICTION,
+    DONE,
+    GAMMA_GIVEN,
     GENERATION,
+    INNER_DIVERGED,
+    JACOBIAN_VALUES_GIVEN,
+    MASS_VALUES_GIVEN,
+    N_EVALUATIONS,
+    N_FACTORIZATIONS,
+    N_INNER,
+    N_PARTITIONS,
     NEARLY_SINGULAR,
+    NEEDS_DENSE,
     PIVOT,
     RANK,
+    RANK_DIFFERS,
     RANK_V,
     ROUNDED,
+    ROWS_CONTRADICT,
+    SINGULAR,
     SMALLEST,
 )
 from twoloop.kernels.evaluation import tasks

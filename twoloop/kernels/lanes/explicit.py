@@ -7,7 +7,8 @@ the mechanism, see generate/lane_code.py.
 
 import numpy as np
 
-from twoloop.kernels.control.controller import N_PAST, N_RULE, factor_of, remember
+from twoloop.kernels.control.loop_state import N_PAST, N_RULE
+from twoloop.kernels.control.step_size import factor_of, record_accepted
 from twoloop.kernels.data.common import compiled, inlined, kernel, merged
 from twoloop.kernels.lanes.layout import (
     ACCEPTED,
@@ -181,7 +182,7 @@ def _accepted(options, work, k):
     if not accepted:
         work[H_NEXT * LANES + k] = min(proposal, SHORTENED * h)
         return False
-    remember(options, past, h, error)
+    record_accepted(options, past, h, error)
     work[H_NEXT * LANES + k] = max(proposal, work[WANTED * LANES + k]) if h < work[WANTED * LANES + k] else proposal
     work[LIMIT_AGE * LANES + k] += 1.0
     if work[LIMIT_AGE * LANES + k] > LIMIT_MEMORY:

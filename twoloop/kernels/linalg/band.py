@@ -15,9 +15,8 @@ from numba import types
 from numba.extending import get_cython_function_address, intrinsic
 
 from twoloop.kernels.compile.private import cgutils
-from twoloop.kernels.data.codes import DONE, MASS_NOT_DEFINITE, SINGULAR
 from twoloop.kernels.data.common import compiled, inlined, merged
-from twoloop.kernels.data.flags import BANDWIDTH, DIAGONAL_MASS
+from twoloop.kernels.data.indices import BANDWIDTH, DIAGONAL_MASS, DONE, MASS_NOT_DEFINITE, SINGULAR
 from twoloop.kernels.linalg.dense import lu_factor, lu_solve
 
 # places in `lapack_addresses`: Cholesky of a banded matrix and its solve, LU with row exchanges real and complex

@@ -6,20 +6,23 @@ independent entries, and (T^T M T) x = T^T (r - M g): M need only be positive de
 
 import numpy as np
 
-from twoloop.kernels.data.codes import DONE, MASS_NOT_DEFINITE, NOT_FINITE, SINGULAR
-from twoloop.kernels.data.common import compiled, merged
-from twoloop.kernels.data.counters import N_FACTORIZATIONS
-from twoloop.kernels.data.finite import finite
-from twoloop.kernels.data.flags import (
+from twoloop.kernels.data.common import compiled, finite, merged
+from twoloop.kernels.data.indices import (
     AUGMENTED,
     CONSTANT_MASS,
     DENSE_FORM,
     DIAGONAL_MASS,
+    DONE,
+    FACTORED,
     FORM,
+    MASS_NOT_DEFINITE,
+    MASS_SCALE,
     MULTIPLIERS,
+    N_FACTORIZATIONS,
+    NOT_FINITE,
     NULL_SPACE,
+    SINGULAR,
 )
-from twoloop.kernels.data.noted import FACTORED, MASS_SCALE
 from twoloop.kernels.linalg import markowitz_lu as at
 from twoloop.kernels.linalg.band import banded_mass, factor_banded_mass, solve_banded_mass
 from twoloop.kernels.linalg.dense import (

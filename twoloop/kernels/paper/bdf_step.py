@@ -10,11 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.kernels.control.predictor import departure
-from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED
+from twoloop.kernels.control.step_size import departure
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, inlined, kernel, merged
-from twoloop.kernels.data.counters import N_OUTER
-from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL
+from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, N_OUTER, OUTER_DIVERGED, RTOL
 from twoloop.kernels.evaluation.inner_loop import accelerations, evaluate_state, rounding_floor
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.paper.iterations import iterate_accelerations

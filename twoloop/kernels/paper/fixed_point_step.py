@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, kernel
-from twoloop.kernels.data.tolerances import ESTIMATE
+from twoloop.kernels.data.indices import DONE, ESTIMATE
 from twoloop.kernels.evaluation.inner_loop import accelerations
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.paper import iterations as at

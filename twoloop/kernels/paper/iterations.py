@@ -10,11 +10,9 @@ Richardson's estimate: the difference of one step and two half steps is the erro
 
 import numpy as np
 
-from twoloop.kernels.control.predictor import restore_predicted
-from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED
+from twoloop.kernels.control.step_size import project_prediction
 from twoloop.kernels.data.common import compiled, exact, inlined, merged
-from twoloop.kernels.data.counters import N_OUTER
-from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL
+from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, N_OUTER, OUTER_DIVERGED, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate, restore, rounding_floor
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TEST, OUTER_TOL, tableau_of
@@ -165,7 +163,7 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
             q1[m], rest[2, m] = _compensated(q[m], rest[0, m], h * v[m] + h * h * in_q)
             v1[m], rest[3, m] = _compensated(v[m], rest[1, m], h * in_v)
     _forget(w.dependent, rest)
-    return restore_predicted(f, w, tolerances, t + h, h, q, v, q1, v1, tolerance)
+    return project_prediction(f, w, tolerances, t + h, h, q, v, q1, v1, tolerance)
 
 
 @merged

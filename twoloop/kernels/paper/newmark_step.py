@@ -2,12 +2,9 @@
 
 import numpy as np
 
-from twoloop.kernels.control.controller import nothing_to_settle
-from twoloop.kernels.control.predictor import departure
-from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED
+from twoloop.kernels.control.step_size import commit_nothing, departure
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, kernel, merged
-from twoloop.kernels.data.counters import N_OUTER
-from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, GAP, RTOL
+from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, GAP, N_OUTER, OUTER_DIVERGED, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate_state, rounding_floor
 from twoloop.kernels.linalg.dense import copy
 
@@ -106,4 +103,4 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
     return Attempt(OUTER_DIVERGED, np.inf, 0.0)
 
 
-NEWMARK = Step(newmark_step, nothing_to_settle)
+NEWMARK = Step(newmark_step, commit_nothing)

@@ -2,10 +2,9 @@
 
 import numpy as np
 
-from twoloop.kernels.control.controller import nothing_to_settle
-from twoloop.kernels.data.codes import DONE
+from twoloop.kernels.control.step_size import commit_nothing
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, kernel
-from twoloop.kernels.data.tolerances import ESTIMATE
+from twoloop.kernels.data.indices import DONE, ESTIMATE
 from twoloop.kernels.evaluation.inner_loop import accelerations
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.paper import iterations as at
@@ -62,4 +61,4 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
     return Attempt(code, error, 0.0)
 
 
-PAPER = Step(paper_step, nothing_to_settle)
+PAPER = Step(paper_step, commit_nothing)

@@ -13,11 +13,9 @@ g_i = int c_i ds and G_i = int (1 - s) c_i ds give velocities and positions; all
 
 import numpy as np
 
-from twoloop.kernels.control.predictor import departure, keep_predicted
-from twoloop.kernels.data.codes import DONE
+from twoloop.kernels.control.step_size import departure, store_prediction
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, inlined, kernel, merged
-from twoloop.kernels.data.counters import N_OUTER
-from twoloop.kernels.data.tolerances import ATOL, RTOL
+from twoloop.kernels.data.indices import ATOL, DONE, N_OUTER, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate_as_given, project
 
 HIGHEST = 12  # order; with orders above 13 the nodes below would not do
@@ -298,7 +296,7 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
     for m in range(n):
         q1[m] += h * h * G * d[m]
         v1[m] += h * g * d[m]
-    keep_predicted(w, q1)
+    store_prediction(w, q1)
     code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)

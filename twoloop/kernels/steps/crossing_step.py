@@ -13,14 +13,23 @@ motion, and the fixed-point iteration converges as it does elsewhere.
 
 import numpy as np
 
-from twoloop.kernels.control.controller import nothing_to_settle
-from twoloop.kernels.control.predictor import keep_predicted
-from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED, SINGULAR
-from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, kernel, merged
-from twoloop.kernels.data.counters import N_OUTER
-from twoloop.kernels.data.flags import STRAIGHT
-from twoloop.kernels.data.noted import BY_GENERAL, ORIENTATION, ORIENTATION_NEW, PIVOT
-from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, GAP, RTOL, allowed
+from twoloop.kernels.control.step_size import commit_nothing, store_prediction
+from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed, compiled, kernel, merged
+from twoloop.kernels.data.indices import (
+    ATOL,
+    BY_GENERAL,
+    DONE,
+    ESTIMATE,
+    GAP,
+    N_OUTER,
+    ORIENTATION,
+    ORIENTATION_NEW,
+    OUTER_DIVERGED,
+    PIVOT,
+    RTOL,
+    SINGULAR,
+    STRAIGHT,
+)
 from twoloop.kernels.evaluation.inner_loop import evaluate_state, project, renew_partition
 from twoloop.kernels.linalg.dense import copy
 
@@ -195,7 +204,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     code = _choose_partition_at_end(f, w, t + h, q1, pivot)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
-    keep_predicted(w, q1)
+    store_prediction(w, q1)
     w.notes[ORIENTATION_NEW] = w.notes[ORIENTATION]
     code = evaluate_state(f, w, t + h, q1, v1, options[INNER_TOL], a1, lam1)
     for k in range(w.dependent.size):
@@ -205,4 +214,4 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     return Attempt(code, error, 0.0)
 
 
-CROSSING = Step(crossing_step, nothing_to_settle)
+CROSSING = Step(crossing_step, commit_nothing)

@@ -22,13 +22,23 @@ times it.
 
 import numpy as np
 
-from twoloop.kernels.control.predictor import departure, keep_predicted
-from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED, SINGULAR
-from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, inlined, kernel, merged
-from twoloop.kernels.data.counters import N_FACTORIZATIONS, N_JACOBIANS, N_OUTER
-from twoloop.kernels.data.flags import BANDWIDTH, FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, FORM, STATIC
-from twoloop.kernels.data.noted import GENERATION
-from twoloop.kernels.data.tolerances import ESTIMATE, allowed
+from twoloop.kernels.control.step_size import departure, store_prediction
+from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, allowed, compiled, inlined, kernel, merged
+from twoloop.kernels.data.indices import (
+    BANDWIDTH,
+    DONE,
+    ESTIMATE,
+    FORCE_BY_Q_GIVEN,
+    FORCE_BY_V_GIVEN,
+    FORM,
+    GENERATION,
+    N_FACTORIZATIONS,
+    N_JACOBIANS,
+    N_OUTER,
+    OUTER_DIVERGED,
+    SINGULAR,
+    STATIC,
+)
 from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, find_tangents, multipliers
 from twoloop.kernels.linalg.dense import copy, ldl_factor, ldl_solve, lu_factor, lu_solve
 from twoloop.kernels.steps import newton_memory as at
@@ -523,7 +533,7 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
             error = max(error, jumps)
         if not error <= 1.0:
             return Attempt(DONE, error, 0.0)
-    keep_predicted(w, q1)
+    store_prediction(w, q1)
     code = evaluate_state(f, w, t + h, q1, v1, options[INNER_TOL], a1, lam1)
     if code == DONE:
         error = max(error, departure(w, tolerances, h, q, v, q1))

@@ -9,13 +9,9 @@ constraints by its error, and the end of the step alone is put back on them.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.kernels.control.controller import nothing_to_settle
-from twoloop.kernels.control.predictor import departure, keep_predicted
-from twoloop.kernels.data.codes import DONE
-from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, inlined, kernel
-from twoloop.kernels.data.counters import N_OUTER
-from twoloop.kernels.data.noted import NEARLY_SINGULAR
-from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL, times_gap
+from twoloop.kernels.control.step_size import commit_nothing, departure, store_prediction
+from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, inlined, kernel, times_gap
+from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, N_OUTER, NEARLY_SINGULAR, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_as_given, evaluate_state, project
 from twoloop.kernels.linalg.dense import copy
 
@@ -180,7 +176,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
         error = _error(tolerances, h, fine, coarse, y, y1, slopes, one, other, near)
         if not error <= 1.0:
             return Attempt(DONE, error, 0.0)
-    keep_predicted(w, q1)
+    store_prediction(w, q1)
     if free:
         code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
     else:
@@ -190,4 +186,4 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     return Attempt(code, error, 0.0)
 
 
-EXPLICIT = Step(explicit_step, nothing_to_settle)
+EXPLICIT = Step(explicit_step, commit_nothing)

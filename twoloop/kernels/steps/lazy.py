@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from twoloop.kernels.control.controller import nothing_to_settle
-from twoloop.kernels.data.codes import NOT_LOADED
+from twoloop.kernels.control.step_size import commit_nothing
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, kernel
+from twoloop.kernels.data.indices import NOT_LOADED
 
 
 @kernel(ATTEMPT)
@@ -16,7 +16,7 @@ def stop_to_load(f, w, options, memory, t, h, tolerances, state, new_state):
     return Attempt(NOT_LOADED, np.inf, 0.0)
 
 
-PLACEHOLDER = Step(stop_to_load, nothing_to_settle)
+PLACEHOLDER = Step(stop_to_load, commit_nothing)
 
 
 class LazyStep(NamedTuple):

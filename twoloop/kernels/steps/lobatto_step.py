@@ -16,25 +16,46 @@ ends of steps in a row are projected onto the constraints together, one in each 
 
 import math
 
-from twoloop.kernels.control import clock as at
-from twoloop.kernels.control.landing import off_grid
-from twoloop.kernels.control.predictor import departure, keep_predicted
-from twoloop.kernels.control.progress import count_step
-from twoloop.kernels.control.singular import COLLAPSED, SHORT, SINGULAR_PIVOT
+from twoloop.kernels.control import loop_state as at
+from twoloop.kernels.control.singular_positions import COLLAPSED, SHORT, SINGULAR_PIVOT
+from twoloop.kernels.control.step_size import count_step, departure, off_grid, store_prediction
 from twoloop.kernels.data import collocation as room_at
-from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED, SINGULAR, UNSUITED
 from twoloop.kernels.data.collocation import GUESSED, LANES, LEFT, MADE, REFUSED, places
-from twoloop.kernels.data.common import ATTEMPT, MANY, SETTLE, Attempt, Step, compiled, inlined, kernel, merged
-from twoloop.kernels.data.counters import (
+from twoloop.kernels.data.common import (
+    ATTEMPT,
+    MANY,
+    SETTLE,
+    SLACK,
+    Attempt,
+    Step,
+    allowed,
+    compiled,
+    inlined,
+    kernel,
+    merged,
+)
+from twoloop.kernels.data.indices import (
+    BY_GENERAL,
+    DEFECT,
+    DONE,
+    ESTIMATE,
+    LEAST,
+    LOOK,
     N_ACCEPTED,
     N_EVALUATIONS,
     N_FACTORIZATIONS,
     N_INNER,
     N_OUTER,
     N_REJECTED_ERROR,
+    NEAR_NOW,
+    NEARLY_SINGULAR,
+    ORIENTATION_NEW,
+    OUTER_DIVERGED,
+    PIVOT,
+    ROUNDED,
+    SINGULAR,
+    UNSUITED,
 )
-from twoloop.kernels.data.noted import BY_GENERAL, DEFECT, NEAR_NOW, NEARLY_SINGULAR, ORIENTATION_NEW, PIVOT, ROUNDED
-from twoloop.kernels.data.tolerances import ESTIMATE, LEAST, LOOK, ROUNDING, allowed
 from twoloop.kernels.evaluation.accelerations import MIN_CORRECTION
 from twoloop.kernels.evaluation.inner_loop import check_redundant, project, renew_partition
 from twoloop.kernels.linalg.dense import copy
@@ -84,7 +105,7 @@ def _collocate(f, w, options, room, tolerances, t, h, state):
     """Iterate the stages of a step; return how that ended, the error, and the factor for the next step size."""
     first, estimated = room[room_at.PREDICTS] == 0.0, tolerances[ESTIMATE] == 1.0
     longest = tolerances[LOOK] / BETWEEN
-    if estimated and h > longest * (1.0 + ROUNDING):
+    if estimated and h > longest * (1.0 + SLACK):
         return REFUSED, h / longest, longest / h
     room[room_at.T], room[room_at.H], room[room_at.DEFECT] = t, h, -1.0
     room[room_at.MAY_GUESS] = 0.0
@@ -111,7 +132,7 @@ def _collocate(f, w, options, room, tolerances, t, h, state):
     most = GROWTH_EARLY if room[room_at.N_STEPS] < EARLY else GROWTH
     if most > GROWTH and m == 1:
         most = GROWTH_AT_ONCE
-    if h > options[FREE] * tolerances[LOOK] * (1.0 + ROUNDING):
+    if h > options[FREE] * tolerances[LOOK] * (1.0 + SLACK):
         w.counters[N_EVALUATIONS] += LANES
         defect = f.audit_nodes(room, state, f.own_numbers)
         if defect < 0.0:
@@ -202,7 +223,7 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
     f.end_nodes(room, state, new_state)
     room[room_at.TRIED] = 1.0
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    keep_predicted(w, q1)
+    store_prediction(w, q1)
     code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
     if code == DONE:
         error = max(error, departure(w, tolerances, h, state[:n], state[n : 2 * n], q1))

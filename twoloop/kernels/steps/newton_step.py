@@ -13,13 +13,9 @@ need tiny steps there.
 
 import numpy as np
 
-from twoloop.kernels.control.predictor import restore_predicted
-from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED
-from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, kernel
-from twoloop.kernels.data.counters import N_OUTER
-from twoloop.kernels.data.flags import FORM, STATIC
-from twoloop.kernels.data.noted import GENERATION
-from twoloop.kernels.data.tolerances import ESTIMATE, LEAST, allowed
+from twoloop.kernels.control.step_size import project_prediction
+from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, allowed, compiled, kernel
+from twoloop.kernels.data.indices import DONE, ESTIMATE, FORM, GENERATION, LEAST, N_OUTER, OUTER_DIVERGED, STATIC
 from twoloop.kernels.evaluation.inner_loop import accelerations, evaluate, multipliers
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps import newton_memory as at
@@ -263,7 +259,7 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             in_v += b[k] * trial[k, m]
         q1[m] = q[m] + h * v[m] + h * h * in_q
         v1[m] = v[m] + h * in_v
-    code, off = restore_predicted(f, w, tolerances, t + h, h, q, v, q1, v1, options[INNER_TOL])
+    code, off = project_prediction(f, w, tolerances, t + h, h, q, v, q1, v1, options[INNER_TOL])
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
     error = 0.0

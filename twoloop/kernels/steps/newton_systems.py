@@ -28,16 +28,20 @@ Three storages serve:
 
 import numpy as np
 
-from twoloop.kernels.data.codes import DONE, NEEDS_DENSE, NOT_FINITE, SINGULAR
-from twoloop.kernels.data.common import compiled, inlined
-from twoloop.kernels.data.counters import N_EVALUATIONS, N_FACTORIZATIONS, N_JACOBIANS
-from twoloop.kernels.data.finite import finite_vector
-from twoloop.kernels.data.flags import (
+from twoloop.kernels.data.common import compiled, finite_vector, inlined
+from twoloop.kernels.data.indices import (
     BANDWIDTH,
+    DONE,
     FORCE_BY_Q_GIVEN,
     FORCE_BY_V_GIVEN,
     FORM,
+    N_EVALUATIONS,
+    N_FACTORIZATIONS,
+    N_JACOBIANS,
+    NEEDS_DENSE,
+    NOT_FINITE,
     REACTION_BY_Q_GIVEN,
+    SINGULAR,
     STATIC,
 )
 from twoloop.kernels.evaluation.constraints import constraint_rows

@@ -5,10 +5,8 @@ See taylor_step.py for the equations.
 
 import numpy as np
 
-from twoloop.kernels.data.codes import DONE, NOT_FINITE
 from twoloop.kernels.data.common import compiled, inlined, merged
-from twoloop.kernels.data.counters import N_EVALUATIONS
-from twoloop.kernels.data.flags import FORM, STATIC
+from twoloop.kernels.data.indices import DONE, FORM, N_EVALUATIONS, NOT_FINITE, STATIC
 from twoloop.kernels.evaluation import operations as op
 from twoloop.kernels.evaluation.tasks import SOLVE
 from twoloop.kernels.linalg.saddle_point import solve_both

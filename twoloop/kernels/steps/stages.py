@@ -3,8 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.kernels.data.common import compiled, inlined, merged
-from twoloop.kernels.data.tolerances import allowed
+from twoloop.kernels.data.common import allowed, compiled, inlined, merged
 
 FARTHEST = 3.0  # largest step ratio over which the old stage polynomial is extrapolated
 END_ERROR_WEIGHT = 0.01  # of `end_error` beside Richardson's estimate: it is there for jumps between ends and stages

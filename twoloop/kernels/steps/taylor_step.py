@@ -17,14 +17,21 @@ before, so that no power of a short time underflows. The end of the step is move
 
 import numpy as np
 
-from twoloop.kernels.control.defect import excess
-from twoloop.kernels.control.predictor import departure, keep_predicted
-from twoloop.kernels.data.codes import DONE
-from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, kernel, merged
-from twoloop.kernels.data.counters import N_OUTER
-from twoloop.kernels.data.flags import STRAIGHT
-from twoloop.kernels.data.noted import BY_GENERAL, DEFECT, NEAR_NOW, NEARLY_SINGULAR
-from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, LOOK, ROUNDING, RTOL, times_gap
+from twoloop.kernels.control.step_size import departure, excess, store_prediction
+from twoloop.kernels.data.common import ATTEMPT, SETTLE, SLACK, Attempt, Step, compiled, kernel, merged, times_gap
+from twoloop.kernels.data.indices import (
+    ATOL,
+    BY_GENERAL,
+    DEFECT,
+    DONE,
+    ESTIMATE,
+    LOOK,
+    N_OUTER,
+    NEAR_NOW,
+    NEARLY_SINGULAR,
+    RTOL,
+    STRAIGHT,
+)
 from twoloop.kernels.evaluation.inner_loop import evaluate_as_given, project
 from twoloop.kernels.evaluation.tasks import EVALUATE_AS_GIVEN
 from twoloop.kernels.linalg.dense import copy
@@ -193,7 +200,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     error, checked, found = 0.0, False, accelerations_found(memory, n)
     if estimated:
         error = x / memory[at.LENGTH]  # larger than the estimate of the error, which is a power of it
-        if error > 1.0 + ROUNDING:
+        if error > 1.0 + SLACK:
             return Attempt(DONE, error, 1.0 / error)
         error = min(error, 1.0)
         singular = w.notes[NEARLY_SINGULAR] != 0.0  # it stays so to the end of the run
@@ -211,7 +218,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if defect > 0.0:
                 return Attempt(DONE, min(defect, BEYOND), _shortened(defect, order))
     _evaluate(series, unit, order, x, q1, v1, found)
-    keep_predicted(w, q1)
+    store_prediction(w, q1)
     code = project(f, w, t + h, q1, v1, options[at.THETA], a1, lam1)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)

@@ -11,9 +11,8 @@ that do not matter are passed over.
 
 import numpy as np
 
-from twoloop.kernels.data.codes import DONE
-from twoloop.kernels.data.common import compiled
-from twoloop.kernels.data.tolerances import GAP, allowed
+from twoloop.kernels.data.common import allowed, compiled
+from twoloop.kernels.data.indices import DONE, GAP
 from twoloop.kernels.evaluation.inner_loop import evaluate
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps import newton_memory as at

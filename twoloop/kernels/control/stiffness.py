@@ -1,18 +1,23 @@
 """Two methods in one run: an explicit one, and Newton's where stiffness would make its steps tiny.
 
-Now and then the largest rate of the motion, rho, the root of the largest eigenvalue of dF/dq or that of dF/dv, F being
-the accelerations, is found by a few power iterations, one evaluation each. While the explicit method takes steps of h
-rho well below its limit of stability, nothing is stiff. Where h rho has come near it, stiffness or accuracy may be the
-reason: then the implicit method is tried for a window of steps, in which its errors count tenfold, and is kept if a
-second of motion costs it less. So it is where h rho is smaller, but rho far above the rates that the motion shows: what
-decays so fast may keep the estimate of the error from longer steps; or where all that could move at that rate is about
-the tolerances, as steps at the limit of stability keep it from dying away. A trial that may be in vain waits until the
-run has cost a few times as much, unless the run as a whole is to cost ten times as much at its present price. Where a
-run is to cost a thousand trials, one comes whatever the rates. Costs are counted in evaluations of the explicit method;
-with code made for the mechanism one of the implicit method counts several times. This is left in the same way, after a
-trial of the explicit method, where its own steps have come below that limit, or a second of motion costs more than the
-explicit one took when it was left. What is not kept is next tried after twice
-as many looks.
+The largest rate of the motion, rho, is the root of the largest eigenvalue of dF/dq, or that of dF/dv, F being the
+accelerations. A few power iterations, one evaluation each, estimate it now and then. While the explicit method takes
+steps of h rho well below its limit of stability, nothing is stiff. Near the limit, stiffness or accuracy may be the
+reason. Then the implicit method is tried for a window of steps, in which its errors count tenfold, and is kept if a
+second of motion costs less.
+
+A trial also begins where h rho is smaller, but
+
+- rho is far above the rates that the motion shows: what decays so fast may keep the estimate of the error from longer
+  steps;
+- all that could move at that rate is about the tolerances, as steps at the limit of stability keep it from dying away;
+- the run would cost a thousand trials.
+
+A trial that may be in vain waits until the run has cost a few times as much, unless the run as a whole is to cost ten
+times as much at its present price. Costs are counted in evaluations of the explicit method; with generated code one
+of the implicit method counts several times. The implicit method is left in the same way, after a trial of the explicit
+one, where its steps have come below that limit, or a second of motion costs more than the explicit method took when it
+was left. A method that was tried in vain is next tried after twice as many estimates.
 
 Both methods are called by their addresses, and are compiled once, where they are.
 """
@@ -20,23 +25,53 @@ Both methods are called by their addresses, and are compiled once, where they ar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.kernels.control.controller import ERROR_BEFORE, H_BEFORE, LEAST_ERROR, N_PAST, N_RULE, factor_of
-from twoloop.kernels.control.directions import DISPLACEMENT, INNER_TOL, first_direction
-from twoloop.kernels.data.codes import DONE, NOT_LOADED, OUTER_DIVERGED
-from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, inlined, kernel, merged
-from twoloop.kernels.data.counters import N_EVALUATIONS, N_JACOBIANS
-from twoloop.kernels.data.flags import FORCE_BY_Q_GIVEN, FORM, STATIC, STRAIGHT
-from twoloop.kernels.data.noted import EXPLICIT_STEP, REUSE, ROUNDED
-from twoloop.kernels.data.tolerances import ESTIMATE, GAP, LONGEST_UNSEEN, allowed, times_gap
-from twoloop.kernels.evaluation.inner_loop import evaluate, renew_partition
-from twoloop.kernels.evaluation.tasks import PROJECT
+from twoloop.kernels.control.loop_state import (
+    DISPLACEMENT,
+    ERROR_BEFORE,
+    H_BEFORE,
+    LEAST_ERROR,
+    N_PAST,
+    N_RULE,
+    initial_direction,
+)
+from twoloop.kernels.control.step_size import evaluate_near, factor_of
+from twoloop.kernels.data.common import (
+    ATTEMPT,
+    SETTLE,
+    Attempt,
+    Step,
+    allowed,
+    compiled,
+    inlined,
+    kernel,
+    merged,
+    times_gap,
+)
+from twoloop.kernels.data.indices import (
+    DONE,
+    ESTIMATE,
+    EXPLICIT_STEP,
+    FORCE_BY_Q_GIVEN,
+    FORM,
+    GAP,
+    LONGEST_UNSEEN,
+    N_EVALUATIONS,
+    N_JACOBIANS,
+    NOT_LOADED,
+    OUTER_DIVERGED,
+    REUSE,
+    ROUNDED,
+    STATIC,
+    STRAIGHT,
+)
+from twoloop.kernels.evaluation.inner_loop import renew_partition
 from twoloop.kernels.linalg.dense import copy
 
-# evaluations before the first look at the rate, and between two; of code made for the mechanism DEARER times as many
-EARLY, INTERVAL = 100.0, 600.0  # a look takes some eight, by the general code
-ITERATIONS = 4
-NEGLIGIBLE = 1e-3  # of 1 / h: a rate of decay that needs no second iteration
-SEED = 1e-3  # what a component of a direction begins with, of the largest
+# evaluations before the first estimate of the rate, and between two; with generated code DEARER times as many
+EARLY, INTERVAL = 100.0, 600.0  # an estimate takes some eight, by the general code
+ITERATIONS = 4  # of the power iteration for dF/dq, and for dF/dv
+NEGLIGIBLE = 1e-3  # of 1 / h: a rate of decay below this needs no second iteration
+SEED = 1e-3  # of the largest component of a direction: what a component that was zero begins with
 SURELY = 3.0  # times LIMIT: where the step is next to the limit of stability
 EARN = 64.0  # evaluations for each independent coordinate before a trial that differences, some eight of each
 TRIAL = 300.0  # evaluations that a trial of the implicit method takes, about
@@ -48,18 +83,18 @@ QUIET = 10.0  # tolerances of velocities: what steps at the limit of stability l
 WORTH = 0.05  # ... and h rho this share of LIMIT: steps may be short for the sake of what an implicit method damps
 INSTANT = 1e-4  # over the largest rate: the time over which the motion's own is differenced
 BELOW = 0.4  # of LIMIT: h rho from which down the explicit method is tried again
-STRICT = 10.0  # what an error counts as during a trial of the implicit method, of lower order than the explicit one
+STRICT = 10.0  # factor on an error during a trial of the implicit method, of lower order than the explicit one
 MEAN = 0.8  # weight of the steps before in the mean step
 SETTLED = 5.0  # accepted steps of a trial before its price is taken
 WINDOW = 10.0  # accepted steps over which it is
 GAIN = 1.2  # what a method on trial must be cheaper by
-PATIENCE = 4.0  # looks before the next trial
+PATIENCE = 4.0  # estimates before the next trial
 
 EXPLICIT, ON_TRIAL, IMPLICIT, BACK_ON_TRIAL = range(4)  # phases
 
-# places in `options`: of the pair, then of the first and of the second method a rule, see controller.py, and REUSE_OF;
+# places in `options`: of the pair, then of the first and of the second method a rule, see loop_state.py, and REUSE_OF;
 # then their options
-# LIMIT: h rho from which on the implicit method is tried, found at so many LOOKS in a row
+# LIMIT: h rho from which on the implicit method is tried, found by so many LOOKS in a row
 # DEARER: evaluations of the first method that one of the second costs
 LIMIT, LOOKS, MATRIX_COST, DEARER, SIZE_1, N_PAIR = range(6)
 REUSE_OF, N_OF_EACH = N_RULE, N_RULE + 1
@@ -79,7 +114,7 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
     RATE,  # the last one found, 1 / s
     FIRST_MEMORY,
     H_MEAN,
-    PAST,  # of the steps of this phase, see controller.py
+    PAST,  # of the steps of this phase, see loop_state.py
     _PAST_ERROR,
     H_TRIED,
     ERROR_TRIED,
@@ -92,18 +127,18 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
 def switching_options(
     limit: float, looks: int, matrix_cost: float, dearer: float, each: ArrayLike, first: ArrayLike, second: ArrayLike
 ) -> NDArray[np.float64]:
-    """`options`: of the pair, see LIMIT and what follows; then a rule and REUSE_OF of each; then their own."""
+    """Return `options`: of the pair, see LIMIT and what follows; then a rule and REUSE_OF of each; then their own."""
     first = np.asarray(first)  # of numbers, or of formulas
     scalars = [limit, float(looks), matrix_cost, dearer, float(first.size)]
     return np.concatenate([scalars, np.asarray(each, dtype=np.float64).ravel(), first, np.asarray(second)])
 
 
 def switching_memory(n_q: int, first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
-    """`memory` for methods with these memories."""
+    """Return `memory` for two methods with these memories."""
     first, second = np.asarray(first), np.asarray(second)
     scalars = np.zeros(N_SCALARS)
     scalars[T_BEGIN], scalars[WAIT], scalars[FIRST_MEMORY] = np.nan, PATIENCE, first.size
-    directions = np.tile(first_direction(n_q), 2)
+    directions = np.tile(initial_direction(n_q), 2)
     return np.concatenate([scalars, directions, first, second])
 
 
@@ -124,17 +159,11 @@ def _memories(memory, n):
 
 
 @compiled
-def _evaluate(f, w, t, Q, V, A):
-    """Accelerations A at a state (Q, V) near the constraints, which is moved there."""
-    # cheaper, to the nearest state on the constraints; and where evaluations do not move it
-    if (f.flags[STRAIGHT] == 1 and w.Rate.size == w.C.size) or f.flags[FORM] == STATIC:
-        return f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
-    return evaluate(f, w, t, Q, V, INNER_TOL, A)
-
-
-@compiled
 def _along(f, w, t, state, direction, by_v, Q, V, A):
-    """How much larger dF/dq or dF/dv makes a direction of the independents, whose image of length 1 replaces it."""
+    """Take one step of a power iteration: return the growth of `direction` under dF/dq or dF/dv.
+
+    `direction`, of the independent coordinates, becomes its image, scaled to length 1.
+    """
     n = Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     places = w.independent_v if by_v else w.independent
@@ -147,7 +176,7 @@ def _along(f, w, t, state, direction, by_v, Q, V, A):
     moved = V if by_v else Q
     for i in places:
         moved[i] += size * direction[i]
-    if _evaluate(f, w, t, Q, V, A) != DONE:
+    if evaluate_near(f, w, t, Q, V, A) != DONE:
         return 0.0
     image, size = 0.0, 0.0
     for i in places:
@@ -162,7 +191,7 @@ def _along(f, w, t, state, direction, by_v, Q, V, A):
 
 @compiled
 def _largest_rate(f, w, memory, t, state, new_state):
-    """The largest rate at a state, 1/s; `new_state` is scratch."""
+    """Return the largest rate at a state, 1/s; `new_state` is scratch."""
     n = w.Q.size
     by_q, by_v = memory[N_SCALARS : N_SCALARS + n], memory[N_SCALARS + n : N_SCALARS + 2 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
@@ -187,14 +216,14 @@ def _largest_rate(f, w, memory, t, state, new_state):
 
 @compiled
 def _shown_rate(f, w, t, state, rate, Q, V, A):
-    """The rate at which the motion changes its velocities, or its accelerations, 1/s; infinite where it is unknown."""
+    """Return the rate, 1/s, at which the motion changes its velocities or accelerations; infinite where unknown."""
     n = Q.size
     instant = INSTANT / rate
     fastest = largest = change = 0.0
     for m in range(n):
         Q[m] = state[m] + instant * state[n + m]
         V[m] = state[n + m] + instant * state[2 * n + m]
-    if _evaluate(f, w, t + instant, Q, V, A) != DONE:
+    if evaluate_near(f, w, t + instant, Q, V, A) != DONE:
         return np.inf
     for i in w.independent_v:
         fastest = max(fastest, abs(state[n + i]))
@@ -207,7 +236,7 @@ def _shown_rate(f, w, t, state, rate, Q, V, A):
 
 @compiled
 def _is_quiet(w, tolerances, state, rate):
-    """Whether all that the independents would change by at this rate is about the tolerances."""
+    """Return whether all that the independents would change by at this rate is about the tolerances."""
     n = w.Q.size
     for i in w.independent_v:
         v = state[n + i]
@@ -218,26 +247,26 @@ def _is_quiet(w, tolerances, state, rate):
 
 @compiled
 def _cost(w, options):
-    """What the run has cost so far, in evaluations."""
+    """Return the cost of the run so far, in evaluations."""
     return w.counters[N_EVALUATIONS] + options[MATRIX_COST] * w.counters[N_JACOBIANS]
 
 
 @compiled
 def _price(w, options, memory, t):
-    """What a second of motion has cost since the price was last begun, in evaluations of the first method."""
+    """Return the cost of a second of motion since the count last began, in evaluations of the first method."""
     price = (_cost(w, options) - memory[COST_BEGIN]) / (t - memory[T_BEGIN])
     return price if _is_explicit(memory) else options[DEARER] * price
 
 
 @compiled
 def _interval(options, memory):
-    """Evaluations until the next look, which itself takes general code."""
+    """Return the number of evaluations until the next estimate of the rate, which itself takes general code."""
     return INTERVAL * options[DEARER] if _is_explicit(memory) else INTERVAL
 
 
 @compiled
 def _enter(w, options, memory, phase, t):
-    """Begin another phase; its method knows nothing of the steps before."""
+    """Begin another phase; its method has no memory of the steps before."""
     memory[PHASE] = phase
     memory[STEPS] = 0.0
     memory[PAST + ERROR_BEFORE] = 0.0
@@ -247,7 +276,7 @@ def _enter(w, options, memory, phase, t):
 
 @compiled
 def _settle_trial(w, options, memory, t):
-    """Whether the method on trial is kept; returns the phase to begin, or -1."""
+    """Return whether the method on trial is kept; returns the phase to begin, or -1."""
     if memory[STEPS] == SETTLED:
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
     if memory[STEPS] < SETTLED + WINDOW:
@@ -263,7 +292,7 @@ def _settle_trial(w, options, memory, t):
 
 @compiled
 def _look(f, w, options, memory, tolerances, t, state, new_state):
-    """Whether the other method is due for a trial; returns the phase to begin, or -1."""
+    """Return whether the other method is due for a trial; returns the phase to begin, or -1."""
     n = w.Q.size
     memory[RATE] = _largest_rate(f, w, memory, t, state, new_state)
     price, cost = _price(w, options, memory, t), _cost(w, options)
@@ -302,7 +331,7 @@ def _look(f, w, options, memory, tolerances, t, state, new_state):
 
 @compiled
 def _restart(memory):
-    """A method's memory as at the beginning of a run."""
+    """Clear a method's memory, as at the beginning of a run."""
     for i in range(memory.size):
         memory[i] = 0.0
 

@@ -1,11 +1,21 @@
-"""What a run looks at beside its steps: whether its partition has become poor, and a singular position is near."""
+"""Watch a run beside its steps: whether its partition has become poor, and whether a singular position is near."""
 
-from twoloop.kernels.control import clock as at
-from twoloop.kernels.data.codes import DONE
+from twoloop.kernels.control import loop_state as at
 from twoloop.kernels.data.common import merged
-from twoloop.kernels.data.counters import N_ACCEPTED
-from twoloop.kernels.data.flags import AUGMENTED, FORM, NULL_SPACE, STATIC, STRAIGHT
-from twoloop.kernels.data.noted import BY_GENERAL, NEAR_NOW, NEARLY_SINGULAR, PIVOT, SENSITIVITY
+from twoloop.kernels.data.indices import (
+    AUGMENTED,
+    BY_GENERAL,
+    DONE,
+    FORM,
+    N_ACCEPTED,
+    NEAR_NOW,
+    NEARLY_SINGULAR,
+    NULL_SPACE,
+    PIVOT,
+    SENSITIVITY,
+    STATIC,
+    STRAIGHT,
+)
 from twoloop.kernels.evaluation.inner_loop import find_tangents, renew_partition
 from twoloop.kernels.evaluation.partition import least_pivot, partition_is_poor
 from twoloop.kernels.evaluation.sparse_inner_loop import PROJECT_STAGES
@@ -25,7 +35,7 @@ NEARER = 0.25  # of the smallest sine at the start of a step: one that ends near
 
 @merged
 def near_singular(f, w, control, clock, t, q):
-    """Whether C_q was close to losing rank when the partition was chosen, and the caller wants to know.
+    """Return whether C_q was close to losing rank when the partition was chosen, and the caller wants to know.
 
     Where steps have no use for partitions, the last one may be old: with a run that has come near such a position once
     it is chosen anew.
@@ -40,7 +50,7 @@ def near_singular(f, w, control, clock, t, q):
 
 @merged
 def ends_at_singular(f, w, control, clock):
-    """Whether a step of the static form ends so near a singular position that the next would have to begin there.
+    """Return whether a step of the sparse form ends so near a singular position that the next would begin there.
 
     Steps cross such a position unharmed where it lies well between their ends.
     """
@@ -50,15 +60,15 @@ def ends_at_singular(f, w, control, clock):
 
 
 @merged
-def lost_at_singular(f, clock, size):
-    """Whether a step of the static form that came to nothing is so short that others have to try, see bridge.py."""
+def fails_at_singular(f, clock, size):
+    """Return whether a step of the static form that came to nothing is so short that others have to try, see steps/."""
     near = clock[at.PIVOT_HERE] < STATIC_SINGULAR * clock[at.LARGEST_PIVOT]
     return f.flags[FORM] == STATIC and near and size < LOST * clock[at.H_LONG]
 
 
 @merged
-def with_care(f, w, control, clock, size):
-    """Whether a step of the static form that begins near a singular position is tried again with more care.
+def retry_with_care(f, w, control, clock, size):
+    """Return whether a step of the static form that begins near a singular position is tried again with more care.
 
     Stages beside the constraints have accelerations there whose errors grow with the nearness. A step that ends well
     beyond may be made where shorter ones, which end nearer, are not: lengths from the longest of the last ones down.
@@ -75,7 +85,7 @@ def with_care(f, w, control, clock, size):
 
 
 @merged
-def note_output(f, w, clock, state):
+def record_pivot_at_output(f, w, clock, state):
     """Note how near a singular position is where a step ends on an output time, or wherever its size says."""
     pivot = least_pivot(f, w, clock[at.T], state[: w.Q.size])
     if f.flags[FORM] == STATIC and pivot > 0.0:
@@ -84,7 +94,7 @@ def note_output(f, w, clock, state):
 
 
 @merged
-def look_at_partition(f, w, control, clock, size, lands, state):
+def check_partition(f, w, control, clock, size, lands, state):
     """Choose coordinates anew where they have become poor, and see how near a singular position is.
 
     The state is full (q, v, a, lam): a new choice of independent coordinates needs no conversion.
@@ -95,7 +105,7 @@ def look_at_partition(f, w, control, clock, size, lands, state):
         clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.notes[PIVOT])
         if w.notes[NEARLY_SINGULAR] == PROJECT_STAGES and w.notes[PIVOT] >= CARE * clock[at.LARGEST_PIVOT]:
             w.notes[NEARLY_SINGULAR] = 0.0
-        return at.GO_ON
+        return at.CONTINUE
     n = w.Q.size
     straight = f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0
     every = 1
@@ -128,4 +138,4 @@ def look_at_partition(f, w, control, clock, size, lands, state):
             return at.RANK_LOST
         if control[at.BRIDGE] == 0.0 and w.notes[PIVOT] < UNDETERMINED * clock[at.LARGEST_PIVOT]:
             return at.RANK_LOST  # no step led across, and velocities would follow from rounding
-    return at.NEAR_SINGULAR if short and near_singular(f, w, control, clock, clock[at.T], state[:n]) else at.GO_ON
+    return at.NEAR_SINGULAR if short and near_singular(f, w, control, clock, clock[at.T], state[:n]) else at.CONTINUE

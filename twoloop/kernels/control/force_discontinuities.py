@@ -1,0 +1,302 @@
+"""Detect sudden changes of forces, C_t and b ahead of a step: a gust, a blow, a switch, a magnet.
+
+A step evaluates the equations at its stages only, and may pass over what happens between two of them. So forces, C_t
+and b are sampled ahead: a sample calls single callbacks and costs less than an evaluation of the equations.
+
+- Second differences of the samples are small where a value is smooth, against its range less the line from the first
+  sample to the last. Of what happens within one or two samples they are as large as the range. The step then ends
+  there, so that the run meets the change. It also ends where a value is not finite.
+- Samples follow the parabola on which the motion sets out, where forces may change suddenly with place or speed and
+  steps are longer than the spacing: each long step is sampled, and all short ones that end within LONG spacings at
+  once. Elsewhere the samples stay at the state at which the step begins.
+- Samples in time alone are also no further apart than a share of the step.
+- The shortest time between two changes is recorded, and the shortest time for which a value differs from those before
+  and behind. Changes as short may have been missed where samples were further apart: a message says so.
+"""
+
+import numpy as np
+
+from twoloop.kernels.control import loop_state as at
+from twoloop.kernels.control.step_size import evaluate_near
+from twoloop.kernels.data.common import allowed, compiled
+from twoloop.kernels.data.indices import DONE, GAP, RTOL
+from twoloop.kernels.evaluation.constraints import constraint_rates, representable_step
+
+N_SAMPLES = 20  # times ahead that are compared
+LONG = 12.0  # spacings: the shortest way along which the motion is sampled
+SHARE = 0.1  # of the range: a second difference that is sudden; that of a bell as wide as four spacings
+LEAST = 0.1  # of rtol, times the largest value so far: a range that may matter
+FLOOR = 1e-150  # ... in any units: squares of less underflow, and the least numbers of all change by steps
+IN_A_STEP = 8.0  # samples within a step: stages lie up to a quarter of it apart, and may all miss what is shorter
+SHRUNK = 0.25  # of the last spacing: below it, samples are taken again
+LEAST_APART = 16.0  # spacings of floating-point numbers between two samples
+HALVINGS = 20  # to find when a value changes between two samples
+SAME = 1e-5  # of the widest spacing: changes that are closer are one
+SOON = 5e-5  # of a hundredth of the run: before, a force that begins at zero, as 1 - cos(t), changes by rounding
+STEEPER = 2.0  # times the changes before and after: the flank of a pulse, and not a slope
+SHORT = 0.5  # of the longest of the last steps: below, something has happened that made steps shorter
+IN_SHORT = 4  # samples within such a step
+DECAYED = 0.5  # of an acceleration: a change within its noise that leaves little of it
+NEARLY = 0.01  # of the spacing: a step that begins so shortly before a change is at it
+LARGEST = N_SAMPLES + 1  # row of w.changes behind those of the values
+MIDDLE = N_SAMPLES + 2  # row of w.changes for values between two samples
+N_CHANGES = N_SAMPLES + 3
+
+
+@compiled
+def _sample(f, w, time, since, q, v, a, now):
+    """Sample forces, C_t and b at a time, at the state `since` seconds after (q, v, a)."""
+    for m in range(q.size):
+        w.x[m] = q[m] + since * (v[m] + 0.5 * since * a[m])
+        w.y[m] = v[m] + since * a[m]
+    now[: q.size] = 0.0
+    f.force(time, w.x, w.y, f.p, now[: q.size])
+    constraint_rates(f, w, time, w.x, now[q.size :])
+
+
+@compiled
+def _largest(values):
+    """Return the largest value so far, of all columns: a coordinate without a force has no scale of its own."""
+    largest = 0.0
+    for x in values:
+        largest = max(largest, x)
+    return largest
+
+
+@compiled
+def _is_smooth(values, k, n):
+    """Return whether the second difference at place k of n + 1 values is about that next to it."""
+    other = k + 1 if k + 2 <= n else k - 1
+    if other < 1:
+        return False
+    here = values[k + 1] - 2.0 * values[k] + values[k - 1]
+    there = values[other + 1] - 2.0 * values[other] + values[other - 1]
+    return here * there > 0.0 and abs(there) > 0.5 * abs(here)
+
+
+@compiled
+def _bend(values, n, slope, least, within):
+    """Return the first place where n + 1 values, less a line, bend suddenly, else 0; and the limit."""
+    low = high = 0.0
+    for k in range(1, n + 1):
+        off = values[k] - values[0] - k * slope
+        low, high = min(low, off), max(high, off)
+    sudden = SHARE * (high - low)
+    if high - low > least:
+        for k in range(1, n):
+            second = values[k + 1] - 2.0 * values[k] + values[k - 1]
+            if abs(second) > sudden and not (within and _is_smooth(values, k, n)):
+                return k, sudden
+    return 0, sudden
+
+
+@compiled
+def _first_discontinuity_of(values, n, along, least):
+    """Return the same of values less the line to their end if `along`, and then of those before the place found."""
+    place, sudden = _bend(values, n, along * (values[n] - values[0]) / max(n, 1), least, False)
+    while place > 1:  # few values may bend as much as that, and smoothly
+        before, share = _bend(values, place, along * (values[place] - values[0]) / place, least, True)
+        if before == 0:
+            break
+        place, sudden = before, share
+    return place, sudden
+
+
+@compiled
+def _is_sudden_change(previous, one, other, following, sudden):
+    """Return whether values change suddenly between two samples, and neither before nor after as if on a slope."""
+    change = other - one
+    sign = 1.0 if change > 0.0 else -1.0
+    beside = max(sign * (one - previous), sign * (following - other))
+    return abs(change) > sudden and STEEPER * beside < abs(change)
+
+
+@compiled
+def _flank(f, w, t, low, high, k, j, q, v, a):
+    """Return the time just behind a change of value j, between times low and high at places k and k + 1."""
+    changes = w.changes
+    before, after = changes[k, j], changes[k + 1, j]
+    for _ in range(HALVINGS):
+        time = 0.5 * (low + high)
+        _sample(f, w, time, 0.0, q, v, a, changes[MIDDLE])
+        now = changes[MIDDLE, j]
+        if abs(now - before) >= abs(after - now):
+            high, after = time, now
+        else:
+            low, before = time, now
+    return high
+
+
+@compiled
+def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, place, column, sudden, q, v, a):
+    """Record the time of a change next to a place where a value bends, and the time since the change before."""
+    values, apart = w.changes[:, column], max(NEARLY * spacing, SAME * clock[at.WIDEST_SAMPLING])
+    soonest = clock[at.T_START] + SOON * tolerances[GAP]
+    for k in range(place - 1, place + 1):
+        low, high = begin + k * spacing, begin + (k + 1) * spacing
+        known = low - apart <= clock[at.LAST_CHANGE] <= high + apart
+        if known or k + 2 > n or low - spacing < soonest:  # what is on both sides is to be seen, too
+            continue
+        if k == 0:
+            _sample(f, w, low - spacing, 0.0, q, v, a, w.changes[MIDDLE])
+        if _is_sudden_change(values[MIDDLE if k == 0 else k - 1], values[k], values[k + 1], values[k + 2], sudden):
+            time = _flank(f, w, t, low, high, k, column, q, v, a)
+            if clock[at.LAST_CHANGE] > -np.inf:
+                clock[at.SHORTEST_CHANGE] = min(clock[at.SHORTEST_CHANGE], abs(time - clock[at.LAST_CHANGE]))
+            clock[at.LAST_CHANGE] = time
+
+
+@compiled
+def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, along, q, v, a):
+    """Return the first sample ahead at which something changes suddenly, or infinity; and the end of the samples.
+
+    The state is that at t, the times go from `begin`, none is after `last`; `along` tells whether the state goes with
+    them.
+    """
+    changes, n, first = w.changes, 0, np.inf
+    for k in range(N_SAMPLES + 1):
+        time = begin + k * spacing
+        if time > last:
+            break
+        _sample(f, w, time, along * (time - t), q, v, a, changes[k])
+        for j in range(changes.shape[1]):
+            if np.isfinite(changes[k, j]):
+                changes[LARGEST, j] = max(changes[LARGEST, j], abs(changes[k, j]))
+            elif k > 0:
+                first = time
+        if first < np.inf:
+            break
+        n = k
+    least = LEAST * tolerances[RTOL]
+    of_forces = max(FLOOR, least * _largest(changes[LARGEST, : q.size]))
+    of_rates = max(FLOOR, least * _largest(changes[LARGEST, q.size :]))
+    bend, column, sudden = n, -1, 0.0
+    for j in range(changes.shape[1]):
+        values = changes[:, j]
+        place, least = _first_discontinuity_of(values, n, along, of_forces if j < q.size else of_rates)
+        if 0 < place < bend:
+            bend, column, sudden = place, j, least
+    if column >= 0:
+        first = min(first, begin + bend * spacing)
+        if along == 0.0:
+            _record_changes(f, w, tolerances, clock, t, begin, spacing, n, bend, column, sudden, q, v, a)
+    return first, min(first, begin + N_SAMPLES * spacing if n == N_SAMPLES else last)
+
+
+@compiled
+def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, a):
+    """Record for how long a value in a short step differs from those before and behind: samples have not met it."""
+    changes, wide, begin, end = w.changes, control[at.APART], clock[at.T_START], t + size
+    clock[at.COMPARED] = t
+    if end + wide > last or (t - 2.0 * wide < begin and end + 2.0 * wide > last):
+        return
+    for k, time in enumerate((t - 2.0 * wide, t - wide, end + wide, end + 2.0 * wide)):
+        _sample(f, w, min(max(time, begin), last), 0.0, q, v, a, changes[k + (k > 1)])
+    least = LEAST * tolerances[RTOL]
+    of_forces = max(FLOOR, least * _largest(changes[LARGEST, : q.size]))
+    of_rates = max(FLOOR, least * _largest(changes[LARGEST, q.size :]))
+    for k in range(IN_SHORT):
+        time = t + k * size / IN_SHORT
+        _sample(f, w, time, 0.0, q, v, a, changes[2])
+        for j in range(changes.shape[1]):
+            values = changes[:, j]
+            low = min(min(values[0], values[1]), min(values[3], values[4]))
+            high = max(max(values[0], values[1]), max(values[3], values[4]))
+            beyond = max(values[2] - high, low - values[2])
+            if beyond > max(STEEPER * (high - low), of_forces if j < q.size else of_rates):
+                first = _flank(f, w, t, max(t - wide, begin), time, 1, j, q, v, a)
+                second = _flank(f, w, t, time, end + wide, 2, j, q, v, a)
+                clock[at.SHORTEST_CHANGE] = min(clock[at.SHORTEST_CHANGE], second - first)
+
+
+@compiled
+def _acceleration_lasts(f, w, tolerances, t, way, q, v, a, Q, V, A):
+    """Return whether accelerations stay about what they are until they have changed a velocity by its tolerance.
+
+    Those of a body that stiff friction holds do not: they are what the tolerances, or rounding, leave of forces in
+    balance, and a parabola on which they went on would leave the state of rest far behind.
+    """
+    n, time, largest, change = w.Q.size, way, 0.0, 0.0
+    for m in range(n):
+        largest = max(largest, abs(a[m]))
+        if a[m] != 0.0:
+            time = min(time, allowed(tolerances, m, v[m], v[m]) / abs(a[m]))
+    if largest == 0.0:
+        return True
+    for m in range(n):
+        Q[m], V[m] = q[m], v[m] + time * a[m]
+    if evaluate_near(f, w, t, Q, V, A) != DONE:
+        return True
+    for m in range(n):
+        change = max(change, abs(A[m] - a[m]))
+    return not change > DECAYED * largest
+
+
+@compiled
+def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a, Q, V, A):
+    """Sample along the motion of a step, and of those behind it that end within LONG spacings, once."""
+    if clock[at.MOTION_SAMPLED_TO] >= t + (1.0 - NEARLY) * size:
+        return
+    way = min(max(size, LONG * spacing), last - t)
+    clock[at.SAMPLES_MOTION] = 1.0
+    first, clock[at.MOTION_SAMPLED_TO] = first_discontinuity(
+        f, w, tolerances, clock, t, t, way / N_SAMPLES, last, 1.0, q, v, a
+    )
+    if first < np.inf and not _acceleration_lasts(f, w, tolerances, t, way, q, v, a, Q, V, A):
+        A[:] = 0.0
+        first, clock[at.MOTION_SAMPLED_TO] = first_discontinuity(
+            f, w, tolerances, clock, t, t, way / N_SAMPLES, last, 1.0, q, v, A
+        )
+    clock[at.SAMPLES_MOTION] = 0.0
+    known = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t  # by closer looks, which are to go on there
+    if not known and way <= N_SAMPLES * min(control[at.APART], size / IN_A_STEP):  # as close as looks in time alone
+        clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], way / N_SAMPLES)
+        if clock[at.MOTION_SAMPLED_TO] > clock[at.SAMPLED_TO]:
+            clock[at.SAMPLED_TO], clock[at.SAMPLED_EVERY] = clock[at.MOTION_SAMPLED_TO], way / N_SAMPLES
+            clock[at.DISCONTINUITY] = first
+    if first < clock[at.DISCONTINUITY_OF_MOTION] or clock[at.DISCONTINUITY_OF_MOTION] <= t + NEARLY * spacing:
+        clock[at.DISCONTINUITY_OF_MOTION] = first
+
+
+@compiled
+def _sample_ahead(f, w, tolerances, control, clock, known, t, size, last, q, v, a):
+    """Return the next sudden change with time ahead of a step, or infinity, where no other one is before it."""
+    every = max(min(control[at.APART], size / IN_A_STEP), LEAST_APART * np.spacing(abs(t)))
+    # a multistep method, whose formula no jump fools, drops its past only where it is refused; and steps find jumps of
+    # C_t and b, if they do not end next to them
+    closer = control[at.ROUGH] > 1.0 and control[at.DRIVEN] == 0.0
+    if closer and every < SHRUNK * clock[at.SAMPLED_EVERY]:
+        clock[at.SAMPLED_TO] = t
+    begin = max(t, clock[at.SAMPLED_TO])
+    at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # which is to be found again
+    while begin < min(t + size, last, known):
+        apart, at_change = min(every, clock[at.SAMPLED_EVERY]) if at_change else every, False
+        clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], apart)
+        first, begin = first_discontinuity(f, w, tolerances, clock, t, begin, apart, last, 0.0, q, v, a)
+        known = min(known, first)
+        clock[at.SAMPLED_TO], clock[at.SAMPLED_EVERY] = begin, apart
+    return known
+
+
+@compiled
+def limit_to_discontinuity(f, w, tolerances, control, clock, t, size, last, state, new_state):
+    """Return the size of a step that does not pass over a sudden change; `new_state` is scratch."""
+    n, spacing = w.Q.size, control[at.SPACING]
+    q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
+    Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
+    shortest = (1.0 if control[at.BY_STATE] == 1.0 else LONG) * spacing
+    if control[at.SAMPLE_MOTION] == 1.0 and shortest < size < (N_SAMPLES + NEARLY) * spacing:
+        _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a, Q, V, A)
+    near = t + NEARLY * min(spacing, size / IN_A_STEP)
+    known = clock[at.DISCONTINUITY] if clock[at.DISCONTINUITY] > near else np.inf
+    along = clock[at.DISCONTINUITY_OF_MOTION] if clock[at.DISCONTINUITY_OF_MOTION] > near else np.inf
+    at_change = known == np.inf and clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO] > -np.inf
+    # not up to the end of a run, where looks within shorter and shorter rests would find the change anew
+    if control[at.BY_TIME] == 1.0 and not (at_change and size <= (1.0 + NEARLY) * clock[at.SAMPLED_EVERY]):
+        known = _sample_ahead(f, w, tolerances, control, clock, known, t, size, last, q, v, a)
+        clock[at.DISCONTINUITY] = known
+    size = min(size, representable_step(t, min(known, along) - t))
+    is_short = size < SHORT * clock[at.H_LONG] or t < clock[at.T_START] + 2.0 * control[at.APART]
+    if control[at.BY_TIME] == 1.0 and is_short and size < control[at.APART] and clock[at.COMPARED] < t:
+        _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, a)
+    return size

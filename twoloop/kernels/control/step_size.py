@@ -1,0 +1,224 @@
+"""Step-size control: the length of the next step, the times on which steps land, and further measures of error.
+
+The length follows from the error of the last step. With the trend (Gustafsson, ACM TOMS 20 (1994), 496) the factor also
+follows how the error has changed since the last accepted step.
+
+Errors that the embedded formula does not see are measured in two ways:
+
+- `departure` compares the dependent positions that the formula predicts with those that the constraints then give. On
+  one assembly of the mechanism the difference is of the order of the step's error. On another assembly it is not,
+  however smooth the independent coordinates are. A mechanism without any (every coordinate prescribed) has no other
+  estimate. Where two assemblies come close to one another, a large step may end on the wrong one with a small
+  difference; it has then passed a zero of det C_qd, which a motion does only through a singular position. So a change
+  of this sign needs a prediction that is nearly exact, as short steps through a singular position have it.
+- `excess` is the defect of a Taylor step: how far its accelerations are from those of the equations at the same states.
+  A series knows the forces at its beginning, to all orders, and nothing of what comes later. So the equations are
+  evaluated where the step ends, and within it at most tolerances[LOOK] apart.
+"""
+
+import numpy as np
+
+from twoloop.kernels.control import loop_state as at
+from twoloop.kernels.control.loop_state import (
+    ERROR_BEFORE,
+    EXPONENT,
+    FACTOR_MAX,
+    FACTOR_MIN,
+    H_BEFORE,
+    INNER_TOL,
+    LEAST_ERROR,
+    SAFETY,
+)
+from twoloop.kernels.data.common import SETTLE, allowed, compiled, is_beyond_gap, kernel, merged
+from twoloop.kernels.data.indices import (
+    ATOL,
+    DEFECT,
+    DONE,
+    ESTIMATE,
+    EXPLICIT_STEP,
+    FORM,
+    LARGEST_DEFECT,
+    LOOK,
+    N_ACCEPTED,
+    N_JACOBIANS,
+    N_PARTITIONS,
+    N_REJECTED_CONVERGENCE,
+    N_REJECTED_ERROR,
+    ORIENTATION,
+    ORIENTATION_NEW,
+    RTOL,
+    STATIC,
+    STRAIGHT,
+    UNCHECKED,
+    WIDEST_GAP,
+)
+from twoloop.kernels.evaluation.constraints import representable_step
+from twoloop.kernels.evaluation.inner_loop import evaluate, restore
+from twoloop.kernels.evaluation.tasks import PROJECT
+from twoloop.kernels.linalg.markowitz_lu import sign_of
+
+KEPT = 1.2  # with the trend, a factor from 1 to this leaves the step as it is: new factors of Newton's matrix cost
+
+
+@compiled
+def factor_of(rule, past, h, error):
+    """Return the step factor after a step h with this error, accepted from 1 down."""
+    if not error > 0.0:
+        return rule[FACTOR_MAX]
+    follows = error <= 1.0 and rule[LEAST_ERROR] > 0.0
+    factor = rule[SAFETY] * (1.0 / error if rule[EXPONENT] == 1.0 else error ** -rule[EXPONENT])
+    if follows and past[ERROR_BEFORE] > 0.0:
+        trend = h / past[H_BEFORE] * (past[ERROR_BEFORE] / error) ** rule[EXPONENT]
+        factor = min(factor, factor * trend)
+    factor = min(rule[FACTOR_MAX], max(rule[FACTOR_MIN], factor))
+    return 1.0 if follows and 1.0 <= factor <= KEPT else factor
+
+
+@merged
+def record_accepted(rule, past, h, error):
+    """Record an accepted step as the last one."""
+    past[H_BEFORE], past[ERROR_BEFORE] = h, max(error, rule[LEAST_ERROR])
+
+
+@compiled
+def evaluate_near(f, w, t, Q, V, A):
+    """Evaluate accelerations A at a state (Q, V) near the constraints, which is moved onto them."""
+    # the nearest state is cheaper to find; and the only one where evaluations do not move the state
+    if (f.flags[STRAIGHT] == 1 and w.Rate.size == w.C.size) or f.flags[FORM] == STATIC:
+        return f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
+    return evaluate(f, w, t, Q, V, INNER_TOL, A)
+
+
+@kernel(SETTLE)
+def commit_nothing(f, w, options, memory, tolerances, accepted):
+    """Do nothing, for a step without a memory."""
+
+
+NEAR = 4.0  # times that differ by less than so many spacings of floating-point numbers are one
+
+
+@merged
+def on_grid(clock, t, h, target, goal):
+    """Return the size of a step of a fixed grid, how many of the grid it is, and whether it reaches the goal.
+
+    Times are counted, not added up; an output time within a millionth of a step of the grid is on it.
+    """
+    rounding = NEAR * np.spacing(max(abs(t), abs(target)))
+    near = max(1e-6 * h, rounding)
+    in_grid = 1.0
+    if target <= clock[at.T_START] + clock[at.N_FIXED] * h + near:
+        in_grid = 0.0  # a second output time beside the same point of the grid
+    end = clock[at.T_START] + (clock[at.N_FIXED] + in_grid) * h
+    reaches = goal <= end + near
+    size = h
+    if abs(t + h - end) > rounding:
+        size = end - t  # back to the grid after such an output time
+    if reaches and goal < target and abs(goal - end) > rounding:
+        in_grid = 0.0
+    return size, in_grid, reaches
+
+
+@merged
+def off_grid(control, t, h, left, leaps):
+    """Return the size of a step with step-size control, and whether it reaches the goal, which is so far away."""
+    reaches = leaps or h >= left * (1.0 - 1e-10)
+    size = h
+    if h > 0.5 * left and not reaches:
+        size = 0.5 * left  # two equal steps rather than a long and a tiny one
+    size = representable_step(t, size)
+    if size > control[at.MAX_STEP]:
+        size = representable_step(t, size - np.spacing(abs(t + size)))
+    return size, reaches
+
+
+FADING = 0.98  # of the longest step, with each accepted one
+
+
+@merged
+def count_step(w, tolerances, control, clock, size, out_step):
+    """Count an accepted step, and record its defect and the widest gap between evaluations."""
+    w.counters[N_ACCEPTED] += 1
+    if w.notes[DEFECT] >= 0.0:
+        w.notes[LARGEST_DEFECT] = max(w.notes[LARGEST_DEFECT], w.notes[DEFECT])
+    else:
+        w.notes[UNCHECKED] += 1.0
+    gap = size
+    if w.notes[DEFECT] >= 0.0:
+        gap = min(size, tolerances[LOOK])
+    elif is_beyond_gap(tolerances, size):  # as only steps may be whose stages are nearer to one another
+        gap = control[at.MAX_EVALUATION_GAP] * size
+    w.notes[WIDEST_GAP] = max(w.notes[WIDEST_GAP], gap)
+    clock[at.H_LONG] = max(size, FADING * clock[at.H_LONG])
+    w.notes[ORIENTATION] = w.notes[ORIENTATION_NEW]
+    out_step[at.H] = size
+    out_step[at.ERRORS] = w.counters[N_REJECTED_ERROR]
+    out_step[at.FAILURES] = w.counters[N_REJECTED_CONVERGENCE]
+    out_step[at.PARTITIONS] = w.counters[N_PARTITIONS]
+    out_step[at.JACOBIANS] = 0.0 if w.notes[EXPLICIT_STEP] == 1.0 else w.counters[N_JACOBIANS]
+
+
+SHARE_OF_MOTION = 0.1  # of the way that the coordinates go in the step: what a prediction may be off at any tolerance
+SHARE_THROUGH_ZERO = 1e-6  # ... and where the sign of det C_qd changes
+LEAST = 1e-300  # in place of a scale of zero, so that a distance of zero needs no branch
+FLOOR = 0.01  # of the tolerances, below which SHARE_OF_MOTION does not matter
+
+
+@merged
+def store_prediction(w, q1):
+    """Store the dependent positions of q1 before the constraints change them."""
+    for k in range(w.dependent.size):
+        w.predicted[k] = q1[w.dependent[k]]
+
+
+@merged
+def departure(w, tolerances, h, q, v, q1):
+    """Return the largest distance of the stored prediction from q1, over the tolerances or over a share of the motion.
+
+    Needs the factors of C_qd at q1, as they stand after the inner loop. Fixed steps test nothing.
+    """
+    if tolerances[ESTIMATE] == 0.0:
+        return 0.0
+    w.notes[ORIENTATION_NEW] = sign_of(w.index, w.values)
+    motion = 0.0
+    for m in range(q.size):
+        motion = max(motion, h * abs(v[m]), abs(q1[m] - q[m]))
+    share, floor = SHARE_OF_MOTION, FLOOR
+    if w.notes[ORIENTATION] * w.notes[ORIENTATION_NEW] < 0.0:
+        share, floor = SHARE_THROUGH_ZERO, 0.0
+    largest = 0.0
+    for k in range(w.dependent.size):
+        m = w.dependent[k]
+        scale = allowed(tolerances, m, q[m], q1[m])
+        largest = max(largest, abs(w.predicted[k] - q1[m]) / max(min(scale, share * motion + floor * scale), LEAST))
+    return largest
+
+
+@merged
+def project_prediction(f, w, tolerances, t, h, q, v, q1, v1, inner_tol):
+    """Put the prediction (q1, v1) of a step of h from (q, v) on the constraints, as `restore` does; code, departure."""
+    store_prediction(w, q1)
+    code = restore(f, w, t, q1, v1, inner_tol)
+    return code, departure(w, tolerances, h, q, v, q1) if code == DONE else 0.0
+
+
+ROUNDING = 1e-13  # of the largest acceleration: a defect that is rounding
+
+
+@compiled
+def excess(tolerances, h, order, found, a, q, v):
+    """Return the defect |found - a| of a step h over what the tolerances allow; infinite where it is not finite.
+
+    The defect of a series of this order grows with the last power of the time: its integral is h / order times what it
+    is at the end.
+    """
+    rtol, share, largest, worst = tolerances[RTOL], h / order, 0.0, 0.0
+    for j in range(a.size):
+        largest = max(largest, abs(a[j]))
+    for j in range(a.size):
+        defect = abs(found[j] - a[j])
+        if not np.isfinite(defect):
+            return np.inf
+        defect = (defect - ROUNDING * largest) * share
+        atol = tolerances[ATOL + j]
+        worst = max(worst, defect / (atol + rtol * abs(v[j])), defect * share / (atol + rtol * abs(q[j])))
+    return worst

@@ -1,0 +1,113 @@
+"""Indices into the arrays that kernels share, and the codes that they return.
+
+Kernels keep their state in arrays of numbers, as compiled code passes these by reference. Each group below names the
+places of one array. What only the loop over steps reads stands in control/loop_state.py.
+"""
+
+from twoloop.kernels.compile.callbacks import OPTIONAL
+
+# codes: DONE, or why an evaluation or a step failed
+(
+    DONE,
+    OUTER_DIVERGED,
+    INNER_DIVERGED,
+    SINGULAR,
+    NOT_FINITE,
+    MASS_NOT_DEFINITE,
+    GAMMA_INACCURATE,
+    RANK_DIFFERS,
+    ROWS_CONTRADICT,
+    NEEDS_DENSE,  # the sparse form cannot decide it
+    NOT_LOADED,  # the step is not loaded yet: the caller loads its machine code
+    UNSUITED,  # the method does not suit the motion here: another one takes over
+) = range(12)
+
+# Functions.flags: whole numbers that tell kernels of a system. BANDWIDTH is -1 where linear algebra is not banded. FORM
+# is how accelerations are found, see linalg/saddle_point.py; DENSE_FORM is what FORM becomes where sparse factors have
+# too many entries. STRAIGHT is 1 where the inner loop is code generated for the mechanism
+CONSTANT_MASS, DIAGONAL_MASS, BANDWIDTH, FORM, DENSE_FORM, STRAIGHT, FIRST_GIVEN = range(7)
+MULTIPLIERS, NULL_SPACE, AUGMENTED, STATIC = range(4)  # values of FORM; the last has sparse_inner_loop.py
+GIVEN = {name: place for place, name in enumerate(OPTIONAL, FIRST_GIVEN)}  # whether an optional callback is given
+N_FLAGS = FIRST_GIVEN + len(GIVEN)
+CONSTRAINT_RATE_GIVEN, GAMMA_GIVEN, FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, KINEMATICS_GIVEN = (
+    GIVEN[name] for name in ("constraint_rate", "gamma", "force_by_q", "force_by_v", "reaction_by_q", "kinematics")
+)
+NONHOLONOMIC_RATE_GIVEN, NONHOLONOMIC_GAMMA_GIVEN = (
+    GIVEN[name] for name in ("nonholonomic_rate", "nonholonomic_gamma")
+)
+MASS_VALUES_GIVEN, JACOBIAN_VALUES_GIVEN = (GIVEN[name] for name in ("mass_values", "jacobian_values"))
+
+# Work.counters: counts of a run
+(
+    N_ACCEPTED,
+    N_REJECTED_ERROR,
+    N_REJECTED_CONVERGENCE,
+    N_OUTER,
+    N_INNER,
+    N_EVALUATIONS,
+    N_PARTITIONS,
+    N_FACTORIZATIONS,
+    N_JACOBIANS,
+    N_COUNTERS,
+) = range(10)
+
+# Work.notes: what one kernel notes for another
+(
+    SENSITIVITY,  # max|Cqd^-1 Cqi| after the first step under this partition; 0: not known yet
+    ORIENTATION,  # sign of det C_qd at the last accepted state under this partition; 0: not known
+    ORIENTATION_NEW,  # ... and at the end of this attempt
+    FAULT_KIND,  # place in Functions of the callback that gave a value that is not finite; -1: none known
+    FAULT_TIME,  # ... and when
+    GAMMA_REQUIRED,  # relative accuracy that Q_d by differences must have, see evaluation/constraints.py
+    GAMMA_SHARE,  # length over which to difference, as a share of the longest one
+    GAMMA_ACCURACY,  # reached when that share was chosen
+    GAMMA_SCALE,  # largest entry of Q_d so far
+    REUSE,  # correction of a position below which the Jacobian before it serves for velocities and accelerations
+    ROUNDED,  # the same at a state that may be accepted: rounding of the positions
+    GENERATION,  # number of partitions so far
+    RANK,  # rank of C_q where it is not what the workspace is made for
+    RANK_V,  # ... of C_q and A
+    CONTRADICTION,  # row that was taken for redundant and is violated
+    PIVOT,  # smallest pivot of the last full pivoting, rows scaled to 1: small near a singular position
+    NEARLY_SINGULAR,  # 1: the run has come near a singular position, or does not watch for one
+    NEAR_NOW,  # 1: a singular position was near at the last check; 2: a step that could look within did not for it
+    MASS_SCALE,  # s of the augmented matrix, see linalg/saddle_point.py
+    FACTORED,  # 1: the factors of the linear problem belong to w.M and w.G
+    KNOWN,  # 1: w.Rate and w.Gamma[:n_c] belong to the state, from the fused callback
+    BY_GENERAL,  # 1: generated code left the last state to the general inner loop
+    EXPLICIT_STEP,  # 1: a method that switches took an explicit step
+    DEFECT,  # largest defect of this attempt over what the tolerances allow; -1: none was evaluated
+    LARGEST_DEFECT,  # the largest of the accepted steps
+    UNCHECKED,  # accepted steps without a defect
+    WIDEST_GAP,  # s, the longest time between two evaluations within accepted steps
+    KINK_BEFORE,  # times between which no jump of C_t or b is known
+    KINK_AFTER,
+    LEANING,  # largest share of a row that counts in a redundant one, when this partition was chosen
+    SMALLEST,  # of the sparse form: least pivot of a row over its size, the sine squared of its angle to others
+    N_NOTES,
+) = range(32)
+
+# tolerances of eq. (26) of the paper, as a step gets them
+(
+    RTOL,
+    ESTIMATE,  # 0 for a fixed step, else 1
+    LEAST,  # the smallest tolerance
+    GAP,  # s, the longest time between two evaluations of the equations
+    LOOK,  # s, the same of steps that evaluate their defect between nodes
+    ATOL,  # from here on: the absolute tolerance of each coordinate and of its velocity
+) = range(6)
+LONGEST_UNSEEN = 0.01  # GAP over the length of the run
+UNTRUE = 30.0  # times the tolerances: errors of velocities beside a singular position that are reported
+
+# kinds of intervals between accepted states, for dense output: which values of the states the polynomials take
+WINDOW = 4  # states that a polynomial goes through
+(
+    APART,  # q and v in one, v and a in another: errors of q and v are independent, and steps are small
+    VELOCITIES,  # q and v, and its derivative: a holds the noise of stiff modes
+    ACCELERATIONS,  # q, v and a, and its derivative
+    ACROSS,  # the same, of a step across a singular position
+    JUMP,  # no polynomial: velocities jump within a few spacings of floating-point numbers
+) = range(5)
+# columns of the table of intervals, one row for all output times within one interval; no polynomial goes beyond the
+# rows LOW and HIGH, at which velocities jump
+FIRST_OWN, LAST_OWN, KIND, FIRST_TIME, END_TIME, LOW, HIGH, N_COLUMNS = range(8)
