@@ -66,7 +66,7 @@ engines: .venv/engines ## the physics engines of the study engines, where they a
 
 table3: install ## the paper's Table 3 into reports/, about three minutes; ARGS=--full takes twenty
 	@echo "[3/3] Compiling the paper's steps and those of the default (once), then 32 cells, IDA and Exudyn"
-	@$(RUN) -c "from twoloop.kernels.steps import explicit_step, lobatto_step; from twoloop.kernels.control import switching" & \
+	@$(RUN) -c "from twoloop.kernels.steps import explicit_step, lobatto_step; from twoloop.kernels.control import stiffness" & \
 	$(RUN) -c "from twoloop.kernels.paper import newmark_step, paper_step; from twoloop.kernels import interpolation" && wait $$!
 	$(RUN) -m studies.table3 $(ARGS)
 
@@ -77,12 +77,12 @@ reports: install ## all studies into reports/
 # does: what Newton's matrices and large systems have in common, and bodies in space, are in one of them
 compile: install ## compile the kernels, and the callbacks of bodies, mechanisms and studies, on two cores
 	@echo "Compiling (once, on both cores) the kernels, and the callbacks of bodies, mechanisms and studies"
-	@$(RUN) -c "from twoloop.kernels.evaluation import inner_loop; from twoloop.kernels.control import controller"
+	@$(RUN) -c "from twoloop.kernels.evaluation import inner_loop; from twoloop.kernels.control import step_size"
 	@$(RUN) -c "from twoloop.kernels.steps import diagonal_step, newton_step; \
 	from twoloop.kernels.evaluation import sparse_inner_loop; from twoloop.bodies.spatial import callbacks, programs; \
 	from studies.bench import sharp_callbacks; $(CALLBACKS_OF_TESTS)" & \
 	$(RUN) -c "from twoloop.kernels import advance, interpolation, cached_run; \
-	from twoloop.kernels.linalg import dependent_columns, rank; from twoloop.kernels.control import switching; \
+	from twoloop.kernels.linalg import dependent_columns, rank; from twoloop.kernels.control import stiffness; \
 	from twoloop.kernels.evaluation import checks, residuals, traced; \
 	from twoloop.kernels.lanes import advance as lanes, explicit, starts; \
 	from twoloop.kernels.steps import adams_step, crossing_step, explicit_step, lazy, lobatto_step, taylor_step; \
