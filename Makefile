@@ -84,7 +84,7 @@ compile: install ## compile the kernels, and the callbacks of bodies, mechanisms
 	$(RUN) -c "from twoloop.kernels import advance, interpolation, cached_run; \
 	from twoloop.kernels.linalg import dependent_columns, rank; from twoloop.kernels.control import stiffness; \
 	from twoloop.kernels.evaluation import checks, residuals, traced; \
-	from twoloop.kernels.lanes import advance as lanes, explicit, starts; \
+	from twoloop.kernels.lanes import advance, explicit, starts; \
 	from twoloop.kernels.steps import adams_step, crossing_step, explicit_step, lazy, lobatto_step, taylor_step; \
 	from twoloop.kernels.paper import bdf_step, fixed_point_step, newmark_step, paper_step; \
 	from twoloop.bodies.planar import callbacks, programs; \

@@ -765,5 +765,5 @@ def _stamp() -> str:
     """Return a digest of what writes the code, and of the kernels that it goes with."""
     from twoloop.kernels.data import common
 
-    kernels = ("lanes.explicit", "control.step_size")
+    kernels = ("lanes.control", "lanes.explicit", "control.step_size")
     return digest_of("".join(map(common.stamp, kernels)), __file__, *WRITERS)

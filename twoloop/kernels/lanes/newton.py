@@ -11,7 +11,7 @@ end of the step alone is put on them. Derivatives are differences, made for all 
 import numpy as np
 
 from twoloop.kernels.data.common import compiled, kernel, merged
-from twoloop.kernels.lanes.explicit import LEAST, N_HEAD, begin_control, choose_steps, end_steps, judge_steps, set_end
+from twoloop.kernels.lanes.control import LEAST, N_HEAD, begin_control, choose_steps, end_steps, judge_steps, set_end
 from twoloop.kernels.lanes.layout import (
     ACCEPTED,
     AHEAD,

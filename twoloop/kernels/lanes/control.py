@@ -1,0 +1,195 @@
+"""Control the steps of Runge-Kutta methods in lanes by an estimate of the error, each lane for itself."""
+
+import numpy as np
+
+from twoloop.kernels.control.loop_state import N_PAST, N_RULE
+from twoloop.kernels.control.step_size import factor_of, record_accepted
+from twoloop.kernels.data.common import compiled, inlined, merged
+from twoloop.kernels.lanes.layout import (
+    ACCEPTED,
+    AHEAD,
+    ATOL,
+    CHECKS_REDUNDANT,
+    ERROR,
+    FINE,
+    FRESH,
+    GAP,
+    H_LIMIT,
+    H_NEXT,
+    LANES,
+    LIMIT_AGE,
+    MANY_STEPS,
+    N_NUMBERS,
+    N_ROWS,
+    NO_VALUES,
+    OFF,
+    OFTEN_REFUSED,
+    ORDER,
+    PAST,
+    REFUSED,
+    ROUGH_TO,
+    RTOL,
+    RUN,
+    RUNNING,
+    SHORTEST,
+    T0,
+    T1,
+    WANTED,
+    H,
+    N,
+    T,
+    X,
+    leave_run,
+    places_of,
+)
+from twoloop.kernels.lanes.operations import enlarge, project_lanes
+
+# what `options` begin with, before those of the single step: the rule of controller.py, then
+# ROUGH: how many times less than its error the estimate of a step may be where a force jumps
+# FIRST: step, of the shortest time scale of the start; LEAST: tolerance
+ROUGH, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
+
+SUDDEN, SHORTENED, WHOLE = 10.0, 0.95, 1e-10  # as in advance.py
+LIMIT_FACTOR, LIMIT_MEMORY = 0.7, 10.0  # as of a Plan
+RESOLVED = 20.0 * SHORTEST  # of the time at the start: the first step is no shorter
+MOST_REFUSED = 30  # one after another, by estimates that may say little of how much shorter a stiff step has to be
+MOST_STEPS = 100_000  # of a run in lanes, which nothing interrupts
+
+
+@inlined
+def _past(work, k):
+    return work[PAST * LANES + N_PAST * k : PAST * LANES + N_PAST * (k + 1)]
+
+
+@compiled
+def _first_step(options, control, work, n, state, a, k):
+    """Return a share of the time in which velocities and accelerations change the coordinates as a whole."""
+    far, fast, sharp, least = 0.0, 0.0, 0.0, np.inf
+    for j in range(n):
+        far = max(far, abs(work[(state + j) * LANES + k]))
+        fast = max(fast, abs(work[(state + n + j) * LANES + k]))
+        sharp = max(sharp, abs(work[(a + j) * LANES + k]))
+        least = min(least, control[ATOL + j])
+    far, scale = max(far, least), control[T1] - control[T0]
+    if fast > 0.0:
+        scale = min(scale, far / fast)
+    if sharp > 0.0:
+        scale = min(scale, np.sqrt(far / sharp))
+    if fast > 0.0 and sharp > 0.0 and fast / sharp > options[FIRST] * scale:
+        scale = min(scale, fast / sharp)
+    return max(options[FIRST] * scale, RESOLVED * abs(control[T0]))
+
+
+@compiled
+def begin_control(options, control, work, n, state, a, start):
+    """Choose first steps of new runs, and copy their accelerations A to `start`."""
+    for k in range(LANES):
+        if work[FRESH * LANES + k] == 1.0:
+            for j in range(n):
+                work[(start + j) * LANES + k] = work[(a + j) * LANES + k]
+            work[H_NEXT * LANES + k] = _first_step(options, control, work, n, state, a, k)
+            work[H_LIMIT * LANES + k], work[LIMIT_AGE * LANES + k] = np.inf, 0.0
+            work[ROUGH_TO * LANES + k] = -np.inf
+            for i in range(N_PAST):
+                work[PAST * LANES + N_PAST * k + i] = 0.0
+
+
+@compiled
+def choose_steps(work, control, status, n_steps):
+    """Choose H and X of each lane, at most the gap, 0 where none runs; FINE are those that run."""
+    t1 = control[T1]
+    for k in range(LANES):
+        work[H * LANES + k], t = 0.0, work[T * LANES + k]
+        if work[RUNNING * LANES + k] == 1.0:
+            wanted = min(work[H_NEXT * LANES + k], work[H_LIMIT * LANES + k], control[GAP])
+            h, left = wanted, t1 - t
+            if h >= left * (1.0 - WHOLE):
+                h = left
+            elif h > 0.5 * left:
+                h = 0.5 * left  # two equal steps rather than a long and a tiny one
+            if n_steps[int(work[RUN * LANES + k])] >= MOST_STEPS:
+                leave_run(work, status, k, MANY_STEPS)
+            elif h > SHORTEST * max(abs(t), abs(t1)):
+                work[H * LANES + k], work[WANTED * LANES + k] = h, wanted
+            else:
+                failed = work[H_LIMIT * LANES + k] < np.inf and work[LIMIT_AGE * LANES + k] == 0.0
+                leave_run(work, status, k, NO_VALUES if failed else OFTEN_REFUSED)
+        work[X * LANES + k] = work[H * LANES + k]
+        work[FINE * LANES + k] = work[RUNNING * LANES + k]
+
+
+@compiled
+def set_end(work, control):
+    """Set AHEAD to the time X after the beginning of the step."""
+    for k in range(LANES):
+        t, x = work[T * LANES + k], work[X * LANES + k]
+        work[AHEAD * LANES + k] = control[T1] if x == control[T1] - t else t + x
+
+
+@compiled
+def end_steps(code, settings, control, work, predicted_v):
+    """Project NEW; ERROR is at least how far it was predicted from there, in positions and velocities.
+
+    Velocities that the constraints change by more than the tolerances show a drive that jumps, or turns, between the
+    stages. `predicted_v`: work for velocities.
+    """
+    n, order = settings[N], settings[ORDER]
+    state, new, predicted, _, _, _, _, _ = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
+    for i in range(n * LANES):
+        work[predicted * LANES + i] = work[new * LANES + i]
+        work[predicted_v * LANES + i] = work[(new + n) * LANES + i]
+    project_lanes(code, order, control, work)
+    if settings[CHECKS_REDUNDANT] == 1:
+        code.redundant(order, control, work)
+    code.departure(order, control, work)
+    for i in range(n * LANES):
+        work[predicted_v * LANES + i] -= work[(new + n) * LANES + i]
+    for j in range(n):
+        atol = control[ATOL + j]
+        enlarge(work, ERROR, predicted_v + j, RUNNING, state + n + j, new + n + j, atol, control[RTOL])
+    for k in range(LANES):
+        work[ERROR * LANES + k] = max(work[ERROR * LANES + k], work[OFF * LANES + k])
+
+
+@merged
+def _accepted(options, work, k):
+    """Return whether the step of a lane is accepted, and choose the size of the next one."""
+    h, t, error = work[H * LANES + k], work[T * LANES + k], work[ERROR * LANES + k]
+    if work[FINE * LANES + k] == 0.0 or not np.isfinite(error):
+        work[H_NEXT * LANES + k], work[H_LIMIT * LANES + k] = 0.5 * h, LIMIT_FACTOR * h
+        work[LIMIT_AGE * LANES + k] = 0.0
+        return False
+    # at a jump the embedded formula may agree by chance: until the place is passed, the estimate has to be smaller
+    strict = options[ROUGH] if t < work[ROUGH_TO * LANES + k] else 1.0
+    accepted = error * strict <= 1.0
+    if error > SUDDEN and not accepted:
+        work[ROUGH_TO * LANES + k] = t + h
+    error *= strict
+    past = _past(work, k)
+    proposal = min(h * factor_of(options, past, h, error), work[H_LIMIT * LANES + k])
+    if not accepted:
+        work[H_NEXT * LANES + k] = min(proposal, SHORTENED * h)
+        return False
+    record_accepted(options, past, h, error)
+    work[H_NEXT * LANES + k] = max(proposal, work[WANTED * LANES + k]) if h < work[WANTED * LANES + k] else proposal
+    work[LIMIT_AGE * LANES + k] += 1.0
+    if work[LIMIT_AGE * LANES + k] > LIMIT_MEMORY:
+        work[H_LIMIT * LANES + k] = np.inf
+    return True
+
+
+@compiled
+def judge_steps(options, work, n, a, start, status):
+    """Set ACCEPTED by ERROR and FINE; copy the accelerations A at the ends of these steps to `start`."""
+    for k in range(LANES):
+        work[ACCEPTED * LANES + k] = 0.0
+        if work[RUNNING * LANES + k] == 0.0:
+            continue
+        if _accepted(options, work, k):
+            work[ACCEPTED * LANES + k] = 1.0
+            for j in range(n):
+                work[(start + j) * LANES + k] = work[(a + j) * LANES + k]
+        else:
+            work[REFUSED * LANES + k] += 1.0
+            if work[REFUSED * LANES + k] > MOST_REFUSED:
+                leave_run(work, status, k, OFTEN_REFUSED if work[FINE * LANES + k] == 1.0 else NO_VALUES)
