@@ -18,7 +18,7 @@ NEED_STUDIES = (
     *("test_differential.py", "test_docs.py", "test_rooms.py"),
 )
 LONGEST = (  # seconds each; those that compile most in a fresh clone are first
-    *("test_short_forces.py", "test_adapters.py", "test_examples.py", "test_docs.py", "test_equations.py"),
+    *("test_short_forces.py", "test_examples.py", "test_docs.py", "test_equations.py"),
     *("test_derivative_campaign.py", "test_lane_methods.py", "test_spring_functions.py", "test_motions.py"),
     *("test_sweeps.py", "test_check.py", "test_algebra.py", "test_claims.py", "test_newton.py"),
 )

@@ -75,6 +75,7 @@ def test_a_failure_is_a_row(rows):
     assert stopped["status"].tolist() == ["MAX_STEPS", "MAX_STEPS"] and stopped["n_accepted"].tolist() == [5, 5]
 
 
+@pytest.mark.slow
 def test_threads_give_the_same_numbers(rows):
     by_threads = sweep(linkage, ANGLES, measure=heights, workers=2, parallel="threads", t_span=(0.0, 0.3), rtol=1e-6)
     pd.testing.assert_frame_equal(by_threads.drop(columns="seconds"), rows.drop(columns="seconds"))

@@ -76,6 +76,7 @@ def test_a_pendulum_on_a_driven_arm_in_space():
     np.testing.assert_allclose(torque, expected, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_functions_that_branch_are_called_in_python_and_do_the_same():
     def smooth(t):
         return 3.0 * np.cos(2.0 * t)

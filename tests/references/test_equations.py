@@ -75,6 +75,7 @@ def test_gamma_is_the_callback_or_differences():
         assert worst(a, b) < 1e-8
 
 
+@pytest.mark.slow
 def test_singular_matrices():
     a, lam = accelerations(pendulum(), [0.0, 0.0], [[0.0, 1.0], [0.0, 0.0]], np.zeros((2, 2)))
     assert np.isnan(a[:, 0]).all() and np.isnan(lam[:, 0]).all()

@@ -18,6 +18,7 @@ def run(name, t_end, *args, **options):
     return solve_index1(problem.system, (0.0, t_end), problem.q0, problem.v0, *args, **options)
 
 
+@pytest.mark.slow
 def test_takes_the_steps_of_solve_ivp_on_equations_written_apart():
     problem = LINKAGES["default"]
     system = problem.system

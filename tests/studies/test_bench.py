@@ -303,6 +303,7 @@ def test_two_equal_runs_are_refused(kept):
         collect([Run(case(), solver(ours), 1e-6)] * 2, kept)
 
 
+@pytest.mark.slow
 def test_a_made_reference_says_how_far_it_holds():
     made = make_reference(problem(), T_END)
     t = np.linspace(0.0, T_END, 77)

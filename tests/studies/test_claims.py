@@ -185,7 +185,8 @@ def test_without_rows_nothing_is_judged():
     assert all(judgement.verdict is NOT_RUN and judgement.why for _, judgement in judged(Rows({}, {})).values())
 
 
-@pytest.mark.parametrize("every", [80, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("every", [80, 1])
 def test_a_missing_solver_is_not_run_and_never_an_exception(tables, every):
     solvers = sorted({str(solver) for table in tables.values() for solver in table["solver"].unique()})
     for solver in {*solvers[::every], IRK, "DOP853, projected"}:
