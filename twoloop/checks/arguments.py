@@ -1,4 +1,4 @@
-"""Check arguments; each message says which is wrong, what was given, what is expected, and what to do."""
+"""Checks of arguments; each message says which one is wrong, what was given, what is expected, and what to do."""
 
 import inspect
 import math
@@ -15,34 +15,35 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 FLOAT, ARRAY = np.dtype(np.float64), np.ndarray
-NUMBERS = (float, int)  # but not bool
-FAR = 1e300  # s: times that need no closer look whether they are finite
-SURELY_APART = 1e-14  # of the ends of a span
-NEAR = 8.0  # times that differ by less than so many spacings of floating-point numbers cannot be told apart
-HOLDS = {"U": "text", "S": "text", "M": "dates", "m": "time differences", "c": "complex numbers"}  # by NumPy's kind
-SHOWN = 120  # characters of what was given, in a message
+NUMBERS = (float, int)  # bool is excluded
+FAR = 1e300  # s: times below this are finite for certain
+SURELY_APART = 1e-14  # relative to the ends of a span: a longer span is long enough for certain
+NEAR = 8.0  # in spacings of floating-point numbers: times that differ by less cannot be distinguished
+# names for messages, by NumPy's kind
+HOLDS = {"U": "text", "S": "text", "M": "dates", "m": "time differences", "c": "complex numbers"}
+SHOWN = 120  # largest number of characters of a given value in a message
 
 
 def shown(value: Any) -> str:
-    """`value` as a message shows it: what Python calls it, cut where it is long."""
+    """Return `value` as a message shows it: its repr, cut if it is long."""
     if isinstance(value, int) and not isinstance(value, bool) and abs(value) >= 10**30:
-        return f"an integer of {value.bit_length()} bits"  # of too many digits for Python to write them
+        return f"an integer of {value.bit_length()} bits"  # more digits than Python writes
     try:
         text = repr(value)
-    except Exception:  # of an object that cannot even be shown
+    except Exception:  # the repr of an object may raise, too
         text = f"an object of type {type(value).__name__}"
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 
 def shaped(array: NDArray[Any]) -> str:
-    """An array of another shape than was expected, as a message shows it."""
+    """Describe an array of an unexpected shape, as a message shows it."""
     if array.ndim == 0:
         return f"the number {shown(array.tolist())}"
     return f"shape {array.shape}, {shown(array.tolist())}"
 
 
 def check_size(name: str, value: Any, least: int) -> int:
-    """Return `value` as an int of at least `least`, or say what is wrong with it."""
+    """Return `value` as an int of at least `least`, or raise."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
         raise TypeError(f"{name} must be an int; given {shown(value)} of type {type(value).__name__}")
     if value < least:
@@ -53,14 +54,14 @@ def check_size(name: str, value: Any, least: int) -> int:
 
 
 def check_flag(name: str, value: Any) -> bool:
-    """Return `value` as a bool, or say that it is none."""
+    """Return `value` as a bool, or raise if it is not one."""
     if not isinstance(value, (bool, np.bool_)):
         raise TypeError(f"{name} must be True or False; given {shown(value)} of type {type(value).__name__}")
     return bool(value)
 
 
 def check_text(name: str, value: Any) -> str:
-    """Return `value`, or say that it is no text."""
+    """Return `value`, or raise if it is not a string."""
     if not isinstance(value, str):
         raise TypeError(f"{name} must be a string; given {shown(value)} of type {type(value).__name__}")
     return value
@@ -74,12 +75,12 @@ def check_path(path: Any, name: str = "path") -> Path:
 
 
 def check_call(name: str, call: str, function: Callable[..., Any], arguments: Sequence[str], remedy: str = "") -> None:
-    """Raise TypeError if a function cannot be called with these arguments in their places."""
+    """Raise TypeError if a function cannot be called with these positional arguments."""
     if callable(function) and _takes(function, len(arguments)):
         return
     try:
         signature = inspect.signature(function)
-    except (TypeError, ValueError):  # built-in functions have none to look at
+    except (TypeError, ValueError):  # built-in functions have no signature
         return
     try:
         signature.bind(*arguments)
@@ -89,7 +90,7 @@ def check_call(name: str, call: str, function: Callable[..., Any], arguments: Se
 
 
 def _takes(function: Callable[..., Any], n: int) -> bool:
-    """Whether a plain function, or the method that calls an object, takes just so many arguments: quick to see."""
+    """Return whether a plain function, or an object's __call__, takes exactly n positional arguments; a fast check."""
     of_object = not isinstance(function, FunctionType)
     own = type(function).__call__ if of_object else function
     if not isinstance(own, FunctionType) or own.__code__.co_kwonlyargcount > 0:
@@ -98,7 +99,7 @@ def _takes(function: Callable[..., Any], n: int) -> bool:
 
 
 def check_choice(name: str, value: Any, choices: Sequence[str]) -> str:
-    """Return `value`, or say what it must be one of."""
+    """Return `value`, or raise if it is not one of the choices."""
     if not isinstance(value, str) or value not in choices:
         known = f"{', '.join(repr(each) for each in choices[:-1])} or {choices[-1]!r}"
         raise (ValueError if isinstance(value, str) else TypeError)(f"{name} must be {known}; given {shown(value)}")
@@ -106,7 +107,7 @@ def check_choice(name: str, value: Any, choices: Sequence[str]) -> str:
 
 
 def check_real(name: str, value: ArrayLike) -> Array:
-    """Return `value` as a new float array, or say that it is not one."""
+    """Return `value` as a new float array, or raise if it is not real."""
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value.copy()
     if type(value) is list and all(type(each) is float for each in value):
@@ -125,21 +126,21 @@ def check_real(name: str, value: ArrayLike) -> Array:
     if array.dtype.kind == "O" and not all(isinstance(each, (int, float)) for each in array.flat):
         raise TypeError(f"{expected}; given {shown(value)}")
     try:
-        with np.errstate(over="ignore"):  # what becomes infinite is said below, by those who want finite numbers
+        with np.errstate(over="ignore"):  # infinite results are reported by the callers that need finite numbers
             return np.array(array, dtype=np.float64)
     except OverflowError as error:
         raise ValueError(f"{name} must hold numbers that fit into a float; given one beyond 1.8e308") from error
 
 
 def _holds_bool(value: Any) -> bool:
-    """Whether a bool stands in nested lists, where NumPy would make it a number."""
+    """Return whether nested lists contain a bool, which NumPy would convert to a number."""
     if isinstance(value, (list, tuple)):
         return any(_holds_bool(each) for each in value)
     return isinstance(value, (bool, np.bool_)) or (isinstance(value, np.ndarray) and value.dtype.kind == "b")
 
 
 def wrong_entries(name: str, wanted: str, array: Array, wrong: NDArray[np.bool_]) -> ValueError:
-    """The error that says which entries of an array are not as they must be, and what they are."""
+    """Return the error that lists the wrong entries of an array and their values."""
     places = np.argwhere(wrong)
     listed = places.ravel() if array.ndim == 1 else places
     given = f"given {shown(array[wrong].tolist())}"
@@ -147,17 +148,18 @@ def wrong_entries(name: str, wanted: str, array: Array, wrong: NDArray[np.bool_]
 
 
 def check_vector(name: str, value: ArrayLike, n: int) -> Array:
-    """Return `value` as a new float vector of length n, or say what is wrong with it."""
+    """Return `value` as a new float vector of length n, or raise."""
     array = check_real(name, value)
     if array.shape != (n,):
         raise ValueError(f"{name} must have shape ({n},); given {shaped(array)}")
-    if not math.isfinite(sum(array.tolist())) and not np.isfinite(array).all():  # sums may be too large
+    # a sum of finite numbers may be infinite
+    if not math.isfinite(sum(array.tolist())) and not np.isfinite(array).all():
         raise wrong_entries(name, "finite", array, ~np.isfinite(array))
     return array
 
 
 def is_vector(value: Any, n: int) -> TypeGuard[Array]:
-    """Whether a value is a float vector of length n, as it is; its numbers may not be finite."""
+    """Return whether a value is a float vector of length n already; its numbers may not be finite."""
     return type(value) is ARRAY and value.dtype == FLOAT and value.shape == (n,)
 
 
@@ -168,7 +170,7 @@ def check_columns(name: str, value: Array, n: int) -> None:
 
 
 def check_indices(name: str, value: Any, n: int) -> list[int]:
-    """Return `value` as a list of different indices below n, or say what is wrong with it."""
+    """Return `value` as a sorted list of different indices below n, or raise."""
     if isinstance(value, (str, bytes)) or not isinstance(value, (Sequence, set, frozenset, range, np.ndarray)):
         raise TypeError(f"{name} must be a list of indices of coordinates, e.g. [0]; given {shown(value)}")
     indices = []
@@ -184,10 +186,10 @@ def check_indices(name: str, value: Any, n: int) -> list[int]:
 
 
 def check_span(t_span: tuple[float, float]) -> tuple[float, float]:
-    """Return start and end, or say what is wrong with them."""
+    """Return the start and the end of `t_span`, or raise if they are wrong."""
     t0, t1 = t_span if type(t_span) is tuple and len(t_span) == 2 else (0.0, 0.0)
     if type(t0) in NUMBERS and type(t1) in NUMBERS and -FAR < t0 < t1 < FAR:
-        if t1 - t0 > SURELY_APART * (abs(t0) + abs(t1)):  # which takes less than their spacing
+        if t1 - t0 > SURELY_APART * (abs(t0) + abs(t1)):  # a cheaper test than the spacing
             return float(t0), float(t1)
         t0, t1 = float(t0), float(t1)
     else:
@@ -203,7 +205,7 @@ def check_span(t_span: tuple[float, float]) -> tuple[float, float]:
 
 
 def check_number(name: str, value: Any) -> float:
-    """Return `value` as a float, or say that it is not a number."""
+    """Return `value` as a float, or raise if it is not a number."""
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
         raise TypeError(f"{name} must be a number; given {shown(value)} of type {type(value).__name__}")
     try:
@@ -213,7 +215,7 @@ def check_number(name: str, value: Any) -> float:
 
 
 def check_finite(name: str, value: Any) -> float:
-    """Return `value` as a float, or say that it is not a finite number."""
+    """Return `value` as a float, or raise if it is not a finite number."""
     number = check_number(name, value)
     if not np.isfinite(number):
         raise ValueError(f"{name} must be finite; given {value!r}")
@@ -221,7 +223,7 @@ def check_finite(name: str, value: Any) -> float:
 
 
 def check_not_negative(name: str, value: Any) -> float:
-    """Return `value` as a finite float from zero up, or say that it is none."""
+    """Return `value` as a finite float that is not negative, or raise."""
     number = check_finite(name, value)
     if number < 0.0:
         raise ValueError(f"{name} must not be negative; given {value!r}")
@@ -254,7 +256,7 @@ def check_tolerance(name: str, value: ArrayLike, n_q: int) -> Array:
 
 
 def check_times(t_eval: ArrayLike, t0: float, t1: float, step_size: float | None) -> Array:
-    """Return the output times as an array, or say what is wrong with them."""
+    """Return the output times as an array, or raise if they are wrong."""
     times = check_real("t_eval", t_eval)
     if times.ndim != 1 or times.size == 0:
         advice = "leave it out for every step" if times.size == 0 else f"write {shown(times.ravel().tolist())}"
@@ -277,15 +279,15 @@ def check_times(t_eval: ArrayLike, t0: float, t1: float, step_size: float | None
 
 
 def _are_apart(times: Array, spacing: float) -> bool:
-    """Whether each of the times comes later than the one before by more than a spacing."""
+    """Return whether each time is later than the one before by more than a spacing."""
     if len(times) == 1:
         return True
-    with np.errstate(invalid="ignore"):  # of infinite times
+    with np.errstate(invalid="ignore"):  # infinite times
         return bool((times[1:] - times[:-1] > spacing).all())
 
 
 def _check_each(times: Array, t0: float, t1: float, spacing: float) -> None:
-    """Say which of the output times is wrong, one of which is."""
+    """Raise the error that describes the wrong output time; one is known to be wrong."""
     if not np.isfinite(times).all():
         raise wrong_entries("t_eval", "finite", times, ~np.isfinite(times))
     if times.min() < t0 or times.max() > t1:
@@ -310,12 +312,12 @@ def _check_each(times: Array, t0: float, t1: float, spacing: float) -> None:
 
 
 def needed(module: str, package: str, what: str) -> Any:
-    """Import a module of a package that is not among the dependencies.
+    """Import a module of an optional package.
 
     Raises
     ------
     ImportError
-        If it is not installed; says what needs it and how to install it.
+        If it is not installed; the message says what needs it and how to install it.
     """
     try:
         return import_module(module)

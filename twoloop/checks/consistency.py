@@ -1,6 +1,6 @@
 """Check the state at the start: consistent, of full rank, finite.
 
-A violation is measured by the correction that would put the state right.
+A violation is measured by the correction that would make the state consistent.
 """
 
 from __future__ import annotations
@@ -26,12 +26,15 @@ if TYPE_CHECKING:
 
 
 CONSISTENT = 1e-8  # correction that an initial state may need, relative to the size of the mechanism
-SURELY = 0.1  # of that: where no more is needed, there is no doubt
-TIED = 1e-6  # relative: corrections that exceed what is allowed by as much, of which the first is named
-NEIGHBOURS = 4  # of a position, at which constraints are looked at for rounding
-MOST_NOISE = 1e-11  # of the largest coordinate: what counts as rounding of a constraint
-NO_INERTIA = 1e-12  # of the largest: singular values of M in such units that are rounding of zero
-ROUNDING = 64.0  # times the spacing of floating-point numbers: what rounding of the state may add to it
+SURELY = 0.1  # share of the accepted correction: below it a state is certainly consistent
+# relative: coordinates whose corrections exceed their limits equally to within this are tied; the first is named
+TIED = 1e-6
+NEIGHBOURS = 4  # number of neighbouring positions at which constraints are evaluated to measure their rounding
+# largest rounding error of a constraint, relative to the largest coordinate times the largest entry of the row
+MOST_NOISE = 1e-11
+# relative to the largest singular value of M in units of the inertia: smaller ones are rounding of zero
+NO_INERTIA = 1e-12
+ROUNDING = 64.0  # allowed rounding error of the state, in spacings of floating-point numbers
 
 
 def surely_consistent(
@@ -45,10 +48,10 @@ def surely_consistent(
     C: Array,
     rates: Array,
 ) -> bool:
-    """Whether `Violation` would accept a state beyond doubt, without singular values.
+    """Return whether `Violation` would certainly accept a state, without singular values.
 
-    Corrections are the same; they must be less than a share of what is accepted, without what rounding explains, and
-    with the least that accelerations M^-1 Q can be.
+    The corrections are the same, but the limits are stricter: a share of the accepted correction, no allowance for
+    rounding, and a lower bound for the accelerations M^-1 Q.
     """
     scales = scales_of(system, t, q, rows)
     fastest = np.where(rows != 0.0, np.abs(v) / scales.columns, 0.0).max(axis=1)
@@ -70,7 +73,7 @@ def surely_consistent(
 
 
 def _surely_small(rows: Array, values: Array, scales: Scales, per_row: Array) -> bool:
-    """Whether the correction that values ask for, and what it leaves, are far below what is accepted."""
+    """Return whether the correction for some values, and its residual, are far below the limits."""
     found = least_solution(scales.scaled(rows), values / scales.rows)
     if found is None:
         return False
@@ -81,9 +84,10 @@ def _surely_small(rows: Array, values: Array, scales: Scales, per_row: Array) ->
 
 
 def is_at_rounding(values: Array, rows: Rows, state: Array, rate: Array | float = 0.0) -> bool:
-    """Whether values are no more than rounding of their terms, which needs no scales to be accepted.
+    """Return whether values are no larger than the rounding of their terms; such values are accepted without scales.
 
-    For rows by their entries, whose scales take full matrices, of entries as well, as large as the largest of a row.
+    Scales of rows given by entries would take full matrices. There each entry counts as large as the largest of its
+    row, which covers rounding of the entries, too.
     """
     if isinstance(rows, SparseRows):
         terms = rows.largest() * (rows.pattern() @ np.abs(state)) + np.abs(rate)
@@ -92,9 +96,9 @@ def is_at_rounding(values: Array, rows: Rows, state: Array, rate: Array | float 
 
 
 def _noise(q: Array, change: Callable[[Array], Array], rows: Array, largest: float) -> Array:
-    """What rounding of a position q changes in values of constraints, by what they change to its neighbours, (n_rows,).
+    """Estimate how much rounding of a position q changes constraints, by their values at neighbours of q, (n_rows,).
 
-    `largest`: of the coordinates or velocities that the rows are multiplied by.
+    `largest`: the largest coordinate or velocity that the rows are multiplied by.
     """
     noise = np.zeros(len(rows))
     for k in range(NEIGHBOURS):
@@ -104,10 +108,10 @@ def _noise(q: Array, change: Callable[[Array], Array], rows: Array, largest: flo
 
 
 def _without_constraints(system: ConstrainedSystem, t: float, q: Array, v: Array, columns: Array) -> Array:
-    """Accelerations M^-1 Q; none in directions without inertia, which the constraints exclude, as of Euler parameters.
+    """Return the accelerations M^-1 Q without constraints; zero in directions without inertia, as of Euler parameters.
 
-    Rounding may leave such an M an inverse of 1e16, so it is cut off, in units in which the largest inertia of each
-    coordinate, here or a unit away, is 1.
+    The constraints exclude these directions. Rounding may leave such an M an inverse of 1e16, so small singular values
+    are cut off, in units in which the largest inertia of each coordinate, here or a unit away, is 1.
     """
     mass, inertia = system.mass(t, q), np.zeros(len(q))
     for each in (mass, defined(lambda: system.mass(t, q + columns * generic_factors(len(q))))):
@@ -120,16 +124,16 @@ def _without_constraints(system: ConstrainedSystem, t: float, q: Array, v: Array
 
 
 class Violation:
-    """What a state violates, as the change of coordinates (or velocities) that would put it right.
+    """Violation of constraints by a state, as the change of coordinates (or velocities) that would correct it.
 
     Attributes
     ----------
     correction : ndarray (n_q,)
         The Newton correction, by least squares with C_q, coordinates weighted by their scales.
     allowed : ndarray (n_q,)
-        How much of it is accepted: 1e-8 of the mechanism's size, and rounding.
+        The accepted correction: 1e-8 of the mechanism's size, plus rounding.
     left : ndarray (n_c,)
-        What the correction leaves, where rows of C_q depend on one another or are zero; `allowed_left` with it.
+        Residual after the correction, where rows of C_q depend on one another or are zero; `allowed_left` is its limit.
     """
 
     def __init__(
@@ -155,10 +159,10 @@ class Violation:
 
     @classmethod
     def of_position(cls, system: ConstrainedSystem, t: float, q: Array, jacobian: Array, scales: Scales) -> Violation:
-        """C(t, q) at a position."""
+        """Measure the violation of C(t, q) = 0 at a position."""
         values, size = system.constraint(t, q), np.abs(q)
 
-        def change(beside: Array) -> Array:  # C may be a difference of terms that its derivatives do not show
+        def change(beside: Array) -> Array:  # C may be a difference of large terms that its derivatives do not show
             return system.constraint(t, beside) - values - jacobian @ (beside - q)
 
         noise = _noise(q, change, jacobian, float(size.max(initial=0.0)))
@@ -169,7 +173,7 @@ class Violation:
     def of_velocity(
         cls, system: ConstrainedSystem, t: float, q: Array, v: Array, jacobian: Array, scales: Scales
     ) -> Violation:
-        """C_q v + C_t and A v + b, beside what is fast there: velocities, drives, what forces can bring about."""
+        """Measure the violation of C_q v + C_t = 0 and A v + b = 0, relative to the fastest motion there."""
         rate = system.rates(t, q)
         fastest = np.where(jacobian != 0.0, np.abs(v) / scales.columns, 0.0).max(axis=1)
         pull = _without_constraints(system, t, q, v, scales.columns)
@@ -177,7 +181,7 @@ class Violation:
         speeds = np.maximum(np.maximum(fastest, np.abs(rate) / scales.rows), falling)
         equation, values = "C_q v + C_t" if system.n_a == 0 else "(C_q v + C_t, A v + b)", jacobian @ v + rate
 
-        def change(beside: Array) -> Array:  # rows turn
+        def change(beside: Array) -> Array:  # the rows change with the position
             return system.rows(t, beside) @ v + system.rates(t, beside) - values
 
         noise = _noise(q, change, jacobian, float(np.abs(v).max(initial=0.0)))
@@ -186,7 +190,7 @@ class Violation:
 
     @property
     def excess(self) -> float:
-        """The largest correction over what is accepted; at most 1 where the state is consistent."""
+        """Return the largest ratio of a correction to its limit; at most 1 if the state is consistent."""
         parts = [(np.abs(self.correction), self.allowed), (self.left, self.allowed_left)]
         return max(float((part[part > 0.0] / allowed[part > 0.0]).max(initial=0.0)) for part, allowed in parts)
 
@@ -217,13 +221,13 @@ class Violation:
         )
 
 
-LEAST = np.array([ROUNDING * EPS, UNSYMMETRIC, SINGULAR_MASS])  # as the kernel takes them
+LEAST = np.array([ROUNDING * EPS, UNSYMMETRIC, SINGULAR_MASS])  # limits in the order in which the kernel reads them
 
 
 class ConstraintWarning(UserWarning):
-    """Constraints depend on one another, or something changes for so short a time that a run may have missed it.
+    """Warning: constraints depend on one another, or a force is so short that a run may have missed it.
 
-    Rows that are left out are checked, and their multipliers are not unique.
+    Dependent rows are left out of the solution but checked; their multipliers are not unique.
 
     Examples
     --------
@@ -248,14 +252,14 @@ def check_start(
     derivatives: bool = True,
     exact: Callable[[], bool] | None = None,
 ) -> None:
-    """Call every callback once at the start and check shapes, finiteness, rank, consistency and, if asked, derivatives.
+    """Call every callback once at the start; check shapes, finiteness, rank, consistency and, if asked, derivatives.
 
-    `exact` says whether derivatives are those of what was traced: then they are not compared with differences.
+    `exact` returns whether derivatives were derived from traces: then they are not compared with differences.
 
     Raises
     ------
     TypeError, ValueError
-        Naming the callback or the argument, what was found and what to do.
+        If a check fails; the message names the callback or the argument, the value found and a remedy.
     """
     check_bounds(system, t0, q0, v0)
     system.check_returned(t0, q0, v0)
@@ -292,14 +296,14 @@ def check_start(
 
 
 class Look:
-    """Arrays for the look of compiled callbacks at one start after another, and what the last one found.
+    """First evaluation of compiled callbacks at one start after another: its arrays, and the result of the last one.
 
     Attributes
     ----------
     mass, rows, pattern : ndarray
         M, C_q with A, and 1 where rows have entries there or nearby.
     definite : bool or None
-        Whether an M that varies has an inverse; None: that is in doubt, or M is constant.
+        Whether an M that varies has an inverse; None: not certain, or M is constant.
     """
 
     def __init__(self, system: ConstrainedSystem):
@@ -318,24 +322,24 @@ class Look:
         self.definite: bool | None = None
 
     def at(self, t: float, q: Array, v: Array) -> int:
-        """Flags of what `first_look` finds at a start."""
+        """Evaluate the callbacks at a start; return the flags of kernels/evaluation/checks.py, or 0 on an exception."""
         definite, indefinite = self.flags.DEFINITE, self.flags.INDEFINITE
         looked, *arrays = self.arrays.values()
         looked.fill(0.0)
         try:
             found: int = self._look(self.system.kit, t, q, v, self.sizes(), *arrays)
-        except Exception:  # of a callback, which is called by itself then
+        except Exception:  # a callback raised: it is called on its own afterwards, which gives the message
             return 0
         self.definite = bool(found & definite) if found & (definite | indefinite) else None
         return found
 
     def sizes(self) -> Array:
-        """What no coordinate is less than in what counts as rounding, as starts before have shown of theirs."""
+        """Return sizes of coordinates that earlier starts found (see `Scales.keep`), the least for rounding errors."""
         sizes: Array = self.system.made.get("sizes", NONE)
         return sizes
 
     def is_surely(self, found: int, t: float, q: Array, v: Array) -> bool:
-        """Whether `Violation` would accept the state of the last look, which found this, beyond doubt."""
+        """Return whether `Violation` would certainly accept the last state, whose evaluation returned `found`."""
         if found & self.flags.CONSISTENT:
             return True
         n, n_c, n_rows = self.system.n_q, self.system.n_c, len(self.rows)
@@ -344,7 +348,7 @@ class Look:
 
 
 def _in_order(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
-    """Whether compiled callbacks give nothing at a start that would have to be looked at more closely."""
+    """Return whether compiled callbacks pass all checks at a start, so that none has to be repeated in detail."""
     if system.called_in_python or system.entries:
         return False
     look = Look(system)

@@ -1,7 +1,7 @@
-"""C_q, C_t, Q_d and the tangents of a system against differences, and the symmetry of M.
+"""Comparison of C_q, C_t, Q_d and the tangents of a system with differences; and the symmetry of M.
 
-A wrong sign in one of them often runs to the end and looks like a motion. Every entry is compared at the start, and
-along a run one direction through all of them.
+A run with a wrong sign in one of them often ends without an error and looks like a motion. At the start every entry is
+compared; along a run one direction through all of them.
 """
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
 
 
-ANYWHERE = (0, 1, -1)  # around the place; where the callbacks are not defined there, after it or before it
-FORWARD = (1, -1)  # for times at the start: callbacks need not work before it
-TIME = 0.1  # s: first guess at how fast constraints move
-NEAR_START = 1e-3  # of the coordinates: tangents are looked at a little off the start, where symmetry hides terms
-ALONG_A_RUN = 9  # half-widths tried at most at a state of a run
+ANYWHERE = (0, 1, -1)  # sides: around the place; if the callbacks are undefined there, after it or before it
+FORWARD = (1, -1)  # sides for times at the start: callbacks need not work before it
+TIME = 0.1  # s: first guess of the time scale of the constraints
+# displacement relative to the coordinates: tangents are checked a little off the start, where no symmetry hides terms
+NEAR_START = 1e-3
+ALONG_A_RUN = 9  # largest number of half-widths tried at a state of a run
 
 WHAT = {
     "jacobian": "the derivative of constraint with respect to q",
@@ -50,16 +51,16 @@ HINTS = {
 
 
 def check_derivatives(system: ConstrainedSystem, t: float, q: Array, exact: Callable[[], bool] | None = None) -> None:
-    """Compare the callbacks of a system with one another near (t, q), at velocities that stand for any.
+    """Compare the callbacks of a system with one another near (t, q), at generic velocities.
 
-    Every entry is compared on its own, with a displacement that suits it; one that differences cannot decide is
-    accepted. C_q comes first, then C_t, then gamma, whose check relies on both. A few dozen calls of each callback for
-    each coordinate, once for each system; none of these where `exact` says that all are what they should be.
+    Every entry is compared on its own, with a suitable displacement; an entry that differences cannot decide is
+    accepted. C_q comes first, then C_t, then gamma, whose check relies on both. This takes a few dozen calls of each
+    callback for each coordinate, once for each system; none if `exact` returns that the derivatives are exact.
 
     Raises
     ------
     ValueError
-        Naming the callback, the entry, the value given and the one differenced.
+        If an entry is wrong; the message names the callback, the entry, the value given and the one differenced.
     """
     if system.checked:
         return
@@ -80,11 +81,11 @@ def check_derivatives(system: ConstrainedSystem, t: float, q: Array, exact: Call
 
 
 def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) -> str | None:
-    """Say which of C_q, C_t and gamma is wrong at a state of a run, or None: formulas may hold near the start only.
+    """Describe which of C_q, C_t and gamma is wrong at a state of a run, or None: formulas may hold at starts only.
 
-    One direction through all coordinates and time stands for all entries, so that this costs as a rule nine calls of
-    `constraint`, sixteen of `jacobian`, ten of `constraint_rate` and one of `gamma`, whatever n_q. Only where the
-    direction shows a difference are the entries compared one by one, as at the start. Tangents are not looked at: they
+    One direction through all coordinates and time stands for all entries. So this mostly costs nine calls of
+    `constraint`, sixteen of `jacobian`, ten of `constraint_rate` and one of `gamma`, whatever n_q. Only if the
+    direction shows a difference are the entries compared one by one, as at the start. Tangents are not checked: they
     decide whether Newton's method converges, not what it converges to.
     """
     jacobian, rate = system.sparse_rows(t, q), system.rates(t, q)
@@ -120,7 +121,7 @@ def _along_a_run(function: Function, scale: float, noise: Array, given: Array, s
 
 @dataclass(frozen=True)
 class _Comparison:
-    """One column of what a callback gives, and the function whose derivative it should be."""
+    """Comparison of one column of a callback's values with the derivative of a function."""
 
     system: ConstrainedSystem
     kind: str
@@ -132,7 +133,7 @@ class _Comparison:
     spacing: float = 0.0
 
     def wrong(self, scale: float, noise: Array, largest: Array, rounding: Array, sides: tuple[int, ...]) -> str | None:
-        """Say which entry is wrong, or None."""
+        """Describe the entry that is wrong, or return None."""
         best = differentiate(
             self.function, self.place, scale, noise, self.given, largest, spacing=self.spacing, sides=sides
         )
@@ -161,9 +162,9 @@ class _Comparison:
 def _wrong_constraint(
     system: ConstrainedSystem, t: float, q: Array, sides: tuple[int, ...], *faster: Array
 ) -> str | None:
-    """Which entry of C_q, C_t or gamma is wrong: the first of them that is, because each relies on those before.
+    """Describe the first wrong entry of C_q, C_t or gamma, in this order, because each relies on those before.
 
-    `gamma` is compared at generic velocities and at the `faster` ones of a run, as it may be wrong at such only.
+    `gamma` is compared at generic velocities and at the `faster` ones of a run, as it may be wrong only at high speed.
     """
     wrong = _wrong_jacobian(system, t, q, sides) if system.n_c > 0 else None
     if wrong is not None:
@@ -187,7 +188,7 @@ def _wrong_constraint(
 
 
 def _unsymmetric_near(system: ConstrainedSystem, t: float, q: Array) -> str | None:
-    """The same a little off the start, where what is zero there shows."""
+    """Check the symmetry of M a little off the start, where entries that are zero at the start show."""
     if system.constant_mass:
         return None
     near = q + NEAR_START * sizes(q) * np.abs(generic_factors(system.n_q))
@@ -199,16 +200,16 @@ def _unsymmetric_near(system: ConstrainedSystem, t: float, q: Array) -> str | No
 
 
 def _gammas(system: ConstrainedSystem) -> list[tuple[str, slice]]:
-    """The right-hand sides of the acceleration constraints that are given, and the rows they belong to."""
+    """Return the given right-hand sides of the acceleration constraints, with the rows they belong to."""
     rows = {"gamma": slice(0, system.n_c), "nonholonomic_gamma": slice(system.n_c, None)}
     return [(kind, part) for kind, part in rows.items() if kind in system.given]
 
 
 def _wrong_jacobian(system: ConstrainedSystem, t: float, q: Array, sides: tuple[int, ...]) -> str | None:
-    """Which entry of C_q or C_t is wrong."""
+    """Describe the wrong entry of C_q or C_t, or return None."""
     jacobian, rate = system.sparse_rows(t, q)[: system.n_c], system.constraint_rate(t, q)
     if not (is_finite(jacobian) and np.isfinite(rate).all()):
-        return None  # outside what they are made for; at a state of the run at_position.py names it
+        return None  # outside the domain of the callbacks; at a state of the run at_position.py reports it
     if isinstance(jacobian, SparseRows):
         wrong = _wrong_group(system, t, q, jacobian)
     else:
@@ -223,7 +224,7 @@ def _wrong_jacobian(system: ConstrainedSystem, t: float, q: Array, sides: tuple[
 
 
 def _wrong_tangent(system: ConstrainedSystem, t: float, q: Array) -> str | None:
-    """Which entry of the tangents that are given is wrong."""
+    """Describe the wrong entry of the given tangents, or return None."""
     if system.functions.flags[FORCE_BY_Q_GIVEN] == 0:
         return None
     v = sizes(q) * generic_factors(system.n_q)
@@ -250,7 +251,7 @@ def _wrong_tangent(system: ConstrainedSystem, t: float, q: Array) -> str | None:
 
 
 def _varies(function: Callable[[Array], Array], x: Array) -> bool:
-    """Whether a function changes along one direction, which is cheaper to see than by all columns."""
+    """Return whether a function changes along one direction, which is cheaper than all columns."""
     values = [defined(lambda part=part: function(part * x)) for part in (1.0, 1.001, 2.0, 0.0, 1e3)]  # type: ignore[misc]
     known = [value for value in values if value is not None]
     return any(bool((value != known[0]).any()) for value in known)
@@ -287,10 +288,10 @@ def _wrong_column(
 
 
 def _wrong_group(system: ConstrainedSystem, t: float, q: Array, jacobian: SparseRows) -> str | None:
-    """The same for C_q by its entries: columns that share no row are displaced together, each by its own scale.
+    """Compare C_q given by entries: columns that share no row are displaced together, each by its own scale.
 
-    A group in which something is wrong is looked at column by column, to name the entry. So is one that hides an entry
-    which is not named: it adds to another column, or stands where there should be nothing.
+    A group with a difference is compared column by column, to name the entry. This also finds an entry whose position
+    is not named: it adds to another column, or to a row that should have none.
     """
     noise = EPS * (abs(jacobian) @ np.abs(q))
     scales, largest = sizes(q), jacobian.largest()
@@ -319,27 +320,27 @@ def _wrong_group(system: ConstrainedSystem, t: float, q: Array, jacobian: Sparse
 
 
 def _rounding(derivative: Callable[[Array], Array], given: Array, x: Array) -> Array:
-    """What rounding of the arguments does to the values given."""
+    """Estimate the effect of rounding of the arguments on the given values."""
     largest = EPS * np.abs(given)
     for signs in np.random.default_rng(2).choice((-2.0, 2.0), (3, len(x))):
         try:
             moved = np.abs(derivative(x * (1.0 + EPS * signs)) - given)
-        except Exception:  # the place is the edge of what the callbacks are made for
+        except Exception:  # the place is at the edge of the callbacks' domain
             continue
         largest = np.fmax(largest, moved)
     return largest
 
 
 def _time_scale(q: Array, v: Array) -> float:
-    """Time in which no coordinate moves by more than its size, s."""
+    """Return the time, s, in which no coordinate moves by more than its size."""
     return float((sizes(q) / np.maximum(np.abs(v), 1e-300)).min())
 
 
 def _spacing(t: float, q: Array, v: Array) -> float:
-    """Time from which on a straight motion moves every coordinate by more than rounding, s."""
+    """Return the time, s, from which on a straight motion moves every coordinate by more than rounding."""
     return max(float(np.spacing(abs(t))), float((np.spacing(np.abs(q)) / np.maximum(np.abs(v), 1e-300)).max()))
 
 
 def _slowing(system: ConstrainedSystem, t: float, q: Array, v: Array, rows: slice) -> Function:
-    """Rows of -(C_q v + C_t) and -(A v + b) along a straight motion, whose derivatives are the right-hand sides."""
+    """Return rows of -(C_q v + C_t, A v + b) along a straight motion; their derivatives are the right-hand sides."""
     return lambda s: -system.velocity_constraint(t + s, q + s * v, v)[rows]

@@ -1,9 +1,9 @@
 """Derivatives by differences, entry by entry, each with an estimate of its own error.
 
-A function is sampled at nine Chebyshev points around a place. Where its expansion in Chebyshev polynomials has decayed
-before it ends, the slope of the interpolant is the derivative, and the last coefficients say how good it is: rounding,
-a kink, a step and an oscillation that the points do not resolve all leave them large (Trefethen, Approximation Theory
-and Approximation Practice, 2013). The width of the interval is looked for, because scales are not known beforehand.
+A function is sampled at nine Chebyshev points around a place. If its expansion in Chebyshev polynomials decays before
+it ends, the slope of the interpolant is the derivative, and the last coefficients estimate its error: rounding, a kink,
+a step, and an oscillation that the points do not resolve all leave them large (Trefethen, Approximation Theory and
+Approximation Practice, 2013). Several widths of the interval are tried, because scales are not known beforehand.
 """
 
 import math
@@ -20,40 +20,44 @@ Function = Callable[[float], Array]
 
 EPS = float(np.finfo(np.float64).eps)
 DEGREE = 8
-TAIL = 5  # coefficients from this one on have to have decayed
+TAIL = 5  # index of the first coefficient that must have decayed
 NODES = np.cos(np.pi * np.arange(DEGREE + 1) / DEGREE)
-SLOPES: dict[int, Array] = {  # of the polynomials at the place, by the side that the interval lies on
+SLOPES: dict[int, Array] = {  # slopes of the polynomials at the place, by the side on which the interval lies
     side: np.asarray(chebyshev.chebval(-float(side), chebyshev.chebder(np.eye(DEGREE + 1)))) for side in (0, 1, -1)
 }
-FIRST = 2.0**-5  # the first half-width, of the scale
-RATIO = 16.0  # of one half-width to the next
-SMALLER, LARGER = 11, 8  # half-widths that are tried on either side
-FINER, WIDER, CLOSER = 4.0, 8, 24  # ratio and numbers of the intervals that have to confirm that an entry is wrong
-BESIDE = (0.55, 1.8, 3.1)  # of the half-width of an estimate: those that may confirm it first
-RIPPLES = 3  # narrower intervals after which a smooth function shows rounding only
-LEAST_SPACINGS = 256.0  # half-width, in spacings of floating-point numbers at the place
-SETTLED = 2e-7  # of an entry: agreement, with the error of the difference, at which no other half-width is tried
-AGREEMENT = 3e-7  # of an entry: less is not an error
-DECAYED = 0.01  # of the first coefficients: the last of a function that the points resolve are no more
-DECAYING = 0.2  # the last two of them to those before, where these are not rounding: else they are a ripple
-NOTHING = 100.0  # times rounding: a function that varies by no more does not vary
-SAFETY = 5.0  # times the estimated error of the difference
-FROZEN = 1e4  # times rounding of what is seen: a function may add larger numbers inside, but hardly so much larger
-FLAT = 3  # intervals, of different widths, on which a function that does not vary has the derivative 0
-TINY = 1e-12  # of the largest entry: such an entry counts as zero
+FIRST = 2.0**-5  # first half-width, relative to the scale
+RATIO = 16.0  # ratio of successive half-widths
+SMALLER, LARGER = 11, 8  # numbers of smaller and larger half-widths that are tried
+# ratio, and numbers of wider and narrower intervals that must confirm that an entry is wrong
+FINER, WIDER, CLOSER = 4.0, 8, 24
+BESIDE = (0.55, 1.8, 3.1)  # half-widths that confirm an estimate first, relative to its own
+RIPPLES = 3  # number of narrower intervals after which a smooth function shows only rounding
+LEAST_SPACINGS = 256.0  # smallest half-width, in spacings of floating-point numbers at the place
+# relative to an entry: at this agreement, error of the difference included, no other half-width is tried
+SETTLED = 2e-7
+AGREEMENT = 3e-7  # relative to an entry: a smaller difference is no error
+DECAYED = 0.01  # largest ratio of the last coefficients to the first, for a function that the points resolve
+# largest ratio of the last two coefficients to those before, if these are not rounding: above, they are a ripple
+DECAYING = 0.2
+NOTHING = 100.0  # in rounding errors: a function that varies by less counts as constant
+SAFETY = 5.0  # multiple of the estimated error of the difference that is allowed
+# in rounding errors of the result: terms inside a function may be larger than its result, but hardly by more than this
+FROZEN = 1e4
+FLAT = 3  # number of intervals of different widths on which a constant function must be constant for the derivative 0
+TINY = 1e-12  # relative to the largest entry: a smaller entry counts as zero
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Derivatives (m,) of the entries of a function by one number, and how far to trust them."""
+    """Estimates of the derivatives (m,) of the entries of a function by one number, and of their errors."""
 
     slope: Array
     error: Array
-    width: Array  # half-width with which each was found; infinite: none was
+    width: Array  # half-width that gave each estimate; infinite: none did
     side: int  # as in `differentiate`
 
     def disagrees(self, given: Array, rounding: Array) -> Array:
-        """How often |given - slope| holds what may be between them, (m,); above 1 the value given is wrong."""
+        """Return |given - slope| over its limit, (m,); above 1 the given value is wrong."""
         allowed = SAFETY * self.error + AGREEMENT * np.abs(given) + SAFETY * rounding
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = np.abs(given - self.slope) / allowed
@@ -66,17 +70,17 @@ class _Window:
     error: Array
     flat: NDArray[np.bool_]
     nothing: NDArray[np.bool_]  # varies by no more than rounding
-    ripple: Array  # the last coefficients, where rounding cannot be the reason
+    ripple: Array  # largest of the last coefficients if they are too large for rounding, else 0
 
 
 def _window(function: Function, place: float, width: float, side: int, noise: Array) -> _Window | None:
-    """Slopes by one interval around the place (side 0), after it (1) or before it (-1); None: not defined on it."""
+    """Compute slopes on an interval around the place (side 0), after it (1) or before it (-1); None: undefined."""
     shifts = width * (NODES + side) / (2.0 if side else 1.0)
-    shifts = (place + shifts) - place  # what floating-point numbers can do there
+    shifts = (place + shifts) - place  # shifts as rounded by floating-point addition to the place
     try:
         with np.errstate(all="ignore"):
             values = np.array([function(float(shift)) for shift in shifts])
-    except Exception:  # outside what the function is made for: at the place itself it has been called before
+    except Exception:  # outside the domain of the function: at the place itself it has been called before
         return None
     if not np.isfinite(values).all():
         return None
@@ -103,7 +107,7 @@ def _window(function: Function, place: float, width: float, side: int, noise: Ar
 
 
 def _widths(scale: float, spacing: float) -> Iterator[float]:
-    """Half-widths to try, from a fraction of the scale, smaller and larger in turn."""
+    """Yield the half-widths to try: first a fraction of the scale, then smaller and larger ones in turn."""
     least = LEAST_SPACINGS * spacing
     first = max(FIRST * scale, least)
     yield first
@@ -126,29 +130,30 @@ def differentiate(
     sides: tuple[int, ...] = (0,),
     most: int = SMALLER + LARGER + 1,
 ) -> Estimate:
-    """Differentiate at a place until each entry is known well enough to judge the one given.
+    """Differentiate at a place until each entry is known well enough to judge the given one.
 
     Parameters
     ----------
     function : callable
-        function(shift) -> (m,), at place + shift; an exception or a value that is not finite says: not defined there.
+        function(shift) -> (m,), at place + shift; an exception or a value that is not finite means undefined there.
     place, scale : float
-        Where, and a first guess at how far the function extends.
+        The place, and a first guess of the distance over which the function changes.
     noise : ndarray (m,)
-        What rounding of the arguments does to the function.
+        Effect of rounding of the arguments on the function.
     given, largest : ndarray (m,)
-        The entries to judge, and the largest entry beside each.
+        The given entries to check, and the largest entry beside each.
     spacing : float
-        Least displacement that rounding lets through, where that is not the spacing of numbers at the place.
+        Smallest displacement that rounding does not hide, if larger than the spacing of numbers at the place.
     sides : tuple of int
-        0: around the place; 1: after it; -1: before it. The next is tried where the function is not defined.
+        0: around the place; 1: after it; -1: before it. The next side is tried if the function is undefined on this
+        one.
     most : int
-        Half-widths that are tried at most.
+        Largest number of half-widths to try.
 
     Returns
     -------
     Estimate
-        Of the half-width with the least estimated error, entry by entry.
+        For each entry, the estimate of the half-width with the smallest estimated error.
     """
     m = len(given)
     for side in sides:
@@ -161,14 +166,14 @@ def differentiate(
             found = _window(function, place, h, side, noise)
             if found is None:
                 continue
-            # on a narrow interval parts of a function may stand still by rounding and the rest look smooth
+            # on a narrow interval, terms of a function may be constant by rounding while the rest looks smooth
             with np.errstate(invalid="ignore"):
                 agrees = ~(np.abs(found.slope - slope) > SAFETY * (found.error + error))
             better = ~found.flat & (found.error < error) & agrees & ~(found.nothing & (h > RATIO * FIRST * scale))
             slope[better], error[better], width[better] = found.slope[better], found.error[better], h
             better = found.flat & (FROZEN * found.error < flat_error)
             flat_error[better], flat_width[better] = FROZEN * found.error[better], h
-            # where a wider interval moves an entry, one on which it does not has only seen rounding, or a dead zone
+            # if a wider interval changes an entry, a narrower one without change showed only rounding, or a dead zone
             moved |= ~found.flat
             best = Estimate(
                 np.where(moved, slope, 0.0),
@@ -180,7 +185,7 @@ def differentiate(
             still = ~moved & (given == 0.0) & (tried >= FLAT)
             if (_settled(best, given, largest) | still).all():
                 return best
-        if tried:  # on other sides a kink at the place would not show
+        if tried:  # a kink at the place would not show on other sides
             return best
     return Estimate(np.zeros(m), np.full(m, np.inf), np.full(m, np.inf), 0)
 
@@ -195,10 +200,10 @@ def _settled(best: Estimate, given: Array, largest: Array) -> NDArray[np.bool_]:
 def confirms(
     function: Function, place: float, entry: int, best: Estimate, given: float, noise: Array, spacing: float = 0.0
 ) -> bool:
-    """Whether other intervals, wider and narrower, also find that this entry is not the one given.
+    """Return whether other intervals, wider and narrower, also find that this entry differs from the given one.
 
-    One disagreement may be an accident, and what moves little and fast (a fine ripple on a long way) shows on narrow
-    intervals only. Where one of them finds another derivative, nothing is certain.
+    One disagreement may be an accident, and a function with a small fast part (a fine ripple on a long slope) shows it
+    on narrow intervals only. If an interval finds another derivative, nothing is certain.
     """
     width = float(best.width[entry])
     for part in BESIDE:
@@ -219,13 +224,14 @@ def confirms(
             continue
         if abs(found.slope[entry] - best.slope[entry]) > SAFETY * (found.error[entry] + best.error[entry]):
             return False
-        if k > RIPPLES and found.ripple[entry] > 0.0:  # not from the ends of the interval: it may hide a steep slope
+        # not caused by the ends of the interval: a ripple may hide a steep slope
+        if k > RIPPLES and found.ripple[entry] > 0.0:
             return False
     return True
 
 
 def defined(function: Callable[[], Array]) -> Array | None:
-    """What a callback gives away from the state, or None: there it may be outside what it is made for."""
+    """Return the value of a callback away from the state; None if it raises or is not finite: outside its domain."""
     try:
         value = function()
     except Exception:
@@ -234,7 +240,7 @@ def defined(function: Callable[[], Array]) -> Array | None:
 
 
 def as_far_as_they_differ(one: float, other: float) -> tuple[str, str]:
-    """Two numbers, to the third digit of their difference: those behind it are rounding, or of no interest."""
+    """Format two numbers to the third digit of their difference; further digits are rounding, or of no interest."""
     if not 0.0 < abs(one - other) < np.inf:
         return f"{one:.3g}", f"{other:.3g}"
     places = 2 - math.floor(math.log10(abs(one - other)))

@@ -1,8 +1,8 @@
-"""How large a mechanism is, coordinate by coordinate: what its consistency is judged by, at any unit and any offset.
+"""Sizes of a mechanism, coordinate by coordinate: consistency is judged by them, in any unit and with any offset.
 
-An offset of coordinates is not a size, and millimetres beside radians have none in common. What has is the Jacobian: it
-says how much of one coordinate does as much to a constraint as how much of another, and how far they must move until
-it is another Jacobian (a rod's length, a radian).
+The offset of a coordinate is not a size, and millimetres and radians have none in common. The Jacobian has: it shows
+which displacements of two coordinates change a constraint equally, and how far they must move until the Jacobian itself
+is another one (a rod's length, a radian).
 """
 
 from __future__ import annotations
@@ -23,38 +23,40 @@ if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
 
 
-FASTEST = 1e9  # times the motion by one's own size in a second: beyond, C_q is nearly zero and the drive is not so fast
+# 1/s: largest speed of a drive, in sizes of the mechanism a second; a faster one means that C_q is nearly zero
+FASTEST = 1e9
 EPS = float(np.finfo(np.float64).eps)
-DISPLACEMENTS = (1e-2, 1e-4, 1e-6)  # of a coordinate, for the curvature of the constraints
-ROUNDS = 3  # in which units are found: the first ones may be off by 1e5
-MOST_PLACES = 16  # positions whose sizes are kept
+DISPLACEMENTS = (1e-2, 1e-4, 1e-6)  # displacements in units of the coordinates, for the curvature of the constraints
+ROUNDS = 3  # iterations that find units: the first ones may be off by 1e5
+MOST_PLACES = 16  # largest number of positions whose sizes are kept
 NONE = np.zeros(0)
-TURNS = 0.1  # units: a row that is short beside what it becomes over this way is short by its position
+# in units: a row that is much shorter than what it becomes over this distance is short only at this position
+TURNS = 0.1
 
 
 @dataclass(frozen=True)
 class Scales:
-    """Units in which the entries of C_q are of like size, and the mechanism's size in these units."""
+    """Scales: units in which the entries of C_q are of like size, and the mechanism's size in these units."""
 
     columns: Array  # (n_q,), units of the coordinates
-    rows: Array  # (n_c,), norms of the rows of C_q in these units, or what they become a little away; 1 for zeros
-    reach: Array  # (n_c,), in these units: how far each constraint stays what it is
+    rows: Array  # (n_c,), norms of the rows of C_q in these units, or their norms nearby if larger; 1 for zero rows
+    reach: Array  # (n_c,), distance in these units over which each constraint keeps its Jacobian
 
     def scaled(self, jacobian: Array) -> Array:
-        """C_q with coordinates in these units and rows of norm 1, less where a row vanishes by its position."""
+        """Return C_q in these units with rows of norm 1, or less where a row vanishes at this position."""
         return jacobian * self.columns / self.rows[:, None]
 
     def by_coordinate(self, per_row: Array, jacobian: Array) -> Array:
-        """The least of what the constraints on each coordinate say, in its own unit; of all, where there is none."""
+        """Return the least value of the constraints on each coordinate, in its unit; of all if it has none."""
         values = np.where(jacobian != 0.0, per_row[:, None], np.inf).min(axis=0, initial=np.inf)
         return self.columns * np.where(np.isfinite(values), values, per_row.min(initial=np.inf))
 
     def keep(self, system: ConstrainedSystem, q: Array, jacobian: Array) -> None:
-        """Note, of a consistent position, how far coordinates move until they matter: beside it, rounding is nothing.
+        """Store the reach of the coordinates at a consistent position: relative to it, rounding is negligible.
 
-        Looks at starts near it go by that where C_q has the same entries, and need not find these scales once more.
-        Elsewhere the mechanism may be smaller by far. The latest of such positions are kept: the sizes of each, where
-        it is, and which entries count there.
+        Later checks of starts nearby use it if C_q has the same entries, and need not find these scales again.
+        Elsewhere the mechanism may be smaller by far. The latest positions are stored: the sizes, the position, and the
+        nonzero entries.
         """
         from twoloop.kernels.evaluation.checks import NEAR_SHARE, NO_ENTRY
 
@@ -67,17 +69,17 @@ class Scales:
 
 
 def sizes(q: Array) -> Array:
-    """A first guess at how far each coordinate must move to matter."""
+    """Return a first guess of the displacement of each coordinate that matters."""
     size, n = np.abs(q), q.size
     ordered = size.copy()
     ordered.sort()
-    first = n - np.count_nonzero(size)  # that is not zero
+    first = n - np.count_nonzero(size)  # index of the first size that is not zero
     middle = 0.5 * float(ordered[(first + n - 1) // 2] + ordered[(first + n) // 2]) if first < n else 1.0
     return np.maximum(size, 1e-3 * middle)
 
 
 def typical_sizes(q: Array) -> Array:
-    """Sizes of the coordinates, (n_q,): none below the median of those that are no zeros by chance, 1 if all are."""
+    """Return sizes of the coordinates, (n_q,): at least the median of those not negligible; 1 if all are zero."""
     from twoloop.kernels.evaluation.checks import NEGLIGIBLE
 
     size = np.abs(q)
@@ -86,23 +88,23 @@ def typical_sizes(q: Array) -> Array:
 
 @cache
 def generic_factors(n_q: int) -> Array:
-    """Between 0.5 and 1.5, of either sign, (n_q,): always the same."""
+    """Return fixed random factors between 0.5 and 1.5, of either sign, (n_q,)."""
     generic = np.random.default_rng(1)
     return generic.uniform(0.5, 1.5, n_q) * generic.choice((-1.0, 1.0), n_q)
 
 
 def median(values: Array) -> float:
-    """Of numbers that are finite, without what NumPy does about others."""
+    """Return the median of finite numbers, without NumPy's checks for others."""
     return _middle(np.sort(values))
 
 
 def _middle(ordered: Array) -> float:
-    """The same of numbers in order."""
+    """Return the median of sorted numbers."""
     return 0.5 * float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
 
 
 def column_scales(jacobian: Rows, typical: Array) -> Array:
-    """Units of the coordinates in which the entries of C_q are of like size; of zero columns, the typical ones."""
+    """Return units of the coordinates in which entries of C_q are of like size; the typical ones for zero columns."""
     from twoloop.kernels.evaluation.checks import column_units
 
     if isinstance(jacobian, SparseRows):
@@ -116,7 +118,7 @@ def column_scales(jacobian: Rows, typical: Array) -> Array:
 
 
 def _sparse_column_scales(jacobian: SparseRows, typical: Array) -> Array:
-    """The same from the entries alone."""
+    """Return the same units from the entries alone."""
     size, (m, n) = np.abs(jacobian.values), jacobian.shape
     counts = size > 1e-12 * jacobian.largest()[jacobian.rows]
     i, j, logs = jacobian.rows[counts], jacobian.columns[counts], np.log(size[counts])
@@ -133,7 +135,7 @@ def _sparse_column_scales(jacobian: SparseRows, typical: Array) -> Array:
 
 
 def scales_of(system: ConstrainedSystem, t: float, q: Array, jacobian: Array) -> Scales:
-    """Scales at a position, from C_q there and nearby; or from C_q and A, if `jacobian` has the rows of both."""
+    """Return the scales at a position, from C_q there and nearby; from C_q and A, if `jacobian` has both."""
     from twoloop.kernels.evaluation.checks import NEGLIGIBLE, row_reaches
 
     size, columns = np.abs(q), units(system, t, q, jacobian, typical_sizes(q))
@@ -150,19 +152,20 @@ def scales_of(system: ConstrainedSystem, t: float, q: Array, jacobian: Array) ->
 
 
 def units(system: ConstrainedSystem, t: float, q: Array, jacobian: Rows, typical: Array) -> Array:
-    """Units of the coordinates in which entries of C_q, with A or without, are of like size, here or a unit away.
+    """Return units of the coordinates in which entries of C_q (and A) are of like size, here or a unit away.
 
-    An entry that is small by the position alone, as of a bar next to upright, says nothing about units.
+    An entry that is small only at this position, as of a bar that is almost upright, says nothing about units.
     """
     columns, ways = column_scales(jacobian, typical), np.outer([1.0, -1.0], generic_factors(len(q)))
-    for _ in range(ROUNDS):  # always as many: rounding is not to decide
+    for _ in range(ROUNDS):  # a fixed number, so that rounding does not decide it
         found = column_scales(_largest(system, t, q + columns * ways, jacobian), typical)
-        columns = np.cbrt(columns * found * found)  # twice the unit makes half the unit of an entry that grows with it
+        # an entry that grows with its coordinate has half the unit at twice the displacement
+        columns = np.cbrt(columns * found * found)
     return columns
 
 
 def _largest(system: ConstrainedSystem, t: float, places: Array, here: Rows) -> Rows:
-    """Entries of rows of the largest magnitude, here and at other places, where the callbacks may not be defined."""
+    """Return the largest magnitude of each entry, here and at other places, at which callbacks may be undefined."""
     if not isinstance(here, SparseRows):
         beside = rows_at(system, t, places)[0][:, : len(here)]
         return np.maximum(abs(here), abs(np.where(np.isfinite(beside), beside, 0.0)).max(axis=0))
@@ -170,7 +173,7 @@ def _largest(system: ConstrainedSystem, t: float, places: Array, here: Rows) -> 
     for place in places:
         try:
             rows = system.sparse_rows(t, place)
-        except Exception:  # outside what the callbacks are made for
+        except Exception:  # outside the domain of the callbacks
             continue
         if isinstance(rows, SparseRows) and is_finite(rows):
             largest = np.maximum(largest, abs(rows.values))
@@ -178,7 +181,7 @@ def _largest(system: ConstrainedSystem, t: float, places: Array, here: Rows) -> 
 
 
 def rows_at(system: ConstrainedSystem, t: float, places: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """C_q and A at positions, (n, n_c + n_a, n_q), and at which of these no callback raised an exception, (n,)."""
+    """Return C_q and A at positions, (n, n_c + n_a, n_q), and at which of these no callback raised, (n,)."""
     from twoloop.kernels.evaluation import checks as first_look
 
     check_callback(system, "jacobian", t, [places[0]])
@@ -187,24 +190,24 @@ def rows_at(system: ConstrainedSystem, t: float, places: Array) -> tuple[Array, 
     evaluate = entry_point(first_look.rows_at)
     try:
         evaluate(kit, t, places, system.n_c, rows.reshape(-1, system.n_q))
-    except Exception:  # then one by one
+    except Exception:  # a position failed: evaluate one by one
         rows[:] = 0.0
         for k in range(n):
             try:
                 evaluate(kit, t, places[k : k + 1], system.n_c, rows[k])
-            except Exception:  # outside what the callbacks are made for
+            except Exception:  # outside the domain of the callbacks
                 defined[k] = False
     return rows, defined
 
 
 @cache
 def signs(n_q: int) -> Array:
-    """Of the displacements of the coordinates, (n_q,): always the same."""
+    """Return fixed random signs of the displacements of the coordinates, (n_q,)."""
     return np.random.default_rng(3).choice((-1.0, 1.0), n_q)
 
 
 def _curvature(system: ConstrainedSystem, t: float, q: Array, columns: Array, n_rows: int) -> Array:
-    """How fast each row of C_q turns, per unit of the coordinates: one digit is enough."""
+    """Return how fast each row of C_q changes per unit of the coordinates; one digit is enough."""
     way = columns * signs(len(q))
     largest = np.zeros(n_rows)
     shifts = np.array([side * part for part in DISPLACEMENTS for side in (1.0, -1.0)])
@@ -220,7 +223,7 @@ def _curvature(system: ConstrainedSystem, t: float, q: Array, columns: Array, n_
 
 
 def generic_velocities(system: ConstrainedSystem, t: float, q: Array, jacobian: Rows, rate: Array) -> list[Array]:
-    """Velocities in which each coordinate matters; where C_t is not zero, the last are as fast as the drive."""
+    """Return velocities in which each coordinate matters; if C_t is not zero, also some as fast as the drive (last)."""
     size = sizes(q)
     v = units(system, t, q, jacobian, size) * generic_factors(len(q))
     v = v / median(np.abs(v) / size)

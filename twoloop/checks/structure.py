@@ -21,23 +21,24 @@ if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
 
 
-RANK_TOLERANCE = 1e-11  # of the largest diagonal entry of R
-SHOWN = 5  # rows that depend on others, of which the equations are written out
-MOST_TERMS, MOST_NAMED = 3, 8  # rows on which another depends: named with their coefficients, and named at all
-WEAK = 1e-9  # of the largest singular value: directions that a pseudo-inverse has beyond doubt
-NO_DIRECTION = 1e-12  # of a row: what rounding leaves of it without its part in others that it depends on
+RANK_TOLERANCE = 1e-11  # relative to the largest diagonal entry of R: smaller pivots are zero
+SHOWN = 5  # largest number of dependent rows whose equations are written out
+# rows on which another one depends: largest number with coefficients, and largest number named
+MOST_TERMS, MOST_NAMED = 3, 8
+WEAK = 1e-9  # relative to the largest singular value: above it, a direction certainly belongs to the pseudo-inverse
+NO_DIRECTION = 1e-12  # relative to a row: a smaller remainder, without its part in the rows it depends on, is rounding
 
 
 def eigenvalues(matrix: Array) -> Array:
-    """Of a symmetric matrix, in order: LAPACK called at once takes a fifth of the time where it is small."""
+    """Return the eigenvalues of a symmetric matrix in ascending order, by LAPACK directly (5 times faster if small)."""
     values: Array = lapack.dsyevd(matrix, compute_v=0)[0]
     return values
 
 
 def orthogonalised(rows: Array, least: float) -> tuple[Array, Array, list[int]]:
-    """Rows of length 1, the lower triangle that makes those rows of them that count, and which these are.
+    """Orthonormalize rows; return the basis, the lower triangle that gives the independent rows, and their indices.
 
-    A row counts if more of it than the share `least` is no combination of those before.
+    A row is independent if the share of it that no combination of the rows before gives is larger than `least`.
     """
     from twoloop.kernels.linalg.rank import independent_rows
 
@@ -48,9 +49,9 @@ def orthogonalised(rows: Array, least: float) -> tuple[Array, Array, list[int]]:
 
 
 def least_solution(rows: Array, values: Array) -> tuple[Array, Array] | None:
-    """What the pseudo-inverse of rows, of length 1 or less, makes of values, and what that leaves of these.
+    """Solve rows x = values by the pseudo-inverse, rows of length 1 or less; return x and the residual.
 
-    None where a direction is so weak that it may count or not.
+    None if a direction is so weak that it is not certain whether it belongs to the pseudo-inverse.
     """
     from twoloop.kernels.linalg import rank as independent
 
@@ -65,7 +66,7 @@ def least_solution(rows: Array, values: Array) -> tuple[Array, Array] | None:
 
 
 def surely_above(ratio: float, rows: Array, rank: int) -> bool:
-    """Whether so many singular values are above this share of the largest, by bounds that cost less than these."""
+    """Return whether `rank` singular values certainly exceed `ratio` times the largest, by bounds, without an SVD."""
     from twoloop.kernels.linalg.rank import singular_values_exceed, size_of_inverse
 
     if rank == len(rows) > 0 and entry_point(singular_values_exceed)(
@@ -80,7 +81,7 @@ def surely_above(ratio: float, rows: Array, rank: int) -> bool:
 
 
 def redundant_rows(scaled: Array) -> list[int]:
-    """Rows of a Jacobian, scaled to like size, that depend on the others, by QR with pivoting."""
+    """Return the rows of a Jacobian, scaled to like size, that depend on the others, by QR with pivoting."""
     if scaled.size == 0:
         return []
     R, order = qr(scaled.T, mode="r", pivoting=True)
@@ -90,7 +91,7 @@ def redundant_rows(scaled: Array) -> list[int]:
 
 
 def in_words(jacobian: Array, redundant: list[int]) -> str:
-    """Which rows depend on which others, with the coefficients where these are few: many differ from start to start."""
+    """Describe which rows depend on which others; with coefficients only if these are few: many vary between starts."""
     from twoloop.kernels.linalg.rank import shares_of_others
 
     (n_rows, n_q), shown = jacobian.shape, redundant[:SHOWN]
@@ -107,7 +108,7 @@ def in_words(jacobian: Array, redundant: list[int]) -> str:
 
 
 def equations_in_words(redundant: list[int], others: list[int], shares: Array, lengths: Array) -> str:
-    """The same from the shares (SHOWN, n) that the others have in the first rows, and the lengths of all rows."""
+    """Describe the same from the shares (SHOWN, n) of the other rows in the first rows, and the lengths of all rows."""
     equations = []
     counts = np.abs(shares) * lengths[others] > 1e-9 * lengths[redundant[: len(shares)], None]
     for i, factors, which in zip(redundant, shares.tolist(), counts, strict=False):
@@ -123,63 +124,64 @@ def equations_in_words(redundant: list[int], others: list[int], shares: Array, l
     return f"row(s) {redundant} depend on the others ({', '.join(equations)}{more})"
 
 
-NEARBY = (0.0, 1e-3, 1e-2, 3e-2)  # of the coordinates: where the pattern of C_q is looked at
+NEARBY = (0.0, 1e-3, 1e-2, 3e-2)  # displacements, relative to the coordinates, at which the pattern of C_q is sampled
 SINGULAR_MASS = 1e-12  # smallest eigenvalue over largest entry, below which M may have no inverse
 
 
 def pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
-    """1 where C_q or A has an entry at a position or near it, (n_c + n_a, n_q); not to be written to."""
+    """Return 1 where C_q or A has an entry at a position or near it, (n_c + n_a, n_q); read-only."""
     return system.remembered_at("pattern", (t, q.tobytes()), lambda: _pattern_of(system, t, q))
 
 
 def _pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
     size = np.maximum(np.abs(q), np.abs(q).max())
-    rows, defined = rows_at(system, t, q + size * ways(system.n_q))  # what is missed is found on the way
+    # entries that are missed here are found during the run
+    rows, defined = rows_at(system, t, q + size * ways(system.n_q))
     return (rows[defined] != 0.0).any(axis=0).astype(float)
 
 
 @cache
 def ways(n_q: int) -> Array:
-    """How far positions near one are from it, (len(NEARBY), n_q), over its size: always the same."""
+    """Return fixed random displacements to nearby positions, relative to the coordinates, (len(NEARBY), n_q)."""
     return np.array(NEARBY)[:, None] * np.random.default_rng(4).uniform(-1.0, 1.0, (len(NEARBY), n_q))
 
 
 def mass_and_rows(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array]:
-    """M, and C_q with A, at a position; not to be written to."""
+    """Return M, and C_q with A below it, at a position; read-only."""
     return system.remembered_at("mass and rows", (t, q.tobytes()), lambda: (system.mass(t, q), system.rows(t, q)))
 
 
 def has_definite_mass(system: ConstrainedSystem, t: float, q: Array) -> bool:
-    """Whether M has an inverse at a position, and not only on velocities that the constraints allow."""
+    """Return whether M has an inverse at a position, not only on the velocities that the constraints allow."""
     return system.remembered_at("definite mass", place_of_mass(system, t, q), lambda: is_definite(system.mass(t, q)))
 
 
 def is_definite(mass: Array) -> bool:
-    """Whether M has an inverse."""
+    """Return whether M has an inverse."""
     return bool(eigenvalues(mass)[0] > SINGULAR_MASS * np.abs(mass).max())
 
 
 def place_of_mass(system: ConstrainedSystem, t: float, q: Array) -> Any:
-    """What a mass matrix depends on."""
+    """Return the key of a mass matrix: the position on which it depends, or None if it is constant."""
     return None if system.constant_mass else (t, q.tobytes())
 
 
 def parts_of(value: Array | tuple[Array, ...]) -> tuple[Array, ...]:
-    """The arrays that a callback fills, of which "kinematics" has several."""
+    """Return the arrays that a callback fills; "kinematics" fills several."""
     return value if isinstance(value, tuple) else (value,)
 
 
 def not_finite(system: ConstrainedSystem, t: float, q: Array, v: Array) -> str | None:
-    """Which callbacks give values that are not finite at (t, q, v); None: all are."""
+    """Name the callbacks whose values are not finite at (t, q, v); None: all are finite."""
     state = {"q": q, "v": v, "lam": np.ones(system.n_c)}
-    looked = [kind for kind in system.given if kind not in system.entries]  # whose values are looked at
+    looked = [kind for kind in system.given if kind not in system.entries]  # callbacks whose values are checked
     values = {kind: system.evaluate(kind, t, *[state[name] for name in KINDS[kind].state]) for kind in looked}
     wrong = [kind for kind, value in values.items() if not all(np.isfinite(part).all() for part in parts_of(value))]
     return f"{' and '.join(wrong)} of {system.name!r} returned values that are not finite" if wrong else None
 
 
 def dependent_rows(system: ConstrainedSystem, t: float, q: Array) -> str:
-    """Which rows of C_q(t, q) depend on the others, in words."""
+    """Describe which rows of C_q(t, q) depend on the others."""
     jacobian = system.rows(t, q)
     rows = redundant_rows(scales_of(system, t, q, jacobian).scaled(jacobian))
     if rows:
@@ -192,7 +194,7 @@ def dependent_rows(system: ConstrainedSystem, t: float, q: Array) -> str:
 
 
 def least_inertia(system: ConstrainedSystem, t: float, q: Array) -> tuple[float, str]:
-    """Smallest over largest eigenvalue of T^T M T, and which coordinates move in the motion that it belongs to."""
+    """Return the smallest over the largest eigenvalue of T^T M T, and describe the motion that it belongs to."""
     mass, rows = system.mass(t, q), system.rows(t, q)
     free = null_space(rows) if len(rows) > 0 else np.eye(system.n_q)
     if free.shape[1] == 0:
@@ -206,18 +208,19 @@ def least_inertia(system: ConstrainedSystem, t: float, q: Array) -> tuple[float,
     )
 
 
-NEAR = 1e-3  # of the coordinates: also looked at a little off the start, where symmetry hides terms
-ROUNDED = 100.0  # times rounding of the terms of a constraint, by which values that callbacks share may differ, too
-MOST = 1_000_000  # numbers of Jacobians that are looked at together
-ROUNDING = 1e-12  # of a difference, relative to the largest entry over the displacement
+NEAR = 1e-3  # displacement relative to the coordinates: a little off the start, where no symmetry hides terms
+# in rounding errors of the terms of a constraint: by as much may values that callbacks share differ, too
+ROUNDED = 100.0
+MOST = 1_000_000  # largest number of entries of Jacobians that are evaluated together
+ROUNDING = 1e-12  # relative to the largest entry over the displacement: rounding error of a difference
 
 
 def unlike_itself(
     system: ConstrainedSystem, states: Sequence[tuple[float, Array, Array]], t0: float, q0: Array
 ) -> tuple[float, str] | None:
-    """Say when and what of M, `kinematics` and values is not as it should be at states of a run from (t0, q0), or None.
+    """Describe what is wrong in M, `kinematics` or values at states of a run from (t0, q0), and when; None: nothing.
 
-    Most often all is the same to the bit, which is seen soon.
+    Mostly all is equal to the bit, which is quick to see.
     """
     before = _mass_at(system, t0, q0).tobytes() if system.constant_mass else b""
     fused = "kinematics" in system.given
@@ -238,7 +241,7 @@ def unlike_itself(
 
 
 def wrong_kinematics(system: ConstrainedSystem, t: float, q: Array) -> str | None:
-    """Compare the fused callback with the separate ones, which are compared with differences."""
+    """Compare the fused callback with the separate ones, which the checks compare with differences."""
     if "kinematics" not in system.given:
         return None
     _, rate, rows = _compared(system, t, q, 0.0 * q)
@@ -252,7 +255,7 @@ def wrong_kinematics(system: ConstrainedSystem, t: float, q: Array) -> str | Non
             "constraint_rate": system.constraint_rate(t, place),
             "gamma": system.gamma(t, place, v),
         }
-        size = EPS * np.abs(separate["jacobian"]) @ np.abs(place)  # of the terms in a constraint
+        size = EPS * np.abs(separate["jacobian"]) @ np.abs(place)  # rounding of the terms in a constraint
         for fused, (kind, given) in zip(system.kinematics(t, place, v), separate.items(), strict=True):
             off = np.abs(fused - given)
             level = SAME * np.abs(given).max(initial=0.0) + (ROUNDED * size if kind == "constraint" else 0.0)
@@ -268,7 +271,7 @@ def wrong_kinematics(system: ConstrainedSystem, t: float, q: Array) -> str | Non
 
 
 def _compared(system: ConstrainedSystem, t: float, q: Array, v: Array) -> tuple[bool, Array, Array]:
-    """Whether kinematics give what the separate callbacks give, and C_t and C_q of these."""
+    """Return whether kinematics agrees with the separate callbacks, and C_t and C_q of the latter."""
     from twoloop.kernels.evaluation.checks import kinematics_agree
 
     n, n_c = system.n_q, system.n_c
@@ -279,7 +282,7 @@ def _compared(system: ConstrainedSystem, t: float, q: Array, v: Array) -> tuple[
 
 
 def changed_mass(system: ConstrainedSystem, t0: float, q0: Array, t: float, q: Array) -> str | None:
-    """Say that a mass is not the same in two places, where it is said to be constant, or None."""
+    """Report that M differs between two positions although constant_mass is set; None if it does not."""
     there, before = defined(lambda: _mass_at(system, t, q)), _mass_at(system, t0, q0)
     if there is None or there.tobytes() == before.tobytes():
         return None
@@ -289,7 +292,7 @@ def changed_mass(system: ConstrainedSystem, t0: float, q0: Array, t: float, q: A
 
 
 def _mass_at(system: ConstrainedSystem, t: float, q: Array) -> Array:
-    """M, or the values of its entries where these are given."""
+    """Return M, or the values of its entries if the system gives these."""
     kind = "mass_values" if "mass" in system.entries else "mass"
     (made,) = system.arrays_of(kind)
     getattr(system.functions, kind)(t, np.ascontiguousarray(q), system.functions.p, made)
@@ -297,7 +300,7 @@ def _mass_at(system: ConstrainedSystem, t: float, q: Array) -> Array:
 
 
 def check_bandwidth(system: ConstrainedSystem, bandwidth: int, t: float, q: Array) -> None:
-    """Displace one coordinate or velocity after another: what lies farther away than the bandwidth may not answer."""
+    """Check the bandwidth: displace each coordinate and velocity; the response must stay within the bandwidth."""
     n, places = system.n_q, np.arange(system.n_q)
     farthest, where = bandwidth, ""
     size = float(np.abs(q).max()) or 1.0
@@ -306,7 +309,7 @@ def check_bandwidth(system: ConstrainedSystem, bandwidth: int, t: float, q: Arra
     steps, away = shift * np.eye(n), np.abs(places - places[:, None])
 
     def look(what: str, first: int, answers: Array, level: float) -> None:
-        """Rows of answers are what answers to coordinates from the first on."""
+        """Find the farthest response: row k of `answers` is the response to coordinate first + k."""
         nonlocal farthest, where
         far = away[first : first + len(answers)]
         distances = np.where(np.isfinite(answers) & (np.abs(answers) > level), far, 0)
@@ -317,7 +320,7 @@ def check_bandwidth(system: ConstrainedSystem, bandwidth: int, t: float, q: Arra
     def force(q: Array, v: Array) -> Array:
         try:
             return system.force(t, q, v)
-        except (ArithmeticError, ValueError):  # math.sqrt and its like, outside what the callbacks are made for
+        except (ArithmeticError, ValueError):  # math.sqrt and its like, outside the domain of the callbacks
             return np.full(n, np.nan)
 
     look("M", 0, system.mass(t, q).T, 0.0)

@@ -1,4 +1,4 @@
-"""Coefficients that generated code reads when it runs, so that it serves all mechanisms of its structure."""
+"""Coefficients that generated code reads when it runs, so that it serves all mechanisms of the same structure."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -14,12 +14,12 @@ from twoloop.generate.program import Program
 
 Terms = tuple[tuple[int, float], ...]  # quantities and their coefficients
 
-IN_THE_CODE = (0.0, 1.0, -1.0)  # coefficients that need no multiplication, and stand in the code
-ROUNDING = 8.0 * 2.0**-52  # relative: what differs from these by less is taken for them
+IN_THE_CODE = (0.0, 1.0, -1.0)  # coefficients that are literals in the code, as they need no multiplication
+ROUNDING = 8.0 * 2.0**-52  # relative: coefficients that differ by less from one of IN_THE_CODE are replaced by it
 
 
 class Coefficient(float):
-    """A coefficient that is read from a place in memory; equal to no other, whatever their values.
+    """Coefficient that is read from an index of a memory; equal to no other, whatever their values.
 
     Coefficients that vary with parameters may have a memory of their own.
     """
@@ -29,7 +29,7 @@ class Coefficient(float):
     varies: bool
 
     def __new__(cls, value: float, place: int, varies: bool = False) -> "Coefficient":
-        """Create the coefficient of a place."""
+        """Create the coefficient stored at an index of the array of numbers."""
         coefficient = super().__new__(cls, value)
         coefficient.place, coefficient.varies = place, varies
         return coefficient
@@ -45,7 +45,7 @@ class Coefficient(float):
 
 
 class Coefficients:
-    """Assigns places to the coefficients of expressions, in the order of their first use.
+    """Numbering of the coefficients of expressions: assigns indices in the order of their first use.
 
     Equal expressions share their places. `apart`: coefficients that vary with parameters have a memory of their own, as
     each SIMD lane has other values.
@@ -61,18 +61,18 @@ class Coefficients:
 
     @property
     def values(self) -> NDArray[np.float64]:
-        """Return the numbers that code reads."""
+        """Return the numbers that the code reads."""
         return np.array(self._values, dtype=np.float64)
 
     @property
     def formulas(self) -> Any:
-        """Return the same numbers as expressions in the parameters; the array is the same until there are more."""
+        """Return these numbers as expressions in the parameters; the array object changes only if numbers are added."""
         if len(self._formulas) != len(self._values):
             self._formulas = array_of(self._values)
         return self._formulas
 
     def of(self, terms: Terms, constant: float = 0.0) -> tuple[Terms, float]:
-        """Return terms and a constant, with coefficients in the place of numbers."""
+        """Replace the numbers of terms and a constant by coefficients."""
         key = tuple((i, rounded(c)) for i, c in terms), rounded(constant)
         numbers = self._numbered.get(key)
         if numbers is None:
@@ -80,14 +80,14 @@ class Coefficients:
         return numbers
 
     def of_form(self, form: Affine) -> tuple[Terms, float]:
-        """Return the same for an expression."""
+        """Replace the numbers of an affine expression by coefficients."""
         numbers = self._of_forms.get(form.key)
         if numbers is None:
             numbers = self._of_forms[form.key] = self.of(tuple(form.terms.items()), form.constant)
         return numbers
 
     def structure(self, program: Program, given: Mapping[int, int] = MappingProxyType({})) -> Iterable[Any]:
-        """List what code for a program depends on, the values of numbers apart; `given`: places of given quantities."""
+        """List what code for a program depends on, but for values of numbers; `given`: indices of given quantities."""
         graph, forms = program.graph, program.forms
         needed = graph.needed_by(forms, given)
         name: dict[int, Any] = {i: f"input {i}" for i, each in enumerate(graph.operations) if each is None}
@@ -105,15 +105,15 @@ class Coefficients:
 
     @property
     def n_varying(self) -> int:
-        """Return how many coefficients vary with parameters."""
+        """Return the number of coefficients that vary with parameters."""
         return len(self._varying)
 
     def for_parameters(self, record: ParameterTape, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the varying coefficients for parameters (n_runs, n_p), a row a run."""
+        """Return the varying coefficients for parameters (n_runs, n_p), one row for each run."""
         return record.evaluate(list(self._varying.values()), parameters)
 
     def _number(self, value: float) -> float:
-        if type(value) is Parameter:  # its present value means nothing
+        if type(value) is Parameter:  # a parameter's present value is no literal
             if self._apart:
                 expression = value.scale, value.powers
                 self._varying.setdefault(expression, value)
@@ -125,7 +125,7 @@ class Coefficients:
 
 
 def in_the_code(value: float) -> float | None:
-    """Return a number that may stand in the code, or None."""
+    """Return the literal for a number, or None if it must be a coefficient."""
     if type(value) is Parameter or not math.isfinite(value):
         return None
     near = float(round(value))

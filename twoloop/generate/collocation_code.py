@@ -32,26 +32,30 @@ from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.indices import ATOL, ESTIMATE, RTOL
 
 Array = NDArray[np.float64]
-LONGEST = 5000  # operations of the equations: code of as many takes 2 s to compile
-SMALLEST = 1e-300  # in place of a coefficient of zero
-FAILED = -1.0  # result of an audit that cannot evaluate the accelerations, in place of the defect
+LONGEST = 5000  # largest number of operations of the equations: code of this length takes 2 s to compile
+SMALLEST = 1e-300  # replaces a divisor of zero
+FAILED = -1.0  # result of an audit that cannot evaluate the accelerations (defects are never negative)
 INFINITE = float("inf")
-CAREFULLY = 8.0  # steps by the elimination that begins with M, after one where the conditions of the other failed
-FIRST_DEGREE = 3.0  # of the polynomial that predicts the second step
+# number of steps that eliminate M first, after a step in which the conditions of the shorter elimination failed
+CAREFULLY = 8.0
+FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the second step
 
 # the iteration
-KAPPA = 0.02  # of the tolerance, what the iteration may leave: errors are then no larger than those of DOP853
-TARGET = 6.0  # sweeps aimed at; more where a polynomial of high degree predicts well, as the step is long then
-MORE = 7  # sweeps beyond the target, after which a step is refused
-SLOW = 0.8  # contraction from which on a step is refused after the third sweep
+# error that the iteration may leave, relative to the tolerance: total errors are then no larger than those of DOP853
+KAPPA = 0.02
+# number of sweeps aimed at; one or two more if a polynomial of degree 6 or 7 predicts well, as steps are long then
+TARGET = 6.0
+MORE = 7  # number of sweeps beyond the target after which a step is rejected
+SLOW = 0.8  # contraction of the iteration above which a step is rejected after the third sweep
 LEAST_RHO, MOST_RHO = 1e-3, 0.9
-SLOW_START, FAST_START = 0.3, 0.04  # limits of the contraction of the first step, beyond which its size is changed
+SLOW_START, FAST_START = 0.3, 0.04  # if the contraction of the first step is outside these limits, its size is changed
 STAGNANT = 0.5  # ratio of changes from which on they are rounding, if they are below NOISE relative to the values
 # the same for steps of fixed size, and the largest number of sweeps; forces may have rounding errors of their own
 ROUNDING_OF_FIXED, NOISE_OF_FIXED, MOST_OF_FIXED = 1e-16, 1e-9, 60.0
-LEAST_CHANGE = 1e-30  # over what may be left
+LEAST_CHANGE = 1e-30  # added to the remaining error over its limit, so that its logarithm exists
 SHARE = 0.5  # weight of the error estimate
-ALLOWED = 16.0  # defect between nodes, over the tolerances: most of it oscillates, and does not last to the end
+# allowed defect between nodes, relative to the tolerances: most of the defect oscillates and cancels until the end
+ALLOWED = 16.0
 
 
 def suits(own: SharedCode) -> bool:
@@ -60,7 +64,7 @@ def suits(own: SharedCode) -> bool:
 
 
 class CollocationCode:
-    """Write the functions of a mechanism.
+    """Generator of the functions that make the collocation steps of one mechanism.
 
     Parameters
     ----------
@@ -71,9 +75,9 @@ class CollocationCode:
     iterated : list of int
         Coordinates on which accelerations depend.
     numbers : Coefficients
-        What the functions read.
+        Coefficients that the functions read.
     structure : str
-        What the functions depend on, the values of these apart.
+        Digest of everything that the functions depend on, except the values of `numbers`.
     """
 
     def __init__(self, own: SharedCode):
@@ -105,10 +109,11 @@ class CollocationCode:
     # the functions
 
     def attempt(self, emit: LaneEmitter, room: Value, state: Value, tolerances: Value, numbers: Value) -> Value:
-        """Write the iteration of the stages of a step; its result is how that ended, see data/collocation.py.
+        """Write the iteration of the stages of a step; its result tells how it ended, see data/collocation.py.
 
-        Where conditions of the accelerations of the fewest operations fail, another function makes the step, and some
-        of the next ones, by those that eliminate M first. They are looked at once, for the last sweep.
+        The accelerations come from the elimination with the fewest operations. If its conditions fail, which are
+        checked once, after the last sweep, another function makes this step and some of the next ones with the
+        elimination that begins with M.
         """
         builder, one = emit.builder, Emitter(emit.builder)
         emit.numbers = emit.constants = numbers
@@ -179,7 +184,7 @@ class CollocationCode:
 
     @contextmanager
     def _leaving(self, emit: LaneEmitter, condition: Value) -> Iterator[None]:
-        """Write what is done where a condition holds; the block has to return."""
+        """Open a block of code for the case that a condition holds; the block has to return."""
         builder = emit.builder
         leave, go_on = builder.append_block(), builder.append_block()
         builder.branch(condition, leave, go_on)
@@ -199,8 +204,9 @@ class CollocationCode:
     def _begin(self, emit: LaneEmitter, room: Value, state: Value, tolerances: Value) -> None:
         """Write the error weights, and predict positions and velocities at the nodes.
 
-        Errors are relative to what positions and velocities are at the beginning, or what half a step adds if that is
-        more. Where no error is estimated, they are relative, of values below 1 absolute.
+        Errors are relative to the larger of two numbers: the size of the position (or velocity) at the beginning, and
+        the change that half a step adds. Steps of fixed size have no error estimate: there errors are relative to that
+        size, or absolute if it is below 1.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
         fixed = builder.compare("fcmp oeq", one.load(tolerances, ESTIMATE), llvm_code.ZERO)
@@ -271,10 +277,10 @@ class CollocationCode:
         evaluate: Callable[[list[Value]], Callable[[], Value]],
         otherwise: Callable[[], Value],
     ) -> Value:
-        """Write the sweeps over the stages until they have converged, or the step is refused.
+        """Write the sweeps over the stages until they have converged, or the step is rejected.
 
-        `evaluate` puts accelerations at [t, q, v] into memory, those of coordinates that are not iterated when what it
-        gives is called, which says whether all may be used. Where they may not, `otherwise` does the step.
+        `evaluate` stores the accelerations of the iterated coordinates at [t, q, v]; the function that it returns
+        stores the other accelerations and returns whether all of them are valid. If not, `otherwise` makes the step.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
 
@@ -355,10 +361,10 @@ class CollocationCode:
     def _judge(self, emit: LaneEmitter, room: Value, state: Value) -> None:
         """Write ERROR and CURVED, and the factors of the next step size by convergence and by the error.
 
-        The coefficients of a in Legendre polynomials tell how fast they fall: t is the larger one of degrees 7 and 8, s
-        of 5 and 6, f of all from 3 on. The error is estimated as t (t / s)^1.5 or, if that is more, t^2 / f. Errors of
-        steps over corners and peaks of forces are at most 20 times as large, in 99 % of them; those of smooth motion
-        are smaller by decades, which costs few steps, as the estimate is of order 12.
+        The coefficients of a in Legendre polynomials show how fast they decrease: t is the larger one of degrees 7 and
+        8, s that of degrees 5 and 6, f the largest of all from degree 3 on. The error is estimated as the larger of t
+        (t / s)^1.5 and t^2 / f. In 99 % of the steps over corners and peaks of forces, errors are at most 20 times the
+        estimate; for smooth motion they are smaller by decades, which costs few steps, as the estimate is of order 12.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
         m, change, target, rho = (one.load(room, place) for place in (at.SWEEPS, at.CHANGE, at.TARGETED, at.RHO))
@@ -396,9 +402,10 @@ class CollocationCode:
         one.store(builder.extract(factors, 1), room, at.FACTOR_OF_ERROR)
 
     def audit(self, emit: LaneEmitter, room: Value, state: Value, numbers: Value) -> Value:
-        """Evaluate the accelerations between the nodes; the result is the largest defect over what is allowed.
+        """Evaluate the accelerations between the nodes; return the largest defect, relative to its limit.
 
-        And by how much the next may be longer.
+        FACTOR_OF_DEFECT becomes the largest factor of the next step size by this defect.
+
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
         emit.numbers = emit.constants = numbers
@@ -434,7 +441,7 @@ class CollocationCode:
         return builder.select(all_hold, defect, constant(DOUBLE, FAILED))
 
     def retry(self, emit: LaneEmitter, room: Value, state: Value) -> None:
-        """Let the polynomial of a refused step predict the shorter one in its place."""
+        """Let the polynomial of a rejected step predict the shorter step that replaces it."""
         one, old = Emitter(emit.builder), self._polynomial(emit, room, other=False)
         with over(emit, self.iterated) as (k, i, _, _):
             a0 = one.load(one.pointer(state, i), 2 * self.n)
@@ -459,7 +466,7 @@ class CollocationCode:
             for value, begin in ((one.load(place, self.q + last), 0), (one.load(place, self.v + last), n), (a1, 2 * n)):
                 one.store(value, here, begin)
             sums = emit.multiply(load_lanes(emit, one.pointer(old, place_of(emit, k))), powers)
-            for distance in (1, 2, 4):  # of all terms up to each degree
+            for distance in (1, 2, 4):  # partial sums of all terms up to each degree
                 shifted = [LANES + k if k < distance else k - distance for k in range(LANES)]
                 sums = emit.add(sums, builder.shuffle(sums, zero, shifted))
             off = emit.add(sums, emit.splat(one.subtract(a0, a1)))
@@ -496,14 +503,14 @@ class CollocationCode:
         one.store(builder.select(predicts, degree, constant(DOUBLE, FIRST_DEGREE)), room, at.NEXT_DEGREE)
 
     def closer(self, emit: LaneEmitter, room: Value, numbers: Value) -> None:
-        """Move positions at the ends of eight steps towards the constraints; write FINE and MOVED."""
+        """Project the positions at the ends of eight steps; write FINE (success) and MOVED (the largest change)."""
         if self.parts is None:
             self._project(emit, room, numbers, self.equations.closer)
         else:
             self._project_in_parts(emit, room, numbers, self.parts.closer, ("moved", "q"))
 
     def nearer(self, emit: LaneEmitter, room: Value, numbers: Value) -> None:
-        """Do the same, and find velocities, accelerations and multipliers there."""
+        """Project the positions likewise, and compute velocities, accelerations and multipliers there."""
         if self.parts is None:
             self._project(emit, room, numbers, self.equations.nearer)
         else:
@@ -525,7 +532,7 @@ class CollocationCode:
     def _project_in_parts(
         self, emit: LaneEmitter, room: Value, numbers: Value, write: Callable[..., Value], names: tuple[str, ...]
     ) -> None:
-        """Do the same by a function of compile_equations.py, which fills arrays of these names."""
+        """Project the ends by a function of compile_equations.py that fills the arrays of these names."""
         one, moved = Emitter(emit.builder), emit.builder.room(DOUBLE, LANES * self.n)
         places = {name: one.pointer(room, place) for name, place in self._places_of_ends().items()} | {"moved": moved}
         state = load_lanes(emit, room, self.ends), places["q"], places["v"]
@@ -571,13 +578,13 @@ class CollocationCode:
         return v
 
     def _values(self, emit: LaneEmitter, first: Value, room: Value, i: Value) -> list[Value]:
-        """Load the accelerations of coordinate i at all nodes; `first` is that at the beginning."""
+        """Load the accelerations of coordinate i at all nodes; `first` is its acceleration at the beginning."""
         one = Emitter(emit.builder)
         place = one.pointer(room, place_of(emit, i))
         return [first, *(one.load(place, self.a + node) for node in range(LANES))]
 
     def _combined(self, emit: LaneEmitter, table: Array, first: Value, room: Value, i: Value) -> Value:
-        """Sum the rows of a table times such accelerations."""
+        """Sum the rows of a table times the accelerations of coordinate i (see `_values`)."""
         return self._sums(emit, table, self._values(emit, first, room, i))
 
     def _sums(self, emit: LaneEmitter, table: Array, terms: Sequence[Value]) -> Value:
@@ -597,11 +604,11 @@ class CollocationCode:
 
 
 class Collocation(NamedTuple):
-    """Hold the functions of a mechanism for collocation steps."""
+    """Functions of a mechanism for collocation steps."""
 
     functions: DeferredFunctions
     code: CollocationCode
-    numbers: Any  # what they read, or formulas for it
+    numbers: Any  # the coefficients that the functions read, or formulas for them
 
 
 def compiled_collocation(of_one: GeneratedCode) -> Collocation:
@@ -629,7 +636,8 @@ def _compiled(own: SharedCode) -> Collocation:
         module = Module(divided=long)
         for name, emit in parts.items():
             llvm_code.write(module, name, KIT.llvm_type(name), emit, partial(LaneEmitter, lanes=LANES))
-        assert len(code.numbers.values) == len(numbers)  # what is read beyond would be anything
+        # otherwise the functions would read arbitrary numbers beyond the end
+        assert len(code.numbers.values) == len(numbers)
         return list(parts), str(module)
 
     functions = DeferredFunctions(
@@ -640,5 +648,5 @@ def _compiled(own: SharedCode) -> Collocation:
 
 @cache
 def _stamp() -> str:
-    """Return a digest of the writers of the functions; what these share with the equations' code is in the key."""
+    """Return a digest of the source of the functions; the key of the cache covers the code that the equations share."""
     return digest_of("", __file__, lane_emitter, lobatto_tables, at)

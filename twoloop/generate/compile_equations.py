@@ -1,16 +1,15 @@
-"""Compile the equations of one mechanism: the tasks of the inner loop that explicit methods call.
+"""Compile the equations of one mechanism: the functions of the inner loop that explicit methods call.
 
-The operations of an elimination become LLVM's instructions one by one, past numba, which would take seconds for some
-hundred of them. The code is kept on disk as that of the kernels is.
+The operations of an elimination become LLVM instructions one by one, without numba, which would take seconds for a few
+hundred of them. The code is cached on disk like that of the kernels.
 
-**Accelerations** are computed by few operations where these serve, else by the elimination of M. Code of the fewest
-operations (null_space.py) divides by fixed pivots. Where one is small, a function of the module that eliminates M first
-finds the same numbers. In lanes it is called for all of them if one needs it, and the others keep what they have: no
-run depends on those beside it.
+**Accelerations** have two forms. The form with the fewest operations (null_space.py) divides by fixed pivots. If one of
+these is small, a function of the module computes the same numbers by the elimination of M. In SIMD lanes it is called
+for all lanes if one needs it; the other lanes keep their results, so that no run depends on its neighbours.
 
-**Long equations** are divided into functions that call one another, each written and compiled once. LLVM's time grows
-faster than the length of a block, and the values of long equations pass through memory in any case. Accelerations and
-both projections share the factors of a position and the solution with them.
+**Long equations** are divided into functions that call one another, each written and compiled once. The time of LLVM
+grows faster than the length of a block, and the values of long equations pass through memory in any case. Accelerations
+and both projections share the factors of a position, and the solution with these factors.
 """
 
 import hashlib
@@ -44,7 +43,7 @@ def write_accelerations(
 ) -> tuple[list[Value], Value]:
     """Write the accelerations at [t, q, v]; return them, and whether they are valid.
 
-    The builder may be in another block afterwards. `emit` knows where coefficients stand.
+    The builder may be in another block afterwards. `emit` has the pointers to the coefficients.
     """
     lowering, n = Lowering(emit, numbers), equations.system.n_q
     for quantity, value in enumerate(inputs):
@@ -62,7 +61,7 @@ def write_accelerations(
 def write_acceleration_function(
     module: Module, name: str, kind: tuple[str, list[str]], equations: Elimination, numbers: Coefficients
 ) -> None:
-    """Write a function of t, q, v and `numbers` that fills a, and returns whether a is valid."""
+    """Write a function of t, q, v and `numbers` that fills a and returns whether a is valid."""
 
     def emit_all(emit: Emitter, t: Value, q: Value, v: Value, given: Value, filled: Value) -> Value:
         lowering, emit.numbers = Lowering(emit, numbers), given
@@ -129,7 +128,7 @@ def _run_accelerations(
 
 
 def _acceleration_function(emit: Emitter, equations: Elimination, way: int, numbers: Coefficients) -> str:
-    """Return the name of a function of the module for accelerations, which is written at the first call."""
+    """Return the name of the module's function for accelerations; it is written at the first call."""
     outputs, mass_first = equations.accelerations[way], way in (-1, len(equations.accelerations) - 1)
     module, name = emit.builder.module, f"{'mass_first' if mass_first else 'quick'}_{emit.suffix}"
     if not module.defines(name):
@@ -156,7 +155,7 @@ def _acceleration_function(emit: Emitter, equations: Elimination, way: int, numb
 
 
 def _numbers(emit: Emitter) -> list[Value]:
-    """Return where coefficients stand; in SIMD lanes also those that all lanes share."""
+    """Return the pointers to the coefficients; in SIMD lanes also to those that all lanes share."""
     constants = getattr(emit, "constants", None)
     return [emit.numbers] if constants is None else [emit.numbers, constants]
 
@@ -171,7 +170,7 @@ SPLIT_PROJECTIONS, SPLIT_ALL = 200, 500
 
 
 class SplitFunctions:
-    """Writes equations in parts, which are functions of the module, and the functions that call them.
+    """Generator of equations in parts: each part is a function of the module, and other functions call them.
 
     Parameters
     ----------
@@ -181,9 +180,10 @@ class SplitFunctions:
     Attributes
     ----------
     solution : Solution
-        Keeps what parts share.
+        Solution of the linear equations; keeps the quantities that parts share.
     at_position, with_factors : dict
-        Programs of parts by their names: of t, q, v and what is kept, and of r, c and what is kept.
+        Programs of parts by their names: functions of t, q, v and the kept quantities, or of r, c and the kept
+        quantities.
     """
 
     def __init__(self, equations: Elimination, numbers: Coefficients):
@@ -203,7 +203,7 @@ class SplitFunctions:
             self._parts[name] = partial(self._part, outputs, {})
 
     def described(self) -> Iterable[Any]:
-        """List what the functions depend on, the values of numbers apart."""
+        """List everything that the functions depend on, except the values of numbers."""
         solution, numbers = self.solution, self.numbers
         yield solution.kept.sizes, list(numbers.structure(solution.kept))
         for outputs in self.at_position.values():
@@ -212,7 +212,7 @@ class SplitFunctions:
             yield outputs.sizes, list(numbers.structure(outputs))
 
     def write(self, module: Module, kinds: Callable[[str], tuple[str, list[str]]]) -> list[str]:
-        """Write the functions that kernels call into a module, and return their names; `kinds` has their types."""
+        """Write the functions that kernels call into a module and return their names; `kinds` returns their types."""
         functions: dict[str, Callable[..., Any]] = {"own_closer": self.closer, "own_nearer": self.nearer}
         if self.equations.quick is None:
             functions["own_there"] = self.there
@@ -220,7 +220,7 @@ class SplitFunctions:
             llvm_code.write(module, name, kinds(name), emit)
         return list(functions)
 
-    # the parts
+    # functions of the module for the parts
 
     def _call(self, emit: Emitter, *calls: tuple[str, Sequence[Value]]) -> Value:
         """Call parts, which are written at their first call; return whether their results are valid."""
@@ -247,18 +247,18 @@ class SplitFunctions:
         return lowering
 
     def _factors(self, emit: Emitter, *arguments: Value) -> Value:
-        """Compute and store what is kept; return whether the conditions hold."""
+        """Compute and store the kept quantities; return whether the conditions hold."""
         graph, solution, kept = self.equations.graph, self.solution, arguments[4]
         lowering = self._lowering(emit, graph, arguments, {})
         places = {i: (kept, place) for i, place in solution.known.items()}
         for i, place in places.items():
-            if graph.operations[i] is None:  # an entry that is t or a coordinate
+            if graph.operations[i] is None:  # this entry is t or a coordinate
                 emit.store(lowering.value(i), *place)
         lowering.run(graph, graph.in_order_of_use(solution.kept.forms), places)
         return lowering.holds(solution.kept, [])
 
     def _part(self, program: Program, kept: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
-        """Compute and store outputs; return whether they are valid. `kept`: places in the fifth argument."""
+        """Compute and store outputs; return whether they are valid. `kept`: indices in the fifth argument."""
         places = {i: (arguments[4], place) for i, place in kept.items()}
         lowering = self._lowering(emit, program.graph, arguments, places)
         results = program.run(lowering)
@@ -270,13 +270,13 @@ class SplitFunctions:
     # functions for kernels, and for code in SIMD lanes
 
     def there(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, a: Value) -> Value:
-        """Compute accelerations."""
+        """Compute the accelerations at (t, q, v)."""
         kept, r, c, lam = self._rooms(emit)
         at = [t, q, v, numbers, kept]
         return self._call(emit, ("factors", at), ("right", [*at, r, c]), ("solution", [r, c, kept, numbers, a, lam]))
 
     def closer(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, moved: Value, out: Value) -> Value:
-        """Move positions towards the constraints."""
+        """Correct positions towards the constraints, by one projection."""
         kept, r, c, lam = self._rooms(emit)
         at = [t, q, v, numbers, kept]
         _clear(emit, self.n, r)
@@ -298,7 +298,7 @@ class SplitFunctions:
         new_v: Value,
         lam: Value,
     ) -> Value:
-        """Move positions and velocities in the metric of M, and compute accelerations and multipliers."""
+        """Correct positions and velocities in the metric of M, and compute accelerations and multipliers."""
         kept, r, c, change = self._rooms(emit)
         u, at = self._room(emit, self.n), [t, q, v, numbers, kept]
         _clear(emit, self.n, r)
@@ -323,7 +323,7 @@ class SplitFunctions:
         return holds
 
     def _rooms(self, emit: Emitter) -> list[Value]:
-        """Return memory for what is kept, r, c, and a solution."""
+        """Reserve memory for the kept quantities, r, c, and a solution."""
         sizes = self.solution.n_kept, self.n, self.n_rows, max(self.n, self.n_rows)
         return [self._room(emit, size) for size in sizes]
 
@@ -332,7 +332,7 @@ class SplitFunctions:
 
 
 def _leave_unless(emit: Emitter, holds: Value) -> None:
-    """Return before any argument is changed where results are invalid; in SIMD lanes, other lanes may be valid."""
+    """Leave the function before it changes an argument if results are invalid; not in SIMD lanes."""
     if holds.type == BIT:
         emit.builder.leave_unless(holds)
 
@@ -354,7 +354,7 @@ Array = NDArray[np.float64]
 def write_function(
     module: Module, name: str, kind: tuple[str, list[str]], program: Program, numbers: Coefficients
 ) -> None:
-    """Write a function of inputs, coefficients, and arrays to fill.
+    """Write a function that reads inputs and coefficients and fills arrays.
 
     It returns whether the conditions hold and the first array is finite, and fills the arrays only then.
     """
@@ -376,7 +376,7 @@ def write_function(
 
 
 class SharedCode:
-    """Compiled functions for the equations that some systems share, or read from the disk.
+    """Compiled functions for the equations that several systems share; read from the disk if they are cached.
 
     Parameters
     ----------
@@ -388,7 +388,7 @@ class SharedCode:
     numbers : Coefficients
         Coefficients that the functions read.
     digest : str
-        Digest of what the functions depend on, the values of coefficients apart.
+        Digest of everything that the functions depend on, except the values of coefficients.
     functions : OwnFunctions
     """
 
@@ -399,7 +399,7 @@ class SharedCode:
         self.outputs = self._programs()
         structure = repr(list(self._described()))
         self.digest = hashlib.sha256((structure + _stamp()).encode()).hexdigest()
-        # passes of LLVM find nothing that makes equations faster, and take up to a quarter of a build
+        # LLVM's optimization passes do not make equations faster, and take up to a quarter of a build
         self.functions = generated_functions("equations", _stamp(), self.digest, self._write, passes=False)
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "GeneratedCode":
@@ -439,7 +439,7 @@ class SharedCode:
 
 
 class GeneratedCode(NamedTuple):
-    """Compiled functions with the coefficients of one system."""
+    """Compiled functions together with the coefficients of one system."""
 
     shared: SharedCode
     numbers: Array  # coefficients that the code reads
@@ -460,12 +460,12 @@ class GeneratedCode(NamedTuple):
 
 
 def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = unchecked) -> GeneratedCode:
-    """Return the code for a system and a start; `check` raises where calls of callbacks differ from their traces.
+    """Return the code for a system and a start; `check` raises if calls of callbacks differ from their traces.
 
     Raises
     ------
     ValueError
-        If its equations cannot be had.
+        If code for its equations cannot be generated.
     """
     try:
         choice = system.remembered_at("choice", (t0, q0.tobytes()), lambda: Choice.at(system, t0, q0))

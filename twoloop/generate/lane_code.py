@@ -1,8 +1,8 @@
 """Machine code of one mechanism for many runs at once: every number is a vector, with one run in each of its lanes.
 
-The operations are those of `series`, `elimination` and `compile_equations`. Coefficients are read, a vector each, so
-that runs may have parameters of their own. Step control of a series is made as code, too. What stands where in memory
-is in kernels/lanes/layout.py. The code is kept on disk by the structure of the equations.
+The operations are those of `series`, `elimination` and `compile_equations`. Coefficients are read as vectors, so that
+each run may have its own parameters. The step-size control of Taylor series is generated, too. The layout of the memory
+is in kernels/lanes/layout.py. The code is cached on disk, by the structure of the equations.
 """
 
 import hashlib
@@ -48,19 +48,19 @@ from twoloop.kernels.lanes import layout as lanes
 from twoloop.kernels.lanes.layout import CODE
 from twoloop.problem.system import ConstrainedSystem
 
-# a step by series, as in kernels/steps/taylor_step.py
-ALLOWED = 0.3  # of the tolerances: how far off the constraints the end of a step is aimed to be before it is projected
+# constants of a step by series, as in kernels/steps/taylor_step.py
+ALLOWED = 0.3  # violation of the constraints that a step aims at before its projection, relative to the tolerances
 MOST_SHORTENED, SHORTENED, GROWTH = 0.1, 0.9, 5.0  # factors of step sizes: the smallest, a safety factor, the largest
-MOST_REFUSED = 10  # steps, one after another
-FIRST_UNIT = 0.01  # of the span: the unit of time of the first series
-# a projection ends with a correction of so much: absolute (unit of q), and of the largest position
+MOST_REFUSED = 10  # largest number of rejections in a row
+FIRST_UNIT = 0.01  # first guess of the unit of time, relative to the length of the run
+# a projection has converged when a correction is below: absolute (unit of q), and relative to the largest position
 LARGEST_MOVE, OF_POSITIONS = 1e-14, 1e-14
-CONTRACTION = 0.5  # of a correction by the next, or the projection does not converge
-AT_ONCE = 3  # coordinates whose Horner schemes run side by side: of each three numbers are carried, in 16 registers
+CONTRACTION = 0.5  # largest ratio of a correction to the one before; above, the projection does not converge
+AT_ONCE = 3  # coordinates whose Horner schemes run side by side: each carries three numbers, and there are 16 registers
 
 
 class Places(NamedTuple):
-    """Hold the order, and pointers to `work` and to its parts, see kernels/lanes/layout.py."""
+    """Order of the series, and pointers to `work` and to its parts, see kernels/lanes/layout.py."""
 
     order: Value
     work: Value
@@ -75,15 +75,15 @@ class Places(NamedTuple):
 
 
 class LaneSteps:
-    """Write step control for a mechanism of n coordinates and n_rows multipliers."""
+    """Writer of the step-size control for a mechanism of n coordinates and n_rows multipliers."""
 
-    n_numbers: int  # that depend on parameters
+    n_numbers: int  # number of coefficients that depend on parameters
 
     def __init__(self, n: int, n_rows: int):
         self.n, self.n_rows = n, n_rows
 
     def unit(self, emit: LaneEmitter, control: Value, work: Value) -> Value:
-        """Return UNIT: of new runs, and after accepted steps."""
+        """Return UNIT, the unit of time of the series: chosen anew for new runs and after accepted steps."""
         select, unit = emit.builder.select, emit.load(work, lanes.UNIT)
         fresh, accepted = (is_set(emit, work, field) for field in (lanes.FRESH, lanes.ACCEPTED))
         span = emit.subtract(common(emit, control, lanes.T1), common(emit, control, lanes.T0))
@@ -99,7 +99,7 @@ class LaneSteps:
         return unit
 
     def lengths(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Choose steps by the last two terms of positions and velocities over the tolerances."""
+        """Choose step sizes by the last two terms of positions and velocities, relative to the tolerances."""
         builder, n, at = emit.builder, self.n, self.places(emit, order, control, work)
         unit, (rtol, atol) = emit.load(work, lanes.UNIT), self.tolerances(emit, control)
         one, found = emit.constant(1.0), []
@@ -138,13 +138,13 @@ class LaneSteps:
             store_mask(emit, work, field, goes)
 
     def evaluate(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Evaluate the state and its accelerations by the series, X units of time on."""
+        """Evaluate the series at X units of time: NEW (positions, velocities), accelerations, predicted positions."""
         at = self.places(emit, order, control, work)
         for j, q in enumerate(self.positions(emit, at, emit.load(work, lanes.X))):
             emit.store(q, at.predicted, j)
 
     def positions(self, emit: LaneEmitter, at: Places, x: Value) -> list[Value]:
-        """Evaluate them by Horner's scheme; return the positions."""
+        """Evaluate positions, velocities and accelerations by Horner's scheme, store them and return the positions."""
         positions: list[Value] = []
         builder, n, order = emit.builder, self.n, at.order
         unit, zero = emit.load(at.work, lanes.UNIT), emit.constant(0.0)
@@ -158,7 +158,8 @@ class LaneSteps:
                 power = builder.sub(builder.sub(order, integer(1)), m)
                 row = emit.pointer(at.series, builder.mul(power, integer(n)))
                 for j, (q, v, a) in zip(some, _threes(carried), strict=True):
-                    a = emit.add(emit.multiply(a, x), v)  # first, so that each takes the register of the one before
+                    # first, so that each number takes the register of its predecessor
+                    a = emit.add(emit.multiply(a, x), v)
                     v = emit.add(emit.multiply(v, x), q)
                     new += [emit.add(emit.multiply(q, x), emit.load(row, j)), v, a]
             for j, (q, v, a) in zip(some, _threes(new), strict=True):
@@ -169,16 +170,17 @@ class LaneSteps:
         return positions
 
     def defect(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Compute the defect of a step at its end."""
+        """Write the defect of a step at its end."""
         at = self.places(emit, order, control, work)
         a = [emit.load(at.a, j) for j in range(self.n)]
         emit.store(self.defect_of(emit, control, at, a), work, lanes.DEFECT)
 
     def defect_of(self, emit: LaneEmitter, control: Value, at: Places, a: list[Value]) -> Value:
-        """Return how far accelerations by the series are from those at NEW, over the tolerances (control/defect.py)."""
+        """Return the defect of the series' accelerations at NEW, relative to the tolerances (see control/defect.py)."""
         n, (rtol, atol) = self.n, self.tolerances(emit, control)
         steps, h = emit.number(at.order), emit.load(at.work, lanes.H)
-        share, per_share = emit.divide(h, steps), emit.divide(steps, h)  # infinite where h is 0: of q nothing is asked
+        # infinite if h is 0: then positions set no limit
+        share, per_share = emit.divide(h, steps), emit.divide(steps, h)
         largest = worst = emit.constant(0.0)
         for each in a:
             largest = emit.larger(emit.function("fabs", each), largest)
@@ -194,7 +196,7 @@ class LaneSteps:
         return emit.multiply(share, worst)
 
     def departure(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Compute how far the prediction of a step was off, see control/predictor.py."""
+        """Write OFF, the error of the prediction of a step relative to its limit, see control/predictor.py."""
         n, at, (rtol, atol) = self.n, self.places(emit, order, control, work), self.tolerances(emit, control)
         h = emit.load(work, lanes.H)
 
@@ -221,11 +223,11 @@ class LaneSteps:
         emit.store(off, work, lanes.OFF)
 
     def turned(self, emit: LaneEmitter, at: Places) -> Value | None:
-        """Return where a step from STATE to NEW may have passed a singular position; None: not checked here."""
+        """Return the lanes in which a step from STATE to NEW may have passed a singular position; None: unchecked."""
         return None
 
     def judge(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Accept steps, or shorten them by as much as they are off; too many rejections, or no values, end a run."""
+        """Accept steps or shorten them by their error; a lane fails after too many rejections, or without values."""
         builder, one = emit.builder, emit.constant(1.0)
         select, per_order = builder.select, emit.divide(one, emit.number(order))
         off, *defects = (emit.load(work, field) for field in (lanes.OFF, lanes.WORST, lanes.DEFECT))
@@ -249,7 +251,8 @@ class LaneSteps:
         store_mask(emit, work, lanes.ACCEPTED, accepted)
         times = emit.load(work, lanes.REFUSED)
         times = select(builder.both(running, refused), emit.add(times, one), times)
-        # shorter steps could pass over a place at which the equations have no values
+        # a value is not finite: fail, because shorter steps could pass over the place where the equations have no
+        # values
         times = select(fine, times, emit.constant(math.inf))
         emit.store(times, work, lanes.REFUSED)
         grown = emit.multiply(emit.load(work, lanes.H), select(refused, factor, emit.constant(GROWTH)))
@@ -269,7 +272,7 @@ class LaneSteps:
         return common(emit, control, lanes.RTOL), [common(emit, control, lanes.ATOL + j) for j in range(self.n)]
 
     def places(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> Places:
-        """Return where everything stands; numbers and constants are read from there, too."""
+        """Return the pointers to all parts of `work`; sets where coefficients and constants are read, too."""
         *fixed, series = lanes.places(self.n, self.n_rows, self.n_numbers)
         emit.numbers = emit.pointer(work, fixed.pop())
         emit.constants = emit.builder.gep(control, integer(lanes.ATOL + self.n))
@@ -285,35 +288,36 @@ def _threes(values: list[Value]) -> Iterator[tuple[Value, Value, Value]]:
 
 
 def common(emit: LaneEmitter, control: Value, place: int) -> Value:
-    """Return a number of `control`, for all lanes."""
+    """Return a number of `control`, broadcast to all lanes."""
     return emit.splat(emit.builder.load(emit.builder.gep(control, integer(place))))
 
 
 def is_set(emit: LaneEmitter, work: Value, field: int) -> Value:
-    """Return in which lanes a field is not 0."""
+    """Return the mask of the lanes in which a field is not 0."""
     return emit.builder.compare("fcmp one", emit.load(work, field), emit.constant(0.0))
 
 
 def store_mask(emit: LaneEmitter, work: Value, field: int, mask: Value) -> None:
-    """Set a field to 1 in the lanes of a mask, and to 0 in others."""
+    """Set a field to 1 in the lanes of a mask, and to 0 in the other lanes."""
     emit.store(emit.builder.select(mask, emit.constant(1.0), emit.constant(0.0)), work, field)
 
 
 def keep_fine(emit: LaneEmitter, work: Value, holds: Value) -> None:
-    """Clear FINE where a condition does not hold."""
+    """Clear FINE in the lanes in which a condition does not hold."""
     store_mask(emit, work, lanes.FINE, emit.builder.both(is_set(emit, work, lanes.FINE), holds))
 
 
-Rows = list[dict[int, Value]]  # entries that are not zero
+Rows = list[dict[int, Value]]  # the nonzero entries of each row, by column
 
 
 def turned(emit: LaneEmitter, before: Rows, after: Rows) -> Value:
-    """Return in which lanes a step may have passed a singular position: det G1 G0^T is not positive.
+    """Return the lanes in which a step may have passed a singular position: det G1 G0^T is not positive.
 
-    G0 and G1 are the rows of the constraints at both ends of the step. The determinant is the inner product of their
-    maximal minors, and near the square of these while a step turns little. A step straight through a position at which
-    the rows lose rank, which leads to another assembly, changes the signs of all of them: they pass through zero. No
-    partition of the coordinates is needed. Lanes count, too, in which the determinant needs a search for pivots.
+    G0 and G1 are the rows of the constraints at both ends of the step. By Cauchy and Binet the determinant is the inner
+    product of their maximal minors. It is close to the square of these while a step turns little. A step straight
+    through a position at which the rows become dependent leads to another assembly: all minors pass through zero and
+    change their signs. No partition of the coordinates is needed. Lanes in which the determinant needs a search for
+    pivots count as well.
     """
     matrix: list[dict[int, Value]] = [{} for _ in before]
     for i, row in enumerate(after):
@@ -327,7 +331,8 @@ def turned(emit: LaneEmitter, before: Rows, after: Rows) -> Value:
     one, zero, select, compare = emit.constant(1.0), emit.constant(0.0), emit.builder.select, emit.builder.compare
     left, sign = set(range(len(matrix))), one
     while left:
-        i = min(left, key=lambda each: (len(matrix[each]), each))  # rows and columns have the same pattern
+        # minimum degree: rows and columns have the same pattern
+        i = min(left, key=lambda each: (len(matrix[each]), each))
         left.remove(i)
         pivot = matrix[i].pop(i)
         below = select(compare("fcmp olt", pivot, zero), emit.negative(sign), zero)
@@ -345,18 +350,18 @@ def turned(emit: LaneEmitter, before: Rows, after: Rows) -> Value:
 
 Array = NDArray[np.float64]
 
-NOTHING = 1e-13  # of products of weights, what rounding leaves of zero
+NOTHING = 1e-13  # sums of products of weights below this are zero but for rounding
 
 
-# A, b and c of an explicit method whose first stage is the state itself, and weights of two estimates of its error
+# A, b and c of an explicit method whose first stage is the state itself, and the weights of two estimates of its error
 Tableau = tuple[Array, Array, Array, Array, Array]
 
 
 class LaneStages:
-    """Write the stages of an explicit Runge-Kutta method, and estimates of its error, for n coordinates.
+    """Writer of the stages of an explicit Runge-Kutta method, and of its error estimates, for n coordinates.
 
-    Velocities of stages are sums of accelerations, so that positions are such sums, too, with the weights A A: both are
-    made of the same accelerations, which are read once. Weights stand in the code, and those that are zero do not.
+    Velocities of stages are weighted sums of accelerations. So positions are such sums, too, with the weights A A, and
+    each acceleration is read once for both. Weights are literals in the code; terms of weight zero are left out.
     """
 
     def __init__(self, tableau: Tableau, n: int):
@@ -364,11 +369,11 @@ class LaneStages:
 
     @property
     def structure(self) -> list[bytes]:
-        """Return what the code depends on."""
+        """Return the tableau as bytes, as the code depends on nothing else."""
         return [np.asarray(each).tobytes() for each in self.tableau]
 
     def write(self, emit: LaneEmitter, arguments: tuple[Value, Value, Value], at: Places) -> None:
-        """Write NEW, X after the beginning of the step, and ERROR, if that is the whole step; FINE on success."""
+        """Write NEW, the state X after the beginning of the step, and ERROR, which is valid if X is the whole step."""
         A, b, c, fine, coarse = self.tableau
         _, control, work = arguments
         x, t = emit.load(work, lanes.X), emit.load(work, lanes.T)
@@ -400,12 +405,13 @@ class LaneStages:
         error = emit.divide(e, emit.function("sqrt", emit.add(emit.constant(1.0), emit.multiply(ratio, ratio))))
         select, compare = emit.builder.select, emit.builder.compare
         error = select(compare("fcmp ogt", e, zero), error, zero)
-        error = select(compare("fcmp oeq", total, zero), error, emit.constant(math.inf))  # a NaN is no maximum
+        # maxima ignore NaN, the sum does not
+        error = select(compare("fcmp oeq", total, zero), error, emit.constant(math.inf))
         emit.store(error, work, lanes.ERROR)
 
 
 class _Coordinate:
-    """Hold one coordinate, in the loop over them, with the accelerations of the stages so far."""
+    """One coordinate within the loop over the coordinates, with its accelerations at the stages so far."""
 
     def __init__(self, stages: LaneStages, emit: LaneEmitter, at: Places, j: Value, count: int):
         n, self.emit, self.new, self.n = stages.n, emit, emit.pointer(at.new, j), stages.n
@@ -413,12 +419,12 @@ class _Coordinate:
         self.before = tuple(emit.load(memory, lanes.BEGIN * n + place) for place in (0, n))
         self._slopes = [(memory, (lanes.SLOPES + k) * n) for k in range(count)]
         self._loaded: dict[int, Value] = {}
-        if count > 1:  # the last one was just found
+        if count > 1:  # the acceleration of the last stage was just computed
             self._loaded[count - 1] = emit.load(emit.pointer(at.a, j))
             emit.store(self._loaded[count - 1], *self._slopes[count - 1])
 
     def sum(self, weights: Array) -> Value:
-        """Return the sum of weights times accelerations."""
+        """Return the weighted sum of the accelerations."""
         total: Value | None = None
         for k, weight in enumerate(weights.tolist()):
             if abs(weight) > NOTHING:
@@ -429,13 +435,13 @@ class _Coordinate:
         return self.emit.constant(0.0) if total is None else total
 
     def share(self, atol: Value, rtol: Value, one: Value, other: Value) -> Value:
-        """Return 1 over the allowed error of a number that changed from `one` to `other`."""
+        """Return 1 / (allowed error of a number that changed from `one` to `other`)."""
         emit = self.emit
         size = emit.larger(emit.function("fabs", one), emit.function("fabs", other))
         return emit.divide(emit.constant(1.0), emit.add(atol, emit.multiply(rtol, size)))
 
     def move(self, weights: Array, twice: Array, x: Value) -> tuple[Value, Value]:
-        """Write NEW: the velocity by weights of accelerations, the position by those and `twice`."""
+        """Write NEW: the velocity with the weights of the accelerations, the position with the weights `twice`."""
         emit, (q, v) = self.emit, self.before
         drift = emit.multiply(emit.constant(float(weights.sum())), v)
         q = emit.add(q, emit.multiply(x, emit.add(drift, emit.multiply(x, self.sum(twice)))))
@@ -446,12 +452,12 @@ class _Coordinate:
 
 
 GOLDEN = 0.6180339887498949
-MOST_PARTS = 1000.0  # of a step, between places that are looked at
-LARGEST = 1500  # operations of a series, which take some seconds to compile
+MOST_PARTS = 1000.0  # largest number of parts of a step, between whose ends the equations are evaluated
+LARGEST = 1500  # largest number of operations of a series: as many take some seconds to compile
 
 
 class LaneCode(LaneSteps):
-    """Write the code of a mechanism, step control included, whose numbers depend on parameters.
+    """Generator of the code of one mechanism, step-size control included; some coefficients depend on parameters.
 
     Parameters
     ----------
@@ -459,14 +465,14 @@ class LaneCode(LaneSteps):
     choice : Choice
     parameters : array of Parameter
     series : bool
-        Whether there is to be code for its Taylor series, too.
+        Whether to generate code for its Taylor series, too.
     tableau : Tableau, optional
-        Of an explicit method, whose stages there is to be code for.
+        Tableau of an explicit method for whose stages code is generated.
 
     Raises
     ------
     Untraceable
-        Saying why the equations, or their series, cannot be had.
+        If the equations, or their series, cannot be generated; the message says why.
     """
 
     def __init__(
@@ -505,7 +511,7 @@ class LaneCode(LaneSteps):
         return *lanes.TASKS, *lanes.TASKS_OF_STAGES, *explicit
 
     def series_size(self, order: int) -> int:
-        """Return the length of the memory that a series of an order takes and works in, in vectors."""
+        """Return the length, in vectors, of the memory for a series of an order and its intermediate results."""
         assert self.recurrences is not None
         return (order + 1) * self.n + self.recurrences.scratch_size(order)
 
@@ -517,14 +523,14 @@ class LaneCode(LaneSteps):
             told += list(self.recurrences.structure)
             parts.append(self.solution.kept)
         else:
-            parts.append(self._rows_at)  # whose numbers have to be known where the code comes from the disk
+            parts.append(self._rows_at)  # its coefficients must be numbered even if the code comes from the disk
         for outputs in parts:
             told += [outputs.sizes, *numbers.structure(outputs)]
         if self.recurrences is not None:
             told += list(numbers.structure(self.solution.solved))
         return hashlib.sha256(repr(told).encode()).hexdigest()
 
-    # what is emitted
+    # the generated functions
 
     def series(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Compute coefficients of q up to an order, in units of time, about the state of each lane."""
@@ -549,10 +555,10 @@ class LaneCode(LaneSteps):
         store_mask(emit, work, lanes.FINE, holds)
 
     def check_within(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Compute WORST, the largest defect at places within the step, each at most the gap from the next, or an end.
+        """Write WORST, the largest defect at places within the step that are at most GAP apart (and from its ends).
 
-        AHEAD is the time of the place, and then of the end.
-        SHIFT, multiples of the golden section less their integers, moves the places as far as the gap allows.
+        AHEAD is the time of each place in turn, and finally of the end of the step. SHIFT is a multiple of the golden
+        section modulo 1; it moves the places as far as GAP allows, so that they differ from step to step.
         """
         builder, at = emit.builder, self.places(emit, order, control, work)
         h, gap = emit.load(work, lanes.H), common(emit, control, lanes.GAP)
@@ -581,14 +587,14 @@ class LaneCode(LaneSteps):
         emit.store(builder.select(last, t1, emit.add(t, h)), work, lanes.AHEAD)
 
     def approach(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Move positions of lanes that FINE names towards the constraints."""
+        """Project the positions of the lanes in which FINE is set: the first correction."""
         act, _ = self._project(emit, self.equations.closer, lanes.FINE, self.places(emit, order, control, work))
         for field in (lanes.FINE, lanes.LEFT_TO_MOVE):
             store_mask(emit, work, field, act)
         emit.store(emit.constant(math.inf), work, lanes.MOVED_BEFORE)
 
     def refine(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Move positions and velocities, and compute accelerations and multipliers, until a move is only rounding."""
+        """Correct positions and velocities until only rounding is left; compute accelerations and multipliers."""
         builder, at = emit.builder, self.places(emit, order, control, work)
         fine, left = (is_set(emit, work, field) for field in (lanes.FINE, lanes.LEFT_TO_MOVE))
         act, moved = self._project(emit, self.equations.nearest, lanes.LEFT_TO_MOVE, at)
@@ -607,7 +613,7 @@ class LaneCode(LaneSteps):
         store_mask(emit, work, lanes.FINE, builder.operation("or", waited, there))
 
     def _project(self, emit: LaneEmitter, outputs: Program, which: int, at: Places) -> tuple[Value, Value]:
-        """Return which lanes could be moved, and how far they were."""
+        """Correct NEW in the lanes of a field; return the lanes that could be corrected, and the largest change."""
         select, work = emit.builder.select, at.work
         inputs = self._new(emit, work, at)
         written, arrays = lower(emit, outputs, inputs, self.numbers)
@@ -624,7 +630,7 @@ class LaneCode(LaneSteps):
         return act, largest
 
     def accelerate(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Compute accelerations at a state as it stands."""
+        """Compute the accelerations at NEW and AHEAD."""
         at = self.places(emit, order, control, work)
         holds, a = self._there(emit, work, at)
         for k, value in enumerate(a):
@@ -636,7 +642,7 @@ class LaneCode(LaneSteps):
         return holds, a
 
     def turned(self, emit: LaneEmitter, at: Places) -> Value | None:
-        """Return where det G1 G0^T is not positive, see `turned`; series are checked by their defects instead."""
+        """Return the lanes in which det G1 G0^T is not positive, see `turned`; None for series: defects show it."""
         if self.recurrences is not None or len(self.equations.rows) == 0:
             return None
         return turned(emit, *(self._rows(emit, at, time, base) for time, base in self._ends(at)))
@@ -645,7 +651,7 @@ class LaneCode(LaneSteps):
         return [(lanes.T, at.state), (lanes.AHEAD, at.new)]
 
     def _rows(self, emit: LaneEmitter, at: Places, time: int, base: Value) -> list[dict[int, Value]]:
-        """Return the entries of G that are not zero, row by row, at a state."""
+        """Return the nonzero entries of G at a state, row by row."""
         inputs = [emit.load(at.work, time), *(emit.load(base, i) for i in range(2 * self.n))]
         _, (entries,) = lower(emit, self._rows_at, inputs, self.numbers)
         rows: list[dict[int, Value]] = [{} for _ in self.equations.rows]
@@ -659,7 +665,7 @@ class LaneCode(LaneSteps):
         self.explicit.write(emit, (order, control, work), self.places(emit, order, control, work))
 
     def redundant(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Check whether the redundant rows hold, too."""
+        """Clear FINE in the lanes in which a redundant row is violated."""
         at, outputs = self.places(emit, order, control, work), self.equations.redundant
         written, (none,) = lower(emit, outputs, self._new(emit, work, at), self.numbers)
         keep_fine(emit, work, written.holds(outputs, none))
@@ -669,7 +675,7 @@ class LaneCode(LaneSteps):
 
 
 class LaneConstraints(LaneSteps):
-    """Write C, C_t and the entries of C_q of a system, whose numbers depend on parameters.
+    """Generator of the code for C, C_t and the entries of C_q, whose coefficients depend on parameters.
 
     Parameters
     ----------
@@ -680,12 +686,12 @@ class LaneConstraints(LaneSteps):
     Attributes
     ----------
     pattern : ndarray of int
-        Where in it the columns of the entries of each row begin, and end, and these columns.
+        For each row, the index in `pattern` at which its columns begin, and the final end; then these columns.
 
     Raises
     ------
     Untraceable
-        Saying why the constraints cannot be had.
+        If the constraints cannot be generated; the message says why.
     """
 
     tasks = lanes.TASKS_OF_STARTS
@@ -705,7 +711,7 @@ class LaneConstraints(LaneSteps):
         self.n_numbers, self.n_quantities = self.numbers.n_varying, len(self._rows.quantities())
 
     def rows(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Compute C, C_t and entries of C_q at NEW and AHEAD, in the memory of the method; FINE: they have values."""
+        """Compute C, C_t and the entries of C_q at NEW and AHEAD; store them in the memory of the series."""
         at = self.places(emit, order, control, work)
         inputs = [emit.load(work, lanes.AHEAD), *(emit.load(at.new, i) for i in range(2 * self.n))]
         written, arrays = lower(emit, self._rows, inputs, self.numbers)
@@ -715,7 +721,7 @@ class LaneConstraints(LaneSteps):
         keep_fine(emit, work, written.holds(self._rows, values))
 
 
-BUILD_SECONDS = 3e-4  # for a quantity, about
+BUILD_SECONDS = 3e-4  # s for one quantity, estimated
 ELIMINATION = (elimination, symbolic_factors, null_space, compile_equations)
 WRITERS = (series, *ELIMINATION, coefficients, lowering, lane_series, lane_emitter, llvm_code, llvm_text)
 
@@ -724,12 +730,12 @@ KIND = "lanes"  # of files on the disk
 
 
 class GeneratedLanes(Generic[Code]):
-    """Compile the code of a mechanism for lanes, and compute the numbers that it reads for any parameters.
+    """Compiled code of a mechanism for lanes, and the coefficients that it reads for any parameters.
 
     Parameters
     ----------
     record : ParameterTape
-        Of the parameters that `code` was made for.
+        Record of the parameters that `code` was generated for.
     code : LaneCode or LaneConstraints
     """
 
@@ -739,7 +745,7 @@ class GeneratedLanes(Generic[Code]):
 
     @cached_property
     def functions(self) -> GeneratedFunctions:
-        """Return the code, compiled when it is first used."""
+        """Return the functions, compiled at their first use."""
         return generated_functions(KIND, _stamp(), self.code.structure, self._write)
 
     def _write(self) -> tuple[list[str], str]:
@@ -756,13 +762,13 @@ class GeneratedLanes(Generic[Code]):
         return BUILD_SECONDS * self.code.n_quantities
 
     def numbers(self, parameters: Array) -> Array:
-        """Return the numbers that the code reads for parameters (n_runs, n_p)."""
+        """Return the coefficients that the code reads, for parameters (n_runs, n_p)."""
         return self.code.numbers.for_parameters(self.record, parameters)
 
 
 @cache
 def _stamp() -> str:
-    """Return a digest of what writes the code, and of the kernels that it goes with."""
+    """Return a digest of the modules that write the code, and of the kernels that call it."""
     from twoloop.kernels.data import common
 
     kernels = ("lanes.control", "lanes.explicit", "control.step_size")

@@ -1,6 +1,6 @@
-"""Arithmetic of many runs at once as LLVM code: every number is a vector, with one run in each of its lanes.
+"""Emitter of arithmetic on SIMD vectors as LLVM code: every number is a vector, with one run in each of its lanes.
 
-Steps by collocation have a stage in each lane instead. The places of their vectors in memory are counted in numbers.
+Collocation steps have one stage in each lane instead; `load_lanes` and `store_lanes` count places in numbers.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,9 +21,9 @@ LARGEST_POWER, SMALLEST = 1000.0, 1e-300
 
 
 class LaneEmitter(Emitter):
-    """Append operations on vectors of one number for each lane; places in memory are counted in such vectors."""
+    """Emitter of operations on vectors with one number for each lane; places in memory are counted in such vectors."""
 
-    constants: Value  # where numbers stand that all lanes have in common
+    constants: Value  # pointer to the numbers that all lanes share
 
     def __init__(self, builder: Builder, lanes: int = LANES):
         super().__init__(builder)
@@ -31,33 +31,33 @@ class LaneEmitter(Emitter):
         self.double, self.whole_number, self.bit = (vector_of(kind, lanes) for kind in (DOUBLE, INTEGER, BIT))
 
     def like(self, builder: Builder) -> "LaneEmitter":
-        """Make an emitter of as many lanes for another function."""
+        """Return an emitter with the same number of lanes for another function."""
         return LaneEmitter(builder, self.lanes)
 
     def splat(self, value: Value) -> Value:
-        """Return a number in all lanes."""
+        """Emit a vector with one number in all lanes."""
         if self.lanes == 1:
             return value
         vector = self.builder.insert(undefined(vector_of(value.type, self.lanes)), value, 0)
         return self.builder.first_everywhere(vector)
 
     def far(self, value: float) -> Value:
-        """Return a number in all lanes that is loaded where it is used."""
+        """Emit a vector with one number in all lanes that is loaded where it is used."""
         return self.splat(super().far(value))
 
     def known(self, number: float) -> Value:
-        """Return a number that is constant, or is read: for all lanes, or one for each."""
+        """Return a literal, or load a coefficient: one for all lanes, or one for each."""
         if not isinstance(number, Coefficient) or number.varies:
             return super().known(number)
         place = self.builder.gep(self.constants, integer(number.place))
         return self.splat(self.builder.load(place, constant=True))
 
     def number(self, whole: Value) -> Value:
-        """Convert an integer to a number."""
+        """Convert an integer to a vector with that number in all lanes."""
         return self.splat(super().number(whole))
 
     def pointer(self, base: Value, *places: Value | int) -> Value:
-        """Return a pointer some vectors further on."""
+        """Return a pointer advanced by a number of vectors."""
         for place in places:
             scaled = (
                 integer(place * self.lanes) if isinstance(place, int) else self.builder.mul(place, integer(self.lanes))
@@ -75,7 +75,7 @@ class LaneEmitter(Emitter):
         self.builder.store(value, self.builder.convert("bitcast", self.pointer(base, place), f"{self.double}*"))
 
     def function(self, name: str, x: Value) -> Value:
-        """Call a function of LLVM, of all lanes, or of libm, lane by lane."""
+        """Apply an LLVM intrinsic to all lanes at once, or a function of libm lane by lane."""
         if name in INTRINSICS:
             return super().function(name, x)
         made, one = undefined(self.double), Emitter(self.builder)
@@ -84,7 +84,7 @@ class LaneEmitter(Emitter):
         return made
 
     def largest_lane(self, x: Value) -> Value:
-        """Return the largest number of all lanes; LLVM's own reduction is sequential, for the sake of NaN."""
+        """Return the largest number of all lanes; LLVM's own reduction is sequential because of NaN."""
         width = self.lanes
         while width > 2:
             width //= 2
@@ -92,11 +92,11 @@ class LaneEmitter(Emitter):
         return x if width == 1 else self.larger(*(self.builder.extract(x, k) for k in (0, 1)))
 
     def largest_whole(self, x: Value) -> Value:
-        """Return the largest number of all lanes, which is whole, as an integer."""
+        """Return the largest of whole numbers in all lanes, as an integer."""
         return self.builder.convert("fptosi", self.largest_lane(x), INTEGER)
 
     def logarithm(self, x: Value) -> Value:
-        """Return log2 x to within 1e-4, of numbers that are not negative; below SMALLEST, that of SMALLEST."""
+        """Return log2 x to within 1e-4 for numbers that are not negative; below SMALLEST, the value at SMALLEST."""
         builder = self.builder
         bits = builder.convert("bitcast", self.larger(x, self.constant(SMALLEST)), self.whole_number)
         exponent = builder.sub(builder.operation("lshr", bits, self.whole(52)), self.whole(1023))
@@ -107,7 +107,7 @@ class LaneEmitter(Emitter):
         )
 
     def exponential(self, x: Value) -> Value:
-        """Return 2^x to a hundredth of a per cent."""
+        """Return 2^x to a relative error of 1e-4."""
         builder = self.builder
         x = self.larger(self.smaller(x, self.constant(LARGEST_POWER)), self.constant(-LARGEST_POWER))
         whole = self.function("rint", x)
@@ -119,31 +119,31 @@ class LaneEmitter(Emitter):
         )
 
     def smallest_of(self, a: Value, b: Value) -> Value:
-        """Return the smaller of two numbers; the first where one is NaN, which stays."""
+        """Return the smaller of two numbers; the first if one of them is NaN, so that a NaN in the first is kept."""
         return self.builder.select(self.builder.compare("fcmp ult", a, b), a, b)
 
     def largest_of(self, a: Value, b: Value) -> Value:
-        """Return the larger of two numbers; the first where it is NaN, which stays."""
+        """Return the larger of two numbers; the first if one of them is NaN, so that a NaN in the first is kept."""
         return self.builder.select(self.builder.compare("fcmp ugt", a, b), a, b)
 
 
 def place_of(emit: LaneEmitter, k: Value) -> Value:
-    """Return the place of vector k."""
+    """Return the index of vector k in memory, in numbers."""
     return emit.builder.mul(k, integer(STAGES))
 
 
 def load_lanes(emit: LaneEmitter, base: Value, place: int = 0) -> Value:
-    """Load a vector at a place, which is counted in numbers."""
+    """Load a vector at an index that counts numbers."""
     return Emitter(emit.builder).load_vector(base, place, STAGES)
 
 
 def store_lanes(emit: LaneEmitter, value: Value, base: Value, place: int = 0) -> None:
-    """Store a vector at a place."""
+    """Store a vector at an index that counts numbers."""
     Emitter(emit.builder).store_vector(value, base, place)
 
 
 def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
-    """Return the sums of the numbers of two vectors, which are added side by side."""
+    """Return the sum of the lanes of each of two vectors, computed side by side."""
     builder, half = emit.builder, STAGES // 2
     lower, upper = ([*range(k, k + half), *range(STAGES + k, STAGES + k + half)] for k in (0, half))
     total = emit.add(builder.shuffle(a, b, lower), builder.shuffle(a, b, upper))
@@ -153,7 +153,7 @@ def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
 
 
 def column(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value:
-    """Return one lane of each of some vectors, side by side."""
+    """Return a vector of one lane of each of some vectors."""
     builder, places = emit.builder, [lane, STAGES + lane]
     if len(vectors) == 1:
         return builder.extract(vectors[0], lane)
@@ -168,7 +168,7 @@ def column(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value:
 def over(
     emit: LaneEmitter, coordinates: Sequence[int], carried: Sequence[Value] = ()
 ) -> Iterator[tuple[Value, Value, list[Any], list[Any]]]:
-    """Loop over some coordinates: yield how many came before, which it is, and the values of `Emitter.loop`."""
+    """Loop over some coordinates: yield the count, the coordinate, and the carried values of `Emitter.loop`."""
     builder = emit.builder
     table = None if list(coordinates) == list(range(len(coordinates))) else builder.module.table(coordinates)
     with emit.loop(integer(0), integer(len(coordinates)), carried) as (k, values, new):

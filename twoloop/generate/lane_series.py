@@ -1,6 +1,6 @@
-"""The recurrences of a Taylor series as code for lanes: coefficients of one order from those of the orders below.
+"""Recurrences of a Taylor series as code for lanes: they compute the coefficients of one order from the lower ones.
 
-Factors of products stand in rows, one for each order; a factor that several products share stands there once.
+Factors of products are stored in rows, one row for each order; a factor that several products share is stored once.
 """
 
 from collections.abc import Sequence
@@ -25,12 +25,13 @@ from twoloop.kernels.evaluation.operations import (
 )
 from twoloop.kernels.lanes.layout import LANES
 
-ZEROS = -1  # the row before that of order 0
-AT_ONCE = 12 if LANES == 8 else 6  # sums in one loop: with more, what is carried does not stay in 32, or 16, registers
+ZEROS = -1  # index of a row of zeros, before the row of order 0
+# number of sums in one loop: of more, the running totals do not fit into 32 (or 16) registers
+AT_ONCE = 12 if LANES == 8 else 6
 
 
 class Operation(NamedTuple):
-    """Hold an operation of a series' program; sine and cosine are one, with two results."""
+    """Operation of a series' program; sine and cosine are one operation with two results."""
 
     kind: int
     results: tuple[int, ...]
@@ -39,10 +40,10 @@ class Operation(NamedTuple):
 
 
 class LaneSeries:
-    """Write the recurrences of a program.
+    """Generator of the code for the recurrences of a program.
 
-    `scratch` holds, lane vectors each: what the factors keep; r; the divisors of inverse functions; sums that are
-    carried to the next order; a row of zeros; and rows of factors of order 0, 1 and so on.
+    `scratch` holds, as lane vectors: the kept factors of the linear equations; r; the reciprocal divisors of inverse
+    functions; sums that are carried to the next order; a row of zeros; and one row of factors for each order from 0 on.
     """
 
     def __init__(self, program: SeriesProgram, solution: Solution, numbers: Coefficients, n: int, n_rows: int):
@@ -74,7 +75,7 @@ class LaneSeries:
 
     @property
     def structure(self) -> list[Any]:
-        """Return what the code depends on."""
+        """Return the data on which the code depends."""
         return [self.n, self.n_rows, self.early, self.late, self.rows, self.balance, self.slots]
 
     def _forms(self, sums: Sums, rows: Sequence[int]) -> list[tuple[Terms, float]]:
@@ -101,14 +102,14 @@ class LaneSeries:
         return made
 
     def _slot(self, *key: Any) -> int:
-        """Return the place in a row of a factor: a form, or ("scaled", form), which is multiplied by its order."""
+        """Return the index of a factor in a row: of a form, or of ("scaled", form), a form times its order."""
         return self.slots.setdefault(key, len(self.slots))
 
     def _shared_sums(self) -> dict[int, tuple[int, int]]:
-        """Find pairs of factors of sines by the result of a product of a cosine, or sine, and the rate of its angle.
+        """Map results of products to pairs of factors of sines: products of a cosine, or sine, and its angle's rate.
 
-        (cos x) x' is the derivative of sin x, so that what is known of the product's coefficient of one order is the
-        sum for the sine of the next, over the unit of time.
+        (cos x) x' is the derivative of sin x. So the part of the product's coefficient that is known before an order is
+        solved is the sum for the sine of the next order, divided by the unit of time.
         """
         pairs: dict[Any, tuple[int, int]] = {}
         for operation in self.early:
@@ -122,7 +123,7 @@ class LaneSeries:
         return {result: pair for result, pair in known.items() if pair is not None}
 
     def _factors(self, operation: Operation) -> list[tuple[int, int]]:
-        """Return the places of the factors X and Y of the products that are summed up for each result."""
+        """Return the indices of the factors X and Y of the product that is summed up for each result."""
         kind, results, first, second = operation
         if results[0] in self._carried:
             return []
@@ -139,7 +140,7 @@ class LaneSeries:
         return [(x, own[1]), (x, own[0])] if kind == SINE else [(x, own[0])]
 
     def begin(self, emit: LaneEmitter, inputs: Sequence[Value], scratch: Value) -> None:
-        """Write order 0, at t, q and v, for which the kept factors are there."""
+        """Write order 0 at t, q and v; the kept factors are in `scratch` already."""
         for place in (*range(self.r, self.divisors), *range(self.carried, self.table)):
             emit.store(emit.constant(0.0), scratch, place)
         row = _Row(self, emit, emit.pointer(scratch, self.table))
@@ -150,7 +151,7 @@ class LaneSeries:
             emit.store(known.sum(*form), scratch, self.r + place)
 
     def order(self, emit: LaneEmitter, k: Value, unit: Value, out: Value, scratch: Value) -> None:
-        """Write velocities of this order and positions of the next from the coefficients below."""
+        """Emit one order of the series: velocities of this order, positions of the next."""
         builder, n = emit.builder, self.n
         following = builder.add(k, integer(1))
         q = emit.pointer(out, builder.mul(k, integer(n)))
@@ -180,7 +181,7 @@ class LaneSeries:
         solution = self.solution
         _, (a, lam) = lower(emit, solution.solved, [*r, *c, *kept], self.numbers)
         per_v, per_q = emit.multiply(unit, inverse), emit.divide(unit, emit.number(following))
-        before = Quantities(emit, lambda i: zero)  # a and lam of the order before
+        before = Quantities(emit, lambda i: zero)  # a and lam of the previous order
         for j in range(n):
             v = emit.multiply(per_v, a[j])
             known.define(1 + n + j, v)
@@ -202,7 +203,7 @@ class LaneSeries:
     def _begin(
         self, emit: LaneEmitter, known: Quantities, operations: list[Operation], row: "_Row", scratch: Value
     ) -> None:
-        """Write order 0: the functions themselves; late factors are stored when they are known."""
+        """Write order 0, the values of the functions; factors of pending products are stored when they are known."""
         one, zero = emit.constant(1.0), emit.constant(0.0)
         for operation in operations:
             kind, results, first, second = operation
@@ -238,16 +239,16 @@ class LaneSeries:
                 row.store((((result, 1.0),), 0.0), value, "if used")
 
     def _sums(self, emit: LaneEmitter, scratch: Value, k: Value) -> dict[tuple[tuple[int, int], bool], Value]:
-        """Sum X[j] Y[k - j] over 1 < j < k for pairs of factors; for those ahead, X[j] Y[k + 1 - j].
+        """Sum X[j] Y[k - j] over 1 < j < k for pairs of factors; for the pairs in `sums_ahead`, sum X[j] Y[k + 1 - j].
 
-        What they miss is added when it is known: so all of them are in one loop, which waits for nothing of the order
-        before, and have the rows in common that they load.
+        The terms at the edges are added when they are known (see `_Edges`). So one loop computes several sums, does not
+        wait for the previous order, and loads each row once.
         """
         builder = emit.builder
         wanted = [(pair, True) for pair in self.sums_ahead]
         found = {pair for each in (*self.early, *self.late) for pair in self._factors(each)}
         wanted += [(pair, False) for pair in found - set(self.sums_ahead)]
-        wanted.sort(key=lambda each: each[0][::-1] if each[1] else each[0])  # by what has a row in common
+        wanted.sort(key=lambda each: each[0][::-1] if each[1] else each[0])  # neighbours in this order share a row
         sums: dict[tuple[tuple[int, int], bool], Value] = {}
         following = builder.add(k, integer(1))
         for begin in range(0, len(wanted), AT_ONCE):
@@ -276,7 +277,7 @@ class LaneSeries:
         order: Value,
         inverse: Value,
     ) -> None:
-        """Write an order that is not 0; of pending products, the part that is known before."""
+        """Write the operations for an order above 0; for pending products, the part that is already known."""
         pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
         sums = {}
         for pair in pairs:
@@ -325,31 +326,31 @@ class LaneSeries:
 
 
 class _Row:
-    """Hold factors of one order, stored where they are used."""
+    """Row of the factors of one order; a factor that was stored here is not loaded again."""
 
     def __init__(self, code: LaneSeries, emit: LaneEmitter, base: Value):
         self.code, self.emit, self.base = code, emit, base
         self._stored: dict[int, Value] = {}
 
     def store(self, key: Any, value: Value, when: str = "") -> None:
-        """Store a factor in its place; "if used": it may have none."""
+        """Store a factor at its index; "if used": only if it has one."""
         place = self.code.slots.get(tuple(key)) if when else self.code.slots[tuple(key)]
         if place is not None and place not in self._stored:
             self._stored[place] = value
             self.emit.store(value, self.base, place)
 
     def load(self, place: int) -> Value:
-        """Return the factor in a place."""
+        """Return the factor at an index."""
         return self._stored[place] if place in self._stored else self.emit.load(self.base, place)
 
 
 class _Edges(NamedTuple):
-    """Hold what the sums of an order k miss; `first` is the row of order 1, of zeros where k is 1 itself."""
+    """Terms that the sums of order k still lack; `first` is the row of order 1, or zeros if k is 1."""
 
     sums: dict[tuple[tuple[int, int], bool], Value]
     first: Value
     one: Value  # the row of order 1
-    before: _Row  # of order k - 1
+    before: _Row  # the row of order k - 1
 
     def now(self, pair: tuple[int, int]) -> Value:
         """Return the sum of X[j] Y[k - j] over 0 < j < k."""

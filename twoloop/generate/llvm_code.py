@@ -1,4 +1,4 @@
-"""Arithmetic on numbers in memory as LLVM code, for code generated for one mechanism.
+"""Emitter of arithmetic on numbers in memory as LLVM code, for code generated for one mechanism.
 
 Numba takes milliseconds for a line of source, and LLVM well below a millisecond for an operation. So a long list of
 operations goes to LLVM directly, as functions that kernels call at their addresses. Sine and cosine are written without
@@ -33,7 +33,7 @@ INTRINSICS = {name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqr
 
 
 class Emitter:
-    """Appends operations to a function of LLVM.
+    """Emitter that appends operations to an LLVM function.
 
     Operands are doubles or vectors of them. Places in memory are counted in doubles. `numbers` points to the
     coefficients that the code reads.
@@ -51,19 +51,19 @@ class Emitter:
         return type(self)(builder)
 
     def constant(self, value: float) -> Value:
-        """Return a number that stands in the code."""
+        """Return a literal number."""
         return constant(self.double, value)
 
     def far(self, value: float) -> Value:
-        """Return a number that is loaded where it is used."""
+        """Return a number that is loaded from memory where it is used."""
         return self.builder.far(value)
 
     def whole(self, value: int) -> Value:
-        """Return an integer that stands in the code, as wide as numbers."""
+        """Return a literal integer of the same width as the numbers."""
         return constant(self.whole_number, value)
 
     def known(self, number: float) -> Value:
-        """Return a number that stands in the code, or load a coefficient, which never changes."""
+        """Return a literal number, or load a coefficient; memory of coefficients never changes."""
         if not isinstance(number, Coefficient):
             return self.constant(number)
         return self.load(self.numbers, number.place, constant=True)
@@ -93,7 +93,7 @@ class Emitter:
         return self.builder.call(f"llvm.fma.{self.suffix}", a.type, [a, b, c])
 
     def polynomial(self, coefficients: Sequence[float], x: Value) -> Value:
-        """Evaluate a polynomial, its constant first; pairs of terms do not wait for one another."""
+        """Evaluate a polynomial, its constant first; pairs of terms are independent, so that they run side by side."""
         square, terms = self.builder.operation("fmul", x, x), [self.far(each) for each in coefficients]
         pairs = [self.fused(second, x, first) for first, second in zip(terms[::2], terms[1::2], strict=False)]
         pairs += terms[2 * len(pairs) :]
@@ -115,7 +115,7 @@ class Emitter:
         return self.builder.select(self.builder.compare("fcmp olt", a, b), a, b)
 
     def times(self, factor: float, a: Value) -> Value:
-        """Multiply by a number that stands in the code, or a coefficient."""
+        """Multiply by a literal, or by a coefficient loaded from memory."""
         if factor in (1.0, -1.0):
             return a if factor == 1.0 else self.negative(a)
         return self.multiply(self.known(factor), a)
@@ -125,22 +125,22 @@ class Emitter:
         return self.builder.convert("sitofp", whole, DOUBLE)
 
     def function(self, name: str, x: Value) -> Value:
-        """Call a function of libm, or its intrinsic."""
+        """Call a function of libm, or the LLVM intrinsic if there is one."""
         intrinsic = INTRINSICS.get(name)
         return self.builder.call(f"{intrinsic}.{self.suffix}" if intrinsic else name, x.type, [x])
 
     def pointer(self, base: Value, *places: Value | int) -> Value:
-        """Return a pointer some doubles further on."""
+        """Return a pointer advanced by a number of doubles."""
         for place in places:
             base = self.builder.gep(base, integer(place) if isinstance(place, int) else place)
         return base
 
     def load(self, base: Value, place: int = 0, constant: bool = False) -> Value:
-        """Load the number at a place; `constant`: it never changes."""
+        """Load the number at an index; `constant`: it never changes."""
         return self.builder.load(self.pointer(base, place), constant=constant)
 
     def store(self, value: Value, base: Value, place: int = 0) -> None:
-        """Store a number at a place."""
+        """Store a number at an index."""
         self.builder.store(value, self.pointer(base, place))
 
     def load_vector(self, base: Value, place: int, width: int) -> Value:
@@ -194,31 +194,31 @@ class Emitter:
 
 
 class Quantities:
-    """Values of numbered quantities, and sums of multiples of them; each is loaded, or summed, once.
+    """Values of numbered quantities, and linear combinations of them; each is loaded, or summed, once.
 
-    Each part of a divided function loads quantities again, as a number that waits in a register would be stored and
-    loaded, too. So memory from which they are loaded must not change.
+    Each part of a divided function loads quantities again: a number that waits for its use would be stored and loaded
+    by the compiler, too. So the memory from which they are loaded must not change.
 
     Parameters
     ----------
     emit : Emitter
     load : callable
-        Emits the value of a quantity that was not defined.
+        Emits the value of a quantity that is not defined.
     """
 
     def __init__(self, emit: Emitter, load: Callable[[int], Value]):
         self._emit, self._load = emit, load
         self._values: dict[int, Value] = {}
-        self._loaded: dict[int, Value] = {}  # in the part of a divided function that is being written
+        self._loaded: dict[int, Value] = {}  # loaded values in the part of a divided function that is being written
         self._part = emit.builder.part
         self._sums: dict[tuple[Terms, float], Value] = {}
 
     def define(self, quantity: int, value: Value) -> None:
-        """Give a quantity its value."""
+        """Define the value of a quantity."""
         self._values[quantity] = value
 
     def value(self, quantity: int) -> Value:
-        """Return a value that was defined, or load it."""
+        """Return the value of a quantity: defined, or else loaded."""
         if quantity in self._values:
             return self._values[quantity]
         loaded = self._here()
@@ -227,11 +227,11 @@ class Quantities:
         return loaded[quantity]
 
     def stored(self, quantity: int) -> None:
-        """Forget a value that can be loaded from now on."""
+        """Drop the value of a quantity that was stored, so that later parts load it."""
         self._here()[quantity] = self._values.pop(quantity)
 
     def _here(self) -> dict[int, Value]:
-        """Return what was loaded in this part."""
+        """Return the values loaded in this part of the function."""
         if self._part != self._emit.builder.part:
             self._part, self._loaded = self._emit.builder.part, {}
         return self._loaded
@@ -245,7 +245,7 @@ class Quantities:
         if key not in self._sums:
             total: Any = None if constant == 0.0 and terms else self._emit.known(constant)
             half = len(terms) // 2 if len(terms) >= LONG else 0
-            if half:  # two chains of additions, which do not wait for one another
+            if half:  # two independent chains of additions run side by side
                 self._sums[key] = self._emit.apart(self.sum(terms[:half], constant), self.sum(terms[half:]))
                 return self._sums[key]
             for quantity, coefficient in terms:
@@ -267,14 +267,14 @@ def write(
     emit: Callable[..., Any],
     emitter: Callable[..., Emitter] = Emitter,
 ) -> None:
-    """Write a function into a module: emit(emitter, *arguments) its code, `kind` the types of result and arguments."""
+    """Write a function into a module: `emit` writes its body, `kind` has the types of its result and arguments."""
     builder = module.function(name, *kind)
     builder.ret(emit(emitter(builder), *builder.arguments))
 
 
 # sine and cosine on [-pi/4, pi/4]: coefficients of x^3, x^5, ... and of x^4, x^6, ... by S. Moshier's Cephes library,
 # sin.c; an angle is reduced by multiples of pi/2, which is the sum of two numbers
-LARGEST_ANGLE = 1e6  # beyond, the sum is not enough
+LARGEST_ANGLE = 1e6  # largest angle, rad: beyond, the two numbers of pi/2 are not exact enough
 HALF_PI = (1.5707963267948966, 6.123233995736766e-17)
 SINES = (
     -1.66666666666666307295e-1,
@@ -295,7 +295,7 @@ COSINES = (
 
 
 def sine_and_cosine(emit: Emitter, x: Value) -> tuple[Value, Value]:
-    """Return sine and cosine, correct to rounding for angles up to LARGEST_ANGLE."""
+    """Emit sine and cosine, correct to rounding for angles up to LARGEST_ANGLE."""
     builder, whole = emit.builder, emit.whole
     turns = emit.function("rint", builder.operation("fmul", x, emit.far(1.0 / HALF_PI[0])))
     rest = x

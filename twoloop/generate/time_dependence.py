@@ -1,4 +1,4 @@
-"""Decide from traces whether callbacks may change suddenly, or much over a short way."""
+"""Decide from traces whether callbacks may change suddenly, or much over a short distance."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -23,39 +23,41 @@ from twoloop.kernels.evaluation.operations import (
 )
 from twoloop.problem.system import ConstrainedSystem
 
-BY_TIME = ("force", "constraint_rate", "nonholonomic_rate")  # callbacks whose changes with time matter ...
-BY_STATE = ("force", "mass", "constraint", "jacobian", "nonholonomic")  # ... and with the state
-SMOOTH = (PRODUCT, SUM, SINE, COSINE)  # polynomials and vibrations, which are never sudden ...
+BY_TIME = ("force", "constraint_rate", "nonholonomic_rate")  # callbacks whose dependence on time matters ...
+BY_STATE = ("force", "mass", "constraint", "jacobian", "nonholonomic")  # ... and on the state
+SMOOTH = (PRODUCT, SUM, SINE, COSINE)  # polynomials and vibrations are never sudden ...
 HIGHEST = 8  # ... up to this degree: a high power of a cosine is a pulse
-HIGHEST_OF_STATE = 32  # degree in q and v up to which changes are noticed from afar; so are roots, but not exp ...
-HIGHEST_INVERSE = 4  # ... and quotients up to this degree ...
-SLOWEST = -2.0  # ... that fall off no faster than this power: 1 / (1 + (x / w)**2), not its square
+# degree in q and v up to which steps notice a change before they meet it; likewise for roots, but not for exp ...
+HIGHEST_OF_STATE = 32
+HIGHEST_INVERSE = 4  # ... and for quotients up to this degree ...
+SLOWEST = -2.0  # ... if they decay no faster than this power: 1 / (1 + (x / w)**2), but not its square
 FASTEST = 4.0  # radians of a vibration per unit of a coordinate or speed, up to which long steps resolve it
-LARGEST = 300  # coordinates; to trace more takes up to seconds, and sampling forces in a run a tenth of that
-TIME = 1  # bit of t, the first input of a graph
+# largest number of coordinates: tracing more takes up to seconds; sampling forces in a run takes a tenth of that
+LARGEST = 300
+TIME = 1  # bit mask of t, the first input of a graph
 
 
 class Sudden(NamedTuple):
-    """Whether a force or drive may act for a short time: at some times, and at some places or speeds."""
+    """Whether forces or drives may act for a short time: at some times, or at some positions or speeds."""
 
     by_time: bool
     by_state: bool
 
 
 class Dependence(NamedTuple):
-    """How the callbacks that some systems share depend on time and state."""
+    """Dependence on time and state of the callbacks that several systems share."""
 
     sudden: Sudden
     narrow: bool  # see `may_be_narrow`
     kinds: frozenset[str]  # kinds of callbacks that were traced
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Dependence":
-        """Return the dependence of one of the systems, which is the same."""
+        """Return the dependence of one of these systems: it does not depend on parameters."""
         return self
 
 
 def may_be_sudden(system: ConstrainedSystem, ran_on_symbols: bool) -> Sudden:
-    """Return whether forces, C_t or b may act for a short time; what cannot be traced may.
+    """Return whether forces, C_t or b may act for a short time; callbacks that cannot be traced may.
 
     Functions called in Python are traced only if the force was before: they may keep their arguments.
     """
@@ -66,10 +68,10 @@ def may_be_sudden(system: ConstrainedSystem, ran_on_symbols: bool) -> Sudden:
 
 
 def may_be_narrow(system: ConstrainedSystem, ran_on_symbols: bool) -> bool:
-    """Return whether callbacks may change much over a short way, though not suddenly.
+    """Return whether forces may change over a distance shorter than a step, though not suddenly.
 
-    Quotients and roots of the state may: 1 / (1 + (x / w)**2) is noticed from afar, but not resolved by long steps. The
-    stages of long steps may meet a fast vibration at like phases.
+    Quotients and roots of the state may: a step notices 1 / (1 + (x / w)**2) before it meets it, but long steps may
+    step over its peak. The stages of a long step may sample a fast vibration at like phases.
     """
     if any(may_be_sudden(system, ran_on_symbols)):
         return True
@@ -105,7 +107,7 @@ def _analyse(system: ConstrainedSystem) -> Any:
 
 
 class Degrees(Algebra[float]):
-    """Degrees of polynomials in some inputs; other inputs are constants."""
+    """Algebra of degrees: the degree of each quantity in some inputs; other inputs are constants."""
 
     functions: Mapping[int, Callable[[float], float]] = MappingProxyType(
         {
@@ -119,7 +121,7 @@ class Degrees(Algebra[float]):
         self.values = dict.fromkeys(inputs, 1.0)
 
     def affine(self, expression: Affine) -> float:
-        """Return the largest degree of the terms."""
+        """Return the largest degree of the terms of a sum."""
         return max((self.values.get(i, 0.0) for i in expression.terms), default=0.0)
 
     def product(self, a: float, b: float) -> float:
@@ -128,7 +130,7 @@ class Degrees(Algebra[float]):
 
 
 class Vibrations(Degrees):
-    """Degrees in sines and cosines, whose high powers are flat between pulses."""
+    """Algebra of degrees in sines and cosines, whose high powers are flat between pulses."""
 
     functions = MappingProxyType(
         {**Degrees.functions, **dict.fromkeys((SINE, COSINE), lambda degree: max(degree, 1.0))}
@@ -136,7 +138,7 @@ class Vibrations(Degrees):
 
 
 class Growth(Degrees):
-    """Powers by which quantities grow far away: negative for reciprocals, zero for vibrations."""
+    """Algebra of growth: powers by which quantities grow far away; negative for reciprocals, zero for vibrations."""
 
     functions = MappingProxyType(
         {
@@ -148,22 +150,22 @@ class Growth(Degrees):
 
 
 class Divisors(Degrees):
-    """The highest degrees of what is divided by; the slope of an arctangent is a quotient."""
+    """Algebra of divisors: their highest degree in each quantity; an arctangent counts, as its slope is a quotient."""
 
     def __init__(self, degrees: Degrees):
         super().__init__()
         self._degrees = degrees
 
     def operation(self, kind: int, first: Affine, second: Affine | None) -> float:
-        """Return the highest degree of the divisors of a result."""
+        """Return the highest degree of the divisors of an operation's result."""
         degree = super().operation(kind, first, second)
         return degree + self._degrees.affine(first) if kind in (RECIPROCAL, ARCTANGENT) else degree
 
 
 class Rates(Degrees):
-    """How many times faster than a coordinate or a speed quantities change at most.
+    """Algebra of rates: how many times faster than a coordinate or a speed each quantity changes at most.
 
-    How fast a multiple of a coordinate by a parameter changes is not known.
+    The rate of a coordinate times a parameter is infinite, as the parameter may have any value.
     """
 
     def affine(self, expression: Affine) -> float:
@@ -179,7 +181,7 @@ class Rates(Degrees):
 
 def _by_time(graph: Graph, needed: list[int]) -> bool:
     depending = [i for i in needed if graph.inputs_of[i] & TIME]
-    degrees = Degrees([0])  # in time, or in vibrations with it
+    degrees = Degrees([0])  # degrees in time, or in vibrations with time
     degrees.run(graph, depending)
     return any(graph.kind(i) not in SMOOTH or degrees.values[i] > HIGHEST for i in depending)
 
@@ -202,7 +204,7 @@ def _by_state(graph: Graph, needed: list[int], n_q: int) -> bool:
 
 
 def _is_narrow(graph: Graph, needed: list[int]) -> bool:
-    """Return whether a quantity is a quotient or a root, a vibration with time, or a fast one with the state."""
+    """Return whether a quantity is a quotient or a root, a vibration in time, or a fast vibration in the state."""
     if any(graph.kind(i) not in SMOOTH for i in needed):
         return True
     rates = Rates()

@@ -1,8 +1,8 @@
 """Compare traced callbacks in numbers with what they return when they are called.
 
-A trace is wrong if the callback branches undetected, keeps something from call to call, or reads what changes beside
-its arguments (a global that numba froze when it compiled it). At the start both are compared at states spread over the
-time of the run and about its start, later at states of the run itself.
+A trace is wrong if the callback branches undetected, keeps something from call to call, or reads data that change and
+are not its arguments (a global that numba froze when it compiled it). Before a run, both are compared at states near
+the start and at times spread over the run; later at states of the run itself.
 """
 
 import copy
@@ -28,22 +28,23 @@ KINDS = (
     *("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma"),
     *("nonholonomic", "nonholonomic_rate", "nonholonomic_gamma"),
 )
-AROUND = 8  # states about the start, beside it
+AROUND = 8  # number of random states near the start at which traces are compared, beside the start
 TIMES = np.linspace(0.0, 1.0, AROUND)  # their times, as shares of the run
 AWAY = 0.3  # their distance from the start, as a share of the size of coordinates
-EACH, MOST = 32, 64  # largest numbers of states of a part of a run, and of a run ...
+EACH, MOST = 32, 64  # largest number of states of a chunk of a run, and of a whole run ...
 FEW = 9  # ... and of a run whose callbacks are called in Python
 ENTRIES = 20_000  # entries of callbacks compared in a run, about: large systems are compared at fewer states
-LOST = 16.0 * np.finfo(float).eps  # of the largest term of a kind: a smaller difference is rounding
-CLEAR = 1e-6  # of the largest term: a smaller difference counts only if it is the same at neighbouring states, ...
+LOST = 16.0 * np.finfo(float).eps  # relative to the largest term of a kind: a smaller difference is rounding
+# relative to the largest term: a smaller difference counts only if it is the same at neighbouring states, ...
+CLEAR = 1e-6
 NEXT = 1e-7  # ... which differ by this relative change
 NEIGHBOURS = 12
 MARGIN = 0.01  # margin of a CheckedRegion, as a share of its sides: states of a run lie farther apart
-AT_REST = 1e-9  # the same, as a share of its longest side without that of time: for coordinates at rest
+AT_REST = 1e-9  # margin relative to the longest side (time excluded): for coordinates at rest
 
 
 class Traced:
-    """Traced callbacks as an operation table, to be compared with calls.
+    """Traced callbacks as an operation table, to be compared with calls of the callbacks.
 
     Parameters
     ----------
@@ -51,7 +52,7 @@ class Traced:
     graph : Graph
         The graph of the trace, whose first inputs are t, q and v.
     forms : mapping or None
-        What callbacks must return, by their kinds. None: the traces of those that are given.
+        Results of the callbacks as traced, by kind. None: the traces of the callbacks that the system has.
     """
 
     def __init__(self, system: ConstrainedSystem, graph: Graph, forms: Mapping[str, Any] | None = None):
@@ -66,34 +67,35 @@ class Traced:
         self.kinds = frozenset(graph.traced)  # kinds that were traced
         self.trusted = False
         entries = (forms[kind][place] for kind, place in self.places)
-        results = {k: form for k, form in enumerate(entries) if form.terms or form.constant}  # others are zero
+        # omit entries that are always zero
+        results = {k: form for k, form in enumerate(entries) if form.terms or form.constant}
         self.not_zero = frozenset(self.places[k][0] for k in results)  # kinds of callbacks that are not all zero
         self.program = OperationTable.of(graph, 1 + 2 * system.n_q, results)
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Traced":
-        """Return the traces of another system of the same cache."""
+        """Return the traces of another system of the same cache, with the numbers of its parameters."""
         traced = self.with_numbers(evaluate)
         traced.name = system.name
         return traced
 
     def with_numbers(self, numbers_for: Callable[[Any], Array]) -> "Traced":
-        """Return the traces with other arrays of numbers, not yet trusted."""
+        """Return a copy with other numbers in the operation table; it is not trusted yet."""
         traced = copy.copy(self)
         traced.program = self.program.with_numbers(numbers_for)
         traced.trusted = False
         return traced
 
     def refuse(self, system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:
-        """Compare at states about the start of a run, see `refuse_wrong`."""
+        """Compare calls and traces at states near the start of a run, see `refuse_wrong`."""
         refuse_wrong([self], system, t0, t1, q, v)
 
     def check_around(self, system: ConstrainedSystem, around: Array) -> None:
-        """Compare at states, of which the first is the start; raise Untraceable at a difference."""
+        """Compare calls and traces at states whose first row is the start; raise Untraceable if they differ."""
         wrong = None
-        for states in (around, *around[:, None, :]):  # all at once, or one by one if a call raises
+        for states in (around, *around[:, None, :]):  # all at once; one by one if a call raises
             try:
                 wrong = wrong or self.wrong(system, states, everywhere=False)
-            except Exception:  # outside the domain of the callbacks
+            except Exception:  # the state is outside the domain of the callbacks
                 continue
             if states is around:
                 break
@@ -104,7 +106,7 @@ class Traced:
     def wrong(self, system: ConstrainedSystem, states: Array, everywhere: bool = True) -> str | None:
         """Describe the first difference between calls and traces at states [t, q, v]; None if there is none.
 
-        `everywhere`: values that are not finite must agree, too.
+        `everywhere`: states at which a call is not finite count, too: the trace must not be finite there either.
         """
         from twoloop.kernels.evaluation import traced as kernels
 
@@ -123,7 +125,8 @@ class Traced:
         else:
             same |= ~finite
         largest = np.where(np.isfinite(bounds), bounds, 0.0).max(axis=0)
-        size = np.repeat(np.maximum.reduceat(largest, np.cumsum(self.n_of) - self.n_of), self.n_of)  # by kind
+        # the largest term of the kind of each entry
+        size = np.repeat(np.maximum.reduceat(largest, np.cumsum(self.n_of) - self.n_of), self.n_of)
         for k, entry in np.argwhere(~same & ~(off <= LOST * size)):
             if not off[k, entry] <= CLEAR * size[entry] or self._stays(system, states[k], int(entry)):
                 return self._message(states[k], int(entry), called[k, entry], traced[k, entry])
@@ -147,7 +150,7 @@ class Traced:
         return n_different, called, traced, bounds
 
     def _stays(self, system: ConstrainedSystem, state: Array, entry: int) -> bool:
-        """Return whether a difference is about the same at neighbouring states, unlike rounding."""
+        """Return whether a difference is about the same at neighbouring states; rounding errors are not."""
         parts = np.random.default_rng(5).uniform(-1.0, 1.0, (NEIGHBOURS, len(state)))
         _, called, traced, _ = self._evaluate(system, state * (1.0 + NEXT * parts))
         off = (called - traced)[:, entry]
@@ -165,14 +168,14 @@ class Traced:
 
 
 class Sample:
-    """Some states [t, q, v] of a run, from its start to its present time."""
+    """A sample of the states [t, q, v] of a run, from its start to its present time."""
 
     def __init__(self, t: float, state: Array, n: int) -> None:
         self._n, self._parts = n, list[Array]()
         self.add(state[:0], state[None, :][:0], t, state)
 
     def add(self, t: Array, rows: Array, end: float, state: Array) -> None:
-        """Take states of a part of the run, whose rows begin with [q, v], and its last state."""
+        """Add states of a chunk of the run, whose rows begin with [q, v], and its last state."""
         stride = 1 + len(t) // EACH
         some = t[::stride]
         part = np.empty((len(some) + 1, 1 + self._n))
@@ -183,23 +186,23 @@ class Sample:
             self._parts = self._parts[::2]
 
     def end(self, t: float, state: Array) -> None:
-        """Drop states beyond a time, and take the state there."""
+        """Drop states after a time, and add the state at that time."""
         states = self.states()
         self._parts = [states[states[:, 0] <= t]]
         self.add(states[:0, 0], states[:0], t, state)
 
     def states(self) -> Array:
-        """Return all states, the last first."""
+        """Return all states, the latest first."""
         return np.concatenate(self._parts)
 
 
 def refuse_wrong(traced: Sequence[Traced], system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:
-    """Compare traces that are not trusted yet at states about the start, spread over the time of a run.
+    """Compare traces that are not trusted yet with calls, at states near the start and at times spread over the run.
 
     Raises
     ------
     Untraceable
-        Naming a callback and an entry.
+        If a trace is wrong; the message names the callback and the entry.
     """
     new = [each for each in traced if not each.trusted]
     if not new:
@@ -215,11 +218,11 @@ Check = Callable[[Traced], None]
 
 
 def unchecked(traced: Traced) -> None:
-    """Accept traces whose results are not used in a run."""
+    """Accept traces without a comparison, as no run uses their results."""
 
 
 def states_around(t0: float, t1: float, q: Array, v: Array) -> Array:
-    """Return a start [t, q, v], and states about it at times of a run, whose speeds are at least a size a second."""
+    """Return the start [t, q, v], and random states near it at times spread over the run."""
     size = sizes(q)
     speed = np.maximum(size, np.abs(v))
     n, parts = len(q), _parts(len(q))
@@ -233,33 +236,33 @@ def states_around(t0: float, t1: float, q: Array, v: Array) -> Array:
 
 @cache
 def _parts(n_q: int) -> Array:
-    """Return fixed numbers between -1 and 1, (2, AROUND, n_q)."""
+    """Return fixed random numbers between -1 and 1, (2, AROUND, n_q)."""
     return np.random.default_rng(6).uniform(-1.0, 1.0, (2, AROUND, n_q))
 
 
 def farthest(t: Array, rows: Array) -> Array:
-    """Return the states [t, q, v] of a run at which a number is smallest or largest, from rows [q, v]."""
+    """Return the states [t, q, v] of a run at which a component is smallest or largest; `rows` are [q, v]."""
     states = np.column_stack([t, rows])
     return states[np.unique([states.argmin(axis=0), states.argmax(axis=0)])]
 
 
 class CheckedRegion:
-    """The region of [t, q, v], and of parameters, in which runs compared callbacks with their traces: two boxes.
+    """Region of [t, q, v] and of parameters in which callbacks agreed with their traces: two boxes.
 
     Attributes
     ----------
     known : ndarray (2, 1 + 2 n_q) or (2, 0)
-        The least and the largest numbers of states that need no new comparison.
+        Least and largest components of the states that need no new comparison.
     """
 
     def __init__(self) -> None:
         self._runs = 0
-        self._parameters: tuple[Array, Array] | None = None  # the least and the largest, of runs of many systems
-        self._box = np.zeros((2, 0))  # the least and the largest of each number
+        self._parameters: tuple[Array, Array] | None = None  # least and largest parameters of runs of many systems
+        self._box = np.zeros((2, 0))  # least and largest value of each component
         self.known = self._box
 
     def is_due(self) -> bool:
-        """Return whether the next run must compare everywhere: the 1st, 2nd, 4th, 8th, ..."""
+        """Return whether the next run must compare at all its states; it is for the runs 1, 2, 4, 8, ..."""
         return (self._runs + 1) & self._runs == 0
 
     def count(self) -> None:

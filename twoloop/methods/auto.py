@@ -1,4 +1,4 @@
-"""Auto(...): the default method, which chooses others and goes from one to the other."""
+"""Auto(...): the default method, which chooses a method for the system and switches during a run."""
 
 from dataclasses import dataclass, replace
 
@@ -13,33 +13,37 @@ from twoloop.methods.plan import Method, Plan, kept_plan, least_tolerance
 from twoloop.methods.taylor import Taylor
 from twoloop.problem.system import ConstrainedSystem
 
-MANY = 16  # coordinates from which on evaluations cost more than the algebra of Adams' method ...
-CONSTRAINED = 0.25  # ... if there are no more constraints than this share of them, as a projection costs more ...
-TIGHT_MANY = 1e-10  # ... or the tolerance is below this ...
-VERY_MANY = 64  # ... or there are so many coordinates
-HUGE = 1000  # coordinates above which Newton's method, whose matrices are full, is not tried
-LONG_STEPS = 1e-9  # tolerance whose rule holds at looser ones, too, for runs of few steps
-SERIES = 1e-6  # tolerance from which down a Taylor series costs less than DOP853 ...
-INVOLVED = 12  # ... up to so many operations a coordinate ...
-SIMPLE = 8  # ... or so many with fewer than FEW coordinates; with MANY at any tolerance up to so many
+MANY = 16  # number of coordinates from which on evaluations cost more than the algebra of Adams' method ...
+# ... unless the constraints are more than this share of them, because a projection then costs more ...
+CONSTRAINED = 0.25
+TIGHT_MANY = 1e-10  # ... or for tolerances below this ...
+VERY_MANY = 64  # ... or for this number of coordinates or more, in any case
+HUGE = 1000  # number of coordinates above which Newton's method, whose matrices are full, is not tried
+LONG_STEPS = 1e-9  # the rule for this tolerance also holds at looser ones, for runs of few steps
+SERIES = 1e-6  # tolerance below which a Taylor series costs less than DOP853 ...
+INVOLVED = 12  # ... with up to this number of operations for each coordinate ...
+# ... or, with fewer than FEW coordinates, up to this number; it also holds with MANY coordinates at any tolerance
+SIMPLE = 8
 FEW = 5
-SERIES_OF_MANY = 1e-8  # the same of MANY coordinates with code made for the mechanism
-LOOSE = 3e-5  # tolerance from which on stiff motion is integrated to few digits ...
-TIGHTEST = 9e-7  # ... and from which down to many
+SERIES_OF_MANY = 1e-8  # as SERIES, for MANY coordinates with generated code
+LOOSE = 3e-5  # tolerance from which on stiff motion is integrated by the method for few digits ...
+TIGHTEST = 9e-7  # ... and below which by the method for many digits
 LIMIT_FEW, LIMIT_MANY = 4.0, 0.25  # h rho from which on stiffness may limit DOP853 (stable to 5.9) and Adams
-LIMIT_FEW_OF_MANY = 2.0  # the same of DOP853 for MANY coordinates
-LOOKS_FEW = 2  # in a row, as accuracy may allow long steps for a while; those of Adams are too short for that
-LIMIT_SERIES = 0.3  # times the order: the same of a series, stable to 0.42 (a decay) to 0.6 times its order
-DEARER = 4.0  # evaluations by code made for the mechanism that one without costs, about ...
-DEARER_HEAVY, HEAVY = 2.0, 17  # ... or, from so many operations of the callbacks a coordinate on, as these cost both
-MATRIX_COST = 3.0  # of a Newton matrix for few coordinates, in evaluations; and one more for every eight of them
+LIMIT_FEW_OF_MANY = 2.0  # the same of DOP853 with MANY coordinates
+LOOKS_FEW = 2  # estimates in a row: accuracy may allow long steps for a while; steps of Adams are too short for that
+# times the order: the same of a series, whose limit of stability is 0.42 (decay) to 0.6 times its order
+LIMIT_SERIES = 0.3
+DEARER = 4.0  # cost of an evaluation without generated code, in evaluations with it, estimated ...
+# ... and from HEAVY operations of callbacks for each coordinate on, as these cost both of them
+DEARER_HEAVY, HEAVY = 2.0, 17
+MATRIX_COST = 3.0  # cost of a Newton matrix for few coordinates, in evaluations; plus one for every eight coordinates
 
 
 def switching(first: Plan, second: Plan, limit: float, n_q: int, looks: int = 1, dearer: float = 1.0) -> Plan:
-    """Return the plan that goes from `first`, explicit or by fixed point, to `second`, Newton's method, and back.
+    """Return the plan that switches from `first`, explicit or by fixed point, to `second`, Newton's method, and back.
 
-    `limit`: h rho, rho being the largest rate of the motion, from which on `second` is tried, if it is found at so many
-    `looks` in a row. `dearer`: what an evaluation of `second` costs, in those of `first`.
+    `limit`: value of h rho (rho: largest rate of the motion) from which on `second` is tried, if `looks` estimates in a
+    row exceed it. `dearer`: cost of an evaluation of `second`, in evaluations of `first`.
     """
     from twoloop.kernels.control import stiffness as kernels
 
@@ -60,7 +64,7 @@ def switching(first: Plan, second: Plan, limit: float, n_q: int, looks: int = 1,
 
 
 def with_matrix_cost(plan: Plan, cost: float) -> Plan:
-    """Return a plan of `switching` for which a Newton matrix costs so many evaluations."""
+    """Return a copy of a plan of `switching` with another cost of a Newton matrix, in evaluations."""
     from twoloop.kernels.control import stiffness as kernels
 
     options = plan.options.copy()
@@ -136,10 +140,13 @@ class Auto:
     tightest: Method
     fixed: Method
     lanes: Lobatto16 | None = None
-    n_rows: int = 0  # constraints of the system; solve_dae says so
-    dearer: float | None = None  # what an evaluation without code costs, in those by code; None: there is no code
-    sparse: bool = False  # whether it gives the values of entries: an evaluation then costs no more than a projection
-    narrow: bool = True  # whether forces may change much over a short way, so that no method may take longer steps
+    n_rows: int = 0  # number of constraints; solve_dae sets it
+    # cost of an evaluation without generated code, in evaluations with it; None: there is no code
+    dearer: float | None = None
+    # whether the system gives its matrices by entries: an evaluation then costs no more than a projection
+    sparse: bool = False
+    # whether forces may change much over a short distance, so that every method must limit its steps
+    narrow: bool = True
 
     @property
     def name(self) -> str:
@@ -148,13 +155,13 @@ class Auto:
 
     @property
     def tested(self) -> str:
-        """Return what the error estimate of implicit steps is taken over."""
+        """Return the quantities that the error estimate of implicit steps counts."""
         return "positions"
 
     def for_system(
         self, system: ConstrainedSystem, code: GeneratedCode | None = None, check: Check = unchecked
     ) -> "Auto":
-        """Return the method for a system, without `series` if its operations are not known, or not reliable."""
+        """Return the method for a system; without `series` if its operations are unknown or unreliable."""
         sparse = len(system.entries) == 2 and system.n_a == 0
         chosen = replace(self, n_rows=system.n_c + system.n_a, series=None, lanes=None, sparse=sparse)
         if code is not None:
@@ -174,7 +181,7 @@ class Auto:
         """Return whether a step of the series costs less than the steps that it replaces."""
         assert self.series is not None and self.series.program is not None
         operations = self.series.program.n_operations / n_q
-        if self.dearer is not None:  # near singular positions, to which it comes then, a series is more exact
+        if self.dearer is not None:  # the series runs only near singular positions, where it is more exact
             return tolerance < (SERIES if n_q < MANY else SERIES_OF_MANY)
         if tolerance < SERIES:
             return operations <= (INVOLVED if n_q >= FEW else SIMPLE)
@@ -182,10 +189,10 @@ class Auto:
 
     def takes_code(self, fixed: bool) -> bool:
         """Return whether its steps may run with generated code."""
-        return not fixed  # by which it is implicit
+        return not fixed  # fixed steps are implicit
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Make the method ready for a run of n_q coordinates."""
+        """Return the plan of the method for a run of n_q coordinates."""
         if fixed:
             return self.fixed.plan(n_q, rtol, atol, True)
         others = self._others(n_q, rtol, atol)
@@ -196,7 +203,7 @@ class Auto:
         return plan.changed(substitute=others, traced=traced, within_newton=others.within_newton)
 
     def _others(self, n_q: int, rtol: float, atol: float) -> Plan:
-        """Return the plan of steps one at a time."""
+        """Return the plan without collocation in lanes: one evaluation at a time."""
         tolerance = least_tolerance(rtol, atol)
         implicit = self.loose if tolerance >= LOOSE else self.tight if tolerance >= TIGHTEST else self.tightest
         second = kept_plan(implicit, n_q, rtol, atol)
@@ -205,7 +212,7 @@ class Auto:
             return self._explicit(n_q, rtol, atol, second, dearer)
         pays = self._series_pays(n_q, tolerance)
         explicit = self._explicit(n_q, rtol, atol, second, dearer)
-        # at looser tolerances as well where steps are long: most others may not be longer than a hundredth of the run
+        # at looser tolerances as well if steps are long: most other methods are limited to a hundredth of the run
         stages_suffice = explicit.unseen < 1.0 and not self.narrow
         if not pays and (stages_suffice or not self._series_pays(n_q, LONG_STEPS)):
             return explicit
@@ -214,12 +221,12 @@ class Auto:
         return chosen.changed(substitute=explicit, provisional=not pays)
 
     def _explicit(self, n_q: int, rtol: float, atol: float, second: Plan, dearer: float) -> Plan:
-        """Return the plan without a series."""
+        """Return the plan of the explicit method and its switch to Newton's method, without a series."""
         many = n_q >= VERY_MANY and not self.sparse
         if n_q >= MANY and self.dearer is None:
             many = many or self.n_rows <= CONSTRAINED * n_q or least_tolerance(rtol, atol) < TIGHT_MANY
         explicit, limit, looks = (self.many, LIMIT_MANY, 1) if many else (self.few, LIMIT_FEW, LOOKS_FEW)
-        if explicit is self.few and n_q >= MANY:  # whose evaluations cost more than a trial
+        if explicit is self.few and n_q >= MANY:  # here evaluations cost more than a trial
             limit, looks = LIMIT_FEW_OF_MANY, 1
         if n_q > HUGE:
             return explicit.plan(n_q, rtol, atol, False)
@@ -227,7 +234,7 @@ class Auto:
 
 
 def _dearer(system: ConstrainedSystem) -> float:
-    """Return the cost of an implicit method's evaluation, in evaluations by generated code."""
+    """Return the cost of an evaluation of the implicit method, in evaluations of generated code."""
     try:
         return DEARER_HEAVY if series_for(system).n_operations >= HEAVY * system.n_q else DEARER
     except Untraceable:

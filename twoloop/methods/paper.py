@@ -1,4 +1,4 @@
-"""Methods of the paper: Newmark and BDF in the two-loop procedure, and its two procedures to the letter."""
+"""Methods of the paper: Newmark and BDF in the two-loop procedure, and its two procedures exactly as printed."""
 
 from dataclasses import dataclass
 
@@ -9,8 +9,9 @@ from twoloop.methods.plan import INNER_TOL, Plan, check_tolerances, outer_tolera
 from twoloop.methods.runge_kutta import RungeKutta
 from twoloop.methods.tableaux import gauss, sun_radau_iib
 
-NO_ESTIMATE = 0.02  # of |beta - 1/6|, below which Newmark's estimate sees no error
-OUTER_SHARE_OF_ERROR = 1e-3  # of err_out; its fixed-point iterations converge so fast that this costs next to nothing
+NO_ESTIMATE = 0.02  # smallest |beta - 1/6|: below, Newmark's error estimate is too close to zero
+# outer tolerance relative to err_out; the fixed-point iterations converge so fast that this costs next to nothing
+OUTER_SHARE_OF_ERROR = 1e-3
 
 
 @dataclass(frozen=True)
@@ -20,8 +21,8 @@ class Newmark:
     Parameters
     ----------
     beta, gamma : float
-        Parameters of (12), in which beta = 1/4 is the average-acceleration method. Other gamma than 1/2, and beta
-        near 1/6, for which the error estimate vanishes, go with fixed steps only.
+        Parameters of (12), in which beta = 1/4 is the average-acceleration method. Fixed steps only: gamma other than
+        1/2, and beta near 1/6, where the error estimate vanishes.
     error_tol : float, optional
         err_out of the paper: a step is accepted when e = |beta - 1/6| h^2 ||a_{n+1} - a_n||_2 is at most this, and the
         error of a run goes with error_tol^(2/3); steps are shortened to end at output times. None: when the largest
@@ -70,7 +71,7 @@ class Newmark:
         return f"Newmark(beta={self.beta:g}, gamma={self.gamma:g})"
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Make the method ready for a run of n_q coordinates."""
+        """Return the plan of the method for a run of n_q coordinates."""
         from twoloop.kernels.paper import newmark_step as kernels
 
         if not fixed and (abs(self.beta - 1.0 / 6.0) < NO_ESTIMATE or self.gamma != 0.5):
@@ -103,17 +104,17 @@ class Newmark:
         )
 
 
-BDF_HIGHEST = 5  # order; the formula of order 6 is next to unstable, those beyond are
+BDF_HIGHEST = 5  # highest order of BDF; the formula of order 6 is almost unstable, those beyond are unstable
 
 
 @dataclass(frozen=True)
 class BDF:
     """Two-loop procedure with backward differentiation formulas of variable step and order (the paper's outlook).
 
-    Of y' = f(y), y = [q_i, v_i], each step solves y = p + c (f(y) - p'), where p extrapolates the last k + 1 points and
-    c = h / (1 + 1/2 + ... + 1/k). The outer loop is a fixed-point iteration on the independent accelerations; every
-    evaluation has the inner loop within it. Two to three evaluations make a step. At equal tolerance errors are larger
-    than those of `RungeKutta`: compare at equal error. It is for few digits.
+    For y' = f(y), y = [q_i, v_i], each step solves y = p + c (f(y) - p'). Here p extrapolates the last k + 1 points,
+    and c = h / (1 + 1/2 + ... + 1/k). The outer loop is a fixed-point iteration on the independent accelerations; every
+    evaluation contains the inner loop. A step takes two to three evaluations. At equal tolerance errors are larger than
+    those of `RungeKutta`: compare at equal error. The method is meant for few digits.
 
     With step-size control a run begins with order 1 and a small step. A step is accepted when the largest component of
     the estimated local error of q and v, dependents too, is within the tolerance. Fixed steps have the order
@@ -123,8 +124,8 @@ class BDF:
     at the rate of the truncation error; large ones may do either from order 3 on. The fixed point limits h to about
     the reciprocal of the largest frequency or rate of decay: stiff problems need small steps.
 
-    The matrices are sparse where systems are large: then all coordinates are integrated, and the end of each step is
-    put on the constraints.
+    Large systems have sparse matrices. There all coordinates are integrated, and the end of each step is projected onto
+    the constraints.
 
     Parameters
     ----------
@@ -177,7 +178,7 @@ class BDF:
         return f"BDF(max_order={self.max_order})"
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Make the method ready for a run of n_q coordinates."""
+        """Return the plan of the method for a run of n_q coordinates."""
         from twoloop.kernels.paper import bdf_step as kernels
 
         inner_tol = INNER_TOL if self.inner_tol is None else self.inner_tol
@@ -186,7 +187,7 @@ class BDF:
             kernels.BDF,
             kernels.options_array(self.max_order, inner_tol, outer_tol, gauss(kernels.STARTER_STAGES)),
             np.zeros(kernels.memory_size(n_q)),
-            exponent=1.0,  # not used: the order varies, and with it the factor, which the step returns
+            exponent=1.0,  # not used: the order varies, and the step returns the factor for its order
             projects=True,
             apart=True,
         )
@@ -216,11 +217,11 @@ def paper_irk(inner_tol: float = 1e-9, outer_tol: float = 1e-9) -> RungeKutta:
       c_3 = 1, b_3 = 1/9 and a_33 = 1/18, lost in print.
     - A step also ends as after (33) when the inner loop does not converge: 25 iterations, a correction of more than
       half the one before, or a singular C_qd.
-    - "Once in a time step or several time steps": the partition is looked at after every step, and chosen anew when
-      max|C_qd^-1 C_qi| has grown to three times what it was, or when a step failed in the inner loop.
+    - "Once in a time step or several time steps": the partition is checked after every step. It is chosen anew when
+    max|C_qd^-1 C_qi| has grown to three times its first value, or when a step failed in the inner loop.
     - Steps are shortened to end at output times and at the end of the run.
-    - A step is refused as well where the force jumps between its start and the first stage: the step and its halves
-      do not see that, and were off by 1e5 tolerances.
+    - A step is also rejected if the force jumps between its start and the first stage: the step and its halves do not
+    see such a jump, and were off by 1e5 tolerances.
 
     Parameters
     ----------
