@@ -1,1 +1,1 @@
-"""What is verified before and during a run: arguments, bounds of arrays, starts, derivatives."""
+"""Checks before and during a run: arguments, bounds of arrays, starts, derivatives."""

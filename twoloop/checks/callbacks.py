@@ -1,8 +1,8 @@
-"""Check callbacks on their own: indices within the bounds of arrays, values of entries, a symmetric mass matrix.
+"""Checks of single callbacks: indices within the bounds of arrays, values of entries, a symmetric mass matrix.
 
-An index out of bounds in machine code would read or write other memory. Each callback first runs once in Python, its
-compiled helpers too, where an index too large is an `IndexError`; what runs only compiled is compiled a second time
-with numba's own check. Branches that are not taken then are not seen.
+An index out of bounds in machine code would read or write other memory. So each callback first runs once in Python,
+with its compiled helpers, where an index that is too large raises `IndexError`. Code that runs only compiled is
+compiled a second time with numba's own check. Branches that are not taken in this call are not checked.
 """
 
 from __future__ import annotations
@@ -28,18 +28,19 @@ OWN = {
     *("twoloop.checks.callbacks", "twoloop.generate.graph", "twoloop.generate.trace"),
     *("twoloop.generate.parameter_expressions", "twoloop.bodies.system"),
 }
-MANY = 4096  # parameters that a callback may ask for beyond those that it has, for telling which array is too short
+# parameters appended to those that a callback has, to find out whether `parameters` is the array that is too short
+MANY = 4096
 
 
 def check_bounds(system: ConstrainedSystem, t: float, q: Array, v: Array) -> None:
-    """Run every compiled callback of a system once at (t, q, v) where bounds are watched; later calls do nothing.
+    """Run every compiled callback of a system once at (t, q, v) with bounds checked; later calls do nothing.
 
-    Dense matrices of large systems that give values of entries are left: what asks for them evaluates them first.
+    Large dense matrices of systems that give values of entries are left out: they are checked before their first use.
 
     Raises
     ------
     ValueError
-        Naming the callback, the index and the sizes of its arrays.
+        If an index is out of bounds; the message names the callback, the index and the sizes of its arrays.
     """
     if len(system.within_bounds) == len(KINDS):
         return
@@ -51,10 +52,10 @@ def check_bounds(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Non
 
 
 def check_callback(system: ConstrainedSystem, kind: str, t: float, state: list[Array]) -> None:
-    """Run one callback as `check_bounds` does all."""
+    """Run one callback with bounds checked, as `check_bounds` does for all of them."""
     if system.called_in_python or kind in system.within_bounds:
         return
-    if kind not in system.given and kind != "jacobian":  # what stands in its place is our own, and calls nothing
+    if kind not in system.given and kind != "jacobian":  # a substitute of twoloop, which calls no function of the user
         system.within_bounds.add(kind)
         return
     function, p, out = getattr(system.functions, kind), system.parameters, system.arrays_of(kind)
@@ -81,7 +82,7 @@ def check_callback(system: ConstrainedSystem, kind: str, t: float, state: list[A
 def _index_error(
     function: Dispatcher, t: float, state: list[Array], p: Array, out: list[Array], changed: list[int] | None = None
 ) -> IndexError | None:
-    """The first index out of bounds, if there is one. To `changed` goes which of `state` and `p` a callback changes."""
+    """Return the first index error, or None; append the indices of changed arrays (`state`, then `p`) to `changed`."""
     for wrap in (_in_python, _with_bounds_checked):
         given = [array.copy() for array in (*state, p)]
         try:
@@ -90,7 +91,7 @@ def _index_error(
                 FunctionCopier(wrap).value(function)(t, *given, *(np.zeros(array.shape) for array in out))
         except IndexError as error:
             return error
-        except Exception:  # what does not run in Python may run compiled; its own errors come up when it is called
+        except Exception:  # it may run only compiled; its own errors are raised when it is called
             continue
         if changed is not None:
             changed += [
@@ -109,7 +110,7 @@ def _with_bounds_checked(function: types.FunctionType, _: Any) -> Any:
 
 
 def place_of(error: BaseException) -> str:
-    """The line of a callback in which an error arose, where Python knows it; its file, but for an index."""
+    """Return the line and the file of a callback in which an error arose, as text; "" if Python does not know it."""
     trace, frames = error.__traceback__, []
     while trace is not None:
         module = trace.tb_frame.f_globals.get("__name__") or ""
@@ -123,15 +124,15 @@ def place_of(error: BaseException) -> str:
     return f", in `{source}` ({file}, line {line})" if source else ""
 
 
-SAME = 1e-11  # relative: values that two callbacks must share
-MOST = 4_000_000  # numbers of a dense matrix that is made for a comparison
-UNSYMMETRIC = 1e-10  # of the largest entry of M, by which entries that must be the same may differ
+SAME = 1e-11  # relative to the largest entry: values that two callbacks must share
+MOST = 4_000_000  # largest number of entries of a dense matrix that is made for a comparison
+UNSYMMETRIC = 1e-10  # relative to the largest entry of M: larger differences from the transpose are no rounding
 
 
 def wrong_values(system: ConstrainedSystem, t: float, q: Array) -> str | None:
-    """Say where `mass_values` or `jacobian_values` do not give what dense callbacks beside them give, or None.
+    """Describe where `mass_values` or `jacobian_values` differ from the dense callbacks beside them, or return None.
 
-    Matrices of more than `MOST` numbers are not made: no run of such a system asks for them.
+    Matrices of more than `MOST` entries are not made: no run of such a system uses them.
     """
     for kind, (rows, columns) in system.entries.items():
         if kind in system.scattered or system.n_q * (system.n_q if kind == "mass" else system.n_c) > MOST:
@@ -153,7 +154,7 @@ def wrong_values(system: ConstrainedSystem, t: float, q: Array) -> str | None:
 
 
 def unsymmetric_mass(system: ConstrainedSystem, t: float, q: Array) -> str | None:
-    """Say which entry of M is not that of its transpose, or None."""
+    """Describe the entry of M that differs from its transpose, or return None."""
     if "mass" in system.entries:
         i, j, one, other = _largest_of_values(system, t, q)
     else:
@@ -167,7 +168,7 @@ def unsymmetric_mass(system: ConstrainedSystem, t: float, q: Array) -> str | Non
 
 
 def _largest_of_matrix(mass: Array) -> tuple[int, int, float, float]:
-    """The entry that differs most from that of the transpose, and both; (0, 0, 0.0, 0.0) where that is rounding."""
+    """Return the entry that differs most from its transpose, with both values; (0, 0, 0.0, 0.0) if that is rounding."""
     off = np.abs(mass - mass.T)
     if not off.max() > UNSYMMETRIC * np.abs(mass).max():
         return 0, 0, 0.0, 0.0
@@ -176,10 +177,10 @@ def _largest_of_matrix(mass: Array) -> tuple[int, int, float, float]:
 
 
 def _largest_of_values(system: ConstrainedSystem, t: float, q: Array) -> tuple[int, int, float, float]:
-    """The same from the entries."""
+    """Return the same from the values of the entries."""
     (rows, columns), values = system.entries["mass"], system.mass_values(t, q)
     where, other = rows * system.n_q + columns, columns * system.n_q + rows
-    places = np.unique(where)  # of both triangles
+    places = np.unique(where)  # entries in both triangles
     one = np.bincount(np.searchsorted(places, where), values, len(places))
     two = np.bincount(np.searchsorted(places, other), values, len(places))
     off = np.abs(one - two)

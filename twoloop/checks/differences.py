@@ -54,7 +54,7 @@ class Estimate:
     slope: Array
     error: Array
     width: Array  # half-width that gave each estimate; infinite: none did
-    side: int  # as in `differentiate`
+    side: int  # side of the interval, see `differentiate`
 
     def disagrees(self, given: Array, rounding: Array) -> Array:
         """Return |given - slope| over its limit, (m,); above 1 the given value is wrong."""

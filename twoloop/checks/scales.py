@@ -30,7 +30,7 @@ DISPLACEMENTS = (1e-2, 1e-4, 1e-6)  # displacements in units of the coordinates,
 ROUNDS = 3  # iterations that find units: the first ones may be off by 1e5
 MOST_PLACES = 16  # largest number of positions whose sizes are kept
 NONE = np.zeros(0)
-# in units: a row that is much shorter than what it becomes over this distance is short only at this position
+# distance in units: a row that is much shorter than its change over it is short only at this position
 TURNS = 0.1
 
 

@@ -1,4 +1,4 @@
-"""Rows of constraints by their entries, for what checks do with a Jacobian that is not to be a full matrix."""
+"""Rows of constraints by their entries, for checks of a Jacobian that must not become a full matrix."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Integers = NDArray[np.int64]
 
 
 class SparseRows:
-    """A matrix (m, n) by its entries, none of them twice; with the operations of an array that checks of it need.
+    """Sparse matrix (m, n) by its entries, without duplicates, with the operations of an array that checks need.
 
     Attributes
     ----------
@@ -26,12 +26,12 @@ class SparseRows:
         self.values = self.added(values)
 
     def added(self, values: Array) -> Array:
-        """Values given in the order of the rows and columns that this was made of, in its own."""
+        """Reorder values from the order of the constructor's rows and columns to that of the entries."""
         return np.bincount(self.place_of, values, len(self.rows)).astype(np.float64)
 
     @property
     def size(self) -> int:
-        """Of the full matrix."""
+        """Return the size of the full matrix."""
         return self.shape[0] * self.shape[1]
 
     def __len__(self) -> int:
@@ -44,45 +44,45 @@ class SparseRows:
         return self.with_values(np.abs(self.values))
 
     def pattern(self) -> SparseRows:
-        """1 for each entry."""
+        """Return the same entries with the value 1."""
         return self.with_values(np.ones(len(self.values)))
 
     def with_values(self, values: Array) -> SparseRows:
-        """Others at the same places."""
+        """Return a matrix with other values of the same entries."""
         other = object.__new__(SparseRows)
         vars(other).update(vars(self), values=values)
         return other
 
     def __getitem__(self, part: slice) -> SparseRows:
-        """All rows: other parts are not asked for."""
+        """Return all rows; no other part is supported."""
         assert part == slice(self.shape[0])
         return self
 
     def part(self, rows: tuple[int, ...], columns: tuple[int, ...]) -> Array:
-        """Some rows and columns as a full matrix."""
+        """Return some rows and columns as a full matrix."""
         made = np.zeros((len(rows), len(columns)))
         for k, row in enumerate(rows):
-            first, last = np.searchsorted(self.rows, [row, row + 1])  # entries are in the order of rows
+            first, last = np.searchsorted(self.rows, [row, row + 1])  # entries are sorted by rows
             for column, value in zip(self.columns[first:last].tolist(), self.values[first:last], strict=True):
                 if column in columns:
                     made[k, columns.index(column)] = value
         return made
 
     def row(self, i: int) -> Array:
-        """One row as a full one."""
+        """Return one row as a full vector."""
         made = np.zeros(self.shape[1])
         first, last = np.searchsorted(self.rows, [i, i + 1])
         made[self.columns[first:last]] = self.values[first:last]
         return made
 
     def matrix(self) -> Array:
-        """The full matrix."""
+        """Return the full matrix."""
         made = np.zeros(self.shape)
         made[self.rows, self.columns] = self.values
         return made
 
     def largest(self) -> Array:
-        """The largest entry of each row, its sign left out, (m,)."""
+        """Return the largest magnitude in each row, (m,)."""
         found = np.zeros(self.shape[0])
         np.maximum.at(found, self.rows, np.abs(self.values))
         return found
@@ -92,17 +92,17 @@ Rows = Array | SparseRows
 
 
 def is_finite(rows: Rows) -> bool:
-    """Whether all entries are finite."""
+    """Return whether all entries are finite."""
     return bool(np.isfinite(rows.values if isinstance(rows, SparseRows) else rows).all())
 
 
 def largest_in_rows(rows: Rows) -> Array:
-    """The largest entry of each row, its sign left out."""
+    """Return the largest magnitude in each row."""
     return rows.largest() if isinstance(rows, SparseRows) else np.abs(rows).max(axis=1, initial=0.0)
 
 
 def norms(rows: Rows) -> Array:
-    """The length of each row."""
+    """Return the norm of each row."""
     if isinstance(rows, SparseRows):
         return np.sqrt(np.bincount(rows.rows, rows.values**2, rows.shape[0]))
     lengths: Array = np.linalg.norm(rows, axis=1)
@@ -110,7 +110,7 @@ def norms(rows: Rows) -> Array:
 
 
 def apart(rows: SparseRows) -> list[Integers]:
-    """The columns in groups, in each of which no two have entries in the same row."""
+    """Group the columns so that no two columns of a group have entries in the same row."""
     in_row: list[list[int]] = [[] for _ in range(rows.shape[0])]
     in_column: list[list[int]] = [[] for _ in range(rows.shape[1])]
     for i, j in zip(rows.rows.tolist(), rows.columns.tolist(), strict=True):

@@ -209,7 +209,7 @@ def least_inertia(system: ConstrainedSystem, t: float, q: Array) -> tuple[float,
 
 
 NEAR = 1e-3  # displacement relative to the coordinates: a little off the start, where no symmetry hides terms
-# in rounding errors of the terms of a constraint: by as much may values that callbacks share differ, too
+# allowed difference of C between two callbacks, beside SAME, in rounding errors of its terms
 ROUNDED = 100.0
 MOST = 1_000_000  # largest number of entries of Jacobians that are evaluated together
 ROUNDING = 1e-12  # relative to the largest entry over the displacement: rounding error of a difference

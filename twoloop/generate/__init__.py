@@ -1,1 +1,1 @@
-"""Code for one mechanism: its callbacks traced, Taylor series, straight-line code, machine code."""
+"""Code for one mechanism: traced callbacks, Taylor series, symbolic elimination, machine code."""

@@ -1,7 +1,7 @@
-"""Choose by numbers at a position what an elimination needs.
+"""Choices of an elimination, made by numbers at a position.
 
-These are independent rows of C_q and A, rows to be added to a singular M, and the coordinates that the rows determine.
-The choice depends on the position alone, so that the same call gets the same code whatever ran before it.
+These are: independent rows of C_q and A, rows to be added to a singular M, and the coordinates that the rows determine.
+The choice depends on the position alone, so that the same call gets the same code whatever ran before.
 """
 
 from collections.abc import Callable
@@ -21,13 +21,14 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-SINGULAR_MASS = 1e-10  # smallest over largest eigenvalue of M, below which rows of G are added to it
-RANK = 1e-9  # relative norm of a row of G without its part in the rows before, below which it depends on them
-NEAR = 0.01  # smallest allowed pivot over the smallest pivot of a row of G at the start
-LEAST = 10.0 ** np.arange(-2, -9, -1)  # smallest allowed pivots, down to those nearly lost to rounding
+SINGULAR_MASS = 1e-10  # smallest over largest eigenvalue of M; below, rows of G are added to M
+RANK = 1e-9  # relative norm of a row of G after elimination of the rows before; below, the row depends on them
+NEAR = 0.01  # smallest allowed pivot, relative to the smallest pivot of a row of G at the start
+# possible values of the smallest allowed pivot, down to those nearly lost to rounding
+LEAST = 10.0 ** np.arange(-2, -9, -1)
 BOUNDS = LEAST[:-1] / NEAR
-# rows of G over coordinates, above which it pays to express some coordinates by the others: below, the system of the
-# rows is the smaller one
+# ratio of rows of G to coordinates above which it pays to express some coordinates by the others: below, the system of
+# the rows is the smaller one
 MOSTLY_ROWS = 2.0 / 3.0
 
 Blocks = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
@@ -42,11 +43,11 @@ class Choice:
     rows : tuple of int
         Independent rows of G.
     added, scale : tuple of int, float
-        Rows of G that make M definite when added, and their factor: a power of two that brings them to its size.
+        Rows of G that make M definite when added to it, and their factor: a power of two that scales them to its size.
     least : float
         Smallest allowed pivot of a row, over its pivot without the other rows; a power of ten.
     blocks : tuple of (rows, columns)
-        One or two of `rows`, by their places in it, and as many coordinates that they determine, in the order of
+        One or two of `rows`, by their indices in it, and as many coordinates that they determine, in the order of
         elimination; empty if it does not pay, or if no coordinates are suitable.
     """
 
@@ -71,7 +72,7 @@ class Choice:
 
 
 class Dependents:
-    """Finds the coordinates that rows of G determine, at one position after another.
+    """Search for the coordinates that rows of G determine, at one position after another.
 
     Parameters
     ----------
@@ -81,8 +82,8 @@ class Dependents:
     Attributes
     ----------
     find : callable or None
-        Of G and `arguments`: how many blocks there are, see kernels/linalg/dependent_columns.py. None: there are
-        none at any position.
+        Function of G and `arguments` that returns the number of blocks, see kernels/linalg/dependent_columns.py. None:
+        there are none at any position.
     """
 
     find: Any = None
@@ -98,7 +99,7 @@ class Dependents:
             self.arguments = kinds, np.array(rows, np.int64), len(rows), room, work, blocks
 
     def blocks(self, G: Array) -> Blocks:
-        """Return the blocks of a choice."""
+        """Return the blocks of the choice for a G."""
         if self.find is None:
             return ()
         n = self.find(G, *self.arguments)
@@ -107,7 +108,7 @@ class Dependents:
 
 
 def _kinds(system: ConstrainedSystem) -> Any:
-    """Return for each entry of G whether it is zero, 0, a number, 1, or varies, 2; None if unknown."""
+    """Return the kind of each entry of G: 0 for zero, 1 for a constant, 2 if it varies; None if unknown."""
     if system.called_in_python:  # a function may keep its arguments, so it is traced as late as possible
         return None
 
@@ -120,13 +121,13 @@ def _kinds(system: ConstrainedSystem) -> Any:
 
     cache = shared_cache(system)
     kinds = cache.remembered("kinds of entries", partial(make, partial(cache.equations, system)))
-    if kinds is None:  # it may be traceable with numbers
+    if kinds is None:  # it may be traceable with the numbers of this system
         kinds = system.remembered("kinds of entries", partial(make, partial(Equations, system)))
     return kinds
 
 
 class Chooser:
-    """Makes the choice for one M and G of a system after another; it is mostly the same."""
+    """Search for the choice at one M and G of a system after another; it is mostly the last one."""
 
     def __init__(self, system: ConstrainedSystem):
         from twoloop.kernels.linalg.rank import choose_rows, room_size
@@ -137,7 +138,7 @@ class Chooser:
         self._key, self._last = (0, b"", 0.0), Choice((), (), 1.0, 0.0)
 
     def choice(self, mass: Array, G: Array) -> Choice:
-        """Return the choice; raises as `Choice.at`."""
+        """Return the choice for an M and a G; raise like `Choice.at`."""
         system, room, chosen = self.system, self._room, self._chosen
         constant = system.constant_mass and system.made.get("no weak mass", False)
         room[0] = 0.0

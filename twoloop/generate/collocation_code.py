@@ -43,18 +43,18 @@ FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the second step
 # the iteration
 # error that the iteration may leave, relative to the tolerance: total errors are then no larger than those of DOP853
 KAPPA = 0.02
-# number of sweeps aimed at; one or two more if a polynomial of degree 6 or 7 predicts well, as steps are long then
+# number of sweeps aimed at; one more if the prediction has degree 6, two more from 7 on, as steps are long then
 TARGET = 6.0
 MORE = 7  # number of sweeps beyond the target after which a step is rejected
 SLOW = 0.8  # contraction of the iteration above which a step is rejected after the third sweep
 LEAST_RHO, MOST_RHO = 1e-3, 0.9
 SLOW_START, FAST_START = 0.3, 0.04  # if the contraction of the first step is outside these limits, its size is changed
 STAGNANT = 0.5  # ratio of changes from which on they are rounding, if they are below NOISE relative to the values
-# the same for steps of fixed size, and the largest number of sweeps; forces may have rounding errors of their own
+# KAPPA and NOISE for steps of fixed size, and the largest number of sweeps; forces may have rounding errors, too
 ROUNDING_OF_FIXED, NOISE_OF_FIXED, MOST_OF_FIXED = 1e-16, 1e-9, 60.0
 LEAST_CHANGE = 1e-30  # added to the remaining error over its limit, so that its logarithm exists
 SHARE = 0.5  # weight of the error estimate
-# allowed defect between nodes, relative to the tolerances: most of the defect oscillates and cancels until the end
+# allowed defect between nodes, relative to the tolerances: most of it oscillates and does not last to the end
 ALLOWED = 16.0
 
 

@@ -1,7 +1,7 @@
 """Derive C_q, C_t and Gamma exactly from traced callbacks.
 
-Programs compute those that are not given. Those that are given are compared with what they must be, without
-differences.
+Programs compute the derivatives for which no callback is given. Given callbacks are compared with the exact derivatives
+instead of differences.
 """
 
 import copy
@@ -21,17 +21,17 @@ from twoloop.generate.trace_cache import Evaluator, TraceCache, derive_cached
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.problem.system import ConstrainedSystem
 
-# callbacks that are derived where not given, and their numbers of rows
+# callbacks that are derived if they are not given, and their numbers of rows
 DERIVABLE = {"jacobian": "n_c", "gamma": "n_c", "nonholonomic_gamma": "n_a"}
 
 
 class DerivedPrograms:
-    """Programs for callbacks that are not given, shared by the systems of a trace cache.
+    """Derived programs that replace missing callbacks, shared by the systems of a trace cache.
 
     Parameters
     ----------
     programs : dict
-        By name, each with the entries to which its results belong.
+        Programs by name, each with the entries to which its results belong.
     traced : Traced
         The traces from which they were derived.
     """
@@ -40,7 +40,7 @@ class DerivedPrograms:
         self.programs, self.traced, self.kinds = programs, traced, traced.kinds
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "DerivedSystem":
-        """Return one of the systems with its programs."""
+        """Return one of the systems together with its programs."""
         functions: dict[str, Any] = {}
         for name, (program, places) in self.programs.items():
             vectors = program.with_numbers(evaluate).packed(places)
@@ -63,9 +63,9 @@ class DerivedSystem(NamedTuple):
 
 
 def with_derived_callbacks(system: ConstrainedSystem, check: Check) -> tuple[ConstrainedSystem, tuple[Traced, ...]]:
-    """Return a system with programs for C_q and Gamma where no callback gives them, and their traces.
+    """Return a system with programs for C_q and Gamma if callbacks for them are missing, and their traces.
 
-    If all are given, or callbacks cannot be traced, it is the system itself without traces: differences replace them.
+    If all are given, or callbacks cannot be traced, return the system itself without traces: differences are used.
     """
     absent = [kind for kind, size in DERIVABLE.items() if getattr(system, size) and kind not in system.given]
     if not absent:
@@ -91,7 +91,7 @@ def _derive_programs(system: ConstrainedSystem, absent: Sequence[str], cache: Tr
 
 
 def _results(equations: Equations, absent: Sequence[str]) -> dict[str, dict[int, Affine]]:
-    """Return the results of each program, by their entries."""
+    """Return the results of each program: expressions by their entries."""
     system = equations.system
     gamma: dict[int, Affine] = {}
     for kind, first in (("gamma", 0), ("nonholonomic_gamma", system.n_c)):
@@ -105,14 +105,15 @@ def _results(equations: Equations, absent: Sequence[str]) -> dict[str, dict[int,
 
 Array = NDArray[np.float64]
 
-MOST = 50_000  # entries of C_q
-NEAR = (0.0, 1e-3, 0.03)  # of the coordinates, and of TIME
+MOST = 50_000  # largest number of entries of C_q
+# displacements at which derivatives are compared, relative to the sizes of coordinates, and to TIME
+NEAR = (0.0, 1e-3, 0.03)
 
 
 def exact_derivatives(system: ConstrainedSystem, check: Check = unchecked) -> Traced | None:
-    """Return what derivatives among the callbacks of a system must be; None if unknown.
+    """Return the traces with which the given derivatives of a system must agree; None if unknown.
 
-    It is unknown if there are no constraints or too many, callbacks cannot be traced, or `check` refuses the traces.
+    They are unknown if there are no constraints or too many, callbacks cannot be traced, or `check` refuses the traces.
     """
     if system.n_q * (system.n_c + system.n_a) > MOST:
         return None
@@ -127,7 +128,7 @@ def _trace_derivatives(system: ConstrainedSystem, cache: TraceCache) -> Traced:
     equations = cache.equations(system)
     given = [kind for kind in ("jacobian", *OF_ROWS) if kind in system.given]
     forms = {kind: equations.derived(kind) for kind in (*given, *(["constraint_rate"] if system.n_c else []))}
-    # the derivatives are those of these callbacks, which must agree with their traces, too
+    # these callbacks must agree with their traces, too, as the derivatives come from the traces
     forms |= {kind: equations.of(kind) for kind in ("constraint", "nonholonomic", "nonholonomic_rate")}
     return Traced(system, equations.graph, forms)
 
@@ -138,7 +139,7 @@ def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
     Raises
     ------
     ValueError
-        If there is no C_t, and C was traced to depend on time, though not near the start.
+        If C_t is not given and C was traced to depend on time, though not near the start.
     """
     away = generic_factors(len(q)) * sizes(q)
     places = [(t + share * TIME, q + share * away) for share in NEAR]
@@ -162,7 +163,7 @@ def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
 
 
 def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
-    """Return rows [t, q, v] for states, with velocities as large as theirs in which every coordinate counts."""
+    """Return rows [t, q, v] with generic velocities as fast as the states', in which every coordinate counts."""
     times, positions, velocities = (np.array(each, dtype=float) for each in zip(*states, strict=True))
     generic = np.array([sizes(q) for q in positions]) * _factors(*positions.shape)
     speed = max(1.0, float(np.abs(velocities).max()) / float(np.abs(generic).max()))
@@ -171,6 +172,6 @@ def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
 
 @cache
 def _factors(n_states: int, n_q: int) -> Array:
-    """Return fixed factors between 0.5 and 1.5, of either sign."""
+    """Return fixed random factors between 0.5 and 1.5, of either sign."""
     random = np.random.default_rng(1)
     return random.uniform(0.5, 1.5, (n_states, n_q)) * random.choice((-1.0, 1.0), (n_states, n_q))

@@ -8,11 +8,11 @@ The matrix of
 with G = [C_q; A] is eliminated without what is zero by its structure, in an order that is chosen once: a row of G after
 all its coordinates, so that the pivots are those of definite matrices, M and -G M^-1 G^T, and need no search.
 
-- A row is nearly a combination of others where its pivot is small against the one that it has without them. There the
-  code is not to be used.
+- A row is nearly a combination of others if its pivot is small compared with its pivot without the other rows. There
+  the code must not be used.
 - The same factors give the nearest position and velocity on the constraints, in the metric of M.
-- Where M is singular, rows g of G are added, M + g^T g, which changes neither.
-- Of redundant rows, a set of full rank is kept.
+- If M is singular, rows g of G are added to it, M + g^T g; this changes neither of these results.
+- Of redundant rows, a subset of full rank is kept.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,14 +32,14 @@ from twoloop.generate.traced_values import Traced
 from twoloop.kernels.evaluation.partition import MAX_VIOLATION
 from twoloop.problem.system import ConstrainedSystem
 
-MOST_ELIMINATED = 60_000  # operations with the elimination: enough for 40 bodies on hinges in space
-# largest cost of `quick` over that of `there` at which both are written. Where pivots are small both are needed, and
-# code of both takes longer to build; with 0.68 (four-bar) a run gains 5 %
+MOST_ELIMINATED = 60_000  # largest number of operations with the elimination: enough for 40 bodies on hinges in space
+# largest ratio of the costs of `quick` and `there` at which both are written: small pivots need both, and the code of
+# both takes longer to build; at 0.68 (four-bar) a run gains 5 %
 WORTH = 0.75
 
 
 class Elimination:
-    """Eliminates the equations of a system, with rows G = [C_q; A].
+    """Symbolic elimination of the equations of a system, with the rows G = [C_q; A].
 
     Parameters
     ----------
@@ -52,24 +52,25 @@ class Elimination:
     Attributes
     ----------
     graph : Graph
-        Its first inputs are t, q and v.
+        Graph of the operations; its first inputs are t, q and v.
     there : Program
         "a" (n_q,), the accelerations at a state, without projection.
     quick : Program or None
         The same by dependent coordinates, if that takes fewer operations. `there` is valid in more positions.
     right : Program
-        "r" (n_q,) and "c" (n_c + n_a,), Q and the right-hand sides of the rows of G in use; without conditions.
+        "r" (n_q,) and "c" (n_c + n_a,): Q, and the right-hand sides of the rows of G in use; without conditions.
     closer : Program
-        "q" (n_q,), moved by a step of Newton's method towards the constraints, in directions that A allows, and "moved"
-        (n_q,), by how much.
+        "q" (n_q,), the position after a Newton step towards the constraints, in directions that A allows, and "moved"
+        (n_q,), the change.
     nearer : Program
-        The same, and "v" (n_q,) on the rows at the position before the move, with "a" (n_q,), "lam" (n_c + n_a,) there.
+        The same, and "v" (n_q,), projected with the rows at the old position, with "a" (n_q,) and "lam" (n_c + n_a,)
+        there.
     off, faster : Program
         "c" (n_c + n_a,), the right-hand sides of the corrections of positions and of velocities.
     redundant : Program
-        Its conditions are that the redundant constraints hold, too; no arrays.
+        Program without arrays; its conditions are that the redundant constraints hold, too.
     parts : SplitFunctions or None
-        Writes the elimination of M in parts, where equations are long: see compile_equations.py, which sets it.
+        Writer of the elimination of M in parts, for long equations: see compile_equations.py, which sets it.
     n_operations : int
         Number of operations of callbacks and elimination, without solutions.
     traced : Traced
@@ -78,7 +79,7 @@ class Elimination:
     Raises
     ------
     Untraceable
-        Saying why the equations cannot be had.
+        If the equations cannot be generated; the message says why.
     """
 
     parts: Any = None
@@ -86,7 +87,7 @@ class Elimination:
     def __init__(self, system: ConstrainedSystem, choice: Choice, equations: Equations | None = None):
         self.equations = Equations(system) if equations is None else equations
         self.system, self.choice, self.graph = system, choice, self.equations.graph
-        self.nothing, self._n_alternative = Affine(self.graph, 0.0, {}), 0  # operations of `quick`
+        self.nothing, self._n_alternative = Affine(self.graph, 0.0, {}), 0  # number of operations of `quick`
         n, (self.q, self.v) = system.n_q, (self.equations.q, self.equations.v)
         self.mass = self._values_of("mass")
         rows = [self._values_of("jacobian"), self._values_of("nonholonomic")]
@@ -153,14 +154,14 @@ class Elimination:
 
     @cached_property
     def there(self) -> Program:
-        """Return the program, see the class."""
+        """Return the program `there` (see the class)."""
         solution = self._accelerations(self.v)
         self._bound()
         return Program(self.graph, {"a": solution[: self.system.n_q]}, self.conditions)
 
     @cached_property
     def quick(self) -> Program | None:
-        """Return the program, see the class."""
+        """Return the program `quick` (see the class)."""
         blocks = self.choice.blocks
         if not blocks:
             return None
@@ -182,7 +183,7 @@ class Elimination:
 
     @cached_property
     def right(self) -> Program:
-        """Return the program, see the class."""
+        """Return the program `right` (see the class)."""
         force, gamma = self._right_sides(self.v)
         used = {*self.choice.rows, *self.choice.added}
         return Program(
@@ -198,7 +199,7 @@ class Elimination:
         return self.factors.solve([*right, *(gamma[k] for k in self.choice.rows)])
 
     def _on_all_rows(self, independent: Sequence[Affine]) -> list[Affine]:
-        """Return numbers for all rows from those for independent rows; the others are 0."""
+        """Return values for all rows from those of the independent rows; 0 for the others."""
         numbers = [self.nothing] * len(self.all_rows)
         for k, number in zip(self.choice.rows, independent, strict=True):
             numbers[k] = number
@@ -206,13 +207,13 @@ class Elimination:
 
     @cached_property
     def off(self) -> Program:
-        """Return the program, see the class."""
+        """Return the program `off` (see the class)."""
         off = [*(-each for each in self._values_of("constraint")), *[self.nothing] * self.system.n_a]
         return Program(self.graph, {"c": self._on_all_rows([off[k] for k in self.choice.rows])})
 
     @cached_property
     def faster(self) -> Program:
-        """Return the program, see the class."""
+        """Return the program `faster` (see the class)."""
         faster = []
         for row, rate in zip(self.rows, self.rates, strict=True):
             total = rate
@@ -223,14 +224,14 @@ class Elimination:
 
     @cached_property
     def closer(self) -> Program:
-        """Return the program, see the class."""
+        """Return the program `closer` (see the class)."""
         moved = self._correction(self.off)
         position = {"moved": moved, "q": [x + change for x, change in zip(self.q, moved, strict=True)]}
         return Program(self.graph, position, self.conditions)
 
     @cached_property
     def nearer(self) -> Program:
-        """Return the program, see the class."""
+        """Return the program `nearer` (see the class)."""
         arrays = self.nearest.arrays
         independent = [arrays["lam"][k] for k in self.choice.rows]
         lam = of_least_norm(self.graph, independent, self.all_rows, self.choice.rows, self.factors.solve)
@@ -239,7 +240,7 @@ class Elimination:
 
     @cached_property
     def nearest(self) -> Program:
-        """Return `nearer` with "lam" 0 for dependent rows."""
+        """Return the program `nearer`, but with "lam" 0 for dependent rows."""
         n, position = self.system.n_q, self.closer.arrays
         v = [(u + change).value() for u, change in zip(self.v, self._correction(self.faster), strict=True)]
         solution = self._accelerations(v)
@@ -285,26 +286,26 @@ def of_least_norm(
 
 
 class Solution:
-    """Solves M a + G^T lam = r with G a = c by factors of a position that are kept in memory.
+    """Solution of M a + G^T lam = r with G a = c, by factors of a position that are stored in memory.
 
     Parameters
     ----------
     equations : Elimination
     more : sequence of Program
-        Programs of the equations; what they share with the factors is kept, too.
+        Programs of the equations; quantities that they share with the factors are stored, too.
 
     Attributes
     ----------
     known : dict
-        The place in memory of each quantity that is kept.
+        Index in memory of each stored quantity.
     kept : Program
-        Computes what is kept.
+        Program that computes the stored quantities.
     graph : Graph
-        Its inputs are r (n_q,), c (n_c + n_a,) and the factors, which are kept first.
+        Graph of the solution; its inputs are r (n_q,), c (n_c + n_a,) and the factors, which come first in memory.
     solved : Program
-        "a" (n_q,) and "lam" (n_c + n_a,); 0 for dependent rows.
+        Program for "a" (n_q,) and "lam" (n_c + n_a,); 0 for dependent rows.
     least : Program
-        "lam" (n_c,) of least norm, where c is "lam" of `solved`.
+        Program for "lam" (n_c,) of least norm, if c is the "lam" of `solved`.
     """
 
     def __init__(self, equations: Elimination, more: Sequence[Program] = ()):
@@ -340,7 +341,7 @@ class Solution:
 
     @property
     def n_kept(self) -> int:
-        """Return the number of quantities that are kept."""
+        """Return the number of stored quantities."""
         return len(self.known)
 
     def _solve(self, right: Sequence[Affine]) -> list[Affine]:
@@ -360,7 +361,7 @@ class Solution:
 
     @cached_property
     def least(self) -> Program:
-        """Return the program, see the class."""
+        """Return the program `least` (see the class)."""
         rows = [self._rows.get(k, []) for k in range(len(self._c))]
         return Program(
             self.graph, {"lam": of_least_norm(self.graph, self._independent(), rows, self._choice.rows, self._solve)}
@@ -368,7 +369,7 @@ class Solution:
 
 
 def _shared(graph: Graph, kept: Sequence[int], more: Sequence[Program]) -> list[int]:
-    """Return the quantities that programs share with what is kept."""
+    """Return the quantities that programs share with the stored ones."""
     computed = set(graph.needed_by(map(graph.quantity, kept)))
     used = {i for outputs in more for form in outputs.forms for i in form.terms}
     for outputs in more:

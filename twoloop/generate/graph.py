@@ -1,4 +1,4 @@
-"""Expressions: a graph of the operations of compiled callbacks, and derivatives as further operations of it.
+"""Graph of the operations of compiled callbacks, whose values are expressions; derivatives extend it.
 
 A value is an affine expression c + sum_i c_i x_i of quantities x_i: the time, coordinates, velocities, and the results
 of products and functions of such expressions. An operation that occurs twice is recorded once.
@@ -25,46 +25,46 @@ from twoloop.generate.parameter_expressions import (
 from twoloop.kernels.evaluation import operations as op
 
 # the second argument of a logarithm or an arctangent is the divisor of its derivative
-MOST_OPERATIONS = 20_000  # in a program; more would take longer to trace than a run takes
-LEAST_FACTOR = 1e-100  # smallest factor taken out of a product: those of high powers would underflow or overflow ...
+MOST_OPERATIONS = 20_000  # largest number of operations of a program; more would take longer to trace than a run takes
+LEAST_FACTOR = 1e-100  # smallest factor taken out of a product: factors of high powers would underflow or overflow ...
 HIGH_POWER = 8  # ... so above this power none are taken out, whatever the values of parameters
 BRANCHES = "it branches on, or converts to a number, what depends on t, q or v"
 
 # functions of numbers, which may be Parameters
 SIN, COS, EXP, LOG, ATAN, ROOT = map(function_of_number, ("sin", "cos", "exp", "log", "atan", "sqrt"))
 
-_equal = float.__eq__  # also of Parameters, without their refusal to be compared
-_size = float.__abs__  # a plain number, also for a Parameter
+_equal = float.__eq__  # compares Parameters, too, which refuse ==
+_size = float.__abs__  # absolute value as a plain number, also of a Parameter
 
 CONVERTS = "it converts what depends on t, q or v to a number, as functions of math do within methods (numpy's do not)"
 
 
 class Graph(Symbolic):
-    """Quantities, numbered from 0.
+    """Graph of quantities, numbered from 0.
 
     Attributes
     ----------
     operations : list
-        For each quantity None, if it is an input, or its kind and one or two arguments.
+        For each quantity its kind and one or two arguments; None for an input.
     sizes : list of int
-        Numbers of inputs that were added together.
+        Number of inputs added by each call of `inputs`.
     traced : dict
-        What callbacks returned for symbols: arrays of expressions by kind of callback.
+        Results of callbacks for symbols: arrays of expressions by kind of callback.
     """
 
     def __init__(self) -> None:
         self.sizes: list[int] = []
         self.operations: list[tuple[int, Affine, Affine | None] | None] = []
-        self.late: list[bool] = []  # whether a quantity depends on other inputs than time and coordinates
-        self.inputs_of: list[int] = []  # bits of the inputs that a quantity depends on
+        self.late: list[bool] = []  # whether a quantity depends on inputs other than time and coordinates
+        self.inputs_of: list[int] = []  # bit masks of the inputs on which a quantity depends
         self.traced: dict[str, Any] = {}
         self._recorded: dict[tuple[int, int, int], int] = {}
-        self._order: dict[int, int] = {}  # order of first use of factors, independent of their values
-        self._numbers: dict[Any, int] = {}  # numbers of expressions by key, as keys take long to compare
+        self._order: dict[int, int] = {}  # order of first use of factors, which does not depend on values
+        self._numbers: dict[Any, int] = {}  # numbers of expressions by key, because keys take long to compare
         self._quantities: dict[int, Affine] = {}
 
     def copy(self) -> "Graph":
-        """Return a graph with the same quantities, to be extended on its own; `traced` is empty."""
+        """Return a graph with the same quantities that can be extended on its own; its `traced` is empty."""
         graph = Graph()
         graph.sizes, graph.late, graph.inputs_of = self.sizes.copy(), self.late.copy(), self.inputs_of.copy()
         graph._recorded, graph._order, graph._numbers = self._recorded.copy(), self._order.copy(), self._numbers.copy()
@@ -93,13 +93,13 @@ class Graph(Symbolic):
         return expression
 
     def number(self, form: "Affine") -> int:
-        """Return a number that equal expressions share, rounding of their coefficients apart."""
+        """Return a number shared by expressions that are equal but for rounding of their coefficients."""
         if form.cached_number is None:
             form.cached_number = self._numbers.setdefault(form.key, len(self._numbers))
         return form.cached_number
 
     def operation(self, kind: int, first: "Affine", second: "Affine | None" = None) -> "Affine":
-        """Return the result of an operation, which is recorded unless it was before."""
+        """Return the result of an operation; an operation that occurred before is not recorded again."""
         key = kind, self.number(first), -1 if second is None else self.number(second)
         quantity = self._recorded.get(key)
         if quantity is None:
@@ -113,7 +113,7 @@ class Graph(Symbolic):
         return self.quantity(quantity)
 
     def needed_by(self, forms: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
-        """Return what expressions depend on, inputs and available quantities apart, in an order of computation."""
+        """Return the quantities that expressions need, but inputs and available ones, in an order of computation."""
         needed: set[int] = set()
         stack = [i for form in forms for i in form.terms]
         while stack:
@@ -135,7 +135,7 @@ class Graph(Symbolic):
         return [form for form in (self.operations[i] or ())[1:] if isinstance(form, Affine)]
 
     def in_order_of_use(self, forms: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
-        """Return the same quantities, each just before its first use."""
+        """Return the quantities that expressions need, each just before its first use."""
         order: list[int] = []
         needed: set[int] = set()
         stack = [i for form in forms for i in form.terms][::-1]
@@ -170,7 +170,7 @@ class Graph(Symbolic):
         return self.operation(op.PRODUCT, a, b)
 
     def square(self, form: "Affine", high: bool) -> "Affine":
-        """Return a square; `high`: it is part of a high power, from which no factors are taken out."""
+        """Return a square; `high`: it is part of a high power, so that no factors are taken out."""
         return self._product(form, form) if high and form.terms else self.product(form, form)
 
 
@@ -184,9 +184,10 @@ def rounded(value: float) -> Any:
 
 
 class Affine:
-    """An affine expression, with the arithmetic of a number.
+    """Affine expression of quantities, with the arithmetic of a number.
 
-    It has no value to be compared. While a callback runs on it, whatever could tell it from a number is refused.
+    It has no value that could be compared. While a callback runs on it, operations that would distinguish it from a
+    number are refused.
     """
 
     __slots__ = ("cached_key", "cached_number", "constant", "graph", "terms")
@@ -204,7 +205,7 @@ class Affine:
 
     @property
     def key(self) -> tuple[Any, ...]:
-        """Return a key that equal expressions share, rounding of their coefficients apart."""
+        """Return a key shared by expressions that are equal but for rounding of their coefficients."""
         if self.cached_key is None:
             self.cached_key = rounded(self.constant), *[(i, rounded(self.terms[i])) for i in sorted(self.terms)]
         return self.cached_key
@@ -215,7 +216,7 @@ class Affine:
         return any(self.graph.late[i] for i in self.terms)
 
     def times(self, factor: float) -> "Affine":
-        """Return a multiple."""
+        """Return the expression times a factor."""
         if type(factor) is float and factor == 1.0:
             return self
         if _equal(factor, 0.0):
@@ -223,7 +224,7 @@ class Affine:
         return Affine(self.graph, self.constant * factor, {i: c * factor for i, c in self.terms.items()})
 
     def normalised(self) -> tuple[float, "Affine"]:
-        """Return a factor, and the quotient by it, whose first coefficient is 1."""
+        """Return a factor and the expression divided by it, whose first coefficient is 1."""
         first = min(self.terms)
         factor = self.terms[first]
         if type(factor) is float and factor == 1.0:
@@ -251,7 +252,7 @@ class Affine:
         for i, c in other.terms.items():
             total = terms[i] + c if i in terms else c
             if _size(total) <= CANCELLED * _size(c):
-                terms.pop(i, None)  # also where a coefficient underflowed and is absent
+                terms.pop(i, None)  # also if a coefficient underflowed and is absent
             else:
                 terms[i] = total
         if _equal(other.constant, 0.0):
@@ -388,13 +389,13 @@ class Affine:
         return self
 
     def item(self) -> "Affine":
-        """Return itself, as a number of NumPy does."""
+        """Return the expression itself, like the method of a NumPy number."""
         return self
 
     real = property(item)
 
     @property  # type: ignore[misc]
-    def __class__(self) -> Any:  # which isinstance reads
+    def __class__(self) -> Any:  # isinstance reads it
         if self.graph.running:
             self.graph.refuse("it asks for the type of what depends on t, q or v")
         return Affine
@@ -445,7 +446,7 @@ def is_zero(form: Affine) -> bool:
 
 
 class Derivative:
-    """Differentiate expressions along a direction of the inputs; derivatives are expressions of the same graph."""
+    """Derivatives of expressions along a direction of the inputs; they are expressions of the same graph."""
 
     def __init__(self, graph: Graph, direction: dict[int, Affine]):
         self.graph = graph

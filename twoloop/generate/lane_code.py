@@ -726,7 +726,7 @@ ELIMINATION = (elimination, symbolic_factors, null_space, compile_equations)
 WRITERS = (series, *ELIMINATION, coefficients, lowering, lane_series, lane_emitter, llvm_code, llvm_text)
 
 Code = TypeVar("Code", LaneCode, LaneConstraints)
-KIND = "lanes"  # of files on the disk
+KIND = "lanes"  # kind of the cached files
 
 
 class GeneratedLanes(Generic[Code]):

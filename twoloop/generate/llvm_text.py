@@ -1,4 +1,4 @@
-"""Write modules of LLVM as text: functions, blocks and operations.
+"""Writer of LLVM modules as text: functions, blocks and operations.
 
 llvmlite writes them from objects, which takes ten times as long: more than LLVM takes to compile them. A type is its
 text. Pointers are written with the type that they point to, which all versions of LLVM read.
@@ -10,11 +10,12 @@ from contextlib import contextmanager
 
 DOUBLE, INTEGER, WORD, BIT, NOTHING = "double", "i64", "i32", "i1", "void"
 LINE = 8  # doubles in a cache line
-LONGEST = 400  # lines of a block of a divided function; longer ones take more than twice as long to compile
+# largest number of lines of a block of a divided function; longer ones take more than twice as long to compile
+LONGEST = 400
 
 
 class Value:
-    """A number, a vector or a pointer: its type and its text."""
+    """Value of an LLVM function (a number, a vector or a pointer): its type and its text."""
 
     __slots__ = ("text", "type")
 
@@ -27,7 +28,7 @@ class Value:
 
 
 class Phi(Value):
-    """A value that depends on the block from which its block is entered."""
+    """Phi node: a value that depends on the block from which its block is entered."""
 
     __slots__ = ("incoming",)
 
@@ -36,17 +37,17 @@ class Phi(Value):
         self.incoming: list[tuple[Value, Block]] = []
 
     def add_incoming(self, value: Value, block: "Block") -> None:
-        """Add the value for a block."""
+        """Add the value for the case that its block is entered from `block`."""
         self.incoming.append((value, block))
 
     def line(self) -> str:
-        """Return its definition."""
+        """Return the definition of the node."""
         ways = ", ".join(f"[{value.text}, %{block.name}]" for value, block in self.incoming)
         return f"{self.text} = phi {self.type} {ways}"
 
 
 class Block:
-    """A sequence of operations."""
+    """Basic block: a sequence of operations."""
 
     def __init__(self, name: str):
         self.name = name
@@ -59,12 +60,12 @@ class Block:
 
 
 def vector_of(kind: str, width: int) -> str:
-    """Return the type of a vector; of width 1 it is that of a number."""
+    """Return the type of a vector; for width 1 that of a number."""
     return kind if width == 1 else f"<{width} x {kind}>"
 
 
 def width_of(kind: str) -> int:
-    """Return how many numbers a value of a type has."""
+    """Return the number of elements of a type; 1 for a number."""
     return int(kind[1:].split()[0]) if kind.startswith("<") else 1
 
 
@@ -74,7 +75,7 @@ def element_of(kind: str) -> str:
 
 
 def constant(kind: str, number: float) -> Value:
-    """Return a number, or a vector of equal numbers."""
+    """Return a literal number, or a vector of equal literals."""
     element, width = element_of(kind), width_of(kind)
     bits = struct.unpack("<Q", struct.pack("<d", number))[0]
     text = f"0x{bits:016X}" if element == DOUBLE else str(number)
@@ -82,13 +83,13 @@ def constant(kind: str, number: float) -> Value:
 
 
 def constants(numbers: Iterable[float]) -> Value:
-    """Return a vector of numbers."""
+    """Return a vector of literal numbers."""
     each = [str(constant(DOUBLE, float(number))) for number in numbers]
     return Value(vector_of(DOUBLE, len(each)), f"<{', '.join(each)}>")
 
 
 def integer(number: int) -> Value:
-    """Return an integer."""
+    """Return a literal integer."""
     return Value(INTEGER, str(number))
 
 
@@ -98,14 +99,14 @@ def undefined(kind: str) -> Value:
 
 
 class Module:
-    """Functions, and declarations of functions that they call.
+    """Module: functions, and declarations of functions that they call.
 
-    `divided`: long blocks are divided, as LLVM's time grows faster than the length of a block.
+    `divided`: long blocks are divided, because LLVM's time grows faster than the length of a block.
     """
 
     def __init__(self, divided: bool = False) -> None:
         self.divided = divided
-        self.kept_apart: list[str] = []  # addresses of blocks
+        self.kept_apart: list[str] = []  # addresses of blocks that LLVM must not merge
         self._tables: list[str] = []
         self._numbers: list[float] = []  # see `Builder.far`
         self._declared: dict[str, str] = {}
@@ -118,18 +119,18 @@ class Module:
         return builder
 
     def defines(self, name: str) -> bool:
-        """Return whether there is a function of a name."""
+        """Return whether the module has a function of this name."""
         return any(function.name == name for function in self._functions)
 
     def table(self, places: Sequence[int]) -> Value:
-        """Add constant integers, and return a pointer to them."""
+        """Add constant integers and return a pointer to them."""
         kind, name = f"[{len(places)} x {WORD}]", f"@table{len(self._tables)}"
         entries = ", ".join([f"{WORD} {place}" for place in places])
         self._tables.append(f"{name} = internal constant {kind} [{entries}]")
         return Value(f"{WORD}*", f"getelementptr inbounds ({kind}, {kind}* {name}, {INTEGER} 0, {INTEGER} 0)")
 
     def far_number(self, number: float) -> int:
-        """Add a number to those of `Builder.far`, and return its place."""
+        """Add a number to those of `Builder.far` and return its index."""
         self._numbers.append(number)
         return len(self._numbers) - 1
 
@@ -155,14 +156,14 @@ class Module:
 
 
 class Builder:
-    """Appends operations to the blocks of a function."""
+    """Builder of a function: appends operations to its blocks."""
 
     def __init__(self, module: Module, name: str, result: str, arguments: Sequence[str], internal: bool = False):
         self.module, self.name, self.result, self.internal = module, name, result, internal
         self.arguments = [Value(kind, f"%a{k}") for k, kind in enumerate(arguments)]
         self._n = self._n_rooms = 0
         self._far: Value | None = None
-        self.part = 0  # present part of a divided function
+        self.part = 0  # index of the present part of a divided function
         self._blocks: list[Block] = []
         self._n_blocks = 0
         self.position_at_end(self.append_block())
@@ -172,17 +173,17 @@ class Builder:
         arguments = ", ".join(map(str, self.arguments))
         body = "\n".join(block.text() for block in self._blocks)
         linkage = "internal " if self.internal else ""
-        # vectors that wait on the stack would lie across two lines of the cache, and take twice as long
+        # spilled vectors would lie across two cache lines without this alignment, and take twice as long
         attributes = "noinline alignstack(64)" if f"<{LINE} x" in body else "noinline"
         return f"define {linkage}{self.result} @{self.name}({arguments}) {attributes} {{\n{body}\n}}"
 
     def append_block(self) -> Block:
-        """Return a new block, which stands in the text where `position_at_end` is called with it."""
+        """Return a new block; its place in the text is where `position_at_end` is called with it."""
         self._n_blocks += 1
         return Block(f"b{self._n_blocks - 1}")
 
     def position_at_end(self, block: Block) -> None:
-        """Append what follows to a block."""
+        """Make a block the present one, to which operations are appended."""
         self.block = block
         self._blocks.append(block)
 
@@ -198,7 +199,7 @@ class Builder:
         return value
 
     def _divide(self) -> None:
-        """Continue in another block, whose address is taken, so that LLVM does not merge it."""
+        """Continue in another block; its address is taken, so that LLVM does not merge it."""
         block = self.append_block()
         self.go_to(block)
         self.module.kept_apart.append(f"i8* blockaddress(@{self.name}, %{block.name})")
@@ -206,7 +207,7 @@ class Builder:
         self.part += 1
 
     def operation(self, name: str, a: Value, b: Value) -> Value:
-        """Append an operation on two values of a type, such as "add" or "fmul fast"."""
+        """Append an operation on two values of the same type, such as "add" or "fmul fast"."""
         return self._value(a.type, f"{name} {a.type} {a.text}, {b.text}")
 
     def negative(self, flags: str, a: Value) -> Value:
@@ -230,11 +231,11 @@ class Builder:
         return self.operation("and", a, b)
 
     def convert(self, name: str, a: Value, kind: str) -> Value:
-        """Convert a value, by "sitofp", "bitcast" and so on."""
+        """Convert a value by an instruction such as "sitofp" or "bitcast"."""
         return self._value(kind, f"{name} {a.type} {a.text} to {kind}")
 
     def compare(self, name: str, a: Value, b: Value) -> Value:
-        """Compare two values, by "fcmp oeq", "icmp slt" and so on."""
+        """Compare two values by an instruction such as "fcmp oeq" or "icmp slt"."""
         kind = vector_of(BIT, width_of(a.type))
         return self._value(kind, f"{name} {a.type} {a.text}, {b.text}")
 
@@ -243,16 +244,16 @@ class Builder:
         return self._value(a.type, f"select {condition}, {a}, {b}")
 
     def call(self, name: str, kind: str, arguments: Sequence[Value], flags: str = "") -> Value:
-        """Call a function, which is declared if the module does not define it; `flags` as of operations."""
+        """Call a function, which is declared if the module does not define it; `flags` are those of operations."""
         self.module.declare(name, kind, [value.type for value in arguments])
         return self._value(kind, f"call {flags} {kind} @{name}({', '.join(map(str, arguments))})")
 
     def run(self, name: str, arguments: Sequence[Value]) -> None:
-        """Call a function of the module without result."""
+        """Call a function of the module that returns nothing."""
         self._line(f"call {NOTHING} @{name}({', '.join(map(str, arguments))})")
 
     def room(self, kind: str, size: int) -> Value:
-        """Allocate memory on the stack, in the first block, as it would grow within a loop."""
+        """Allocate memory on the stack, in the first block: within a loop it would grow."""
         pointer = Value(f"{kind}*", f"%room{self._n_rooms}")
         self._blocks[0].lines.insert(
             self._n_rooms, f"{pointer.text} = alloca {kind}, {integer(max(size, 1))}, align 64"
@@ -261,7 +262,7 @@ class Builder:
         return pointer
 
     def far(self, number: float) -> Value:
-        """Load a number where it is used; a constant would occupy a register, or the stack, before."""
+        """Load a number where it is used; a literal would occupy a register, or the stack, before."""
         if self._far is None:
             self._far = Value(f"{DOUBLE}*", "%far")
             self._blocks[0].lines.insert(0, f"%far = load {DOUBLE}*, {DOUBLE}** @far")
@@ -269,7 +270,7 @@ class Builder:
         return self.load(self.gep(self._far, integer(self.module.far_number(number))))
 
     def leave_unless(self, condition: Value) -> None:
-        """Return false from the function where a condition does not hold."""
+        """Return false from the function if a condition does not hold."""
         go_on, leave = self.append_block(), self.append_block()
         self.branch(condition, go_on, leave)
         self.position_at_end(leave)
@@ -277,7 +278,7 @@ class Builder:
         self.position_at_end(go_on)
 
     def gep(self, base: Value, place: Value) -> Value:
-        """Return a pointer some elements further on."""
+        """Return a pointer advanced by a number of elements."""
         return self._value(base.type, f"getelementptr inbounds {base.type[:-1]}, {base}, {place}")
 
     def load(self, pointer: Value, align: int = 8, constant: bool = False) -> Value:
@@ -298,17 +299,17 @@ class Builder:
         return self._value(element_of(vector.type), f"extractelement {vector}, {WORD} {place}")
 
     def shuffle(self, a: Value, b: Value, places: Sequence[int]) -> Value:
-        """Select elements of two vectors; those of the second are counted on from the first."""
+        """Select elements of two vectors; indices of the second continue those of the first."""
         mask = f"<{len(places)} x {WORD}> <{', '.join(f'{WORD} {place}' for place in places)}>"
         return self._value(vector_of(element_of(a.type), len(places)), f"shufflevector {a}, {b}, {mask}")
 
     def first_everywhere(self, vector: Value) -> Value:
-        """Return a vector filled with the first element."""
+        """Return a vector filled with the first element of a vector."""
         mask = f"<{width_of(vector.type)} x {WORD}> zeroinitializer"
         return self._value(vector.type, f"shufflevector {vector}, {vector}, {mask}")
 
     def phi(self, kind: str) -> Phi:
-        """Append a value that depends on the block before."""
+        """Append a phi node, whose value depends on the previous block."""
         phi = Phi(kind, f"%{self._n}")
         self._n += 1
         self.block.lines.append(phi)

@@ -1,4 +1,4 @@
-"""Compute the coefficients of Lobatto IIIA with nine nodes, the first of which is the end of the step before.
+"""Coefficients of Lobatto IIIA with nine nodes, the first of which is the end of the previous step.
 
 A polynomial of degree 8 through values at the nodes is expanded in Legendre polynomials, whose integrals and
 derivatives at the ends are known (Hairer & Wanner, Solving ODEs II, IV.5). The order is 16.
@@ -18,7 +18,7 @@ N = 9
 
 
 class Tables(NamedTuple):
-    """Hold the tables for nodes c_0 = 0 < ... < c_8 = 1. Row k multiplies the value at node k.
+    """Tables for nodes c_0 = 0 < ... < c_8 = 1; row k multiplies the value at node k.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ def tables() -> Tables:
     values = _legendre(x)
     weights = 2 / (N * (N - 1) * values[N - 1] ** 2)
     norms = np.array([np.longdouble(2) / (2 * k + 1) for k in range(N)])
-    norms[N - 1] = np.longdouble(2) / (N - 1)  # what the quadrature gives of the square of the last one
+    norms[N - 1] = np.longdouble(2) / (N - 1)  # the quadrature is not exact for the square of the last polynomial
     coefficients = values[:N] * weights / norms[:, None]  # (k, node): Legendre coefficients of the Lagrange polynomials
     powers = [
         np.array([[sign ** (n + k) * comb(n, k) * comb(n + k, k) for n in range(N)] for k in range(1, N)]).T
@@ -80,7 +80,7 @@ def _nodes() -> Extended:
 
 
 def _legendre(z: Extended) -> Extended:
-    """Evaluate P_0 to P_10, a row each."""
+    """Evaluate P_0 to P_10, one row each."""
     return np.array([legendre.legval(z, np.array([0] * k + [1], dtype=np.longdouble)) for k in range(N + 2)])
 
 

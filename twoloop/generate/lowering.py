@@ -1,6 +1,6 @@
-"""Write programs into functions of LLVM, with coefficients that are read from memory.
+"""Lowering of programs to LLVM functions, with coefficients that are read from memory.
 
-One code serves all mechanisms of its structure: the numbers that it reads differ.
+One code serves all mechanisms of the same structure: only the numbers that it reads differ.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,25 +24,25 @@ from twoloop.kernels.evaluation.operations import (
 
 FUNCTIONS = {SQUARE_ROOT: "sqrt", EXPONENTIAL: "exp", LOGARITHM: "log", ARCTANGENT: "atan"}
 
-Place = tuple[Value, int]  # an array, and a place in it
+Place = tuple[Value, int]  # an array, and an index in it
 NOWHERE: Mapping[int, Place] = {}
 
 
 class Lowering(Algebra[Value]):
-    """The algebra of LLVM code: values are written into a function, of numbers or of SIMD lanes.
+    """Algebra of LLVM code: values are written into a function, as numbers or as SIMD lanes.
 
     Parameters
     ----------
     emit : Emitter
     numbers : Coefficients
     places : dict, optional
-        Where quantities stand that were computed before.
+        Memory locations of quantities that were computed before.
     """
 
     def __init__(self, emit: Emitter, numbers: Coefficients, places: Mapping[int, Place] = NOWHERE):
         super().__init__()
         self.emit, self.numbers, self._places = emit, numbers, dict(places)
-        self.angles: list[Value] = []  # of sines and cosines
+        self.angles: list[Value] = []  # arguments of sines and cosines, whose size is limited
         self.functions = {kind: partial(emit.function, name) for kind, name in FUNCTIONS.items()}
         self.functions[RECIPROCAL] = lambda x: emit.divide(emit.constant(1.0), x)
         self._quantities = Quantities(emit, lambda quantity: emit.load(*self._places[quantity]))
@@ -50,11 +50,11 @@ class Lowering(Algebra[Value]):
         self._computed = set(places)
 
     def define(self, quantity: int, value: Value) -> None:
-        """Give a quantity its value."""
+        """Define the value of a quantity."""
         self._quantities.define(quantity, value)
 
     def take(self, graph: Graph, given: Sequence[Value]) -> None:
-        """Take the inputs of a graph, which are given as numbers or in memory, and loaded there first."""
+        """Define the inputs of a graph, given as numbers or as arrays, which are loaded first."""
         first = 0
         for argument, size in zip(given, graph.sizes, strict=True):
             if argument.type == self.emit.double:
@@ -89,7 +89,7 @@ class Lowering(Algebra[Value]):
         return self._pairs[first.key][kind == COSINE]
 
     def run(self, graph: Graph, quantities: Iterable[int], places: Mapping[int, Place] = NOWHERE) -> None:
-        """Compute quantities in their order; what has a place is stored there at once."""
+        """Compute quantities in the given order; those in `places` are stored at once."""
         if not places:
             return super().run(graph, quantities)
         for i in quantities:
@@ -101,10 +101,10 @@ class Lowering(Algebra[Value]):
         return None
 
     def outputs(self, program: Program) -> list[list[Value]]:
-        """Compute the arrays of a program, and what its conditions depend on.
+        """Compute the arrays of a program and the quantities of its conditions.
 
         In a divided function each number is computed just before it is used, as few numbers stay in registers from one
-        part to the next; LLVM finds an order within a part only.
+        part to the next, and LLVM reorders operations only within a part.
         """
         graph = program.graph
         if not self.emit.builder.module.divided:
@@ -115,17 +115,17 @@ class Lowering(Algebra[Value]):
         return arrays
 
     def forms(self, graph: Graph, forms: Sequence[Affine]) -> list[Value]:
-        """Compute expressions; what was computed for others before is not computed again."""
+        """Compute expressions; quantities that were computed before are not computed again."""
         quantities = graph.in_order_of_use(forms, self._computed)
         self.run(graph, quantities)
         self._computed.update(quantities)
         return [self.affine(form) for form in forms]
 
     def holds(self, program: Program, values: Sequence[Value]) -> Value:
-        """Return whether the conditions hold, no angle is too large, and values are finite."""
+        """Return whether the conditions hold, no angle is too large, and all values are finite."""
         emit, builder, zero = self.emit, self.emit.builder, self.emit.constant(0.0)
         total = zero
-        for value in values:  # what is not finite becomes NaN
+        for value in values:  # values that are not finite make the sum NaN
             total = emit.add(total, emit.multiply(value, zero))
         holds = builder.compare("fcmp oeq", total, zero)
         pairs = [(self.affine(larger), self.affine(smaller)) for larger, smaller in program.conditions]

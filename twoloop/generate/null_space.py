@@ -1,10 +1,10 @@
 """Eliminate dependent coordinates from the equations of motion by the rows G a = gamma.
 
-With G = [G_d G_i], a_d = g + B a_i for B = -G_d^-1 G_i and g = G_d^-1 gamma. What is left is the small system
-(T^T M T) a_i = T^T (Q - M g) with T = [B; 1]. It takes about half the operations of an elimination that begins with M,
-and M may be singular where the constraints do not let it be felt.
+With G = [G_d G_i], a_d = g + B a_i for B = -G_d^-1 G_i and g = G_d^-1 gamma. The remaining system is small: (T^T M T)
+a_i = T^T (Q - M g) with T = [B; 1]. It takes about half the operations of an elimination that begins with M, and M may
+be singular in directions that the constraints exclude.
 
-Pivots are fixed. Where one becomes small on the way, the conditions do not hold, and other code has to find a.
+Pivots are fixed. If one becomes small during a run, the conditions fail, and other code has to compute a.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,20 +13,21 @@ from typing import Any
 from twoloop.generate.graph import Affine, is_zero
 from twoloop.generate.symbolic_factors import Factors
 
-Blocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # rows and columns of pivots, one or two each
-Terms = dict[int, Affine]  # entries of a row that are not zero, by their columns
+Blocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # rows and columns of the pivots, one or two each
+Terms = dict[int, Affine]  # nonzero entries of a row, by their columns
 
-# Squares of the least pivot over what it is divided into, or its column, and of the sine between two columns. The
-# accelerations lose up to three times as many digits. At a start more is asked for, see linalg/dependent_columns.py.
+# least square of: a pivot over the entries that it divides, or over its column; the sine between two columns. The
+# accelerations lose up to three times as many digits. At a start the limits are stricter, see
+# linalg/dependent_columns.py.
 LEAST = 0.03**2
 
 
 class NotReduced(Exception):
-    """Say that a pivot is zero by its structure, or that the elimination takes too many operations."""
+    """Exception: a pivot is zero by its structure, or the elimination takes too many operations."""
 
 
 class DependentCoordinates:
-    """Solve G a = gamma for the dependent accelerations, a_d = g + B a_i.
+    """Solution of G a = gamma for the dependent accelerations, a_d = g + B a_i.
 
     Parameters
     ----------
@@ -34,25 +35,25 @@ class DependentCoordinates:
         G, of full rank.
     gamma : sequence of Affine
     blocks : sequence of (rows, columns)
-        Of pivots, in their order.
+        Rows and columns of the pivots, in the order of elimination.
     most : int
-        Operations, of which it is not to take more.
+        Largest number of operations.
 
     Attributes
     ----------
     independent : list of int
-        The coordinates that stay.
+        Independent coordinates.
     T : list of dict
-        The entries of T in each row, by the coordinate that they multiply.
+        Nonzero entries of T in each row, by the coordinate that they multiply.
     g : list of Affine
-        0 for the coordinates that stay.
+        The vector g; 0 for independent coordinates.
     conditions : list of (Affine, Affine)
-        The first is larger than the second where pivots are not too small.
+        Pairs of which the first is larger than the second if pivots are not too small.
 
     Raises
     ------
     NotReduced
-        If a pivot is zero by its structure, or it takes more operations.
+        If a pivot is zero by its structure, or if it takes more operations.
     """
 
     def __init__(self, rows: Sequence[Sequence[Affine]], gamma: Sequence[Affine], blocks: Blocks, most: int):
@@ -76,7 +77,7 @@ class DependentCoordinates:
                 self._substitute(j, self._rows[i])
 
     def _eliminate(self, places: tuple[int, ...], columns: tuple[int, ...]) -> None:
-        """Solve rows for columns, and take these out of the other rows that are left."""
+        """Solve rows for columns, and eliminate these from the remaining rows."""
         self.check()
         block = [[self._rows[i].get(j, self._zero) for j in columns] for i in places]
         pivot, inverse = self._inverse(block)
@@ -101,12 +102,12 @@ class DependentCoordinates:
             self._add_conditions(block, columns, pivot, solved)
 
     def check(self, more: int = 0) -> None:
-        """Raise `NotReduced` where the elimination has become too long, or would with more operations."""
+        """Raise `NotReduced` if the elimination is too long, or would be with `more` operations."""
         if len(self._graph.operations) + more > self._most:
             raise NotReduced
 
     def _inverse(self, block: list[list[Affine]]) -> tuple[Affine, list[list[Affine]]]:
-        """Return the determinant of a block, and its inverse."""
+        """Return the determinant of a block and its inverse."""
         if len(block) == 1:
             ((determinant,),) = block
         else:
@@ -125,11 +126,12 @@ class DependentCoordinates:
     def _add_conditions(
         self, block: list[list[Affine]], columns: tuple[int, ...], pivot: Affine, solved: list[Terms]
     ) -> None:
-        """Require that no pivot is too small for what is divided by it, and that rows are not nearly dependent.
+        """Require that no pivot is too small for the entries that it divides, and that rows are not nearly dependent.
 
-        Then columns of a block are nearly parallel, or one pivot is small in its column, where its row may be, too.
+        A pivot that is too small means that the columns of a block are nearly parallel, or that one pivot is small in
+        its column, where its row may be small, too.
 
-        The sign of a pivot has no part in it: on either side of zero the accelerations are the same function.
+        The sign of a pivot does not matter: on either side of zero the accelerations are the same function.
         """
         entries = [entry for row in solved for j, entry in row.items() if j < self._n]
         total = _dot(self._zero, [(entry, entry) for entry in entries])
@@ -144,7 +146,7 @@ class DependentCoordinates:
             self.conditions.append((pivot * pivot, (a * b).times(LEAST)))
 
     def _substitute(self, j: int, row: Terms) -> None:
-        """Express a dependent coordinate by independent ones, and by later ones, which are expressed already."""
+        """Express a dependent coordinate by independent ones; later dependent ones have been expressed already."""
         self.check()
         right, entries = row.get(self._n, self._zero), dict[int, Affine]()
         for k, entry in row.items():
@@ -158,13 +160,13 @@ class DependentCoordinates:
 def reduced_accelerations(
     mass: Any, force: Sequence[Affine], coordinates: DependentCoordinates
 ) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-    """Return the accelerations, and the conditions that the independent coordinates have inertia."""
+    """Return the accelerations, and the conditions that all independent motions have inertia."""
     n, T, g, independent = len(mass), coordinates.T, coordinates.g, coordinates.independent
     zero = Affine(mass[0, 0].graph, 0.0, {})
     rows = [[(mass[i, j], j) for j in range(n) if not is_zero(mass[i, j])] for i in range(n)]
     forces = [(force[i] - _dot(zero, ((x, g[j]) for x, j in rows[i]))).value() for i in range(n)]
     matrix: dict[tuple[int, int], Affine] = {}
-    coordinates.check(sum(len(row) ** 2 // 2 for row in T))  # of T^T M T, if M is diagonal
+    coordinates.check(sum(len(row) ** 2 // 2 for row in T))  # operations of T^T M T, if M is diagonal
     for a, x in enumerate(independent):
         moved = [_dot(zero, ((entry, T[j][x]) for entry, j in row if x in T[j])).value() for row in rows]  # M T
         for b, y in enumerate(independent[: a + 1]):
@@ -179,7 +181,7 @@ def reduced_accelerations(
 
 
 def _definite(matrix: dict[tuple[int, int], Affine], factors: Factors) -> Iterator[tuple[Affine, Affine]]:
-    """Yield the conditions on pivots of the reduced mass matrix: each over its value without those before."""
+    """Yield the conditions on pivots of the reduced mass matrix, each relative to its value without earlier ones."""
     pivots = iter(factors.positive)
     for places, _, _ in factors.blocks:
         alone: Affine | None = None

@@ -1,7 +1,7 @@
-"""Numbers that tape how they were computed from parameters, so that one trace serves other values of these.
+"""Numbers that record how they were computed from parameters, so that one trace serves all values of these.
 
 A `Parameter` is a float with which callbacks compute as with any other; the result is a `Parameter` again. Tracing
-decides by values (what cancels, which expressions are equal), so these must be generic.
+decides by present values (which terms cancel, which expressions are equal), so these must be generic.
 """
 
 import math
@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-Powers = tuple[tuple[int, float], ...]  # a product of atoms: their places and exponents; empty for 1
+Powers = tuple[tuple[int, float], ...]  # a product of atoms: their indices and exponents; empty for 1
 
-MOST_TERMS = 200  # in a sum: its key holds all of them, and takes long to compare
-_as_float = float.__pos__  # a Parameter as a float, without its refusal to be converted
-CANCELLED = 8.0 * 2.0**-52  # relative: what rounding leaves of two terms that cancel
+MOST_TERMS = 200  # largest number of terms of a sum: its key holds all of them, and takes long to compare
+_as_float = float.__pos__  # converts a Parameter to a float; float() would be refused
+CANCELLED = 8.0 * 2.0**-52  # relative: a smaller sum of two terms is rounding of zero
 NUMBERS = (int, float, np.number)
 _UNARY = ("sin", "cos", "tan", "sqrt", "exp", "log", "arctan", "sinh", "cosh", "tanh", "absolute")
 FUNCTIONS = {name: getattr(np, name) for name in (*_UNARY, "hypot", "power")}
-OPERATORS: dict[str, Callable[..., Any]] = {  # functions of NumPy as operators of Python
+OPERATORS: dict[str, Callable[..., Any]] = {  # NumPy's functions as Python operators
     "add": operator.add,
     "subtract": operator.sub,
     "multiply": operator.mul,
@@ -45,24 +45,24 @@ class Untraceable(ValueError):
 
 
 class Refusal(BaseException):
-    """Leaves a callback that does not run on symbols; its own `except Exception` cannot catch it."""
+    """Exception that leaves a callback that does not run on symbols; its own `except Exception` cannot catch it."""
 
 
 class Symbolic:
-    """Base of what callbacks run on in the place of numbers.
+    """Base of the objects that replace numbers while a callback is traced.
 
     Attributes
     ----------
     running : bool
-        Whether a callback runs on it now.
+        Whether a callback is running on it now.
     refused : str
-        Why that callback cannot run on it; the callback may have caught the exception.
+        Reason why that callback cannot run on it; the callback may have caught the exception.
     """
 
     running, refused = False, ""
 
     def refuse(self, reason: str) -> NoReturn:
-        """Leave the running callback, and keep the reason."""
+        """Leave the running callback, and store the reason."""
         if not self.running:
             raise Untraceable(reason)
         self.refused = self.refused or reason
@@ -70,7 +70,7 @@ class Symbolic:
 
     @contextmanager
     def watched(self) -> Iterator[None]:
-        """Surround the run of a callback; raise Untraceable if it was refused something and caught the exception."""
+        """Watch the run of a callback; raise Untraceable if it was refused something and caught the exception."""
         self.running, self.refused = True, ""
         try:
             yield
@@ -81,7 +81,7 @@ class Symbolic:
 
 
 class ParameterTape(Symbolic):
-    """Records how numbers were computed from parameters.
+    """Record of how numbers were computed from parameters.
 
     Its atoms are parameters, sums of products of atoms, and functions of such products. A callback that runs on its
     numbers must not branch on their present values.
@@ -91,12 +91,12 @@ class ParameterTape(Symbolic):
     values : sequence of float
         Values of all parameters, generic ones for those that vary.
     varying : sequence of int
-        Places of the parameters that vary.
+        Indices of the parameters that vary.
     """
 
     def __init__(self, values: Sequence[float], varying: Iterable[int]):
         self.atoms: list[Any] = [None] * len(values)
-        self.merged: dict[tuple[Powers, Powers], Powers] = {}  # products of two products
+        self.merged: dict[tuple[Powers, Powers], Powers] = {}  # cache of products of two products
         self._places: dict[Any, int] = {}
         self.parameters = np.empty(len(values), dtype=object)
         self.parameters[:] = [float(value) for value in values]
@@ -104,14 +104,14 @@ class ParameterTape(Symbolic):
             self.parameters[place] = Parameter(float(values[place]), self, 1.0, ((place, 1.0),))
 
     def atom(self, definition: Any) -> Powers:
-        """Return a sum or a function as a product of one atom, which is recorded unless it was before."""
+        """Return a sum or a function as a product of one atom; equal definitions share their atom."""
         if definition not in self._places:
             self._places[definition] = len(self.atoms)
             self.atoms.append(definition)
         return ((self._places[definition], 1.0),)
 
     def terms(self, number: float) -> dict[Powers, float]:
-        """Return a number as a sum of products, by their coefficients."""
+        """Return a number as a sum of products: a dict of coefficients by product."""
         if type(number) is not Parameter:
             return {(): number} if number else {}
         (place, exponent), *further = number.powers
@@ -169,7 +169,7 @@ class ParameterTape(Symbolic):
 
 
 class Parameter(float):
-    """A float, and the product of atoms of which it is a multiple."""
+    """Float that is a multiple of a product of atoms."""
 
     __slots__ = ("powers", "scale", "tape")
     tape: ParameterTape
@@ -177,7 +177,7 @@ class Parameter(float):
     powers: Powers
 
     def __new__(cls, value: float, tape: ParameterTape, scale: float, powers: Powers) -> "Parameter":
-        """Create a number of a tape."""
+        """Create a Parameter that belongs to a tape."""
         parameter = float.__new__(cls, value)
         parameter.tape, parameter.scale, parameter.powers = tape, scale, powers
         return parameter
@@ -191,7 +191,7 @@ class Parameter(float):
         return elementwise(lambda *given: applied(name, *given), inputs, out)
 
     def _decides(self, reason: str = "it branches on its parameters, or rounds them") -> None:
-        """Refuse what is true of the present value alone; the tracer itself may ask."""
+        """Refuse an operation whose result depends on the present value; the tracer itself may use it."""
         caller = sys._getframe(2).f_globals.get("__name__", "")
         if self.tape.running and not caller.startswith(__name__.rpartition(".")[0]):
             self.tape.refuse(reason)
@@ -258,7 +258,8 @@ def _product(a: float, b: float) -> float:
 
 
 def _power(base: float, exponent: float) -> float:
-    if type(exponent) is Parameter or not exponent.is_integer():  # the root of a square is no product: its sign is lost
+    # the root of a square is no product: its sign would be lost
+    if type(exponent) is Parameter or not exponent.is_integer():
         return _function("power", base, exponent)
     assert isinstance(base, Parameter)
     return base.to(exponent) if exponent else 1.0
@@ -293,7 +294,7 @@ def applied(name: str, *arguments: Any) -> Any:
 def _function(name: str, *numbers: float) -> Parameter:
     tape = _tape_of(*numbers)
     arguments = tuple((each.powers, each.scale) if isinstance(each, Parameter) else ((), each) for each in numbers)
-    with np.errstate(all="ignore"):  # a generic number may be outside the domain
+    with np.errstate(all="ignore"):  # a generic value may be outside the domain
         value = float(FUNCTIONS[name](*map(float, numbers)))
     return Parameter(value, tape, 1.0, tape.atom((name, arguments)))
 
@@ -307,7 +308,7 @@ def _operator(name: str, swapped: bool) -> Callable[[Parameter, Any], Any]:
         pair = (other, self) if swapped else (self, other)
         if issubclass(type(other), np.ndarray):
             return self.__array_ufunc__(getattr(np, name), "__call__", *pair)
-        if not issubclass(type(other), NUMBERS):  # by type(), as a symbol refuses isinstance
+        if not issubclass(type(other), NUMBERS):  # by type(): a symbol refuses isinstance
             return NotImplemented
         return operation(*(each if type(each) is Parameter else float(each) for each in pair))
 
@@ -336,7 +337,7 @@ for _name in _UNARY:
 
 
 def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = None) -> Any:
-    """Apply a function to arrays of numbers and symbols, without NumPy calling their `__array_ufunc__` again."""
+    """Apply a function to arrays of numbers and symbols, bypassing NumPy's call of their `__array_ufunc__`."""
     operands = list(map(_operand, inputs))
     results = np.frompyfunc(function, len(operands), 1)(*operands)
     if out is None:
@@ -346,7 +347,7 @@ def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = 
 
 
 def _operand(value: Any) -> Any:
-    """Return an array of objects, also for a single number, or for a symbol, which refuses isinstance."""
+    """Return an array of objects; also for a single number, or for a symbol, which refuses isinstance."""
     if issubclass(type(value), np.ndarray):
         return value.astype(object)
     array = np.empty((), dtype=object)

@@ -3,7 +3,7 @@
 - `Program.run` executes a program, or writes it. The algebra says what values are: arrays (`Arrays`), LLVM code
   (`lowering.Lowering`), degrees of growth (`time_dependence.Degrees`).
 - `OperationTable` lists the operations for compiled kernels, which walk over its rows.
-- Derivatives extend the graph (`graph.Derivative`). What depends on parameters alone is in the coefficients
+- Derivatives extend the graph (`graph.Derivative`). Expressions of parameters alone are coefficients
   (`parameter_expressions`), which are computed before a program runs.
 """
 
@@ -24,22 +24,23 @@ Array = NDArray[np.float64]
 T = TypeVar("T")
 
 # a program of a user's function is compared with the function
-STATES = 5  # at so many states ...
-BETWEEN = 0.37  # ... s apart, of no usual period
+STATES = 5  # number of states at which they are compared ...
+BETWEEN = 0.37  # ... time between them, s: no usual period
 AGREES = 1e-10  # largest relative difference
 
-COSTS = {op.PRODUCT: 1, op.RECIPROCAL: 4}  # in multiplications; terms of sums count 1, and functions 0
+# cost in multiplications; each further term of a sum counts 1, functions count 0
+COSTS = {op.PRODUCT: 1, op.RECIPROCAL: 4}
 
 
 class Algebra(Generic[T]):
-    """Values of the quantities of a graph in one kind of arithmetic.
+    """Algebra: values of the quantities of a graph in one kind of arithmetic.
 
     Attributes
     ----------
     functions : mapping
         Operations of one argument, by their kinds.
     values : dict
-        By quantity.
+        Values by quantity.
     """
 
     functions: Mapping[int, Callable[[T], T]]
@@ -64,25 +65,25 @@ class Algebra(Generic[T]):
         return argument if kind == op.SUM else self.functions[kind](argument)
 
     def define(self, quantity: int, value: T) -> None:
-        """Give a quantity its value."""
+        """Define the value of a quantity."""
         self.values[quantity] = value
 
     def run(self, graph: Graph, quantities: Iterable[int]) -> None:
-        """Compute quantities in their order: the walk that all algebras share."""
+        """Compute quantities in the given order: the walk that all algebras share."""
         for i in quantities:
             operation = graph.operations[i]
             assert operation is not None
             self.define(i, self.operation(*operation))
 
     def outputs(self, program: "Program") -> list[list[T]]:
-        """Compute the arrays of a program, and what its conditions depend on; inputs are defined."""
+        """Compute the arrays of a program and the quantities of its conditions; inputs must be defined."""
         self.run(program.graph, program.quantities())
         return [[self.affine(form) for form in forms] for forms in program.arrays.values()]
 
 
 @dataclass(frozen=True)
 class Program:
-    """Outputs to be computed from the inputs of a graph: arrays, and conditions that must hold.
+    """Program: outputs to be computed from the inputs of a graph, arrays and conditions that must hold.
 
     Attributes
     ----------
@@ -98,17 +99,17 @@ class Program:
     conditions: list[tuple[Affine, Affine]] = field(default_factory=list)
 
     def run(self, algebra: Algebra[T], inputs: Sequence[T] = ()) -> list[list[T]]:
-        """Return the arrays for values of the inputs, in their order."""
+        """Run the program on values of the inputs, in their order; return its arrays."""
         for quantity, value in enumerate(inputs):
             algebra.define(quantity, value)
         return algebra.outputs(self)
 
     def quantities(self, available: Container[int] = ()) -> list[int]:
-        """Return what the outputs depend on, inputs and what is available apart, in an order of computation."""
+        """Return the quantities that the outputs need, but inputs and available ones, in an order of computation."""
         return self.graph.needed_by(self.forms, available)
 
     def cost(self) -> int:
-        """Estimate the time to compute it, functions apart, in multiplications and additions."""
+        """Estimate the cost of the program in multiplications and additions, without functions."""
         forms, total = self.forms, 0
         for i in self.quantities():
             kind, *_ = self.graph.operations[i]  # type: ignore[misc]
@@ -118,23 +119,23 @@ class Program:
 
     @property
     def sizes(self) -> tuple[dict[str, int], int]:
-        """Sizes of the arrays, and the number of conditions."""
+        """Return the sizes of the arrays, and the number of conditions."""
         return {name: len(forms) for name, forms in self.arrays.items()}, len(self.conditions)
 
     @property
     def forms(self) -> list[Affine]:
-        """All expressions of arrays and conditions."""
+        """Return all expressions of arrays and conditions."""
         forms = [form for array in self.arrays.values() for form in array]
         return [*forms, *(form for condition in self.conditions for form in condition)]
 
 
 class Arrays(Algebra[Any]):
-    """NumPy arrays, one number for each run.
+    """Algebra of NumPy arrays, one number for each run.
 
     Parameters
     ----------
     tape : ParameterTape
-        Of the coefficients.
+        Record of the coefficients.
     parameters : ndarray (n_runs, n_p)
     """
 
@@ -166,13 +167,13 @@ class Arrays(Algebra[Any]):
         return a * b
 
     def outputs(self, program: Program) -> list[list[Any]]:
-        """Compute the arrays of a program; what has no value is NaN or infinite."""
+        """Compute the arrays of a program; undefined values are NaN or infinite."""
         with np.errstate(all="ignore"):
             return super().outputs(program)
 
 
 class OperationTable(NamedTuple):
-    """A program for compiled kernels, see kernels/evaluation/operations.py.
+    """Table of the operations of a program for compiled kernels, see kernels/evaluation/operations.py.
 
     `rows` has a row for each operation, `columns` and `coefficients` the terms of all affine expressions, and
     `constants` their constants, two for each row.
@@ -186,7 +187,7 @@ class OperationTable(NamedTuple):
 
     @classmethod
     def of(cls, graph: Graph, n_inputs: int, results: Mapping[int, Affine]) -> "OperationTable":
-        """List the operations that results, by their places, need of the first quantities of a graph."""
+        """List the operations that results, by their indices, need; the first quantities of the graph are inputs."""
         needed = graph.needed_by(results.values())
         node = {i: i for i in range(n_inputs)} | {i: n_inputs + k for k, i in enumerate(needed)}
         operations: list[Any] = [(*graph.operations[i], node[i]) for i in needed]  # type: ignore[misc]
@@ -210,7 +211,7 @@ class OperationTable(NamedTuple):
         )
 
     def flat(self) -> list[float]:
-        """Return all numbers as they stand in the parameters of a model: results are the first nodes."""
+        """Return all numbers as the parameters of a model hold them: results are the first nodes."""
         rows = self.rows.copy()
         is_result = rows[:, KIND] == RESULT
         n_results = int(is_result.sum())
@@ -228,5 +229,5 @@ class OperationTable(NamedTuple):
         return integers.astype(np.int64), np.concatenate([self.constants.ravel(), self.coefficients])
 
     def with_numbers(self, numbers_for: Callable[[Any], Array]) -> "OperationTable":
-        """Return the table with other arrays in the place of its numbers."""
+        """Return the table with other numbers."""
         return self._replace(constants=numbers_for(self.constants), coefficients=numbers_for(self.coefficients))

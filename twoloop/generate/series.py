@@ -1,7 +1,7 @@
-"""Write the program for the Taylor series of a mechanism's motion.
+"""Program for the Taylor series of a mechanism's motion.
 
-Each order needs G = [C_q; A] and its rates, M and Q, see taylor_step.py. Quantities on which G and M depend are early:
-they depend on time and coordinates. Those of Q may be late: they depend on velocities, too. G v and G^T lam + M a are
+Each order needs G = [C_q; A] and its rates, M and Q, see taylor_step.py. The quantities of G and M are early: they
+depend on time and coordinates. Those of Q may be late: they depend on velocities, too. G v and G^T lam + M a are
 written with few products: terms that share a factor are one product.
 """
 
@@ -24,31 +24,31 @@ from twoloop.problem.system import ConstrainedSystem
 Integers = NDArray[np.int64]
 Array = NDArray[np.float64]
 
-MOST_ENTRIES = 200_000  # entries of M and C_q, above which a series is traced only on request
+MOST_ENTRIES = 200_000  # largest number of entries of M and C_q for which a series is traced without a request
 
 READ = ("mass", "force", "jacobian", "nonholonomic", "constraint_rate", "nonholonomic_rate")
 
 
 class Sums(NamedTuple):
-    """Affine expressions: the first term of each, then the further terms, row by row."""
+    """Affine expressions as arrays: the first term of each expression, then the further terms, row by row."""
 
-    column: Integers  # of the first term
+    column: Integers  # quantity of the first term
     coefficient: Array
     constant: Array
-    row: Integers  # of the further terms
+    row: Integers  # expression to which a further term belongs
     more_column: Integers
     more_coefficient: Array
 
 
 @dataclass(frozen=True)
 class Table:
-    """Operations in an order of computation; their results are consecutive quantities.
+    """Table of operations in an order of computation; their results are consecutive quantities.
 
     Attributes
     ----------
     groups : ndarray (n, 7)
         Kind, first and end of operations that do not depend on one another, and of the further terms of their first and
-        second arguments. A group of sines holds the cosines of the same angles, too. The last group are products that
+        second arguments. A group of sines includes the cosines of the same angles. The last group has the products that
         wait for the solution of an order.
     first, second : Sums
         Arguments of the operations.
@@ -61,7 +61,7 @@ class Table:
 
 @dataclass(frozen=True)
 class SeriesProgram:
-    """The program of a series, on the quantities t, q, v, a, lam, results of `early`, results of `late`.
+    """Program of a series, on the quantities t, q, v, a, lam, results of `early`, results of `late`.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class SeriesProgram:
     late : Table
         Late operations; the last are the products of G^T lam + M a.
     rows, row_places : Sums, ndarray
-        G v + G_t without multiples of v: rows that are not zero, and their places.
+        G v + G_t without multiples of v: the rows that are not zero, and their indices.
     balance, balance_places : Sums, ndarray
         Q - G^T lam - M a without multiples of lam and a, likewise.
     traced : Traced or None
@@ -119,17 +119,17 @@ class SeriesProgram:
 
 
 def is_quick(system: ConstrainedSystem) -> bool:
-    """Return whether a series is traced within a second or so: matrices are traced as full ones."""
+    """Return whether a series is traced within about a second: matrices are traced as full ones."""
     return system.n_q * (system.n_q + system.n_c + system.n_a) <= MOST_ENTRIES
 
 
 def series_for(system: ConstrainedSystem, check: Check = unchecked) -> SeriesProgram:
-    """Return the cached program of a system; `check` raises where calls of callbacks differ from their traces.
+    """Return the cached program of a system; `check` raises if calls of callbacks differ from their traces.
 
     Raises
     ------
     Untraceable
-        As of `series_program`.
+        As `series_program`.
     """
 
     def make(cache: TraceCache) -> SeriesProgram:
@@ -149,7 +149,7 @@ def series_program(
     Raises
     ------
     Untraceable
-        Names the callback, and why it cannot be traced.
+        If a callback cannot be traced; the message names it and the reason.
     """
     equations = Equations(system) if equations is None else equations
     n, n_rows = system.n_q, system.n_c + system.n_a
@@ -178,7 +178,7 @@ def series_program(
 
 
 def _sums_of(graph: Graph) -> dict[int, Affine]:
-    """Return the expressions of quantities that are sums: a series needs no recurrence for them."""
+    """Return the expressions of quantities that are sums, for which a series needs no recurrence."""
     sums: dict[int, Affine] = {}
     for i, operation in enumerate(graph.operations):
         if operation is not None and operation[0] == SUM:
@@ -187,7 +187,7 @@ def _sums_of(graph: Graph) -> dict[int, Affine]:
 
 
 def _without_sums(sums: dict[int, Affine], form: Affine) -> Affine:
-    """Return an expression without quantities that are sums."""
+    """Replace the quantities of an expression that are sums by their terms."""
     named = [i for i in form.terms if i in sums]
     if not named:
         return form
@@ -207,8 +207,8 @@ def _sum_of_products(
 ) -> Affine:
     """Return rest + sum_i factors[i] multipliers[i] with few products, which are added to `products`.
 
-    Terms are collected by factors, or by the quantities in these, whichever gives fewer products. If both give as many,
-    rates are collected by quantities: a cosine times the rate of its angle is the derivative of the sine.
+    Terms are collected by factors, or by the quantities in these, whichever gives fewer products. If both give the same
+    number, rates are collected by quantities: a cosine times the rate of its angle is the derivative of the sine.
     """
     total = rest
     by_factor: dict[Any, tuple[Affine, Affine]] = {}
@@ -235,7 +235,7 @@ def _sum_of_products(
 
 
 def _unit_product(factor: Affine, multiplier: Affine) -> tuple[Any, float, Affine, Affine]:
-    """Return the key of a product of unit scale, the scale, and both factors."""
+    """Normalize a product; return its key, its scale, and both factors."""
     scale, multiplier = multiplier.normalised()
     return (factor.key, multiplier.key), scale, factor, multiplier
 
@@ -290,7 +290,7 @@ def _assemble(
 
 
 def _used(graph: Graph, forms: list[Affine]) -> list[tuple[int, Any]]:
-    """Return the operations that expressions need; with a sine goes the cosine of its angle, and vice versa."""
+    """Return the operations that expressions need; a sine brings the cosine of its angle, and vice versa."""
     needed = set(graph.needed_by(forms))
     pairs = (SINE, COSINE)
     angles = {each[1].key for i in needed if (each := graph.operations[i]) is not None and each[0] in pairs}
@@ -302,7 +302,7 @@ def _used(graph: Graph, forms: list[Affine]) -> list[tuple[int, Any]]:
 
 
 def _nonzero(forms: list[Affine], place: dict[int, int]) -> tuple[Sums, Integers]:
-    """Return the expressions that are not zero, and their places."""
+    """Return the expressions that are not zero, and their indices."""
     kept = [k for k, form in enumerate(forms) if form.terms or form.constant]
     sums = _sums([forms[k] for k in kept], place)
     places = np.array(kept, dtype=np.int64)
@@ -315,11 +315,11 @@ def _without(form: Affine, inputs: Container[int]) -> Affine:
 
 
 def _grouped(operations: list[Any]) -> list[tuple[int, list[Any]]]:
-    """Group operations by level and kind: a group depends on groups before it only."""
+    """Group operations by level and kind: a group depends only on the groups before it."""
     nodes = {node for node, *_ in operations}
     level: dict[int, int] = {}
     groups: dict[tuple[int, int], list[Any]] = {}
-    for node, kind, first, second in operations:  # in an order of computation
+    for node, kind, first, second in operations:  # they are in an order of computation
         used = [i for form in (first, second) if form is not None for i in form.terms if i in nodes]
         level[node] = 1 + max((level[i] for i in used), default=0)
         if second is None:
@@ -329,7 +329,7 @@ def _grouped(operations: list[Any]) -> list[tuple[int, list[Any]]]:
     for (number, kind), members in sorted(groups.items()):
         if kind == COSINE:
             continue
-        members.sort(key=_term_counts)  # neighbours take equally long
+        members.sort(key=_term_counts)  # operations of equal length become neighbours
         if kind == SINE:
             cosines = {first.key: node for node, first, _ in groups[number, COSINE]}
             members += [(cosines[first.key], first, second) for _, first, second in members]

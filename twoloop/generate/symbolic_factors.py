@@ -7,22 +7,22 @@ from twoloop.generate.graph import Affine
 
 
 class Block(NamedTuple):
-    """One or two rows that are eliminated together, which takes one division."""
+    """Block of one or two rows that are eliminated together, which takes one division."""
 
     places: tuple[int, ...]
-    inverse: list[list[Affine]]  # of the pivots
-    below: list[tuple[int, list[Affine]]]  # rows of L
+    inverse: list[list[Affine]]  # inverse of the pivots
+    below: list[tuple[int, list[Affine]]]  # rows of L below the pivots
 
 
 class Factors:
-    """L D L^T of a symmetric matrix of expressions, in an order that a definite matrix of this pattern allows.
+    """Factors L D L^T of a symmetric matrix of expressions, in an order that suits a definite matrix of this pattern.
 
     Attributes
     ----------
     blocks : list of Block
-        In the order of elimination.
+        Blocks in the order of elimination.
     conditions : list of (Affine, Affine)
-        For each row from `n` on its pivot, and the pivot that it would have without the other rows.
+        For each row from `n` on its pivot, and its pivot without the other rows from `n` on.
     positive : list of Affine
         Pivots that are positive if the matrix of the first `n` rows is definite.
     """
@@ -73,7 +73,7 @@ class Factors:
         return [[(c * inverse).value(), (-b * inverse).value()], [(-b * inverse).value(), (a * inverse).value()]]
 
     def solve(self, right: Sequence[Affine]) -> list[Affine]:
-        """Return the solution for a right-hand side."""
+        """Solve for a right-hand side."""
         return solve(self.blocks, right)
 
 
@@ -85,7 +85,7 @@ def _dot(a: Sequence[Affine], b: Sequence[Affine]) -> Affine:
 
 
 def solve(blocks: Sequence[Block], right: Sequence[Affine]) -> list[Affine]:
-    """Return the solution for a right-hand side; multiples of a quantity are added before the multiplication."""
+    """Solve for a right-hand side; multiples of one quantity are added before the multiplication."""
     solution = list(right)
     pending: list[list[tuple[Affine, Affine]]] = [[] for _ in right]
     for places, _, below in blocks:
@@ -102,7 +102,7 @@ def solve(blocks: Sequence[Block], right: Sequence[Affine]) -> list[Affine]:
 
 
 def _gathered(products: Sequence[tuple[Affine, Affine]]) -> Any:
-    """Return the sum of products, with one product for all multiples of a factor."""
+    """Sum products, with one product for all multiples of a factor."""
     total: Any = 0.0
     groups: dict[Any, tuple[Affine, Affine]] = {}
     for factor_a, factor_b in products:
@@ -123,7 +123,7 @@ def _pairs(rows: list[dict[int, Affine]], n: int) -> list[tuple[int, int]]:
 
     The rank of G is that of the other rows plus the number of pairs, which take no condition and no division.
     """
-    pairs: dict[int, int] = {}  # by rows
+    pairs: dict[int, int] = {}  # coordinates by rows of G
     for i, row in enumerate(rows[:n]):
         if len(row) == 2 and i in row and max(row) >= n and not any(entry.terms for entry in row.values()):
             pairs.setdefault(max(row), i)

@@ -1,11 +1,11 @@
-"""Trace callbacks: run them in Python on symbols, in whose place `math` and `numpy` take expressions.
+"""Trace callbacks: run them in Python on symbols, with functions of expressions for those of `math` and `numpy`.
 
-What a callback makes of symbols must be what it makes of numbers. So a function that is not known to do the same with
-both is refused by name when it is given symbols, even if the callback catches the refusal. What remains undetected,
-such as a global that has changed, `traced_values.py` finds by comparing numbers.
+A callback must do with symbols exactly what it does with numbers. So a function that may treat them differently is
+refused by name when it is given symbols, even if the callback catches the refusal. Changes that remain undetected, as
+of a global, are found by comparing numbers (`traced_values.py`).
 
-`Equations` holds every callback of one system as an array of expressions, with exact derivatives in the place of
-callbacks that are not given. Series, eliminations, references and derived callbacks read them from there.
+`Equations` holds every callback of one system as an array of expressions; exact derivatives replace callbacks that are
+not given. Series, eliminations, references and derived callbacks read them there.
 """
 
 import copy
@@ -46,12 +46,12 @@ CONVERSIONS = ("array", "asarray", "ascontiguousarray")
 
 
 def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
-    """Run a callback in Python on symbols, and return its result, which is None for a compiled one.
+    """Run a callback in Python on symbols and return its result; compiled callbacks fill arrays and return None.
 
     Raises
     ------
     Untraceable
-        If it does not run on symbols, or treats them otherwise than numbers.
+        If it does not run on symbols, or treats them differently from numbers.
     """
     graph, value = t.graph, None
     with graph.watched():
@@ -68,7 +68,7 @@ def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
 
 
 def as_forms(graph: Graph, values: Any) -> Any:
-    """Convert what a callback filled or returned to expressions, in place."""
+    """Convert an array that a callback filled or returned to expressions, in place."""
     for place in np.ndindex(values.shape):
         entry = values[place]
         if type(entry) is not Affine:
@@ -82,7 +82,7 @@ def as_forms(graph: Graph, values: Any) -> Any:
 
 
 class _Traced(FunctionCopier):
-    """Copies callbacks, with the mathematics of expressions in the place of `math` and `numpy`."""
+    """Copier of callbacks that replaces `math` and `numpy` by functions of expressions."""
 
     def copies(self, value: Any) -> bool:
         return isinstance(value, Dispatcher | types.FunctionType)
@@ -121,7 +121,7 @@ def _type(value: Any, *more: Any) -> Any:
 
 
 def _symbol_in(value: Any) -> Affine | None:
-    """Return an expression in a number, an array, or a list of these; None if there is none."""
+    """Return a symbol in a number, an array, or a list of these; None if there is none."""
     if type(value) is Affine:
         return value
     if isinstance(value, np.ndarray):
@@ -145,7 +145,7 @@ def _refuse(value: Any, does: str) -> None:
 
 
 def _of_numbers(function_of_numbers: Any, name: str) -> Callable[..., Any]:
-    """Wrap a function that is not known to take expressions: it refuses them."""
+    """Wrap a function that may not work with expressions: it refuses them."""
 
     @functools.wraps(function_of_numbers)
     def function(*arguments: Any, **options: Any) -> Any:
@@ -156,7 +156,7 @@ def _of_numbers(function_of_numbers: Any, name: str) -> Callable[..., Any]:
 
 
 def _either(of_numbers: Any, of_symbols: Callable[..., Any]) -> Callable[..., Any]:
-    """Join a function of numbers with one of expressions."""
+    """Combine a function of numbers with the same function of expressions."""
 
     def function(*arguments: Any) -> Any:
         if _symbol_in(arguments) is None:
@@ -174,7 +174,7 @@ def _is_real(dtype: Any) -> bool:
 
 
 def _constructor(constructor: Any) -> Callable[..., Any]:
-    """Wrap `zeros`, `ones` or `empty`, whose arrays of real numbers hold expressions."""
+    """Wrap `zeros`, `ones` or `empty`: their arrays of real numbers can hold expressions."""
 
     def function(shape: Any, dtype: Any = None, **options: Any) -> Any:
         if not _is_real(dtype):
@@ -219,7 +219,7 @@ def _norm(x: Any, *more: Any, **options: Any) -> Any:
 
 
 class _Mathematics:
-    """`math`, `numpy` or a part of it, whose functions take expressions, too, and whose arrays hold them."""
+    """Substitute for `math`, `numpy` or a part of it: its functions take expressions, too, and its arrays hold them."""
 
     def __init__(self, module: types.ModuleType):
         self._module = module
@@ -247,7 +247,7 @@ class _Mathematics:
         return _of_numbers(original, f"{self._module.__name__}.{name}")
 
 
-# in the order in which they are traced
+# order in which callbacks are traced
 CALLBACKS = (
     *("constraint", "constraint_rate", "jacobian", "nonholonomic", "nonholonomic_rate", "mass", "force"),
     *("gamma", "nonholonomic_gamma"),
@@ -256,18 +256,18 @@ OF_ROWS = {"gamma": ("jacobian", "constraint_rate"), "nonholonomic_gamma": ("non
 
 
 class Equations:
-    """The traced callbacks of a system; each is traced once, at its first use.
+    """Traced callbacks of a system; each is traced once, at its first use.
 
     Parameters
     ----------
     system : ConstrainedSystem
     parameters : array of float or Parameter, optional
-        In the place of the system's own.
+        Values that replace the system's own parameters.
 
     Attributes
     ----------
     graph : Graph
-        Its first inputs are t, q and v.
+        Graph of the traces; its first inputs are t, q and v.
     t : Affine
     q, v : list of Affine (n_q,)
     """
@@ -279,18 +279,18 @@ class Equations:
         (self.t,) = self.graph.inputs(1, False)
         self.q, self.v = self.graph.inputs(system.n_q, False), self.graph.inputs(system.n_q, True)
         self._forms: dict[str, Any] = {}
-        self._copied: dict[str, Any] = {}  # traced in the graph of which this one is a copy
+        self._copied: dict[str, Any] = {}  # results traced in the graph of which this one is a copy
 
     def trace_all(self) -> "Equations":
         """Trace all callbacks that can be traced, so that copies share them."""
         for kind in CALLBACKS:
             if not self._is_derived(kind):
-                with suppress(Untraceable):  # raised again where the callback is needed
+                with suppress(Untraceable):  # raised again when the callback is needed
                     self.of(kind)
         return self
 
     def copy(self) -> "Equations":
-        """Return equations with a graph of their own, which do not trace again what was traced here."""
+        """Return equations with their own graph, which contains all that was traced here."""
         equations = copy.copy(self)
         equations.graph = self.graph.copy()
         equations.t, equations.q, equations.v = (
@@ -301,14 +301,14 @@ class Equations:
         return equations
 
     def of(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
-        """Return the array of a kind of callback, as expressions: zeros, or derivatives, if it is not given.
+        """Return the array of a kind of callback as expressions; zeros or derivatives if it is not given.
 
-        `v`: expressions in the place of the velocities.
+        `v`: expressions that replace the velocities.
 
         Raises
         ------
         Untraceable
-            If a callback does not run on symbols; says which, and why.
+            If a callback does not run on symbols; the message names it and the reason.
         """
         if v is not None and "v" in KINDS[kind].state:
             return self._make(kind, v)
@@ -317,7 +317,7 @@ class Equations:
         return self._forms[kind].copy()
 
     def derived(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
-        """Differentiate for C_q, C_t or a right-hand side, whether there is a callback or not."""
+        """Derive C_q, C_t or a right-hand side by differentiation, even if there is a callback for it."""
         if kind == "jacobian":
             return self._jacobian()
         return self._rate() if kind == "constraint_rate" else self._gamma(*OF_ROWS[kind], self.v if v is None else v)
@@ -355,7 +355,7 @@ class Equations:
         return out
 
     def _jacobian(self) -> Any:
-        """Return C_q from C."""
+        """Derive C_q from C."""
         constraint, unit = self.of("constraint"), Affine(self.graph, 1.0, {})
         jacobian = np.empty((self.system.n_c, self.system.n_q), dtype=object)
         for j, coordinate in enumerate(self.q):
@@ -364,7 +364,7 @@ class Equations:
         return jacobian
 
     def _rate(self) -> Any:
-        """Return C_t from C."""
+        """Derive C_t from C."""
         constraint, by_t = self.of("constraint"), Derivative(self.graph, {only(self.t): Affine(self.graph, 1.0, {})})
         return symbols(by_t.of(form) for form in constraint)
 
@@ -398,6 +398,6 @@ def runs_on_symbols(system: ConstrainedSystem, kind: str, parameters: Any) -> bo
 
 
 def only(form: Affine) -> int:
-    """Return the one quantity of which an expression consists."""
+    """Return the quantity of an expression that consists of one."""
     (place,) = form.terms
     return place

@@ -1,7 +1,7 @@
-"""Cache what is traced of callbacks, for all systems that share them: its numbers are expressions in the parameters.
+"""Cache of traces for all systems that share their callbacks: coefficients are expressions in the parameters.
 
-- Parameters that are whole numbers keep their values, as these may be counts, places or switches, and zeros and ones
-  leave operations out. What is equal, but for its sign, stays equal. So systems of one cache differ in other numbers.
+- Parameters that are whole numbers keep their values, as they may be counts, indices or switches, and zeros and ones
+  save operations. Parameters of equal magnitude stay equal. So the systems of one cache differ only in other numbers.
 - A callback that branches on its parameters, or rounds them, has no such expressions. It is traced for each system.
 """
 
@@ -21,23 +21,26 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 Gathered = tuple[Array, NDArray[np.int64], list[Powers]]
-Evaluator = Callable[[Any], Array]  # gives the numbers of an array of expressions for one system
+Evaluator = Callable[[Any], Array]  # computes the numbers of an array of expressions for one system
 
-GENERIC = 0.5, 1.5  # range of the parameters with which callbacks are traced: of one size, so that none hides another
-EXTREME = 1e-30  # parameters below it, or above its inverse, keep their values: their powers would leave the range
+# range of the parameters with which callbacks are traced: of like size, so that no term hides another
+GENERIC = 0.5, 1.5
+# parameters smaller than this, or larger than its inverse, keep their values: their powers would over- or underflow
+EXTREME = 1e-30
 
 _CACHES = BoundedCache()
 
 
 class TraceCache:
-    """What is derived from the callbacks that some systems share.
+    """Cache of the results derived from the callbacks that several systems share.
 
     Parameters
     ----------
     parameters : ndarray (n_p,)
         Parameters of one of the systems.
     classes : ndarray of int (n_p,)
-        For each parameter the number that it is, counted from 1 and negative for a negative one; 0: it keeps its value.
+        Class of each parameter: parameters of equal magnitude share a number from 1 on, negative for negative ones; 0:
+        it keeps its value.
 
     Attributes
     ----------
@@ -46,14 +49,14 @@ class TraceCache:
     traced : set of str
         Kinds of callbacks that were traced: they write the same entries in all systems.
     within_bounds : set of str
-        Kinds among these that `check_bounds` has checked in one of the systems.
+        Kinds among these whose bounds `check_bounds` has checked in one of the systems.
     """
 
     def __init__(self, parameters: Array, classes: NDArray[np.int64]):
         self._classes = classes
         n_numbers = int(np.abs(self._classes).max(initial=0))
         _, first = np.unique(np.abs(self._classes), return_index=True)
-        self._first = first[self._classes[first] != 0]  # first place of each number
+        self._first = first[self._classes[first] != 0]  # first index of each number
         self._tape = ParameterTape(np.random.default_rng(7).uniform(*GENERIC, n_numbers).tolist(), range(n_numbers))
         self.parameters = parameters.astype(object) if self._classes.any() else parameters.copy()
         for place in np.flatnonzero(self._classes).tolist():
@@ -63,18 +66,19 @@ class TraceCache:
         self.traced: set[str] = set()
         self.within_bounds: set[str] = set()
         self._made: dict[Any, Any] = {}
-        self._arrays: dict[int, tuple[Any, Gathered]] = {}  # by the ids of the arrays, which are kept alive here
-        self._tracing = RLock()  # all traces record on one tape
+        # by id; the arrays are stored as well, so that ids are not reused
+        self._arrays: dict[int, tuple[Any, Gathered]] = {}
+        self._tracing = RLock()  # one lock, as all traces record on one tape
 
     def equations(self, system: ConstrainedSystem) -> Equations:
-        """Return the traced callbacks, with a graph to be extended."""
+        """Return the traced callbacks; their graph can be extended."""
         if system.called_in_python:  # a function may keep its arguments, so it is traced as late as possible
             return Equations(system, self.parameters)
         traced: Equations = self.remembered("equations", lambda: Equations(system, self.parameters).trace_all())
         return traced.copy()
 
     def numbers(self, parameters: Array) -> Array:
-        """Return the numbers of a system's parameters, one for each class."""
+        """Return the magnitudes of a system's parameters, one for each class."""
         return np.abs(parameters[self._first])
 
     def products(self, parameters: Array) -> Callable[[Powers], Any]:
@@ -82,7 +86,7 @@ class TraceCache:
         return self._tape.products(self.numbers(parameters))
 
     def evaluator(self, parameters: Array) -> Evaluator:
-        """Return a function that evaluates arrays of expressions, which this cache keeps, for a system's parameters."""
+        """Return a function that evaluates arrays of expressions, stored in this cache, for a system's parameters."""
         product = self.products(parameters)
 
         def evaluate(array: Any) -> Array:
@@ -91,14 +95,14 @@ class TraceCache:
             scales, places, products = self._gathered(array)
             with np.errstate(all="ignore"):
                 values: Array = scales * np.array(list(map(product, products)))[places]
-            if not np.isfinite(values).all():  # as where an expression divides by a sum of parameters that is zero
+            if not np.isfinite(values).all():  # an expression may divide by a sum of parameters that is zero
                 raise Untraceable("a number of them is not finite for these parameters")
             return values
 
         return evaluate
 
     def _gathered(self, array: Any) -> Gathered:
-        """Return the scales of an array's entries, the places of their products, and the products."""
+        """Return the scales of an array's entries, the indices of their products, and the products."""
         entry = self._arrays.get(id(array))
         if entry is None:
             powers = [each.powers if type(each) is Parameter else () for each in array.ravel()]
@@ -112,7 +116,7 @@ class TraceCache:
         return entry[1]
 
     def remembered(self, what: Any, make: Callable[[], Any]) -> Any:
-        """Return what `make` returned at the first call for this key."""
+        """Return the result of `make` of the first call for this key."""
         if what not in self._made:
             with self._tracing:
                 if what not in self._made:
@@ -126,13 +130,13 @@ def derive_cached(
 ) -> Any:
     """Return what `make` derives from shared traces, for one system: the result of its method `of`.
 
-    The system gets a trace of its own if callbacks cannot be traced with parameters that vary, or if `check` refuses
-    the result, as a callback may treat these otherwise than numbers.
+    The system gets a trace of its own if callbacks cannot be traced with variable parameters, or if `check` refuses the
+    result, as a callback may treat variable parameters differently from numbers.
 
     Raises
     ------
     Untraceable
-        If it cannot be derived, or is refused.
+        If the result cannot be derived, or `check` refuses it.
     """
     for find in (_own_cache,) if system.called_in_python else (trace_cache_of, _own_cache):
         cache = system.remembered(("family", find), partial(find, system))
@@ -149,7 +153,7 @@ def derive_cached(
 
 
 def _derived_for(system: ConstrainedSystem, cache: TraceCache, what: Any, make: Callable[[TraceCache], Any]) -> Any:
-    """Return what is derived for a system, or the reason why it cannot be."""
+    """Return the result for a system, or the exception that says why there is none."""
     try:
         shared = cache.remembered(what, partial(make, cache))
         return shared.of(system, system.remembered(("numbers", cache), partial(cache.evaluator, system.parameters)))
@@ -160,25 +164,25 @@ def _derived_for(system: ConstrainedSystem, cache: TraceCache, what: Any, make: 
 
 
 def take_bounds(system: ConstrainedSystem) -> None:
-    """Take over what `check_bounds` found in systems that share the traces, whose callbacks do the same."""
+    """Copy the results of `check_bounds` for systems that share the traces, as their callbacks do the same."""
     if not system.called_in_python:
         system.within_bounds |= shared_cache(system).within_bounds
 
 
 def give_bounds(system: ConstrainedSystem) -> None:
-    """Share what `check_bounds` found in a system."""
+    """Share the results of `check_bounds` for a system with those that have the same traces."""
     if not system.called_in_python:
         cache = shared_cache(system)
         cache.within_bounds |= cache.traced & system.within_bounds
 
 
 def shared_cache(system: ConstrainedSystem) -> TraceCache:
-    """Return the traces that a system of compiled callbacks shares with others."""
+    """Return the cached traces that a system of compiled callbacks shares with others."""
     return system.remembered(("family", trace_cache_of), partial(trace_cache_of, system))  # type: ignore[no-any-return]
 
 
 def trace_cache_of(system: ConstrainedSystem) -> TraceCache:
-    """Look up the traces that a system of compiled callbacks shares with others, which `run` puts into systems, too."""
+    """Look up the traces that a system of compiled callbacks shares with others."""
     parameters = system.parameters
     classes = _classes(parameters)
     fixed = parameters[classes == 0] + 0.0  # without a sign of zero
@@ -190,12 +194,12 @@ def trace_cache_of(system: ConstrainedSystem) -> TraceCache:
 
 
 def _own_cache(system: ConstrainedSystem) -> TraceCache:
-    """Return traces for the parameters of a system alone, all of which are plain numbers."""
+    """Return traces for one system alone, with its parameters as plain numbers."""
     return TraceCache(system.parameters, np.zeros(system.parameters.size, dtype=np.int64))
 
 
 def _classes(parameters: Array) -> NDArray[np.int64]:
-    """Number the sizes of parameters in order of appearance, with the signs; 0 for those that keep their values."""
+    """Number the magnitudes of parameters in order of appearance, with the signs; 0: it keeps its value."""
     size = np.abs(parameters)
     varies = (size > EXTREME) & (size < 1.0 / EXTREME) & (size != np.floor(size))
     _, first, which = np.unique(size[varies], return_index=True, return_inverse=True)
@@ -213,7 +217,8 @@ class ParameterArrays:
     """
 
     def __init__(self) -> None:
-        self._arrays: dict[int, tuple[Any, Array]] = {}  # by the ids of the arrays, which are kept alive here
+        # by id; the arrays are stored as well, so that ids are not reused
+        self._arrays: dict[int, tuple[Any, Array]] = {}
         self._places: list[tuple[Array, NDArray[np.int64], slice]] = []
         self._products: dict[Powers, int] = {}
         self._scales: list[float] = []
@@ -221,7 +226,7 @@ class ParameterArrays:
         self._gathered: tuple[list[Powers], Array, NDArray[np.int64]] | None = None
 
     def array(self, expressions: Any) -> Array:
-        """Return the numbers of an array of expressions, which the next `write` fills in."""
+        """Return the array of numbers for an array of expressions; the next `write` fills it."""
         if expressions.dtype != object:
             return expressions  # type: ignore[no-any-return]
         if id(expressions) not in self._arrays:
@@ -241,7 +246,7 @@ class ParameterArrays:
         return numbers.reshape(expressions.shape)
 
     def write(self, product: Callable[[Powers], Any]) -> None:
-        """Fill in the numbers for the parameters of `product`, see TraceCache.products."""
+        """Write the numbers for the parameters of `product`, see TraceCache.products."""
         if self._gathered is None:
             return
         products, scales, which = self._gathered

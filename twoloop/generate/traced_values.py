@@ -266,7 +266,7 @@ class CheckedRegion:
         return (self._runs + 1) & self._runs == 0
 
     def count(self) -> None:
-        """Count a run."""
+        """Count one more run."""
         self._runs += 1
 
     def without_known(self, states: Array) -> Array:

@@ -1,1 +1,1 @@
-"""What a user chooses: frozen options, one file a family, and what a method hands to a run."""
+"""Methods that a user can choose: frozen options, one file for each family, and the plan of a run."""

@@ -6,8 +6,8 @@ import numpy as np
 
 from twoloop.methods.plan import LARGEST_MOVE, Plan
 
-# h times the frequency of a vibration that grows by 1 % a step, and times a rate of decay, at orders 1 to 12; of decay
-# that of order 6 from there on, because the order does not stay above where decay limits the steps
+# limits of h times the frequency of a vibration (it grows by 1 % a step), and of h times a rate of decay, for orders 1
+# to 12; for decay, the value of order 6 from there on, as the order does not stay higher if decay limits the steps
 STABLE_TO = tuple(
     zip(
         (2.01, 2.01, 0.92, 0.97, 1.09, 1.23, 1.28, 1.13, 1.00, 0.89, 0.79, 0.71),
@@ -28,8 +28,8 @@ class Adams:
     independent coordinates. The method thus departs from the paper, whose outer loop has only independent coordinates,
     and a new partition does not interrupt it.
 
-    It starts by itself, with order 1 and a short step. After a run of many steps, it is measured at a few states
-    whether stability rather than accuracy limited the steps. If so, `result.message` says so and names other methods.
+    It starts by itself, with order 1 and a short step. After a run of many steps, a test at a few states shows whether
+    stability rather than accuracy limited the steps. If so, `result.message` says so and names other methods.
 
     Notes
     -----
@@ -60,12 +60,12 @@ class Adams:
         return True
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Make the method ready for a run of n_q coordinates.
+        """Return the plan of the method for a run of n_q coordinates.
 
         Raises
         ------
         ValueError
-            If the step is to be constant: order and accuracy of the first steps need a step that varies.
+            If the step size is fixed: the first steps need a variable size for their order and accuracy.
         """
         from twoloop.kernels.steps import adams_step as kernels
 
@@ -79,6 +79,6 @@ class Adams:
             np.array([LARGEST_MOVE]),
             np.zeros(kernels.memory_size(n_q)),
             projects=True,
-            exponent=1.0,  # not used: the order varies, and with it the factor, which the step returns
+            exponent=1.0,  # not used: the order varies, and the step returns the factor for its order
             stable_to=lambda memory: STABLE_TO[int(memory[kernels.ORDER]) - 1],
         )

@@ -14,15 +14,15 @@ from twoloop.methods.taylor import Taylor
 from twoloop.problem.system import ConstrainedSystem
 
 MANY = 16  # number of coordinates from which on evaluations cost more than the algebra of Adams' method ...
-# ... unless the constraints are more than this share of them, because a projection then costs more ...
+# ... if the constraints are at most this share of the coordinates, as a projection costs more ...
 CONSTRAINED = 0.25
-TIGHT_MANY = 1e-10  # ... or for tolerances below this ...
-VERY_MANY = 64  # ... or for this number of coordinates or more, in any case
+TIGHT_MANY = 1e-10  # ... or if the tolerance is below this ...
+VERY_MANY = 64  # ... or from this number of coordinates on, in any case
 HUGE = 1000  # number of coordinates above which Newton's method, whose matrices are full, is not tried
 LONG_STEPS = 1e-9  # the rule for this tolerance also holds at looser ones, for runs of few steps
 SERIES = 1e-6  # tolerance below which a Taylor series costs less than DOP853 ...
 INVOLVED = 12  # ... with up to this number of operations for each coordinate ...
-# ... or, with fewer than FEW coordinates, up to this number; it also holds with MANY coordinates at any tolerance
+# ... or up to this number with fewer than FEW coordinates, and with MANY coordinates at any looser tolerance
 SIMPLE = 8
 FEW = 5
 SERIES_OF_MANY = 1e-8  # as SERIES, for MANY coordinates with generated code
@@ -181,7 +181,7 @@ class Auto:
         """Return whether a step of the series costs less than the steps that it replaces."""
         assert self.series is not None and self.series.program is not None
         operations = self.series.program.n_operations / n_q
-        if self.dearer is not None:  # the series runs only near singular positions, where it is more exact
+        if self.dearer is not None:  # near singular positions, where the series then takes over, it is more exact
             return tolerance < (SERIES if n_q < MANY else SERIES_OF_MANY)
         if tolerance < SERIES:
             return operations <= (INVOLVED if n_q >= FEW else SIMPLE)

@@ -1,8 +1,8 @@
 """DOP853(...): the explicit method of order 8 of Dormand and Prince, in the two-loop procedure.
 
 Tableau: Hairer, Nørsett and Wanner, Solving Ordinary Differential Equations I (1993), II.5. The numbers are those of
-`scipy.integrate.DOP853`, which a test compares: that package takes a tenth of a second to import. Both error estimates
-weigh the slopes of the stages; the weight of the slope at the end is zero.
+`scipy.integrate.DOP853`; they are copied, because importing that package takes a tenth of a second, and a test compares
+them. Both error estimates weigh the slopes of the stages; the weight of the slope at the end is zero.
 """
 
 from dataclasses import dataclass
@@ -63,12 +63,15 @@ E5 = np.array(
 )
 
 
-COARSE_SHARE = 0.1  # of the estimate of order 3 beside that of order 5
-REUSE = 1e-4  # of the tolerance: how far off a stage may be from the position of the Jacobian that its velocities use
-LEAST_ERROR = 1e-6  # of the tolerance, in the trend: an error of order 8 falls a hundredfold with steps half as long
-SEEN = C[(B != 0.0) | (E5 != 0.0) | (E3 != 0.0)]  # stages that count
-UNSEEN = float(np.diff([*np.sort(SEEN), 1.0]).max())  # of a step, between two of them: 4/15
-STABLE_TO = (5.96, 6.39)  # h times the frequency of a vibration, and times a rate of decay
+COARSE_SHARE = 0.1  # weight of the estimate of order 3 beside that of order 5
+# relative to the tolerance: largest distance of a stage from the position of the Jacobian for its velocities
+REUSE = 1e-4
+# relative to the tolerance, in the trend: an error of order 8 falls a hundredfold if steps are halved
+LEAST_ERROR = 1e-6
+SEEN = C[(B != 0.0) | (E5 != 0.0) | (E3 != 0.0)]  # nodes of the stages with nonzero weights
+# longest part of a step between two of these nodes, relative to the step: 4/15
+UNSEEN = float(np.diff([*np.sort(SEEN), 1.0]).max())
+STABLE_TO = (5.96, 6.39)  # limits of stability: h times the frequency of a vibration, and h times a rate of decay
 SAFETY = 0.8  # with 0.9 twice as many steps are rejected, and at equal error it costs about a tenth more
 
 
@@ -79,9 +82,9 @@ class DOP853:
     It is for smooth motion that is not stiff. There is no outer loop. Every stage is one evaluation, so a step costs 12
     evaluations, and a rejected one 11. Accepted states are on the constraints.
 
-    If the motion is slower than what could vibrate or decay, stability, not accuracy, limits the step h: h w_max to
-    5.96 for undamped vibrations, and h times the largest rate of decay to 6.39. Vibrations that such steps hardly
-    resolve are damped, by 0.15 % of the amplitude per step at h w_max = 3. If stability limited many steps,
+    If parts of the system could vibrate or decay faster than it moves, stability, not accuracy, limits the step h:
+    h w_max to 5.96 for undamped vibrations, and h times the largest rate of decay to 6.39. Vibrations that such steps
+    hardly resolve are damped, by 0.15 % of the amplitude per step at h w_max = 3. If stability limited many steps,
     `result.message` says so and names other methods.
 
     A step is accepted when the largest component of the estimated local error of q and v, including the dependent
@@ -140,7 +143,7 @@ class DOP853:
         return self.stages == "free"
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Make the method ready for a run of n_q coordinates."""
+        """Return the plan of the method for a run of n_q coordinates."""
         from twoloop.kernels.steps import explicit_step as kernels
 
         s, free = len(B), self.stages == "free"

@@ -1,4 +1,4 @@
-"""Define Lobatto16: implicit Runge-Kutta steps by fixed-point iteration, all stages at once."""
+"""Lobatto16: implicit Runge-Kutta steps by fixed-point iteration, all stages at once."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -15,8 +15,8 @@ from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import LARGEST_MOVE, Plan
 from twoloop.problem.system import ConstrainedSystem
 
-PARTS = 6  # of a step, made again for the solution between its ends
-UNSEEN = float(np.diff([0.0, *tables().nodes]).max())  # of a step, between two nodes
+PARTS = 6  # number of parts of a step, computed again for the solution between its ends
+UNSEEN = float(np.diff([0.0, *tables().nodes]).max())  # longest part of a step between two nodes, relative to the step
 
 
 @dataclass(frozen=True)
@@ -27,14 +27,14 @@ class Lobatto16:
     prediction by the polynomial of the step before. Generated code evaluates the eight unknown stages at once, one in
     each SIMD lane; a step takes four to eight such sweeps. Accepted states are on the constraints.
 
-    It is for smooth motion that is not stiff. Where the iteration converges too slowly, as in stiff motion, "DOP853"
-    goes on. So it does behind a singular position at tolerances below 1e-8; the position itself is crossed by
-    collocation with projected stages.
+    It is for smooth motion that is not stiff. If the iteration converges too slowly, as in stiff motion, the run
+    continues with "DOP853". It also does so after a singular position at tolerances below 1e-8; the position itself is
+    crossed by collocation with projected stages.
 
     Raises
     ------
     ValueError
-        From `solve_dae`, if there can be no code for the system: its callbacks branch on t, q or v, or are too long.
+        Raised by `solve_dae` if no code can be generated: callbacks branch on t, q or v, or are too long.
 
     Notes
     -----
@@ -54,8 +54,8 @@ class Lobatto16:
 
     needs_code: ClassVar[bool] = True
     name: ClassVar[str] = "Lobatto16"
-    code: GeneratedCode | None = None  # made for one system; solve_dae puts it in
-    narrow: bool = True  # whether forces may change much over a short way
+    code: GeneratedCode | None = None  # generated for one system; solve_dae sets it
+    narrow: bool = True  # whether forces may change much over a short distance
 
     def for_system(
         self, system: ConstrainedSystem, code: GeneratedCode | None = None, check: Check = unchecked
@@ -65,7 +65,7 @@ class Lobatto16:
         Raises
         ------
         ValueError
-            If there is no code for it.
+            If there is no code for it, or it is too long.
         """
         if code is None or not suits(code.shared):
             raise ValueError(
@@ -79,7 +79,7 @@ class Lobatto16:
         return True
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Return the plan of a run of n_q coordinates."""
+        """Return the plan of the method for a run of n_q coordinates."""
         from twoloop.kernels.steps import lobatto_step as kernels
 
         if self.code is None:

@@ -124,8 +124,8 @@ class BDF:
     at the rate of the truncation error; large ones may do either from order 3 on. The fixed point limits h to about
     the reciprocal of the largest frequency or rate of decay: stiff problems need small steps.
 
-    Large systems have sparse matrices. There all coordinates are integrated, and the end of each step is projected onto
-    the constraints.
+    Large systems use sparse matrices. There all coordinates are integrated, and the end of each step is moved onto the
+    constraints.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ class BDF:
 
 
 def paper_irk(inner_tol: float = 1e-9, outer_tol: float = 1e-9) -> RungeKutta:
-    """The paper's procedure with Sun's 3-stage Radau IIB; run it with rtol = atol = 1e-5 to follow Sect. 4.1.
+    """Return the paper's procedure with Sun's 3-stage Radau IIB; run it with rtol = atol = 1e-5 to follow Sect. 4.1.
 
     As printed: coordinate partitioning by LU; eqs. (14), (15) for the dependents at every stage; explicit Euler
     prediction; the outer loop ends by (32), is given up by (33); the error is (26), (27), the difference of one step
@@ -218,10 +218,10 @@ def paper_irk(inner_tol: float = 1e-9, outer_tol: float = 1e-9) -> RungeKutta:
     - A step also ends as after (33) when the inner loop does not converge: 25 iterations, a correction of more than
       half the one before, or a singular C_qd.
     - "Once in a time step or several time steps": the partition is checked after every step. It is chosen anew when
-    max|C_qd^-1 C_qi| has grown to three times its first value, or when a step failed in the inner loop.
+      max|C_qd^-1 C_qi| has grown to three times its first value, or when a step failed in the inner loop.
     - Steps are shortened to end at output times and at the end of the run.
     - A step is also rejected if the force jumps between its start and the first stage: the step and its halves do not
-    see such a jump, and were off by 1e5 tolerances.
+      see such a jump, and were off by 1e5 tolerances.
 
     Parameters
     ----------
@@ -242,7 +242,7 @@ def paper_irk(inner_tol: float = 1e-9, outer_tol: float = 1e-9) -> RungeKutta:
 
 
 def paper_newmark(inner_tol: float = 1e-9, outer_tol: float = 1e-9, beta: float = 0.5) -> Newmark:
-    """The two-loop procedure with Newmark's method that the paper compares with; beta = 1/2 as printed.
+    """Return the two-loop procedure with Newmark's method that the paper compares with; beta = 1/2 as printed.
 
     As printed: (12) with beta = gamma = 1/2; the outer loop by (11) and (12) with the inner loop between them.
 

@@ -11,15 +11,15 @@ from twoloop.kernels.compile.caches import BoundedCache
 
 Array = NDArray[np.float64]
 
-# of Newton in the inner loop: it converges quadratically and tests the last correction, so about the square remains
+# Newton's method in the inner loop converges quadratically and tests its last correction: about the square remains
 INNER_TOL = 1e-8
 LEAST_ERROR = 0.01  # `least_error` of the plans of most methods
 ROUGH = 10.0  # `rough` of the plans of most methods, measured
-# correction relative to a position below which a projection is not repeated: velocities are then off by as much
+# largest correction of a position after which a projection is not repeated: velocities are then off by as much
 LARGEST_MOVE = 1e-14
 OUTER_SHARE = 0.01  # tolerance of the outer loop, relative to that of the step
 OUTER_TOL_FIXED = 1e-14  # a fixed step has no tolerance to derive it from: iterate to rounding
-LEAST_TOLERANCE = 1e-14  # smallest tolerance of a loop: smaller ones are below rounding
+LEAST_TOLERANCE = 1e-14  # lower limit of the tolerance that a loop has to reach
 
 
 @dataclass(frozen=True)

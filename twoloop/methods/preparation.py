@@ -1,4 +1,4 @@
-"""Prepare a method for runs of a system: machine code of the mechanism, and plans, which are kept with the system."""
+"""Preparation of a method for runs of a system: generated code, and plans, both cached with the system."""
 
 from typing import Literal
 
@@ -18,14 +18,14 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 Compiled = bool | Literal["auto"]
 
-# most operations of the series of a small mechanism; they do not depend on the position. Code of mechanisms with 230 to
-# 280 operations takes 0.6 s to build, two thirds of it in LLVM; with 370 to 690 it takes 0.7 to 1.9 s (Bricard 1.6,
-# governor 1.9, whose stiff motion takes a tenth longer with code)
+# largest number of operations of the series of a small mechanism; it does not depend on the position. Code of
+# mechanisms with 230 to 280 operations takes 0.6 s to build, two thirds of it in LLVM; with 370 to 690 it takes 0.7 to
+# 1.9 s (Bricard 1.6, governor 1.9, whose stiff motion takes a tenth longer with code)
 SMALL = 300
 
 
 def check_compiled(value: Compiled) -> Compiled:
-    """Return `value`, or say what it must be."""
+    """Return `value`, or raise if it is not one of the choices."""
     if isinstance(value, (bool, np.bool_)):
         return bool(value)
     if isinstance(value, str) and value == "auto":
@@ -38,12 +38,11 @@ def check_compiled(value: Compiled) -> Compiled:
 def code_for(
     system: ConstrainedSystem, method: Method, fixed: bool, compiled: Compiled, t0: float, q0: Array, check: Check
 ) -> GeneratedCode | None:
-    """Return the generated code for a run, if it gets any.
+    """Return the generated code for a run, or None if the run gets none.
 
-    What is left open depends on the arguments of the call alone, so that the same call gives the same numbers whatever
-    ran before it.
+    "auto" depends only on the arguments of the call, so that the same call gives the same numbers whatever ran before.
 
-    Raises ValueError if code is asked for and does not go with the method, or cannot be had.
+    Raises ValueError if code is requested but does not suit the method, or cannot be generated.
     """
     if compiled is True:
         _refuse(method, fixed)
@@ -59,7 +58,7 @@ def code_for(
 
 
 def may_have_code(system: ConstrainedSystem, method: Method, fixed: bool, compiled: Compiled) -> bool:
-    """Return whether a run gets code where it can be had."""
+    """Return whether a run gets code if it can be generated."""
     if needs_code(method):
         return True
     if compiled == "auto":
@@ -81,7 +80,7 @@ def _needed(
 
 
 def _refuse(method: Method, fixed: bool) -> None:
-    """Raise where code does not go with the method, before it is made."""
+    """Raise if code does not suit the method, before it is generated."""
     if not takes_code(method, fixed):
         implicit = " with step_size, by which it is implicit" if takes_code(method, False) else ""
         raise ValueError(
@@ -91,7 +90,7 @@ def _refuse(method: Method, fixed: bool) -> None:
 
 
 def is_small(system: ConstrainedSystem) -> bool:
-    """Return whether its callbacks are compiled, can be traced, and make few operations."""
+    """Return whether the callbacks of a system are compiled, can be traced, and take few operations."""
 
     def look() -> bool:
         try:
@@ -102,9 +101,9 @@ def is_small(system: ConstrainedSystem) -> bool:
     return not system.called_in_python and bool(system.remembered("small", look))
 
 
-MOST = 16  # plans that are kept with a system
+MOST = 16  # largest number of plans cached with a system
 
-# the plan of steps, and by kind those of parts of steps, for the solution between their ends; other runs may share them
+# the plan of the steps, and by kind the plans of their parts, for the solution between their ends; runs may share these
 Plans = tuple[Plan, dict[int, Plan]]
 
 
@@ -126,13 +125,14 @@ def plans_for(
     kept: dict[tuple[object, ...], Plans] = system.remembered("plans", dict)
     made = None if known is None else kept.get(key)
     if made is None:
-        ready = None if known is None else methods.get((known, choice))  # it does not depend on tolerances
+        # the prepared method does not depend on tolerances
+        ready = None if known is None else methods.get((known, choice))
         if ready is None:
             ready = method.for_system(system, code, check) if hasattr(method, "for_system") else method
         made = _made(system, ready, rtol, atol, fixed, code)
         settled = code is not None or _series(ready) == _series(method)
         if known is not None and settled and all(each.trusted for each in made[0].traced):
-            while len(kept) >= MOST:  # other threads may add to them
+            while len(kept) >= MOST:  # a loop, because other threads may add plans
                 kept.pop(next(iter(kept.copy())), None)
             kept[key] = made
             if len(methods) < MOST:
@@ -142,7 +142,7 @@ def plans_for(
 
 
 def _series(method: Method) -> bool:
-    """Return whether a method has a series: it may lose it for one start, where `check` finds other values."""
+    """Return whether a method has a series: it may lose it for one start, if `check` finds other values."""
     return getattr(method, "series", None) is not None
 
 

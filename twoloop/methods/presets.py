@@ -1,4 +1,4 @@
-"""Names that stand for methods with their usual settings, and what makes two methods the same."""
+"""Presets: names of methods with their usual settings; and a key that equal methods share."""
 
 from typing import Any
 
@@ -50,18 +50,18 @@ OWN = (
     Newmark,
     RungeKutta,
     Taylor,
-)  # whose objects are the values of their options
-PLAIN = (str, int, float, np.generic, type(None))  # such values, beside tableaux
+)  # methods that are determined by the values of their options
+PLAIN = (str, int, float, np.generic, type(None))  # types of such values, beside tableaux
 _OF_PRESETS = frozenset(map(id, PRESETS.values()))
 
 
 def is_preset(method: Any) -> bool:
-    """Return whether it is a preset or the name of one, which do not change."""
+    """Return whether a method is a preset or the name of one; these never change."""
     return isinstance(method, str) or id(method) in _OF_PRESETS
 
 
 def identity(method: Method) -> Any:
-    """Return a key that methods of the same options share, by which runs are cached; None: there is none."""
+    """Return a key shared by methods with the same options, by which runs are cached; None: the method has no key."""
     if is_preset(method):
         return id(method)
     if type(method) not in OWN:

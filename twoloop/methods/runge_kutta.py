@@ -20,14 +20,15 @@ from twoloop.methods.plan import (
 )
 from twoloop.methods.tableaux import Tableau
 
-NEWTON_TOL_FIXED = 1e-12  # the outer tolerance of fixed steps where stiff forces magnify rounding
-LIMIT_OF_FIXED_POINT = 1.5  # h rho from which on the fixed-point iteration converges slowly: Newton's method is tried
-# condition number of the eigenvectors of A from which on they count as no basis; 1 over it: an eigenvalue of zero
+NEWTON_TOL_FIXED = 1e-12  # outer tolerance of fixed steps by Newton's method, as stiff forces magnify rounding
+# h rho above which the fixed-point iteration converges slowly, so that Newton's method is tried
+LIMIT_OF_FIXED_POINT = 1.5
+# largest condition number of the eigenvectors of A that count as a basis; 1 over it: smallest nonzero eigenvalue
 ILL_CONDITIONED = 1e8
-# highest order for which a step is divided into so many parts: with fewer the error between steps is more than a few
-# times that at the steps (four-bar linkage, tolerances of 1e-4 to 1e-12)
+# number of parts of a step by the highest order for which it suffices: with fewer parts the error between steps is more
+# than a few times that at the steps (four-bar linkage, tolerances of 1e-4 to 1e-12)
 PARTS = {5: 1, 6: 2, 8: 3, 10: 4, np.inf: 6}
-UNDIVIDED = 6  # the highest order for which this holds of steps by Newton's method, whose accelerations are of no use
+UNDIVIDED = 6  # highest order for which steps by Newton's method, whose accelerations are of no use, are not divided
 
 
 @dataclass(frozen=True)
@@ -39,24 +40,24 @@ class RungeKutta:
     tableau : Tableau
         Any tableau of `twoloop.methods.tableaux`.
     outer : {"auto", "fixed-point", "newton", "paper"}
-        "fixed-point": iteration on the stage accelerations, predicted from the step before, with a growth test.
+        "fixed-point": iteration on the stage accelerations, predicted from the previous step, with a growth test.
         "newton": simplified Newton on the stage accelerations, its linear algebra in the eigenvectors of the tableau's
         A, with derivatives from the tangents that the system gives, else by differences of the two-loop right-hand
         side, kept while it converges fast. For stiff problems, where fixed-point iteration needs h w_max below a
         constant. Its error estimate is an embedded one of order s, filtered (Hairer & Wanner II, IV.8); `error` has no
         effect.
-        "auto": "fixed-point" until steps have come near where that no longer converges, and Newton's method, on trial,
-        costs less for a second of motion; and back again, see `Auto`.
+        "auto": "fixed-point" until steps come near the limit of its convergence and a trial of Newton's method costs
+        less for a second of motion; and back again, see `Auto`.
         "paper": fixed-point iteration on [v_i, q_i] from an explicit Euler prediction, with the tests (32) and (33).
-        The step size follows the error and, but with "paper", its trend (Gustafsson 1994).
+        The step size follows the error and, except with "paper", its trend (Gustafsson 1994).
     error : {"richardson", "richardson-paper"}
         Both take the difference of one step of h and two of h/2, undivided as in (26), for the local error.
         "richardson": its largest component counts, and the step continues from the extrapolated state, put back on
         the constraints, whose order is one higher. "richardson-paper": its root mean square (27) counts, and the step
         continues from the two half steps. Fixed steps estimate nothing and are the tableau's own, with sums from step
-        to step that make up for rounding (Kahan's). Beside "richardson"
-        the accelerations at both ends of the step are compared with the polynomial through those of the stages: so a
-        jump of the force between an end and the stage next to it, which no stage sees, is found.
+        to step that compensate rounding (Kahan's). With "richardson" the accelerations at both ends of the step are
+        compared with the polynomial through those of the stages. This finds a jump of the force between an end and its
+        nearest stage, which no stage sees.
     inner_tol : float, optional
         Newton on the positions stops when its largest correction, just made, is at most this (unit of q). None: 1e-8.
     outer_tol : float, optional
@@ -69,12 +70,12 @@ class RungeKutta:
         mechanisms that swing back the way they came, `RungeKutta(gauss(3), partition="symmetric")` with fixed steps
         then shows no drift of the energy. Step-size control spoils this.
     tested : {"all", "positions"}
-        What the error estimate of outer="newton" is taken over: positions and velocities, or positions and what
-        velocities make of them before they turn back or decay. Stiff vibrations that do not matter show in the
-        velocities; "positions" passes over them.
+        Quantities that the error estimate of outer="newton" counts: positions and velocities, or positions and the
+        effect of velocities on them before these turn back or decay. Stiff vibrations that do not matter show in the
+        velocities; "positions" ignores them.
     outer_test : {"all", "independent"}
-        What (32) of outer="paper" is taken over: all coordinates and velocities, after the dependent ones are restored,
-        or the independent ones only. The text of the paper says both. Without effect on other outer loops.
+        Quantities that (32) of outer="paper" counts: all coordinates and velocities, after the dependent ones are
+        restored, or the independent ones only. The text of the paper says both. No effect on other outer loops.
 
     Raises
     ------
@@ -133,7 +134,7 @@ class RungeKutta:
         return ", ".join([self.tableau.name, self.outer, self.error, *changed])
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Make the method ready for a run of n_q coordinates."""
+        """Return the plan of the method for a run of n_q coordinates."""
         from twoloop.kernels.paper import iterations
         from twoloop.kernels.steps.lazy import LazyStep
         from twoloop.kernels.steps.stages import options_array
@@ -193,7 +194,7 @@ class RungeKutta:
         return made.changed(within_newton=made.changed(memory=made.memory.copy(), parts=tableau.stages - 1))
 
     def _parts(self) -> int:
-        """Return into how many parts a step is divided, so that the solution between its ends is as accurate."""
+        """Return the number of parts of a step that makes the solution between its ends as accurate."""
         if self.outer in ("newton", "paper"):
             return 1
         return next(parts for order, parts in PARTS.items() if self.tableau.order <= order)
@@ -201,11 +202,12 @@ class RungeKutta:
 
 Array = NDArray[np.float64]
 
-STAGE_SHARE = 3.0  # of the tolerance: the correction that is this small is still made, and convergence is quadratic
+# correction over the tolerance at which iteration stops: it is still applied, and convergence is quadratic
+STAGE_SHARE = 3.0
 LOOSEST_OUTER = 3e-3  # relative: with larger corrections stiff problems are solved so badly that steps become short
-FEW_STEPS = 1e-3  # tolerance below which the share is smaller by the number of steps over which corrections add up
+FEW_STEPS = 1e-3  # tolerance below which the share decreases with the number of steps, over which corrections add up
 STAGE_TOL_FIXED = 1e-12  # relative; stiff forces magnify rounding
-STAGE_SAFETY = 0.8  # with 0.9 one attempt in seven is refused where the motion is not smooth, as of the stiff beam
+STAGE_SAFETY = 0.8  # with 0.9 one attempt in seven is rejected if the motion is not smooth, as for the stiff beam
 
 
 def _trbdf2() -> tuple[Array, Array]:
@@ -228,17 +230,17 @@ def _esdirk4() -> tuple[Array, Array]:
     return A, np.array([*embedded, -3700637 / 11593932, 61727 / 225920])
 
 
-FORMULAS = {"TRBDF2": (_trbdf2, 2), "ESDIRK4": (_esdirk4, 4)}  # and their orders
+FORMULAS = {"TRBDF2": (_trbdf2, 2), "ESDIRK4": (_esdirk4, 4)}  # with their orders
 
 
 def _jump_weights(c: Array) -> Array:
-    """Return weights of ESDIRK4's stages, exact for quadratic accelerations, that see a jump at any place.
+    """Return weights of ESDIRK4's stages, exact for quadratic accelerations, that detect a jump at any place in a step.
 
-    What they add up to over the stages behind a jump is about half of what the step is wrong by at most.
+    Their sum over the stages behind a jump is about half of the largest error of the step.
     """
     order = np.argsort(c)
     at = c[order]
-    behind = np.array([0.1392, 0.0, -0.16, -0.16, 0.0])  # the second and the last follow from exactness
+    behind = np.array([0.1392, 0.0, -0.16, -0.16, 0.0])  # the second and the last follow from exactness, see below
     moments = np.array([np.diff(at), np.diff(at**2)])
     behind[[1, 4]] = np.linalg.solve(moments[:, [1, 4]], -moments @ behind)
     weights = np.zeros(len(c))
@@ -282,8 +284,8 @@ class ESDIRK:
         to max(|value|, 1). None: 3 min(rtol, atol), at most 3e-3, and below tolerances of 1e-3 less by the number of
         steps over which such corrections add up; with fixed steps 1e-12.
     tested : {"all", "positions"}
-        What the error estimate is taken over: positions and velocities, or positions and what velocities make of them.
-        Stiff vibrations that do not matter show in the velocities; "positions" passes over them.
+        Quantities that the error estimate counts: positions and velocities, or positions and the effect of velocities
+        on them. Stiff vibrations that do not matter show in the velocities; "positions" ignores them.
 
     Raises
     ------
@@ -322,7 +324,7 @@ class ESDIRK:
         return self.formula if self.tested == "positions" else f"{self.formula}, velocities tested"
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Make the method ready for a run of n_q coordinates."""
+        """Return the plan of the method for a run of n_q coordinates."""
         from twoloop.kernels.steps.lazy import LazyStep
         from twoloop.kernels.steps.newton_memory import diagonal_memory, diagonal_options, n_matrices
 

@@ -15,13 +15,13 @@ from twoloop.checks.arguments import check_real, check_size, check_text, check_v
 
 Array = NDArray[np.float64]
 
-CONSISTENT = 1e-12  # of a sum of coefficients
-MOST_STAGES = 100  # a step of as many stages is longer than any motion is smooth
+CONSISTENT = 1e-12  # relative to the sum of magnitudes of coefficients: rounding error of their sum
+MOST_STAGES = 100  # largest number of stages: longer steps than these suit no motion, as none is smooth for so long
 
 
 @dataclass(frozen=True, eq=False)
 class Tableau:
-    """Coefficients of a Runge-Kutta method, checked when they are put together.
+    """Coefficients of a Runge-Kutta method, checked when the tableau is created.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class Tableau:
 
     @property
     def content(self) -> tuple[object, ...]:
-        """Return its present content, for comparisons."""
+        """Return the present coefficients as a key for comparisons."""
         return self.name, self.order, self.A.tobytes(), self.b.tobytes(), self.c.tobytes()
 
     @property
@@ -130,7 +130,7 @@ def _check_stages(s: int, least: int, family: str) -> None:
 
 
 def gauss(s: int) -> Tableau:
-    """Gauss, s stages: order 2s, symplectic and symmetric.
+    """Return the Gauss tableau with s stages: order 2s, symplectic and symmetric.
 
     Raises
     ------
@@ -151,7 +151,7 @@ def gauss(s: int) -> Tableau:
 
 
 def radau_iia(s: int) -> Tableau:
-    """Radau IIA, s stages: order 2s - 1, stiffly accurate, L-stable, not symplectic.
+    """Return the Radau IIA tableau with s stages: order 2s - 1, stiffly accurate, L-stable, not symplectic.
 
     Raises
     ------
@@ -172,7 +172,7 @@ def radau_iia(s: int) -> Tableau:
 
 
 def sun_radau_iib(s: int) -> Tableau:
-    """Sun's symplectic Radau II ("IIB"), s stages: order 2s - 1; s = 3 is Table 1 of the paper.
+    """Return Sun's symplectic Radau II ("IIB") tableau with s stages: order 2s - 1; s = 3 is Table 1 of the paper.
 
     Its stability function is that of Gauss: |R(iy)| = 1 and R(infinity) = +-1, no damping. With s = 1 it is the
     implicit midpoint rule, of order 2.
@@ -196,7 +196,7 @@ def sun_radau_iib(s: int) -> Tableau:
 
 
 def lobatto_iiie(s: int) -> Tableau:
-    """Lobatto IIIE, s stages: order 2s - 2, symplectic and symmetric.
+    """Return the Lobatto IIIE tableau with s stages: order 2s - 2, symplectic and symmetric.
 
     Raises
     ------

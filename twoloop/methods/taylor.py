@@ -1,4 +1,4 @@
-"""Taylor(): the Taylor series of the motion, found from the equations of the callbacks."""
+"""Taylor(): the Taylor series of the motion, derived from the equations of the callbacks."""
 
 import math
 from dataclasses import dataclass, replace
@@ -17,16 +17,17 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-LOWEST, HIGHEST = 4, 40  # orders that may be asked for
+LOWEST, HIGHEST = 4, 40  # limits of the option `order`
 PER_DIGIT, LEAST = 1.15, 5.0  # order = LEAST + PER_DIGIT digits: about the cheapest on the mechanisms of the bench
-PER_DIGIT_IN_LANES, LEAST_IN_LANES = 1.25, 3.5  # the same of code for lanes
-FIXED = 19  # order of constant steps
-FEWEST, MOST = 3, 6  # parts of a step for the solution between its ends: states of its own series, on the constraints
-PADDED = 8  # operations of a table are a multiple of this
+PER_DIGIT_IN_LANES, LEAST_IN_LANES = 1.25, 3.5  # the same for code in SIMD lanes
+FIXED = 19  # order of fixed steps
+# number of parts of a step for the solution between its ends: states of the step's series, projected
+FEWEST, MOST = 3, 6
+PADDED = 8  # the number of operations in a table is padded to a multiple of this
 
 
 def order_in_lanes(rtol: float, atol: float) -> int:
-    """Return the order of code for lanes at these tolerances."""
+    """Return the order of the series in SIMD lanes at these tolerances."""
     return _order(rtol, atol, LEAST_IN_LANES, PER_DIGIT_IN_LANES)
 
 
@@ -36,7 +37,7 @@ def _order(rtol: float, atol: float, least: float, per_digit: float) -> int:
 
 @dataclass(frozen=True)
 class Taylor:
-    """The Taylor series of the motion, its order set by the tolerance, for smooth motion that is not stiff.
+    """Taylor series of the motion, its order set by the tolerance, for smooth motion that is not stiff.
 
     The cheapest method here at tight tolerances. The callbacks run once in Python on symbols; this takes milliseconds
     and compiles nothing. The coefficients of q, v, a and lam follow from their operations, order by order. Each order
@@ -45,24 +46,23 @@ class Taylor:
     the constraints, in the metric of M. The method thus departs from the paper, whose outer loop has only independent
     coordinates.
 
-    It takes callbacks that give C_q and do not branch on t, q or v, made of + - * /, powers, sin, cos, tan, sqrt,
-    hypot, exp, log, atan, sinh, cosh and tanh. `solve_dae` raises ValueError where they are not, and names the
-    callback.
+    It needs callbacks that give C_q and do not branch on t, q or v, made of + - * /, powers, sin, cos, tan, sqrt,
+    hypot, exp, log, atan, sinh, cosh and tanh. If they are not, `solve_dae` raises ValueError and names the callback.
 
     Parameters
     ----------
     order : int, optional
-        Of the method, 4 to 40: velocities are a series of this order, positions of one more. None: 5 and 1.15 for each
-        digit of the smaller tolerance, or 19 with constant steps.
+        Order of the method, 4 to 40: velocities are a series of this order, positions of one more. None: 5 plus 1.15
+        for each digit of the smaller tolerance, or 19 with fixed steps.
 
     Raises
     ------
     TypeError, ValueError
-        If order is not such a number.
+        If order is not an int from 4 to 40.
 
     Notes
     -----
-    The orders to which each equation is to be differentiated: J. D. Pryce, A simple structural analysis method for
+    Number of derivatives of each equation: J. D. Pryce, A simple structural analysis method for
     DAEs, BIT 41 (2001), 364-394. The step: the length at which each of the last two terms is within the tolerance, A.
     Jorba and M. Zou, A software package for the numerical integration of ODEs by means of high-order Taylor methods,
     Experimental Mathematics 14 (2005), 99-117. In the statistics every coefficient counts as an evaluation.
@@ -78,7 +78,7 @@ class Taylor:
     """
 
     order: int | None = None
-    program: SeriesProgram | None = None  # of one system; solve_dae puts it in
+    program: SeriesProgram | None = None  # program of one system; solve_dae sets it
 
     def __post_init__(self) -> None:
         if self.order is not None and not LOWEST <= check_size("order", self.order, 1) <= HIGHEST:
@@ -92,12 +92,12 @@ class Taylor:
     def for_system(
         self, system: ConstrainedSystem, code: GeneratedCode | None = None, check: Check = unchecked
     ) -> "Taylor":
-        """Return the method with the operations of this system; generated code makes no use of them.
+        """Return the method with the operations of this system; it does not use generated code for them.
 
         Raises
         ------
         ValueError
-            If its callbacks do not run on symbols, or `check` finds that they give something else.
+            If its callbacks do not run on symbols, or `check` finds that their traces differ from calls.
         """
         try:
             program = series_for(system, check)
@@ -112,7 +112,7 @@ class Taylor:
         return True
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
-        """Make the method ready for a run of n_q coordinates."""
+        """Return the plan of the method for a run of n_q coordinates."""
         from twoloop.kernels.steps import recurrences as series
         from twoloop.kernels.steps import taylor_step as taylor
 
@@ -145,7 +145,7 @@ class Taylor:
 
 
 def _options(program: SeriesProgram, highest: int, widths: list[int]) -> Array:
-    """Return the parameter block that the step reads, integers by their bits."""
+    """Return the options that the step reads as one array; integers are stored by their bits."""
     from twoloop.kernels.steps import recurrences as series
 
     tables = [[table.groups.ravel(), *table.first, *table.second] for table in (program.early, program.late)]
