@@ -225,7 +225,7 @@ LEAST = np.array([ROUNDING * EPS, UNSYMMETRIC, SINGULAR_MASS])  # limits in the 
 
 
 class ConstraintWarning(UserWarning):
-    """Warning: constraints depend on one another, or a force is so short that a run may have missed it.
+    """Warning: constraints depend on one another, or something changes so briefly that a run may have missed it.
 
     Dependent rows are left out of the solution but checked; their multipliers are not unique.
 
@@ -334,7 +334,7 @@ class Look:
         return found
 
     def sizes(self) -> Array:
-        """Return sizes of coordinates that earlier starts found (see `Scales.keep`), the least for rounding errors."""
+        """Return sizes of coordinates at earlier starts (see `Scales.keep`): lower limits for rounding errors."""
         sizes: Array = self.system.made.get("sizes", NONE)
         return sizes
 

@@ -209,7 +209,7 @@ def _wrong_jacobian(system: ConstrainedSystem, t: float, q: Array, sides: tuple[
     """Describe the wrong entry of C_q or C_t, or return None."""
     jacobian, rate = system.sparse_rows(t, q)[: system.n_c], system.constraint_rate(t, q)
     if not (is_finite(jacobian) and np.isfinite(rate).all()):
-        return None  # outside the domain of the callbacks; at a state of the run at_position.py reports it
+        return None  # outside the domain of the callbacks; at a state of the run partition.py reports it
     if isinstance(jacobian, SparseRows):
         wrong = _wrong_group(system, t, q, jacobian)
     else:

@@ -176,7 +176,7 @@ class LaneSteps:
         emit.store(self.defect_of(emit, control, at, a), work, lanes.DEFECT)
 
     def defect_of(self, emit: LaneEmitter, control: Value, at: Places, a: list[Value]) -> Value:
-        """Return the defect of the series' accelerations at NEW, relative to the tolerances (see control/defect.py)."""
+        """Return the defect of the series' accelerations at NEW, relative to the tolerances (control/step_size.py)."""
         n, (rtol, atol) = self.n, self.tolerances(emit, control)
         steps, h = emit.number(at.order), emit.load(at.work, lanes.H)
         # infinite if h is 0: then positions set no limit
@@ -196,7 +196,7 @@ class LaneSteps:
         return emit.multiply(share, worst)
 
     def departure(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write OFF, the error of the prediction of a step relative to its limit, see control/predictor.py."""
+        """Write OFF, the error of the prediction of a step relative to its limit, see control/step_size.py."""
         n, at, (rtol, atol) = self.n, self.places(emit, order, control, work), self.tolerances(emit, control)
         h = emit.load(work, lanes.H)
 
@@ -227,7 +227,7 @@ class LaneSteps:
         return None
 
     def judge(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Accept steps or shorten them by their error; a lane fails after too many rejections, or without values."""
+        """Accept steps or shorten them by their error; a lane fails after too many rejections or a NaN."""
         builder, one = emit.builder, emit.constant(1.0)
         select, per_order = builder.select, emit.divide(one, emit.number(order))
         off, *defects = (emit.load(work, field) for field in (lanes.OFF, lanes.WORST, lanes.DEFECT))

@@ -74,53 +74,54 @@ def with_matrix_cost(plan: Plan, cost: float) -> Plan:
 
 @dataclass(frozen=True)
 class Auto:
-    """Explicit steps where nothing is stiff, Newton's method where stiffness is measured; both ways during a run.
+    """Default method: explicit steps, and Newton's method where stiffness is measured; a run may switch both ways.
 
-    A run begins with `series` where the operations of the callbacks can be seen, and are few: at most 12 for each
-    coordinate (8 of fewer than five coordinates) at tolerances below 1e-6, at most 8 at others if there are 16
-    coordinates or more. Else with `few`; with `many` from 64 coordinates on, or from 16 on with at most a quarter as
-    many constraints or tolerances below 1e-10. With code made for the mechanism (by `compiled=True` of `solve_dae`, or
-    its default for small ones) it begins with `lanes`. Where this cannot go on, or equations are too long for it, it
-    goes on with a series at tolerances below 1e-6, of 16 coordinates or more below 1e-8, else with `few`, or with
-    `many` from 64 coordinates on.
+    A run begins with `series` if the operations of the callbacks can be traced and are few: at most 12 for each
+    coordinate (8 with fewer than five coordinates) at tolerances below 1e-6; at looser ones at most 8, with 16
+    coordinates or more. Otherwise it begins with `few`, or with `many`: from 64 coordinates on, and from 16 on if there
+    are at most a quarter as many constraints or the tolerance is below 1e-10. With generated code (`compiled=True` of
+    `solve_dae`, or its default for small mechanisms) it begins with `lanes`. If this cannot continue, or the equations
+    are too long for it, the run continues with a series at tolerances below 1e-6 (from 16 coordinates on: below 1e-8),
+    else with `few`, or from 64 coordinates on with `many`.
 
-    Systems that give the values of entries have `few` from 64 coordinates on, too, unless tolerances are below 1e-10 or
-    there are at most a quarter as many constraints: their projections, one a step, cost as much as evaluations.
+    Systems that give the values of entries begin with `few` from 64 coordinates on, too, unless tolerances are below
+    1e-10 or there are at most a quarter as many constraints: their projections, one a step, cost as much as
+    evaluations.
 
-    At looser tolerances than these a run begins with `series` as well where others may take no steps longer than a
-    hundredth of the run: within 10 steps it goes on without, if the next would be no longer than that. Steps of `few`
-    may be longer where forces and constraints have no quotients, roots or fast vibrations. A run also goes on without
-    the series where this is not finite and the functions are.
+    At looser tolerances than these a run also begins with `series` if the other methods may take no steps longer than a
+    hundredth of the run. Within 10 steps it continues without the series if the next step would be no longer than that.
+    Steps of `few` may be longer if forces and constraints have no quotients, roots or fast vibrations. A run also
+    continues without the series if the series is not finite and the functions are.
 
-    After 100 evaluations, and then every 600, of code made for the mechanism two to four times as many, the largest
-    rate of the motion is estimated, from the derivatives of the accelerations. The implicit method is tried for 15
-    steps where the steps have come near the limit of stability that this rate sets (at two looks in a row; at one with
-    `many`, and with `few` from 16 coordinates on), or are above 5 % of it and the rate is more than thirty times that
-    of the motion itself, or all that could move at this rate is within ten tolerances of velocities. Unless they are
-    far beyond that limit, this waits until the run has cost three trials, and 64 evaluations for each independent
-    coordinate if tangents have to be differenced, or three tenths of what the run will cost as a whole at its present
-    price are as much. If it is to cost a thousand trials, one is made whatever the rates. The implicit method is kept
-    if a second of motion costs it less, counted in evaluations and Newton matrices: `loose` at tolerances from 3e-5 on,
-    `tightest` below 9e-7, else `tight`. It is left the same way, where its steps come below that limit or a second of
-    motion costs more than the explicit method took. Counts decide, not times: a run can be repeated.
+    The largest rate of the motion is estimated from the derivatives of the accelerations, after 100 evaluations and
+    then after every 600 (two to four times as many with generated code). The implicit method is tried for 15 steps if
+    the steps have come near the limit of stability that this rate sets (at two estimates in a row; at one with `many`,
+    and with `few` from 16 coordinates on), or are above 5 % of it and the rate is more than thirty times that of the
+    motion itself, or all that could move at this rate is within ten tolerances of velocities. Unless the steps are far
+    beyond that limit, the trial waits until the run has cost three trials, and 64 evaluations for each independent
+    coordinate if tangents have to be differenced, or until three tenths of the cost of the whole run, extrapolated from
+    its present cost, are as much. If the run is to cost a thousand trials, one is made whatever the rates. The implicit
+    method is kept if a second of motion costs it less, counted in evaluations and Newton matrices: `loose` at
+    tolerances from 3e-5 on, `tightest` below 9e-7, else `tight`. The run returns to the explicit method if the steps
+    come below that limit, or if a second of motion costs more than with the explicit method. Counts decide, not times:
+    a run can be repeated.
 
-    Above 1000 coordinates no implicit method is tried, as its matrices are full; nor is a series where M and C_q have
-    more than 200,000 entries together, zeros among them, as it takes seconds to find (method="Taylor" does).
+    Above 1000 coordinates no implicit method is tried, as its matrices are full. No series is tried if M and C_q have
+    more than 200,000 entries together, zeros among them, as it takes seconds to find (method="Taylor" does it).
 
-    While the implicit method runs, errors of positions are within the tolerances; those of velocities are tested
-    for what they will make of the positions before they turn back or decay.
-    With constant steps it is `fixed` throughout.
+    While the implicit method runs, errors of positions are within the tolerances; velocities are tested for the errors
+    that they will cause in the positions before they turn back or decay. With fixed steps, `fixed` makes the whole run.
 
     Parameters
     ----------
     few, many : method object
         Explicit methods, for few and for many coordinates.
     series : Taylor or None
-        None: `few` and `many` alone; so `for_system` has it where callbacks are not made of operations that it knows.
+        None: only `few` and `many`; `for_system` sets None if callbacks are not made of operations that it knows.
     loose, tight, tightest : method object
         Implicit methods, for loose, tight and the tightest tolerances.
     fixed : method object
-        For constant steps.
+        Method for fixed steps.
 
     Examples
     --------
