@@ -1,1 +1,1 @@
-"""Many runs of one system: the same again and again, or thousands at once with parameters and starts of their own."""
+"""Many runs of one system: one setup used again and again, or thousands at once with parameters and starts of each."""

@@ -1,4 +1,4 @@
-"""consistent_states: many guesses put on the constraints at once."""
+"""consistent_states: project many guesses onto the constraints at once."""
 
 from __future__ import annotations  # ArrayLike stays a word in help()
 
@@ -20,8 +20,8 @@ from twoloop.run.projection import ConsistentState, consistent_state
 if TYPE_CHECKING:
     from twoloop.generate.lane_code import GeneratedLanes, LaneConstraints
 
-MOST_ROWS = 200  # whose factors in lanes have no zeros
-SINGLY = 0.01  # about what `consistent_state` takes, s
+MOST_ROWS = 200  # largest number of constraints in lanes, where factors are dense
+SINGLY = 0.01  # s, estimated time of one call of `consistent_state`
 
 
 def consistent_states(
@@ -35,10 +35,10 @@ def consistent_states(
 ) -> tuple[Array, Array]:
     """Project many guesses onto the constraints, each by the least change, as `consistent_state` does with one.
 
-    Guesses that are near the constraints are moved together, by Gauss-Newton on the equations that the callbacks were
-    traced to, in SIMD lanes on all cores; each result is compared with what the callbacks themselves say. The others go
-    through `consistent_state` one by one, as do those of systems with nonholonomic rows or whose callbacks cannot be
-    traced, of large systems, and a few guesses for which the code is not worth its time.
+    Guesses that are near the constraints are projected together, by Gauss-Newton on the equations that the callbacks
+    were traced to, in SIMD lanes on all cores; the callbacks themselves then check each result. `consistent_state`
+    projects all others one at a time: guesses farther away, large systems, systems with nonholonomic rows or whose
+    callbacks cannot be traced, and so few guesses that compiling code for them does not pay.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def consistent_states(
     q, v : array_like (n_q,) or (n_runs, n_q)
         Guesses: one for all, or one for each.
     parameters : array_like (n_runs, n_p), optional
-        Of each, instead of `system.parameters`.
+        Parameters of each run, instead of `system.parameters`.
     keep : sequence of int, optional
         Coordinates that stay as given, position and velocity. None: all may move.
 
@@ -89,14 +89,14 @@ def consistent_states(
         lanes = _InLanes(system, starts)
         made_q, made_v, fine = lanes.put(starts, moves, 0)
         left = np.flatnonzero(~fine)
-        for run in left[:1].tolist():  # it says how many rows are redundant, if that is why
+        for run in left[:1].tolist():  # its result tells how many rows are redundant, if that is the reason
             found = singly(run)
             n_redundant = system.n_c - len(found.dependent)
             if n_redundant > 0:
                 made_q[left], made_v[left], fine[left] = lanes.put(starts.some(left), moves, n_redundant)
             if not fine[run]:
                 made_q[run], made_v[run], fine[run] = *found, True
-    # of others compiled callbacks may go out of the bounds of their arrays, which single calls look at
+    # without a trace, compiled callbacks may exceed their arrays: single calls check this, so only traced ones are run
     traced = np.flatnonzero(fine)
     made = Starts(t, made_q[traced], made_v[traced], starts.parameters[traced])
     fine[traced] = ~far_off(kit_to_write(system), made)
@@ -106,12 +106,12 @@ def consistent_states(
 
 
 class _InLanes:
-    """Code for the constraints of a system, and how it puts guesses on them.
+    """Generated code that projects guesses onto the constraints of a system.
 
     Raises
     ------
     Untraceable
-        Saying why lanes cannot do it.
+        If lanes cannot do it; the message says why.
     """
 
     def __init__(self, system: ConstrainedSystem, starts: Starts):
@@ -132,7 +132,7 @@ class _InLanes:
             raise Untraceable("it is not worth the code for so few")
 
     def put(self, starts: Starts, moves: Integers, n_redundant: int) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Positions and velocities put on the constraints, so many of which are redundant; which may be taken."""
+        """Project positions and velocities onto the constraints, some of them redundant; also return which to take."""
         from twoloop.kernels.lanes import layout
         from twoloop.kernels.lanes import starts as kernels
 

@@ -23,7 +23,7 @@ Integers = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Runs:
-    """Many runs, one along the first axis each.
+    """Results of many runs, one run per entry of the first axis.
 
     Attributes
     ----------
@@ -39,13 +39,13 @@ class Runs:
     n_evaluations : ndarray (n_runs,)
         Solutions for accelerations, as `Statistics` counts them.
     singly : ndarray (n_runs,) of bool
-        Runs that were not made in lanes, but one by one, as by `solve_dae`.
+        Runs that were not integrated in lanes, but one at a time, as by `solve_dae`.
     message : str
-        How many runs reached the end, how many were made in lanes, by which method, how many singly, and why.
+        How many runs reached the end, how many went in lanes, by which method, how many one at a time, and why.
     messages : dict of int to str
-        What `solve_dae` said of those runs that failed.
+        Messages of `solve_dae` for the runs that failed.
     reasons : dict of int to str
-        Why each of the runs that were made singly was.
+        Why each run that did not go in lanes was integrated one at a time.
 
     Examples
     --------
@@ -73,7 +73,7 @@ class Runs:
 
     @property
     def success(self) -> NDArray[np.bool_]:
-        """Whether a run reached its end."""
+        """Whether each run reached its end."""
         made: NDArray[np.bool_] = self.status >= 0
         return made
 
@@ -86,14 +86,14 @@ class Runs:
 
 Flags = NDArray[np.bool_]
 
-FAR = 1e5  # tolerances, by which a motion that is not chaotic does not end elsewhere
-CALL = 1e-3  # s of a call of solve_dae beside its steps
-WORTH = 20.0  # times what the runs of a call take singly: what their code may take to compile, as it is kept
+FAR = 1e5  # in tolerances: a motion that is not chaotic does not end farther from the first run
+CALL = 1e-3  # s, time of a call of solve_dae besides its steps
+WORTH = 20.0  # largest time of compilation over that of single runs: the code is cached for later calls
 
 
 @dataclass
 class LaneEnsemble:
-    """Runs of one system from t0 to t1, and what came of them so far.
+    """Runs of one system from t0 to t1, and their results so far.
 
     Attributes
     ----------
@@ -101,19 +101,19 @@ class LaneEnsemble:
     starts : Starts
     t1 : float
     times : ndarray (n_t,)
-        At which states are wanted.
+        Output times.
     rtol, atol : float, ndarray (n_q,)
     q, v : ndarray (n_runs, n_q, n_t)
-        NaN where there is nothing yet.
+        NaN where there is no result yet.
     n_steps, n_evaluations : ndarray (n_runs,)
     methods : list of str
-        Those that made runs in lanes.
+        Methods that integrated runs in lanes.
     turn : ndarray (n_runs,)
-        Which of them made each run; -1: none.
+        Index of the method that integrated each run; -1: none.
     reasons : dict
-        Why others were left, by their numbers.
+        Why runs were left to `solve_dae`, by their numbers.
     why : str
-        Why none was made, or the first method made none.
+        Why no run went in lanes, or none by the first method.
     """
 
     system: ConstrainedSystem
@@ -139,15 +139,15 @@ class LaneEnsemble:
 
     @property
     def in_lanes(self) -> Flags:
-        """Which runs were made in lanes."""
+        """Whether each run was integrated in lanes."""
         made: Flags = self.turn >= 0
         return made
 
     def make_in_lanes(self, method: str, first: Result, threads: int) -> None:
-        """Make those that lanes can make, by the methods of a preset.
+        """Integrate the runs that lanes can do, by the methods of a preset.
 
-        `first` is the first run, made singly: it says whether the motion is stiff and what runs cost, and lanes have
-        to end where it does.
+        `first` is the first run, integrated by `solve_dae`: it tells whether the motion is stiff and what runs cost.
+        Lanes have to end where it does.
 
         Raises
         ------
@@ -171,16 +171,16 @@ class LaneEnsemble:
                 self.why = self.why or str(reason)
 
     def max_step(self, run: int) -> float:
-        """Of a run that is left: what was met in short looks is to be met again."""
+        """Return the largest step of a run that is left: a short force that samples met must be met again."""
         return (self.t1 - self.starts.t0) / LOOKS if self.reasons.get(run) == WHY[SHORT] else np.inf
 
     def _make(self, lanes: LaneRuns, which: Integers, first: Result, threads: int) -> None:
-        """Have these runs made.
+        """Integrate these runs in lanes.
 
         Raises
         ------
         Untraceable
-            If the first one ends elsewhere than by itself.
+            If the first one ends elsewhere than by `solve_dae`.
         """
         starts, t1, times, rtol, atol = self.starts, self.t1, self.times, self.rtol, self.atol
         for run in which[far_off(lanes.kit, starts)[which]].tolist():
@@ -192,13 +192,13 @@ class LaneEnsemble:
         fine = lanes.judge(which, status, t1, rtol, float(atol.min()), q, v, at_end)
         if fine[0] and first.success:
             known = first.q[:, -1:]
-            off = np.abs(q[0][:, ends == first.t[-1]] - known)  # of nothing, where that time is not among these
+            off = np.abs(q[0][:, ends == first.t[-1]] - known)  # empty if that time is not among these
             if (off > FAR * (atol[:, None] + rtol * np.abs(known))).any():
                 raise Untraceable(f"the first run ends elsewhere by itself, {FAR:g} tolerances and more away")
         fine[0] = False
         n, runs = len(within), which[fine]
         for states, own, start in ((self.q, q, starts.q), (self.v, v, starts.v)):
-            if len(which) == len(states):  # twice as fast as by their numbers
+            if len(which) == len(states):  # twice as fast as by indices
                 np.copyto(states[:, :, len(times) - n :], own[:, :, :n], where=fine[:, None, None])
             else:
                 states[runs, :, len(times) - n :] = own[fine, :, :n]
@@ -222,13 +222,13 @@ def _check_start(system: ConstrainedSystem, starts: Starts, run: int) -> None:
 
 
 def of_run(run: int, error: ValueError) -> ValueError:
-    """The error of a single run, with its number, and the function for many runs in the place of that for one."""
+    """Return the error of a single run with its number; its advice names the function for many runs."""
     return ValueError(f"run {run}: {error}".replace("twoloop.consistent_state(", "twoloop.consistent_states("))
 
 
-SHOWN = 5  # numbers of runs in a message
-FIRST = "the first, which checks the system"  # why it is made singly
-CLOSER, TIGHT = 0.1, 1e-9  # of the tolerances: those of the first run, unless they are as tight as this
+SHOWN = 5  # largest number of runs that a message names
+FIRST = "the first, which checks the system"  # reason for which the first run is not in lanes
+CLOSER, TIGHT = 0.1, 1e-9  # factor of the tolerances of the first run, unless these are as tight as TIGHT
 
 
 def ensemble(
@@ -247,16 +247,16 @@ def ensemble(
 ) -> Runs:
     """Integrate many runs of one system, each with parameters and a start of its own.
 
-    Runs use machine code made for the system, one run in each lane of the processor's vectors. Each run has its own
+    Runs use code generated for the system, one run in each lane of the processor's vectors. Each run has its own
     steps, which are checked as those of a single run. A lane whose run has ended takes the next one. All parameters use
     the same code, which is kept on disk.
 
-    What lanes cannot do is made by `solve_dae`, run by run: runs that come near a singular position, systems whose
+    Some runs are integrated by `solve_dae` one at a time: runs that come near a singular position, systems whose
     callbacks branch or that have nonholonomic rows, events, and other methods. So are runs whose forces or drives were
     seen to act for less than a thousandth of the run, with a `max_step` of half of that, and runs that take less than a
-    twentieth of the estimated time to make their code. The first run is also made by `solve_dae`, with all of its
-    checks, and with a tenth of the tolerances where these are above 1e-9, as lanes are compared with it. At the end of
-    every other run, the callbacks are compared with what was found there.
+    twentieth of the estimated time to compile their code. The first run is also integrated by `solve_dae`, with all of
+    its checks, and with a tenth of the tolerances if these are above 1e-9, because lanes are compared with it. At the
+    end of every other run, the callbacks are compared with the state found there.
 
     Parameters
     ----------
@@ -266,7 +266,7 @@ def ensemble(
     q0, v0 : array_like (n_q,) or (n_runs, n_q)
         Consistent starts (see `consistent_states`): one for all runs, or one for each.
     parameters : array_like (n_runs, n_p), optional
-        Of each run, instead of `system.parameters`. None: these.
+        Parameters of each run. None: `system.parameters` for all.
     rtol, atol, t_eval, events
         As for `solve_dae`; t_eval None: states are stored at the start and the end.
     method : str or method object
@@ -293,14 +293,15 @@ def ensemble(
 
     Notes
     -----
-    In lanes, as in a single run, the equations are evaluated at least every hundredth of the run. So no step of a Radau
-    method is longer, and no step of DOP853 longer than 3.75 hundredths, as the widest gap between its stages is 4/15 of
-    a step, or than a hundredth where a callback has quotients, roots or fast vibrations. Where a force may act for a
-    short time, steps are no longer than a two-thousandth of the run; a single run evaluates only the forces there.
-    Stages are off the constraints by the error of the formula. This includes the Radau methods, whose unknowns are here
-    the accelerations of all coordinates. The end of each step is put on the constraints. States at `t_eval` within a
-    step are the ends of shorter steps from its beginning. A run that would take more than 100,000 steps is made by
-    `solve_dae`. So is one that by series meets a place at which the equations have no values.
+    In lanes, as in a single run, the equations are evaluated at least every hundredth of the run. Steps of a Radau
+    method are no longer than this. Steps of DOP853 are no longer than 3.75 hundredths, because the widest gap between
+    its stages is 4/15 of a step; if a callback has quotients, roots or fast vibrations, no longer than a hundredth. If
+    a force may act for a short time, steps are no longer than a two-thousandth of the run; a single run then evaluates
+    only the forces so often. Stages violate the constraints by the error of the formula, also in the Radau methods,
+    whose unknowns in lanes are the accelerations of all coordinates. The end of each step is projected onto the
+    constraints. States at `t_eval` within a step are the ends of shorter steps from its beginning. `solve_dae`
+    integrates runs that would take more than 100,000 steps, and runs by series that meet a place at which the equations
+    have no values.
 
     Examples
     --------
@@ -330,7 +331,7 @@ def ensemble(
 
     def single(run: int, max_step: float = np.inf) -> Result:
         result = _alone(system, starts, run, (t0, t1), options | {"max_step": max_step})
-        if result.status is Status.INTERRUPTED:  # as in lanes, and not of this run alone
+        if result.status is Status.INTERRUPTED:  # Ctrl-C ends all runs, as it does in lanes
             raise KeyboardInterrupt
         for out, found in ((runs.q, result.q), (runs.v, result.v)):
             out[run, :, : len(result.t)], out[run, :, len(result.t) :] = found, np.nan
@@ -341,9 +342,9 @@ def ensemble(
         return result
 
     may_go = events is None and method in IN_LANES and n_runs > 1
-    if may_go and float(rtol) > TIGHT and tolerance.min() > TIGHT:  # lanes are compared with it
+    if may_go and float(rtol) > TIGHT and tolerance.min() > TIGHT:  # lanes are compared with the first run
         options |= {"rtol": CLOSER * float(rtol), "atol": CLOSER * tolerance}
-    first = single(0)  # which checks the system, derivatives and all
+    first = single(0)  # checks the system, derivatives and all
     options |= {"rtol": float(rtol), "atol": tolerance}
     if events is not None:
         runs.why = "events are looked for in single runs only"
@@ -387,6 +388,6 @@ def _message(status: Integers, runs: LaneEnsemble, reasons: dict[int, str]) -> s
 
 
 def _numbered(runs: list[int]) -> str:
-    """How many runs, and which."""
+    """Describe how many runs there are, and which."""
     told = ", ".join(map(str, runs[:SHOWN])) + (", ..." if len(runs) > SHOWN else "")
     return f"run {told}" if len(runs) == 1 else f"{len(runs)} runs ({told})"

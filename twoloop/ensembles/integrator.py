@@ -1,4 +1,4 @@
-"""Integrator: the same system, method and tolerances for run after run."""
+"""Integrator: one system, method and tolerances for run after run."""
 
 from __future__ import annotations  # ArrayLike stays a word in help()
 
@@ -23,17 +23,17 @@ from twoloop.run.record import record_of
 from twoloop.run.sampled import SampledRun, SampledState
 from twoloop.solve import solve_dae
 
-MOST = 64  # systems of other parameters that are kept
+MOST = 64  # largest number of cached systems with other parameters
 FOR_SAMPLES = {"method", "rtol", "atol", "max_step", "check_derivatives"}
 OF_A_RUN = {"system", "t_span", "q0", "v0", "method", "rtol", "atol", "t_eval", "store"}
 
 
 class Integrator:
-    """A system with a method and tolerances, for many runs one after another, or for one from sample to sample.
+    """Integrator of one system with a method and tolerances, for many runs one after another, or from sample to sample.
 
-    What does not change from run to run is made once and kept: plans, machine code, checks of the same start, and for
-    the latest parameters the systems that they make. A copy begins without a motion: give it a `start`. For thousands
-    of runs at once see `ensemble`.
+    Plans, machine code, checks of the same start, and the systems of the latest parameters do not change from run to
+    run: they are created once and cached. A copy begins without a motion: give it a `start`. For thousands of runs at
+    once see `ensemble`.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ class Integrator:
         q0, v0 : array_like (n_q,)
             Consistent coordinates and velocities.
         parameters : array_like, optional
-            Those of the first sample. None: those of the system.
+            Parameters of the first sample. None: those of the system.
 
         Returns
         -------
@@ -164,8 +164,8 @@ class Integrator:
 
         No checks are repeated. Accelerations jump with the inputs, and the method restarts there. Error control is that
         of `run`. As in a run, the equations are evaluated at least every hundredth of the time since the start, so the
-        first samples are divided into many steps. A sample that meets a force too short for its looks is made again,
-        and a `ConstraintWarning` says where earlier samples may have missed one.
+        first samples are divided into many steps. A sample that meets a force too short for them is repeated, and
+        a `ConstraintWarning` says where earlier samples may have missed one.
 
         Parameters
         ----------
@@ -201,7 +201,7 @@ class Integrator:
         return self._sampled.step(float(dt))
 
     def result(self) -> Result:
-        """The motion since `start`, at the ends of the samples: a `Result` to plot, animate and save.
+        """Return the motion since `start`, at the ends of the samples: a `Result` to plot, animate and save.
 
         Returns
         -------
@@ -228,7 +228,7 @@ class Integrator:
         return kept
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Make copies, also in other processes, that have no motion: two cannot step on in the same arrays."""
+        """Make copies, also in other processes, without a motion: two integrators cannot share the arrays of one."""
         return _made, (self.system, self._options)
 
     def __repr__(self) -> str:

@@ -1,4 +1,4 @@
-"""Integrate runs in SIMD lanes: choose the methods, compile their code, look at short forces, judge each run."""
+"""Runs in SIMD lanes: choose the methods, compile their code, sample short forces, check each run."""
 
 from __future__ import annotations
 
@@ -38,18 +38,18 @@ from twoloop.problem.system import ConstrainedSystem
 if TYPE_CHECKING:
     from twoloop.generate.lane_code import GeneratedLanes, LaneCode
 
-AT_ONCE = 30_000  # numbers that are compared together
+AT_ONCE = 30_000  # largest number of values that are compared together
 
 
 class ShortLooks:
-    """Looks at forces and drives of many runs, at times a two-thousandth of a run apart.
+    """Sampling of the forces and drives of many runs, at times a two-thousandth of a run apart.
 
     Parameters
     ----------
     system : ConstrainedSystem
-        Whose callbacks run on symbols, and have no nonholonomic rows.
+        A system whose callbacks run on symbols, without nonholonomic rows.
     values, varying
-        Of a `ParameterTape`: generic parameters, and which of them differ from run to run.
+        As for `ParameterTape`: generic parameters, and which of them differ from run to run.
     """
 
     def __init__(self, system: ConstrainedSystem, values: Array, varying: Sequence[int]):
@@ -60,9 +60,9 @@ class ShortLooks:
         self._program = Program(graph, {"": [x for x in forms if any(graph.inputs_of[i] & TIME for i in x.terms)]})
 
     def meet(self, times: Array, rtol: float, parameters: Array, q: Array, v: Array) -> NDArray[np.bool_]:
-        """Which runs, of these parameters, meet what lasts for less than two looks, or has no value.
+        """Return which runs meet a change that lasts less than two samples, or a value that is not finite.
 
-        q, v : (n_runs, n), of one state of each run.
+        q, v : (n_runs, n), one state of each run.
         """
         met = np.zeros(len(q), dtype=bool)
         size = max(1, AT_ONCE // max(1, len(times) * len(self._program.forms)))
@@ -78,7 +78,7 @@ class ShortLooks:
 
 
 def _are_short(values: Array, rtol: float) -> NDArray[np.bool_]:
-    """In which runs some value, (n_times, n_runs, n), changes suddenly twice within two looks."""
+    """Return in which runs a value, (n_times, n_runs, n), jumps twice within two samples or is not finite."""
     if not values.size:
         return np.zeros(values.shape[1], dtype=bool)
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=(0, 2)))
@@ -96,15 +96,15 @@ def _are_short(values: Array, rtol: float) -> NDArray[np.bool_]:
     return np.asarray(short | ~finite)
 
 
-INVOLVED = 6.0  # operations of a series a coordinate, from which on "auto" takes DOP853 (measured at 2, 11 and 13) ...
+INVOLVED = 6.0  # operations of a series per coordinate, from which on "auto" takes DOP853 (measured at 2, 11, 13) ...
 STAGES_TO = 1e-9  # ... down to this tolerance
-STAGES = {"RadauIIA5": 3, "RadauIIA9": 5, "RadauIIA13": 7}  # of the implicit methods
-IN_LANES = ("auto", "Taylor", "DOP853", *STAGES)  # presets that go in lanes
+STAGES = {"RadauIIA5": 3, "RadauIIA9": 5, "RadauIIA13": 7}  # number of stages of the implicit methods
+IN_LANES = ("auto", "Taylor", "DOP853", *STAGES)  # presets that can run in lanes
 
 
 @dataclass(frozen=True)
 class LaneMethod:
-    """A method made ready for runs in lanes.
+    """Method prepared for runs in lanes.
 
     Attributes
     ----------
@@ -112,17 +112,17 @@ class LaneMethod:
     series : bool
         Whether it needs code for Taylor series.
     order : int
-        What code made for a mechanism gets as the order.
+        The order that generated code gets.
     evaluations : int
-        Of an attempt, besides those that its kernel counts and the one at its end.
+        Evaluations of an attempt, besides those that its kernel counts and the one at its end.
     options : ndarray
-        What its step reads.
+        The numbers that its step reads.
     tableau : tuple of ndarray or None
-        Of an explicit method, for which code is made: A, b, c and the weights of two estimates of its error.
+        For an explicit method with generated code: A, b, c and the weights of two estimates of its error.
     unseen : float
-        Of a step, the longest part within which the equations are not looked at.
+        The longest part of a step within which the equations are not evaluated.
     step, memory : callable
-        Its kernel, compiled when it is first asked for, and the length of its memory, in vectors, for such code.
+        The kernel of its step, compiled when first needed, and the length of its memory, in vectors, for given code.
     """
 
     name: str
@@ -137,9 +137,9 @@ class LaneMethod:
 
 
 def is_involved(system: ConstrainedSystem) -> bool:
-    """Whether a Taylor series takes so many operations that a dozen evaluations cost less.
+    """Return whether a Taylor series takes so many operations that a dozen evaluations cost less.
 
-    Not where something is narrow: there steps of DOP853 have to be short, and a series is only looked at within them.
+    Return False if a force may be narrow: DOP853 then needs short steps, a series only samples within its steps.
     """
     if may_be_narrow(system, ran_on_symbols=True):
         return False
@@ -150,10 +150,10 @@ def is_involved(system: ConstrainedSystem) -> bool:
 
 
 def lane_methods(name: str, stiff: bool, n: int, rtol: float, atol: float, involved: bool = False) -> list[LaneMethod]:
-    """Methods for runs of n coordinates by a preset; the next one where no code can be had for one.
+    """Return the methods of a preset for runs of n coordinates; each serves if no code can be had for the one before.
 
-    "auto" takes Taylor series, or DOP853 where there are none or, down to STAGES_TO, these are `involved`; for stiff
-    motion the Radau method that it takes singly, at loose tolerances that of order 5.
+    "auto" takes Taylor series, or DOP853 if there are none or, down to STAGES_TO, if the series are `involved`. For
+    stiff motion it takes the Radau method of single runs, at loose tolerances that of order 5.
     """
     if name == "DOP853":
         return [_dop853(n, rtol, atol)]
@@ -213,7 +213,7 @@ def _newton(name: str, tested: Literal["all", "positions"], n: int, rtol: float,
 
 
 def _options(method: Method, n: int, rtol: float, atol: float) -> Array:
-    """What a step reads, behind what explicit.py reads."""
+    """Return the numbers that a step reads, after those that explicit.py reads."""
     plan = method.plan(n, rtol, atol, False)
     return np.concatenate([plan.rule, [plan.rough, cached_run().FIRST_STEP, least_tolerance(rtol, atol)], plan.options])
 
@@ -221,15 +221,15 @@ def _options(method: Method, n: int, rtol: float, atol: float) -> Array:
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-N_SAMPLES = 100  # of a run, at least as many at which the equations are looked at ...
-OF_SUDDEN = 20  # ... times as many where a force may act for a short time: lanes do not look ahead
-SMALLEST, LARGEST = 128, 4096  # runs of a block; numbers of all of a block's runs are made at once
-FOR_EACH = 3  # blocks for each of several threads, so that all end at about the same time
+N_SAMPLES = 100  # smallest number of evaluations of the equations in a run ...
+OF_SUDDEN = 20  # ... times this if a force may act for a short time: lanes do not sample ahead
+SMALLEST, LARGEST = 128, 4096  # number of runs of a block; coefficients of all its runs are computed at once
+FOR_EACH = 3  # blocks per thread, so that all threads end at about the same time
 LOOKS = N_SAMPLES * OF_SUDDEN
-SHORT = min(layout.NO_START, layout.UNLIKE) - 1  # beside what layout.py says
-AGREES = 1e-7  # of the terms of an equation: what rounding may leave of it at the end of a run
+SHORT = min(layout.NO_START, layout.UNLIKE) - 1  # a status besides those of layout.py
+AGREES = 1e-7  # relative to the terms of an equation: residual that rounding may leave at the end of a run
 
-WHY = {  # a run is left to a run of its own, by what layout.py says of it
+WHY = {  # reasons for which a run is left to `solve_dae`, by its status in layout.py
     layout.NO_START: "the code made for the first run does not hold at the start",
     layout.NO_STATE: "a state at t_eval could not be put on the constraints",
     layout.NO_VALUES: "the equations have no values in a step (constraints lose rank, a root of a negative number)",
@@ -241,7 +241,7 @@ WHY = {  # a run is left to a run of its own, by what layout.py says of it
 
 
 class LaneRuns:
-    """The code of a system for lanes, and what it makes of many runs.
+    """Generated code of a system for lanes, and the runs that it integrates.
 
     Parameters
     ----------
@@ -252,7 +252,7 @@ class LaneRuns:
     Raises
     ------
     Untraceable
-        Saying why lanes cannot do it.
+        If lanes cannot integrate the system; the message says why.
     """
 
     def __init__(self, system: ConstrainedSystem, starts: Starts, method: LaneMethod):
@@ -264,7 +264,7 @@ class LaneRuns:
         self.places = LOOKS if any(sudden) else N_SAMPLES * unseen
         self.looks = ShortLooks(system, generic, varying) if sudden.by_time else None
         choice = Choice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
-        kind = ("lanes", method.series, method.tableau is None, choice, tuple(varying))  # of which the latest is kept
+        kind = ("lanes", method.series, method.tableau is None, choice, tuple(varying))  # the latest code is cached
 
         def make() -> GeneratedLanes[LaneCode]:
             from twoloop.generate.lane_code import GeneratedLanes, LaneCode  # loads kernels: at the first ensemble
@@ -285,10 +285,10 @@ class LaneRuns:
         out_q: Array,
         out_v: Array,
     ) -> tuple[Integers, Integers, Integers, Array]:
-        """Make these runs: what became of each, as layout.py has it, steps, evaluations, a and lam at the end."""
+        """Integrate these runs; return status (see layout.py), steps and evaluations, and a and lam at the end."""
         n_runs = len(which)
         status, n_steps, n_evaluations = np.zeros((3, n_runs), dtype=np.int64)
-        n_evaluations += 1  # at the start
+        n_evaluations += 1  # the evaluation at the start
         ends = np.full((n_runs, self.system.n_q + self.system.n_c), np.nan)
 
         def block(rows: slice) -> None:
@@ -325,7 +325,7 @@ class LaneRuns:
         advance.advance_lanes(kit, settings, control, method.options, *arrays)
 
     def agree(self, which: Integers, made: Flags, t1: float, atol: float, q: Array, v: Array, ends: Array) -> Flags:
-        """Of which of these runs, of those that were made, callbacks say that the equations hold at their end.
+        """Return which of these runs, of those that were made, satisfy the equations at their end, by the callbacks.
 
         q, v : (n_runs, n, n_t), the last at the end; ends : a and lam there.
         """
@@ -349,7 +349,7 @@ class LaneRuns:
         v: Array,
         ends: Array,
     ) -> Flags:
-        """Of which of these runs all states were found and agree; the status of others says why not."""
+        """Return which of these runs have all states and agree with callbacks; the status of others says why not."""
         made = status == layout.ENDED
         found = np.isfinite(q).all(axis=(1, 2))
         fine = made & found
@@ -366,7 +366,7 @@ class LaneRuns:
 
 
 def in_blocks(make: Callable[[slice], None], n_runs: int, threads: int) -> None:
-    """Have blocks of runs made, by so many threads."""
+    """Call `make` for blocks of runs, in so many threads."""
     n_blocks = 1 if threads == 1 else FOR_EACH * threads
     size = int(np.clip(-(-n_runs // n_blocks), SMALLEST, LARGEST))
     blocks = [slice(begin, min(begin + size, n_runs)) for begin in range(0, n_runs, size)]
@@ -379,7 +379,7 @@ def in_blocks(make: Callable[[slice], None], n_runs: int, threads: int) -> None:
 
 
 def aligned(vectors: int, lanes: int) -> Array:
-    """Zeros whose address a vector of all lanes may have."""
+    """Return zeros at an address that a vector of all lanes may have."""
     size = 8 * lanes
     room = np.zeros(vectors * lanes + lanes)
     first = -room.ctypes.data % size // 8
@@ -387,7 +387,7 @@ def aligned(vectors: int, lanes: int) -> Array:
 
 
 def threads_of(wanted: int | None) -> int:
-    """How many threads: those that are wanted, else one for each core that this process may use."""
+    """Return the number of threads: `wanted`, else one for each core that this process may use."""
     if wanted is not None:
         return wanted
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,4 +1,4 @@
-"""Starts and parameters of many runs: what is given for all or for each, checked, and one row a run."""
+"""Starts and parameters of many runs: arrays given for all runs or for each, checked and expanded to one row a run."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from twoloop.checks.arguments import Array, check_real, shaped, shown, wrong_entries
 from twoloop.problem.system import ConstrainedSystem
 
-NEAR = 1e4  # times rounding of its terms: an equation of a start that needs no closer look
-SLOW = 1e-3  # of the largest speed of all runs: what rounding leaves in velocities is not less in a run at rest
-GENERIC = 16  # runs of which generic parameters are a mean
+NEAR = 1e4  # times the rounding error of its terms: a residual of a start below this needs no closer check
+SLOW = 1e-3  # relative to the largest speed of all runs: the scale of rounding errors in velocities for a run at rest
+GENERIC = 16  # number of runs whose parameters are averaged for generic ones, besides the extreme ones
 
 
 @dataclass
 class Starts:
-    """Starts of runs at t0, a row each."""
+    """Starts of runs at t0, one row per run."""
 
     t0: float
     q: Array
@@ -24,14 +24,14 @@ class Starts:
     parameters: Array
 
     def some(self, which: NDArray[np.intp]) -> "Starts":
-        """Those of some runs."""
+        """Return the starts of some runs."""
         return Starts(self.t0, self.q[which], self.v[which], self.parameters[which])
 
 
 def all_starts(
     system: ConstrainedSystem, t0: float, q0: Any, v0: Any, parameters: Any, names: tuple[str, str] = ("q0", "v0")
 ) -> Starts:
-    """Rows for all runs.
+    """Check the arguments, and return one row of starts and parameters for each run.
 
     Raises
     ------
@@ -66,19 +66,19 @@ def all_starts(
 
 
 def system_of(system: ConstrainedSystem, starts: Starts, run: int) -> ConstrainedSystem:
-    """The system with the parameters of a run."""
+    """Return the system with the parameters of a run."""
     same = np.array_equal(starts.parameters[run], system.parameters)
     return system if same else system.with_parameters(starts.parameters[run])
 
 
 def generic_system(system: ConstrainedSystem, starts: Starts) -> ConstrainedSystem:
-    """One in which all acts that does in any of the runs: a factor that is zero in the first may not be in others."""
+    """Return a system with every term that acts in any run: a factor that is zero in the first may not be in others."""
     generic, _ = generic_parameters(starts.parameters)
     return system if np.array_equal(generic, system.parameters) else system.with_parameters(generic)
 
 
 def kit_to_write(system: ConstrainedSystem) -> tuple[Any, NDArray[np.int64]]:
-    """The callbacks with parameters of their own that a kernel may write, and n_q, n_c and the place of the first."""
+    """Return callbacks with their own writable parameters, and n_q, n_c and the index of the first parameter."""
     from twoloop.kernels.data.common import Kit
 
     own = system.with_parameters(system.parameters) if system.parameters.size else system
@@ -86,7 +86,7 @@ def kit_to_write(system: ConstrainedSystem) -> tuple[Any, NDArray[np.int64]]:
 
 
 def far_off(kit: tuple[Any, NDArray[np.int64]], starts: Starts) -> NDArray[np.bool_]:
-    """Of which starts callbacks say that C or C_q v + C_t is more than what rounding of their terms may leave."""
+    """Return for which starts C or C_q v + C_t exceeds the possible rounding error of its terms."""
     from twoloop.kernels.evaluation.residuals import constraint_residuals
 
     functions, sizes = kit
@@ -97,11 +97,11 @@ def far_off(kit: tuple[Any, NDArray[np.int64]], starts: Starts) -> NDArray[np.bo
 
 
 def generic_parameters(parameters: Array) -> tuple[Array, list[int]]:
-    """Parameters between those of some runs, bound by no rule but a linear one of all, and which of them vary."""
+    """Return parameters between those of the runs, in no relation but linear ones of all, and which of them vary."""
     varies = (parameters != parameters[:1]).any(axis=0)
     if not varies.any():
         return parameters[0], []
-    ends = (parameters[:, varies].argmin(axis=0), parameters[:, varies].argmax(axis=0))  # what one run alone has counts
+    ends = (parameters[:, varies].argmin(axis=0), parameters[:, varies].argmax(axis=0))  # a value of one run counts
     rows = parameters[np.concatenate([np.arange(0, len(parameters), max(1, len(parameters) // GENERIC)), *ends])]
     weights = np.random.default_rng(3).uniform(0.5, 1.5, len(rows))
     return np.where(varies, weights @ rows / weights.sum(), parameters[0]), np.flatnonzero(varies).tolist()

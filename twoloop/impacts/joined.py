@@ -18,7 +18,7 @@ CHANGES = "velocities jumped in impacts, or stops were closed or joints stuck fo
 
 
 class Impact(NamedTuple):
-    """An impact: time, s; stops; velocities before and after (n_q,); impulses of the stops and of their friction.
+    """Impact: time, s; stops; velocities before and after (n_q,); impulses of the stops and of their friction.
 
     Impulses are in N s (N m s for an angle); those of friction act along `slide`, and are zero without friction.
 

@@ -400,7 +400,7 @@ class Motion:
         return lambda t, q, v: sign * float(self.modes.gradients(q, k) @ v) - offset
 
     def _slips(self, balance: Any) -> Any:
-        """Return the event of friction that is exceeded, from what is needed and there; all of it may slip at once."""
+        """Return the event at which the needed friction exceeds the available one; all of it may be used at first."""
         needed, available = balance(self.t, self.q, self.v)
         if abs(needed) > (1.0 + RELEASED) * available:
             raise Undetermined(f"friction of {abs(needed):.10g} is needed, but it has {available:.10g}")
@@ -483,8 +483,8 @@ def solve_with_stops(
     -----
     Impacts and releases are located like events. The gaps, their rates and the forces of closed stops are evaluated
     four times per step, and at least at every two-thousandth of the motion. A gap that closes and opens again between
-    two evaluations is found, unless its rate changes sign more than once there; then reduce `max_step`. The time of an
-    impact is as accurate as the motion before it.
+    two evaluations is found, unless its rate changes sign more than once between them; then reduce `max_step`. The time
+    of an impact is as accurate as the motion before it.
 
     Examples
     --------

@@ -1,1 +1,1 @@
-"""What a user writes: systems, callbacks in plain Python, joints, events, drawings, and problems of these."""
+"""Parts of a model that a user writes: systems, callbacks in plain Python, joints, events, drawings, and problems."""

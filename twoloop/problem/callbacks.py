@@ -1,4 +1,4 @@
-"""Turn what a user gives, plain functions and entries of matrices, into callbacks; stand in for those left out."""
+"""Turn plain functions and entries of matrices into callbacks, and substitute those left out."""
 
 import ctypes
 import inspect
@@ -22,9 +22,9 @@ from twoloop.kernels.compile.dependencies import digest_as, digest_of
 from twoloop.kernels.compile.private import Dispatcher
 
 Integers = NDArray[np.int64]
-Entries = tuple[Integers, Integers]  # rows and columns
+Entries = tuple[Integers, Integers]  # row and column indices
 
-LARGE = 64  # coordinates from which entries are faster than dense matrices; on chains of bars it is 36
+LARGE = 64  # number of coordinates from which on entries are faster than dense matrices; on chains of bars it is 36
 # kinds that return the values of entries, by their dense kinds
 VALUES_OF = {"mass": "mass_values", "jacobian": "jacobian_values"}
 
@@ -87,7 +87,7 @@ class DenseFunction:
         """Return the matrix; of symbols if the function returns symbols."""
         values = np.asarray(self.values(t, q, *p))
         if values.shape != self.entries[0].shape:
-            return values  # whose shape is refused where it is stored
+            return values  # its shape is refused when it is stored
         matrix = np.zeros(self.shape, dtype=values.dtype if values.dtype == object else np.float64)
         for i, j, value in zip(*(indices.tolist() for indices in self.entries), values, strict=True):
             matrix[i, j] = matrix[i, j] + value
@@ -98,8 +98,8 @@ class DenseFunction:
 FIRST_DISPLACEMENT = 2.0**-6
 SHRINKAGE = 0.125  # factor after a displacement over which the constraints bend too much
 N_DISPLACEMENTS = 9
-AGREEMENT = 1e-11  # of the formulas of order 6 and 8, relative to the entry, at which no shorter one is tried
-ROUNDING = 1e-14  # of a constraint, relative to its largest value at the displaced points
+AGREEMENT = 1e-11  # relative to an entry: if the formulas of order 6 and 8 agree to this, the displacement is kept
+ROUNDING = 1e-14  # rounding error of a constraint, relative to its largest value at the displaced points
 
 # d/dx at 0 from f(k h) - f(-k h), k = 1 ... 4, over h
 ORDER_8 = (4.0 / 5.0, -1.0 / 5.0, 4.0 / 105.0, -1.0 / 280.0)
@@ -158,7 +158,7 @@ def differenced_jacobian(constraint: Dispatcher) -> Dispatcher:
     return compile_callback("jacobian", jacobian, digests_of(jacobian))
 
 
-Address = tuple[int, tuple[int, ...]]  # of a contiguous float64 array, and its shape: numba boxes an array in 0.5 us
+Address = tuple[int, tuple[int, ...]]  # address and shape of a contiguous float64 array: numba boxes an array in 0.5 us
 
 KIND_NAMES = tuple(KINDS)
 _ARRAYS: dict[Address, Array] = {}  # by address: arrays of a run do not move
@@ -343,7 +343,7 @@ def check_arguments(kind: str, function: Callable[..., Any], parameters: bool) -
     expected = ("t", *KINDS[kind].state)
     try:
         arguments = inspect.signature(function).parameters
-    except (TypeError, ValueError):  # built-in functions have none to look at
+    except (TypeError, ValueError):  # built-in functions have no signature
         return parameters
     names = tuple(arguments)
     for order in (expected, (*expected, "p")):
@@ -408,12 +408,12 @@ def _is_left_out(kind: str, callbacks: dict[str, Any]) -> bool:
     """Return whether a kind is missing, None, or the stand-in that another system has in its place."""
     entry, given = KINDS[kind], callbacks.get(kind)
     if given is None:
-        return kind not in callbacks or entry.optional or kind == "mass"  # in whose place are mass_values
+        return kind not in callbacks or entry.optional or kind == "mass"  # mass_values may replace it
     return entry.optional and entry.absent != "differences" and given is zero_callback(kind)
 
 
 def checked_entries(callbacks: dict[str, Any], n_q: int, n_c: int, mass: Any, jacobian: Any) -> dict[str, Entries]:
-    """Return where the entries of M and C_q are whose values callbacks return; raise if they do not fit."""
+    """Return the rows and columns of entries of M and C_q whose values callbacks return; raise if they do not fit."""
     checked: dict[str, Entries] = {}
     for kind, entries, shape in (("mass", mass, (n_q, n_q)), ("jacobian", jacobian, (n_c, n_q))):
         values, name = VALUES_OF[kind], f"{kind}_entries"
@@ -426,7 +426,7 @@ def checked_entries(callbacks: dict[str, Any], n_q: int, n_c: int, mass: Any, ja
 
 
 class PlainFunctions(NamedTuple):
-    """Plain functions by kind, where the entries are that they return, and which of them take the parameters p."""
+    """Plain functions by kind, the entries whose values they return, and which of them take the parameters p."""
 
     functions: dict[str, Any]
     entries: dict[str, Entries]

@@ -1,4 +1,4 @@
-"""Manage compiled functions of a system: source generated from equations, values that numba froze, pickles."""
+"""Compiled functions of a system: source generated from equations, values that numba froze, pickles."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def _write(path: Path, text: str) -> None:
 
 
 class Change(NamedTuple):
-    """A value that is no longer as it was compiled: the callback, the name in it, and both values."""
+    """Value that has changed since it was compiled: the callback, the name in it, and both values."""
 
     kind: str
     name: str
@@ -220,7 +220,7 @@ def _code_of(helper: Any) -> str:
 
 
 class PickledCall:
-    """Pickle as a call, `find(*arguments)`, that the other process makes."""
+    """Object that pickles as a call, `find(*arguments)`, which the other process makes."""
 
     def __init__(self, find: Callable[..., Any], *arguments: Any):
         self.call = find, arguments

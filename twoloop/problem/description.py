@@ -1,4 +1,4 @@
-"""Describe what results know of a system beside its equations: drawing, names, energy, joints, stops."""
+"""Description of a system for its results, besides the equations: drawing, names, energy, joints, stops."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Description:
-    """Hold names and pictures for results; a `Problem` hands them to its system.
+    """Names and pictures of a system for its results; a `Problem` hands them to its system.
 
     Attributes
     ----------
@@ -120,7 +120,7 @@ class Description:
     drawing: Drawing | None = None
 
     def with_parameters(self, p: NDArray[Any]) -> Description:
-        """Return what holds for other parameters: an energy or a drawing may enclose those that it was made with."""
+        """Return the description for other parameters, without an energy or a drawing that may enclose the old ones."""
         if not isinstance(self.energy, GeneratedEnergy):
             return Description(self.coordinates)
         return Description(self.coordinates, replace(self.energy, parameters=tuple(p.tolist())), self.conserved)

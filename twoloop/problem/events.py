@@ -13,7 +13,7 @@ from twoloop.checks.arguments import Array, check_call, shown
 
 SAMPLES = 4  # least number of parts of a step, at whose ends the sign is checked
 WHOLE = 1.0 - 1e-9  # so that rounding does not add a part to a step of SAMPLES times the time between samples
-PRECISION = 4.0 * float(np.finfo(float).eps)  # of the time of an event, as in SciPy
+PRECISION = 4.0 * float(np.finfo(float).eps)  # relative precision of the time of an event, as in SciPy
 # iterations of Brent's method, which halves the interval at least every 53rd time: for zeros of high order
 MAX_ITERATIONS = 3000
 

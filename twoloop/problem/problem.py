@@ -132,12 +132,12 @@ class Problem:
     purpose : str
         What it tests, in plain words.
     conserved : bool or None
-        Whether the energy is an invariant. None: unknown, and nothing is judged by it; `studies.compare` then looks at
+        Whether the energy is an invariant. None: unknown, and nothing is judged by it; `studies.compare` then checks
         the energy of its reference.
     invariants : mapping
-        Further ones: name to invariant(t, q, v), as `energy`.
+        Further invariants: name to invariant(t, q, v), as `energy`.
     condition : Condition or None
-        The pass rule of the benchmark's authors, where they have one.
+        The pass rule of the benchmark's authors, if they have one.
     coordinates : tuple of str
         Names of the coordinates with their units, such as "x of crank (m)"; results name their columns by them.
     drawing : Drawing or None

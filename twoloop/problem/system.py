@@ -37,7 +37,7 @@ from twoloop.problem.callbacks import (
 from twoloop.problem.compiled_functions import FrozenValues, pickled, unpickled
 from twoloop.problem.description import Description, Joint, check_joints
 
-# in a docstring, which has the indentation of the source before Python 3.13, and none since
+# placeholder in a docstring, which has the indentation of the source before Python 3.13, and none since
 PLACEHOLDER = re.compile(r"^( *)\{callbacks\}\n", re.MULTILINE)
 
 
@@ -184,7 +184,7 @@ class ConstrainedSystem:
         self.entries = checked_entries(callbacks, self.n_q, self.n_c, mass_entries, jacobian_entries)
         self.name = check_text("name", name)
         self.joints = check_joints(joints, self.n_q, self.n_c + self.n_a)
-        self.description = Description()  # a Problem puts its own in its place
+        self.description = Description()  # a Problem replaces it
         p = checked_parameters(parameters)
         if not isinstance(constant_mass, (bool, np.bool_)):
             raise TypeError(f"constant_mass must be True or False; given {constant_mass!r}")
@@ -195,7 +195,7 @@ class ConstrainedSystem:
                 f"bandwidth needs a constant mass matrix; given bandwidth={bandwidth} for a mass that may change"
             )
         self.given = given_callbacks(callbacks, self.n_c, self.n_a)
-        self.scattered: frozenset[str] = frozenset()  # dense kinds made of their values
+        self.scattered: frozenset[str] = frozenset()  # dense kinds computed from values of entries
         for kind, function in self.given.items():
             entry = KINDS[kind]
             if not isinstance(function, Dispatcher) or entry.signature.args not in function.overloads:
@@ -223,7 +223,7 @@ class ConstrainedSystem:
             for kind, entry in KINDS.items()
         }
         self.within_bounds: set[str] = set()  # kinds that check_callback has checked
-        self.checked = False  # by check_derivatives
+        self.checked = False  # whether check_derivatives has passed
         self.made: dict[Any, Any] = {}  # cache of what follows from the equations, see `remembered`
         self.shared: dict[Any, Any] = {}  # cache shared with systems of other parameters: checked options, and runs
 
@@ -254,7 +254,7 @@ class ConstrainedSystem:
         # the handle of Python functions comes first, and is no parameter of the user
         p = self.functions.p[self.called_in_python :].copy()  # kernels want an array that may be written
         p.setflags(write=False)
-        return p.view()  # which cannot be made writable again
+        return p.view()  # users cannot make this view writable again
 
     @parameters.setter
     def parameters(self, value: Any) -> None:

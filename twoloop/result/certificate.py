@@ -27,7 +27,7 @@ LOOSER = (10.0, 100.0)  # factors of the tolerances with which a failed reintegr
 
 
 class CertificateWarning(UserWarning):
-    """A run does not pass its certificate: its defect is larger than the tolerances allow.
+    """Warning that a run does not pass its certificate: its defect is larger than the tolerances allow.
 
     Examples
     --------

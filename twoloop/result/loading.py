@@ -22,7 +22,7 @@ from twoloop.run.record import Statistics, Status
 from twoloop.run.recorder import read
 
 KINDS = (indices.APART, indices.VELOCITIES, indices.ACCELERATIONS, indices.ACROSS)
-INTEGER_LIMIT = 2**63  # of counts
+INTEGER_LIMIT = 2**63  # limit of counts
 BLOCK = 1024  # rows of an array checked at a time
 MIN_INTERIOR = 2  # smallest number of states within an interval: its two ends
 

@@ -22,7 +22,7 @@ SOFTWARE = """@software{twoloop,
   version = VERSION
 }"""
 
-# by prefix of the method name; the sources are those named in the docstrings of the methods
+# keys of the bibliography by prefix of the method name; the sources are those named in the docstrings of the methods
 SOURCES = {
     "Sun Radau IIB": ("sun",),
     "Gauss": ("butcher",),

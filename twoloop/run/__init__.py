@@ -1,1 +1,1 @@
-"""One run: its arrays, its loop in chunks, the solution between steps, and what is said of how it ended."""
+"""Integration of one run: its arrays, its loop in chunks, the solution between steps, and the message at its end."""

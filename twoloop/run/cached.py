@@ -1,8 +1,8 @@
-"""Cache integrators: a call with the options of an earlier one reuses its plan, code, arrays and checks.
+"""Cached integrators: a call with the options of an earlier one reuses its plan, code, arrays and checks.
 
-`CachedIntegrator` calls `start_and_advance` of kernels/cached_run.py, which checks the start and takes a first chunk of
+`CachedIntegrator` calls `start_and_advance` of kernels/cached_run.py, which checks the start and makes a first chunk of
 steps. If that reaches the end and nothing unusual happens, the fields of the result are deferred. Otherwise
-`IntegrationLoop` goes on from there.
+`IntegrationLoop` continues the run.
 """
 
 import time
@@ -49,17 +49,17 @@ from twoloop.run.workspace import GAMMA_ACCURACY, sparse_factors_pay
 
 Array = NDArray[np.float64]
 
-MOST_WAITING = 4  # integrators of equal options that wait for a call, one a thread
-FIRST_CHUNKS = 4  # in one call, where no states between them are sampled: then Ctrl-C is answered after 0.1 s at most
-AFTER_ERROR = 16  # calls that do not try the arrays after a callback raised in them
-LATER = (*OF_STEPS, "stats")  # fields that are put together apart from the others
+MOST_WAITING = 4  # largest number of idle integrators of equal options, one per thread
+FIRST_CHUNKS = 4  # chunks in the first call, if no states are sampled between them: Ctrl-C is answered within 0.1 s
+AFTER_ERROR = 16  # number of calls that skip an integrator after a callback raised in it
+LATER = (*OF_STEPS, "stats")  # fields that are computed separately from the others
 OTHERS = {name: value for name, value in DEFAULTS.items() if name not in LATER}
-SHORT = 1e-3  # s of CPU time of the last run: below it, the elapsed time is read, which takes less time
-REACHED_END = Status.REACHED_END  # to look it up in the enumeration takes longer
+SHORT = 1e-3  # s of CPU time of the last run: below it the elapsed time is measured, which takes less time to read
+REACHED_END = Status.REACHED_END  # a look-up in the enumeration takes longer
 
 
 class Output(NamedTuple):
-    """Say which states a run has to store: at all steps, or at times, which may be its ends alone; and if `sol`."""
+    """Requested states: at all steps, or at times, which may be the ends of the run alone; and if `sol` is wanted."""
 
     times: Array | None
     at_ends: bool
@@ -68,11 +68,11 @@ class Output(NamedTuple):
 
     @property
     def between(self) -> Array | None:
-        """Times between steps."""
+        """Output times between steps, or None."""
         return None if self.at_ends else self.times
 
     def wanted(self, run: Run) -> OutputRequest:
-        """Return the same for `IntegrationLoop`."""
+        """Return the request for `IntegrationLoop`."""
         return OutputRequest(self.times, self.at_ends or run.lands, self.dense, None, MemoryStore())
 
 
@@ -81,28 +81,28 @@ STEPS = Output(None, False, False, None)
 
 @dataclass(frozen=True)
 class Missed:
-    """Ask for a run to be repeated, as it may have missed short changes, with evaluations `every` so many seconds."""
+    """Request to repeat a run that may have missed short changes, with evaluations at most `every` seconds apart."""
 
     every: float
     cpu_time: float
 
 
 class CachedIntegrator:
-    """Integrate from start after start with the same plan and the same arrays.
+    """Integrator that reuses one plan and the same arrays for start after start.
 
     Parameters
     ----------
     run : Run
         A run at its start; the integrator takes it over.
     system : ConstrainedSystem
-        The one of the call: `run.system` may be another, with derived callbacks.
+        System of the call: `run.system` may be another, with derived callbacks.
     code : GeneratedCode or None
         The machine code that its plan calls.
     definite : bool
         Whether M has an inverse at its start.
     options : Options
-    kin : SharedSetup or None
-        What it shares with runs of systems of other parameters, which it may then be made for.
+    shared : SharedSetup or None
+        Setup shared by systems of other parameters, for which the integrator then serves, too.
     """
 
     def __init__(
@@ -122,15 +122,15 @@ class CachedIntegrator:
         self.look, self.loops, self.skips = Look(looked), cached_run(), 0
         self.arrays, self.given = arrays_of(run, self.look, code, definite, options, room), looked.kit
         self._start_and_advance = entry_point(self.loops.start_and_advance)
-        # places in the block: where states begin, and the report of a run that has only one
+        # indices in the block: the beginning of the states, and of the report of a run that has only one state
         self.states_from, self.width = self.arrays.report.size, len(run.state)
         self.one_state_from = self.states_from - self.loops.N_HEAD - 1
-        self.moved = False  # whether the loop may have changed `run`, beside its arrays
+        self.moved = False  # whether the loop may have changed attributes of `run`, besides its arrays
         self.at_start = {name: getattr(run, name) for name in ("plan", "memory", "chunk", "kit", "functions")}
         self.form, self.cpu_time = run.kit.flags[FORM], np.inf  # CPU time of the last run, s
         self.between = OutputInterpolation(run)
         self.of_run = run.rank, run.redundant, bool(run.plan.own)
-        self.counted = self.arrays.start_rows.tobytes()  # the rows that count, to which `of_run` belongs
+        self.counted = self.arrays.start_rows.tobytes()  # the independent rows to which `of_run` belongs
         self.dependent = {self.counted: (run.redundant, run.rows_warning)}
 
     @staticmethod
@@ -140,9 +140,9 @@ class CachedIntegrator:
 
     @staticmethod
     def gives(run: Run, output: Output, shared: SharedSetup | None) -> bool:
-        """Return whether arrays that serve from start to start can give an output."""
+        """Return whether arrays that are reused from start to start can give an output."""
         if output.dense and (output.between is not None or shared is not None):
-            return False  # both have the same states within steps; what belongs to kin takes other parameters
+            return False  # sol and output must have the same states within steps; a shared setup takes other parameters
         return output.between is None or not (run.lands or run.kit.flags[FORM] == indices.AUGMENTED)
 
     def integrate(
@@ -157,8 +157,8 @@ class CachedIntegrator:
     ) -> dict[str, Any] | Missed | None:
         """Integrate a system from a start, and return the fields of the result.
 
-        None if the start has to be checked more closely, or a callback raised: then `set_up` says what is wrong. Where
-        nothing unusual happened, the fields are put together when they are asked for, from a copy of the arrays.
+        Return None if the start must be checked more closely, or if a callback raised: `set_up` then describes what is
+        wrong. If nothing unusual happened, the fields are deferred: computed on access, from a copy of the arrays.
         """
         run, region, arrays, loops, parametric = self.run, self.region, self.arrays, self.loops, self.parametric
         due = region.is_due()
@@ -181,7 +181,7 @@ class CachedIntegrator:
             n = n_rows = self._start_and_advance(*start, False)
             if n == loops.IN_DOUBT and self.look.is_surely(0, t0, q0, v0):
                 n = self._start_and_advance(*start, True)
-        except Exception:  # of a callback; the loop knows what to do
+        except Exception:  # raised by a callback: the loop handles it
             self.skips, arrays.last_start[loops.N_EQUAL] = AFTER_ERROR, loops.NEVER
             return None
         self.cpu_time = clock() - began
@@ -200,7 +200,7 @@ class CachedIntegrator:
         begin, end = self.one_state_from - n_rows - n * N_STEP_COLUMNS, self.states_from
         data = arrays.block[begin : end if at_times is not None else end + (1 + n_rows) * self.width].copy()
         fields["later"] = partial(_field, data, at_times, self.of_run, self.cpu_time, system, t1, self.options)
-        region.count()  # the loop counts its runs itself
+        region.count()  # runs that the loop ends are counted there
         return fields
 
     def _finished(
@@ -214,7 +214,7 @@ class CachedIntegrator:
         due: bool,
         fields: dict[str, Any],
     ) -> dict[str, Any] | Missed | tuple[tuple[Array, Array] | None] | None:
-        """Check the first chunk of a run, and go on to its end if that is not its last one.
+        """Check the first chunk of a run, and integrate to the end if that is not its last chunk.
 
         Return all fields of a run in which something happened, or else what the deferred fields need: a tuple of the
         output times and the rows there, or of None for all steps. `fields` gets `sol`.
@@ -259,7 +259,7 @@ class CachedIntegrator:
         return (at_times,)
 
     def _agrees(self, t1: float, q0: Array, v0: Array) -> bool:
-        """Check a system of other parameters at a new start, where other rows may be redundant."""
+        """Return whether callbacks agree at a new start or with new parameters; other rows may be redundant there."""
         run = self.run
         if run.rows_warning:  # rounding may decide which row is left out
             counted = self.arrays.start_rows.tobytes()
@@ -274,14 +274,14 @@ class CachedIntegrator:
         return self.parametric is None or self.parametric.agrees(run.t0, q0, v0, t1, mass, derivatives)
 
     def _return_to_start(self) -> None:
-        """Put back what the loop may have changed, beside arrays."""
+        """Restore the attributes of the run, besides arrays, that the loop may have changed."""
         run, self.moved = self.run, False
         if run.plan is self.at_start["plan"] and not run.substituted and run.kit.flags[FORM] == self.form:
-            self.at_start |= {"kit": run.kit, "functions": run.functions}  # it may have loaded a step
+            self.at_start |= {"kit": run.kit, "functions": run.functions}  # keep a step that the kit may have loaded
         vars(run).update(self.at_start, crossings=[], jumps=[], lengths=[], substituted=False)
 
     def _compared(self, t: Array, rows: Array, t1: float, inside: bool, due: bool) -> bool:
-        """Compare callbacks at states that lie where none was compared, or everywhere; whether they were right.
+        """Compare callbacks at states outside the compared region, or everywhere; return whether they were right.
 
         `inside`: all states lie where callbacks were compared.
         """
@@ -294,7 +294,7 @@ class CachedIntegrator:
             sample = Sample(float(t[0]), rows[0], n)
             sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
             states = sample.states()
-            if not everywhere:  # a sample may lie in known places, and all later runs would be sampled in vain
+            if not everywhere:  # samples may all lie in the region; later runs would then be sampled in vain
                 states = np.concatenate([farthest(t, rows[:, :n]), states])
             if compare_callbacks_at(run, region, states, self.check_derivatives, status, "", everywhere)[0] != status:
                 return False
@@ -305,9 +305,9 @@ class CachedIntegrator:
 
 
 def fields_of(record: Record, options: Options, system: ConstrainedSystem, compiled: bool) -> dict[str, Any]:
-    """Return the fields of the result of a run that the loop took to its end."""
+    """Return the fields of the result of a run that the loop integrated to its end."""
     fields = vars(record) | options.metadata | {"system": system, "atol": options.atol.copy(), "compiled": compiled}
-    if (own := options.own_tolerance) is not None:  # Newmark's own test, of positions, has its place
+    if (own := options.own_tolerance) is not None:  # Newmark tests positions by a tolerance of its own
         fields |= {"rtol": own, "atol": np.full(system.n_q, own), "untested": np.ones(len(record.h), dtype=bool)}
     return fields
 
@@ -322,7 +322,7 @@ def _field(
     options: Options,
     name: str,
 ) -> dict[str, Any]:
-    """Return a deferred field of a result, with those that belong to it; `data` is the report of the run."""
+    """Return a deferred field of a result, with those computed together; `data` is the report of the run."""
     if name == "message":
         return {name: describe_arrival(t1, options.step_size is not None)}
     loops, n_states, n_steps = cached_run(), int(data[0]), int(data[1])
@@ -339,21 +339,21 @@ def _field(
     return OTHERS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
-NEARER = 0.1  # of the smallest pivot at the start of the first run: below it, a start is looked at anew
+NEARER = 0.1  # relative to the smallest pivot at the start of the first run: a start below it is checked anew
 
 
 def first_chunk(run: Run) -> int:
-    """Return the number of attempts of the first chunk, which fills as many rows at most."""
+    """Return the number of attempts of the first chunk, which fills at most as many rows."""
     return max(LANES, run.chunk * (FIRST_CHUNKS if run.plan.stable_to is None else 1))
 
 
 def arrays_of(
     run: Run, look: Look, code: GeneratedCode | None, definite: bool, options: Options, room: int
 ) -> SimpleNamespace:
-    """Make the arrays that `start_and_advance` of kernels/cached_run.py reads and writes, with room for so many steps.
+    """Create the arrays that `start_and_advance` of kernels/cached_run.py reads and writes, for at most `room` steps.
 
     The run is at its start; its clock, control and tolerances become parts of one array. `look` is of its system, or of
-    the one that it stands for; `code` is the machine code that its plan calls; `definite`: whether M has an inverse.
+    the system that it stands for; `code` is the machine code that its plan calls; `definite`: whether M has an inverse.
     """
     from twoloop.kernels.evaluation import checks as first_look
     from twoloop.kernels.linalg import rank as pivots
@@ -370,7 +370,7 @@ def arrays_of(
     blocks = [] if choice is None else [(i[0], i[-1], j[0], j[-1]) for i, j in choice.blocks]
     dependents = Dependents(system, () if choice is None else choice.rows)
     search = dependents.arguments if dependents.find else (nothing, nothing, 0, np.zeros(0), nothing, nothing)
-    places = np.flatnonzero(memory.view(np.int64))  # -0 is not what is cleared
+    places = np.flatnonzero(memory.view(np.int64))  # bits, because clearing would not restore -0.0
     weak = 0.0 if system.constant_mass and system.made.get("no weak mass", False) else SINGULAR_MASS
     of_start: tuple[float, ...]
     of_start = max(run.rtol, GAMMA_ACCURACY), run.reuse, 0.0 if run.plan.watchful else 1.0
@@ -405,7 +405,7 @@ def arrays_of(
 
 
 def _expected(choice: Choice | None) -> tuple[NDArray[np.int64], float]:
-    """Return a choice of pivots as kernels read it, and its scale."""
+    """Return a choice of pivots as the array that kernels read, and its scale."""
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
     place = int(np.searchsorted(-LEAST, -choice.least))
@@ -413,24 +413,24 @@ def _expected(choice: Choice | None) -> tuple[NDArray[np.int64], float]:
     return np.array(numbers, dtype=np.int64), choice.scale
 
 
-MOST, LARGEST = 16, 150_000  # entries of a system's cache, one for each set of options; numbers in a run's workspace
-MOST_ALIKE = 3  # entries of equal options, as starts may ask for other code
+MOST, LARGEST = 16, 150_000  # sets of options in a system's cache; numbers in the workspace of a cached run
+MOST_ALIKE = 3  # entries of equal options: other starts may need other code
 
 
 class CacheEntry(NamedTuple):
-    """Keep a run at its start, and its integrators, for calls with the same options, from there or from elsewhere."""
+    """Cached run at its start, and its integrators, for calls with the same options, from this or another start."""
 
     run: Run
     start: tuple[float, bytes, bytes]
     t1: float
     code: GeneratedCode | None
-    definite: bool  # whether M was
-    moves: bool  # whether the run of another start differs by that start alone
-    waiting: list[CachedIntegrator] | None  # integrators, one a thread; None: the compiled loop cannot start this run
-    shared: SharedSetup | None = None  # what it shares with systems of other parameters
+    definite: bool  # whether M was definite at the start
+    moves: bool  # whether a run from another start differs only by that start
+    waiting: list[CachedIntegrator] | None  # idle ones, one per thread; None: the compiled loop cannot start this run
+    shared: SharedSetup | None = None  # setup shared with systems of other parameters
 
 
-# where the last run began, the entries, and the code of the last run, if it was that of no entry
+# the last start, the entries by options, and the id of the last run's code if no entry has it
 NO_RUNS: tuple[Any, dict[Any, tuple[CacheEntry, ...]], int | None] = (None, {}, None)
 
 
@@ -444,10 +444,10 @@ def cached_result(
     output: Output,
     interrupts: Interrupts,
 ) -> tuple[dict[str, Any], str] | Missed | Run | None:
-    """Integrate by the cached integrator of the system and its options, which the first call makes.
+    """Integrate by the cached integrator of the system and its options, which the first call creates.
 
-    Returns the fields of the result and a warning of its rows. A `Run` at its start if it cannot be cached; None if
-    `set_up` has to check the start.
+    Return the fields of the result and a warning of its rows; a `Missed` if the run must be repeated; a `Run` at its
+    start if it cannot be cached; None if `set_up` has to check the start.
     """
     alike = system.made.get("runs", NO_RUNS)[1].get(options.key, ())
     if not alike and (others := system.shared.get("runs")):
@@ -482,16 +482,16 @@ def cached_result(
 def set_up(
     system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
 ) -> tuple[Run, CacheEntry | None]:
-    """Make a run at its start, or copy a cached one, from the same start or from another; with the entry of a new one.
+    """Create a run at its start, or copy a cached one, from the same start or another; return it and its new entry.
 
-    Cached are runs of twoloop's own methods, compiled callbacks and trusted traces.
+    Runs are cached if the method is twoloop's own, callbacks are compiled, and traces are trusted.
 
     Raises
     ------
     TypeError, ValueError
-        If the start is refused, the method cannot run the system, or asked-for code cannot be had.
+        If the start is refused, the method cannot run the system, or requested code cannot be had.
     """
-    if system.called_in_python:  # what such functions find in their surroundings may change
+    if system.called_in_python:  # such functions may depend on variables that change
         return _new_run(system, t0, t1, q0, v0, options)[0], None
     start, call = (t0, q0.tobytes(), v0.tobytes()), options.key
     came_from, runs, before = system.made.get("runs", NO_RUNS)
@@ -510,14 +510,14 @@ def set_up(
             _share_setup(system, run, code, t1, options)
     new, added = not alike or before == id(code) if entry is None else came_from == start != entry.start, None
     if new and (added := _entry_of(run, code, t1, options)) is not None:
-        runs = {} if len(runs) == MOST else dict(runs)  # another thread may read the old one
+        runs = {} if len(runs) == MOST else dict(runs)  # a copy: another thread may read the old one
         runs[call] = added, *[each for each in alike if each is not entry][: MOST_ALIKE - 1]
     system.made["runs"] = start, runs, id(code) if entry is None else None
     return run, added
 
 
 def _entry_of(run: Run, code: GeneratedCode | None, t1: float, options: Options) -> CacheEntry | None:
-    """Return what is cached of a run at its start, if it may be."""
+    """Return the cache entry of a run at its start, or None if the run cannot be cached."""
     system, n = run.system, run.system.n_q
     trusted = identity(options.method) is not None and all(traced.trusted for traced in run.traced)
     if not trusted or run.work.notes.base.size > LARGEST:
@@ -539,7 +539,7 @@ def _trace_cache(system: ConstrainedSystem) -> TraceCache:
 
 
 def _share_setup(system: ConstrainedSystem, run: Run, code: GeneratedCode | None, t1: float, options: Options) -> None:
-    """Keep a run for systems of other parameters, from the second of these on."""
+    """Cache the setup of a run for systems of other parameters, from the second of these on."""
     call, seen, known = (options.key, _trace_cache(system)), system.functions, system.shared.get("runs", {})
     if call not in known:
         system.shared["runs"] = (known if len(known) < MOST else {}) | {call: seen}
@@ -557,7 +557,7 @@ def _share_setup(system: ConstrainedSystem, run: Run, code: GeneratedCode | None
 def _moved(
     entry: CacheEntry, system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
 ) -> Run | None:
-    """Return a run from another start; None where that needs another form of the equations, or other code."""
+    """Return a run from another start; None if that needs another form of the equations, or other code."""
     _check_start(system, t0, q0, v0, options.check_derivatives)
     if entry.code is not None and not entry.code.serves(system, t0, q0):
         return None
@@ -597,7 +597,7 @@ def _new_run(
 
 
 def _check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, derivatives: bool) -> None:
-    """Check a start, once as long as no other is options for."""
+    """Check a start, unless it is the one that was checked last."""
 
     def check() -> None:
         check_start(system, t0, q0, v0, derivatives=derivatives, exact=lambda: exact_near(system, t0, q0, v0))

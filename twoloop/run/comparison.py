@@ -1,4 +1,4 @@
-"""Callbacks compared once more, where a run went: derivatives, and what was traced of them."""
+"""Comparison of callbacks at states of a finished run: derivatives, and the recorded traces."""
 
 import warnings
 from typing import TYPE_CHECKING, Any
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-LATER = 4  # states of the run at which derivatives are checked again, the last among them
+LATER = 4  # states of the run at which derivatives are checked again, including the last one
 
 
 def compare_callbacks(
     run: "Run", sample: Sample, end: float, check_derivatives: bool, status: Status, message: str
 ) -> tuple[Status, str]:
-    """Status and message, unless callbacks are not what they should be where the run went.
+    """Return the status and the message, changed if callbacks are wrong at states of the run.
 
-    Compiled ones are not compared again where they were: see CheckedRegion.
+    Compiled callbacks are not compared again in the region where they were: see CheckedRegion.
     """
     region = checked_region_of(run, check_derivatives)
     parameters = run.varied_parameters
@@ -48,7 +48,7 @@ def checked_region_of(run: "Run", check_derivatives: bool) -> CheckedRegion:
     """Return the region in which callbacks were compared, in runs of this system and kind."""
     if run.region is not None:
         return run.region
-    what = (check_derivatives, *map(id, run.traced))  # the system keeps these
+    what = (check_derivatives, *map(id, run.traced))  # the system keeps these objects, so that their ids stay unique
     return run.system.remembered(("territory", what), CheckedRegion)  # type: ignore[no-any-return]
 
 
@@ -61,7 +61,7 @@ def compare_callbacks_at(
     message: str,
     everywhere: bool = False,
 ) -> tuple[Status, str]:
-    """Compare them at states [t, q, v] of the run, the last first: those outside the checked region, or everywhere."""
+    """Compare callbacks at states [t, q, v] of the run, the last first, outside the checked region or everywhere."""
     first = states[-1]
     if not everywhere:
         states = region.without_known(states)
@@ -80,7 +80,7 @@ def compare_callbacks_at(
 
 
 def _derivatives_again(run: "Run", states: Array, first: Array, status: Status, message: str) -> tuple[Status, str]:
-    """Status and message, unless a derivative, or a constant mass, is wrong where the run went from its first state."""
+    """Return the status and the message, changed if a derivative or a constant mass is wrong at states of the run."""
     n = run.system.n_q
     chosen = states[:: 1 + (len(states) - 1) // LATER][::-1]
     some = [(float(each[0]), each[1 : 1 + n], each[1 + n :]) for each in chosen]
@@ -98,14 +98,14 @@ def _derivatives_again(run: "Run", states: Array, first: Array, status: Status, 
 
 
 def find_nondeterminism(system: ConstrainedSystem, states: Array) -> str | None:
-    """Say how a force called in Python differs at a state [t, q, v] once others were in between, or None."""
+    """Describe how a force called in Python differs when it is evaluated again at the same state [t, q, v], or None."""
     n, made = system.n_q, []
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         for t, *state in (*states, *states[::-1]):
             try:
                 made.append(system.force(t, np.array(state[:n]), np.array(state[n:])))
-            except Exception:  # outside what it is made for
+            except Exception:  # the state is outside the domain of the force
                 made.append(np.full(n, np.nan))
     once, again = np.array(made[: len(states)]), np.array(made[len(states) :][::-1])
     both = np.isfinite(once) & np.isfinite(again)
@@ -121,7 +121,7 @@ def find_nondeterminism(system: ConstrainedSystem, states: Array) -> str | None:
 
 
 def _traces(run: "Run", states: Any, status: Status, message: str) -> tuple[Status, str]:
-    """Status and message, unless a callback gives other values than what was recorded of it."""
+    """Return the status and the message, changed if a callback differs from its recorded trace."""
     for traced in run.traced:
         wrong = traced.wrong(run.system, states)
         if wrong is not None:

@@ -1,4 +1,4 @@
-"""Polynomials through the stored states of a run, put back on the constraints: what dense_solution.py evaluates."""
+"""Interpolation of the stored states of a run by polynomials, projected onto the constraints; see dense_solution.py."""
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Groups = NDArray[np.int64]
 
-KEPT = 512  # intervals whose interior states are kept
-SOUND = 65536  # intervals of which it is kept in mind that their polynomials hold
-OFF = 10.0  # tolerances by which polynomials may be off the constraints and the equations
-REPAIRED = 4  # steps into which an interval is divided whose polynomials are
+KEPT = 512  # largest number of intervals whose interior states are cached
+SOUND = 65536  # largest number of intervals that are remembered to have accurate polynomials
+OFF = 10.0  # largest accepted error of polynomials in the constraints and the equations, over the tolerances
+REPAIRED = 4  # number of steps that divide an interval whose polynomials have a larger error
 
 
 class Table(NamedTuple):
-    """Hold states at accepted steps: times (n,), rows [q, v, a] (n, 3 n_q), the kind of the interval behind each."""
+    """States at accepted steps: times (n,), rows [q, v, a] (n, 3 n_q), and the kind of the interval after each."""
 
     t: Array
     states: Array
@@ -41,7 +41,7 @@ class Table(NamedTuple):
 
 
 def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: float) -> tuple[int, int]:
-    """Ranks of C_q, and of C_q and A, by which workspaces are made: the kernels rely on them."""
+    """Return the ranks of C_q, and of C_q and A, by which workspaces are created: the kernels rely on them."""
     from twoloop.kernels import advance
 
     kit = kit_of(system, t, q)
@@ -53,7 +53,7 @@ def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: floa
 
 
 class Interpolator:
-    """Evaluates tables of states of one system; has a workspace of its own.
+    """Interpolator of tables of states of one system, with a workspace of its own.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class Interpolator:
     ranks : (int, int)
         Of C_q, and of C_q and A.
     plans : dict, optional
-        How intervals of a kind are divided into `plan.parts` fixed steps; others are not.
+        By kind, the plan that divides an interval into `plan.parts` fixed steps; other kinds are not divided.
     """
 
     def __init__(
@@ -94,9 +94,9 @@ class Interpolator:
         self.static = static_form(system, t0, row[: system.n_q], *self.plans.values())
         self.matrices = max((plan.matrices for plan in self.plans.values()), default=0)
         self._prepare()
-        self.failures, self.tells = 0, True  # of the last call, of which it may warn
+        self.failures, self.tells = 0, True  # number of failures of the last call; whether to warn of them
         self.filled: dict[float, tuple[Array, Array]] = {}
-        self.sound: set[float] = set()  # where intervals begin whose neighbours serve
+        self.sound: set[float] = set()  # beginnings of intervals that neighbouring states interpolate well
         self.judges = True
         self._make_room()
 
@@ -105,7 +105,7 @@ class Interpolator:
         system, t0, row = self.made_of[:3]
         q0, static = row[: system.n_q], self.static
         for plan in self.plans.values():
-            loaded(plan.second)  # a kit is to serve as long as the solution
+            loaded(plan.second)  # a kit must serve as long as the solution
         self.kits = {kind: kit_of(system, t0, q0, plan, static) for kind, plan in self.plans.items()}
         self.kit = kit_of(system, t0, q0, None, static)
         pattern = pattern_of(system, t0, q0) if static is None else np.zeros((0, 0))
@@ -116,13 +116,13 @@ class Interpolator:
         from twoloop.kernels import advance
 
         system, t0, row = self.made_of[:3]
-        self.work.notes[indices.GENERATION] = 1.0  # the ranks are known
+        self.work.notes[indices.GENERATION] = 1.0  # GENERATION 1: the ranks are known
         state = np.concatenate([row, np.zeros(system.n_c + system.n_a)])
         entry_point(advance.start)(self.kit, self.work, t0, state)
         self.repairs: dict[bool, tuple[Plan, Any]] = {}
 
     def begin(self, system: ConstrainedSystem, t0: float, row: Array, pattern: Array) -> None:
-        """Be as new, for a run from another state where the same kits serve, and rows have entries as in `pattern`."""
+        """Reset for a run from another state that uses the same kits; rows have entries as in `pattern`."""
         self.made_of = (system, t0, row.copy(), *self.made_of[3:])
         self.system, self.judges = system, True
         self.filled, self.sound = {}, set()
@@ -131,17 +131,17 @@ class Interpolator:
         self.nodes[:], self.room[:], self.rows[:] = 0.0, 0.0, 0.0
 
     def _become_dense(self) -> None:
-        """Leave the static form, which could not decide something."""
+        """Replace the static form, which could not decide something."""
         self.static = None
         self._prepare()
 
     def _make_room(self) -> None:
-        """Scratch for the coefficients of two polynomials."""
+        """Allocate scratch arrays for the coefficients of two polynomials."""
         half = 3 * max(names.WINDOW, self.parts + 1)
         n = self.system.n_q
         self.nodes, self.room, self.rows = np.zeros(2 * half), np.zeros((2 * half, n)), np.zeros((3, 2 * n))
 
-    def __reduce__(self) -> tuple[Any, ...]:  # for copies, and other processes
+    def __reduce__(self) -> tuple[Any, ...]:  # copies, also in other processes
         return type(self), self.made_of, {"parts": self.parts, "filled": self.filled, "judges": self.judges}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -170,7 +170,7 @@ class Interpolator:
         return out
 
     def within(self, table: Table, t: float) -> Callable[[float], Array]:
-        """What gives the same at one time after another, all of them in the interval of t."""
+        """Return a function that interpolates at one time after another, all of them in the interval of t."""
         groups = _groups(table, np.searchsorted(table.t[1:-1], [t], side="right"))
         groups[:, names.END_TIME] = 1
         self._settle(table, groups)
@@ -200,7 +200,7 @@ class Interpolator:
         return failures
 
     def _settle(self, table: Table, groups: Groups) -> None:
-        """See to it that each interval has interior states, or is known to need none."""
+        """Ensure that each interval has interior states, or is known to need none."""
         begins = table.t[groups[:, names.FIRST_OWN]].tolist()
         new = np.array([t not in self.sound and t not in self.filled for t in begins])
         if not self.judges or not new.any():
@@ -239,7 +239,7 @@ class Interpolator:
         return out
 
     def _repair(self, table: Table, group: Groups, worst: float) -> None:
-        """Choose what serves an interval best: its neighbours, states within it by steps, or its ends alone."""
+        """Choose the best states for an interval: its neighbours, those of steps within it, or its ends alone."""
         i, kind = int(group[names.FIRST_OWN]), int(group[names.KIND])
         begin = float(table.t[i])
         ends = (table.t[i : i + 2], table.states[i : i + 2])
@@ -255,7 +255,7 @@ class Interpolator:
             self.sound.add(begin)
 
     def _repair_plan(self, kind: int) -> tuple[Plan, Any]:
-        """By what steps an interval of a kind is divided where its method has none of its own."""
+        """Return the plan and the kit of the steps that divide an interval of a kind for a repair."""
         stiff = kind == names.VELOCITIES
         if stiff not in self.repairs:
             from twoloop.methods.dop853 import DOP853
@@ -275,7 +275,7 @@ class Interpolator:
         return self.repairs[stiff]
 
     def _divided(self, table: Table, groups: Groups) -> tuple[Table, Groups, Groups]:
-        """A table of interior states, the groups of intervals that are in it, and those of others."""
+        """Return a table of interior states, the groups of intervals that are in it, and the groups of the others."""
         begins = table.t[groups[:, names.FIRST_OWN]].tolist()
         filled = np.array([t in self.filled for t in begins], dtype=bool)
         pairs = [self.filled[t] for t in begins if t in self.filled]
@@ -289,9 +289,9 @@ class Interpolator:
         return Table(np.concatenate(t), np.concatenate(states), table.kinds), own, groups[~filled]
 
     def _fill(self, table: Table, plan: Plan, kit: Any, intervals: Groups) -> dict[float, tuple[Array, Array]]:
-        """Interior states of these intervals, by when they begin; where that fails, fewer of them, or none."""
+        """Compute interior states of intervals, by the times at which they begin; fewer or none if steps fail."""
         n = self.system.n_q
-        tolerances = np.zeros(ATOL + n)  # without an estimate
+        tolerances = np.zeros(ATOL + n)  # zeros: no error estimate
         state = np.zeros(3 * n + self.system.n_c + self.system.n_a)
         vectors = (plan.options, plan.memory.copy(), plan.memory, tolerances, state, state.copy())
         filled = {}
@@ -309,9 +309,9 @@ class Interpolator:
         return filled
 
     def interiors(self, table: Table) -> Iterator[tuple[Array, Array]]:
-        """The interior states of divided intervals, (m, parts + 1) and (m, parts + 1, 3 n_q), for `keep`, in blocks.
+        """Yield interior states of divided intervals in blocks, (m, parts + 1) and (m, parts + 1, 3 n_q), for `keep`.
 
-        NaN where an interval has fewer.
+        Rows end with NaN if an interval has fewer states.
         """
         groups = _groups(table, np.arange(len(table.t) - 1))
         for block in _blocks(groups):
@@ -325,7 +325,7 @@ class Interpolator:
             yield t, states
 
     def keep(self, t: Array, states: Array) -> None:
-        """Take interior states as they were found before; no others can be found."""
+        """Restore interior states that `interiors` yielded; no others can be computed."""
         self.parts, self.judges = t.shape[1] - 1, False
         self._make_room()
         sizes = np.isfinite(t).sum(axis=1).tolist()
@@ -334,7 +334,7 @@ class Interpolator:
         }
 
     def complete(self, times: Array, states: Array, out: Array) -> None:
-        """Fill rows [a, lam] at rows [q, v] on the constraints."""
+        """Compute rows [a, lam] at rows [q, v] on the constraints, and write them to `out`."""
         complete, times, states = entry_point(self.kernels.complete), *map(np.ascontiguousarray, (times, states))
         failures = complete(self.kit, self.work, times, states, out)
         if failures > 0 and self.static is not None:
@@ -346,12 +346,12 @@ class Interpolator:
 
 
 def _blocks(groups: Groups) -> list[Groups]:
-    """Rows of intervals, as many at a time as have their interior states kept."""
+    """Split rows of intervals into blocks of as many as have their interior states cached."""
     return [groups[begin : begin + KEPT] for begin in range(0, len(groups), KEPT)]
 
 
 def _groups(table: Table, which: Groups) -> Groups:
-    """A row for each of these intervals, without the times in it."""
+    """Return a row for each of these intervals, without the times in it."""
     groups = np.zeros((len(which), names.N_COLUMNS), dtype=np.int64)
     groups[:, names.FIRST_OWN], groups[:, names.LAST_OWN] = which, which + 1
     groups[:, names.KIND] = table.kinds[which]
@@ -370,12 +370,12 @@ def _warn(what: str, stacklevel: int = 4) -> None:
 
 
 class OutputInterpolation:
-    """Interpolate states at output times of runs that use the same arrays, one after another.
+    """Interpolation of states at output times, for runs that use the same arrays one after another.
 
     Parameters
     ----------
     run : Run
-        At its start, or beyond.
+        A run at its start, or beyond.
     """
 
     def __init__(self, run: "Run"):
@@ -383,7 +383,7 @@ class OutputInterpolation:
         self._interpolator: Interpolator | None = None
 
     def find(self, times: Array, t: Array, rows: Array, kinds: NDArray[np.int64], pattern: Array) -> None:
-        """Find [q, v] at times, by rows [q, v, a, lam] at the ends of the steps and the kinds of these.
+        """Interpolate [q, v] at `times`, from rows [q, v, a, lam] at the ends of the steps and the kinds of these.
 
         `pattern`: 1 where the rows of the constraints have entries at the start.
         """
@@ -404,13 +404,13 @@ class OutputInterpolation:
             return None
         added = np.full((len(times), len(self.run.state) - found.shape[1]), np.nan)
         known.complete(times, found, added)
-        if known.static is not None or known.repairs:  # it is not what it was
+        if known.static is not None or known.repairs:  # it has changed: the next run needs a new one
             self._interpolator = None
         return np.concatenate([found, added], axis=1) if known.failures == 0 else None
 
 
 def interpolator_of(run: "Run", row: Array) -> Interpolator:
-    """Make the interpolator of a run, which starts with this row [q, v, a]."""
+    """Create the interpolator of a run, which starts with this row [q, v, a]."""
     ranks, atol = (len(run.work.rows), len(run.work.rows_v)), run.tolerances[indices.ATOL :]
     interiors = {kind: plan.fresh() for kind, plan in run.interiors.items()}
     return Interpolator(run.system, run.t0, row, run.rtol, atol, ranks, interiors)

@@ -1,4 +1,4 @@
-"""The solution between the steps, as a user has it: the state of a run at any time."""
+"""Dense output for users: the state of a run at any time between its start and its end."""
 
 from __future__ import annotations  # ArrayLike stays a word in help()
 
@@ -20,12 +20,12 @@ class DenseState:
     t : float or ndarray (n,)
         Times, s.
     q, v : ndarray (n_q,) or (n_q, n)
-        Coordinates and velocities, on the constraints to rounding; not so close to a singular position, where rounding
+        Coordinates and velocities, on the constraints to rounding, except close to a singular position, where rounding
         would make the velocities: a warning says so.
     a : ndarray (n_q,) or (n_q, n)
-        Accelerations there, evaluated when they are first asked for.
+        Accelerations at these times, evaluated when they are first read.
     lam : ndarray (n_c + n_a,) or (n_c + n_a, n)
-        Multipliers there, likewise.
+        Multipliers at these times, likewise.
     """
 
     def __init__(self, interpolator: Interpolator, t: Array, order: Groups, rows: Array):
@@ -35,7 +35,7 @@ class DenseState:
         self.q, self.v = self._unsorted(rows[:, :n]), self._unsorted(rows[:, n:])
 
     def _unsorted(self, rows: Array) -> Array:
-        """Columns in the order of `t` of rows in that of time."""
+        """Return columns in the order of `t`, given rows in the order of time."""
         columns = np.empty(rows.shape[::-1])
         columns[:, self._order] = rows.T
         return columns if np.ndim(self.t) else columns[:, 0]
@@ -59,27 +59,28 @@ class DenseState:
 
 
 class DenseSolution:
-    """`result.sol`: the state of a run at any time between its start and its end.
+    """Dense output, `result.sol`: the state of a run at any time between its start and its end.
 
-    Between accepted steps q and v are Hermite polynomials, and dependents are then restored by the inner loop, so that
-    the constraints hold to rounding. At an accepted step the state is the one stored. The polynomials go through q, v
-    and a of four neighbouring states (order 12), where Newton's method was at work in the outer loop through q and v
-    (order 8: a has the noise of vibrations that are stepped over); of `BDF` and `Newmark` v has a polynomial of its
-    own, through v and a (order 8). `RungeKutta` of order 6 and
-    more, by Newton's method of order 7 and more, and `Taylor` take steps that are too long for this, in `auto` too:
-    each is divided into 2 to 6 equal steps of the method, when the first time within it is asked for, which costs about
-    as much as the run has cost. Where the last of its states changes a polynomial by more than the tolerances, it is
-    held against the constraints and the equations at two places of the interval. Where it is off them, as beside a
-    singular position or a force that jumps, the interval is divided into four steps of `DOP853` (of a Radau method
-    where Newton's method was at work), or its two ends are all that count, whichever fits best. Evaluations for this,
-    and for restoring, are counted nowhere.
+    Between accepted steps q and v are Hermite polynomials; the inner loop then restores the dependent coordinates, so
+    that the constraints hold to rounding. At an accepted step the state is the stored one. The polynomials go through
+    q, v and a of four neighbouring states (order 12). Where Newton's method was at work in the outer loop, they go
+    through q and v (order 8), because a has the noise of vibrations that are stepped over. For `BDF` and `Newmark`, v
+    has a polynomial of its own, through v and a (order 8).
 
-    It takes 8 (2 + 3 n_q) bytes of memory a step.
+    The steps of `RungeKutta` of order 6 and more (by Newton's method of order 7 and more) and of `Taylor`, in `auto`
+    too, are too long for this. Each is divided into 2 to 6 equal steps of the method when a time within it is first
+    evaluated; this costs about as much as the run. If the last of its states changes a polynomial by more than the
+    tolerances, the polynomial is compared with the constraints and the equations at two places of the interval. If it
+    violates them, as beside a singular position or a force that jumps, the interval is divided into four steps of
+    `DOP853` (of a Radau method where Newton's method was at work), or only its two ends are used, whichever fits best.
+    Evaluations for this, and for restoring, are not counted.
+
+    The solution takes 8 (2 + 3 n_q) bytes of memory per step.
 
     Attributes
     ----------
     t_min, t_max : float
-        The times that it covers, s.
+        Times that the solution covers, s.
 
     Examples
     --------
@@ -99,7 +100,7 @@ class DenseSolution:
         self.t_min, self.t_max = float(table.t[0]), t_max
 
     def __call__(self, t: ArrayLike) -> DenseState:
-        """The state at a time or at times (n,) in any order.
+        """Return the state at one time or at times (n,) in any order.
 
         Raises
         ------
@@ -109,7 +110,7 @@ class DenseSolution:
         times = check_real("t", t)
         if times.ndim > 1:
             raise ValueError(f"t must be a number or have shape (n,); given {shaped(times)}")
-        outside = ~((times >= self.t_min) & (times <= self.t_max))  # NaN, too
+        outside = ~((times >= self.t_min) & (times <= self.t_max))  # also true for NaN
         if outside.any():
             raise ValueError(
                 f"t must lie within the run, from {self.t_min!r} to {self.t_max!r}; given "

@@ -1,4 +1,4 @@
-"""Repeat runs that may have missed short changes of forces, and compute velocities behind a jump of C_t or b.
+"""Repeat runs that may have missed short changes of forces, and compute velocities after a jump of C_t or b.
 
 A run that met a short change is repeated with more evaluations, at most MOST times: changes that follow one another
 without end, as noise does, would take evaluations without end. Then a warning says so.
@@ -15,21 +15,21 @@ from twoloop.run.messages import warn_user
 if TYPE_CHECKING:
     from twoloop.run.run import Run
 
-WITHIN = 2.0  # looks: a run that met what lasts no longer is made again, as some of it may last shorter still
-SEEN = 1.25  # looks: what lasts longer does not fall between two of them; of the rest it is said
-CLOSER = 4.0  # looks within the shortest change, when the run is made again ...
-MOST_CLOSER = 8.0  # ... but no more times as many looks as before
-MOST = 2  # runs that are made again
+WITHIN = 2.0  # gaps between evaluations: a run that met a shorter change is repeated, as others may be shorter still
+SEEN = 1.25  # gaps between evaluations: longer changes cannot fall between two of them; of shorter ones the run warns
+CLOSER = 4.0  # evaluations within the shortest change when the run is repeated ...
+MOST_CLOSER = 8.0  # ... but at most so many times as many evaluations as before
+MOST = 2  # largest number of repetitions of a run
 
 
 def may_have_missed_changes(run: "Run", looks: float = WITHIN) -> bool:
-    """Return whether something changed for so short a time that the next such change may have been passed over."""
+    """Return whether something changed for so short a time that another such change may have been missed."""
     a, clock = run.a, run.clock
     return bool(clock[a.SHORTEST_CHANGE] < looks * clock[a.WIDEST_SAMPLING])
 
 
 def closer(run: "Run") -> float:
-    """Return the time between evaluations, s, with which a repeated run meets what this one may have missed."""
+    """Return the time between evaluations, s, for a repeated run to meet the changes that this one may have missed."""
     a, clock = run.a, run.clock
     return float(max(clock[a.SHORTEST_CHANGE] / CLOSER, clock[a.WIDEST_SAMPLING] / MOST_CLOSER))
 
@@ -49,16 +49,16 @@ def warn_of_missed_changes(run: "Run") -> str:
 
 Array = NDArray[np.float64]
 
-CORRECTIONS = 3  # of positions, which are off by less than the tolerances
-NEGLIGIBLE = 1e-12  # relative: singular values, and eigenvalues, that count as zero: redundant rows
-HOLDS = 1e-8  # relative: what is left of them where there is a solution
+CORRECTIONS = 3  # Newton corrections of positions, which are off by less than the tolerances
+NEGLIGIBLE = 1e-12  # relative to the largest: smaller singular values and eigenvalues count as zero (redundant rows)
+HOLDS = 1e-8  # relative residual of the equations below which they count as solved
 
 
 def state_behind_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Array | None:
     """Return the state [q, v] at t, right after a jump, from the one before; None: no velocities fit the constraints.
 
-    M (v+ - v) + G^T p = 0 and G v+ + (C_t, b) = 0: of all velocities that the constraints allow the nearest in the
-    metric of M.
+    Solve M (v+ - v) + G^T p = 0 and G v+ + (C_t, b) = 0: v+ is nearest to v, in the metric of M, of all velocities that
+    the constraints allow.
     """
     q = corrected(system, t, q)
     equations, lengths, size = scaled_equations(system, t, q)
@@ -77,7 +77,7 @@ def corrected(system: ConstrainedSystem, t: float, q: Array) -> Array:
 
 
 def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, float]:
-    """Build the matrix [M G^T; G 0], rows G over their lengths and times the size of M; with these numbers."""
+    """Return the matrix [M G^T; G 0], the rows G scaled to the size of M, with their lengths and this size."""
     mass, rows = system.mass(t, q), system.rows(t, q)
     lengths, size = np.linalg.norm(rows, axis=1), float(np.abs(mass).max())
     lengths[lengths == 0.0] = 1.0

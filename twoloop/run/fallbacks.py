@@ -1,4 +1,4 @@
-"""Go on where a run's own steps cannot: with another method, across a singular position, or over a jump."""
+"""Continue a run where its own steps cannot: with another method, across a singular position, or over a jump."""
 
 from functools import cache
 
@@ -17,13 +17,13 @@ from twoloop.run.workspace import kit_of, kit_with
 
 Array = NDArray[np.float64]
 
-# of the longest of the last steps: lengths to try for a step across a singular position, on which no stage should fall
+# lengths to try for a step across a singular position, on which no stage should fall, over the longest last step
 LENGTHS = tuple(0.85**k for k in range(28))
-CLEAR = 0.3  # of the largest pivot that C_q had, from which on the run's own steps go on
+CLEAR = 0.3  # relative to the largest pivot that C_q had: above it the run's own steps continue
 
 
 def may_cross(run: Run, code: int) -> bool:
-    """Return whether steps across follow: near a singular position, also where the method is not suited to it."""
+    """Return whether steps across a singular position follow, also if the method asks for a switch near one."""
     a, notes = run.a, run.work.notes
     if code == a.SWITCH_METHOD:
         from twoloop.kernels.steps.lobatto_step import TIGHT
@@ -34,10 +34,10 @@ def may_cross(run: Run, code: int) -> bool:
 
 
 def switch_method(run: Run) -> None:
-    """Go on with the plan of another method, where that of the run is not suited, or its values are not finite."""
+    """Switch to the substitute plan, because the run's method is not suited, or its values are not finite."""
     substitute = run.plan.substitute
     assert substitute is not None
-    run.plan, run.memory = substitute.fresh(), substitute.memory  # in which no run writes
+    run.plan, run.memory = substitute.fresh(), substitute.memory  # no run writes to this memory
     _renew_kit(run)
     run.substituted = True
     run.control_by(run.plan)
@@ -48,13 +48,13 @@ def switch_method(run: Run) -> None:
 
 
 def load(run: Run) -> None:
-    """Load the compiled step that a run has come to."""
+    """Load the compiled step that a run needs next."""
     loaded(run.plan.second)
     _renew_kit(run)
 
 
 def _renew_kit(run: Run) -> None:
-    """Make the kit that calls the steps of the run's plan."""
+    """Create the kit that calls the steps of the run's plan."""
     if run.static is None:
         run.kit = kit_with(run.system, run.functions.flags, run.plan)
     else:
@@ -83,7 +83,7 @@ def cross_singularity(run: Run) -> tuple[Plan, Array]:
 
 
 def lengths_across(longest: float, allowed: float) -> list[float]:
-    """Return the lengths to try for a step across, s: each above the largest one allowed would be the same attempt."""
+    """Return the lengths to try for a step across, s; each above the largest one allowed would be the same attempt."""
     first = min(longest, allowed)
     return [first, *(longest * part for part in LENGTHS if longest * part < first)]
 
@@ -97,7 +97,7 @@ def _crossing_plan(n_q: int) -> Plan:
 
 @cache
 def _crossing_options() -> Array:
-    """Compute the options of such steps once: the tableau takes longer than most steps across."""
+    """Compute the options of steps across, once: the tableau takes longer than most of these steps."""
     from twoloop.kernels.steps import crossing_step as kernels
 
     tableau = gauss(kernels.S)
@@ -105,7 +105,7 @@ def _crossing_options() -> Array:
 
 
 def crossing_kit(kit: Kit) -> Kit:
-    """Return the kit of steps across; it is kept with that of the run's own steps."""
+    """Return the kit of steps across, which is cached with that of the run's own steps."""
     from twoloop.kernels.steps.crossing_step import CROSSING
 
     known = vars(kit)

@@ -1,9 +1,9 @@
 """Integrate chunk by chunk: call the compiled `advance`, handle the code that it returns, and record the run.
 
-Ctrl-C ends the run, which returns what it has, wherever the signal arrives. An exception that arises between any two
-instructions of Python finds arrays half written, and machine code between its calls of Python that knows no way out. So
-the signal raises `KeyboardInterrupt` only within the functions of a user, which may take long and from which every
-caller expects exceptions; elsewhere it is kept until the loop looks for it.
+Ctrl-C ends the run, which returns what it has, wherever the signal arrives. An exception between two arbitrary
+instructions of Python could leave arrays half written, and machine code cannot pass it on between its calls of Python.
+Therefore the signal raises `KeyboardInterrupt` only within functions of the user, which may take long and whose callers
+expect exceptions. Elsewhere it is stored until the loop checks for it.
 """
 
 import _signal  # type: ignore[import-not-found]  # `signal` makes enumerations of handlers, which takes 8 microseconds
@@ -67,37 +67,37 @@ from twoloop.run.singular_positions import Place, turned_last
 Array = NDArray[np.float64]
 
 CALLS_A_USER = (PythonFunctions.call.__code__, Event.__call__.__code__)
-IMPATIENCE = 3  # signals after which the next one raises at once, whatever is lost
+IMPATIENCE = 3  # signals after which the next one raises at once, even if the result is lost
 
 
 class Interrupts:
-    """Stands in for Python's own handler of Ctrl-C, from when it listens until it is left; a user's handler stays.
+    """Handler of Ctrl-C that replaces Python's own between `listen` and `leave`; a user's handler stays.
 
-    Before, Ctrl-C raises, as ever: that takes less, where all that is half written then is thrown away.
+    Before `listen`, Ctrl-C raises as usual: this takes less time, and all that is half written then is thrown away.
 
     Attributes
     ----------
     asked : int
-        How many signals came.
+        Number of signals so far.
     """
 
     asked, _stands_in = 0, False
 
     def listen(self) -> "Interrupts":
-        """Keep signals from here on, but for those within the functions of a user."""
+        """Store signals from here on, except those within functions of the user."""
         if _signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            with suppress(ValueError):  # in threads other than the main one, which get no signals
+            with suppress(ValueError):  # raised in threads other than the main one, which get no signals
                 _signal.signal(signal.SIGINT, self._heard)
                 self._stands_in = True
         return self
 
     def answers(self) -> bool:
-        """Return whether Ctrl-C that was raised is answered by a result: not the fourth, nor a user's handler's."""
-        self.listen()  # where the handler is Python's own
+        """Return whether a raised Ctrl-C ends in a result: not the fourth one, nor one that a user's handler raised."""
+        self.listen()  # if the handler is Python's own
         return self._stands_in and self.asked <= IMPATIENCE
 
     def leave(self) -> None:
-        """Let Python's own handler have its place again."""
+        """Restore Python's own handler."""
         if self._stands_in:
             _signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -116,8 +116,8 @@ def _within_a_users_function(frame: FrameType | None) -> bool:
 
 
 def describe_interrupt(t: float, table: Array) -> str:
-    """Describe a run that Ctrl-C ended at t, with these rows [q, v, a, lam]."""
-    gaps = int(np.isnan(table[:, -1:]).sum())  # where one of them is missing, all are
+    """Describe a run that Ctrl-C ended at t; `table` has its rows [q, v, a, lam]."""
+    gaps = int(np.isnan(table[:, -1:]).sum())  # if one entry of [a, lam] is missing, all are
     unknown = f" Accelerations and multipliers are NaN at {gaps} of its times." if gaps else ""
     return f"Interrupted from the keyboard at t = {t:.10g}. The result holds what was computed before.{unknown}"
 
@@ -146,38 +146,38 @@ def interrupted_record(system: ConstrainedSystem, t0: float, events: list[Any] |
     )
 
 
-BUFFER_ROWS = 1024
-BUFFER_STEPS = 4096
-CHUNK_TO_EVENT = 16  # attempts where an event may end the run: what is computed beyond it is in vain
+BUFFER_ROWS = 1024  # largest number of states in the buffers of a chunk ...
+BUFFER_STEPS = 4096  # ... and of steps
+CHUNK_TO_EVENT = 16  # attempts per chunk if an event may end the run: steps computed beyond it are in vain
 CHUNK_TIME = 0.05  # s of CPU; chunks that take longer do not grow, so that Ctrl-C is heard
-# ends of which it may be said that stability limited the steps
+# statuses whose message may say that stability limited the steps
 EXPLAINED_BY_STIFFNESS = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
-NO_KINDS = np.zeros(0, dtype=np.int64)  # of intervals within which nothing is wanted
-MOST_SPARE, LARGEST_SPARE = 16, 250_000  # buffers that wait for their next run, and numbers of each of them
-_spare: dict[tuple[int, int, int], Buffers] = {}  # buffers, by their sizes, for the next run
+NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
+MOST_SPARE, LARGEST_SPARE = 16, 250_000  # largest number of buffers kept for later runs, and of numbers in each
+_spare: dict[tuple[int, int, int], Buffers] = {}  # buffers for the next run, by their sizes
 
 
 class IntegrationLoop:
-    """Take a run to its end, and record it.
+    """Loop that integrates a run to its end, and records it.
 
     Parameters
     ----------
     run : Run
-        At its start, or behind a first chunk of steps, with which the loop has to `resume`.
+        A run at its start, or after a first chunk of steps, which is then given to `resume`.
     t1 : float
-        Where it ends, s.
-    wanted : Wanted
+        End of the run, s.
+    request : OutputRequest
     report : callable
         Takes the time reached, after each chunk.
     time_limit : float or None
         s.
     interrupts : Interrupts
     last : bool
-        Whether it is not made again, if it may have missed something.
+        Whether the run is not repeated if it may have missed something.
     start : ndarray, optional
         The row [q, v, a, lam] at the start of a run that has left it.
     system : ConstrainedSystem, optional
-        The one that the result is of, where the arrays of that of the run will belong to another.
+        System of the result, if the arrays of the run's system will belong to another.
     """
 
     def __init__(
@@ -205,15 +205,15 @@ class IntegrationLoop:
         to_event = request.events is not None and any(event.terminal < np.inf for event in request.events)
         if to_event:
             self.largest_chunk = run.chunk = CHUNK_TO_EVENT
-        # the run is looked at after so many attempts, however long the chunks are that the clock allows
+        # the run is checked after so many attempts, however long the chunks are that CHUNK_TIME allows
         self.between_looks = self.next_look = run.chunk
-        self.plan, self.control, self.kit = run.plan, run.control, run.kit  # at the moment: not always the run's own
+        self.plan, self.control, self.kit = run.plan, run.control, run.kit  # may differ from the run's own
         self.counts = BEFORE.copy()
-        self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # of which nothing is kept yet
+        self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # steps that were not stored yet, after an empty array
         if self.request.store.finished:
             self._tell()
         self.filled = np.zeros(2, dtype=np.int64)
-        ends_before = to_event or time_limit is not None  # then t1 may only stand for any time
+        ends_before = to_event or time_limit is not None  # t1 may then be an arbitrary late time
         self.stall = StallDetector(run.t0, np.inf if ends_before else OUT_OF_REACH)
         self.stiffness = StiffnessMonitor(run.plan)
         self.sample = Sample(run.t0, self.start, 2 * run.system.n_q)
@@ -222,13 +222,13 @@ class IntegrationLoop:
         self.code = INTERRUPTED if interrupts.asked else run.a.PAUSED
 
     def resume(self, code: int, t: Array, rows: Array, steps: Array, cpu_time: float) -> None:
-        """Copy the first chunk, times, rows and steps as of `advance`, and handle the code that it ended with."""
+        """Record a copy of the first chunk (times, rows and steps of `advance`), and handle the code that ended it."""
         self.code, self.cpu = code, cpu_time
         self._take(t.copy(), rows.copy(), steps.copy(), self._kinds(steps, False, False))
         self._handle(steps, False, cpu_time)
 
     def to_end(self, check_derivatives: bool) -> Record:
-        """Go on chunk by chunk, compare derivatives once more at the end, and return the record of the run."""
+        """Integrate chunk by chunk to the end, compare derivatives once more there, and return the run's record."""
         run, recorder = self.run, self.recorder
         a, clock = run.a, run.clock
         buffers, copied = self._buffers(), True
@@ -238,7 +238,7 @@ class IntegrationLoop:
             self._advance(buffers)
             n_rows, n_steps = self.filled.tolist()
             t, rows, steps = buffers[0][:n_rows], buffers[1][:n_rows], buffers[2][:n_steps]
-            copied = 2 * n_rows < len(buffers[0])  # then copies take less room
+            copied = 2 * n_rows < len(buffers[0])  # copies take less memory then
             if copied:
                 t, rows, steps = t.copy(), rows.copy(), steps.copy()
             self._take(t, rows, steps, self._kinds(steps, across, leaps))
@@ -262,7 +262,7 @@ class IntegrationLoop:
         return self._record(check_derivatives)
 
     def _handle(self, steps: Array, across: bool, spent: float) -> None:
-        """Handle the code that `advance` came back with: at the end it stays, else it says why the loop stops."""
+        """Handle the code that `advance` returned; afterwards it is PAUSED if the loop continues, else why it stops."""
         if self.code == self.run.a.ALL_OUTPUT_DONE:
             if self.stiffness.samples:
                 self.stiffness.add_steps(steps[:, self.run.a.H])
@@ -273,18 +273,18 @@ class IntegrationLoop:
         self.report(self.run.clock[self.run.a.T])
 
     def _advance(self, buffers: Buffers) -> None:
-        """One chunk, compiled."""
+        """Advance by one chunk of steps in compiled code."""
         run, a = self.run, self.run.a
         run.control[a.MAX_ATTEMPTS] = min(run.chunk, max(0, self.next_look - run.attempts()))
-        self.filled[:] = 0  # for Ctrl-C before the chunk begins
+        self.filled[:] = 0  # Ctrl-C may arrive before the chunk begins
         try:
             self.code = run.advance(self.outputs, buffers, self.filled, (self.plan, self.control, self.kit))
         except KeyboardInterrupt:
             self.code = INTERRUPTED
-        except Exception as error:  # of a callback; beyond a terminal event it does not matter
+        except Exception as error:  # raised by a callback; beyond a terminal event it does not matter
             if (
                 run.clock[a.SAMPLES_MOTION] == 1.0 and not self.interrupts.asked
-            ):  # at a state to which the run may not come
+            ):  # a sampled state that the motion may never reach
                 run.clock[a.SAMPLES_MOTION] = self.control[a.SAMPLE_MOTION] = 0.0
             else:
                 self.code, self.raised = INTERRUPTED, None if self.interrupts.asked else error
@@ -292,7 +292,7 @@ class IntegrationLoop:
                     error.add_note(_where(run.system.name, float(run.clock[a.T]), error))
 
     def _take(self, t: Array, rows: Array, steps: Array, kinds: NDArray[np.int64]) -> None:
-        """Take over what a chunk has stored."""
+        """Store the states and the steps of a chunk."""
         run = self.run
         self.sample.add(t, rows, float(run.clock[run.a.T]), run.state)
         self.step_parts.append(steps)
@@ -301,13 +301,13 @@ class IntegrationLoop:
         self.recorder.add(t, rows, kinds)
 
     def _tell(self) -> None:
-        """Keep what is told of each step."""
+        """Store the fields that have one row per step."""
         steps, self.step_parts = np.concatenate(self.step_parts), self.step_parts[:1]
         for name, values in step_fields(steps, self.counts).items():
             self.request.store.add(name, values)
 
     def _look(self, steps: Array, across: bool, spent: float) -> None:
-        """See whether the run gets anywhere, and how long the next chunk may be."""
+        """Check whether the run makes progress, and choose the length of the next chunk."""
         run, a = self.run, self.run.a
         h = steps[:, a.H]
         self.stiffness.add_steps(h)
@@ -327,7 +327,7 @@ class IntegrationLoop:
             self.code = INTERRUPTED
 
     def _go_on(self, across: bool, n_steps: int) -> None:
-        """Choose what makes the next steps, where it is not what made the last ones."""
+        """Choose the method of the next steps, if it is not that of the last ones."""
         run, a = self.run, self.run.a
         if self.code == a.NEEDS_DENSE or run.is_lost_without_dense(self.code):
             run.change_form()
@@ -344,7 +344,7 @@ class IntegrationLoop:
         elif self.code == a.NEEDS_COMPILATION:
             began = time.monotonic()
             load(run)
-            self.deadline += time.monotonic() - began  # compilation does not count
+            self.deadline += time.monotonic() - began  # compilation does not count against time_limit
             self.kit, self.code = run.kit, a.PAUSED
         elif self.code == a.AT_DISCONTINUITY and not across and apply_jump(run, self.t1):
             self.code = a.PAUSED
@@ -354,7 +354,7 @@ class IntegrationLoop:
                 self.kit = run.kit
 
     def _stalls(self, across: bool) -> bool:
-        """Return whether a method that has a substitute takes no step, though no singular position is near."""
+        """Return whether a method that has a substitute makes no step, though no singular position is near."""
         run, a = self.run, self.run.a
         stalls = self.code == a.STEP_TOO_SMALL and run.control[a.MAY_SWITCH] == 1.0
         return stalls and not across and run.work.notes[indices.NEARLY_SINGULAR] != 1.0
@@ -408,7 +408,7 @@ class IntegrationLoop:
         return record_of(Record, DEFAULTS | fields)
 
     def _last_step(self, t: Array, table: Array) -> list[Place]:
-        """Return the beginning of the last step if velocities turned in it, as near a singular position."""
+        """Return the beginning of the last step if velocities turned in it, as they do near a singular position."""
         run = self.run
         if self.request.times is not None or self.recorder.ended is not None:
             return []
@@ -425,7 +425,7 @@ class IntegrationLoop:
         return list(zip(t.tolist(), table, strict=True))
 
     def _buffers(self) -> Buffers:
-        """Return buffers for the states and steps of a chunk, each attempt of which fills one row at most."""
+        """Return buffers for the states and steps of a chunk; each attempt fills at most one row."""
         chunk, width = self.run.chunk, len(self.run.state)
         n_rows, n_steps = max(min(chunk, BUFFER_ROWS), LANES), max(min(chunk, BUFFER_STEPS), LANES)
         spare = _spare.pop((n_rows, n_rows * width, n_steps), None)
@@ -434,7 +434,7 @@ class IntegrationLoop:
         return np.empty(n_rows), np.empty((n_rows, width)), np.empty((n_steps, self.run.a.N_STEP_COLUMNS))
 
     def _recorder(self) -> Recorder:
-        """Make the recorder, with an interpolator if states between steps are requested."""
+        """Create the recorder, with an interpolator if states between steps are requested."""
         run, n = self.run, self.run.system.n_q
         interpolator = interpolator_of(run, self.start[: 3 * n]) if self.request.between_steps else None
         apart = LONGEST_UNSEEN * (self.t1 - run.t0) / SAMPLES
@@ -442,7 +442,7 @@ class IntegrationLoop:
         return Recorder(self.request, interpolator, n, run.t0, self.start, every)
 
     def _kinds(self, steps: Array, across: bool, leaps: bool) -> NDArray[np.int64]:
-        """Return the kind of interval of each accepted step, for the solution between them."""
+        """Return the kind of interval of each accepted step, for the dense solution."""
         run = self.run
         if not self.request.between_steps:
             return NO_KINDS
@@ -454,10 +454,10 @@ class IntegrationLoop:
 
 
 def silent(t: float) -> None:
-    """Report nothing of how far a run is."""
+    """Report no progress."""
 
 
 def _where(name: str, t: float, error: Exception) -> str:
-    """Describe what the error of a compiled callback does not say: the system, and the time."""
+    """Describe what the error of a compiled callback does not contain: the system, and the time."""
     beyond = ": it asks an array for more than it has, as beyond the end of a table" * isinstance(error, IndexError)
     return f"raised by a compiled callback of system {name!r} in a step from t = {t:.10g}{beyond}"

@@ -1,4 +1,4 @@
-"""What is said of how a run ended: status and message, and what to try."""
+"""Messages about the end of a run: status, description and advice."""
 
 import sys
 import warnings
@@ -30,10 +30,10 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 NEARLY_SINGULAR = 1e-3  # smallest over largest singular value of C_q, below which a message says so
-LASTING = 100.0  # times what the tolerances allow: errors of velocities on the way that end the trust in a run
-LOST_AT_END = 1e-6  # the same, in any units, too, below which the state at the end is said not to be determined
-CROSSINGS = "\0"  # stands for what is said of singular positions that were crossed
-NEXT_TO_END = 1e-3  # of the run: where it stops so close to its end, that is said
+LASTING = 100.0  # times the tolerances: larger errors of velocities along the way make a run untrustworthy
+LOST_AT_END = 1e-6  # ratio of singular values, in any units, below which the state at the end counts as not determined
+CROSSINGS = "\0"  # placeholder for the description of singular positions that were crossed
+NEXT_TO_END = 1e-3  # relative to the run: if it stops so close to its end, the message says so
 
 _REASONS = {
     indices.DONE: "the error estimate stayed above the tolerances",
@@ -56,9 +56,9 @@ def _describe_passages(run: "Run") -> str:
 
 
 def message_of(run: "Run", words: str, system: "ConstrainedSystem", later: Later | None = None) -> dict[str, Any]:
-    """Return the message, or a `later` that makes it: to measure what was crossed takes longer than many a run.
+    """Return the message, or a `later` that computes it: measuring crossings takes longer than many runs.
 
-    `system`: one that stays what it is, as the arrays of the run may not; `later`: of other fields.
+    `system`: must not change later, as the arrays of the run may; `later`: computes other fields.
     """
     if CROSSINGS not in words:
         return {"message": words}
@@ -69,14 +69,14 @@ def message_of(run: "Run", words: str, system: "ConstrainedSystem", later: Later
             return later(name)
         return {"message": words.replace(CROSSINGS, describe_crossings(system, crossings, now, rank))}
 
-    # what functions in Python find in their surroundings may change
+    # functions in Python may depend on variables that change: compute the message now
     return made("message") if system.called_in_python else {"later": made}
 
 
 def reject_turned_velocities(
     run: "Run", last_step: list[Place], landed: list[Place], end: float, status: Status, message: str
 ) -> tuple[Status, str]:
-    """Status and message, unless velocities turned at a singular position that was crossed, or in the last step.
+    """Return status and message, changed if velocities turned at a crossed singular position, or in the last step.
 
     `landed`: states before the end on which steps had to end.
     """
@@ -91,7 +91,7 @@ def reject_turned_velocities(
 
 
 def describe_rounding(run: "Run", places: list[Place], end: float) -> str:
-    """Describe where steps went on from velocities that rounding had made; nothing if they did so nowhere."""
+    """Describe where steps continued from velocities that rounding had changed; return nothing otherwise."""
     system, n = run.system, run.system.n_q
     for t, state in sorted({place[0]: place for place in places}.values(), key=itemgetter(0)):
         q, v = state[:n], state[n : 2 * n]
@@ -108,12 +108,12 @@ def describe_rounding(run: "Run", places: list[Place], end: float) -> str:
 
 
 def describe_arrival(t: float, fixed: bool) -> str:
-    """Return the first sentence of the message of a run that came to its end."""
+    """Return the first sentence of the message of a run that reached its end."""
     return f"Reached the end, t = {t:g}{', with a constant step: no error was estimated' if fixed else ''}."
 
 
 def outcome(run: "Run", code: int, t1: float, pace: StallDetector) -> tuple[Status, str]:
-    """Status and message for how the run ended."""
+    """Return status and message of a run, from the code with which it ended."""
     a, t = run.a, float(run.clock[run.a.T])
     if code == a.ALL_OUTPUT_DONE:
         reached = describe_arrival(t, run.control[a.FIXED_STEP] > 0.0)
@@ -176,7 +176,7 @@ def outcome(run: "Run", code: int, t1: float, pace: StallDetector) -> tuple[Stat
 
 
 def _standstill(run: "Run", t1: float, pace: StallDetector) -> str:
-    """Describe how short the steps are, how many the rest takes, and what may be the reason."""
+    """Describe how short the steps are, how many more the run would take, and what may be the reason."""
     left = (t1 - float(run.clock[run.a.T])) / pace.mean
     before, advice = "", "Shorten t_span, or look at the units of velocities, masses and forces. "
     if pace.slows:
@@ -238,7 +238,7 @@ def warn_user(text: str) -> str:
 
 
 def _over_allowed(run: "Run", t: float, q: Array, v: Array) -> float:
-    """Estimate the errors of velocities that rounding of positions makes, over the tolerances."""
+    """Estimate the errors of velocities caused by rounding of positions, over the tolerances."""
     allowed = run.tolerances[indices.ATOL :] + run.rtol * np.abs(v).max()
     return float((velocity_rounding_errors(run.system, t, q, v, run.rank) / allowed).max())
 

@@ -1,7 +1,7 @@
-"""Monitor a run: a stall detector, and a monitor that says whether stability, not accuracy, limited the steps.
+"""Monitors of a run: a stall detector, and a monitor that says whether stability, not accuracy, limited the steps.
 
-For the second, the largest rate of the motion is found by power iteration at a few states when the run is over: that of
-dF/dq and of dF/dv, F being the accelerations. A rate times the step is compared with what the method is stable to, for
+The second estimates the largest rate of the motion at a few states after the run, by power iteration with dF/dq and
+dF/dv, F being the accelerations. The rate times the step is compared with the stability limit of the method, for
 vibrations and for decay.
 """
 
@@ -16,22 +16,22 @@ from twoloop.methods.plan import Plan
 
 Array = NDArray[np.float64]
 
-INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # beside what advance() returns
-STAGNATION_STEPS = 20_000  # accepted steps over which the pace is judged ...
-STAGNATION_PACE = 1e-3  # ... against the longest step of the run, and ...
-STAGNATION_LEFT = 1e7  # ... the steps that the rest of the run would take
-OUT_OF_REACH = 1e11  # such steps at which a run ends, however long the others were: they take days at the least
+INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # codes of this module, besides those that advance() returns
+STAGNATION_STEPS = 20_000  # accepted steps over which the mean step is measured; it is small if it is below ...
+STAGNATION_PACE = 1e-3  # ... this share of the longest step of the run, and the run stalls if it is small and ...
+STAGNATION_LEFT = 1e7  # ... the rest of the run would take more than this number of steps
+OUT_OF_REACH = 1e11  # number of remaining steps at which a run ends whatever its longest step was: they would take days
 
 
 class StallDetector:
-    """Lengths of the accepted steps, to see that a run does not get anywhere.
+    """Monitor of the lengths of accepted steps, to detect a run that makes no progress.
 
     Parameters
     ----------
     t0 : float
-        Where the run begins, s.
+        Start of the run, s.
     most : float
-        Steps that the rest may take if they are as long as those before.
+        Number of steps that the rest may take if they are as long as the last ones.
     """
 
     def __init__(self, t0: float, most: float = OUT_OF_REACH):
@@ -40,12 +40,12 @@ class StallDetector:
         self.longest = self.mean = 0.0
 
     def add_steps(self, h: Array) -> None:
-        """Note the lengths of accepted steps."""
+        """Add the lengths of accepted steps."""
         self.longest = max(self.longest, float(h.max(initial=0.0)))
         self.window_n += len(h)
 
     def stagnates(self, t: float, t1: float) -> bool:
-        """Return whether the run has come to a standstill, at time t."""
+        """Return whether the run stalls at time t."""
         if self.window_n < STAGNATION_STEPS:
             return False
         self.mean = (t - self.window_t) / self.window_n
@@ -54,21 +54,21 @@ class StallDetector:
 
     @property
     def slows(self) -> bool:
-        """Whether the steps were much longer before."""
+        """Whether the steps were much longer earlier in the run."""
         return self.mean < STAGNATION_PACE * self.longest
 
 
-MOST = 8  # sampled states; they lie about as far from one another
-LAST_STEPS = 8  # whose median is the step at a state
-ITERATIONS = 6
-START = 0.1  # share of all coordinates in the direction of each look
-ALIGNED = 0.9  # cosine from which on two directions are one
-MANY = 200  # accepted steps before the last look, from which on it is worth a sentence
-NEXT_TO = 0.45  # of the limit of stability, which half of the states have to reach; smooth motion stays below 0.4
+MOST = 8  # most states that are kept; they are spread about evenly over the run
+LAST_STEPS = 8  # number of last steps whose median is the step at a state
+ITERATIONS = 6  # power iterations at each state
+START = 0.1  # share of a vector with all coordinates that is added to the direction before each estimate
+ALIGNED = 0.9  # absolute cosine above which the image counts as parallel to the direction
+MANY = 200  # accepted steps below which nothing is said about stiffness
+NEXT_TO = 0.45  # share of the limit of stability that half of the states must reach; smooth motion stays below 0.4
 
 
 class StiffnessSample(NamedTuple):
-    """Hold a state of a run, the step h there, and what h times a rate of vibration or decay may be for stability."""
+    """Sampled state of a run, the step h there, and limits of h times a rate of vibration or decay for stability."""
 
     t: float
     q: Array
@@ -80,21 +80,21 @@ class StiffnessSample(NamedTuple):
 
 
 class StiffnessMonitor:
-    """Sample states of a run as it goes on, to find out at its end whether stability limited its steps."""
+    """Monitor that samples states of a run, to find out at its end whether stability limited its steps."""
 
     def __init__(self, plan: Plan):
         self.plan, self.every, self.n_seen, self.n_steps = plan, 1, 0, 0
-        self.last = np.zeros(0)  # lengths of the last steps
+        self.last = np.zeros(0)  # lengths of the last LAST_STEPS steps
         self.samples: list[StiffnessSample] = []
 
     def add_steps(self, steps: Array) -> None:
-        """Note the lengths of accepted steps."""
+        """Add the lengths of accepted steps."""
         self.n_steps += steps.size
         last = steps[-LAST_STEPS:]
         self.last = last if last.size == LAST_STEPS else np.concatenate([self.last, last])[-LAST_STEPS:]
 
     def sample_state(self, t: float, state: Array, n_q: int) -> None:
-        """Keep this state, that after the last steps; of many only every second, fourth, ..."""
+        """Keep the state after the last steps; of many states, keep only every second, fourth, ..."""
         if self.plan.stable_to is None or self.last.size < LAST_STEPS:
             return
         self.n_seen += 1
@@ -109,18 +109,18 @@ class StiffnessMonitor:
 
 
 def describe_stiffness(looks: StiffnessMonitor, kit: Any, work: Any) -> str:
-    """Return a sentence if stability limited the steps, else nothing. What stands in the workspace is lost."""
+    """Return a sentence if stability limited the steps, else nothing. Overwrites the workspace."""
     if not looks.samples or looks.n_steps < MANY:
         return ""
     start = initial_direction(work.Q.size)
     directions = [np.zeros_like(start), np.zeros_like(start)]
     found = []
     for sample in looks.samples:
-        for direction in directions:  # that of the look before, in which no coordinate may have been lost for good
+        for direction in directions:  # starts from the state before: no coordinate may have been lost from it for good
             direction += START * start
         try:
             vibration, decay = _rates(kit, work, sample, directions)
-        except Exception:  # of a callback at a displaced state, which is none of the run: there is nothing to say
+        except Exception:  # raised by a callback at a displaced state, which the run did not visit: say nothing
             return ""
         h = sample.h
         found.append((h * vibration / sample.vibration, h * decay / sample.decay, vibration, decay, h))
@@ -135,7 +135,7 @@ def describe_stiffness(looks: StiffnessMonitor, kit: Any, work: Any) -> str:
 
 
 def _rates(kit: Any, work: Any, sample: StiffnessSample, directions: list[Array]) -> tuple[float, float]:
-    """Angular frequency of the fastest vibration and the fastest rate of decay, 1/s, as far as they dominate."""
+    """Return the angular frequency of the fastest vibration and the fastest decay, 1/s, as far as they dominate."""
     from twoloop.kernels.evaluation import tasks
 
     if kit.inner(kit, work, tasks.RENEW_PARTITION, sample.t, sample.q, sample.v, 0.0, work.x, work.lam) != indices.DONE:
@@ -149,7 +149,7 @@ def _rates(kit: Any, work: Any, sample: StiffnessSample, directions: list[Array]
 def _largest(
     kit: Any, work: Any, sample: StiffnessSample, direction: Array, places: NDArray[np.int64], by_v: bool
 ) -> tuple[float, bool]:
-    """Find the largest growth of a direction under dF/dq or dF/dv by power iteration, and whether it is reversed."""
+    """Return the largest growth of a direction under dF/dq or dF/dv by power iteration, and whether it is reversed."""
     from twoloop.kernels.evaluation import tasks
 
     size = DISPLACEMENT * max(1.0, float(np.abs(sample.v if by_v else sample.q).max()))

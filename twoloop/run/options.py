@@ -1,4 +1,4 @@
-"""Validate the options of a call, once; calls with equal options share one key, by which integrators are cached."""
+"""Validation of the options of a call; calls with equal options share one key, by which integrators are cached."""
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -15,7 +15,7 @@ from twoloop.methods.presets import PRESETS, identity, is_preset
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.run import Run
 
-SMALLEST_TOLERANCE = 1e-15  # where both tolerances are below it, rounding hides the error of a step
+SMALLEST_TOLERANCE = 1e-15  # relative or absolute tolerance: if both are smaller, rounding hides the error of a step
 
 
 @lru_cache(maxsize=1024)
@@ -26,7 +26,7 @@ def _key(*_: Any) -> object:
 
 @dataclass(frozen=True)
 class Options:
-    """Hold the validated options of a call; `solve_dae` says what the names mean."""
+    """Validated options of a call; `solve_dae` explains the names."""
 
     method: Method
     rtol: float
@@ -40,24 +40,24 @@ class Options:
 
     @cached_property
     def key(self) -> object:
-        """The key of the cache of integrators: equal for calls with equal options."""
+        """Key of the cache of integrators: equal for calls with equal options."""
         sizes = self.first_step, self.max_step, self.max_steps, self.step_size
         tolerances = self.rtol, self.atol.tobytes()
         return _key(identity(self.method), *tolerances, *sizes, self.compiled, self.check_derivatives)
 
     @cached_property
     def own_tolerance(self) -> float | None:
-        """The tolerance of positions of a method that tests these by itself."""
+        """Tolerance of positions of a method that tests the errors of positions by itself, else None."""
         return getattr(self.method, "error_tol", None)
 
     @cached_property
     def metadata(self) -> dict[str, Any]:
-        """Fields of a result that the options give; `untested` is None where all steps are tested, else of the run."""
+        """Fields of a result that options give; `untested` is None if all steps are tested, else it is the run's."""
         tested = getattr(self.method, "tested", "all")
         return {"method": self.method.name, "rtol": self.rtol} | ({} if tested == "positions" else {"untested": None})
 
     def set_sizes(self, run: Run, t1: float) -> None:
-        """Set the first and the largest step of a run to t1, unless its steps are constant, and where kinks may be."""
+        """Set the first and the largest step of a run to t1, unless steps are constant; no jump of C_t is known yet."""
         run.work.notes[indices.KINK_AFTER] = t1
         if self.step_size is None:
             run.set_sizes(self.first_step, self.max_step, t1)
@@ -81,10 +81,10 @@ def options_of(
     check_derivatives: Any,
     compiled: Any,
 ) -> Options:
-    """Validate the options of a call, unless they are the objects of the last call: these were validated there."""
+    """Validate the options of a call, unless they are the objects of the last call, which were validated then."""
     last, options = system.shared.get("options", NO_OPTIONS)
     m, r, a, first, longest, most, size, dense, shows, limit, checks, code = last
-    # to compare them in a loop, or to collect them in a tuple, takes a tenth of a short repeated call
+    # a loop or a tuple for these comparisons would take a tenth of a short repeated call
     same = m is method and r is rtol and a is atol and first is first_step and longest is max_step and most is max_steps
     same = same and size is step_size and dense is dense_output and shows is progress and limit is time_limit
     if same and checks is check_derivatives and code is compiled:
@@ -92,7 +92,7 @@ def options_of(
     last = method, rtol, atol, first_step, max_step, max_steps, step_size, dense_output, progress, time_limit
     last = *last, check_derivatives, compiled
     options = check_options(system, *last)
-    if type(atol) is float and is_preset(method):  # the caller may change an array, or another object
+    if type(atol) is float and is_preset(method):  # other types may be changed by the caller
         system.shared["options"] = last, options
     return options
 
@@ -112,7 +112,7 @@ def check_options(
     check_derivatives: Any,
     compiled: Any,
 ) -> Options:
-    """Return the options of a call; raises where one is wrong."""
+    """Validate and return the options of a call; raise if one is wrong."""
     check_flag("dense_output", dense_output)
     if progress is not None:
         check_flag("progress", progress)
@@ -145,7 +145,7 @@ def check_options(
 
 
 def check_method(method: str | Method) -> Method:
-    """Return the method of a name, or the object itself; raises where it is neither."""
+    """Return the method of a name, or the method object itself; raise for anything else."""
     names = ", ".join(PRESETS)
     if isinstance(method, str):
         if method not in PRESETS:

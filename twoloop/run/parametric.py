@@ -1,8 +1,8 @@
-"""A run of one system of a family, made ready for others of it: they differ in parameters, which it takes as inputs.
+"""Runs of systems that differ only in their parameters, which one prepared run takes as inputs.
 
-All that depends on parameters stands in arrays of its own: `p`, and numbers that are formulas in it. What decides by
-numbers is decided anew, and the callbacks are compared with one another and with what they were traced to for every
-vector of parameters, as at the first run of a system; along a run where no states or parameters were compared before.
+All numbers that depend on parameters are in separate arrays: `p`, and results of formulas in `p`. Decisions that depend
+on numbers are made again. For every vector of parameters the callbacks are compared with one another and with their
+traces, as at the first run of a system; along a run, where no states or parameters were compared before.
 """
 
 import copy
@@ -29,26 +29,26 @@ from twoloop.run.workspace import is_diagonal, kit_with
 
 Array = NDArray[np.float64]
 
-NUMBERS = ("options", "numbers", "own_numbers")  # of a plan, that may be formulas
-PARTS = ("interior", "substitute", "within_newton")  # plans that a plan holds
+NUMBERS = ("options", "numbers", "own_numbers")  # fields of a plan that may depend on parameters
+PARTS = ("interior", "substitute", "within_newton")  # fields of a plan that are plans themselves
 
 
 class SharedSetup:
-    """Hold the setup shared by runs that differ only in the parameters.
+    """Setup shared by runs that differ only in the parameters.
 
     Parameters
     ----------
     run : Run
-        Of one of the systems, at its start, which stays there.
+        A run of one of the systems, at its start, where it stays.
     code : GeneratedCode or None
         The machine code that its plan calls.
     method, fixed, compiled
-        How it was asked for.
+        Options with which the code was requested.
 
     Raises
     ------
     ValueError
-        If not all is known that depends on the parameters.
+        If something that depends on the parameters is not known as a formula.
     """
 
     def __init__(self, run: Run, code: GeneratedCode | None, method: Method, fixed: bool, compiled: Compiled):
@@ -78,20 +78,20 @@ class SharedSetup:
 
 
 class ParametricRun:
-    """Run for the parameters of one system after another in the same arrays.
+    """Prepared run for the parameters of one system after another, in the same arrays.
 
     Parameters
     ----------
-    kin : SharedSetup
+    shared : SharedSetup
     run : Run
-        A copy of that of the kin, at its start. It gets these arrays.
+        A copy of the run of `shared`, at its start. It gets these arrays.
 
     Attributes
     ----------
     given : ConstrainedSystem
-        The system that they are for.
+        The system whose parameters the arrays hold.
     system : ConstrainedSystem
-        The same with these arrays, and with what is remembered of it.
+        A copy of it with these arrays, and with the cache that belongs to them.
     """
 
     def __init__(self, shared: SharedSetup, run: Run):
@@ -112,7 +112,7 @@ class ParametricRun:
         run.functions = run.kit.functions
 
     def take(self, system: ConstrainedSystem) -> bool:
-        """Be for a system of the family; whether it was for another one."""
+        """Set the run to a system of the family, and return whether it was set to another one."""
         if system is self.given:
             return False
         self._take(system)
@@ -126,7 +126,7 @@ class ParametricRun:
         self.system.functions, self.system.made = self._functions, self._remembered.copy()
         self.system.within_bounds.update(self.shared.family.within_bounds)
         self.system.checked, self._mass_agrees = False, not system.constant_mass
-        self.system.bandwidth = None  # no run of these makes use of it
+        self.system.bandwidth = None  # the banded form is not used by these runs
         for traced in self.run.traced:
             traced.trusted = False
 
@@ -144,12 +144,12 @@ class ParametricRun:
             if with_derivatives:
                 check_derivatives(system, t0, q, lambda: exact_near(system, t0, q, v))
             refuse_wrong(run.traced, system, t0, t1, q, v)
-        except Exception:  # of a callback, too; the long way says what it is
+        except Exception:  # a callback may raise, too; the general way of the call describes it
             return False
         return self._mass_agrees
 
     def _numbered(self, plan: Plan) -> Plan:
-        """Return a plan with these arrays in the place of formulas."""
+        """Return a plan whose formulas are replaced by the arrays of their values."""
         array, known = self._formulas.array, vars(plan)
         changes: dict[str, Any] = {name: array(known[name]) for name in NUMBERS if known[name] is not None}
         changes |= {name: self._numbered(known[name]) for name in PARTS if known[name] is not None}
@@ -157,7 +157,7 @@ class ParametricRun:
 
 
 def _told(run: Run) -> list[Any]:
-    """List all that the plans of a run hold, numbers to the bit."""
+    """List everything that the plans of a run hold, numbers to the bit."""
     plans = [run.plan, *run.interiors.values()]
     return [run.kit.flags.tobytes(), *(each for plan in plans for each in _of_plan(plan))]
 
@@ -168,5 +168,5 @@ def _of_plan(plan: Plan) -> Iterator[Any]:
             yield from _of_plan(value)
         elif name == "traced":
             yield [part.tobytes() for each in value for part in each.program[:-1]]
-        elif name != "stable_to":  # a function without a name
+        elif name != "stable_to":  # stable_to is a function without a name
             yield value.tobytes() if isinstance(value, np.ndarray) else value

@@ -1,8 +1,8 @@
 """consistent_state: project a guess onto the constraints, and report how far it moved and on which assembly it is.
 
-Large systems are projected by sparse factors, without the matrices of the small ones. Where rows depend on one another
-beside the constraints only nearly, near a dead centre, and for guesses that may lead elsewhere, it takes
-the dense way.
+Large systems are projected by sparse factors, without dense matrices. Dense matrices are used in three cases:
+dependent rows are only nearly dependent beside the constraints; the position is near a dead centre; the guess may lead
+to another assembly.
 """
 
 from __future__ import annotations  # ArrayLike stays a word in help()
@@ -30,13 +30,13 @@ from twoloop.run.workspace import kit_of, workspace
 
 Array = NDArray[np.float64]
 
-CLEAR = 1e-5  # sine of a row to others, below which a position may be near a dead centre
-MOST_CORRECTIONS, ROUNDING = 25, 1e-14  # by Newton's method, and what of the largest coordinate is rounding
-STRAIGHT = 0.5  # of a displacement: how far its projection may end from where C_q sends it, on the same assembly
+CLEAR = 1e-5  # sine of the angle between a row and the others, below which a position may be near a dead centre
+MOST_CORRECTIONS, ROUNDING = 25, 1e-14  # number of Newton iterations; rounding error relative to the largest coordinate
+STRAIGHT = 0.5  # relative to a displacement: its projection ends so close to where C_q sends it, on the same assembly
 
 
 class _Metric:
-    """The static form with the unit matrix in the place of M: its corrections are the least of all coordinates."""
+    """Static form with the unit matrix in place of M: its corrections are the smallest changes of all coordinates."""
 
     def __init__(self, system: ConstrainedSystem, t: float, q: Array, form: Any, rank: int | None = None):
         self.system, self.t, self.rank = system, t, rank
@@ -49,12 +49,12 @@ class _Metric:
         self.work.mass_values[:] = diagonal / np.bincount(rows, diagonal, system.n_q)[rows]
 
     def ask(self, task: int, q: Array, v: Array, a: Array | None = None, lam: Array | None = None) -> int:
-        """What the inner loop says to a task; q and v are changed."""
+        """Call a task of the inner loop and return its code; q and v are changed."""
         a, lam = self.work.x if a is None else a, self.work.lam if lam is None else lam
         return int(entry_point(self.kit.inner)(self.kit, self.work, task, self.t, q, v, 0.0, a, lam))
 
     def nearest(self, way: Array) -> Array:
-        """What the constraints, by the factors there are, leave of a displacement."""
+        """Return the part of a displacement that the constraints allow, by the current factors."""
         rows = self.system.sparse_rows(self.t, self.at)
         change = np.zeros(len(way))
         zero, residual = np.zeros(len(way)), np.ascontiguousarray(rows @ way)
@@ -62,9 +62,9 @@ class _Metric:
         return way - change
 
     def onto_constraints(self, q: Array) -> Array | None:
-        """q on the constraints by the rows that count; None where that fails, or where others are violated then.
+        """Project q onto the independent rows; return None if that fails or violates the other rows.
 
-        Rows that depend on others on the constraints do so only nearly beside them, where a choice would fail.
+        Rows that are dependent on the constraints are only nearly so beside them, where a choice of rows would fail.
         """
         zero, change = np.zeros(len(q)), np.zeros(len(q))
         for _ in range(MOST_CORRECTIONS):
@@ -78,15 +78,15 @@ class _Metric:
         return q if is_at_rounding(held, self.system.sparse_rows(self.t, q), q) else None
 
     def project(self, q: Array, v: Array) -> tuple[Array, Array] | None:
-        """q and v on the constraints."""
+        """Project q and v onto the constraints; return None if that fails."""
         q, on_the_way = q.copy(), v.copy()
         if (
             self.ask(tasks.RENEW_PARTITION, q, v) != indices.DONE
             or self.ask(tasks.RESTORE, q, on_the_way) != indices.DONE
         ):
             return None
-        v = v.copy()  # the least change of the velocities is that where positions end
-        for task in (tasks.RESTORE, tasks.RESTORE, tasks.FIND_NULL_SPACE):  # twice, to rounding
+        v = v.copy()  # the least change of velocities is that at the final positions
+        for task in (tasks.RESTORE, tasks.RESTORE, tasks.FIND_NULL_SPACE):  # RESTORE twice: to rounding
             if self.ask(task, q, v) != indices.DONE:
                 return None
         self.at = q
@@ -94,16 +94,16 @@ class _Metric:
 
 
 class Dependence(NamedTuple):
-    """The rank of C_q of a large system at a position, and rows that are made of others."""
+    """Rank of C_q of a large system at a position, and the rows that depend on others."""
 
     rank: int
-    shares: dict[int, Array]  # of each row that does not count, (n_c,): what of the others it is made of
+    shares: dict[int, Array]  # coefficients (n_c,) of each dependent row in terms of the other rows
     allowed: Array  # a displacement that C_q allows, at most 1 in the units of the coordinates, (n_q,)
-    onto_constraints: Callable[[Array], Array | None]  # a position near it moved to them, by the rows that count here
+    onto_constraints: Callable[[Array], Array | None]  # projects a position near it, by the rows independent here
 
 
 def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | None:
-    """Which rows of a large sparse system depend on others; None where that is not to be left to sparse factors."""
+    """Return which rows of a large sparse system depend on others; None if that is not to be left to sparse factors."""
     form, all_rows = static_form(system, t, q), system.sparse_rows(t, q)
     if form is None or not isinstance(all_rows, SparseRows):
         return None
@@ -130,7 +130,7 @@ def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | No
 def project_sparsely(
     system: ConstrainedSystem, t: float, q: Array, v: Array, check_assembly: bool
 ) -> tuple[Array, Array] | None:
-    """(q, v) moved to the constraints by the least change; None where that is not to be left to sparse factors."""
+    """Project (q, v) onto the constraints by the least change; None if that is not to be left to sparse factors."""
     form = static_form(system, t, q)
     if form is None:
         return None
@@ -147,7 +147,7 @@ def project_sparsely(
     there = _Metric(system, t, found[0], form, metric.rank)
     if (
         there.ask(tasks.RENEW_PARTITION, found[0].copy(), v.copy()) != indices.DONE
-    ):  # other rows count on the constraints
+    ):  # other rows are independent on the constraints
         return None
     rows, rate = system.sparse_rows(t, found[0]), system.rates(t, found[0])
     if not is_at_rounding(system.constraint(t, found[0]), rows, found[0]):
@@ -161,7 +161,7 @@ def project_sparsely(
 
 
 def _same_from_elsewhere(metric: _Metric, found: Array, moved: Array) -> bool:
-    """Whether other guesses, as far off, end where C_q sends them."""
+    """Return whether other guesses, as far off, end where C_q sends them."""
     far = float(np.abs(moved).max())
     generic = np.random.default_rng(8).uniform(-1.0, 1.0, (2, len(found)))
     rest = np.zeros(len(found))
@@ -176,23 +176,23 @@ def _same_from_elsewhere(metric: _Metric, found: Array, moved: Array) -> bool:
 
 
 MAX_ITERATIONS = 50
-CONVERGED = 1e-2  # of what a start may be off
-SINGULAR = 1e-10  # smallest singular value of scaled columns that still count as independent
-NEGLIGIBLE, WEAK = 1e-13, 1e-2  # singular values of rows of length 1 that count as zero: as a rule; redundant
+CONVERGED = 1e-2  # relative to the violation that a start may have: below it the iteration has converged
+SINGULAR = 1e-10  # relative to the largest: singular values of scaled columns above it count as independent
+NEGLIGIBLE, WEAK = 1e-13, 1e-2  # relative: smaller singular values of normalized rows are zero; WEAK: of redundant rows
 DEAD_CENTRE = 0.01  # smallest over largest singular value, below which a position is called near a dead centre
-SAME = 0.1  # of what the projection moves: positions that are nearer to each other are one
+SAME = 0.1  # relative to the change that the projection makes: positions nearer to each other count as one
 LOST = 1e8  # largest change of a position over its scale: farther away rounding hides where the mechanism is
 
 
 class Move(NamedTuple):
-    """The largest change that the projection made."""
+    """Largest change that the projection made, and its coordinate."""
 
     change: float
     coordinate: int
 
 
 class ConsistentState(tuple[Array, Array]):
-    """What `consistent_state` returns: the tuple (q, v), with a report.
+    """Tuple (q, v) that `consistent_state` returns, with a report of the projection.
 
     Attributes
     ----------
@@ -298,7 +298,7 @@ def consistent_state(
 
 
 class _LargeState(ConsistentState):
-    """The same of a large system, which says on which assembly it is when it is asked: that takes full matrices."""
+    """Consistent state of a large system; its assembly is computed on access, because that takes full matrices."""
 
     system: ConstrainedSystem
     t: float
@@ -335,7 +335,7 @@ def _position(
     found, excess, iterations = _gauss_newton(system, t, guess, free)
     redundant = found is None or _rank(scales.scaled(system.jacobian(t, found))) < system.n_c
     cut = WEAK if redundant else NEGLIGIBLE
-    if redundant:  # rows that depend on one another do so on the constraints, and beside them only nearly
+    if redundant:  # dependent rows are so on the constraints, and beside them only nearly
         found, excess, iterations = _gauss_newton(system, t, guess, free, cut)
     if found is None or not excess <= 1.0:
         diverged = found is None
@@ -364,9 +364,9 @@ def _position(
 def _another_assembly(
     system: ConstrainedSystem, t: float, found: Array, guess: Array, free: NDArray[np.intp], scales: Scales, cut: float
 ) -> str | None:
-    """Where another guess leads that is as far from the position found as the one given; None: to the same assembly.
+    """Describe where another guess, as far from the found position as the given one, leads; None: the same assembly.
 
-    Two assemblies are positions with the same values of all but the dependent coordinates. Where there is but one, a
+    Two assemblies are positions with the same values of all but the dependent coordinates. If there is only one, a
     small displacement ends where C_q sends it, to first order, with the same sign of the determinant.
     """
     moved = (found - guess) / scales.columns
@@ -391,7 +391,7 @@ def _another_assembly(
         expected = found + way + _least_change(jacobian, free, -(jacobian @ way), cut)
         if distance(again, expected) <= STRAIGHT * float(np.abs(other).max()) and sign_at(again) == sign:
             continue
-        mixed = found.copy()  # on a curved path, or on another assembly: its dependents, with the first's other values
+        mixed = found.copy()  # curved path or other assembly: its dependents with the first's other values
         mixed[columns] = again[columns]
         beside, excess, _ = _gauss_newton(system, t, mixed, np.array(columns, dtype=int), cut)
         if beside is None or not excess <= 1.0:
@@ -402,7 +402,7 @@ def _another_assembly(
 
 
 def _change(one: Array, other: Array, scales: Scales) -> str:
-    """Which coordinate changes most, with as many digits as show it."""
+    """Describe which coordinate changes most, with as many digits as show the change."""
     j = int(np.abs((other - one) / scales.columns).argmax())
     size, change = max(abs(float(one[j])), abs(float(other[j]))), abs(float(other[j] - one[j]))
     digits = min(17, 3 + max(0, math.ceil(math.log10(size / change)))) if change > 0.0 else 3
@@ -412,12 +412,12 @@ def _change(one: Array, other: Array, scales: Scales) -> str:
 def _gauss_newton(
     system: ConstrainedSystem, t: float, q: Array, free: NDArray[np.intp], cut: float = NEGLIGIBLE
 ) -> tuple[Array | None, float, int]:
-    """Position (None: lost), what it is still off over what is accepted, and how many iterations it took."""
+    """Return the position (None: diverged), its violation over the accepted one, and the number of iterations."""
     best, nearest, guess = np.inf, q, q
     for iteration in range(1, MAX_ITERATIONS + 1):
         try:
             jacobian, values = system.jacobian(t, q), system.constraint(t, q)
-        except (ArithmeticError, ValueError):  # an iterate outside what the callbacks are made for
+        except (ArithmeticError, ValueError):  # an iterate outside the domain of the callbacks
             return None, np.inf, iteration
         if not (np.isfinite(jacobian).all() and np.isfinite(values).all()):
             return None, np.inf, iteration
@@ -425,11 +425,11 @@ def _gauss_newton(
         scales = scales_of(system, t, q, jacobian)
         excess = Violation.of_position(system, t, q, jacobian, scales).excess
         if excess == 0.0 or (excess <= CONVERGED and excess >= 0.5 * best):
-            return q, excess, iteration  # as far as rounding lets it
+            return q, excess, iteration  # as close as rounding allows
         if excess < best:
             best, nearest = excess, q
         q = q + step
-        if not (np.abs(q - guess) <= LOST * scales.columns).all():  # NaN too
+        if not (np.abs(q - guess) <= LOST * scales.columns).all():  # also true for NaN
             return None, np.inf, iteration
     return (
         (nearest if best <= 1.0 else q),
@@ -439,7 +439,7 @@ def _gauss_newton(
 
 
 def _least_change(jacobian: Array, free: NDArray[np.intp], values: Array, cut: float = NEGLIGIBLE) -> Array:
-    """The smallest change of the free coordinates that changes C by these values to first order."""
+    """Return the smallest change of the free coordinates that changes C by `values` to first order."""
     norms = np.linalg.norm(jacobian, axis=1)
     norms = np.where(norms > 0.0, norms, 1.0)
     change = np.zeros(jacobian.shape[1])
@@ -453,7 +453,7 @@ def _rank(scaled: Array) -> int:
 
 
 def _assembly(scaled: Array, free: NDArray[np.intp]) -> tuple[tuple[int, ...], int, float]:
-    """The dependent columns, the sign of their determinant, and how far they are from losing rank."""
+    """Return the dependent columns, the sign of their determinant, and how far they are from losing rank."""
     rank = _rank(scaled[:, free])
     if rank == 0:
         return (), 0, 0.0
@@ -467,7 +467,7 @@ def _assembly(scaled: Array, free: NDArray[np.intp]) -> tuple[tuple[int, ...], i
 
 
 def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
-    """The direction in which the constraints hold the free coordinates least; its largest entry is 1."""
+    """Return the direction in which the constraints hold the free coordinates least; its largest entry is 1."""
     values, rows = np.linalg.svd(scaled[:, free], full_matrices=False)[1:]
     held = values > SINGULAR * values.max()
     direction = np.zeros(scaled.shape[1])
@@ -476,7 +476,7 @@ def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
 
 
 def _smallest(scales: Scales, jacobian: Array, free: NDArray[np.intp], kept: list[int]) -> str:
-    """Say that C_q nearly loses rank at a position, where it does in its own units and in like ones, and how far."""
+    """Describe that C_q nearly loses rank, in its own and in scaled units, and how far; return nothing elsewhere."""
     if jacobian[:, free].size == 0:
         return ""
     values = [np.linalg.svd(each[:, free], compute_uv=False) for each in (jacobian, scales.scaled(jacobian))]

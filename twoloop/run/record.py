@@ -1,4 +1,4 @@
-"""Define what a run returns: its trajectory, how it ended and what it cost. `Result` makes more of it."""
+"""Record of a run: its trajectory, how it ended and what it cost. `Result` adds views to it."""
 
 import pickle
 from collections.abc import Callable
@@ -27,7 +27,7 @@ Later = Callable[[str], dict[str, Any]]  # takes the name of a field, and return
 
 
 class Status(IntEnum):
-    """How a run ended: 0 reached the end, 1 an event, negative a failure. See docs/when_it_fails.md for each.
+    """Status with which a run ended: 0 reached the end, 1 an event, negative a failure. See docs/when_it_fails.md.
 
     Examples
     --------
@@ -77,7 +77,7 @@ MEANINGS: dict[Status, str] = {
 
 
 def explained(status: Status) -> str:
-    """Name the page that explains a failure, for the end of its message; nothing for a run that succeeded."""
+    """Return the sentence that names the page about a failure, for the end of its message; empty after success."""
     return "" if status >= 0 else f" See docs/when_it_fails.md#{status.name.lower()}."
 
 
@@ -95,19 +95,19 @@ class Statistics:
         Newton iterations of the inner loop.
     n_evaluations : int or None
         Solutions of eq. (6) for accelerations and multipliers, and evaluations of the forces alone, with which the
-        derivatives of a banded system are made.
+        derivatives of a banded system are computed.
     n_partitions : int or None
         Coordinate partitionings, the first included.
     n_factorizations : int or None
         Matrix factorisations: of C_qd, of C_q M^-1 C_q^T, of M where it is not constant, of the partitionings,
         and for Newton's method in the outer loop.
     n_jacobians : int or None
-        Times the derivatives of the right-hand side were made for Newton's method in the outer loop.
+        Evaluations of the derivatives of the right-hand side for Newton's method in the outer loop.
     cpu_time : float
         Process time of the integration, s: of the steps, of storing what they give, of events, and of q and v at output
         times between them. Compilation, checks of the input, the workspace, the first accelerations, and a and lam at
-        output times between steps are not included. A run that was made again counts as a whole; counts are those of
-        the last time. Of repeated runs that take less than a millisecond it is the time that elapses.
+        output times between steps are not included. If a run was repeated, the time includes all attempts, while the
+        counts are those of the last one. For repeated calls that take less than a millisecond, it is the elapsed time.
 
     Examples
     --------
@@ -133,7 +133,7 @@ class Statistics:
 
 @dataclass(frozen=True)
 class Record:
-    """A trajectory, how the run ended, and what it cost: the fields of `Result`, which says what they are."""
+    """Trajectory, status and cost of a run: the fields of `Result`, which explains them."""
 
     t: Array
     q: Array
@@ -172,7 +172,7 @@ class Record:
 
     @property
     def description(self) -> Description:
-        """Names, energy and drawing, as far as the `Problem` of the system told them."""
+        """Names, energy and drawing, as far as the `Problem` of the system gave them."""
         return Description() if self.system is None else self.system.description
 
     @property
@@ -192,7 +192,7 @@ class Record:
         return np.asarray(self._known("energy")(self.t, self.q, self.v))
 
     def _known(self, what: str) -> Any:
-        """The energy or the drawing, or what to do to have it."""
+        """Return the energy or the drawing; if there is none, raise an error that says how to get it."""
         found = getattr(self.description, what)
         if found is None:
             raise ValueError(
@@ -207,7 +207,7 @@ class Record:
         state = {each.name: getattr(self, each.name) for each in fields(self)}
         try:
             pickle.dumps(self.system)
-        except TypeError:  # of functions without a name of their own
+        except TypeError:  # functions without a name of their own cannot be pickled
             state["system"] = None
         if self.arcs:
             state |= {"arcs": (), "sol": None}
@@ -221,7 +221,7 @@ class Record:
 
 
 def record_of(kind: type[AnyRecord], fields: dict[str, Any]) -> AnyRecord:
-    """Make a record of these fields, which it takes over: the constructor of a frozen dataclass with thirty is slow."""
+    """Create a record of these fields, which it takes over: the constructor of a large frozen dataclass is slow."""
     made = _new(kind)
     _set_fields(made, fields)
     return made
@@ -231,9 +231,9 @@ _new, _set_fields = object.__new__, vars(Record)["__dict__"].__set__
 
 
 class _Deferred:
-    """Defer a field until it is first read: where a record lacks it, its `later` makes it.
+    """Descriptor that defers a field until it is first read: if a record lacks it, its `later` computes it.
 
-    It stands beside the fields in `vars(record)`.
+    `later` is kept beside the fields in `vars(record)`.
     """
 
     def __init__(self, name: str):
@@ -242,13 +242,13 @@ class _Deferred:
     def __get__(self, record: Any, owner: Any = None) -> Any:
         known = {} if record is None else vars(record)
         if "later" not in known:
-            raise AttributeError(self.name)  # of a class: its default stands with the fields
+            raise AttributeError(self.name)  # also on the class: the default is in the dataclass field
         known.update(known["later"](self.name) | known)
         return known[self.name]
 
 
 DEFAULTS = {each.name: each.default for each in fields(Record) if each.default is not MISSING}
-for _field in fields(Record):  # behind the decorator, which would take it for a default
+for _field in fields(Record):  # after the decorator, which would take a descriptor for a default
     setattr(Record, _field.name, _Deferred(_field.name))
 
 
@@ -260,7 +260,7 @@ BEFORE = np.array([0, 0, 1])  # rejections and partitions before all steps: the 
 
 
 def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
-    """Return the fields of a record that have a row a step; `counts`, those before the steps, become those after."""
+    """Return the fields of a record with one row per step; `counts`, those before the steps, become those after."""
     n = len(steps)
     h, changes, untested = np.empty(n), np.empty((3, n), dtype=np.int64), np.empty(n, dtype=np.bool_)
     entry_point(cached_run().split_steps)(steps, counts, h, changes, untested)
@@ -268,23 +268,23 @@ def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
 
 
 def statistics(counted: Integers, cpu: float) -> Statistics:
-    """Return the counts of a workspace, with the CPU time of the run, s."""
+    """Return the statistics of a run, from the counts of its workspace and its CPU time, s."""
     return Statistics(**dict(zip(COUNTED, COUNTERS(counted.tolist()), strict=True)), cpu_time=cpu)
 
 
 def of_run(run: "Run", t: Array, table: Array) -> dict[str, Any]:
-    """Return the fields of a trajectory, of rows [q, v, a, lam], and those of the run as a whole."""
+    """Return the fields of the trajectory, from rows [q, v, a, lam], and those of the run as a whole."""
     return {
         **state_fields(run.system.n_q, t, table),
         "rank": run.rank,
-        "redundant": run.redundant.copy(),  # runs of one start share it
+        "redundant": run.redundant.copy(),  # runs from one start share this array
         "defect": run.defect(),
         "widest_gap": float(run.work.notes[indices.WIDEST_GAP]),
     }
 
 
 def state_fields(n: int, t: Array, table: Array) -> dict[str, Array]:
-    """Return the fields of a trajectory alone, of n coordinates."""
+    """Return the fields of a trajectory of n coordinates, from its rows."""
     columns = table.T
     return {
         "t": t,
@@ -296,7 +296,7 @@ def state_fields(n: int, t: Array, table: Array) -> dict[str, Array]:
 
 
 def interval_kinds(run: "Run", steps: Array) -> Integers:
-    """Return the kind of interval of each step that the plan of the run made, for the solution within them."""
+    """Return the kind of interval of each step that the plan of the run made, for the dense solution."""
     if run.plan.apart:
         return np.full(len(steps), indices.APART)
     explicit = indices.ACROSS if run.substituted else indices.ACCELERATIONS

@@ -1,4 +1,4 @@
-"""Record accepted steps as they come: all states, or those at output times, and events; in memory or in files."""
+"""Recorder of accepted steps: all states, or those at output times, and events; in memory or in files."""
 
 from collections import defaultdict
 from collections.abc import Callable
@@ -14,17 +14,17 @@ from twoloop.problem.events import Event, EventSearch
 from twoloop.run.dense import Interpolator, Table
 from twoloop.run.dense_solution import DenseSolution
 
-MAGIC, HEAD = b"\x93NUMPY\x01\x00", 128  # bytes before the numbers of a file, in NumPy's format npy
-OF_STEPS = ("h", "rejected_error", "rejected_convergence", "partitioned", "untested")  # with a row a step
+MAGIC, HEAD = b"\x93NUMPY\x01\x00", 128  # bytes before the numbers of a file, in NumPy's npy format
+OF_STEPS = ("h", "rejected_error", "rejected_convergence", "partitioned", "untested")  # fields with one row per step
 
 
 class MemoryStore:
-    """Store arrays by name in memory, each of parts that follow one another.
+    """Store of arrays by name in memory, each as a list of parts that follow one another.
 
     Attributes
     ----------
     finished : bool
-        Whether what is added should be as it is to stay, as no later look would reach all of it.
+        Whether added rows must be in their final form, as later changes would not reach all of them.
     """
 
     finished = False
@@ -33,11 +33,11 @@ class MemoryStore:
         self._parts: defaultdict[str, list[NDArray[Any]]] = defaultdict(list)
 
     def add(self, name: str, part: NDArray[Any]) -> None:
-        """Append rows to an array, which may be kept as they are."""
+        """Append rows to an array; the part may be stored without a copy."""
         self._parts[name].append(part)
 
     def cut(self, name: str, n: int) -> None:
-        """Leave the first n rows of an array."""
+        """Keep the first n rows of an array."""
         self._parts[name] = [self.array(name)[:n]]
 
     def array(self, name: str) -> NDArray[Any]:
@@ -47,7 +47,7 @@ class MemoryStore:
 
 
 class FileStore:
-    """Store arrays in a new folder: a file of NumPy's for each array, complete after each part.
+    """Store of arrays in a new folder: a NumPy file for each array, complete after each part.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ class FileStore:
     Raises
     ------
     OSError
-        Of `add`, if there is no room left.
+        In `add`, if the disk is full.
     """
 
     finished = True
@@ -75,14 +75,14 @@ class FileStore:
             self._close(file, name, dtype, (n + len(part), *width))
 
     def cut(self, name: str, n: int) -> None:
-        """Leave the first n rows of an array."""
+        """Keep the first n rows of an array."""
         dtype, (before, *width) = self._shapes[name]
         with self._path(name).open("r+b") as file:
             file.truncate(HEAD + min(n, before) * self._row(dtype, width))
             self._close(file, name, dtype, (min(n, before), *width))
 
     def array(self, name: str) -> NDArray[Any]:
-        """Return all rows, which are read as they are used; what is written to them stays out of the file."""
+        """Return all rows, memory-mapped; what is written to them does not reach the file."""
         return mapped(self._path(name))
 
     def _path(self, name: str) -> Path:
@@ -93,7 +93,7 @@ class FileStore:
         return int(dtype.itemsize * np.prod(width, dtype=np.int64))
 
     def _close(self, file: Any, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
-        """Write the head, last: a process that dies before leaves the array as it was."""
+        """Write the header last: a process that dies before leaves the array as it was."""
         head = repr({"descr": dtype.str, "fortran_order": False, "shape": shape}).ljust(HEAD - len(MAGIC) - 3) + "\n"
         file.flush()
         file.seek(0)
@@ -105,12 +105,12 @@ Store = MemoryStore | FileStore
 
 
 def mapped(path: Path) -> NDArray[Any]:
-    """Map the array in a file, which is read as it is used."""
+    """Map the array in a file into memory; what is written to it does not reach the file."""
     return np.load(path, mmap_mode="c", allow_pickle=False).view(np.ndarray)  # type: ignore[no-any-return]
 
 
 def read(folder: Path) -> dict[str, NDArray[Any]]:
-    """Read the arrays in a folder, without rows that others have not yet: those of a process that died."""
+    """Read the arrays in a folder, cut to the rows that all arrays of a group have: a process may have died."""
     arrays = {path.stem: mapped(path) for path in sorted(folder.glob("*.npy"))}
     for group in (("t", "states"), OF_STEPS, ("sol_t", "sol_states")):
         there = [name for name in group if name in arrays]
@@ -121,12 +121,12 @@ def read(folder: Path) -> dict[str, NDArray[Any]]:
 
 Array = NDArray[np.float64]
 
-PENDING = 1024  # states that wait for a look at the intervals between them, where nothing hurries it
+PENDING = 1024  # number of states that wait for the search of the intervals between them, unless it is needed sooner
 
 
 @dataclass(frozen=True)
 class OutputRequest:
-    """Say what a run has to store.
+    """Requested output of a run.
 
     Attributes
     ----------
@@ -135,11 +135,11 @@ class OutputRequest:
     lands : bool
         Whether steps end at all output times, so that nothing is interpolated.
     dense : bool
-        Whether the dense solution is wanted.
+        Whether the dense solution is requested.
     events : list of Event or None
-        None: no events were asked for.
-    kept : MemoryStore or FileStore
-        What takes it.
+        None: no events were requested.
+    store : MemoryStore or FileStore
+        Where the output is stored.
     """
 
     times: Array | None
@@ -150,17 +150,17 @@ class OutputRequest:
 
     @property
     def every_step(self) -> bool:
-        """Whether the states of all steps are needed, if only for a while."""
+        """Whether the states of all steps are needed, if only temporarily."""
         return self.times is None or self.between_steps
 
     @property
     def between_steps(self) -> bool:
-        """Whether states between steps are wanted."""
+        """Whether states between steps are requested."""
         return (self.times is not None and not self.lands) or self.dense or self.events is not None
 
 
 class _Between(NamedTuple):
-    """Interpolate states between steps for the search for events."""
+    """Interpolation of states between steps, for the search for events."""
 
     interpolator: Interpolator
     table: Table
@@ -173,11 +173,11 @@ class _Between(NamedTuple):
 
 
 class Recorder:
-    """Takes the states of accepted steps, chunk by chunk.
+    """Recorder of the states of accepted steps, chunk by chunk.
 
-    An interval is looked at when all states are known that its polynomials go through, so that what comes out does not
-    depend on the chunks. Of the states before it as many are kept as the polynomials need, and all if they are wanted.
-    Events are looked for at least once every so many seconds (`every`).
+    An interval is searched when all states are known that its polynomials go through, so that the output does not
+    depend on the chunks. As many states before it are kept as the polynomials need, and all if they are requested.
+    Events are searched at least every `every` seconds.
 
     Attributes
     ----------
@@ -186,7 +186,7 @@ class Recorder:
     n_steps, last_step : int, float
         After a terminal event: the number of steps up to it, and the part of the last one before it, s.
     interrupted : bool
-        Whether Ctrl-C broke off the search for events, or what is computed between the steps.
+        Whether Ctrl-C interrupted the search for events, or the interpolation between the steps.
     """
 
     def __init__(
@@ -195,9 +195,9 @@ class Recorder:
         self.request, self.interpolator, self._n_q, self._width = request, interpolator, n_q, len(state)
         self.n_steps, self.last_step = 0, 0.0
         self.interrupted = False
-        self._t, self._rows = np.array([t0]), state[None, :].copy()  # the last states, and those not looked at
+        self._t, self._rows = np.array([t0]), state[None, :].copy()  # the last states, and those not yet searched
         self._kinds = np.empty(0, dtype=np.int64)
-        self._next = 0  # the first interval of these that was not looked at
+        self._next = 0  # index of the first interval of these that was not searched
         self._n_outputs = 0
         ends = request.events is not None and any(event.terminal < np.inf for event in request.events)
         self._waits_for = 0 if ends or request.store.finished else PENDING
@@ -207,9 +207,9 @@ class Recorder:
             self._store(self._t[:0], self._rows[:0, : 2 * self._n_q])
 
     def add(self, t: Array, rows: Array, kinds: NDArray[np.int64]) -> None:
-        """Take over the states [q, v, a, lam] at which steps ended, and what kind of interval each step is.
+        """Record the states [q, v, a, lam] at which steps ended, and the kind of interval of each step.
 
-        Of the kinds there is one a step where states between steps are wanted, else none.
+        There is one kind per step if states between steps are requested, else none.
         """
         self._add(t, rows, kinds)
         if not self.request.between_steps:
@@ -232,12 +232,12 @@ class Recorder:
             store.add("sol_kinds", kinds)
 
     def _store(self, t: Array, rows: Array) -> None:
-        """Take rows [q, v, a, lam], or [q, v] where the rest is found at the end."""
+        """Store rows [q, v, a, lam], or [q, v] if the rest is computed at the end."""
         self.request.store.add("t", t)
         self.request.store.add("states", self._completed(t, rows) if self.request.store.finished else rows)
 
     def finish(self) -> None:
-        """No more states come."""
+        """Search the remaining intervals: no more states follow."""
         self._look(len(self._t) - 1)
 
     @property
@@ -247,13 +247,13 @@ class Recorder:
 
     @property
     def broken_off(self) -> float | None:
-        """When the search for events was interrupted, behind which nothing is known of them: the result ends there."""
+        """Time at which the search for events was interrupted: the result ends there, as later events are not known."""
         behind = self.interrupted and self.search is not None and self.ended is None
         return self.search.reached if behind and self.search is not None else None
 
     @property
     def ended(self) -> tuple[Event, float] | None:
-        """The event that ended the run, and when."""
+        """Event that ended the run, and its time."""
         return None if self.search is None else self.search.ended
 
     def _look(self, end: int) -> None:
@@ -312,7 +312,7 @@ class Recorder:
             self.interpolator.complete(times, rows, added)
         except KeyboardInterrupt:
             self.interrupted = True
-            added[np.isnan(added).any(axis=1)] = np.nan  # a row that was half written, too
+            added[np.isnan(added).any(axis=1)] = np.nan  # also of a row that was half written
         return np.concatenate([rows, added], axis=1)
 
     def solution(self) -> DenseSolution | None:
@@ -324,7 +324,7 @@ class Recorder:
         return DenseSolution(self.interpolator, table, end if self.ended is None else self.ended[1])
 
     def events(self) -> tuple[list[Array], list[Array], list[Array]] | tuple[None, None, None]:
-        """Times, coordinates and velocities of the events, an array for each event function."""
+        """Return times, coordinates and velocities of the events, one array for each event function."""
         if self.search is None:
             return None, None, None
         n = self._n_q

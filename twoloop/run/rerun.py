@@ -1,4 +1,4 @@
-"""Pieces of a run made again: short runs from stored states, by an explicit or an implicit method."""
+"""Independent rerun of pieces of a run: short runs from stored states, by an explicit or an implicit method."""
 
 from __future__ import annotations  # ArrayLike stays a word in help()
 
@@ -19,14 +19,14 @@ from twoloop.run.run import Run
 
 Array = NDArray[np.float64]
 
-CHUNK = 256  # attempts at steps in one call
-FIRST_TRY = 0.1  # of a piece: its first step where nothing is known of one before
-SHARE = 0.1  # of the tolerances of the run: those of the pieces ...
-FINEST = 1e-13  # ... which rounding allows no smaller
+CHUNK = 256  # attempts at steps in one call of `advance`
+FIRST_TRY = 0.1  # relative to a piece: its first step, if no step of a piece before is known
+SHARE = 0.1  # relative to the tolerances of the run: those of the pieces ...
+FINEST = 1e-13  # ... but not below this, because of rounding
 
 
 def tighter(tolerance: ArrayLike) -> Array:
-    """Tolerances of a piece made again, for those of the run."""
+    """Return the tolerances of the pieces for those of the run."""
     return np.minimum(tolerance, np.maximum(SHARE * np.asarray(tolerance), FINEST))
 
 
@@ -36,13 +36,13 @@ def explicit() -> tuple[Method, Array]:
 
 
 def implicit(velocities: bool) -> tuple[Method, Array]:
-    """Return the method for stiff motion, and its nodes; `velocities`: their errors are tested, too."""
+    """Return the method for stiff motion, and its nodes; `velocities`: whether errors of velocities are tested, too."""
     tableau = radau_iia(7)
     return RungeKutta(tableau, outer="newton", tested="all" if velocities else "positions"), tableau.c
 
 
 class RerunPiece(NamedTuple):
-    """Hold states [q, v] at a time within a piece and at its end, and the longest step, s."""
+    """Result of a piece: states [q, v] at a time within it and at its end, and the longest step, s."""
 
     between: Array
     end: Array
@@ -50,7 +50,7 @@ class RerunPiece(NamedTuple):
 
 
 class IndependentRerun:
-    """Recompute pieces of a run, each from a given state, in the same arrays.
+    """Independent rerun of pieces of a run, each from a given state, in the same arrays.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class IndependentRerun:
     t, q, v : float, ndarray (n_q,)
         A state of the run.
     method : (method object, ndarray)
-        What makes the pieces, with the places within its steps where it looks at the equations, from 0 to 1.
+        The method of the pieces, and the nodes of its steps at which it evaluates the equations, from 0 to 1.
     rtol, atol : float, ndarray (n_q,)
         Tolerances.
     max_step : float
@@ -83,13 +83,13 @@ class IndependentRerun:
         a, control = self.run.a, self.run.control
         control[a.MAX_STEP], control[a.BRIDGE], control[a.STORE_ALL] = max_step, 0.0, 0.0
         control[a.MAX_ATTEMPTS] = CHUNK
-        self.run.work.notes[indices.GAMMA_REQUIRED] = np.inf  # the run has judged its differences
+        self.run.work.notes[indices.GAMMA_REQUIRED] = np.inf  # the run has checked the accuracy of its differences
         rows = (np.empty(len(RerunPiece._fields)), np.empty((len(RerunPiece._fields), len(self.run.state))))
         self.buffers, self.filled = (*rows, np.empty((CHUNK, a.N_STEP_COLUMNS))), np.zeros(2, dtype=np.int64)
         self.next_step = np.inf
 
     def to(self, t0: float, state: Array, between: float, t1: float, most: int) -> RerunPiece | None:
-        """Start from a state [q, v] at t0; None if t1 is not reached within so many attempts at steps."""
+        """Integrate from a state [q, v] at t0; return None if t1 is not reached within `most` attempts at steps."""
         run, a, n = self.run, self.run.a, len(state)
         first_step, self.next_step = self.next_step, np.inf
         if run.restart(t0, state[: n // 2], state[n // 2 :]) != indices.DONE:

@@ -1,4 +1,4 @@
-"""One run: its arrays, at its start, with what the kernels keep in them."""
+"""Arrays of one run at its start, and what the kernels store in them."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -33,18 +33,18 @@ from twoloop.run.static_form import static_form, with_newton
 from twoloop.run.workspace import kit_of, kit_with, prepare_workspace, workspace
 
 Array = NDArray[np.float64]
-Buffers = tuple[Array, Array, Array]  # for times, states and steps
+Buffers = tuple[Array, Array, Array]  # times, states and steps
 
-FIRST_CHUNK = 1024  # attempts of a small compiled system before Python looks at the run: a look costs 0.2 ms
-FIRST_CHUNK_IN_PYTHON = 64  # ... of one whose callbacks are plain Python functions, which may be slow
-SMALL = 32  # coordinates; chunks of larger systems are shorter in proportion
-PROVISIONAL = 10  # steps within which a method that pays for long steps only gives way if they are short
+FIRST_CHUNK = 1024  # attempts of a small compiled system between two checks in Python, which cost 0.2 ms each
+FIRST_CHUNK_IN_PYTHON = 64  # ... of a system whose callbacks are plain Python functions, which may be slow
+SMALL = 32  # number of coordinates; chunks of larger systems are shorter in proportion
+PROVISIONAL = 10  # number of steps within which a method that pays only for long steps is replaced if they are short
 NONE = np.zeros((0, 0))
-CONTRADICTS = 1e-6  # relative: what the accelerations of redundant rows may differ by
+CONTRADICTS = 1e-6  # relative: largest disagreement of redundant rows with the accelerations
 
 
 class Run:
-    """Set up the arrays of a run at its start; `IntegrationLoop` takes it to its end.
+    """Arrays of a run, set up at its start; `IntegrationLoop` integrates it to its end.
 
     Raises
     ------
@@ -79,7 +79,7 @@ class Run:
         self.functions = self.kit.functions
         n_rows = system.n_c + system.n_a
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
-        # ranks are found anew at every start: those of the last one are a guess, which spares a second workspace
+        # ranks are computed at every start: those of the last one are a guess, which saves a second workspace
         self.work = self._workspace(*(system.made.get("ranks", ()) if self.static is None else ()))
         self.new_state = np.zeros_like(self.state)
         self.tolerances = np.zeros(indices.ATOL + system.n_q)
@@ -99,23 +99,23 @@ class Run:
         self.clock = np.zeros(loop_state.N_CLOCK)
         self._set_clock(t0)
         self.control_by(plan)
-        self.substituted = False  # whether another plan has taken over, for good
-        self.near = singular_threshold(rtol)  # pivots at output times below which velocities are looked at
+        self.substituted = False  # whether another plan has replaced the first for good
+        self.near = singular_threshold(rtol)  # pivots at output times below which errors of velocities are estimated
         ran = any("force" in each.kinds for each in plan.traced)
         changes = system.remembered(("changes", ran), lambda: (may_be_sudden(system, ran), may_be_narrow(system, ran)))
         sudden, narrow = (Sudden(False, False), True) if step_size is not None else changes
         self.sudden: Sudden = sudden
         self.control[[loop_state.BY_TIME, loop_state.BY_STATE]] = self.sudden
         self.narrow = narrow or plan.unseen == 1.0
-        self.crossings: list[list[tuple[float, Array]]] = []  # states before and behind steps across singular positions
-        self.lengths: list[float] = []  # of steps across such a position that are still to be tried
+        self.crossings: list[list[tuple[float, Array]]] = []  # states before and after steps across singular positions
+        self.lengths: list[float] = []  # step lengths that are still to be tried across such a position
         self.jumps: list[float] = []  # times at which velocities changed as by an impulse
-        self.compared_until = [-np.inf]  # how far callbacks were compared, in this run or an equal one
-        self.region: CheckedRegion | None = None  # where callbacks were compared, if cached integrators share it
-        self.varied_parameters: Array | None = None  # of a run that is made for the parameters of several systems
+        self.compared_until = [-np.inf]  # time up to which callbacks were compared, in this run or an equal one
+        self.region: CheckedRegion | None = None  # shared by cached integrators: callbacks were compared there
+        self.varied_parameters: Array | None = None  # parameters of a run that is used for several systems
         self._begin()
         self.rank = len(self.work.rows_v)
-        self.said: dict[tuple[int, ...], str] = {}  # of redundant rows, at the first start of this run where they are
+        self.said: dict[tuple[int, ...], str] = {}  # descriptions of redundant rows, made when first needed
         self.redundant, self.rows_warning = self.redundant_rows()
         self.start_warning = self._start_warning()
 
@@ -126,9 +126,9 @@ class Run:
         return other
 
     def at(self, t0: float, q0: Array, v0: Array) -> "Run | None":
-        """Copy this run for another start of equal ranks of C_q; None if these differ, or it cannot begin there.
+        """Copy this run for another start with equal ranks of C_q; None if these differ, or it cannot begin there.
 
-        Not of the static form.
+        Runs in the static form cannot be copied like this.
         """
         other = self._copy()
         other.t0, other.compared_until = t0, [-np.inf]
@@ -143,7 +143,7 @@ class Run:
         return other
 
     def restart(self, t: float, q: Array, v: Array) -> int:
-        """Begin at a state, with a method that remembers nothing; the code of the accelerations there."""
+        """Begin at a state, with a method that remembers no steps; return the code of the accelerations there."""
         n, state = self.system.n_q, self.state
         state[:n], state[n : 2 * n], state[2 * n :] = q, v, 0.0
         self.plan.memory[:] = self.memory
@@ -152,7 +152,7 @@ class Run:
         return code
 
     def _set_clock(self, t: float) -> None:
-        """Put the clock to the start of a run at t."""
+        """Set the clock to the start of a run at t."""
         a, clock = self.a, self.clock
         clock[:] = 0.0
         clock[a.T] = clock[a.T_START] = t
@@ -208,7 +208,7 @@ class Run:
             crossings=[],
             jumps=[],
         )
-        if self.static is None and self.kit.flags[indices.FORM] == indices.AUGMENTED:  # which a run may change
+        if self.static is None and self.kit.flags[indices.FORM] == indices.AUGMENTED:  # a run may change these flags
             other.kit = kit_with(self.system, self.kit.flags, other.plan)
             other.functions = other.kit.functions
         return other
@@ -219,7 +219,7 @@ class Run:
         return self.plan.lands or self.control[self.a.FIXED_STEP] > 0.0
 
     def control_by(self, plan: Plan) -> None:
-        """Step-size control as a plan wants it."""
+        """Set the step-size control of a plan."""
         a, control = self.a, self.control
         control[: a.N_RULE] = plan.rule
         control[a.LIMIT_START], control[a.LIMIT_FACTOR] = plan.limit_start, plan.limit_factor
@@ -231,7 +231,7 @@ class Run:
         self.clock[a.H_LIMIT] = plan.limit_start
 
     def _workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
-        """Make the workspace for ranks of C_q and of all rows; without them for full ones."""
+        """Create the workspace for ranks of C_q and of all rows; None: full rank."""
         q0 = self.state[: self.system.n_q]
         pattern = self._pattern(q0) if self.static is None else NONE
         ranks = rank, rank_v
@@ -240,12 +240,12 @@ class Run:
         return work
 
     def _pattern(self, q: Array) -> Array:
-        """Return where the rows of the constraints have entries."""
+        """Return the pattern of the entries of the constraint rows."""
         system, t0 = self.system, self.t0
         return system.remembered_at("pattern", (t0, q.tobytes()), lambda: pattern_of(system, t0, q))  # type: ignore[no-any-return]
 
     def is_lost_without_dense(self, code: int) -> bool:
-        """Return whether the static form found no step, however short, and others may."""
+        """Return whether the static form found no step, however short, though other forms may find one."""
         reasons = (indices.INNER_DIVERGED, indices.SINGULAR, indices.MASS_NOT_DEFINITE)
         return (
             self.static is not None
@@ -254,9 +254,9 @@ class Run:
         )
 
     def change_form(self) -> None:
-        """Go on with Newton's matrices in the static form where they are due, else with the forms of saddle_point.py.
+        """Change the form of the linear algebra, at the current state.
 
-        At the state there is.
+        Add Newton's matrices to the static form if they are due, else use the forms of saddle_point.py.
         """
         n = self.system.n_q
         before, largest = self.work, float(self.clock[self.a.LARGEST_PIVOT])
@@ -280,10 +280,10 @@ class Run:
             clock[a.FAILURE_CODE] = indices.DONE
         state = self.state.copy()
         code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
-        if code == indices.RANK_DIFFERS:  # as it does where a start at which rows depend on one another was left
+        if code == indices.RANK_DIFFERS:  # happens after a start at which rows depend on one another
             self.work.notes[indices.GENERATION] = 1.0
             code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
-        if before.notes[indices.PIVOT] > 0.0 and largest > 0.0:  # as if it had been looked at in this way all along
+        if before.notes[indices.PIVOT] > 0.0 and largest > 0.0:  # as if this form had measured all pivots so far
             pivot = self.work.notes[indices.PIVOT]
             self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest / before.notes[indices.PIVOT])
 
@@ -307,7 +307,7 @@ class Run:
             self.system.made["ranks"] = ranks = int(self.work.notes[indices.RANK]), int(self.work.notes[indices.RANK_V])
             self.work = self._workspace(*ranks)
             code = start(self.kit, self.work, self.t0, self.state)
-        if code == indices.GAMMA_INACCURATE:  # the first step says so, too, and that run has a result
+        if code == indices.GAMMA_INACCURATE:  # the first step reports it, too, and then the run has a result
             required = self.work.notes[indices.GAMMA_REQUIRED]
             self.work.notes[indices.GAMMA_REQUIRED] = np.inf
             code = start(self.kit, self.work, self.t0, self.state)
@@ -331,7 +331,7 @@ class Run:
         )
 
     def redundant_rows(self, rows: Rows | None = None) -> tuple[NDArray[np.int64], str]:
-        """Find rows of C_q and A at the start that depend on others, and describe them; `rows`: if these are known."""
+        """Return the rows of C_q and A at the start that depend on others, and describe them; `rows`: if known."""
         n_rows = self.system.n_c + self.system.n_a
         if self.rank == n_rows:
             return np.zeros(0, dtype=np.int64), ""
@@ -353,30 +353,30 @@ class Run:
         return np.array(redundant), self.said[found]
 
     def _start_warning(self) -> str:
-        """Describe a start beside a singular position, where pivots are small: those of static factors vary."""
+        """Describe a start beside a singular position, where pivots are small; those of static factors vary more."""
         if self.work.notes[indices.PIVOT] > (MARGIN * WEAK if self.static is None else LEAST):
             return ""
         atol, q = self.tolerances[indices.ATOL :], self.state[: self.system.n_q]
         return describe_singular_start(self.system, self.t0, q, self.rank, self.rtol, atol)
 
     def contradicting(self, rows: Rows) -> NDArray[np.int64]:
-        """Find rows of C_q and A at the start that depend on others and with which the accelerations disagree."""
+        """Return the rows of C_q and A at the start that depend on others and disagree with the accelerations."""
         n = self.system.n_q
         a, gamma = self.state[2 * n : 3 * n], self.work.Gamma
         off = np.abs(rows @ a - gamma)
-        if off.max() <= CONTRADICTS:  # the least that is allowed
+        if off.max() <= CONTRADICTS:  # no row has a smaller tolerance
             return np.zeros(0, dtype=np.int64)
         return np.flatnonzero(off > CONTRADICTS * np.maximum(abs(rows) @ np.abs(a) + np.abs(gamma), 1.0))
 
     def _rows(self) -> Rows:
-        """C_q and A at the start."""
+        """Return C_q and A at the start."""
         system, q = self.system, self.state[: self.system.n_q]
         if system.called_in_python or system.entries:
             return system.sparse_rows(self.t0, q)
         return mass_and_rows(system, self.t0, q)[1]
 
     def _in_words(self, all_rows: Rows, rows: list[int]) -> str:
-        """Describe which rows depend on which others; the factors of the static form give the shares of the first."""
+        """Describe which rows depend on which others; factors of the static form give coefficients of the first."""
         if not isinstance(all_rows, SparseRows):
             return in_words(all_rows, rows)
         q, counted = self.state[: self.system.n_q], self.work.rows_v.tolist()
@@ -397,29 +397,29 @@ class Run:
         self.control[self.a.SHORTEST] = cached_run().SHORTEST_STEP * first
 
     def limit_steps(self) -> None:
-        """Let no step pass over a hundredth of the run without an evaluation.
+        """Limit the steps: none may pass over a hundredth of the run without an evaluation.
 
-        Where something may be narrow, one stage that meets it may say too little: no step is longer then.
+        If a force may be short, one stage that meets it may not show it: then no step is longer than that.
         """
         unseen = 1.0 if self.narrow else self.plan.unseen
         longest = np.inf if self.plan.looks_within else self.tolerances[indices.GAP] / unseen
         self.control[self.a.MAX_STEP], self.control[self.a.MAX_EVALUATION_GAP] = min(self.max_step, longest), unseen
 
     def first_step(self, t: float, t1: float, state: Array, longest: float = 0.0) -> float:
-        """Return the first step from a state, s. With a longest one, let no step skip a hundredth of the run."""
+        """Return the first step from a state, s; with `longest`, also bound all steps by a hundredth of the run."""
         numbers = self.system.n_q, t, t1, self.least_atol, longest, self.plan.looks_within
         first: float = entry_point(cached_run().set_sizes)(self.control, self.tolerances, state, *numbers)
         return first
 
     def defect(self) -> float | None:
-        """Return the largest defect of the steps, if all of them found theirs."""
+        """Return the largest defect of the steps, or None if it is not known for all of them."""
         notes = self.work.notes
         checked = self.work.counters[indices.N_ACCEPTED] > 0 and notes[indices.UNCHECKED] == 0.0
         return float(notes[indices.LARGEST_DEFECT]) if checked else None
 
     def passed_near_singular(self) -> bool:
-        """Return whether steps had to end so near a singular position that rounding may have made velocities."""
-        near = self.near if self.static is None else LEAST  # pivots of static factors vary more, and a look takes long
+        """Return whether steps had to end so near a singular position that rounding may have changed velocities."""
+        near = self.near if self.static is None else LEAST  # pivots of static factors vary more, and a check takes long
         return bool(self.clock[self.a.PIVOT_AT_OUTPUT] < near)
 
     def attempts(self) -> int:

@@ -1,4 +1,4 @@
-"""A run that stops at every sample of a controller, where parameters may change, without checks on the way."""
+"""Run that stops at every sample of a controller, where parameters may change; no checks are made along the way."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from twoloop.run.run import Run
 
 Array = NDArray[np.float64]
 
-STEPS = 1024  # in one call of the compiled loop
+STEPS = 1024  # number of steps that one call of the compiled loop may take
 FORCES = {"force", "force_by_q", "force_by_v"}
 CHANGED = "the parameters changed at samples"
 
 
 class SampledState(NamedTuple):
-    """The state at the end of a sample: t, s, and q, v, a (n_q,), lam (n_c + n_a,); read-only.
+    """State at the end of a sample: t, s, and q, v, a (n_q,), lam (n_c + n_a,); read-only.
 
     Examples
     --------
@@ -59,7 +59,7 @@ class SampledState(NamedTuple):
 
 
 class SampledRun:
-    """Integrate from sample to sample.
+    """Integration from sample to sample with parameters that may change.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ class SampledRun:
     Raises
     ------
     TypeError, ValueError
-        If the start is refused, or the method is a Taylor series, which is made for given parameters.
+        If the start is refused, or the method is a Taylor series, whose code holds for given parameters only.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class SampledRun:
         def check(traced: Traced) -> None:
             traced.refuse(system, t0, t0 + 1.0, q0, v0)
 
-        self._derived, _ = with_derived_callbacks(system, check)  # by what inputs must not enter
+        self._derived, _ = with_derived_callbacks(system, check)  # its derivatives show what inputs must not enter
         self._plan = method.plan(system.n_q, rtol, float(atol.min()), False)
         self.system, self.method, self.max_step, self.t0 = system, method, max_step, t0
         self._tolerances = rtol, atol
@@ -109,28 +109,28 @@ class SampledRun:
         if self.run.start_warning:
             warn_user(self.run.start_warning)
         self.p = system.functions.p[system.called_in_python :]
-        self._free: set[int] = set()  # places of parameters that are known to enter forces alone
+        self._free: set[int] = set()  # indices of parameters that were checked to enter forces alone
         self._changed = self._failed = False
         self._outputs, self._filled = np.zeros(1), np.zeros(2, dtype=np.int64)
         self._buffers = np.empty(1), np.empty((1, len(self.run.state))), np.empty((STEPS, self.run.a.N_STEP_COLUMNS))
         self.rows, self.times, self.steps = list[Array](), list[float](), list[Array]()
-        self.cpu, self._every = 0.0, np.inf  # s between two looks, where a sample has met what is short
+        self.cpu, self._every = 0.0, np.inf  # time between evaluations, s; finite once a sample has met a short change
         self._note(t0)
 
     def _run_from(self, t: float, q: Array, v: Array) -> Run:
         run = Run(self._derived, self._plan.fresh(), t, q, v, *self._tolerances, None)
-        run.work.notes[indices.GENERATION] = 1.0  # the ranks are known
+        run.work.notes[indices.GENERATION] = 1.0  # GENERATION 1: the ranks are known
         run.set_sizes(None, self.max_step, t + 1.0)
         run.control[run.a.STORE_ALL] = 0.0
         return run
 
     @property
     def t(self) -> float:
-        """Where it is, s."""
+        """Time of the last sample, s."""
         return self.times[-1]
 
     def set(self, inputs: Any) -> None:
-        """Take other parameters: a mapping from places to numbers, or all of them."""
+        """Set other parameters: a mapping from their indices to numbers, or all of them."""
         if not self.p.size:
             raise ValueError(f"inputs are parameters, of which {self.system.name!r} has none: make it with parameters=")
         if isinstance(inputs, Mapping):
@@ -154,17 +154,17 @@ class SampledRun:
             self._write(place, float(values[place]))
 
     def step(self, dt: float) -> SampledState:
-        """Go on by dt, and note the state there; after a failure, from the last sample."""
+        """Integrate by dt, and keep the state there; after a failure, continue from the last sample."""
         if self._failed:
             self._return()
         end, began = self.times[-1] + dt, time.process_time()
-        self._failed = True  # until it is at its end: a callback may raise, too
+        self._failed = True  # until the end is reached, as a callback may raise
         for left in range(MOST, -1, -1):
             self._go_to(end)
             run = self.run
             if left == 0 or not may_have_missed_changes(run):
                 break
-            if len(self.times) > 1:  # samples before may have missed something, and are not made again
+            if len(self.times) > 1:  # earlier samples may have missed something, and are not repeated
                 warn_of_missed_changes(run)
             self._every = closer(run)
             self._return()
@@ -175,10 +175,10 @@ class SampledRun:
         return self.state
 
     def _go_to(self, end: float) -> None:
-        """Steps from the last sample to the end of the next one."""
+        """Integrate from the last sample to the end of the next one."""
         run, a, clock = self.run, self.run.a, self.run.clock
         t = self.times[-1]
-        if self._changed or self.system.called_in_python:  # what such functions find in their surroundings may change
+        if self._changed or self.system.called_in_python:  # global variables of Python functions may change
             self._begin_anew(t)
         run.first_step(self.t0, end, run.state, run.max_step)
         run.control[a.APART] = min(self._every, run.control[a.APART])
@@ -193,7 +193,7 @@ class SampledRun:
 
     @property
     def state(self) -> SampledState:
-        """The state at the end of the last sample."""
+        """State at the end of the last sample."""
         row, n = self.rows[-1], self.run.system.n_q
         return SampledState(self.times[-1], row[:n], row[n : 2 * n], row[2 * n : 3 * n], row[3 * n :])
 
@@ -225,11 +225,11 @@ class SampledRun:
         )
 
     def _begin_anew(self, t: float) -> None:
-        """Find accelerations with other parameters, and let the method forget the motion before."""
+        """Compute the accelerations with the new parameters, and let the method forget the motion before."""
         run, a = self.run, self.run.a
         code = entry_point(run.kernels.start)(run.kit, run.work, t, run.state)
         first = 0
-        if run.plan.first is not None:  # of a pair it is kept which of the two is at work
+        if run.plan.first is not None:  # for a pair of methods: remember which one is active
             from twoloop.kernels.control.stiffness import N_SCALARS
 
             first = N_SCALARS + 2 * run.system.n_q
@@ -243,7 +243,7 @@ class SampledRun:
         self._changed = False
 
     def _return(self) -> None:
-        """Go back to the last sample: the run stands where it failed, with whatever it tried there."""
+        """Go back to the last sample: the run is where it failed, with the arrays that it left there."""
         before, n = self.run, self.system.n_q
         try:
             self.run = self._run_from(self.t, self.rows[-1][:n], self.rows[-1][n : 2 * n])
@@ -254,7 +254,7 @@ class SampledRun:
         self._changed = False
 
     def _finish_by_loop(self, end: float) -> None:
-        """Go on where one call of the compiled loop did not come to the end: many steps, a jump, or a failure."""
+        """Continue if one call of the compiled loop did not reach the end: many steps, a jump, or a failure."""
         run = self.run
         run.t0, run.start_warning = float(run.clock[run.a.T]), ""
         wanted = OutputRequest(np.array([end]), True, False, None, MemoryStore())
@@ -277,7 +277,7 @@ class SampledRun:
         self._changed = True
 
     def _check_free(self, place: int, value: float) -> None:
-        """Refuse an input that is more than a force: with it the state would jump."""
+        """Refuse an input that enters more than forces: with it the state would jump."""
         before, n = float(self.p[place]), self.system.n_q
         t, row = self.times[-1], self.rows[-1]
         known = {"q": row[:n], "v": row[n : 2 * n]}

@@ -1,7 +1,8 @@
-"""Describe singular positions: where steps crossed them, and what rounding and the tolerances leave open near them.
+"""Description of singular positions: where steps crossed them, and what rounding and tolerances leave open near them.
 
-Near them the constraints hold positions only to rounding over the smallest singular value s, along the direction d that
-they hold least. Over such a way they change, and with them the velocities, which are divided by s again.
+Near such a position the constraints hold q only to rounding over the smallest singular value s, along the direction d
+that they hold least. Over this distance the constraints change, and with them the velocities, which are divided by s
+again.
 """
 
 from collections.abc import Callable, Iterator
@@ -18,17 +19,17 @@ Array = NDArray[np.float64]
 Place = tuple[float, Array]  # time and state [q, v, ...]
 Ratio = Callable[[ConstrainedSystem, float, Array, int], float]
 
-LOST = 1e-2  # smallest over largest singular value, below which constraints are said to lose rank
-SAMPLES = 33  # of the motion across
-SHOWN = 3  # places of which a message speaks
-DIFFERENCE = 1e-6  # relative: length of the way on which gamma is found by differences
-SHORT = 0.1  # of what rows become where they turn as others do: those that are shorter are so by their position
-TURNED = 3.0  # of what the accelerations before and behind give: velocities that changed by more turned in between ...
-APPARENT = 10.0  # ... which counts where it exceeds the tolerances so many times
+LOST = 1e-2  # smallest over largest singular value, below which messages say that constraints lose rank
+SAMPLES = 33  # positions between two states at which the ratio is evaluated
+SHOWN = 3  # number of places that a message names
+DIFFERENCE = 1e-6  # relative length of the displacement for differences (gamma, and derivatives of the rows)
+SHORT = 0.1  # relative to the length of a row if it turned as others do: shorter rows are short by their position
+TURNED = 3.0  # times the change that accelerations explain: velocities that changed by more turned in between ...
+APPARENT = 10.0  # ... which counts if it exceeds the tolerances so many times
 
 
 def describe_crossings(system: ConstrainedSystem, crossings: list[list[Place]], now: Place, rank: int) -> str:
-    """Describe where steps went across, from the states before and, if the run came so far, behind."""
+    """Describe where steps went across, from the states before and, if the run came so far, after each place."""
     found = {ends[0][0]: _least_ratio(system, ends[0], [*ends, now][1], rank) for ends in crossings[:SHOWN]}
     lost = {t: ratio for t, ratio in found.items() if ratio < LOST}
     others = {t: ratio for t, ratio in found.items() if ratio >= LOST}
@@ -47,7 +48,7 @@ def describe_crossings(system: ConstrainedSystem, crossings: list[list[Place]], 
 
 
 def singular_ratio(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
-    """Smallest over largest singular value of as many rows as count; 1 where there are none."""
+    """Return the smallest over the largest singular value of the `rank` independent rows; 1 if there are none."""
     values = np.linalg.svd(system.rows(t, q), compute_uv=False)[:rank]
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
 
@@ -59,7 +60,7 @@ def _least_ratio(
     n, (t0, first), (t1, last) = system.n_q, before, behind
     if t1 == t0:
         return ratio(system, t0, first[:n], rank)
-    from scipy.interpolate import CubicHermiteSpline  # takes a tenth of a second to import, and few runs need it
+    from scipy.interpolate import CubicHermiteSpline  # imports for a tenth of a second, and few runs need it
 
     way = CubicHermiteSpline([t0, t1], [first[:n], last[:n]], [first[n : 2 * n], last[n : 2 * n]])
     return min(ratio(system, float(t), way(t), rank) for t in np.linspace(t0, t1, SAMPLES))
@@ -68,9 +69,9 @@ def _least_ratio(
 def describe_turn(
     system: ConstrainedSystem, crossings: list[list[Place]], now: Place, rank: int, rtol: float, atol: Array
 ) -> str:
-    """Describe where velocities turned by more than accelerations explain; nothing if they did so nowhere.
+    """Describe where velocities turned by more than accelerations explain; return nothing if they did so nowhere.
 
-    Positions within the tolerance are near other branches of the motion there, onto which steps may have come.
+    At such a place other branches of the motion are within the tolerance, and steps may have come onto one of them.
     """
     n = system.n_q
     for (t0, first), (t1, last), across in _passages(crossings, now):
@@ -80,7 +81,7 @@ def describe_turn(
         if not (turn > np.maximum(APPARENT * (atol + rtol * speeds), TURNED * (t1 - t0) * least)).any():
             continue
         near = min(LOST, np.sqrt(rtol + float(atol.max()) / size)) if size > 0.0 else LOST
-        # where no step led across, the run's own steps may have gone on to anywhere
+        # if no step led across, the run's own steps may have followed any branch: evaluate the last state only
         here, there = (t0, first), (t1, last)
         ratio = _least_ratio(system, here if across else there, there, rank, ratio_in_any_units)
         if ratio >= near:
@@ -100,7 +101,7 @@ def describe_turn(
 
 def turned_last(times: Array, rows: Array, n: int) -> bool:
     """Return whether velocities of the last two states [q, v, a] differ by more than their accelerations give."""
-    most = np.maximum.reduce  # a method max of arrays takes three calls, and repeated runs few more
+    most = np.maximum.reduce  # the method max of arrays makes three calls, which short repeated runs would notice
     if times.size < 2:
         return False
     turn = most(np.abs(rows[-1, n : 2 * n] - rows[-2, n : 2 * n]))
@@ -109,7 +110,7 @@ def turned_last(times: Array, rows: Array, n: int) -> bool:
 
 
 def _passages(crossings: list[list[Place]], now: Place) -> Iterator[tuple[Place, Place, bool]]:
-    """The states before and behind each passage, and whether steps led across; one may take several crossings."""
+    """Yield the states before and after each passage, and whether steps led across; one may take several crossings."""
     before: Place | None = None
     for first, *behind in crossings:
         before = first if before is None else before
@@ -129,7 +130,7 @@ def _v(n: int) -> slice:
 
 
 def _known_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array, near: float) -> float:
-    """The largest acceleration without what rows give whose singular values are below this share of the largest."""
+    """Return the largest acceleration without the rows whose singular values are below `near` times the largest."""
     mass, rows, lengths, units = _in_any_units(system, t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     kept = values > near * values[0]
@@ -142,15 +143,15 @@ def _known_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array,
 
 
 def ratio_in_any_units(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
-    """As `singular_ratio`, but independent of the units of coordinates and rows."""
+    """Return the ratio of `singular_ratio`, but independent of the units of coordinates and rows."""
     values = np.linalg.svd(_in_any_units(system, t, q)[1], compute_uv=False)[:rank]
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
 
 
 def _in_any_units(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
-    """Mass and rows with coordinates in which each has a mass of one, lengths of these rows, and units of the former.
+    """Return mass and rows in coordinates in which each has a mass of one, lengths of these rows, and units.
 
-    The rows are divided by their lengths, or by what these are some way off where they are short by the position.
+    The rows are divided by their lengths, or by their lengths some way off if they are short at this position only.
     """
     mass, rows = system.mass(t, q), system.rows(t, q)
     inertia = np.abs(np.diagonal(mass))
@@ -159,9 +160,9 @@ def _in_any_units(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array,
     way = DIFFERENCE * max(np.abs(q).max(), DIFFERENCE) * units / units.max() * signs(len(q))
     try:
         bends = np.linalg.norm((system.rows(t, q + way) - system.rows(t, q - way)) * units, axis=1)
-    except (ArithmeticError, ValueError):  # as a root does beyond a dead centre
+    except (ArithmeticError, ValueError):  # a square root, for example, fails beyond a dead centre
         bends = np.zeros(len(rows))
-    if bends.max(initial=0.0) > 0.0:  # not NaN
+    if bends.max(initial=0.0) > 0.0:  # false for NaN
         lengths = np.maximum(lengths, SHORT * lengths.max() * bends / bends.max())
     lengths[lengths == 0.0] = 1.0
     return mass * units * units[:, None], rows * units / lengths[:, None], lengths, units
@@ -178,8 +179,8 @@ def _measured(found: dict[float, float]) -> str:
 
 
 ROUNDING = 0.5 * float(np.finfo(np.float64).eps)
-WEAK = 1e-2  # of the largest singular value: directions that are looked at
-LEAST, MARGIN = 1e-5, 30.0  # of pivots that are looked at more closely, and how many times the singular values they are
+WEAK = 1e-2  # relative to the largest singular value: directions below it are examined
+LEAST, MARGIN = 1e-5, 30.0  # ratio of pivots below which they are always checked; factor from singular values to pivots
 
 
 def singular_threshold(rtol: float) -> float:
@@ -188,7 +189,7 @@ def singular_threshold(rtol: float) -> float:
 
 
 def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: Array, rank: int) -> Array:
-    """Estimate the errors of velocities by rounding of positions, (n_q,); NaN where callbacks fail near q."""
+    """Estimate the errors of velocities caused by rounding of positions, (n_q,); NaN if callbacks fail near q."""
     rows = system.rows(t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     errors = np.zeros(len(q))
@@ -202,9 +203,9 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
         try:
             turn = np.subtract(*(system.velocity_constraint(t, each, v) for each in beside)) / (2.0 * step)
             bend = np.abs(np.subtract(*(system.rows(t, each) for each in beside)))
-        except (ArithmeticError, ValueError):  # as a root does beyond a dead centre
+        except (ArithmeticError, ValueError):  # a square root, for example, fails beyond a dead centre
             return np.full(len(q), np.nan)
-        # rows that are short here are so by their position: a constraint is rounded as it would be some way off
+        # rows may be short at this position only: scale the rounding error of a constraint by its rows some way off
         away = np.abs(rows) + (bend * (np.abs(rows).max() / bend.max()) if bend.any() else 0.0)
         rounding = ROUNDING * np.sqrt((away * away) @ (q * q))
         errors = np.maximum(errors, np.abs(way * (u @ turn)) * np.sqrt((u * u) @ (rounding * rounding)) / value**2)
@@ -212,7 +213,7 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
 
 
 def describe_singular_start(system: ConstrainedSystem, t: float, q: Array, rank: int, rtol: float, atol: Array) -> str:
-    """Describe a start from which the tolerances reach to where the constraints lose rank; nothing elsewhere."""
+    """Describe a start that the tolerances do not distinguish from a singular position; return nothing elsewhere."""
     if rank == 0 or surely_above(WEAK, system.rows(t, q), rank):
         return ""
     ratio = singular_ratio(system, t, q, rank)
@@ -230,9 +231,9 @@ def describe_singular_start(system: ConstrainedSystem, t: float, q: Array, rank:
 
 
 def _way_to_singular(system: ConstrainedSystem, t: float, q: Array, rank: int) -> Array:
-    """To where the smallest singular value is zero, (n_q,), to first order; not finite where nothing leads there.
+    """Estimate the way to the nearest singular position, (n_q,), to first order; not finite if there is no such way.
 
-    Along what the constraints allow, with what they hold least.
+    It is the one, among those that the other constraints allow, along which the smallest singular value changes most.
     """
     left, values, right = np.linalg.svd(system.rows(t, q))
     u, w, held = left[:, rank - 1], right[rank - 1], right[: rank - 1]
@@ -240,7 +241,7 @@ def _way_to_singular(system: ConstrainedSystem, t: float, q: Array, rank: int) -
     for j, way in enumerate(np.eye(len(q)) * step):
         try:
             gradient[j] = u @ (system.rows(t, q + way) - system.rows(t, q - way)) @ w / (2.0 * step)
-        except (ArithmeticError, ValueError):  # as a root does beyond a dead centre
+        except (ArithmeticError, ValueError):  # a square root, for example, fails beyond a dead centre
             return np.full(len(q), np.nan)
     gradient -= held.T @ (held @ gradient)
     with np.errstate(divide="ignore", invalid="ignore"):

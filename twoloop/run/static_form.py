@@ -1,4 +1,4 @@
-"""Decide whether a run may use the static form, for large systems, and find where the entries of its matrices are."""
+"""Static form of large systems: decide whether a run may use it, and find the entries of its matrices."""
 
 from typing import Any, NamedTuple
 
@@ -22,8 +22,8 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-DISPLACED = 1e-3  # relative to max(1, |value|): coordinates and velocities, to see what they change
-NEWTON_SPARSE = 0.2  # of the multiplications of dense factors: a program with more of them is not worth its indices
+DISPLACED = 1e-3  # relative to max(1, |value|): displacement of coordinates and velocities, to see what depends on them
+NEWTON_SPARSE = 0.2  # share of the entries and operations of dense factors above which a program does not pay
 
 
 def newton_form(
@@ -35,9 +35,9 @@ def newton_form(
     together: list[tuple[int, ...]],
     stiff: list[int],
 ) -> tuple[NDArray[np.int32], int] | None:
-    """Make the program of Newton's matrix, see sparse_lu.py, and count the groups of columns that are differenced.
+    """Create the program of Newton's matrix, see sparse_lu.py, and count the groups of columns that are differenced.
 
-    None where it is not sparse, or cannot be found.
+    Return None if the matrix is not sparse, or has no program.
     """
     found: set[tuple[int, int]] = set()
     rng = np.random.default_rng(9)
@@ -47,7 +47,7 @@ def newton_form(
         q = q0 + share * size * rng.uniform(-1.0, 1.0, system.n_q)
         try:
             found |= _entries(system, t0, q, rng.uniform(-1.0, 1.0, system.n_q), lam, most)
-        except Exception:  # outside what the callbacks are made for; what is missed is found on the way
+        except Exception:  # outside the domain of the callbacks; missed entries are found during the run
             continue
         if len(found) > most:
             return None
@@ -60,7 +60,7 @@ def newton_form(
 
 
 def _entries(system: ConstrainedSystem, t: float, q: Array, v: Array, lam: Array, most: float) -> set[tuple[int, int]]:
-    """Find where Q - C_q^T lam changes with a coordinate, and Q with a velocity, and the same mirrored."""
+    """Find the entries of the derivatives of Q - C_q^T lam by coordinates and of Q by velocities, and their mirrors."""
 
     def reaction(q: Array) -> Array:
         if "jacobian" not in system.entries:
@@ -84,30 +84,30 @@ def _entries(system: ConstrainedSystem, t: float, q: Array, v: Array, lam: Array
 
 
 SINGULAR = 1e-10  # smallest over largest eigenvalue of a body's M, below which it counts as singular
-ALONG = 1e-3  # of a row: more of it has to lie along directions without mass if it is to stiffen these
-NEWTON = 1.6  # times LARGE: coordinates from which on Newton's matrices are sparse
-SPARSE = 0.05  # of the multiplications of dense factors: a program with more of them is not worth its indices
+ALONG = 1e-3  # relative to a row: smallest part along directions without mass with which the row stiffens these
+NEWTON = 1.6  # times LARGE: number of coordinates from which on Newton's matrices are sparse
+SPARSE = 0.05  # share of the entries and operations of dense factors above which a program does not pay for its indices
 
 
 class StaticForm(NamedTuple):
-    """Hold the program of a system, and what a workspace for it needs."""
+    """Program of the static form of a system, and what a workspace for it needs."""
 
     program: NDArray[np.int32]
     static: Static
     mass: Entries
-    pattern: Array  # of a dense Jacobian, (n_c, n_q), 1 where it has entries; of no size beside jacobian_values
-    mass_pattern: Array  # of a dense M that is not constant, likewise
-    known: tuple[Any, ...]  # of what a program of Newton's matrix is made besides
-    newton: NDArray[np.int32] | None = None  # that program, once it is asked for
-    n_groups: int = 0  # of columns, for each of which Newton's matrix takes displaced forces
+    pattern: Array  # pattern of a dense Jacobian, (n_c, n_q), 1 at its entries; empty with jacobian_values
+    mass_pattern: Array  # pattern of a dense M that is not constant, likewise
+    known: tuple[Any, ...]  # further arguments of `newton_form`
+    newton: NDArray[np.int32] | None = None  # program of Newton's matrix, once it is needed
+    n_groups: int = 0  # number of groups of columns, for each of which Newton's matrix takes displaced forces
 
     def matrix_cost(self) -> float:
-        """What Newton's matrix and its factors cost, in evaluations of accelerations, about."""
+        """Estimate the cost of Newton's matrix and its factors, in evaluations of accelerations."""
         assert self.newton is not None
         return self.n_groups + float(self.newton[N_UPDATES]) / max(1.0, float(self.program[N_UPDATES]))
 
     def n_matrices(self, matrices: int) -> int:
-        """Numbers of Newton's matrices, of a plan with so many dense ones."""
+        """Return the number of floats of Newton's matrices, for a plan with `matrices` dense ones."""
         from twoloop.kernels.steps.newton_memory import SYSTEMS
         from twoloop.kernels.steps.newton_systems import matrices_size
 
@@ -118,7 +118,7 @@ class StaticForm(NamedTuple):
 
 
 def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -> StaticForm | None:
-    """Make the static form of a system for runs by these plans; None where it does not serve, or would not pay."""
+    """Create the static form of a system for runs by these plans; None if it does not serve them, or would not pay."""
     if system.n_q < LARGE or system.n_c == 0 or system.n_a > 0 or system.bandwidth is not None:
         return None
     known = "gamma" in system.given or system.functions.gamma_program.size > 0
@@ -131,7 +131,7 @@ def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -
 
 
 def with_newton(system: ConstrainedSystem, t0: float, q0: Array, form: StaticForm) -> StaticForm | None:
-    """Add the program of Newton's matrix; None where there is none, or would not pay."""
+    """Add the program of Newton's matrix; return None if there is none, or it would not pay."""
     if system.n_q < NEWTON * LARGE:
         return None
     made = system.remembered("newton form", lambda: newton_form(system, t0, q0, *form.known))
@@ -165,9 +165,9 @@ def _made(system: ConstrainedSystem, t0: float, q0: Array) -> StaticForm | None:
 
 
 def _together(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]:
-    """Coordinates of one body each: those that joints act on, and all others that are laid out as these, in space.
+    """Return the coordinates of each body: those that joints act on, and all others that are laid out alike, in space.
 
-    A joint names one of its bodies, so that the end of a chain may be in none.
+    A joint names only one of its bodies, so that no joint may name the body at the end of a chain.
     """
     named = [joint.translation + joint.rotation for joint in system.joints]
     layouts = {tuple(j - own[0] for j in own) for own in named}
@@ -181,9 +181,9 @@ def _together(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]
 def _stiff_rows(
     system: ConstrainedSystem, t0: float, q0: Array, mass: Entries, jacobian: Entries, together: list[tuple[int, ...]]
 ) -> list[int]:
-    """Find rows of single bodies that M is singular along, with no entry but where M has some: see sparse_ldl.py.
+    """Find rows of single bodies that M is singular along, with entries only where M has some: see sparse_ldl.py.
 
-    No more than make it definite: others, as of a hinge on the ground, hold the body as joints do.
+    Return no more than make M definite: other such rows, as of a hinge on the ground, are treated like joints.
     """
     values = system.mass_values(t0, q0) if "mass" in system.entries else system.mass(t0, q0)[mass]
     body_of = np.array(bodies_of(system.n_q, mass, together))
@@ -218,7 +218,7 @@ def _stiff_rows(
 
 
 def _without_mass(block: Array) -> Array:
-    """Directions along which a body's M is singular, one a row."""
+    """Return the directions along which a body's M is singular, one per row."""
     if not np.isfinite(block).all():
         return np.eye(len(block))
     values, ways = np.linalg.eigh(block)
@@ -226,12 +226,12 @@ def _without_mass(block: Array) -> Array:
 
 
 def _is_sparse(n_q: int, n_entries: int) -> bool:
-    """Return whether there are so few entries that it is worth while to look for an order."""
+    """Return whether there are so few entries that it pays to search for an elimination order."""
     return n_entries <= SPARSE * n_q * n_q + 24 * n_q
 
 
 def _dense_work(n_q: int, n_c: int) -> float:
-    """Multiplications of one evaluation by Schur's complement, about."""
+    """Estimate the multiplications of one evaluation by Schur's complement."""
     return 0.5 * n_c * n_c * (n_q + n_c / 3.0)
 
 
@@ -241,14 +241,14 @@ def _places(pattern: Array) -> Entries:
 
 
 def _mass_pattern(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
-    """1 where M has an entry at a position or, if it is not constant, near it."""
+    """Return a matrix with 1 where M has an entry at a position or, if M is not constant, near it."""
     found = np.zeros((system.n_q, system.n_q))
     size = np.maximum(np.abs(q0), np.abs(q0).max())
     ways = np.random.default_rng(5).uniform(-1.0, 1.0, (len(NEARBY), system.n_q))
     for share, way in zip(NEARBY[:1] if system.constant_mass else NEARBY, ways, strict=False):
         try:
             mass = system.mass(t0, q0 + share * size * way)
-        except Exception:  # outside what the callbacks are made for; what is missed is found on the way
+        except Exception:  # outside the domain of the callbacks; missed entries are found during the run
             continue
         found[(mass != 0.0) | (mass.T != 0.0)] = 1.0
     return found

@@ -1,4 +1,4 @@
-"""What every use of the kernels needs of a system: its callbacks with flags, and a workspace."""
+"""Kits and workspaces: the callbacks of a system with flags, and the arrays that all kernels need."""
 
 from typing import Any
 
@@ -31,8 +31,8 @@ from twoloop.run.static_form import StaticForm
 
 Array = NDArray[np.float64]
 
-GAMMA_ACCURACY = 1e-11  # relative; differences of C_q and C_t cannot be asked for more
-MOST_KITS = 16  # that are kept with a system
+GAMMA_ACCURACY = 1e-11  # relative error of gamma below which differences of C_q and C_t cannot come
+MOST_KITS = 16  # largest number of kits that are cached with a system
 
 
 def kit_of(
@@ -51,7 +51,7 @@ def kit_of(
         functions = system.functions
         return Kit(functions._replace(flags=flags.copy()), inner_loop), functions
 
-    if flags[FORM] == AUGMENTED:  # which a run may change
+    if flags[FORM] == AUGMENTED:  # a run may change these flags
         return make()[0]
     made: tuple[Kit, Any] = system.remembered(("general kit", id(system.functions), flags.tobytes()), make)
     return made[0]
@@ -100,25 +100,25 @@ def _flags(system: ConstrainedSystem, t0: float, q0: Array, definite: bool) -> t
 
 
 def sparse_factors_pay(system: ConstrainedSystem, flags: Array) -> bool:
-    """Return whether sparse factors would pay, which need an M with an inverse, or inertia in all that moves."""
+    """Return whether sparse factors would pay; they need an M with an inverse, or inertia in all that moves."""
     return sparse_pays(system.n_q, system.n_c + system.n_a, bool(flags[DIAGONAL_MASS]))
 
 
 def is_diagonal(mass: Array) -> bool:
-    """Return whether M has no entries beside its diagonal."""
+    """Return whether M has no entries outside its diagonal."""
     return np.count_nonzero(mass) == np.count_nonzero(mass.diagonal())
 
 
 def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
-    """Make the kit of these flags and of a plan, which the system keeps for the next run."""
+    """Return the kit of these flags and of a plan, which the system caches for the next run."""
     from twoloop.kernels.evaluation.inner_loop import inner_loop
 
     read = (plan.numbers, plan.own_numbers)
     kept: dict[Any, tuple[Kit, Any]] = system.remembered("kits", dict)
-    # what it names by numbers is held by what is kept
+    # the cached objects keep those alive whose ids are in the key
     called = (plan.inner, plan.step, plan.first, plan.second)
     key = (id(system.functions), flags.tobytes(), *called, len(LOADED), *map(id, (*plan.own, *read)))
-    changes = flags[FORM] == AUGMENTED  # which a run may
+    changes = flags[FORM] == AUGMENTED  # a run may change these flags
     if key in kept:
         return _with_own_flags(kept[key][0]) if changes else kept[key][0]
     flags = flags.copy()
@@ -132,12 +132,12 @@ def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
 
 
 def _steps_of(plan: Plan) -> tuple[Any, Any, Any]:
-    """Return the step that is called, and the two between which it chooses: the second one may stay unused."""
+    """Return the step that is called, and the two between which it chooses; the second is loaded only when needed."""
     return loaded(plan.step), loaded(plan.first), without_loading(plan.second)
 
 
 def _with_own_flags(kit: Kit) -> Kit:
-    """Copy a kit for one run, which takes a tenth of the time that another kit does."""
+    """Copy a kit for one run: this takes a tenth of the time of a new kit."""
     other, flags, table = object.__new__(Kit), kit.flags.copy(), kit.table.copy()
     table[common.KIT.places["flags"]] = flags.ctypes.data
     functions = kit.functions._replace(flags=flags)
@@ -156,9 +156,9 @@ def workspace(
     static: StaticForm | None = None,
     matrices: int = 0,
 ) -> common.Work:
-    """Make a workspace for ranks of C_q and of all rows; without them for full ones. `pattern` is that of all rows.
+    """Create a workspace for ranks of C_q and of all rows (None: full); `pattern` is that of all rows.
 
-    `matrices`: as of a plan.
+    `matrices`: number of dense matrices, as in a plan.
     """
     flags = kit.flags
     reduced, augmented = flags[DENSE_FORM] == NULL_SPACE, flags[FORM] == AUGMENTED
@@ -180,7 +180,7 @@ def prepare_workspace(
     reuse: float,
     static: StaticForm | None = None,
 ) -> common.Work:
-    """Prepare a workspace for a run, whatever the one before has left in it."""
+    """Prepare a workspace for a run, whatever the run before has left in it."""
     given = map(np.ascontiguousarray, (pattern, q0))
     entry_point(cached_run().prepare_workspace)(work, *lasting(work), *given, max(rtol, GAMMA_ACCURACY), reuse)
     if static is not None:
@@ -192,7 +192,7 @@ def prepare_workspace(
 
 
 def _fill(work: common.Work, system: ConstrainedSystem, form: StaticForm, q0: Array) -> None:
-    """Fill in what stays constant in a workspace of the static form."""
+    """Fill in the constant parts of a workspace of the static form."""
     work.pattern[:], work.mass_pattern[:] = form.pattern, form.mass_pattern
     work.dependent[:] = work.independent[:] = np.arange(system.n_q)
     work.counts[:] = 1.0

@@ -38,7 +38,7 @@ def _in_executor(executor: Executor, work: Work, runs: dict[int, Row]) -> Iterat
         for task in as_completed(tasks):
             try:
                 row = task.result()
-            except Exception as error:  # of the cluster: `one_run` raises none
+            except Exception as error:  # raised by the cluster: `one_run` raises none
                 row = failure_row(f"{type(error).__name__}: {error}")
             yield tasks[task], row
     finally:
@@ -74,7 +74,7 @@ def _in_processes(work: Work, runs: dict[int, Row], n_workers: int) -> Iterator[
 
 
 class _Worker:
-    """A process, and the number of the run that it is working on."""
+    """Worker process, and the number of the run that it is working on."""
 
     def __init__(self, work: Work, number: int, run: Row):
         # spawned: a fork of a process with threads may deadlock

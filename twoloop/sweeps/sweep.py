@@ -48,7 +48,7 @@ def sweep(
 ) -> Any:
     """Solve a mechanism for many sets of parameters.
 
-    The first run is made in the calling process: it compiles what is missing once for all workers, and an error in
+    The first run is solved in the calling process: it compiles what is missing once for all workers, and an error in
     `problem_of`, `measure` or `options` is raised at once. Afterwards, a run that fails, or whose process dies, becomes
     a row with the reason.
 
