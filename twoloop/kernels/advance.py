@@ -1,4 +1,4 @@
-"""Many steps with step-size control, until the last output time, a full buffer or a failure.
+"""Advance by many steps with step-size control, until the last output time, a full buffer or a failure.
 
 `advance` knows nothing of the method: the step is the kit's, with its options and its memory.
 """
@@ -61,9 +61,10 @@ from twoloop.kernels.evaluation.inner_loop import (
 from twoloop.kernels.evaluation.partition import CHANGED
 from twoloop.kernels.linalg.dense import copy
 
-UNFORESEEN = 10.0  # an error that is so large was not foreseen: the force jumps, or bends, within the step
-REFUSED = 0.95  # of a refused step is what the next one is at most
-FIRST_JUDGED = 2  # accepted step after which a provisional method may give way: the first one may be a guess
+# error of a rejected step, over the tolerances, from which on the force is taken to jump or bend within it
+UNFORESEEN = 10.0
+REFUSED = 0.95  # maximum ratio of the next step to a rejected one
+FIRST_JUDGED = 2  # accepted step from which on a trial method may be replaced: the first step may be a guess
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR))
@@ -71,7 +72,7 @@ def start(f, w, t, state):
     """Factor the mass matrix, choose the partition, and complete the state (q, v given) by a and lam."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
-    w.notes[KINK_BEFORE] = t  # a drive may have a kink at the start
+    w.notes[KINK_BEFORE] = t  # C_t or b of a drive may be discontinuous at the start
     code = prepare_mass(f, w, t, q)
     if code == DONE:
         code = renew_partition(f, w, t, q)
@@ -79,14 +80,14 @@ def start(f, w, t, state):
         code = find_tangents(f, w, t, q)
     if code == DONE:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
-    if code == DONE and f.flags[GAMMA_GIVEN] == 0:  # now with the scale by which its differences are judged
+    if code == DONE and f.flags[GAMMA_GIVEN] == 0:  # now with the scale by which the differences of Gamma are judged
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
     return code
 
 
 @merged
 def _kink(f, w, t, size, tolerances, accepted, state, new_state):
-    """What `locate_discontinuity` says of a step whose velocities change by more than its accelerations explain."""
+    """Locate a discontinuity in a step whose velocities change by more than its accelerations explain."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     if not accepted:
@@ -100,7 +101,7 @@ def _kink(f, w, t, size, tolerances, accepted, state, new_state):
 
 @merged
 def _attempt(f, w, options, memory, tolerances, control, clock, t, size, leaps, state, new_state):
-    """A step: its code, its error and the factor by which the next may be longer."""
+    """Attempt a step; return its code, its error and the factor of the next step."""
     w.notes[ORIENTATION_NEW] = 0.0
     if clock[at.FAILURE_CODE] == DONE:
         w.notes[FAULT_KIND] = -1.0
@@ -122,7 +123,7 @@ def _attempt(f, w, options, memory, tolerances, control, clock, t, size, leaps, 
 
 @merged
 def _before_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
-    """Whether C_t or b jumps or bends within a step, which is then to end there."""
+    """Return whether C_t or b jumps or bends within a step, which then has to end there."""
     kind, low, high = _kink(f, w, t, size, tolerances, accepted, state, new_state)
     if kind == JUMP:
         clock[at.JUMP_FROM] = t if low - t <= NEAR * np.spacing(abs(t)) else low
@@ -137,10 +138,10 @@ def _before_kink(f, w, tolerances, control, clock, t, size, accepted, state, new
 
 @merged
 def _failed(f, w, control, clock, t, size, code, retried, state):
-    """What becomes of a step that failed for such a reason: a shorter one, another partition, or the end.
+    """Handle a step that failed: shorten it, renew the partition, or return the code that ends the loop.
 
-    A step of fixed size keeps it, and only a partition that went bad within it may be the reason; `retried` is where
-    that was tried.
+    A step of fixed size cannot become shorter: only the partition is renewed. `retried` is the time at which that was
+    already tried.
     """
     n = w.Q.size
     poor = code in (SINGULAR, INNER_DIVERGED)
@@ -169,7 +170,7 @@ def _failed(f, w, control, clock, t, size, code, retried, state):
 
 @merged
 def _refused(f, w, control, clock, t, size, proposal, state):
-    """What becomes of a step whose error is too large: a shorter one, a tiny one by a spacing, or steps across."""
+    """Handle a step whose error is too large: shorten it, by a spacing at least, or stop at a singular position."""
     n = w.Q.size
     w.counters[N_REJECTED_ERROR] += 1
     clock[at.FAILURE_CODE] = DONE
@@ -185,7 +186,7 @@ def _refused(f, w, control, clock, t, size, proposal, state):
 
 @merged
 def _may_go_on(control, clock):
-    """Whether the method makes steps in a row, and nothing else has to be looked at before each of them."""
+    """Return whether the method may take many steps in a row, without checks before each of them."""
     if control[at.MAKES_MANY] == 0.0 or control[at.FIXED_STEP] > 0.0 or clock[at.APPLIES_JUMP] == 1.0:
         return False
     if control[at.SPACING] > 0.0 or clock[at.T] == clock[at.JUMP_FROM]:
@@ -195,7 +196,7 @@ def _may_go_on(control, clock):
 
 @merged
 def _was_last(f, w, clock, outputs, state):
-    """Go on to the next output time from one that was reached; whether there is none."""
+    """Advance to the next output time; return whether the last one was reached."""
     record_pivot_at_output(f, w, clock, state)
     clock[at.NEXT_OUTPUT] += 1.0
     return int(clock[at.NEXT_OUTPUT]) == outputs.size
@@ -217,7 +218,7 @@ def advance(
     """
     fixed = control[at.FIXED_STEP] > 0.0
     n = w.Q.size
-    retried = np.inf  # where a step of fixed size was tried again with a new partition
+    retried = np.inf  # time at which a step of fixed size was repeated with a new partition
     filled[0] = 0
     filled[1] = 0
     attempts = 0.0
@@ -257,7 +258,7 @@ def advance(
         target = outputs[int(clock[at.NEXT_OUTPUT])]
         goal = min(target, clock[at.JUMP_TO] if leaps else clock[at.JUMP_FROM])
         h = control[at.FIXED_STEP] if fixed else min(clock[at.H_NEXT], clock[at.H_LIMIT], control[at.MAX_STEP])
-        in_grid = 1.0  # steps of the grid that this one is
+        in_grid = 1.0  # number of steps of the fixed grid that this step covers
         if fixed:
             size, in_grid, reaches = on_grid(clock, t, h, target, goal)
         else:
@@ -279,7 +280,7 @@ def advance(
         )
         if code == NOT_LOADED:
             return at.NEEDS_COMPILATION
-        # at a jump the embedded formula may agree by chance: until the place is passed, the estimate has to be smaller
+        # at a jump the embedded formula may agree by chance: until ROUGH_TO the estimated error has to be smaller
         strict = control[at.ROUGH] if t < clock[at.ROUGH_TO] else 1.0
         accepted = code == DONE and error * strict <= 1.0
         if accepted and not reaches and ends_at_singular(f, w, control, clock):
@@ -342,7 +343,7 @@ def advance(
         clock[at.LIMIT_AGE] += 1.0
         if clock[at.LIMIT_AGE] > control[at.LIMIT_MEMORY]:
             clock[at.H_LIMIT] = control[at.LIMIT_START]
-            clock[at.FAILURE_CODE] = DONE  # until then it is why steps are short
+            clock[at.FAILURE_CODE] = DONE  # kept until then as the reason why steps are short
         if lands and _was_last(f, w, clock, outputs, state):
             return at.ALL_OUTPUT_DONE
         if fixed and not lands:

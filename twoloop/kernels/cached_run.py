@@ -1,4 +1,4 @@
-"""Run from a start to the end of the first chunk in one compiled call, and report on it; parts of this for Python.
+"""Run from a start to the end of the first chunk in one compiled call, and report on it.
 
 `start_and_advance` checks the start, makes the same choices as the run before it, takes steps, and fills one block:
 
@@ -7,7 +7,7 @@
 
 `advance` writes states as they come, from the fixed place on. The rest is as long as the run has steps, and is copied
 when these are over, so that it ends where states begin. All that a result needs is then one piece without gaps, which
-Python copies by one slice, and takes apart when a field of the result is asked for.
+Python copies by one slice, and takes apart when a field of the result is used.
 """
 
 import math
@@ -35,12 +35,12 @@ from twoloop.kernels.data.common import (
 from twoloop.kernels.data.indices import FORM, GAP, LONGEST_UNSEEN, LOOK, N_ACCEPTED, N_COUNTERS
 from twoloop.kernels.evaluation.checks import CONSISTENT, DEFINITE, IN_ORDER, INDEFINITE
 
-ROUNDING = 1e-15  # of the largest coordinate: corrections of this size are rounding
+ROUNDING = 1e-15  # relative to the largest coordinate: smaller corrections are rounding errors
 
 
 @merged
 def prepare_work(w, numbers, integers, pattern, q, accuracy, reuse):
-    """Make a workspace as it is before a run from q; `numbers` and `integers` are what counts when a step begins."""
+    """Reset a workspace to its state before a run from q; `numbers` and `integers` are its lasting arrays."""
     for k in range(numbers.size):
         numbers[k] = 0.0
     for k in range(integers.size):
@@ -65,18 +65,18 @@ def prepare_workspace(w, numbers, integers, pattern, q, accuracy, reuse):
     prepare_work(w, numbers, integers, pattern, q, accuracy, reuse)
 
 
-FIRST_STEP = 0.01  # of the shortest time scale that a state shows: the first step ...
-RESOLVED = 1e4  # ... but no fewer spacings of floating-point numbers at the start
-SHORTEST_STEP = 1e-16  # of the first step
-SHARPER = 10  # times as often steps that look within look at the equations, of what may be sharp in q or v
+FIRST_STEP = 0.01  # first step, relative to the shortest time scale of the state ...
+RESOLVED = 1e4  # ... but at least this many spacings of floating-point numbers at the start
+SHORTEST_STEP = 1e-16  # relative to the first step: shorter steps are too small
+SHARPER = 10  # ratio of GAP to LOOK, if forces may change suddenly with place or speed
 
 
 @exact
 def _first_step(state, n, t, span, least):
-    """A share of the time in which velocities and accelerations change the coordinates as a whole, s.
+    """Return the first step, s: a share of the time in which the state moves by the size of its coordinates.
 
-    `least` is what counts as the size of coordinates that are zero, of which there is no other length. Of those next to
-    zero that time may be less than numbers near t can tell apart.
+    `least` is the size of coordinates that are all zero, which have no length of their own. For coordinates close to
+    zero that time may be shorter than the spacing of floating-point numbers near t.
     """
     far, fast, sharp = least, 0.0, 0.0
     for j in range(n):
@@ -87,14 +87,17 @@ def _first_step(state, n, t, span, least):
         scale = min(scale, far / fast)
     if sharp > 0.0:
         scale = min(scale, math.sqrt(far / sharp))
-    if fast > 0.0 and sharp > 0.0 and fast / sharp > FIRST_STEP * scale:  # not at what is next to rest
+    if fast > 0.0 and sharp > 0.0 and fast / sharp > FIRST_STEP * scale:  # not if the motion is almost at rest
         scale = min(scale, fast / sharp)
     return max(FIRST_STEP * scale, RESOLVED * np.spacing(abs(t)))
 
 
 @exact
 def _limit_steps(control, tolerances, span, longest, within):
-    """Let no hundredth of a run pass unseen. `within`: its steps look within, and may be as long as that is."""
+    """Limit gaps between evaluations to a hundredth of the run.
+
+    With `within`, steps evaluate the equations within themselves, and only `longest` limits them.
+    """
     gap = LONGEST_UNSEEN * span
     tolerances[GAP], tolerances[LOOK] = gap, gap / (SHARPER if control[at.BY_STATE] > 0.0 else 1.0)
     control[at.MAX_STEP] = longest if within else min(longest, gap / control[at.MAX_EVALUATION_GAP])
@@ -104,7 +107,7 @@ def _limit_steps(control, tolerances, span, longest, within):
 
 @kernel(f8(VECTOR, VECTOR, VECTOR, i8, f8, f8, f8, f8, types.boolean))
 def set_sizes(control, tolerances, state, n, t, t1, least, longest, within):
-    """The first step from a state, s; and if a longest one is given, no hundredth of the run is to pass unseen."""
+    """Return the first step from a state, s; if `longest` is given, also bound the gaps between evaluations."""
     if longest > 0.0:
         _limit_steps(control, tolerances, t1 - t, longest, within)
     return _first_step(state, n, t, t1 - t, least)
@@ -112,7 +115,7 @@ def set_sizes(control, tolerances, state, n, t, t1, least, longest, within):
 
 @merged
 def _all_within(t, rows, box):
-    """Whether all times, and rows as far as the box has numbers, lie between its rows [t, q, v]."""
+    """Return whether all times, and rows as far as the box has columns, lie between its rows [t, q, v]."""
     for k in range(t.size):
         if not box[0, 0] <= t[k] <= box[1, 0]:
             return False
@@ -124,9 +127,9 @@ def _all_within(t, rows, box):
 
 @kernel(types.void(MATRIX, INTEGERS, VECTOR, types.int64[:, ::1], types.boolean[::1]))
 def split_steps(steps, counts, h, changes, untested):
-    """Split the rows of steps: length, what each added to `counts`, and whether it was one of Newton's method.
+    """Split the rows of steps: size, what each added to `counts`, and whether it was implicit (used Newton's method).
 
-    `counts` are rejections and partitions before, and then after these steps.
+    `counts` are the rejections and partitions before these steps, and afterwards those after them.
     """
     for k in range(h.size):
         h[k], untested[k] = steps[k, at.H], steps[k, at.JACOBIANS] > 0.0
@@ -135,15 +138,15 @@ def split_steps(steps, counts, h, changes, untested):
             changes[i, k], counts[i] = count - counts[i], count
 
 
-# what `start_and_advance` returns instead of the number of its steps: the start needs other choices; it is not surely
-# consistent and has to be checked more closely; the report has to be read, or more steps have to be taken
+# codes of `start_and_advance` other than a number of steps. REFUSED: the start needs other choices. IN_DOUBT: the start
+# may be inconsistent and needs a closer check. UNUSUAL: Python has to read the report, or has to take more steps
 REFUSED, IN_DOUBT, UNUSUAL = -1, -2, -3
 
-# Arrays of a run that starts again and again: of the checks of a start and of choices, then of the run itself.
-# - `start_numbers`: clock, control and tolerances at a start, which `numbers` becomes
-# - `start_memory`: what stands in the method's `memory` at `memory_places`; the rest, nearly all, is zero
-# - `last_start`: the last start, see START; `saved` and `saved_integers`: all that counts there, from the second equal
-#   start on; `start_rows`: the rows that count there
+# Arrays of a run that starts again and again: first for the checks of a start and for choices, then for the run.
+# - `start_numbers`: clock, control and tolerances at a start, which are copied to `numbers`
+# - `start_memory`: nonzero values of the method's `memory`, at `memory_places`; nearly all others are zero
+# - `last_start`: the last start, see START; `saved` and `saved_integers`: the whole state of the run there, from the
+#   second equal start on; `start_rows`: the independent rows there
 RUN_ARRAYS = Reference(
     "RunArrays",
     {
@@ -165,18 +168,19 @@ RUN_ARRAYS.add_function("choose", i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INT
 RUN_ARRAYS.add_function("dependents", i8(MATRIX, INTEGERS, INTEGERS, i8, VECTOR, INTEGERS, INTEGERS))
 RUN_ARRAYS.add_function("start", i8(KIT, WORK, f8, VECTOR))
 RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS))
-# in `constants`: of starts, whether rows have entries wherever `kinds` says so, what `choose` takes, the flag of an M
-# that varies, else 0, the smallest pivot with which one is taken and the form of the equations; of steps, a first one,
-# or 0, and what set_sizes takes; of ends, the pivot below which speeds are looked at, how many times what accelerations
-# give these may change by, and how many looks at sudden changes two of these must be apart
+# indices in `constants`. Starts: whether rows have entries wherever `kinds` says so, arguments of `choose`, the flag of
+# an M that varies (else 0), the smallest pivot of an accepted start, and the form of the equations. Steps: a first
+# step, or 0, and arguments of set_sizes. Ends: the pivot below which velocities are checked, the largest ratio of their
+# change to that by the accelerations, and the least distance of two sudden changes, in samples
 ACCURACY, REUSE, NEARLY_SINGULAR, IN_ALL_PLACES, RANK, WEAK, SCALE, CONTRADICTS = range(8)
 OF_MASS, LEAST_PIVOT, IN_FORM, FIRST, LEAST, LONGEST, LOOKS_WITHIN, NEAR, MOST_TURNED, LOOKS = range(8, 18)
-PLACE, N_KEPT, N_ADDED, KEPT = range(4)  # in `expected`, which is empty without code; those that help follow those kept
+# in `expected`, which is empty without generated code; rows added for M follow the kept rows
+PLACE, N_KEPT, N_ADDED, KEPT = range(4)
 
 
 @merged
 def _makes_same_choices(b):
-    """Whether the rows that count, those that help M, and the coordinates that follow are those of the code."""
+    """Return whether the independent rows, the rows added for M and the dependent coordinates are those of the code."""
     b.scratch[0] = 0.0
     place = b.choose(b.mass, b.rows, b.constants[RANK], b.constants[WEAK], b.bounds, b.scratch, b.chosen)
     n_kept, n_added = b.expected[N_KEPT], b.expected[N_ADDED]
@@ -207,7 +211,7 @@ def _copy(one, other):
 
 @merged
 def _left_out_rows_hold(w, b, n):
-    """Whether the accelerations agree with all rows where some, which depend on others, were left out."""
+    """Return whether the accelerations agree with all rows, also with redundant rows that were left out."""
     if w.rows_v.size == len(b.rows):
         return True
     for i in range(len(b.rows)):
@@ -229,7 +233,7 @@ def _check_start(given, b, t, q, v, sizes, ways):
 
 @merged
 def _has_all_entries(b):
-    """Whether rows have an entry wherever they may have one: then they need not be looked at nearby."""
+    """Return whether rows have an entry wherever they may have one: then they need not be checked nearby."""
     n, same = b.rows.shape[1], True
     for k in range(b.kinds.size):
         same = same and (b.kinds[k] != 0) == (b.rows[k // n, k % n] != 0.0)
@@ -238,9 +242,9 @@ def _has_all_entries(b):
 
 @merged
 def _start_run(f, given, w, b, t, t1, q, v, sizes, sure):
-    """Begin a run to t1 at a state, with the same choices as the run before it; 0, or why it cannot.
+    """Begin a run to t1 at a state, with the choices of the run before it; return 0, or why that fails.
 
-    `given`: the system that is looked at, with `sizes` as of `look`. `sure`: the state is known to be consistent.
+    `given`: the system that is checked, with `sizes` as `look` takes them. `sure`: the state is known to be consistent.
     """
     n = q.size
     if not (finite_vector(q) and finite_vector(v)):
@@ -293,14 +297,14 @@ def _restore_start(b):
     _copy(b.saved_integers, b.lasting_integers)
 
 
-# in `last_start`, before t, t1, q and v: how often a run began there, up to IS_SAVED
+# in `last_start`, before t, t1, q and v: how often a run began there, at most IS_SAVED
 N_EQUAL, START = 0, 1
 NEVER, IS_SAVED = 0.0, 2.0
 
 
 @exact
 def _is_last_start(last_start, t, t1, q, v):
-    """Whether a start is the last one, to the bit; it becomes that."""
+    """Return whether a start equals the last one to the bit, and store it as the last one."""
     n, same = q.size, last_start[N_EQUAL] > NEVER
     for k in range(2 + 2 * n):
         x = t if k == 0 else t1 if k == 1 else q[k - 2] if k < 2 + n else v[k - 2 - n]
@@ -320,7 +324,7 @@ N_HEAD = N_REPORT + N_COUNTERS
 
 @merged
 def _velocities_turned(b, k, n):
-    """Whether the velocities of the last two states differ by more than one of their accelerations gives."""
+    """Return whether velocities change in the last step by more than the accelerations at its ends explain."""
     change, first, last = 0.0, 0.0, 0.0
     for j in range(n):
         change = max(change, abs(b.states[k, n + j] - b.states[k - 1, n + j]))
@@ -330,9 +334,9 @@ def _velocities_turned(b, k, n):
 
 @merged
 def _write_report(w, b, box, n_rows, n_steps, code, is_new):
-    """Report on a run with so many rows, behind the first, and steps; return the number of steps if the run is plain.
+    """Write the report of a run with n_rows states after the first, and n_steps steps.
 
-    `box` has rows [t, q, v], or nothing.
+    Returns the number of steps if nothing has to be checked, else UNUSUAL. `box` has rows [t, q, v], or is empty.
     """
     turned = n_rows > 0 and _velocities_turned(b, n_rows, w.Q.size)
     inside = box.shape[1] > 0 and _all_within(b.t[: 1 + n_rows], b.states, box)
@@ -361,7 +365,7 @@ def start_and_advance(f, given, w, b, t, t1, q, v, sizes, box, sure):
 
     A start that equals the last one to the bit is checked once more, and then saved for those that follow.
     """
-    f.flags[FORM] = int(b.constants[IN_FORM])  # which a run may have changed
+    f.flags[FORM] = int(b.constants[IN_FORM])  # a run may have changed it
     same, often = _is_last_start(b.last_start, t, t1, q, v), b.last_start[N_EQUAL]
     if same and often == IS_SAVED:
         _restore_start(b)

@@ -1,4 +1,4 @@
-"""The solution between accepted steps: polynomials through neighbouring states, put back on the constraints.
+"""Interpolate states within steps by polynomials through neighbouring states, projected onto the constraints.
 
 States are rows [q, v, a] at the times `t`; interval i lies between rows i and i + 1. With PARTS > 1 interior states are
 computed first, by steps of the method, and a polynomial goes through those of one interval.
@@ -25,20 +25,20 @@ from twoloop.kernels.evaluation.partition import least_pivot, partition_is_poor
 from twoloop.kernels.linalg.dense import copy, largest_of
 
 TABLE = types.int64[:, ::1]
-PLACES = (0.3, 0.7)  # within an interval, of its length, where polynomials are looked at
+PLACES = (0.3, 0.7)  # positions within an interval, relative to its length, at which polynomials are checked
 LOOKS = len(PLACES)
 EPS = 2.0**-52
-EVEN = 8.0  # longest over shortest
-NOISY = 10.0  # of the tolerances of velocities
+EVEN = 8.0  # largest ratio of two gaps at which steps count as equally long
+NOISY = 10.0  # relative to the tolerance of velocities: rounding above this counts as noise
 SINGULAR_SHARE = (
-    0.01  # of the smallest pivot at the ends of an interval: below it a place is beside a singular position
+    0.01  # relative to the smallest pivots at the ends of an interval: below this a position counts as singular
 )
-SINGULAR_PIVOT = 1e-5  # of the largest: below it, too
+SINGULAR_PIVOT = 1e-5  # a smaller pivot (rows scaled to 1) counts as singular, too
 
 
 @merged
 def _window(low, high, i, last):
-    """First and last of the rows that the polynomial of the interval from row i goes through: centred but at ends."""
+    """Return the first and last row of the polynomial of the interval from row i: centred, except at ends."""
     if last > i + 1:  # the interval has states of its own
         return i, last
     size = min(kinds.WINDOW, high - low + 1)
@@ -48,7 +48,7 @@ def _window(low, high, i, last):
 
 @compiled
 def _divided_differences(t, states, lo, hi, i, h, place, order, z, c):
-    """Newton's form of the Hermite polynomial through rows lo to hi, in (time - t[i]) / h; its number of coefficients.
+    """Compute Newton's form of the Hermite polynomial through rows lo to hi, in (time - t[i]) / h; return its size.
 
     For the block of columns from `place` on, less row i of them, with `order` values at each node: the blocks behind it
     are its derivatives.
@@ -75,7 +75,7 @@ def _divided_differences(t, states, lo, hi, i, h, place, order, z, c):
 
 @merged
 def _interpolate(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
-    """q and v as the polynomials have them, by Horner's scheme."""
+    """Evaluate q and v of the polynomials by Horner's scheme."""
     n = q.size
     for m in range(n):
         value, slope = c[size - 1, m], 0.0
@@ -93,7 +93,7 @@ def _interpolate(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
 
 @merged
 def _kind(kind, tolerances, h, states, i):
-    """APART also where an interval is so short that rounding of q is more than the tolerances of its slope."""
+    """Return APART also if an interval is so short that rounding of q exceeds the tolerances of its slope."""
     n = tolerances.size - ATOL
     for m in range(n):
         atol, rtol = tolerances[ATOL + m], tolerances[RTOL]
@@ -104,7 +104,7 @@ def _kind(kind, tolerances, h, states, i):
 
 @merged
 def _turned(tolerances, v_0, v):
-    """Whether restored velocities are farther from those of the polynomials than errors of these explain."""
+    """Return whether restored velocities differ from those of the polynomials by more than errors explain."""
     speed = largest_of(v_0)
     for m in range(v.size):
         if not abs(v[m] - v_0[m]) <= UNTRUE * (tolerances[ATOL + m] + tolerances[RTOL] * speed):
@@ -114,7 +114,7 @@ def _turned(tolerances, v_0, v):
 
 @compiled
 def _is_singular(f, w, t, states, i, last, time, q):
-    """Whether the rows are so much nearer to losing rank at a place of an interval than at its ends."""
+    """Return whether the rows are much closer to losing rank within an interval than at its ends."""
     n, largest = w.Q.size, 0.0
     for r in (i, last):
         if renew_partition(f, w, t[r], states[r, :n]) == DONE:
@@ -125,14 +125,16 @@ def _is_singular(f, w, t, states, i, last, time, q):
 
 @kernel(i8(KIT, WORK, f8, VECTOR, VECTOR, MATRIX, TABLE, VECTOR, VECTOR, MATRIX, MATRIX))
 def between(f, w, tolerance, tolerances, t, states, groups, times, z, room, out):
-    """Rows [q, v] of `out` at `times`; the number of times at which no dependents were found, or rounding made them.
+    """Write rows [q, v] of `out` at `times`; return the number of failed projections.
 
-    There q and v are those of the polynomials. `z` and `room` hold nodes and coefficients of two polynomials.
+    A projection fails if no dependent coordinates are found, or if rounding determines its velocities beside a singular
+    position: q and v are then those of the polynomials. `z` and `room` hold the nodes and coefficients of two
+    polynomials.
     """
     n = w.Q.size
     half = z.size // 2
     z_q, z_v, c_q, c_v = z[:half], z[half:], room[:half], room[half:]
-    q_0, v_0 = room[2 * half - 2], room[2 * half - 1]  # c_v has no use for them
+    q_0, v_0 = room[2 * half - 2], room[2 * half - 1]  # the last two rows, which c_v does not use
     reduced = f.flags[FORM] == NULL_SPACE  # then w.D is known
     failures = 0
     for g in range(groups.shape[0]):
@@ -143,7 +145,7 @@ def between(f, w, tolerance, tolerances, t, states, groups, times, z, room, out)
         order = 3 if kind >= kinds.ACCELERATIONS else 2
         size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
         size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == kinds.APART else 0
-        # which coordinates are kept is to depend on the time alone, not on what else is asked for
+        # the choice of the independent coordinates must depend on the time alone, not on other output times
         chosen = False
         for p in range(groups[g, kinds.FIRST_TIME], groups[g, kinds.END_TIME]):
             q, v = out[p, :n], out[p, n : 2 * n]
@@ -178,7 +180,7 @@ def between(f, w, tolerance, tolerances, t, states, groups, times, z, room, out)
 
 @merged
 def _off(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other):
-    """Largest difference of two states, in positions and velocities, over the tolerances."""
+    """Return the largest difference of two states, in positions and velocities, over the tolerances."""
     n = q.size
     rtol, largest = tolerances[RTOL], 0.0
     for m in range(n):
@@ -190,7 +192,7 @@ def _off(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other):
 
 @merged
 def _slope_of_velocity(kind, h, s, z, c, size, z_v, c_v, size_v, a):
-    """The accelerations that the polynomials have, into `a`."""
+    """Write the accelerations of the polynomials to `a`."""
     for m in range(a.size):
         value, slope, bend = c[size - 1, m], 0.0, 0.0
         for r in range(size - 2, -1, -1):
@@ -209,7 +211,7 @@ def _slope_of_velocity(kind, h, s, z, c, size, z_v, c_v, size_v, a):
 
 @merged
 def _even(t, lo, hi):
-    """Whether the gaps between these times are of similar length."""
+    """Return whether the gaps between these times are of similar length."""
     shortest, longest = np.inf, 0.0
     for r in range(lo, hi):
         shortest, longest = min(shortest, t[r + 1] - t[r]), max(longest, t[r + 1] - t[r])
@@ -218,13 +220,13 @@ def _even(t, lo, hi):
 
 @kernel(i8(KIT, WORK, f8, VECTOR, VECTOR, MATRIX, TABLE, VECTOR, MATRIX, MATRIX, VECTOR))
 def judge(f, w, tolerance, tolerances, t, states, groups, z, room, rows, out):
-    """How far the polynomials of these intervals are off, over the tolerances, into `out`; 0 where that is soon seen.
+    """Estimate the error of the polynomials of these intervals over the tolerances, into `out`.
 
-    Where its last node changes a polynomial by less than the tolerances, it is taken as it is. Else it is held against
-    the constraints and the equations, at places within the interval: what its accelerations are off, times the time in
-    which a polynomial of its degree can turn, is off in velocity. Accelerations that hold the noise of stiff modes say
-    nothing; of those the change by the last node counts alone. Methods of low order take steps that are short for their
-    polynomials, which then are off between unlike steps only.
+    The error is 0 if the last node changes a polynomial by less than the tolerances. Otherwise the polynomial is
+    compared with the constraints and the equations at positions within the interval: the error of its accelerations,
+    times the time in which a polynomial of its degree can turn, is an error of velocity. If accelerations hold the
+    noise of stiff modes, only the change by the last node counts. Methods of low order take steps that are short for
+    their polynomials: these are checked only between steps of unequal length.
     """
     n = w.Q.size
     half = z.size // 2
@@ -280,7 +282,7 @@ def judge(f, w, tolerance, tolerances, t, states, groups, z, room, rows, out):
 
 @kernel(i8(KIT, WORK, VECTOR, MATRIX, MATRIX))
 def complete(f, w, times, states, out):
-    """Rows [a, lam] of `out` at states [q, v] on the constraints; the number of those at which there are none: NaN."""
+    """Write rows [a, lam] of `out` at consistent states [q, v]; return the number of failures (rows of NaN)."""
     n = w.Q.size
     code = SINGULAR
     failures = 0
@@ -294,7 +296,7 @@ def complete(f, w, times, states, out):
                 code = find_tangents(f, w, times[p], q)
         if code == DONE:
             code = accelerations(f, w, times[p], q, v, out[p, :n], out[p, n:])
-        if code == GAMMA_INACCURATE:  # the best that there is, as no step depends on it
+        if code == GAMMA_INACCURATE:  # take the best available values: no step depends on them
             required = w.notes[GAMMA_REQUIRED]
             w.notes[GAMMA_REQUIRED] = np.inf
             code = accelerations(f, w, times[p], q, v, out[p, :n], out[p, n:])
@@ -307,7 +309,7 @@ def complete(f, w, times, states, out):
 
 @kernel(i8(KIT, WORK, *(VECTOR,) * 7, MATRIX, INTEGERS, VECTOR, MATRIX))
 def fill(f, w, options, memory, at_rest, tolerances, state, new_state, t, states, intervals, out_t, out):
-    """States within intervals, by equal steps of the method; how many intervals could not be filled, their t NaN.
+    """Compute states within intervals by equal steps of the method; return the number of failures, whose t is NaN.
 
     `out_t` and `out` have the same number of rows for each; the first and the last are the ends of the interval.
     """

@@ -1,4 +1,4 @@
-"""The workspace of a run, allocated once."""
+"""Allocate the workspace of a run once, and reuse it for later runs of the same sizes."""
 
 import math
 from collections.abc import Mapping
@@ -15,26 +15,27 @@ from twoloop.kernels.evaluation.drive_discontinuities import N_PARTS
 from twoloop.kernels.linalg.band import N_ROUTINES
 from twoloop.kernels.linalg.markowitz_lu import MAX_ENTRIES_PER_LINE, N_COUNTS, N_LISTS, index_size, values_size
 
-MOST_FREE, LARGEST_FREE = 32, 100_000  # workspaces that wait for their next run, and numbers of each of them
-WORD, LINE = 8, 8  # bytes of a number, and numbers in a line of the cache, at which arrays begin
+# most unused workspaces that are kept for later runs, and most numbers that one of them may have
+MOST_FREE, LARGEST_FREE = 32, 100_000
+WORD, LINE = 8, 8  # bytes of a number; numbers in a cache line, at the start of which each array begins
 
 
 class Static(NamedTuple):
-    """What the static form needs beside the sizes of a system."""
+    """Sizes that the static form needs beside those of a system."""
 
     n_factors: int
     n_mass_values: int
     n_jacobian_values: int
-    dense_mass: bool  # whether M, or C_q, is filled as a matrix, from which the values are taken
+    dense_mass: bool  # whether M, or C_q, is stored as a full matrix, from which the values are taken
     dense_jacobian: bool
 
 
 Sizes = tuple[int, int, int, int, int, bool, bool, int, Static | None, int]
-Places = list[tuple[str, int, int, tuple[int, ...]]]  # of arrays in a piece of memory: name, begin, end, shape
+Places = list[tuple[str, int, int, tuple[int, ...]]]  # arrays in a piece of memory: name, begin, end, shape
 
 
 class Layout(NamedTuple):
-    """Where the arrays of a workspace of some sizes stand, in one piece of memory for numbers and one for integers.
+    """Offsets of the arrays of a workspace, in one piece of memory for numbers and one for integers.
 
     The table of addresses and shapes is `table` + `of_numbers` times the address of the one + `of_integers` times that
     of the other. The first `n_lasting` numbers, and integers, count at the start of a step; others are filled before
@@ -64,11 +65,11 @@ def make_work(
     static: Static | None = None,
     n_matrices: int = 0,
 ) -> Work:
-    """The workspace of one run; ranks are those of C_q, and of C_q and A, at most n_c and n_c + n_a.
+    """Return the workspace of one run; ranks are those of C_q, and of C_q and A, at most n_c and n_c + n_a.
 
-    There is room for n_matrices numbers of those of Newton's method.
+    The matrices of Newton's method get n_matrices numbers.
 
-    It may be one that a run of these sizes gave back: to make the arrays takes longer than to clear them.
+    A workspace that a run of these sizes gave back is reused: to allocate the arrays takes longer than to clear them.
     """
     r = min(n_c, n_q) if rank is None else rank
     r_v = min(n_c + n_a, n_q) if rank_v is None else rank_v
@@ -77,13 +78,13 @@ def make_work(
 
 
 def empty(sizes: Sizes) -> Work:
-    """A workspace of such sizes as another has, full of zeros."""
+    """Return a workspace of the given sizes, full of zeros."""
     given_back = _given_back(sizes)
     return _new(sizes) if given_back is None else cleared(given_back)
 
 
 def copy_of(work: Work) -> Work:
-    """A workspace with the same in it."""
+    """Return a copy of a workspace."""
     sizes = work.sizes
     other = _given_back(sizes) or _new(sizes)
     for mine, given in zip(lasting(other), lasting(work), strict=True):
@@ -93,7 +94,7 @@ def copy_of(work: Work) -> Work:
 
 
 def lasting(work: Work) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The numbers and integers of a workspace that count at the start of a step."""
+    """Return the numbers and integers of a workspace that count at the start of a step."""
     layout = _layout(*work.sizes)
     return work.notes.base[: layout.n_lasting], work.counters.base[: layout.n_lasting_integers]
 
@@ -117,22 +118,22 @@ def _new(sizes: Sizes) -> Work:
 
 
 def give_back(work: Work) -> None:
-    """Let the next run of the same sizes have this workspace, of which nothing is used any more."""
+    """Give a workspace that is no longer used to the next run of the same sizes."""
     free = _free.pop(work.sizes, [])
     if work.notes.base.size <= LARGEST_FREE and len(free) < MOST_FREE:
         free.append(work)
-    _free[work.sizes] = free  # behind those that wait longer
+    _free[work.sizes] = free  # at the end, behind sizes whose workspaces have waited longer
     for oldest in list(_free)[:-1]:
         if sum(map(len, list(_free.values()))) <= MOST_FREE:
             break
         _free.pop(oldest, None)
 
 
-_free: dict[Sizes, list[Work]] = {}  # those that were given back
+_free: dict[Sizes, list[Work]] = {}  # unused workspaces, by sizes
 
 
 def cleared(work: Work) -> Work:
-    """A workspace as it is when it is new."""
+    """Reset a workspace to its state when it was new."""
     for each in lasting(work):
         each[:] = 0
     work.G_of_S[:] = np.nan
@@ -141,14 +142,14 @@ def cleared(work: Work) -> Work:
 
 @cache
 def cached_run() -> Any:
-    """The module of that name: compiled, or read from the disk, when it is first asked for."""
+    """Return the module `cached_run`, compiled or read from the disk at the first call."""
     from twoloop.kernels import cached_run
 
     return cached_run
 
 
 def _of_static_form(n_q: int, n_c: int, rank: int, static: Static) -> tuple[dict[str, tuple[int, ...]], ...]:
-    """Shapes of numbers and integers that the static form changes: no partition, no matrix that it can do without.
+    """Return the shapes of numbers and integers that the static form changes: no partition, no unused matrix.
 
     All coordinates stand for the dependent ones, whose predictions are compared, and for the independent ones.
     """
@@ -178,7 +179,7 @@ def _of_static_form(n_q: int, n_c: int, rank: int, static: Static) -> tuple[dict
     integers: dict[str, tuple[int, ...]] = {
         "places": (n_c + 1,),
         **{"rows": (rank,), "dependent": (n_q,), "independent": (n_q,), "index": (index_size(0),)},
-        **dict.fromkeys(("rows_v", "dependent_v", "independent_v"), (0,)),  # those of positions
+        **dict.fromkeys(("rows_v", "dependent_v", "independent_v"), (0,)),  # velocities use the arrays of positions
         **dict.fromkeys(("index_v", "index_a"), (index_size(0),)),
     }
     return numbers, integers
@@ -203,7 +204,7 @@ def _layout(
     size = n_q + r_v if augmented else 0
     n_entries = (n_rows + 1) * n_q
     numbers: dict[str, tuple[int, ...]] = {
-        "augmented": (n_entries + n_q * n_q,),  # first: others are parts of it
+        "augmented": (n_entries + n_q * n_q,),  # first: `entries`, `G` and `M` are parts of it
         "L": (n_q, n_q),
         "S": (r_v, r_v),
         "W": (r_v, n_q),
@@ -251,7 +252,8 @@ def _layout(
         integers |= changed[1]
         rows_of_G, side = (n_rows + 1) * static.dense_jacobian, n_q * static.dense_mass
         n_entries = rows_of_G * n_q
-    of_positions = {name for name in integers if n_a == 0 and f"{name}_v" in integers}  # which velocities share
+    # arrays of positions that velocities use as well
+    of_positions = {name for name in integers if n_a == 0 and f"{name}_v" in integers}
     for name in of_positions:
         del integers[f"{name}_v"]
     if n_a == 0:
@@ -262,7 +264,7 @@ def _layout(
     of_numbers["M"] = n_entries, n_entries + side * side, (side, side)
     lists = (
         (N_COUNTS + N_LISTS * min(r, MAX_ENTRIES_PER_LINE)) * r if static is None else 0
-    )  # of `index`, for the time of ordering
+    )  # lists in `index` that only the ordering uses
     lasting = of_numbers["matrices"][0], of_integers["index"][1] - lists
     if n_a == 0:
         of_numbers["values_v"] = of_numbers["values"]
@@ -279,7 +281,7 @@ def _layout(
 
 
 def _placed(shapes: Mapping[str, tuple[int, ...]]) -> tuple[dict[str, tuple[int, int, tuple[int, ...]]], int]:
-    """Where arrays begin and end, each in a line of the cache of its own, and the length of all."""
+    """Return where arrays begin and end, each at the start of a cache line, and the total length."""
     places, end = {}, 0
     for name, shape in shapes.items():
         size = math.prod(shape)

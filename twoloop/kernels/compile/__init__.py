@@ -1,14 +1,14 @@
-"""Compile callbacks and kernels and keep them on disk; all that touches private parts of numba is here."""
+"""Compile callbacks and kernels and cache them on disk; all uses of private parts of numba are here."""
 
 import re
 
 import numba
 
-LEAST, BELOW = (0, 61), (0, 69)  # as pyproject.toml has them
+LEAST, BELOW = (0, 61), (0, 69)  # limits of the version, as in pyproject.toml
 
 
 def check_version(found: str) -> None:
-    """Raise unless this is a version of numba that the private parts used here are known of.
+    """Raise unless the private parts of this version of numba are known.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Machine code on disk: where numba keeps it, when it is out of date, and what happens where it cannot be kept.
+"""Cache machine code on disk: where numba keeps it, when it is out of date, and what happens if it cannot be kept.
 
 Numba watches the file in which a function stands, and nothing else: not the helpers in other files, and not the values
 of globals, which it freezes. It raises when no folder can be written and when a file is damaged, and runs what others
@@ -44,7 +44,7 @@ ADVICE = (
 
 
 class Untrusted(OSError):
-    """Refuse a file or folder that somebody else could have written; the text says why."""
+    """Error for a file or folder that somebody else could have written; the text gives the reason."""
 
 
 def read_trusted(path: Path) -> bytes:
@@ -63,13 +63,13 @@ def read_trusted(path: Path) -> bytes:
 
 
 def write_trusted(path: Path, content: bytes) -> None:
-    """Write a new file, which no other user may write, whatever the umask."""
+    """Write a new file that no other user may write, whatever the umask."""
     with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644), "wb") as file:
         file.write(content)
 
 
 def make_trusted_folder(folder: Path) -> None:
-    """Make a folder, and missing ones above it, which no other user may write, whatever the umask."""
+    """Create a folder, and missing ones above it, that no other user may write, whatever the umask."""
     for each in [*reversed(folder.parents), folder]:
         if not each.exists():
             each.mkdir(0o755, exist_ok=True)
@@ -77,7 +77,7 @@ def make_trusted_folder(folder: Path) -> None:
 
 @cache
 def trusted_folder(folder: Path) -> Path:
-    """Return the folder if only the user can write it and change what stands above it; else a replacement.
+    """Return the folder if only the user can write it and change the folders above it; otherwise a replacement.
 
     The replacement is in the folder of the user's caches or, if that is in doubt too, a temporary one of this process.
     """
@@ -93,18 +93,19 @@ def trusted_folder(folder: Path) -> Path:
 
 
 def reason_to_distrust(folder: Path) -> str:
-    """Return why somebody else may have written a folder, or what stands above it; "" if nobody can."""
-    if os.name != "posix":  # rights on other systems are not in the mode
+    """Return why somebody else may have written a folder, or one above it; "" if nobody can."""
+    if os.name != "posix":  # other systems do not keep access rights in the mode
         return ""
     real = Path(os.path.realpath(folder))
     for each in [real, *real.parents]:
         try:
             found = each.stat()
-        except FileNotFoundError:  # to be made
+        except FileNotFoundError:  # the folder does not exist yet
             continue
         except OSError as error:
             return f"{each} cannot be looked at ({error.strerror})"
-        sticky = each != real and found.st_mode & stat.S_ISVTX  # there only the owner of an entry can replace it
+        # in a sticky folder only the owner of an entry can replace it
+        sticky = each != real and found.st_mode & stat.S_ISVTX
         why = _reason_of_owner(found) if sticky else _reason_of_mode(found)
         if why:
             return f"{each} {why}"
@@ -160,7 +161,7 @@ def _warn_first(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
 
-MAX_ON_DISK = 500  # sets of functions made for single mechanisms, of each kind, on disk
+MAX_ON_DISK = 500  # most sets of functions generated for single mechanisms, of each kind, on disk
 CHECKSUM = hashlib.sha256().digest_size
 
 
@@ -176,7 +177,7 @@ class CodeFiles:
         self.made_of = numba.__version__, stamp
 
     def save(self, key: Any, data: Any) -> None:
-        """Write what numba made for a key, in place of the previous file."""
+        """Write numba's data for a key, in place of the previous file."""
         content = pickle.dumps((repr((*self.made_of, key)), dumps(data)))
         path = self._path(key)
         unfinished = path.with_suffix(f".{uuid.uuid4().hex}")
@@ -195,7 +196,7 @@ class CodeFiles:
         return self._path(key).exists()
 
     def load(self, key: Any) -> Any:
-        """Read what numba made for a key; None if it is missing."""
+        """Read numba's data for a key; return None if the file is missing."""
         try:
             content = read_trusted(self._path(key))
         except OSError:
@@ -218,7 +219,7 @@ class CodeFiles:
 
 
 def _time_written(path: Path) -> float:
-    """Return when a file was written; 0 if another process has removed it."""
+    """Return the time at which a file was written; 0 if another process has removed it."""
     try:
         return path.stat().st_mtime
     except OSError:
@@ -229,8 +230,8 @@ UNWRITABLE = (
     "twoloop: machine code cannot be kept on disk, so every process compiles again. Set NUMBA_CACHE_DIR to a folder "
     "that only you can write"
 )
-MAX_IN_MEMORY = 50  # sets of functions made for single mechanisms, of each kind, in memory
-# numba 0.61 has it under a private name
+MAX_IN_MEMORY = 50  # most sets of functions generated for single mechanisms, of each kind, in memory
+# numba 0.61 has this class under a private name
 _LOCATOR: Any = vars(caching).get("UserProvidedCacheLocator") or vars(caching)["_UserProvidedCacheLocator"]
 
 
@@ -263,7 +264,7 @@ def compile_cached(
     if watched is not None:
         try:
             dispatcher._cache = _Cache(function, *watched, announcement)
-        except RuntimeError:  # numba finds no folder; there is none for what is typed at a prompt
+        except RuntimeError:  # numba finds no folder; functions typed at a prompt have none
             if Path(inspect.getfile(function)).exists():
                 warn_once(UNWRITABLE)
     with garbage_collection_off():
@@ -275,7 +276,7 @@ def compile_cached(
 
 @contextmanager
 def garbage_collection_off() -> Iterator[None]:
-    """Suspend the collection of cycles, a sixth of the time: what numba makes lives until the end."""
+    """Suspend the collection of cycles, which takes a sixth of the time: numba's objects live until the end."""
     collecting = gc.isenabled()
     gc.disable()
     try:
@@ -286,7 +287,7 @@ def garbage_collection_off() -> Iterator[None]:
 
 
 class BoundedCache(dict[Any, Any]):
-    """Cache what was made for single mechanisms, by digests: the newest MAX_IN_MEMORY, as a sweep makes one a run."""
+    """Cache data of single mechanisms by digests: the newest MAX_IN_MEMORY, because a sweep adds one for each run."""
 
     def __setitem__(self, key: Any, made: Any) -> None:
         super().__setitem__(key, made)
@@ -298,12 +299,12 @@ _N_COMPILED = [0]
 
 
 def n_compiled() -> int:
-    """Return how many functions of numba, which stay in memory, this process has compiled or read from the disk."""
+    """Return the number of numba functions, all in memory, that this process has compiled or read from the disk."""
     return _N_COMPILED[0]
 
 
 def cache_folder(package: types.ModuleType) -> Path | None:
-    """Return where numba keeps the machine code of a package; None if no folder can be written."""
+    """Return the folder of the machine code of a package; None if no folder can be written."""
 
     def anything() -> None:
         pass
@@ -317,11 +318,11 @@ def cache_folder(package: types.ModuleType) -> Path | None:
 
 
 def with_unique_name(function: Callable[..., Any], watched: tuple[str, str] | None) -> Callable[..., Any]:
-    """Return a copy of a nested function, or a lambda, under a name that no other has; any other function as it is.
+    """Return a copy of a nested function, or a lambda, under a unique name; return any other function unchanged.
 
-    Numba's symbols are made of the qualified name and of a number that counts within a process. Two closures of one
-    name whose machine code comes from different processes may share a symbol: the one that is loaded first is then
-    called in the place of both.
+    Numba's symbols consist of the qualified name and of a number that counts within a process. Two closures of one name
+    whose machine code comes from different processes may share a symbol: the one that is loaded first is then called in
+    the place of both.
     """
     if watched is None or "<" not in function.__qualname__:
         return function
@@ -336,11 +337,11 @@ def with_unique_name(function: Callable[..., Any], watched: tuple[str, str] | No
 
 
 class _Cache(FunctionCache):
-    """Extend numba's cache of one function by our stamp; what goes wrong in it costs time and raises nothing."""
+    """Extend numba's cache of one function by the stamp of twoloop; its errors cost time but are never raised."""
 
     def __init__(self, function: Callable[..., Any], stamp: str, key: str, announcement: str):
         chosen: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
-        if chosen:  # numba would make it as the umask has it
+        if chosen:  # numba would create the folder by the umask
             with suppress(OSError):
                 make_trusted_folder(Path(chosen, _LOCATOR.get_suitable_cache_subpath(inspect.getfile(function))))
         super().__init__(function)
@@ -356,7 +357,7 @@ class _Cache(FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         try:
             found = super().load_overload(sig, target_context)
-        except Exception:  # a file of another installation; it is compiled again and overwritten
+        except Exception:  # a file of another installation: the function is compiled again and the file overwritten
             found = None
         if found is None and self._announcement:
             warn_once(self._announcement)
@@ -370,9 +371,9 @@ class _Cache(FunctionCache):
 
 
 def sources_folder() -> Path:
-    """Return where generated source is kept: NUMBA_CACHE_DIR if it is set, else the folder of the user's caches.
+    """Return the folder of generated source: NUMBA_CACHE_DIR if it is set, else the folder of the user's caches.
 
-    If others can write there, it is a folder in which they cannot.
+    If others can write there, return a folder that they cannot write.
     """
     chosen: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
     folder = chosen or AppDirs(appname="twoloop", appauthor=False).user_cache_dir
@@ -392,8 +393,8 @@ def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispa
         watched = digests_of(function)
         dispatcher = njit(**options)(with_unique_name(function, watched))
         if watched is not None:
-            _COMPILED_DIGESTS[dispatcher] = watched  # so that a closure around it does not compile it again
-            with suppress(RuntimeError):  # there is no folder that can be written
+            _COMPILED_DIGESTS[dispatcher] = watched  # so that a closure that encloses it does not compile it again
+            with suppress(RuntimeError):  # no folder can be written
                 dispatcher._cache = _Cache(dispatcher.py_func, *watched, "")
         return dispatcher
 
@@ -401,7 +402,7 @@ def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispa
 
 
 def digests_of(function: Callable[..., Any]) -> tuple[str, str] | None:
-    """Return digests of all that the machine code of a function depends on, and of what it encloses.
+    """Return digests of all that the machine code of a function depends on, and of the values that it encloses.
 
     The first is of its code, its defaults, and the values of the globals and of the attributes of modules that it
     names; of compiled helpers among them the same, and so on. None: something among it cannot be watched.
@@ -413,9 +414,9 @@ def digests_of(function: Callable[..., Any]) -> tuple[str, str] | None:
 
 
 def _digests_and_helpers(function: Callable[..., Any]) -> tuple[tuple[str, str] | None, list[Any]]:
-    """Return the digests of `digests_of`, and the helpers that were met, each after those that it names."""
+    """Return the digests of `digests_of`, and the helpers found, each after those that it names."""
     code, enclosed = Digest(), Digest()
-    enclosed.names = names_reached(function)  # of modules among what it encloses
+    enclosed.names = names_reached(function)  # names of attributes of the modules that it encloses
     try:
         code.add_function(function, enclosed=False)
         enclosed.add(enclosed_by(function))
@@ -426,10 +427,10 @@ def _digests_and_helpers(function: Callable[..., Any]) -> tuple[tuple[str, str] 
 
 
 def helper(function: Callable[..., Any]) -> Any:
-    """Decorate what compiled callbacks call: numba's `njit` with our cache.
+    """Decorate a function that compiled callbacks call: numba's `njit` with the cache of twoloop.
 
-    Such a function allocates nothing, so that it needs no numba runtime, whose counts of references to arrays take
-    longer than a row of C_q.
+    Such a function allocates nothing. So it needs no numba runtime, whose counts of references to arrays take longer
+    than a row of C_q.
     """
     options: dict[str, Any] = {"_nrt": False, "error_model": "numpy"}
     dispatcher = njit(**options)(function)
@@ -438,13 +439,14 @@ def helper(function: Callable[..., Any]) -> Any:
     return dispatcher
 
 
-_COMPILED_DIGESTS: WeakKeyDictionary[Any, tuple[str, str]] = WeakKeyDictionary()  # what helpers depended on
+# digests of what helpers depended on when they were compiled
+_COMPILED_DIGESTS: WeakKeyDictionary[Any, tuple[str, str]] = WeakKeyDictionary()
 
 
 def _put_under_cache(helper: Any) -> None:
-    """Replace numba's cache of a helper by ours, and recompile one that names other values now.
+    """Replace numba's cache of a helper by that of twoloop, and recompile a helper that names other values now.
 
-    Numba's cache does not see what a helper calls in other files. What numba has compiled, or read, it keeps for all
+    Numba's cache does not see what a helper calls in other files. Numba keeps what it has compiled, or read, for all
     functions that call it later; it may have done so before the helper came here, unless the signatures were given.
     """
     watched, known = _digests_and_helpers(getattr(helper, "py_func", helper))[0], _COMPILED_DIGESTS.get(helper)

@@ -1,12 +1,12 @@
-"""The kinds of callback that a mechanism may have, in one table, and the decorator that compiles one.
+"""Define the kinds of callback that a mechanism may have, in one table, and the decorator that compiles one.
 
-All that is said of a kind anywhere follows from its entry in `KINDS`: the signature that numba compiles, the fields of
+All other definitions of a kind follow from its entry in `KINDS`: the signature that numba compiles, the fields of
 `Functions` that the kernels see, the methods and the documentation of `ConstrainedSystem`, and the adapters for plain
 Python functions.
 
-Functions that index arrays by numbers that they compute, as in a table, have their bounds checked in every call.
-Without that, machine code reads other memory beyond the end of a table, or ends the process. What functions with
-constant indices and counters of loops do, the first call shows, and they are left as they are.
+Functions that index arrays by computed numbers, as in a table, have their bounds checked in every call. Otherwise
+machine code would read other memory beyond the end of a table, or end the process. The first call shows whether
+functions with constant indices and loop counters are correct: they are not checked.
 """
 
 import ast
@@ -34,12 +34,13 @@ from twoloop.kernels.compile.dependencies import (
 )
 from twoloop.kernels.compile.private import add_signature, options_of
 
-BOUNDS_CHECK = {"boundscheck": True}  # for numba
-SAFE_CALLS = ("len", "min", "max", "abs", "range", "enumerate", "zip", "reversed")  # with arguments that are safe
+BOUNDS_CHECK = {"boundscheck": True}  # option of numba
+# calls that are safe if their arguments are
+SAFE_CALLS = ("len", "min", "max", "abs", "range", "enumerate", "zip", "reversed")
 
 
 def with_bounds_checks(function: Callable[..., Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
-    """Return a function, or its copy with helpers whose bounds are checked, and the options that numba needs for it."""
+    """Return a function (or its copy with bounds-checked helpers) and the options that numba needs for it."""
     helpers = [helper for place in frozen_places(function) if (helper := python_function(place.value)) is not None]
     if any(map(has_computed_indices, helpers)):
         return FunctionCopier(_with_bounds_checks).copy_of(function), BOUNDS_CHECK
@@ -47,11 +48,11 @@ def with_bounds_checks(function: Callable[..., Any]) -> tuple[Callable[..., Any]
 
 
 def _with_bounds_checks(copy: Any, original: Any) -> Any:
-    """Recompile a copy of a helper with its options and bounds checks; a function that is no helper stays."""
+    """Recompile a copy of a helper with its options and bounds checks; return other functions unchanged."""
     helper = python_function(original)
     if helper is None:
         return copy
-    copy.__qualname__ = f"{helper.__qualname__}.watched"  # numba's symbols are made of it
+    copy.__qualname__ = f"{helper.__qualname__}.watched"  # numba's symbols contain this name
     return jit(**{**options_of(original), **BOUNDS_CHECK})(with_unique_name(copy, digests_of(helper)))
 
 
@@ -61,14 +62,14 @@ def has_computed_indices(function: Callable[..., Any]) -> bool:
         return False
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
-    except (OSError, TypeError, SyntaxError):  # typed at a prompt, or a part of a statement
+    except (OSError, TypeError, SyntaxError):  # the source was typed at a prompt, or is a part of a statement
         return True
     computed = _computed_names(tree)
     return any(not _is_safe(node.slice, computed) for node in ast.walk(tree) if isinstance(node, ast.Subscript))
 
 
 def _computed_names(tree: ast.AST) -> set[str]:
-    """Return the names that may stand for other numbers than constants and counters of loops."""
+    """Return the names that may have other values than constants and loop counters."""
     found = {node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)}
     while True:
         before = len(found)
@@ -89,7 +90,7 @@ def _computed_names(tree: ast.AST) -> set[str]:
 
 
 def _is_safe(node: ast.AST | None, computed: set[str]) -> bool:
-    """Return whether an expression is of constants, counters of loops and sizes alone."""
+    """Return whether an expression consists of constants, loop counters and sizes only."""
     if node is None or isinstance(node, ast.Constant):
         return True
     if isinstance(node, ast.Name):
@@ -110,11 +111,11 @@ def _is_safe(node: ast.AST | None, computed: set[str]) -> bool:
 
 f8 = numba.types.float64
 VECTOR = numba.types.float64[::1]
-READ = numba.types.Array(f8, 1, "C", readonly=True)  # in memory the same
+READ = numba.types.Array(f8, 1, "C", readonly=True)  # has the same layout in memory
 MATRIX = numba.types.float64[:, ::1]
 
-# what callbacks depend on beside t and p, and the size of each
-STATE = {"q": "n_q", "v": "n_q", "lam": "n_c"}  # of the multipliers those of C alone
+# arguments of callbacks beside t and p, and the size of each
+STATE = {"q": "n_q", "v": "n_q", "lam": "n_c"}  # the multipliers are those of C only
 
 
 @dataclass(frozen=True)
@@ -360,13 +361,14 @@ def callback(kind: str, allocates: bool = True) -> Callable[[Callable[..., None]
     return decorate
 
 
-if callback.__doc__:  # not so with python -OO
+if callback.__doc__:  # python -OO removes docstrings
     callback.__doc__ = callback.__doc__.format(
         kinds=",\n        ".join(f'"{name}" ({", ".join(kind.arguments)})' for name, kind in KINDS.items())
     )
 
 
-_OPTIONS: dict[str, Any] = {"error_model": "numpy"}  # of numba: a division by zero is an infinity, as in the kernels
+# option of numba: a division by zero gives an infinity, as in the kernels
+_OPTIONS: dict[str, Any] = {"error_model": "numpy"}
 
 
 def compile_callback(
@@ -376,7 +378,7 @@ def compile_callback(
     named: Callable[..., Any] | None = None,
     allocates: bool = True,
 ) -> Dispatcher:
-    """Compile a function that works in place for the signature of its kind, or say in two lines why it cannot be.
+    """Compile a function that works in place for the signature of its kind, or say in two lines why that fails.
 
     `watched` is that of `compile_cached`; `named` is the function to name in the message, if it is another.
     """
@@ -391,7 +393,8 @@ def compile_callback(
     else:
         add_signature(made, KINDS[kind].signature)
     if watched is not None:
-        digest_as(made, f"{kind} {watched}")  # as it was compiled, whatever becomes of what it names
+        # the digest stays that of this compilation, whatever becomes of the values that it names
+        digest_as(made, f"{kind} {watched}")
     frozen_values(made, function)
     return made
 
@@ -404,7 +407,7 @@ def _compile_writable(
     error: Exception,
     options: dict[str, Any],
 ) -> Dispatcher:
-    """Compile a function whose helpers want arrays that may be written; refuse one that writes to them itself."""
+    """Compile a function whose helpers require writable arrays; refuse one that writes to them itself."""
     try:
         made = compile_cached(function, KINDS[kind].signature, watched, **options)
     except Exception as its_own:
@@ -423,7 +426,7 @@ _ONLY_A_HELPER = re.compile(r"Invalid use of type\(CPUDispatcher\(")
 
 @cache
 def zero_callback(kind: str) -> Dispatcher:
-    """Compile the replacement of an optional callback that is not given: it leaves zeros."""
+    """Compile the replacement of an optional callback that is missing: it leaves zeros."""
 
     def leaves_zeros(t, q, p, out):
         pass
@@ -439,7 +442,7 @@ def zero_callback(kind: str) -> Dispatcher:
 
 
 def _failure_message(kind: str, function: Callable[..., Any], error: Exception) -> str:
-    """Say which function numba cannot compile, with the line of numba's message that says most."""
+    """Return the message for a function that numba cannot compile, with the best line of numba's message."""
     return (
         f"{kind}: numba cannot compile the function {_named(function)}; it must use numbers, numpy arrays of one type "
         f"and of the shape that {kind} asks for, and functions that numba knows (helpers need numba.njit)\n"
@@ -452,8 +455,8 @@ def _named(function: Callable[..., Any]) -> str:
     return f"{name!r} ({code.co_filename}, line {code.co_firstlineno})" if code else repr(name)
 
 
-_SOURCE = re.compile(r"^File \".*?^[ ]*\^$", re.MULTILINE | re.DOTALL)  # what numba shows of a file, down to its mark
-# lines of numba's messages that only lead to another
+_SOURCE = re.compile(r"^File \".*?^[ ]*\^$", re.MULTILINE | re.DOTALL)  # numba's excerpt of a file, down to its mark
+# lines of numba's messages that only refer to another line
 _UNINFORMATIVE = re.compile(
     r"Failed in |- Resolution failure|During: |File \"|>>> |There (is|are) \d+ candidate|- Of which|Overload (in|of) |"
     r"With argument|Rejected as|raised from|None$|Tried |This (is usually|error)|<source elided>|Enable logging"
@@ -466,7 +469,7 @@ def _without_colours(error: Exception) -> str:
 
 def _telling_line(error: Exception) -> str:
     plain = _without_colours(error)
-    plain = re.sub(r":\s*>>> ", ": ", _SOURCE.sub("", plain))  # a signature that was not found
+    plain = re.sub(r":\s*>>> ", ": ", _SOURCE.sub("", plain))  # remove a signature that was not found
     lines = [line.strip() for line in plain.splitlines() if line and not line.startswith("    ")]
     telling = [line for line in lines if line and not _UNINFORMATIVE.match(line) and not line.startswith("def ")]
     return f"{type(error).__name__}: {telling[-1] if telling else plain.strip()[:200]}"

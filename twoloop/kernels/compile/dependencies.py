@@ -1,4 +1,4 @@
-"""What machine code depends on: all that a function names, encloses and freezes; digests and copies of it.
+"""Find what machine code depends on: all values that a function names, encloses and freezes; their digests and copies.
 
 Numba freezes globals, free variables, defaults, attributes of modules, items of tuples and compiled helpers in the
 functions that it compiles. `Digest` hashes them, `frozen_places` lists them, and `FunctionCopier` copies a function
@@ -24,13 +24,13 @@ from numba.core.types import Type
 
 from twoloop.kernels.compile.private import Dispatcher, jitable_templates, options_of
 
-# libraries whose functions are told apart by name; the versions of numba and numpy are compared, too
+# libraries whose functions are identified by name; the versions of numba and numpy are compared, too
 LIBRARIES = {*sys.stdlib_module_names, "numpy", "numba", "scipy"}
 
-# codes whose names are kept: functions are made again and again from one code, and to read the instructions of helpers
-# again takes most of the time of tracing
+# number of codes whose names are cached: the same code gives new functions again and again, and to read the
+# instructions of helpers again takes most of the time of tracing
 MAX_CODES = 2000
-FORM = 2  # another one for machine code that files of earlier versions may have wrong
+FORM = 2  # change this if files of earlier versions may have wrong machine code
 
 
 def digest_of(text: str, *sources: str | types.ModuleType) -> str:
@@ -45,7 +45,7 @@ _DIGEST_TEXTS: WeakKeyDictionary[Dispatcher, str] = WeakKeyDictionary()
 
 
 def digest_as(callback: Dispatcher, what: str) -> None:
-    """Register a text as the digest of a callback that goes to Python and so cannot be digested itself."""
+    """Register a text as the digest of a callback that calls Python and so cannot be digested itself."""
     _DIGEST_TEXTS[callback] = what
 
 
@@ -55,17 +55,17 @@ def enclosed_by(function: Any) -> list[Any]:
 
 
 class NotDigestible(Exception):
-    """Report a value that may change unseen."""
+    """Error for a value that may change unnoticed."""
 
 
 class Digest:
-    """Hash values of many types, and follow functions to whatever they name."""
+    """Hash values of many types, and follow functions to all values that they name."""
 
     def __init__(self) -> None:
         self.hash = hashlib.sha256(f"{FORM} {np.__version__}".encode())
-        self.names: set[str] = set()  # of attributes that the code being looked at, or its helpers, may take of modules
-        self.seen: dict[tuple[int, str], int] = {}  # and in which order
-        self.helpers: list[Any] = []  # that were followed, each after those that it names
+        self.names: set[str] = set()  # names of attributes that the current code, or its helpers, may take of modules
+        self.seen: dict[tuple[int, str], int] = {}  # values seen, with their order
+        self.helpers: list[Any] = []  # helpers that were followed, each after those that it names
 
     def add(self, value: Any) -> None:
         """Add a value."""
@@ -122,7 +122,7 @@ class Digest:
                     self.add([name, vars(module)[name]])
 
     def _add_name(self, value: Any) -> None:
-        """Add functions and types of the libraries by their names; nothing else may stand for itself."""
+        """Add functions and types of libraries by their names; reject any other value."""
         if isinstance(value, type) and hasattr(value, "_fields"):
             self.hash.update(f"{value.__qualname__}{value._fields}".encode())
             return
@@ -135,7 +135,7 @@ class Digest:
 
     def _is_new(self, value: Any, name: str = "") -> bool:
         key = (id(value), name)
-        if key in self.seen:  # one of several, and which one counts
+        if key in self.seen:  # the value was added before: add its position
             self.hash.update(f"<again {self.seen[key]}>".encode())
             return False
         self.seen[key] = len(self.seen)
@@ -143,19 +143,19 @@ class Digest:
 
 
 def names_in(code: types.CodeType) -> set[str]:
-    """Return the names of globals and attributes in a code and the functions within it."""
+    """Return the names of globals and attributes in a code and in the functions within it."""
     inner = [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
     return set(code.co_names).union(*map(names_in, inner))
 
 
 def globals_of(function: Any) -> dict[str, Any]:
-    """Return the globals that a function, or one within it, loads; an attribute, as in `math.log`, is none."""
+    """Return the globals that a function, or one within it, loads; attributes, as in `math.log`, are not included."""
     names = {each.name for each in _loads(function.__code__) if not each.free} & set(function.__globals__)
     return {name: function.__globals__[name] for name in sorted(names)}
 
 
 def names_reached(function: Any, seen: set[int] | None = None) -> set[str]:
-    """Return the names in a function and in compiled helpers that it names, to which it may pass a module."""
+    """Return the names in a function and in the compiled helpers that it names, to which it may pass a module."""
     seen = set() if seen is None else seen
     seen.add(id(function))
     names = names_in(function.__code__)
@@ -168,19 +168,19 @@ def names_reached(function: Any, seen: set[int] | None = None) -> set[str]:
 
 
 def is_library(module: str) -> bool:
-    """Return whether a module is of Python, or of a package that is told by its version."""
+    """Return whether a module belongs to Python, or to a package that is identified by its version."""
     return module.partition(".")[0] in LIBRARIES
 
 
 def is_ours(module: str) -> bool:
-    """Return whether a module is of twoloop or generated by it: what it names stays, and its indices are in bounds."""
+    """Return whether a module belongs to twoloop or is generated: its names are constant, its indices in bounds."""
     return f"{module}.".startswith(("twoloop.", "twoloop_equations_"))
 
 
-LOADS_GLOBAL = ("LOAD_GLOBAL", "LOAD_NAME")  # the latter within a class
+LOADS_GLOBAL = ("LOAD_GLOBAL", "LOAD_NAME")  # LOAD_NAME occurs within a class
 LOADS_ATTRIBUTE = ("LOAD_ATTR", "LOAD_METHOD")
-FROZEN_VALUES = "__as_compiled__"  # the attribute of a compiled callback that holds what it named then
-NO_EFFECT = ("EXTENDED_ARG", "CACHE", "NOP", "PUSH_NULL")  # these do nothing to what was loaded
+FROZEN_VALUES = "__as_compiled__"  # attribute of a compiled callback with the values of its names at compilation
+NO_EFFECT = ("EXTENDED_ARG", "CACHE", "NOP", "PUSH_NULL")  # instructions that do not change the loaded value
 
 
 class Place(NamedTuple):
@@ -205,7 +205,7 @@ class Place(NamedTuple):
 
 
 class _Loaded(NamedTuple):
-    """Name a global or a free variable that a code loads, and the attributes that it takes of it, one of the other."""
+    """Global or free variable that a code loads, and the chain of attributes that it takes of it."""
 
     free: bool
     name: str
@@ -213,9 +213,9 @@ class _Loaded(NamedTuple):
 
 
 def frozen_values(compiled: Any, function: Any = None) -> list[tuple[Place, bytes | None]]:
-    """Return what `frozen_places` gave when this was called first, each with the bytes of an array.
+    """Return the result of the first `frozen_places` of a function, each value with the bytes of an array.
 
-    `function` is the one that was compiled, or that of which it was a copy.
+    `function` is the one that was compiled, or the original of its copy.
     """
     found: list[tuple[Place, bytes | None]] | None = getattr(compiled, FROZEN_VALUES, None)
     if found is None:
@@ -229,9 +229,9 @@ def _bytes(value: Any) -> bytes | None:
 
 
 def frozen_places(function: Any, seen: set[int] | None = None) -> Iterator[Place]:
-    """List where a function and its helpers find what numba freezes: numbers, arrays, text, functions, modules.
+    """List where a function and its helpers find values that numba freezes: numbers, arrays, text, functions, modules.
 
-    Our own modules name nothing that changes; in them, only helpers are followed.
+    Names in modules of twoloop are constant; in these modules, only helpers are followed.
     """
     seen = set() if seen is None else seen
     if id(function) in seen:
@@ -248,7 +248,7 @@ def frozen_places(function: Any, seen: set[int] | None = None) -> Iterator[Place
 
 
 def python_function(value: Any) -> FunctionType | None:
-    """Return what numba compiles to a helper (by `njit`, `register_jitable`, `vectorize` or `cfunc`); else None."""
+    """Return the function of a compiled helper (`njit`, `register_jitable`, `vectorize` or `cfunc`); else None."""
     if isinstance(value, Dispatcher):
         return value.py_func  # type: ignore[no-any-return]
     if isinstance(value, FunctionType):
@@ -269,14 +269,14 @@ def _freezes(value: Any) -> bool:
 
 
 def _with_items(place: Place, seen: set[int]) -> Iterator[Place]:
-    """Yield a place, and those within it if it holds a tuple."""
+    """Yield a place, and those of its items if it holds a tuple."""
     yield place
     if not isinstance(place.value, tuple) or id(place.value) in seen:
         return
     seen.add(id(place.value))
     fields = getattr(place.value, "_fields", None)
     for k, value in enumerate(place.value):
-        if isinstance(value, (tuple, np.ndarray, np.void)) or callable(value):  # numbers stay
+        if isinstance(value, (tuple, np.ndarray, np.void)) or callable(value):  # numbers in a tuple do not change
             name = f"{place.name}[{k}]" if fields is None else f"{place.name}.{fields[k]}"
             yield from _with_items(Place(None, "", name, value), seen)
 
@@ -289,7 +289,7 @@ def _direct_places(function: FunctionType) -> Iterator[Place]:
         yield Place(None, "", name, value)
     cells: dict[str, CellType] = dict(zip(code.co_freevars, function.__closure__ or (), strict=True))
     for free, name, attributes in _loads(code):
-        if not free and name not in space:  # built in
+        if not free and name not in space:  # a built-in name
             continue
         holder, value = (cells[name], cells[name].cell_contents) if free else (space, space[name])
         place = Place(holder, name, name, value)
@@ -301,7 +301,7 @@ def _direct_places(function: FunctionType) -> Iterator[Place]:
 def _places_of_module(place: Place, attributes: tuple[str, ...], names: set[str]) -> Iterator[Place]:
     """Yield the attributes that are taken of a module of the user, and of modules within it.
 
-    If the module itself goes elsewhere, as to a local variable or to a helper, all that bear `names` are taken.
+    If the module itself is passed on, as to a local variable or a helper, all attributes with `names` are yielded.
     """
     if not isinstance(place.value, ModuleType) or is_library(place.value.__name__):
         return
@@ -334,13 +334,13 @@ def _loads(code: CodeType) -> tuple[_Loaded, ...]:
 class FunctionCopier:
     """Copy functions with replacements for the compiled helpers that they name or enclose."""
 
-    # wrap(copy, original) -> what stands in the place of the original
+    # wrap(copy, original) -> replacement of the original
     def __init__(self, wrap: Callable[[types.FunctionType, Any], Any]):
         self.wrap = wrap
         self.known: dict[Any, Any] = {}
 
     def value(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        """Return the replacement of a value; `names` are those that may be taken of a module."""
+        """Return the replacement of a value; `names` are the attributes that may be taken of a module."""
         if self.copies(value):
             if id(value) not in self.known:
                 self._rewrite(value)
@@ -376,7 +376,7 @@ class FunctionCopier:
         own_globals = dict(function.__globals__)
         copy = types.FunctionType(function.__code__, own_globals, function.__name__, function.__defaults__, cells)
         copy.__kwdefaults__, copy.__qualname__ = function.__kwdefaults__, function.__qualname__
-        self.known[id(helper)] = self.wrap(copy, helper)  # before what it names, which may be itself
+        self.known[id(helper)] = self.wrap(copy, helper)  # before the values that it names, which may include itself
         for name in own & set(own_globals):
             own_globals[name] = self.value(own_globals[name], names)
         if function.__defaults__ is not None:

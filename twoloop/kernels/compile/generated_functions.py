@@ -1,8 +1,8 @@
-"""Functions of LLVM made for one mechanism: compiled past numba, kept on disk, and called by kernels at their address.
+"""Compile functions of LLVM generated for one mechanism without numba, cache them on disk, and load their addresses.
 
 Numba writes, parses and optimises some thousand lines around each function, and its front end takes ten milliseconds
-for a line of source. What is made for a mechanism is arithmetic on numbers in memory, in the order in which it is to be
-done, so that LLVM has little to do before it makes machine code of it.
+for a line of source. Code generated for a mechanism is arithmetic on numbers in memory, already in the right order, so
+that LLVM has little to do before it emits machine code.
 """
 
 from collections import defaultdict
@@ -42,7 +42,7 @@ class GeneratedFunctions:
 
 
 class DeferredFunctions:
-    """Generate functions when their addresses are first used: those that a run may not need."""
+    """Generate functions when their addresses are first used, because a run may not need them."""
 
     def __init__(self, make: Callable[[], GeneratedFunctions]):
         self._make = make
@@ -58,7 +58,7 @@ class DeferredFunctions:
         return self.functions.addresses
 
 
-_IN_MEMORY: dict[str, BoundedCache] = defaultdict(BoundedCache)  # by kind
+_IN_MEMORY: dict[str, BoundedCache] = defaultdict(BoundedCache)  # caches by kind
 
 
 def generated_functions(
@@ -85,7 +85,7 @@ def generated_functions(
     files, place = _code_files(kind, stamp), _disk_key(key)
     try:
         kept = files.load(place)
-    except Exception:  # a file of another installation; it is written anew
+    except Exception:  # a file of another installation: it is written again
         kept = None
     if kept is None:
         names, text = write()
@@ -100,7 +100,7 @@ def generated_functions(
 
 
 def are_cached(kind: str, stamp: str, key: str) -> bool:
-    """Return whether `generated_functions` would find them."""
+    """Return whether the functions are in memory or on disk."""
     return key in _IN_MEMORY[kind] or _code_files(kind, stamp).has(_disk_key(key))
 
 
@@ -113,7 +113,7 @@ def _disk_key(key: str) -> Any:
 
 
 def object_code(text: str, passes: bool = True) -> bytes:
-    """Compile a module for this processor; `passes`: the operations are simplified first."""
+    """Compile a module for this processor; with `passes`, simplify the operations first."""
     machine = _compiler()
     target = f'target triple = "{_triple()}"\ntarget datalayout = "{machine.target_data}"\n'
     module = binding.parse_assembly(target + text)
@@ -131,9 +131,9 @@ def _compiler() -> Any:
 
 @cache
 def _two_passes() -> tuple[Any, Any]:
-    """Make the two passes that speed up small mechanisms by a tenth; all others together find nothing more.
+    """Create the two passes that speed up small mechanisms by a tenth; all other passes together gain nothing more.
 
-    They are made once a process: each pass that is let go leaves some 300 kB.
+    They are created once a process, because each discarded pass leaves about 300 kB.
     """
     passes = binding.create_new_module_pass_manager()
     passes.add_reassociate_pass()
@@ -142,7 +142,7 @@ def _two_passes() -> tuple[Any, Any]:
 
 
 def _all_passes() -> tuple[Any, Any]:
-    """Make the passes of llvmlite 0.44, which serve one module."""
+    """Create the passes of llvmlite 0.44, which serve one module."""
     builder = _pass_builder()
     return builder.getModulePassManager(), builder
 
@@ -157,8 +157,8 @@ def _triple() -> str:
 
 
 def _machine() -> Any:
-    """Make LLVM's description of the processor as numba sees it (NUMBA_CPU_NAME); an engine keeps the one given."""
-    options: dict[str, Any] = {"opt": 1}  # 2 takes a quarter longer and finds nothing more in straight lines
+    """Create LLVM's description of the processor as numba sees it (NUMBA_CPU_NAME); an engine keeps the one it gets."""
+    options: dict[str, Any] = {"opt": 1}  # level 2 takes a quarter longer and gains nothing in straight-line code
     cpu_target.target_context.codegen()._customize_tm_options(options)
     return binding.Target.from_triple(_triple()).create_target_machine(**options)
 

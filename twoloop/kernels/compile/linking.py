@@ -1,15 +1,15 @@
-"""How the kernels are compiled: helpers not on their own, but within the kernels that call them.
+"""Compile kernels: helpers are not compiled alone, but within the kernels that call them.
 
-Numba optimises each function together with all that it calls and makes machine code of it, so that a helper at depth
-five is optimised six times, and its machine code is made without ever being called. Here helpers are handed on as
-LLVM's intermediate code, and the kernel at the top is optimised once. Numba's front end, half of the time, leaves out
-what finds nothing to do. Loops are neither unrolled nor vectorised: those of a mechanism are short, and the code that
-tests whether they are costs more than it gains.
+Numba optimises each function together with all that it calls and emits its machine code, so that a helper at depth five
+is optimised six times, and its own machine code is never called. Here helpers are passed on as LLVM's intermediate
+code, and the kernel at the top is optimised once. Passes of numba's front end (half of the time) that find nothing to
+do are left out. Loops are neither unrolled nor vectorised: those of a mechanism are short, and the tests of their
+length cost more than they gain.
 
-While a kernel is compiled, `kernel_rules` replaces some of numba's functions; what others compile meanwhile is theirs.
-An index of a kernel does not count from the end where it is negative, as none is: the code that asks for it would hide
-from LLVM that elements lie side by side. The other rules give the same machine code in less time: half of a compilation
-is Python, and numba finds the same things again and again.
+While a kernel is compiled, `kernel_rules` replaces some of numba's functions; compilations of other functions meanwhile
+are not affected. A negative index of a kernel does not count from the end, as none is negative: the code for this would
+hide from LLVM that elements are adjacent. The other rules give the same machine code in less time: half of a
+compilation is Python, in which numba computes the same results again and again.
 """
 
 from collections.abc import Callable, Iterator
@@ -48,7 +48,7 @@ _any_indexing: Any = arrayobj.basic_indexing
 
 
 def _indexing(context: Any, builder: Any, kind: Any, array: Any, index_types: Any, indices: Any, **options: Any) -> Any:
-    """Return the address of one element of a contiguous array, without what only views need."""
+    """Return the address of one element of a contiguous array, without the code that only views need."""
     of_element = len(indices) == kind.ndim and all(isinstance(each, types.Integer) for each in index_types)
     if kind.layout != "C" or not of_element or options.get("boundscheck"):
         return _any_indexing(context, builder, kind, array, index_types, indices, **options)
@@ -60,7 +60,8 @@ def _indexing(context: Any, builder: Any, kind: Any, array: Any, index_types: An
 
 _plain_call_type: Any = BaseFunction.get_call_type
 _call_types: dict[Any, tuple[Any, Any]] = {}
-_options: dict[int, tuple[Any, str]] = {}  # of functions, and what they say; kept, so that no other gets their place
+# options of functions and their texts; kept, so that no other object gets their id
+_options: dict[int, tuple[Any, str]] = {}
 
 
 def _text_of(options: Any) -> str:
@@ -70,7 +71,7 @@ def _text_of(options: Any) -> str:
 
 
 def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
-    """Return the signature of a call of one of numba's functions, found once for the same types and options.
+    """Return the signature of a call of one of numba's functions, cached for the same types and options.
 
     Numba tries all implementations of an operator at each call, which is a tenth of a compilation.
     """
@@ -87,7 +88,7 @@ _sizes: dict[str, int] = {}
 
 
 def _size_of(self: Any, kind: Any) -> Any:
-    """Return the size of a type, for which numba has LLVM read a module at each variable."""
+    """Return the size of a type, cached, because numba lets LLVM read a module at each variable."""
     name = str(kind)
     if name not in _sizes:
         _sizes[name] = _found_size(self, kind)
@@ -99,20 +100,20 @@ _inlined: dict[Any, Any] = {}
 
 
 def _inlined_code(self: Any, function: Any, enable_ssa: bool = False) -> Any:
-    """Return the code of a function that is inlined, which numba copies, and reads anew at each call."""
+    """Return the cached code of an inlined function, which numba would read again at each call."""
     if (function, enable_ssa) not in _inlined:
         _inlined[function, enable_ssa] = _inlined_passes(self, function, enable_ssa)
     self.flags.enable_ssa = enable_ssa
     code = copy(_inlined[function, enable_ssa])
-    code.func_id = FunctionIdentity.from_function(function)  # variables are named after it
+    code.func_id = FunctionIdentity.from_function(function)  # variables get their names from it
     return code
 
 
-_LEAVES = {ir.Loc, str, int, bool, type(None)}  # of what a statement holds
+_LEAVES = {ir.Loc, str, int, bool, type(None)}  # types of a statement's parts that contain no variables
 
 
 def _variables(self: Any, held: Any) -> list[Any]:
-    """Return the variables that a statement names; numba calls a function for each thing that it holds."""
+    """Return the variables that a statement names, faster than numba, which calls a function for each of its parts."""
     if isinstance(held, ir.Var):
         return [held]
     if isinstance(held, ir.Inst):
@@ -131,9 +132,9 @@ _load_registries: Any = CPUContext.load_additional_registries
 
 
 def _load_once(self: Any) -> None:
-    """Install what numba implements of Python's and NumPy's functions, which it imports anew at each function.
+    """Install numba's implementations of Python's and NumPy's functions, which numba imports again for each function.
 
-    An intrinsic that is first met is put into one of the registries that are there; copies of a context share them.
+    A new intrinsic is added to one of the existing registries; copies of a context share them.
     """
     if self._registries:
         for registry in list(self._registries):
@@ -146,11 +147,11 @@ _LOCKS = ("numba:llvm_lock", "numba:compiler_lock")
 
 
 def _ignoring_locks(tell: Any) -> Any:
-    """Report events, but not those of locks: some thousand for each kernel, each of which measures all before it."""
+    """Report events, but not those of locks: some thousand for each kernel, and each measures all before it."""
     return lambda kind, *args, **named: None if kind in _LOCKS else tell(kind, *args, **named)
 
 
-# in the place of what; Function inherits what it gets here
+# owner, name and replacement of each function; Function inherits the one that it gets here
 _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
     (Function, "get_call_type", _call_type),
     (arrayobj, "fix_integer_index", _index),
@@ -163,7 +164,7 @@ _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
     (event, "end_event", _ignoring_locks(event.end_event)),
 ]
 _NONE = object()
-_depth = [0]  # compilations of kernels, one within another
+_depth = [0]  # number of nested compilations of kernels
 
 
 @contextmanager
@@ -187,7 +188,7 @@ def kernel_rules() -> Iterator[None]:
 
 
 class _WithoutEnvironment:
-    """Stand for the code generator of code that is not loaded, where the environment has no address."""
+    """Code generator of code that is not loaded, so that its environment has no address."""
 
     def __init__(self, codegen: Any):
         self._codegen = codegen
@@ -200,7 +201,7 @@ class _WithoutEnvironment:
 
 
 class _Linked(CPUCodeLibrary):
-    """Hold the code of a helper, to be linked into its callers."""
+    """Code of a helper, to be linked into its callers."""
 
     @property
     def codegen(self) -> Any:
@@ -210,10 +211,10 @@ class _Linked(CPUCodeLibrary):
         return 0
 
     def _optimize_final_module(self) -> None:
-        pass  # its callers do
+        pass  # its callers optimise it
 
     def _get_module_for_linking(self) -> Any:
-        """Return the code as it is, which nothing else uses: numba links a copy."""
+        """Return the code itself, not a copy: nothing else uses it, and numba links a copy."""
         if self._shared_module is None:
             self._ensure_finalized()
             for function in self._final_module.functions:
@@ -227,7 +228,7 @@ class _Linked(CPUCodeLibrary):
 
 
 class _Whole(JITCodeLibrary):
-    """Hold the code of a kernel and of all that it calls."""
+    """Code of a kernel and of all that it calls."""
 
     vectorized = False
 
@@ -239,14 +240,14 @@ class _Whole(JITCodeLibrary):
 
 
 class _Vectorized(_Whole):
-    """Hold the code of a kernel whose loops are worth vectorizing."""
+    """Code of a kernel whose loops are worth vectorizing."""
 
     vectorized = True
 
 
-# passes over every function that find nothing to do in kernels: functions within functions; whole arrays in an
-# expression, as none is allocated; overloads that are put in the place of calls before lowering; what cannot stand in
-# a compiled function
+# passes over every function that find nothing to do in kernels: functions within functions; expressions of whole
+# arrays, as none is allocated; overloads that replace calls before lowering; code that a compiled function cannot
+# contain
 _SKIPPED_PASSES = {InlineClosureLikes, NopythonRewrites, InlineOverloads, IRLegalization}
 
 
@@ -292,7 +293,7 @@ class VectorizingCompiler(KernelCompiler):
 
 @cache
 def entry_point(function: Dispatcher) -> Any:
-    """Return what Python calls of a function with one signature, without a check of the types: these must fit.
+    """Return the function that Python calls for a compiled function, without a check of types: these must fit.
 
     That check costs as much as two steps of a small mechanism.
     """
@@ -300,11 +301,12 @@ def entry_point(function: Dispatcher) -> Any:
     return compiled.entry_point
 
 
-_ADDRESSES: WeakKeyDictionary[Dispatcher, int] = WeakKeyDictionary()  # of functions, which have one signature each
+# addresses of functions, which have one signature each
+_ADDRESSES: WeakKeyDictionary[Dispatcher, int] = WeakKeyDictionary()
 
 
 def machine_code(function: Dispatcher, signature: Any) -> int:
-    """Return the address of a compiled function; it takes arguments and reports errors as numba's functions do."""
+    """Return the address of a compiled function; its arguments and errors are passed as for numba's functions."""
     if function not in _ADDRESSES:
         compiled: Any = function.overloads.get(signature.args) or function.get_compile_result(signature)
         _ADDRESSES[function] = int(compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name))

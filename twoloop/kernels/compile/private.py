@@ -1,4 +1,4 @@
-"""What of numba's private parts is used where code is generated; other modules take it from here."""
+"""Private parts of numba that code generation uses; other modules import them from here."""
 
 from copy import copy
 from types import FunctionType
@@ -12,25 +12,25 @@ __all__ = ["Dispatcher", "add_signature", "cgutils", "forget_compiled", "jitable
 
 
 def jitable_templates(function: Any) -> list[Any]:
-    """Return what numba keeps of a function made by `register_jitable`, which it compiles anew in its callers.
+    """Return numba's templates of a function made by `register_jitable`, which it compiles again in each caller.
 
-    An empty list for any other function.
+    The list is empty for any other function.
     """
     context: Any = cpu_target.typing_context
     if not isinstance(function, FunctionType):
         return []
-    context.refresh()  # what was registered since numba last compiled
+    context.refresh()  # include functions registered since numba last compiled
     try:
         templates = list(getattr(context.resolve_value_type(function), "templates", ()))
-    except ValueError:  # numba does not know it
+    except ValueError:  # numba does not know the function
         return []
     sources = [getattr(getattr(each, "_overload_func", None), "__closure__", None) for each in templates]
     own = [any(cell.cell_contents is function for cell in source or ()) for source in sources]
-    return templates if all(own) else []  # another implementation may stand in its place
+    return templates if all(own) else []  # another implementation may replace it
 
 
 def add_signature(function: Dispatcher, signature: Any) -> None:
-    """Let a function of one signature be called with another, whose arguments are the same in memory."""
+    """Let a function of one signature be called with another, whose arguments have the same layout in memory."""
     own: Any = function
     (compiled,) = own.overloads.values()
     own._insert([each._code for each in signature.args], compiled.entry_point, False)
@@ -46,6 +46,6 @@ def options_of(helper: Any) -> dict[str, Any]:
 
 
 def forget_compiled(function: Any) -> None:
-    """Have numba compile a function made by `register_jitable` again where it is called next."""
+    """Let numba compile a function made by `register_jitable` again at its next call."""
     for template in jitable_templates(function):
         template._impl_cache.clear()

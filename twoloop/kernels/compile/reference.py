@@ -25,7 +25,7 @@ _KNOWN: dict[str, Any] = {}
 
 
 def _known(name: str) -> Any:
-    """Return the reference of a name: numba unpickles it by this, as functions may take that very reference."""
+    """Return the reference of a name; numba unpickles it by this, because functions may require that very object."""
     return _KNOWN[name]
 
 
@@ -49,10 +49,10 @@ class Reference(types.Type):
         self.arrays = dict(arrays)
         self.dtypes = {field: as_dtype(kind.dtype) for field, kind in self.arrays.items()}
         self.functions: dict[str, Signature] = {}
-        self.llvm_functions: set[str] = set()  # of these, those of LLVM
+        self.llvm_functions: set[str] = set()  # names of the LLVM functions among these
         self.places: dict[str, int] = {}
         self.n_words = 0
-        self._addresses: Any = BoundedCache()  # of functions of a value, which take long to look up
+        self._addresses: Any = BoundedCache()  # addresses of the functions of a value, whose look-up is slow
         for field, kind in self.arrays.items():
             self.places[field] = self.n_words
             self.n_words += 1 + kind.ndim
@@ -76,7 +76,7 @@ class Reference(types.Type):
         _define_call(self, field, signature)
 
     def add_llvm_functions(self, signatures: Mapping[str, Signature]) -> None:
-        """Add generated functions, which may be called if they are there; arrays are one-dimensional."""
+        """Add generated functions, which may be called if they are present; arrays are one-dimensional."""
         for field, signature in signatures.items():
             self.functions[field] = signature
             self.llvm_functions.add(field)
@@ -90,9 +90,9 @@ class Reference(types.Type):
         return str(_plain(signature.return_type)), [str(_plain(kind)) for kind in signature.args]
 
     def table(self, values: Any) -> Any:
-        """Make the table, int64, of an object with arrays and functions of these names, which has to outlive it.
+        """Return the int64 table of an object with arrays and functions of these names; the object has to outlive it.
 
-        Generated functions are given by their addresses, 0 for those that are not there.
+        Generated functions are given by their addresses; 0: missing.
         """
         words: list[int] = []
         for field, kind in self.arrays.items():
@@ -119,9 +119,9 @@ register_model(Reference)(models.OpaqueModel)
 
 @unbox(Reference)
 def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
-    """Unbox a Python object that stands for a reference: its attribute `address`, or itself if it is a number.
+    """Unbox a Python object that represents a reference: its attribute `address`, or itself if it is a number.
 
-    To find an attribute takes a tenth of a microsecond.
+    To look up an attribute takes a tenth of a microsecond.
     """
     kind = c.builder.load(
         c.builder.gep(c.builder.bitcast(obj, obj.type.as_pointer()), [ir.Constant(ir.IntType(32), 1)])
@@ -140,7 +140,7 @@ def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
 
 
 def _load(context: Any, builder: Any, pointer: Any, place: int, kind: Any) -> Any:
-    """Load a word of a table; it never changes, which lets LLVM load it once."""
+    """Load a word of a table; mark it as constant, so that LLVM loads it only once."""
     slot = builder.gep(builder.bitcast(pointer, ir.IntType(64).as_pointer()), [ir.Constant(ir.IntType(64), place)])
     word = builder.load(builder.bitcast(slot, kind.as_pointer()))
     word.set_metadata("invariant.load", builder.module.add_metadata([]))
@@ -185,7 +185,7 @@ def _array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) -> An
     }
     model = context.data_model_manager[kind]
     array = ir.Constant(context.get_value_type(kind), ir.Undefined)
-    for name, value in fields.items():  # in registers; numba's helper would write them to memory, one by one
+    for name, value in fields.items():  # in registers; numba's helper would write the fields to memory, one by one
         at = model.get_field_position(name)
         made = ir.Constant(array.type.elements[at], None) if value is None else value
         array = builder.insert_value(array, made, at)

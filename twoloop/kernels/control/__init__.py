@@ -1,1 +1,1 @@
-"""What steps share beside their formulas: prediction, switching, defects."""
+"""Control of steps, whatever their formulas: step size, switching, discontinuities, singular positions."""

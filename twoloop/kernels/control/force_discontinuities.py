@@ -22,23 +22,25 @@ from twoloop.kernels.data.common import allowed, compiled
 from twoloop.kernels.data.indices import DONE, GAP, RTOL
 from twoloop.kernels.evaluation.constraints import constraint_rates, representable_step
 
-N_SAMPLES = 20  # times ahead that are compared
-LONG = 12.0  # spacings: the shortest way along which the motion is sampled
-SHARE = 0.1  # of the range: a second difference that is sudden; that of a bell as wide as four spacings
-LEAST = 0.1  # of rtol, times the largest value so far: a range that may matter
-FLOOR = 1e-150  # ... in any units: squares of less underflow, and the least numbers of all change by steps
-IN_A_STEP = 8.0  # samples within a step: stages lie up to a quarter of it apart, and may all miss what is shorter
-SHRUNK = 0.25  # of the last spacing: below it, samples are taken again
-LEAST_APART = 16.0  # spacings of floating-point numbers between two samples
-HALVINGS = 20  # to find when a value changes between two samples
-SAME = 1e-5  # of the widest spacing: changes that are closer are one
-SOON = 5e-5  # of a hundredth of the run: before, a force that begins at zero, as 1 - cos(t), changes by rounding
-STEEPER = 2.0  # times the changes before and after: the flank of a pulse, and not a slope
-SHORT = 0.5  # of the longest of the last steps: below, something has happened that made steps shorter
-IN_SHORT = 4  # samples within such a step
-DECAYED = 0.5  # of an acceleration: a change within its noise that leaves little of it
-NEARLY = 0.01  # of the spacing: a step that begins so shortly before a change is at it
-LARGEST = N_SAMPLES + 1  # row of w.changes behind those of the values
+N_SAMPLES = 20  # number of sample times ahead that are compared
+LONG = 12.0  # spacings: shortest distance ahead over which the motion is sampled
+SHARE = 0.1  # relative to the range: second difference of a sudden change, equal to that of a bell four spacings wide
+LEAST = 0.1  # relative to rtol times the largest value so far: smallest range that may matter
+# ... and its lower bound in any units: squares below this underflow, and subnormal numbers change in steps
+FLOOR = 1e-150
+IN_A_STEP = 8.0  # samples within a step: stages are up to a quarter of it apart, and may all miss a shorter force
+SHRUNK = 0.25  # relative to the last spacing: below this, samples are taken again
+LEAST_APART = 16.0  # smallest spacing of samples, in spacings of floating-point numbers
+HALVINGS = 20  # number of bisections to find when a value changes between two samples
+SAME = 1e-5  # relative to the widest spacing: changes closer than this are one change
+# relative to a hundredth of the run: before that, a force that begins at zero (1 - cos(t)) changes by rounding
+SOON = 5e-5
+STEEPER = 2.0  # ratio to the changes before and after: the flank of a pulse is steeper than this, a slope is not
+SHORT = 0.5  # relative to the longest of the last steps: shorter steps show that something has happened
+IN_SHORT = 4  # number of samples within a short step
+DECAYED = 0.5  # relative to an acceleration: a larger change, while velocities change by their tolerance, is a decay
+NEARLY = 0.01  # relative to the spacing: a step that begins closer than this to a change begins at the change
+LARGEST = N_SAMPLES + 1  # row of w.changes for the largest values so far, behind those of the values
 MIDDLE = N_SAMPLES + 2  # row of w.changes for values between two samples
 N_CHANGES = N_SAMPLES + 3
 
@@ -56,7 +58,7 @@ def _sample(f, w, time, since, q, v, a, now):
 
 @compiled
 def _largest(values):
-    """Return the largest value so far, of all columns: a coordinate without a force has no scale of its own."""
+    """Return the largest value so far, over all columns: a coordinate without a force has no scale of its own."""
     largest = 0.0
     for x in values:
         largest = max(largest, x)
@@ -65,7 +67,7 @@ def _largest(values):
 
 @compiled
 def _is_smooth(values, k, n):
-    """Return whether the second difference at place k of n + 1 values is about that next to it."""
+    """Return whether the second difference at place k of n + 1 values is close to that of its neighbour."""
     other = k + 1 if k + 2 <= n else k - 1
     if other < 1:
         return False
@@ -76,7 +78,7 @@ def _is_smooth(values, k, n):
 
 @compiled
 def _bend(values, n, slope, least, within):
-    """Return the first place where n + 1 values, less a line, bend suddenly, else 0; and the limit."""
+    """Return the first index at which n + 1 values, less a line, bend suddenly (0: nowhere), and the limit."""
     low = high = 0.0
     for k in range(1, n + 1):
         off = values[k] - values[0] - k * slope
@@ -92,9 +94,12 @@ def _bend(values, n, slope, least, within):
 
 @compiled
 def _first_discontinuity_of(values, n, along, least):
-    """Return the same of values less the line to their end if `along`, and then of those before the place found."""
+    """Return the first sudden bend of values (less the line to their end if `along`), with its limit.
+
+    The search is repeated among the values before the bend found.
+    """
     place, sudden = _bend(values, n, along * (values[n] - values[0]) / max(n, 1), least, False)
-    while place > 1:  # few values may bend as much as that, and smoothly
+    while place > 1:  # a smooth curve may bend as much within few values
         before, share = _bend(values, place, along * (values[place] - values[0]) / place, least, True)
         if before == 0:
             break
@@ -104,7 +109,7 @@ def _first_discontinuity_of(values, n, along, least):
 
 @compiled
 def _is_sudden_change(previous, one, other, following, sudden):
-    """Return whether values change suddenly between two samples, and neither before nor after as if on a slope."""
+    """Return whether values change suddenly between two samples, and much less before and after."""
     change = other - one
     sign = 1.0 if change > 0.0 else -1.0
     beside = max(sign * (one - previous), sign * (following - other))
@@ -113,7 +118,7 @@ def _is_sudden_change(previous, one, other, following, sudden):
 
 @compiled
 def _flank(f, w, t, low, high, k, j, q, v, a):
-    """Return the time just behind a change of value j, between times low and high at places k and k + 1."""
+    """Return the time just behind the change of value j between the times low and high (samples k and k + 1)."""
     changes = w.changes
     before, after = changes[k, j], changes[k + 1, j]
     for _ in range(HALVINGS):
@@ -129,13 +134,13 @@ def _flank(f, w, t, low, high, k, j, q, v, a):
 
 @compiled
 def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, place, column, sudden, q, v, a):
-    """Record the time of a change next to a place where a value bends, and the time since the change before."""
+    """Record the time of a change next to the index where a value bends, and the time since the change before."""
     values, apart = w.changes[:, column], max(NEARLY * spacing, SAME * clock[at.WIDEST_SAMPLING])
     soonest = clock[at.T_START] + SOON * tolerances[GAP]
     for k in range(place - 1, place + 1):
         low, high = begin + k * spacing, begin + (k + 1) * spacing
         known = low - apart <= clock[at.LAST_CHANGE] <= high + apart
-        if known or k + 2 > n or low - spacing < soonest:  # what is on both sides is to be seen, too
+        if known or k + 2 > n or low - spacing < soonest:  # a change needs samples on both sides
             continue
         if k == 0:
             _sample(f, w, low - spacing, 0.0, q, v, a, w.changes[MIDDLE])
@@ -185,7 +190,7 @@ def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, along,
 
 @compiled
 def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, a):
-    """Record for how long a value in a short step differs from those before and behind: samples have not met it."""
+    """Record how long a value in a short step differs from its neighbours: the samples have missed that change."""
     changes, wide, begin, end = w.changes, control[at.APART], clock[at.T_START], t + size
     clock[at.COMPARED] = t
     if end + wide > last or (t - 2.0 * wide < begin and end + 2.0 * wide > last):
@@ -211,10 +216,10 @@ def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, 
 
 @compiled
 def _acceleration_lasts(f, w, tolerances, t, way, q, v, a, Q, V, A):
-    """Return whether accelerations stay about what they are until they have changed a velocity by its tolerance.
+    """Return whether accelerations hardly change until they have changed a velocity by its tolerance.
 
-    Those of a body that stiff friction holds do not: they are what the tolerances, or rounding, leave of forces in
-    balance, and a parabola on which they went on would leave the state of rest far behind.
+    Those of a body that stiff friction holds do change: they are what the tolerances, or rounding, leave of balanced
+    forces. A parabola that continued them would leave the state of rest far behind.
     """
     n, time, largest, change = w.Q.size, way, 0.0, 0.0
     for m in range(n):
@@ -234,7 +239,7 @@ def _acceleration_lasts(f, w, tolerances, t, way, q, v, a, Q, V, A):
 
 @compiled
 def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a, Q, V, A):
-    """Sample along the motion of a step, and of those behind it that end within LONG spacings, once."""
+    """Sample once along the motion of a step, and of the following steps that end within LONG spacings."""
     if clock[at.MOTION_SAMPLED_TO] >= t + (1.0 - NEARLY) * size:
         return
     way = min(max(size, LONG * spacing), last - t)
@@ -248,8 +253,9 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
             f, w, tolerances, clock, t, t, way / N_SAMPLES, last, 1.0, q, v, A
         )
     clock[at.SAMPLES_MOTION] = 0.0
-    known = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t  # by closer looks, which are to go on there
-    if not known and way <= N_SAMPLES * min(control[at.APART], size / IN_A_STEP):  # as close as looks in time alone
+    # known from closer samples, which have to continue there
+    known = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t
+    if not known and way <= N_SAMPLES * min(control[at.APART], size / IN_A_STEP):  # as close as samples in time alone
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], way / N_SAMPLES)
         if clock[at.MOTION_SAMPLED_TO] > clock[at.SAMPLED_TO]:
             clock[at.SAMPLED_TO], clock[at.SAMPLED_EVERY] = clock[at.MOTION_SAMPLED_TO], way / N_SAMPLES
@@ -260,15 +266,15 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
 
 @compiled
 def _sample_ahead(f, w, tolerances, control, clock, known, t, size, last, q, v, a):
-    """Return the next sudden change with time ahead of a step, or infinity, where no other one is before it."""
+    """Return the next sudden change with time ahead of a step, or `known` (infinite if none) if that is earlier."""
     every = max(min(control[at.APART], size / IN_A_STEP), LEAST_APART * np.spacing(abs(t)))
-    # a multistep method, whose formula no jump fools, drops its past only where it is refused; and steps find jumps of
-    # C_t and b, if they do not end next to them
+    # a multistep method restarts only after a rejected step, as no jump deceives its formula; steps find jumps of C_t
+    # and b if they do not end next to them
     closer = control[at.ROUGH] > 1.0 and control[at.DRIVEN] == 0.0
     if closer and every < SHRUNK * clock[at.SAMPLED_EVERY]:
         clock[at.SAMPLED_TO] = t
     begin = max(t, clock[at.SAMPLED_TO])
-    at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # which is to be found again
+    at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # the change has to be found again
     while begin < min(t + size, last, known):
         apart, at_change = min(every, clock[at.SAMPLED_EVERY]) if at_change else every, False
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], apart)
@@ -291,7 +297,7 @@ def limit_to_discontinuity(f, w, tolerances, control, clock, t, size, last, stat
     known = clock[at.DISCONTINUITY] if clock[at.DISCONTINUITY] > near else np.inf
     along = clock[at.DISCONTINUITY_OF_MOTION] if clock[at.DISCONTINUITY_OF_MOTION] > near else np.inf
     at_change = known == np.inf and clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO] > -np.inf
-    # not up to the end of a run, where looks within shorter and shorter rests would find the change anew
+    # not up to the end of a run, where samples of shorter and shorter remaining spans would find the change again
     if control[at.BY_TIME] == 1.0 and not (at_change and size <= (1.0 + NEARLY) * clock[at.SAMPLED_EVERY]):
         known = _sample_ahead(f, w, tolerances, control, clock, known, t, size, last, q, v, a)
         clock[at.DISCONTINUITY] = known

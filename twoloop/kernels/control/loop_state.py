@@ -1,4 +1,4 @@
-"""Indices into the arrays of the loop over steps, and what `advance` returns.
+"""Indices into the arrays of the integration loop, and the codes that `advance` returns.
 
 `control` holds settings, constant during a run, and begins with the rule of step-size control. `clock` holds the state
 of the loop, carried from call to call, and begins with the past of step-size control.
@@ -18,38 +18,39 @@ from numpy.typing import NDArray
     ROWS_VIOLATED,
     NEAR_SINGULAR,
     SWITCH_METHOD,
-    AT_DISCONTINUITY,  # of C_t or b: the caller puts the state beyond it into new_state
+    AT_DISCONTINUITY,  # C_t or b jumps here: the caller puts the state behind the jump into new_state
     NEEDS_DENSE,  # the sparse form cannot decide it
-    NEEDS_COMPILATION,  # of the step that is due, which is then tried again
+    NEEDS_COMPILATION,  # the step is not compiled; it is tried again once it is
 ) = range(12)
-CONTINUE = -1  # none of these: the loop goes on
+CONTINUE = -1  # no end code: the loop continues
 
-# rule of step-size control: the factor is SAFETY error**-EXPONENT within FACTOR_MIN and FACTOR_MAX; LEAST_ERROR is what
-# a smaller error counts as in the trend (Hairer & Wanner II, IV.8), 0: without the trend
+# rule of step-size control: the factor is SAFETY error**-EXPONENT within FACTOR_MIN and FACTOR_MAX. Errors below
+# LEAST_ERROR count as LEAST_ERROR in the trend (Hairer & Wanner II, IV.8); 0: without the trend
 SAFETY, EXPONENT, FACTOR_MIN, FACTOR_MAX, LEAST_ERROR, N_RULE = range(6)
-# past of step-size control: size and error of the last accepted step
+# history of step-size control: size and error of the last accepted step
 H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
 
 # `control`, after the rule
 (
-    MAX_STEP,  # s
+    MAX_STEP,  # largest step, s
     FIXED_STEP,  # s; 0: step-size control
-    LIMIT_START,  # h_max at the beginning of a step
-    LIMIT_FACTOR,  # h_max becomes this times the step that did not converge ...
-    LIMIT_MEMORY,  # ... for this many accepted steps
-    MAX_STEPS,  # accepted steps
+    LIMIT_START,  # value of H_LIMIT without a recent failure
+    LIMIT_FACTOR,  # H_LIMIT becomes this times the step that did not converge ...
+    LIMIT_MEMORY,  # ... during this number of accepted steps
+    MAX_STEPS,  # largest number of accepted steps
     STORE_ALL,  # 1: every accepted step is stored; 0: output times only
     SYMMETRIC,  # 1: each step has the partition of its midpoint; 0: a partition stays until it is renewed
-    MAX_ATTEMPTS,  # in one call, so that the caller can watch the run
+    MAX_ATTEMPTS,  # largest number of attempts in one call, so that the caller can watch the run
     BRIDGE,  # 1: stop with NEAR_SINGULAR where steps become short near a singular position
-    SHORTEST,  # s; a shorter step is too small, and so is one of a few spacings of t
+    SHORTEST,  # shortest step, s; a step of a few spacings of t is too short as well
     MAY_SWITCH,  # 1: stop with SWITCH_METHOD at a value that is not finite ...
-    TRIAL_STEPS,  # ... and within this number of steps, if the next one is no longer than steps of other methods may be
+    TRIAL_STEPS,  # ... and within this number of steps, if the next one is not longer than GAP
     DRIVEN,  # 1: C_t or b may jump
-    ROUGH,  # by how much an error may be larger than its estimate where a force jumps, see UNFORESEEN in advance.py
+    ROUGH,  # factor by which errors may exceed their estimates where a force jumps, see UNFORESEEN in advance.py
     SPACING,  # s, between samples of the forces ahead, see force_discontinuities.py; 0: no samples
-    APART,  # s, between samples in time alone, which are also taken ahead of shorter steps
-    SAMPLE_MOTION,  # 1: samples follow the motion; 0: they stay at the state, as a callback raised along the motion
+    APART,  # s, between samples in time alone, which are taken ahead of shorter steps as well
+    # 1: samples follow the motion; 0: they stay at the state, because a callback raised along the motion
+    SAMPLE_MOTION,
     BY_TIME,  # 1: forces may change suddenly with time
     BY_STATE,  # 1: forces may change suddenly with place or speed: samples follow the motion of short steps, too
     FIRST_GIVEN,  # 1: the first step is the user's, and not a guess that may become longer
@@ -73,30 +74,31 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     N_FIXED,  # steps of the fixed grid so far
     FAILURE_CODE,
     H_FAILED,
-    H_LONG,  # the longest of the last steps, fading
-    LARGEST_PIVOT,  # the largest so far of the smallest pivots of C_q
-    JUMP_FROM,  # the interval in which C_t or b jumps, where one lies ahead; else infinite
+    H_LONG,  # longest of the last steps, fading
+    LARGEST_PIVOT,  # largest so far of the smallest pivots of C_q
+    JUMP_FROM,  # start of the interval ahead in which C_t or b jumps; infinite without one
     JUMP_TO,
-    APPLIES_JUMP,  # 1: the next step leads over that interval, and new_state is its end
+    APPLIES_JUMP,  # 1: the next step crosses that interval, and new_state is its end
     ROUGH_TO,  # end of the last step that was rejected for a sudden error
-    PIVOT_HERE,  # the smallest pivot at the end of the last step, of the sparse form
-    SAMPLED_TO,  # end of the samples in time
-    SAMPLED_EVERY,  # s, spacing of the last such samples
+    PIVOT_HERE,  # sparse form: the smallest pivot at the end of the last step
+    SAMPLED_TO,  # end of the samples taken in time
+    SAMPLED_EVERY,  # s, spacing of the last samples in time
     WIDEST_SAMPLING,  # s, the widest spacing so far
-    DISCONTINUITY,  # time of the next sudden change that they show
-    DISCONTINUITY_OF_MOTION,  # ... and of the next one that samples along the motion show
-    COMPARED,  # time at which a short step was last compared with what is before and behind it
+    DISCONTINUITY,  # time of the next sudden change found by samples in time
+    DISCONTINUITY_OF_MOTION,  # ... and of the next one found by samples along the motion
+    COMPARED,  # time at which a short step was last compared with its neighbours
     LAST_CHANGE,  # time of the last sudden change of a value
     SHORTEST_CHANGE,  # s, the shortest time between two such changes
     MOTION_SAMPLED_TO,  # end of the samples along the motion
-    SAMPLES_MOTION,  # 1: while callbacks are called at states that the motion may never reach
-    PIVOT_AT_OUTPUT,  # the smallest pivot where steps had to end: output times, a grid; see least_pivot in partition.py
+    SAMPLES_MOTION,  # 1 while forces are sampled ahead, at states that the motion may not reach
+    # smallest pivot at output times or grid points, where steps had to end; see least_pivot in partition.py
+    PIVOT_AT_OUTPUT,
     N_CLOCK,
 ) = range(N_PAST, N_PAST + 28)
 
-# Power iterations for the largest rate, in a run (stiffness.py) and after it (run/stability.py)
-DISPLACEMENT = 1e-6  # of the largest coordinate or velocity, for derivatives along a direction
-INNER_TOL = 1e-8  # of the positions; their error is squared
+# power iterations for the largest rate, in stiffness.py and in run/monitors.py
+DISPLACEMENT = 1e-6  # relative to the largest coordinate or velocity: length of differences along a direction
+INNER_TOL = 1e-8  # tolerance of the projected positions
 
 
 def initial_direction(n_q: int) -> NDArray[np.float64]:

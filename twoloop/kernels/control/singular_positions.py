@@ -1,4 +1,4 @@
-"""Watch a run beside its steps: whether its partition has become poor, and whether a singular position is near."""
+"""Check the partition and the distance from a singular position between the steps of a run."""
 
 from twoloop.kernels.control import loop_state as at
 from twoloop.kernels.data.common import merged
@@ -20,25 +20,25 @@ from twoloop.kernels.evaluation.inner_loop import find_tangents, renew_partition
 from twoloop.kernels.evaluation.partition import least_pivot, partition_is_poor
 from twoloop.kernels.evaluation.sparse_inner_loop import PROJECT_STAGES
 
-SHORT = 0.5  # of the longest of the last steps: a step below it may be near a singular position ...
-COLLAPSED = 0.2  # of it: steps for which the pivots of C_q are looked at anew
-SINGULAR_PIVOT = 0.2  # ... and is where the smallest pivot of C_q is below this share of the largest it had
-STATIC_SINGULAR = 0.01  # the same of the static form, whose pivots are sines of single rows ...
-CARE = 0.05  # ... and where a refused step that begins below this share is tried again with care ...
-LESS = 0.8  # ... and then by steps each of which is this times the one before
-LOST = 0.001  # ... and which is given up there for steps below this share of the longest
-UNDETERMINED = 1e-6  # share of the largest pivot below which rounding makes accelerations: short steps are not to go on
-RARELY = 16  # accepted steps from one look at the partition to the next where steps do without it
-FEW = 32  # degrees of freedom; where they are k times as many, a partition is looked at every k + 1 steps: T is full
-NEARER = 0.25  # of the smallest sine at the start of a step: one that ends nearer to a singular position ends half-way
+SHORT = 0.5  # relative to the longest of the last steps: a shorter step may be near a singular position ...
+COLLAPSED = 0.2  # relative to the same: for shorter steps the pivots of C_q are computed again
+SINGULAR_PIVOT = 0.2  # ... and is near one if the smallest pivot of C_q is below this share of the largest it had
+STATIC_SINGULAR = 0.01  # the same share for the static form, whose pivots are sines of single rows ...
+CARE = 0.05  # ... share below which a rejected step that begins there is repeated with care ...
+LESS = 0.8  # ... by steps each of which is this times the one before ...
+LOST = 0.001  # ... and share of the longest of the last steps below which steps there are given up
+# share of the largest pivot below which rounding determines accelerations: short steps must not continue
+UNDETERMINED = 1e-6
+RARELY = 16  # accepted steps from one check of the partition to the next, if steps do not use it
+FEW = 32  # degrees of freedom; k times as many mean that a partition is checked every k + 1 steps, because T is full
+NEARER = 0.25  # relative to the smallest sine at the start of a step: a step that ends below this is halved
 
 
 @merged
 def near_singular(f, w, control, clock, t, q):
     """Return whether C_q was close to losing rank when the partition was chosen, and the caller wants to know.
 
-    Where steps have no use for partitions, the last one may be old: with a run that has come near such a position once
-    it is chosen anew.
+    Steps that do not use partitions may have an old one: it is renewed once the run has come near such a position.
     """
     if control[at.BRIDGE] == 0.0:
         return False
@@ -61,17 +61,17 @@ def ends_at_singular(f, w, control, clock):
 
 @merged
 def fails_at_singular(f, clock, size):
-    """Return whether a step of the static form that came to nothing is so short that others have to try, see steps/."""
+    """Return whether a failed, very short step of the static form near a singular position is left to dense forms."""
     near = clock[at.PIVOT_HERE] < STATIC_SINGULAR * clock[at.LARGEST_PIVOT]
     return f.flags[FORM] == STATIC and near and size < LOST * clock[at.H_LONG]
 
 
 @merged
 def retry_with_care(f, w, control, clock, size):
-    """Return whether a step of the static form that begins near a singular position is tried again with more care.
+    """Return whether a step of the static form that begins near a singular position is repeated with more care.
 
-    Stages beside the constraints have accelerations there whose errors grow with the nearness. A step that ends well
-    beyond may be made where shorter ones, which end nearer, are not: lengths from the longest of the last ones down.
+    Stages off the constraints have accelerations whose errors grow near such a position. A step that ends well
+    beyond may succeed where shorter ones, which end nearer, fail: lengths are tried from the longest of the last down.
     """
     near = clock[at.PIVOT_HERE] < CARE * clock[at.LARGEST_PIVOT]
     if f.flags[FORM] != STATIC or control[at.FIXED_STEP] > 0.0 or w.notes[NEARLY_SINGULAR] == 1.0 or not near:
@@ -86,16 +86,17 @@ def retry_with_care(f, w, control, clock, size):
 
 @merged
 def record_pivot_at_output(f, w, clock, state):
-    """Note how near a singular position is where a step ends on an output time, or wherever its size says."""
+    """Record the distance from a singular position at an output time, or at the end of a step of fixed size."""
     pivot = least_pivot(f, w, clock[at.T], state[: w.Q.size])
     if f.flags[FORM] == STATIC and pivot > 0.0:
-        pivot /= max(pivot, clock[at.LARGEST_PIVOT])  # sines, which are small in large mechanisms
+        # sines are small in large mechanisms: take their ratio to the largest
+        pivot /= max(pivot, clock[at.LARGEST_PIVOT])
     clock[at.PIVOT_AT_OUTPUT] = min(clock[at.PIVOT_AT_OUTPUT], pivot)
 
 
 @merged
 def check_partition(f, w, control, clock, size, lands, state):
-    """Choose coordinates anew where they have become poor, and see how near a singular position is.
+    """Renew a poor partition, and check how near a singular position is.
 
     The state is full (q, v, a, lam): a new choice of independent coordinates needs no conversion.
     """
@@ -118,7 +119,7 @@ def check_partition(f, w, control, clock, size, lands, state):
         find_tangents(f, w, clock[at.T], state[:n])
     if looked and partition_is_poor(w) and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
-    # a new partition shows when the position is left behind; here steps have no use for it, and an old one may last
+    # a renewed partition shows whether the position is left behind: these steps do not use it, so an old one may last
     if f.flags[STRAIGHT] == 1 and w.notes[NEAR_NOW] == 2.0 and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
     clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.notes[PIVOT])
@@ -126,16 +127,16 @@ def check_partition(f, w, control, clock, size, lands, state):
     if w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
         w.notes[NEARLY_SINGULAR] = w.notes[NEAR_NOW] = 1.0
     if size < COLLAPSED * clock[at.H_LONG] and w.notes[NEARLY_SINGULAR] == 0.0 and control[at.BRIDGE] == 1.0:
-        # a motion may go straight towards a singular position, and its partition show nothing of it
+        # a motion may approach a singular position although its partition shows nothing of it
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
-        w.notes[SENSITIVITY] = 1.0  # as of a partition far from there: this one is not to last
+        w.notes[SENSITIVITY] = 1.0  # the value of a partition far from there, so that this one is renewed soon
         if w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
             w.notes[NEARLY_SINGULAR] = w.notes[NEAR_NOW] = 1.0
     if short and size < LOST * clock[at.H_LONG] and w.notes[NEARLY_SINGULAR] == 1.0:
-        # the partition that serves implicit methods well up to there was chosen far from there
+        # the partition, which serves implicit methods well up to there, was chosen far from there
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
         if control[at.BRIDGE] == 0.0 and w.notes[PIVOT] < UNDETERMINED * clock[at.LARGEST_PIVOT]:
-            return at.RANK_LOST  # no step led across, and velocities would follow from rounding
+            return at.RANK_LOST  # no step has crossed the position, and rounding would determine velocities
     return at.NEAR_SINGULAR if short and near_singular(f, w, control, clock, clock[at.T], state[:n]) else at.CONTINUE

@@ -1,4 +1,4 @@
-"""Step-size control: the length of the next step, the times on which steps land, and further measures of error.
+"""Step-size control: the size of the next step, the times on which steps land, and additional error measures.
 
 The length follows from the error of the last step. With the trend (Gustafsson, ACM TOMS 20 (1994), 496) the factor also
 follows how the error has changed since the last accepted step.
@@ -57,7 +57,7 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, restore
 from twoloop.kernels.evaluation.tasks import PROJECT
 from twoloop.kernels.linalg.markowitz_lu import sign_of
 
-KEPT = 1.2  # with the trend, a factor from 1 to this leaves the step as it is: new factors of Newton's matrix cost
+KEPT = 1.2  # with the trend, a factor between 1 and this keeps the step size: a new one would need new Newton factors
 
 
 @compiled
@@ -83,7 +83,8 @@ def record_accepted(rule, past, h, error):
 @compiled
 def evaluate_near(f, w, t, Q, V, A):
     """Evaluate accelerations A at a state (Q, V) near the constraints, which is moved onto them."""
-    # the nearest state is cheaper to find; and the only one where evaluations do not move the state
+    # generated code projects to the nearest state at less cost; with the static form, `evaluate` would not project at
+    # all
     if (f.flags[STRAIGHT] == 1 and w.Rate.size == w.C.size) or f.flags[FORM] == STATIC:
         return f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
     return evaluate(f, w, t, Q, V, INNER_TOL, A)
@@ -94,25 +95,25 @@ def commit_nothing(f, w, options, memory, tolerances, accepted):
     """Do nothing, for a step without a memory."""
 
 
-NEAR = 4.0  # times that differ by less than so many spacings of floating-point numbers are one
+NEAR = 4.0  # times closer than this many spacings of floating-point numbers count as equal
 
 
 @merged
 def on_grid(clock, t, h, target, goal):
-    """Return the size of a step of a fixed grid, how many of the grid it is, and whether it reaches the goal.
+    """Return the size of a step of a fixed grid, how many grid steps it covers, and whether it reaches the goal.
 
-    Times are counted, not added up; an output time within a millionth of a step of the grid is on it.
+    Times are counted, not added up; an output time within a millionth of a step of a grid point counts as on the grid.
     """
     rounding = NEAR * np.spacing(max(abs(t), abs(target)))
     near = max(1e-6 * h, rounding)
     in_grid = 1.0
     if target <= clock[at.T_START] + clock[at.N_FIXED] * h + near:
-        in_grid = 0.0  # a second output time beside the same point of the grid
+        in_grid = 0.0  # a second output time next to the same grid point
     end = clock[at.T_START] + (clock[at.N_FIXED] + in_grid) * h
     reaches = goal <= end + near
     size = h
     if abs(t + h - end) > rounding:
-        size = end - t  # back to the grid after such an output time
+        size = end - t  # back to the grid after an output time off the grid
     if reaches and goal < target and abs(goal - end) > rounding:
         in_grid = 0.0
     return size, in_grid, reaches
@@ -120,7 +121,7 @@ def on_grid(clock, t, h, target, goal):
 
 @merged
 def off_grid(control, t, h, left, leaps):
-    """Return the size of a step with step-size control, and whether it reaches the goal, which is so far away."""
+    """Return the size of a step under step-size control, and whether it reaches the goal, `left` seconds ahead."""
     reaches = leaps or h >= left * (1.0 - 1e-10)
     size = h
     if h > 0.5 * left and not reaches:
@@ -131,7 +132,7 @@ def off_grid(control, t, h, left, leaps):
     return size, reaches
 
 
-FADING = 0.98  # of the longest step, with each accepted one
+FADING = 0.98  # factor of the longest recent step with each accepted step
 
 
 @merged
@@ -145,7 +146,7 @@ def count_step(w, tolerances, control, clock, size, out_step):
     gap = size
     if w.notes[DEFECT] >= 0.0:
         gap = min(size, tolerances[LOOK])
-    elif is_beyond_gap(tolerances, size):  # as only steps may be whose stages are nearer to one another
+    elif is_beyond_gap(tolerances, size):  # only steps with closely spaced stages may be longer than GAP
         gap = control[at.MAX_EVALUATION_GAP] * size
     w.notes[WIDEST_GAP] = max(w.notes[WIDEST_GAP], gap)
     clock[at.H_LONG] = max(size, FADING * clock[at.H_LONG])
@@ -157,10 +158,11 @@ def count_step(w, tolerances, control, clock, size, out_step):
     out_step[at.JACOBIANS] = 0.0 if w.notes[EXPLICIT_STEP] == 1.0 else w.counters[N_JACOBIANS]
 
 
-SHARE_OF_MOTION = 0.1  # of the way that the coordinates go in the step: what a prediction may be off at any tolerance
-SHARE_THROUGH_ZERO = 1e-6  # ... and where the sign of det C_qd changes
-LEAST = 1e-300  # in place of a scale of zero, so that a distance of zero needs no branch
-FLOOR = 0.01  # of the tolerances, below which SHARE_OF_MOTION does not matter
+# relative to the motion of the coordinates in the step: largest error of a prediction at any tolerance
+SHARE_OF_MOTION = 0.1
+SHARE_THROUGH_ZERO = 1e-6  # ... if the sign of det C_qd changes
+LEAST = 1e-300  # replaces a scale of zero, so that a distance of zero needs no branch
+FLOOR = 0.01  # relative to the tolerances: a smaller distance is allowed whatever SHARE_OF_MOTION says
 
 
 @merged
@@ -195,13 +197,13 @@ def departure(w, tolerances, h, q, v, q1):
 
 @merged
 def project_prediction(f, w, tolerances, t, h, q, v, q1, v1, inner_tol):
-    """Put the prediction (q1, v1) of a step of h from (q, v) on the constraints, as `restore` does; code, departure."""
+    """Project the prediction (q1, v1) of a step of h from (q, v) onto the constraints; return code and departure."""
     store_prediction(w, q1)
     code = restore(f, w, t, q1, v1, inner_tol)
     return code, departure(w, tolerances, h, q, v, q1) if code == DONE else 0.0
 
 
-ROUNDING = 1e-13  # of the largest acceleration: a defect that is rounding
+ROUNDING = 1e-13  # relative to the largest acceleration: a smaller defect is rounding
 
 
 @compiled

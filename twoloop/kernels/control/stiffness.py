@@ -1,4 +1,4 @@
-"""Two methods in one run: an explicit one, and Newton's where stiffness would make its steps tiny.
+"""Combine two methods in one run: an explicit one, and an implicit one where stiffness would make its steps tiny.
 
 The largest rate of the motion, rho, is the root of the largest eigenvalue of dF/dq, or that of dF/dv, F being the
 accelerations. A few power iterations, one evaluation each, estimate it now and then. While the explicit method takes
@@ -67,59 +67,60 @@ from twoloop.kernels.data.indices import (
 from twoloop.kernels.evaluation.inner_loop import renew_partition
 from twoloop.kernels.linalg.dense import copy
 
-# evaluations before the first estimate of the rate, and between two; with generated code DEARER times as many
-EARLY, INTERVAL = 100.0, 600.0  # an estimate takes some eight, by the general code
-ITERATIONS = 4  # of the power iteration for dF/dq, and for dF/dv
-NEGLIGIBLE = 1e-3  # of 1 / h: a rate of decay below this needs no second iteration
-SEED = 1e-3  # of the largest component of a direction: what a component that was zero begins with
-SURELY = 3.0  # times LIMIT: where the step is next to the limit of stability
-EARN = 64.0  # evaluations for each independent coordinate before a trial that differences, some eight of each
-TRIAL = 300.0  # evaluations that a trial of the implicit method takes, about
-AFFORDED = 3.0  # trials that the run has cost so far, before one that may be in vain ...
-OF_RUN = 0.3  # ... or this share of what the run will cost as a whole, if it goes on as it does
-ANYWAY = 100.0  # ... beside so many times as much, and once more for each trial, it comes whatever the rates
-APART = 30.0  # rates that the motion does not show are as many times as fast as those that it shows ...
-QUIET = 10.0  # tolerances of velocities: what steps at the limit of stability leave of a decay to and fro
-WORTH = 0.05  # ... and h rho this share of LIMIT: steps may be short for the sake of what an implicit method damps
-INSTANT = 1e-4  # over the largest rate: the time over which the motion's own is differenced
-BELOW = 0.4  # of LIMIT: h rho from which down the explicit method is tried again
-STRICT = 10.0  # factor on an error during a trial of the implicit method, of lower order than the explicit one
-MEAN = 0.8  # weight of the steps before in the mean step
-SETTLED = 5.0  # accepted steps of a trial before its price is taken
-WINDOW = 10.0  # accepted steps over which it is
-GAIN = 1.2  # what a method on trial must be cheaper by
-PATIENCE = 4.0  # estimates before the next trial
+# evaluations before the first estimate of the rate, and between two estimates; DEARER times as many with generated code
+EARLY, INTERVAL = 100.0, 600.0  # an estimate takes about eight evaluations by the general code
+ITERATIONS = 4  # iterations of the power method for dF/dq, and for dF/dv
+NEGLIGIBLE = 1e-3  # relative to 1 / h: a rate of decay below this needs no second iteration
+SEED = 1e-3  # relative to the largest component of a direction: start value of a component that was zero
+SURELY = 3.0  # times LIMIT: above this, the step is at the limit of stability
+EARN = 64.0  # evaluations per independent coordinate before a trial that differences, which takes about eight for each
+TRIAL = 300.0  # approximate number of evaluations that a trial of the implicit method takes
+AFFORDED = 3.0  # number of trials whose cost the run has to exceed before a trial that may be in vain ...
+OF_RUN = 0.3  # ... where this share of the expected cost of the whole run counts as its cost, if it is larger
+# times the cost of AFFORDED trials, and once more for each trial so far: then a trial begins whatever the rates
+ANYWAY = 100.0
+APART = 30.0  # a rate this many times above those that the motion shows counts as hidden ...
+QUIET = 10.0  # tolerances of velocities: residual oscillation of a decay under steps at the limit of stability
+WORTH = 0.05  # ... and h rho relative to LIMIT: above this, an implicit method that damps may allow longer steps
+INSTANT = 1e-4  # relative to 1 / rate: time step of the difference that estimates the rate of the motion
+BELOW = 0.4  # relative to LIMIT: if h rho is below this, the explicit method is tried again
+# factor on the error during a trial of the implicit method, whose order is lower than that of the explicit one
+STRICT = 10.0
+MEAN = 0.8  # weight of the previous mean in the mean step
+SETTLED = 5.0  # number of accepted steps of a trial before its cost is measured
+WINDOW = 10.0  # number of accepted steps over which its cost is measured
+GAIN = 1.2  # ratio of costs above which the method on trial replaces the other
+PATIENCE = 4.0  # number of estimates before the next trial
 
 EXPLICIT, ON_TRIAL, IMPLICIT, BACK_ON_TRIAL = range(4)  # phases
 
-# places in `options`: of the pair, then of the first and of the second method a rule, see loop_state.py, and REUSE_OF;
-# then their options
-# LIMIT: h rho from which on the implicit method is tried, found by so many LOOKS in a row
-# DEARER: evaluations of the first method that one of the second costs
+# indices in `options`: first those of the pair, then for each method its step-size rule (see loop_state.py) and
+# REUSE_OF, then the options of each method. LIMIT: h rho above which the implicit method is tried, if LOOKS estimates
+# in a row exceed it. DEARER: cost of an evaluation of the second method in evaluations of the first
 LIMIT, LOOKS, MATRIX_COST, DEARER, SIZE_1, N_PAIR = range(6)
 REUSE_OF, N_OF_EACH = N_RULE, N_RULE + 1
 N_OPTIONS = N_PAIR + 2 * N_OF_EACH
 
-# places in `memory`: scalars, two directions (n_q), then the two memories
+# indices in `memory`: scalars, two directions (n_q), then the memories of the two methods
 (
     PHASE,
-    STEPS,  # accepted in this phase
+    STEPS,  # number of accepted steps in this phase
     MAY_LOOK,  # 1: the last attempt was accepted
-    LOOK_AT,  # evaluations at which to look again
+    LOOK_AT,  # number of evaluations at which the rate is estimated again
     LOOKS_TO_WAIT,
     WAIT,
     T_BEGIN,
     COST_BEGIN,
-    PRICE,  # of the method before the trial
-    RATE,  # the last one found, 1 / s
+    PRICE,  # cost of a second of motion by the method before the trial
+    RATE,  # last estimate of the largest rate, 1 / s
     FIRST_MEMORY,
     H_MEAN,
-    PAST,  # of the steps of this phase, see loop_state.py
+    PAST,  # history of the steps of this phase, see loop_state.py
     _PAST_ERROR,
     H_TRIED,
     ERROR_TRIED,
     N_TRIALS,
-    NEAR,  # looks in a row at which h rho was above LIMIT
+    NEAR,  # number of estimates in a row with h rho above LIMIT
     N_SCALARS,
 ) = range(19)
 
@@ -127,8 +128,8 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
 def switching_options(
     limit: float, looks: int, matrix_cost: float, dearer: float, each: ArrayLike, first: ArrayLike, second: ArrayLike
 ) -> NDArray[np.float64]:
-    """Return `options`: of the pair, see LIMIT and what follows; then a rule and REUSE_OF of each; then their own."""
-    first = np.asarray(first)  # of numbers, or of formulas
+    """Return `options`: those of the pair (see LIMIT), a rule and REUSE_OF for each method, then their own options."""
+    first = np.asarray(first)  # array of numbers, or of formulas
     scalars = [limit, float(looks), matrix_cost, dearer, float(first.size)]
     return np.concatenate([scalars, np.asarray(each, dtype=np.float64).ravel(), first, np.asarray(second)])
 
@@ -196,7 +197,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
     by_q, by_v = memory[N_SCALARS : N_SCALARS + n], memory[N_SCALARS + n : N_SCALARS + 2 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
     squared = damping = 0.0
-    # code made for the mechanism has no use for the partition, which may be an old one whose independents hardly move
+    # generated code does not use the partition: it may be an old one whose independent coordinates hardly move
     explicit = memory[PHASE] == EXPLICIT
     if explicit and f.flags[STRAIGHT] == 1 and renew_partition(f, w, t, state[:n]) != DONE:
         return 0.0
@@ -206,7 +207,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
         damping = _along(f, w, t, state, by_v, True, Q, V, A)
         if damping * memory[H_MEAN] < NEGLIGIBLE:
             break
-    for m in range(n):  # coordinates that were independent at no look, or have no part in it, are begun anew
+    for m in range(n):  # restart coordinates that were independent at no estimate, or have no part in the direction
         if by_q[m] == 0.0:
             by_q[m] = SEED
         if by_v[m] == 0.0:
@@ -236,7 +237,7 @@ def _shown_rate(f, w, t, state, rate, Q, V, A):
 
 @compiled
 def _is_quiet(w, tolerances, state, rate):
-    """Return whether all that the independents would change by at this rate is about the tolerances."""
+    """Return whether velocities that change at this rate would change by about the tolerances only."""
     n = w.Q.size
     for i in w.independent_v:
         v = state[n + i]
@@ -266,7 +267,7 @@ def _interval(options, memory):
 
 @compiled
 def _enter(w, options, memory, phase, t):
-    """Begin another phase; its method has no memory of the steps before."""
+    """Begin another phase, whose method knows nothing of the steps before."""
     memory[PHASE] = phase
     memory[STEPS] = 0.0
     memory[PAST + ERROR_BEFORE] = 0.0
@@ -276,7 +277,7 @@ def _enter(w, options, memory, phase, t):
 
 @compiled
 def _settle_trial(w, options, memory, t):
-    """Return whether the method on trial is kept; returns the phase to begin, or -1."""
+    """Decide whether the method on trial is kept; return the phase to begin, or -1 during the trial."""
     if memory[STEPS] == SETTLED:
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
     if memory[STEPS] < SETTLED + WINDOW:
@@ -292,7 +293,7 @@ def _settle_trial(w, options, memory, t):
 
 @compiled
 def _look(f, w, options, memory, tolerances, t, state, new_state):
-    """Return whether the other method is due for a trial; returns the phase to begin, or -1."""
+    """Estimate the rate and decide whether the other method is due for a trial; return the phase to begin, or -1."""
     n = w.Q.size
     memory[RATE] = _largest_rate(f, w, memory, t, state, new_state)
     price, cost = _price(w, options, memory, t), _cost(w, options)
@@ -304,7 +305,7 @@ def _look(f, w, options, memory, tolerances, t, state, new_state):
         memory[NEAR] += 1.0
     if memory[LOOKS_TO_WAIT] > 0.0:
         return -1
-    # a trial that may be in vain, in which derivatives are differenced, has to cost little beside the run so far
+    # a trial that may be in vain, and that differences, has to cost little compared with the run so far
     paid, afforded = cost, AFFORDED * TRIAL * options[DEARER]
     if np.isfinite(tolerances[GAP]):
         paid = max(paid, OF_RUN * tolerances[GAP] / LONGEST_UNSEEN * price)
@@ -315,13 +316,13 @@ def _look(f, w, options, memory, tolerances, t, state, new_state):
         hidden = _is_quiet(w, tolerances, state, memory[RATE])
         if not hidden:
             hidden = memory[RATE] > APART * _shown_rate(f, w, t, state, memory[RATE], Q, V, A)
-    # explicit steps about a speed at which friction turns show its rate at few states
-    # and what a run will cost is known once it has left the short steps of its start
+    # explicit steps near a speed at which friction reverses show its rate at few states; and the cost of a run is known
+    # only after the short steps of its start
     anyway = cheap and cost > afforded and paid > ANYWAY * afforded * (1.0 + memory[N_TRIALS])
     due = share > SURELY or hidden or anyway or (memory[NEAR] >= options[LOOKS] and cheap)
-    if cheap and share <= 1.0:  # before a trial is affordable it is kept in mind that one will be due
+    if cheap and share <= 1.0:  # while no trial is affordable, NEAR keeps that one will be due
         memory[NEAR] = 0.0
-    dear = price > GAIN * memory[PRICE]  # than the explicit method was when it was left
+    dear = price > GAIN * memory[PRICE]  # compared with the explicit method when it was left
     if (memory[PHASE] == EXPLICIT and due) or (memory[PHASE] == IMPLICIT and (share < BELOW or dear)):
         memory[PRICE] = price
         memory[N_TRIALS] += 1.0
@@ -338,7 +339,7 @@ def _restart(memory):
 
 @kernel(SETTLE)
 def settle_switching(f, w, options, memory, tolerances, accepted):
-    """Settle the method that made the attempt, and count its accepted steps."""
+    """Commit or discard the attempt in the method that made it, and count its accepted steps."""
     first, second = _memories(memory, w.Q.size)
     begin = N_OPTIONS + int(options[SIZE_1])
     memory[MAY_LOOK] = 0.0
@@ -355,13 +356,13 @@ def settle_switching(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """One attempt by one of the two, with the step factor that the controller would choose for it alone.
+    """Attempt a step by the active method, with the step factor that the controller would choose for it alone.
 
-    A method of the second kind begins anew each time; its memory is all zeros then.
+    A method restarts at each change to it, with a memory of zeros.
     """
     n = w.Q.size
     first, second = _memories(memory, n)
-    if np.isnan(memory[T_BEGIN]):  # of a run, or of what is left of it beyond a singular position
+    if np.isnan(memory[T_BEGIN]):  # at the start of a run, or of its rest behind a singular position
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
         memory[LOOK_AT] = w.counters[N_EVALUATIONS] + EARLY * options[DEARER]
     if memory[MAY_LOOK] == 1.0 and tolerances[ESTIMATE] == 1.0:
@@ -390,7 +391,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
             w.notes[EXPLICIT_STEP] = 0.0
             code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     else:
-        # only steps of the first method may be longer, as it looks within them or has stages near one another
+        # only the first method may take longer steps: it evaluates within its steps, or has closely spaced stages
         longer = times_gap(tolerances, h)
         if longer > 0.0:
             return Attempt(DONE, longer, 1.0 / longer)

@@ -1,1 +1,1 @@
-"""The arrays and numbers that all kernels share."""
+"""Arrays and numbers that all kernels share."""

@@ -1,44 +1,44 @@
-"""Lay out the memory of collocation steps, which generated code fills and steps/lobatto_step.py reads.
+"""Layout of the memory of collocation steps, which generated code fills and steps/lobatto_step.py reads.
 
 Offsets are counted in numbers from an aligned place on. A group of eight numbers, "lanes", has one for each unknown
 node, or one for each of eight steps that are projected together.
 """
 
 LANES = 8
-ORDER = 12.0  # of the estimate of the error
-NOISE = 1e-13  # relative: differences of values below it may be rounding
-# how the iteration of the stages ended; GUESSED: the step size was a guess, and another is to be tried; LEFT: the
-# accelerations could not be found
+ORDER = 12.0  # order of the estimated error
+NOISE = 1e-13  # relative: differences of values below this may be rounding
+# results of the iteration of the stages. GUESSED: the step size was a guess, and another one is tried. LEFT: the
+# accelerations could not be computed
 MADE, REFUSED, GUESSED, LEFT = range(4)
 
 (
     T,  # beginning of the step
     H,
-    H_BEFORE,  # of the step whose polynomial predicts this one
-    DEGREE,  # of the polynomial that predicts
+    H_BEFORE,  # size of the step whose polynomial predicts this one
+    DEGREE,  # degree of the polynomial that predicts
     PREDICTS,  # 1: there is a polynomial; 0: accelerations are predicted to be constant
-    WHICH,  # which of two polynomials is that of the last accepted step
+    WHICH,  # index of the polynomial of the last accepted step
     TRIED,  # 1: the other polynomial is that of the step just attempted
     NEXT_DEGREE,
-    KEPT_DEGREE,  # degree of the prediction before a refused step; 0: none was refused
+    KEPT_DEGREE,  # degree of the prediction before a rejected step; 0: none was rejected
     MAY_GUESS,  # 1: the step size is a guess, and another is tried if the contraction is far from what is aimed at
-    CAREFUL,  # steps that are still to be taken by the elimination that begins with M
+    CAREFUL,  # number of steps that still use the elimination that begins with M
     STARTS,  # guesses of the first step size so far
-    N_STEPS,  # since the beginning
-    LIMITED,  # steps that convergence, not accuracy, kept short, less the others
+    N_STEPS,  # number of steps since the beginning
+    LIMITED,  # number of steps that convergence limited, less those that accuracy limited
     UNMADE,  # twice the number of steps that did not converge, less those accepted
     DEFECT,  # largest defect between nodes, over what is allowed; -1: there was no audit
     RHO,  # contraction of a sweep
     SWEEPS,  # number of sweeps of the step
     TARGETED,  # number of sweeps aimed at
-    CHANGE,  # of velocities by the last sweep, over the tolerances
-    ERROR,  # of the step, over the tolerances
+    CHANGE,  # change of velocities by the last sweep, over the tolerances
+    ERROR,  # error of the step, over the tolerances
     CURVED,  # Legendre coefficients of degree 5 and 6 of the accelerations, over the tolerances
-    FACTOR,  # of the next step size, by convergence ...
-    FACTOR_OF_ERROR,  # ... by the error ...
-    FACTOR_OF_DEFECT,  # ... and by the defect
+    FACTOR,  # factor of the next step size by convergence ...
+    FACTOR_OF_ERROR,  # ... factor by the error ...
+    FACTOR_OF_DEFECT,  # ... and factor by the defect
     ALLOWED_H,  # step size that the error would have allowed
-    SIZE,  # of velocities and their changes, over the tolerances
+    SIZE,  # size of velocities and their changes, over the tolerances
     STRICTER,  # ratio by which the tolerances of other coordinates are stricter than those of the iterated ones
 ) = range(28)
 POWERS = 32  # lanes: powers 1 to 8 of the step size over the one before

@@ -1,4 +1,4 @@
-"""What all kernels share: types and compiling decorators, the workspace, the table of callbacks, the tolerances.
+"""Shared definitions of kernels: types, compiling decorators, the workspace, the table of callbacks, tolerances.
 
 Every callback of a mechanism has one fixed signature and works in place. The integrator is compiled once, and takes any
 mechanism and any method as first-class functions.
@@ -27,10 +27,10 @@ from twoloop.kernels.data.indices import ATOL, ESTIMATE, FAULT_KIND, FAULT_TIME,
 
 i8 = types.int64
 INTEGERS = types.int64[::1]
-PLACES = types.int32[::1]  # of long programs, which are to stay in the cache
+PLACES = types.int32[::1]  # indices of long programs; 32 bits, so that they fit in the cache
 
-# programs in the place of callbacks that are not given, see evaluation/program.py, and that of the elimination of large
-# systems and of their Newton matrices, see linalg/symbolic_factorization.py; of size 0 where there is none
+# Programs that replace missing callbacks (evaluation/program.py), and those of the sparse elimination of large systems
+# and of their Newton matrices (linalg/symbolic_factorization.py); of size 0 if there is none
 PROGRAMS = (
     "jacobian_program",
     "jacobian_numbers",
@@ -44,30 +44,30 @@ Functions: Any = namedtuple("Functions", [*KINDS, "p", "flags", *PROGRAMS])  # t
 
 
 class Work(NamedTuple):
-    """Arrays that an evaluation writes; made once a run.
+    """Arrays that an evaluation writes; allocated once a run.
 
     Sizes: n_q coordinates; n_c + n_a rows of C_q and A, of which r_v have full rank, among them r of C_q; n_dof = n_q -
     r_v. Fields that end in _v belong to velocities; without rows of A they are the same arrays as those of positions.
     """
 
     M: Any  # (n_q, n_q) mass matrix
-    L: Any  # (n_q, n_q) of a constant M the inverse, else its factors, see ldl_factor; or banded ones
+    L: Any  # (n_q, n_q) inverse of a constant M, else the factors of M, dense (see ldl_factor) or banded
     G: Any  # (n_c + n_a + 1, n_q) C_q and A at the last position, and a row of zeros
-    entries: Any  # the same numbers as a vector
-    augmented: Any  # the same, and those of M behind
-    S: Any  # (r_v, r_v) G M^-1 G^T of the rows that count, and its factors
-    W: Any  # (r_v, n_q) its rows G M^-1
+    entries: Any  # the same numbers as `G`, as a vector
+    augmented: Any  # the numbers of `G`, followed by those of M
+    S: Any  # (r_v, r_v) G M^-1 G^T of the independent rows, and its factors
+    W: Any  # (r_v, n_q) rows G M^-1 of the independent rows
     A: Any  # (n_dof, n_dof) T^T M T and its factors; empty where S is used
     MT: Any  # (n_q, n_dof) M T
     D: Any  # (n_dof + 1, r_v) rows of -(G_d^-1 G_i)^T, and the dependent velocities at v_i = 0: in order of elimination
     Gx: Any  # (n_c + n_a, n_q) rows at a displaced point (Q_d by differences); scratch for full pivoting
-    G_of_S: Any  # (n_c + n_a, n_q) the G that S and W belong to, where M is constant, not diagonal; NaN: none
-    pattern: Any  # (n_c + n_a, n_q) 1 where G was ever seen to have an entry
-    mass_pattern: Any  # (n_q, n_q) the same of M; empty without the augmented form
-    places: Any  # where the entries of each row of G begin (n_c + n_a + 1), counted in what follows: their columns
+    G_of_S: Any  # (n_c + n_a, n_q) the G of which S and W were computed, if M is constant and not diagonal; NaN: none
+    pattern: Any  # (n_c + n_a, n_q) 1 where G has had a nonzero entry
+    mass_pattern: Any  # (n_q, n_q) 1 where M has had a nonzero entry; empty without the augmented form
+    places: Any  # where the entries of each row of G begin (n_c + n_a + 1), then their columns
     Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences over a double length, and with the length tried before
     rates: Any  # (13, n_c + n_a) C_t and b at times within a step, see drive_discontinuities.py
-    changes: Any  # (8, n_q + n_c + n_a) of forces, C_t and b with time, see force_discontinuities.py
+    changes: Any  # (8, n_q + n_c + n_a) changes of forces, C_t and b with time, see force_discontinuities.py
     Q: Any  # (n_q) force
     x: Any  # (n_q) scratch
     y: Any  # (n_q) scratch
@@ -77,13 +77,13 @@ class Work(NamedTuple):
     g: Any  # (n_c + n_a) scratch
     z: Any  # (r_v) scratch
     lam: Any  # (n_c + n_a) multipliers of an evaluation that is not kept
-    minimum: Any  # room for the multipliers of least norm
-    rows: Any  # (r) rows of C that count
+    minimum: Any  # memory for the multipliers of least norm
+    rows: Any  # (r) independent rows of C
     dependent: Any  # (r) columns of the coordinates that they determine
-    independent: Any  # (n_q - r) columns of the others
+    independent: Any  # (n_q - r) columns of the independent coordinates
     index: Any  # program of the factors of C_qd, see markowitz_lu.py
     values: Any  # the factors
-    rows_v: Any  # (r_v) rows of G that count
+    rows_v: Any  # (r_v) independent rows of G
     dependent_v: Any  # (r_v)
     independent_v: Any  # (n_dof)
     index_v: Any
@@ -97,19 +97,19 @@ class Work(NamedTuple):
     lapack: Any  # addresses of lapack.ROUTINES; 0 where linear algebra is dense
     predicted: Any  # (r) dependent positions that the integration formula gives, before the constraints restore them
     notes: Any  # (N_NOTES) see indices.py
-    nodes: Any  # what the operations of a program make
-    matrices: Any  # of Newton's method, see steps/newton_memory.py and steps/newton_static.py
-    # of the static form alone; there N is n_q + n_c, and what is of no use to it is empty
+    nodes: Any  # results of the operations of a program
+    matrices: Any  # matrices of Newton's method, see steps/newton_memory.py and steps/newton_systems.py
+    # fields of the static form, empty in others; N is n_q + n_c; fields that this form does not use are empty in it
     mass_values: Any  # entries of M, see linalg/symbolic_factorization.py
     jacobian_values: Any  # entries of G
-    counts: Any  # (n_c) 1 for rows that count, else 0
+    counts: Any  # (n_c) 1 for independent rows, else 0
     factors: Any
     pivot_sizes: Any  # (N)
     unknowns: Any  # (N) right-hand side and solution
-    solutions: Any  # (3 N) scratch, and (n_c) what M is stiffened by along rows, see linalg/sparse_ldl.py
+    solutions: Any  # (3 N) scratch, and (n_c) the stiffening of M along rows, see linalg/sparse_ldl.py
 
-    sizes: Any = None  # by which it was made
-    address: Any = 0  # of the table by which kernels find these arrays
+    sizes: Any = None  # arguments from which it was allocated
+    address: Any = 0  # address of the table by which kernels find these arrays
     table: Any = None
 
 
@@ -133,7 +133,7 @@ def _type_of_work(value: Any, context: Any) -> Any:
 
 
 class Attempt(NamedTuple):
-    """What a step says of itself: made or not, how wrong, and how long the next one should be.
+    """Result of an attempted step: its code, its error and the factor of the next step.
 
     code : DONE, or why it could not be made.
     error : over the tolerances; it is accepted from 1 down. A step that is longer than the method allows, and was not
@@ -148,7 +148,7 @@ class Attempt(NamedTuple):
 
 
 class Step(NamedTuple):
-    """A step, and what is to become of what it kept in its memory, once it is known whether it was accepted.
+    """Compiled functions of a step: `attempt` makes it, `settle` commits or discards it in the method's memory.
 
     `many` makes steps in a row, where a method has it.
     """
@@ -183,18 +183,18 @@ for _name in ("settle", "settle_first", "settle_second"):
 MANY = i8(KIT, WORK, *[VECTOR] * 5, f8, *[VECTOR] * 3, MATRIX, MATRIX)
 KIT.add_function("attempt_many", MANY)
 
-# functions made for a mechanism, see generate/straight_code.py and collocation_code.py; those that return a
-# flag say whether their conditions hold, and fill what they are given only then
+# Functions generated for a mechanism, see generate/elimination.py and collocation_code.py. Those that return a flag
+# say whether their conditions hold, and fill their arrays only then
 OWN_FUNCTIONS = {
-    # (t, q, v, numbers, ...): accelerations; positions moved towards the constraints, by x; the same and velocities,
-    # accelerations and multipliers; accelerations where rows that do not count hold, too
+    # (t, q, v, numbers, ...): accelerations; positions moved towards the constraints, by x; these with velocities,
+    # accelerations and multipliers; accelerations if redundant rows hold, too
     "own_there": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
     "own_closer": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR),
     "own_nearer": types.boolean(f8, *[VECTOR] * 8),
     "own_redundant": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
-    # of collocation, on a memory that data/collocation.py describes: (room, state, tolerances, numbers), with how the
-    # stages ended as its result; (room, state, numbers), with the defect between nodes; (room, state); (room, state,
-    # new_state); (room, numbers)
+    # functions of collocation, on a memory that data/collocation.py describes: (room, state, tolerances, numbers),
+    # which returns how the stages ended; (room, state, numbers), which returns the defect between nodes; (room,
+    # state); (room, state, new_state); (room, numbers)
     "attempt_nodes": f8(*[VECTOR] * 4),
     "audit_nodes": f8(*[VECTOR] * 3),
     "retry_nodes": types.none(*[VECTOR] * 2),
@@ -205,7 +205,7 @@ OWN_FUNCTIONS = {
 KIT.add_llvm_functions(OWN_FUNCTIONS)
 
 
-_FOLDER = Path(__file__).parents[1]  # of the kernels
+_FOLDER = Path(__file__).parents[1]  # folder of the kernels
 
 
 def _path(module: str) -> Path:
@@ -219,7 +219,7 @@ def _text(module: str) -> str:
 
 
 def _imports(text: str) -> set[str]:
-    """Names of the kernels' modules that a source imports, such as "steps.stages"."""
+    """Return the names of the kernels' modules that a source imports, such as "steps.stages"."""
     names = set()
     for room, several, one in re.findall(
         r"^from twoloop\.kernels([\w.]*) import (?:\(([^)]*)\)|(.+))$", text, re.MULTILINE
@@ -234,7 +234,7 @@ def _imports(text: str) -> set[str]:
 
 @cache
 def stamp(module: str) -> str:
-    """A digest of what the kernels of a module, such as "steps.stages", depend on: sources, and the callbacks."""
+    """Return a digest of what the kernels of a module, such as "steps.stages", depend on: sources and callbacks."""
     known: set[str] = set()
     found = {module}
     while found:
@@ -247,7 +247,7 @@ def stamp(module: str) -> str:
 
 
 def _module(function: Callable[..., Any]) -> str:
-    """The module of a kernel, such as "steps.stages"."""
+    """Return the module of a kernel, such as "steps.stages"."""
     path = Path(inspect.getfile(function)).with_suffix("")
     return ".".join(path.relative_to(_FOLDER).parts) if path.is_relative_to(_FOLDER) else path.stem
 
@@ -271,8 +271,8 @@ def kernel(signature: Any, vectorized: bool = False) -> Callable[[Callable[..., 
     return compile_now
 
 
-# NaN and infinity keep their meaning. Without numba's runtime no array can be allocated, so a step that would does not
-# compile, and none is reference-counted, which costs an evaluation of the four-bar a third of its time
+# NaN and infinity keep their meaning. Without numba's runtime, code that allocates arrays does not compile. It also
+# avoids reference counts, which would take a third of the time of an evaluation of the four-bar
 OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "fastmath": {"contract", "reassoc", "nsz", "arcp"},
@@ -282,17 +282,17 @@ OPTIONS: dict[str, Any] = {
 
 
 def _helper(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
-    """A decorator for what kernels call; such a function must not be called from Python."""
+    """Return a decorator for functions that only kernels call, never Python."""
     wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return njit(**{**OPTIONS, **wrappers, "pipeline_class": HelperCompiler, **options})
 
 
-# Flags are said outright, because a callee inherits its caller's: what a merged helper calls would be merged, too.
-# A helper whose floating-point operations keep their order
+# Flags are given explicitly because a callee inherits those of its caller: what a merged helper calls would be merged,
+# too. `exact` keeps the order of floating-point operations
 exact = _helper(fastmath=False, forceinline=False)
-compiled = _helper(forceinline=False)  # a helper that kernels call; one copy, unless LLVM finds it short
-inlined = _helper(inline="always")  # one that vanishes in its caller; only such a one can return views of arrays
-# the same later, by LLVM, and so typed once: for what is short, or called in every evaluation; each call is a copy
+compiled = _helper(forceinline=False)  # compiled as one copy, unless LLVM finds it short enough to inline
+inlined = _helper(inline="always")  # inlined into its caller; only such a helper can return views of arrays
+# inlined later, by LLVM, and so typed once: for short helpers, or those of every evaluation; each call is a copy
 merged = _helper(forceinline=True)
 
 
@@ -300,7 +300,7 @@ NONE = np.zeros(0)
 
 
 class Kit:
-    """What kernels get of a system and a method, one reference: the callbacks, the inner loop and the step.
+    """Data of a system and a method that kernels get by one reference: callbacks, inner loop and step.
 
     The latter two are compiled once, and not again in what calls them; None where they are not called. A step that
     chooses between two others has these as `first` and `second`. An inner loop that calls functions made for the
@@ -378,7 +378,7 @@ def not_finite(notes, kind, t, q):
 
 @compiled
 def source_of_acceleration(w):
-    """Return the place in Functions of the callback that gave an acceleration that is not finite; -1: none of these."""
+    """Return the index in Functions of the callback that gave an acceleration that is not finite; -1: none."""
     n_c = w.C.size
     if not finite_vector(w.Rate[:n_c]):
         return RATE
@@ -393,7 +393,7 @@ def source_of_acceleration(w):
     return FORCE if not finite_vector(w.Q) else -1
 
 
-SLACK = 1e-9  # relative: a step may be longer than GAP by rounding
+SLACK = 1e-9  # relative: rounding may make a step longer than GAP by this much
 
 
 @merged
@@ -410,7 +410,7 @@ def is_beyond_gap(tolerances, h):
 
 @merged
 def times_gap(tolerances, h):
-    """Return the length of a step over GAP, or 0 where it is no longer than GAP or its size is fixed."""
+    """Return the length of a step over GAP, or 0 if it is no longer than GAP or has a fixed size."""
     if tolerances[ESTIMATE] == 1.0 and is_beyond_gap(tolerances, h):
         return h / tolerances[GAP]
     return 0.0

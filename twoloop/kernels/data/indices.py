@@ -22,9 +22,9 @@ from twoloop.kernels.compile.callbacks import OPTIONAL
     UNSUITED,  # the method does not suit the motion here: another one takes over
 ) = range(12)
 
-# Functions.flags: whole numbers that tell kernels of a system. BANDWIDTH is -1 where linear algebra is not banded. FORM
-# is how accelerations are found, see linalg/saddle_point.py; DENSE_FORM is what FORM becomes where sparse factors have
-# too many entries. STRAIGHT is 1 where the inner loop is code generated for the mechanism
+# Functions.flags: whole numbers that describe a system to kernels. BANDWIDTH is -1 if linear algebra is not banded.
+# FORM is the form of the linear equations of accelerations, see linalg/saddle_point.py; DENSE_FORM replaces it if
+# sparse factors have too many entries. STRAIGHT is 1 if the inner loop is code generated for the mechanism
 CONSTANT_MASS, DIAGONAL_MASS, BANDWIDTH, FORM, DENSE_FORM, STRAIGHT, FIRST_GIVEN = range(7)
 MULTIPLIERS, NULL_SPACE, AUGMENTED, STATIC = range(4)  # values of FORM; the last has sparse_inner_loop.py
 GIVEN = {name: place for place, name in enumerate(OPTIONAL, FIRST_GIVEN)}  # whether an optional callback is given
@@ -51,23 +51,23 @@ MASS_VALUES_GIVEN, JACOBIAN_VALUES_GIVEN = (GIVEN[name] for name in ("mass_value
     N_COUNTERS,
 ) = range(10)
 
-# Work.notes: what one kernel notes for another
+# Work.notes: values that one kernel stores for another
 (
     SENSITIVITY,  # max|Cqd^-1 Cqi| after the first step under this partition; 0: not known yet
     ORIENTATION,  # sign of det C_qd at the last accepted state under this partition; 0: not known
     ORIENTATION_NEW,  # ... and at the end of this attempt
     FAULT_KIND,  # place in Functions of the callback that gave a value that is not finite; -1: none known
-    FAULT_TIME,  # ... and when
+    FAULT_TIME,  # time of that evaluation
     GAMMA_REQUIRED,  # relative accuracy that Q_d by differences must have, see evaluation/constraints.py
-    GAMMA_SHARE,  # length over which to difference, as a share of the longest one
-    GAMMA_ACCURACY,  # reached when that share was chosen
+    GAMMA_SHARE,  # length of the differences, as a share of the longest one
+    GAMMA_ACCURACY,  # accuracy that was reached when that share was chosen
     GAMMA_SCALE,  # largest entry of Q_d so far
     REUSE,  # correction of a position below which the Jacobian before it serves for velocities and accelerations
-    ROUNDED,  # the same at a state that may be accepted: rounding of the positions
+    ROUNDED,  # as REUSE, at a state that may be accepted: rounding of the positions
     GENERATION,  # number of partitions so far
-    RANK,  # rank of C_q where it is not what the workspace is made for
-    RANK_V,  # ... of C_q and A
-    CONTRADICTION,  # row that was taken for redundant and is violated
+    RANK,  # rank of C_q, if it differs from the rank of the workspace
+    RANK_V,  # rank of C_q and A, likewise
+    CONTRADICTION,  # row that was taken for redundant but is violated
     PIVOT,  # smallest pivot of the last full pivoting, rows scaled to 1: small near a singular position
     NEARLY_SINGULAR,  # 1: the run has come near a singular position, or does not watch for one
     NEAR_NOW,  # 1: a singular position was near at the last check; 2: a step that could look within did not for it
@@ -77,13 +77,13 @@ MASS_VALUES_GIVEN, JACOBIAN_VALUES_GIVEN = (GIVEN[name] for name in ("mass_value
     BY_GENERAL,  # 1: generated code left the last state to the general inner loop
     EXPLICIT_STEP,  # 1: a method that switches took an explicit step
     DEFECT,  # largest defect of this attempt over what the tolerances allow; -1: none was evaluated
-    LARGEST_DEFECT,  # the largest of the accepted steps
-    UNCHECKED,  # accepted steps without a defect
+    LARGEST_DEFECT,  # largest defect of the accepted steps
+    UNCHECKED,  # number of accepted steps for which no defect was evaluated
     WIDEST_GAP,  # s, the longest time between two evaluations within accepted steps
     KINK_BEFORE,  # times between which no jump of C_t or b is known
     KINK_AFTER,
-    LEANING,  # largest share of a row that counts in a redundant one, when this partition was chosen
-    SMALLEST,  # of the sparse form: least pivot of a row over its size, the sine squared of its angle to others
+    LEANING,  # largest coefficient of an independent row in a redundant one, when this partition was chosen
+    SMALLEST,  # sparse form: least pivot of a row over its size, the squared sine of its angle to the others
     N_NOTES,
 ) = range(32)
 
@@ -97,17 +97,17 @@ MASS_VALUES_GIVEN, JACOBIAN_VALUES_GIVEN = (GIVEN[name] for name in ("mass_value
     ATOL,  # from here on: the absolute tolerance of each coordinate and of its velocity
 ) = range(6)
 LONGEST_UNSEEN = 0.01  # GAP over the length of the run
-UNTRUE = 30.0  # times the tolerances: errors of velocities beside a singular position that are reported
+UNTRUE = 30.0  # times the tolerances: velocity errors above this next to a singular position are reported
 
 # kinds of intervals between accepted states, for dense output: which values of the states the polynomials take
 WINDOW = 4  # states that a polynomial goes through
 (
-    APART,  # q and v in one, v and a in another: errors of q and v are independent, and steps are small
-    VELOCITIES,  # q and v, and its derivative: a holds the noise of stiff modes
-    ACCELERATIONS,  # q, v and a, and its derivative
-    ACROSS,  # the same, of a step across a singular position
+    APART,  # q and v in one polynomial, v and a in another: errors of q and v are independent, and steps are small
+    VELOCITIES,  # q and v in one polynomial and its derivative: a holds the noise of stiff modes
+    ACCELERATIONS,  # q, v and a in one polynomial and its derivatives
+    ACROSS,  # as ACCELERATIONS, for a step across a singular position
     JUMP,  # no polynomial: velocities jump within a few spacings of floating-point numbers
 ) = range(5)
-# columns of the table of intervals, one row for all output times within one interval; no polynomial goes beyond the
-# rows LOW and HIGH, at which velocities jump
+# columns of the table of intervals; a row stands for all output times within one interval. No polynomial extends beyond
+# the rows LOW and HIGH, at which velocities jump
 FIRST_OWN, LAST_OWN, KIND, FIRST_TIME, END_TIME, LOW, HIGH, N_COLUMNS = range(8)

@@ -1,1 +1,1 @@
-"""One evaluation: constraints, partition, inner loop, accelerations, and the way back to the constraints."""
+"""Evaluation of a state: constraints, partition, inner loop, accelerations, and the projection onto the constraints."""

@@ -1,9 +1,9 @@
-"""Accelerations and multipliers, eqs. (6)-(8) of the paper, and the projection of a state to the constraints.
+"""Accelerations and multipliers, eqs. (6)-(8) of the paper, and the projection of a state onto the constraints.
 
-Where a step integrates all coordinates, a state is off the constraints by the error of the formula. One pass finds the
-accelerations there and moves positions and velocities to the nearest that the constraints allow, nearest in the metric
-of M, which does not depend on the partition. Positions are then good to the square of their correction, velocities and
-accelerations to the correction itself: one that is not near rounding is followed by another pass.
+If a step integrates all coordinates, its states are off the constraints by the error of the formula. One pass computes
+the accelerations there and moves positions and velocities to the nearest state on the constraints, in the metric of M,
+which does not depend on the partition. Positions are then accurate to the square of their correction, velocities and
+accelerations to the correction itself: a correction that is not near rounding is followed by another pass.
 """
 
 import numpy as np
@@ -44,12 +44,12 @@ from twoloop.kernels.linalg.saddle_point import factor, factor_mass, least_norm,
 
 @merged
 def acceleration_constraint(f, w, t, q, v):
-    """Compute the right-hand side Gamma of G a = Gamma into w.Gamma; return DONE, or why it cannot be had."""
+    """Compute the right-hand side Gamma of G a = Gamma into w.Gamma; return DONE, or why that failed."""
     n_c, n_rows = w.C.size, w.Rate.size
     if w.notes[KNOWN] == 1.0 and n_rows == n_c:
         return DONE
     given, given_a = f.flags[GAMMA_GIVEN] == 1, f.flags[NONHOLONOMIC_GAMMA_GIVEN] == 1
-    first, last = 0, n_rows  # rows that no callback gives
+    first, last = 0, n_rows  # range of the rows that no callback gives
     w.Gamma[:] = 0.0
     if given:
         f.gamma(t, q, v, f.p, w.Gamma[:n_c])
@@ -133,7 +133,7 @@ def equilibrate(f, w, a, lam):
         least_norm(w, lam)
 
 
-MIN_CORRECTION = 10.0  # of positions: no correction is asked to be smaller
+MIN_CORRECTION = 10.0  # in units of the rounding of positions: smaller corrections are never required
 
 
 @merged
@@ -159,7 +159,7 @@ def accelerate_at(f, w, t, q, v, a):
 
 @merged
 def _correct(f, w, x):
-    """Add the least correction in the metric of M to x that takes -w.g away from G x; return its largest entry."""
+    """Add to x the least correction in the metric of M that changes G x by w.g; return its largest entry."""
     w.Q[:] = 0.0
     solve(f, w, w.Q, w.g, w.y)
     largest = 0.0
@@ -186,12 +186,13 @@ def _correct_both(f, w, q, v):
 
 @merged
 def project_state(f, w, t, q, v, theta, a, lam):
-    """Move (q, v) to the constraints, then compute accelerations and multipliers there.
+    """Project (q, v) onto the constraints, then compute accelerations and multipliers there.
 
-    Rows of A hold for velocities alone; positions are moved in directions that they allow.
+    Rows of A hold for velocities only; positions move in directions that these rows allow.
 
-    Positions are corrected until a correction is at most theta, velocities alike, relative to the largest. Where it is
-    at most theta times the smallest pivot, by whose inverse tangents turn, velocities are right after the same pass.
+    Positions are corrected until a correction is at most theta, velocities likewise, relative to the largest. If the
+    correction is at most theta times the smallest pivot, whose inverse bounds how tangents turn, velocities are right
+    after the same pass.
     """
     before = np.inf
     theta = max(theta, MIN_CORRECTION * w.notes[ROUNDED])
@@ -205,7 +206,8 @@ def project_state(f, w, t, q, v, theta, a, lam):
             w.C[:] = 0.0
             f.constraint(t, q, f.p, w.C)
         w.counters[N_INNER] += 1
-        if f.flags[KINEMATICS_GIVEN] == 0 and f.flags[FORM] != NULL_SPACE:  # whose tangents needed them
+        # the tangents of NULL_SPACE have already evaluated the rates
+        if f.flags[KINEMATICS_GIVEN] == 0 and f.flags[FORM] != NULL_SPACE:
             constraint_rates(f, w, t, q, w.Rate)
         moved, faster = _correct_both(f, w, q, v)
         if not np.isfinite(moved):
@@ -213,7 +215,7 @@ def project_state(f, w, t, q, v, theta, a, lam):
         if moved <= theta and faster <= theta * max(1.0, largest_of(v)):
             break
         if moved <= w.notes[PIVOT] * theta:
-            w.notes[KNOWN] = 0.0  # the tangents are those of the end, but Gamma belongs to the velocities before
+            w.notes[KNOWN] = 0.0  # Gamma was computed at the old velocities: compute it again
             break
         if moved > CONTRACTION * before:
             if not moved <= ROUNDING_OF_CORRECTIONS * largest_of(q):

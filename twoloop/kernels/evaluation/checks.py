@@ -1,4 +1,4 @@
-"""What the checks of a start compute in compiled code: one evaluation of all callbacks, rows, and units of the rows.
+"""Compiled parts of the checks of a start: one evaluation of all callbacks, rows, and units of the rows.
 
 Where the evaluation finds nothing wrong, no other check needs to run. Units are those in which the entries of a matrix
 are of like size; the reach of a row says how far it stays what it is (checks/scales.py).
@@ -20,9 +20,9 @@ from twoloop.kernels.data.indices import (
 )
 from twoloop.kernels.linalg.dense import largest_of, ldl_factor
 
-NO_ENTRY = 1e-12  # of the largest in a row: what rounding has left
-MAX_SWEEPS = 20  # of the least squares by turns, at most
-NEGLIGIBLE = 1e-6  # of the largest coordinate: smaller ones are zero by chance and are no size
+NO_ENTRY = 1e-12  # relative to the largest entry of a row: smaller entries are rounding errors
+MAX_SWEEPS = 20  # largest number of sweeps of the alternating least squares
+NEGLIGIBLE = 1e-6  # relative to the largest coordinate: smaller ones are zero by chance and give no size
 
 
 @exact
@@ -37,7 +37,7 @@ def _sort(values):
 
 @exact
 def _columns_from(rows, columns, counts, logs):
-    """Fit units of the columns to norms of the rows; return whether they are those from before."""
+    """Fit units of the columns to norms of the rows; return whether they are unchanged."""
     same = True
     for j in range(columns.size):
         total, n = 0.0, 0
@@ -64,9 +64,9 @@ def _rows_from(columns, rows, counts, logs):
 
 @kernel(types.void(MATRIX, VECTOR, VECTOR, MATRIX, MATRIX, VECTOR, VECTOR))
 def column_units(matrix, typical, columns, counts, logs, rows, room):
-    """Compute units of the columns, by least squares of log|entry| + column - row; of zero columns, the typical ones.
+    """Compute units of the columns, by least squares of log|entry| + column - row; zero columns get the typical units.
 
-    The unit of the whole, which is free, is the median of the typical ones. The other arrays are scratch.
+    The unit of the whole matrix, which is free, is the median of the typical ones. The other arrays are scratch.
     """
     n_used, shift = 0, 0.0
     for i in range(rows.size):
@@ -98,9 +98,9 @@ def column_units(matrix, typical, columns, counts, logs, rows, room):
 
 @kernel(types.void(MATRIX, VECTOR, f8, VECTOR, VECTOR))
 def row_reaches(in_units, radius, negligible, room, reach):
-    """Compute how far each row stays what it is: its radius, or the values of its coordinates if these are smaller.
+    """Compute the reach of each row: its radius, or the values of its coordinates if these are smaller.
 
-    Of these it is the smaller half that counts, so that an offset does not; values that are negligible do not.
+    Only the smaller half of the values counts, so that an offset has no effect; negligible values do not count.
     """
     for i in range(reach.size):
         largest, n = 0.0, 0
@@ -118,16 +118,16 @@ def row_reaches(in_units, radius, negligible, room, reach):
             reach[i] = room[(n - 1) // 2]
 
 
-# flags of what is found: all is finite, M symmetric, no row empty; the state on the rows but for rounding; an M that
-# varies definite, or not
+# flags of results. IN_ORDER: all values are finite, M is symmetric, no row is empty. CONSISTENT: the state is on the
+# rows up to rounding. DEFINITE, INDEFINITE: of an M that varies, both by a margin
 IN_ORDER, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
-NEAR_SHARE = 0.5  # of how far the coordinates move until they matter: where these are still of that size
-ROUNDING_OF_ZERO = 2.0**-52  # of the largest coordinate: one as small is rounding of zero
-EIGENVALUE_MARGIN = 2.0  # times what counts as no eigenvalue: what rounding does not reach
+NEAR_SHARE = 0.5  # relative to the sizes of the coordinates: a position this near has the same sizes
+ROUNDING_OF_ZERO = 2.0**-52  # relative to the largest coordinate: a smaller one is a rounded zero
+EIGENVALUE_MARGIN = 2.0  # factor on the eigenvalue that counts as zero: more than rounding changes it by
 
 
 def room_size(n: int, n_c: int, n_a: int) -> int:
-    """Return how many numbers callbacks fill, beside M and the rows, and scratch."""
+    """Return the length of `room`: numbers that callbacks fill, beside M and the rows, and scratch."""
     return n + 2 * (n_c + n_a) + n_c * (n + 4) + n * max(n, n_c + n_a + 1)
 
 
@@ -164,7 +164,7 @@ def _symmetric(mass, allowed):
 
 @exact
 def _rounding(value, row, state, sizes, least, rate, allowed):
-    """Return whether a value is at most this share of the terms in its sum, no state counting below its size."""
+    """Return whether a value is at most this share of the terms in its sum; no state counts as less than its size."""
     size = abs(rate)
     for j in range(state.size):
         size += abs(row[j]) * max(abs(state[j]), sizes[j], least)
@@ -173,7 +173,7 @@ def _rounding(value, row, state, sizes, least, rate, allowed):
 
 @exact
 def _is_near(q, sizes, place):
-    """Return whether a position is near another, of which these are the sizes, so that they are its own, too."""
+    """Return whether a position is so near to one with known sizes that these are its own, too."""
     near = True
     for j in range(q.size):
         near = near and abs(q[j] - place[j]) <= NEAR_SHARE * sizes[j]
@@ -182,7 +182,7 @@ def _is_near(q, sizes, place):
 
 @exact
 def _has_entries(rows, entries):
-    """Return whether these entries of rows count, and no others: sizes say little if one vanishes there."""
+    """Return whether exactly these entries of rows are not zero: sizes say little if one of them vanishes there."""
     same, n = True, rows.shape[1]
     for i in range(entries.size // n):
         largest = largest_of(rows[i])
@@ -193,7 +193,7 @@ def _has_entries(rows, entries):
 
 @exact
 def _find_known_sizes(q, rows, n_c, sizes):
-    """Return the place of the sizes known of a position near this one; -1: there are none."""
+    """Return the place of the sizes that are known of a position near this one; -1: there are none."""
     n = q.size
     width = 2 * n + n_c * n
     for k in range(0, sizes.size, width):
@@ -204,7 +204,7 @@ def _find_known_sizes(q, rows, n_c, sizes):
 
 @exact
 def _consistent(C, rate, rows, q, v, sizes, allowed):
-    """Return whether positions and velocities are on the rows up to rounding, of velocities of the fastest coordinate.
+    """Return whether positions and velocities satisfy the rows up to rounding.
 
     No coordinate counts as less than its size, where that is known, or than what rounding leaves of the largest: of
     coordinates that are zero but for rounding, as in a plane, a constraint is not zero to rounding of its terms.
@@ -227,12 +227,13 @@ def _consistent(C, rate, rows, q, v, sizes, allowed):
 def _note_entries(rows, pattern):
     for i in range(len(rows)):
         for j in range(rows.shape[1]):
-            pattern[i, j] = 1.0 if rows[i, j] != 0.0 else pattern[i, j]  # written in any case: so it is vectorised
+            # written in any case, so that the loop is vectorized
+            pattern[i, j] = 1.0 if rows[i, j] != 0.0 else pattern[i, j]
 
 
 @exact
 def _note_entries_near(f, t, q, ways, place, rows, n_c, pattern):
-    """Add entries of rows to the pattern at positions that lie so many times the size of q from it."""
+    """Add entries of rows to the pattern at positions whose distances from q are `ways` times its size."""
     largest = largest_of(q)
     for k in range(len(ways)):
         for j in range(q.size):
@@ -267,7 +268,7 @@ def evaluate_start(f, t, q, v, sizes, lam, room, mass, rows, ways, pattern, leas
     begins with the force, C, and C_t with b.
     """
     n, n_c, n_rows, flags = q.size, lam.size, rows.shape[0], f.flags
-    force, C, rate, gamma = n, n + n_c, n + n_c + n_rows, n + n_c + 2 * n_rows  # where they end
+    force, C, rate, gamma = n, n + n_c, n + n_c + n_rows, n + n_c + 2 * n_rows  # ends of the parts of `room`
     f.mass(t, q, f.p, mass)
     f.force(t, q, v, f.p, room[:force])
     f.constraint(t, q, f.p, room[force:C])
@@ -306,7 +307,7 @@ def evaluate_start(f, t, q, v, sizes, lam, room, mass, rows, ways, pattern, leas
         found = IN_ORDER
         if _consistent(room[force:C], room[C:rate], rows, q, v, sizes, least[0]):
             found |= CONSISTENT
-    if flags[CONSTANT_MASS] == 0:  # beyond doubt
+    if flags[CONSTANT_MASS] == 0:  # an M between the two margins gets neither flag
         if _definite(mass, EIGENVALUE_MARGIN * least[2], scratch):
             found |= DEFINITE
         elif not _definite(mass, least[2] / EIGENVALUE_MARGIN, scratch):
@@ -319,7 +320,7 @@ def evaluate_start(f, t, q, v, sizes, lam, room, mass, rows, ways, pattern, leas
 
 @kernel(types.void(KIT, f8, MATRIX, i8, MATRIX))
 def rows_at(f, t, places, n_c, rows):
-    """Evaluate C_q, of n_c rows, and A at each of these positions, one below the other; `rows` has zeros."""
+    """Evaluate C_q, of n_c rows, and A at each of these positions, one below the other; `rows` contains zeros."""
     n_rows = len(rows) // len(places)
     for k in range(len(places)):
         begin = k * n_rows
@@ -329,7 +330,7 @@ def rows_at(f, t, places, n_c, rows):
 
 @exact
 def _agree(fused, given, allowed, more):
-    """Return whether no number differs by more than this share of the largest, and what a row may more."""
+    """Return whether no number differs by more than this share of the largest, plus `more` of its row."""
     largest = 0.0
     for i in range(given.shape[0]):
         for j in range(given.shape[1]):
@@ -343,9 +344,9 @@ def _agree(fused, given, allowed, more):
 
 @kernel(types.boolean(KIT, f8, VECTOR, VECTOR, MATRIX, MATRIX, VECTOR, f8, f8))
 def kinematics_agree(f, t, q, v, fused, given, more, allowed, rounding):
-    """Return whether the fused callback gives what the separate ones give, up to a share of the largest number of each.
+    """Return whether the fused callback agrees with the separate ones, up to a share of the largest number of each.
 
-    Constraints may be off by rounding of their terms, too. Arrays are full of zeros: `fused` and `given` have the rows
+    Constraints may also differ by rounding of their terms. Arrays are full of zeros: `fused` and `given` have the rows
     C, C_t and gamma, and C_q below, (3 + n_q, n_c); `more` has n_c numbers.
     """
     n, n_c = q.size, more.size

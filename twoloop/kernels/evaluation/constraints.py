@@ -1,4 +1,4 @@
-"""Rows of the constraints on velocities, their rates, and the right-hand side Gamma of their derivative by differences.
+"""Rows of the constraints on velocities, their rates, and Gamma (right-hand side of accelerations) by differences.
 
 Rows are C_q of C(t, q) = 0, then A of A(t, q) v + b(t, q) = 0.
 
@@ -48,7 +48,7 @@ def _clear_places(w):
 def clear_rows(f, w):
     """Set w.G to zero.
 
-    If it is large, only at the places of its entries. One at another place is found at the end of a step.
+    If it is large, only the places of its entries are cleared. An entry at another place is found at the end of a step.
     """
     if f.flags[FORM] == AUGMENTED:
         _clear_places(w)
@@ -95,7 +95,7 @@ def kinematics(f, w, t, q, v):
 
 @merged
 def gather_independent_columns(G, rate, rows, independent, D):
-    """Gather the right-hand sides for the rows of w.D."""
+    """Gather the right-hand sides for w.D: columns of the independent coordinates, and rates."""
     for j in range(independent.size):
         column = independent[j]
         for k in range(rows.size):
@@ -109,11 +109,13 @@ LEVELS = 12  # lengths tried by _choose_length, each a quarter of the one before
 ROUNDING_DISAGREEMENT = 1e-9  # relative disagreement below which nothing but rounding is left
 # relative disagreement below which a longer length loses nothing and has less rounding
 LENGTHENING_DISAGREEMENT = 1e-11
-# of values at 0, e, 2 e and 4 e: derivatives of order 2 over e and over 2 e
+# weights of values at 0, e, 2 e and 4 e: first derivatives of order 2, over e and over 2 e
 ONE_SIDED, ONE_SIDED_TWICE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
-ONE_SIDED_LENGTH = 1.0 / 16.0  # their error is of lower order: a shorter length, so that none has to be looked for
-ROUNDING_OF_TERMS = 1e-14  # of the terms of G v over the longest length: where they cancel, Gamma cannot be had better
-CONVERGED_SHARE = 0.01  # of the required accuracy: a change by less ends the search for a length
+# relative to the two-sided length: the error is of lower order, and a shorter length saves the search for one
+ONE_SIDED_LENGTH = 1.0 / 16.0
+# relative to the terms of G v over the longest length: where these cancel, Gamma cannot be more accurate
+ROUNDING_OF_TERMS = 1e-14
+CONVERGED_SHARE = 0.01  # relative to the required accuracy: a smaller change ends the search for a length
 
 
 @exact
@@ -126,17 +128,17 @@ def representable_step(t, h):
 def longest_difference(q, v):
     """Return the time, s, over which to difference: MAX_DIFFERENCE, or until q moves by that share of max|q|.
 
-    But at least the share MIN_SHARE of it.
+    It is at least MIN_SHARE times MAX_DIFFERENCE.
     """
     size, speed = largest_of(q), largest_of(v)
     if speed <= size:
         return MAX_DIFFERENCE
-    return MAX_DIFFERENCE * max(size / speed, MIN_SHARE)  # where all coordinates pass through zero
+    return MAX_DIFFERENCE * max(size / speed, MIN_SHARE)  # MIN_SHARE matters where all coordinates pass through zero
 
 
 @merged
 def _one_sided_direction(notes, t, e):
-    """Return the side of t on which to difference because of a known jump of C_t or b; 0: on both."""
+    """Return the side of t on which to difference because of a known jump of C_t or b; 0: both sides."""
     before, after = t - notes[KINK_BEFORE], notes[KINK_AFTER] - t
     if min(before, after) >= 2.0 * e:
         return 0.0
@@ -186,13 +188,13 @@ def _differences(f, w, t, q, v, e, first, last):
 
 @merged
 def _max_disagreement(notes):
-    """Return the largest disagreement that needs no other length: the result is better by far, up to rounding."""
+    """Return the largest disagreement that needs no other length: the result is far better, up to rounding."""
     return max(notes[GAMMA_REQUIRED], ROUNDING_DISAGREEMENT) * notes[GAMMA_SCALE]
 
 
 @compiled
 def _choose_length(f, w, t, q, v, longest, first, last):
-    """Difference over ever shorter lengths until the result no longer changes, or keep the one that changed it least.
+    """Difference over ever shorter lengths until the result no longer changes, or use the one that changed it least.
 
     Returns DONE, or GAMMA_INACCURATE if it changed by more than is allowed.
     """
@@ -223,7 +225,7 @@ def _choose_length(f, w, t, q, v, longest, first, last):
 
 @compiled
 def gamma_by_differences(f, w, t, q, v, first, last):
-    """Compute rows first to last of Gamma by differences; return GAMMA_INACCURATE if no length will do.
+    """Compute rows first to last of Gamma by differences; return GAMMA_INACCURATE if no length is accurate enough.
 
     Gamma = -d/de [G v + (C_t, b)](t + e, q + e v) at e = 0.
 
@@ -235,7 +237,7 @@ def gamma_by_differences(f, w, t, q, v, first, last):
     if e > 0.0:
         largest, disagreement, terms = _differences(f, w, t, q, v, e, first, last)
         if np.isnan(largest) or disagreement == 0.0 or w.notes[GAMMA_SCALE] == 0.0:
-            return DONE  # what is not finite is found where it is used; without a scale nothing can be judged
+            return DONE  # values that are not finite are found at their use; without a scale nothing can be judged
         rounding = ROUNDING_OF_TERMS * terms / longest
         w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], largest, rounding / w.notes[GAMMA_REQUIRED])
         if disagreement < LENGTHENING_DISAGREEMENT * w.notes[GAMMA_SCALE]:

@@ -1,10 +1,10 @@
-"""Times at which C_t or b jumps: the end of a ramp in a drive, say, where velocities change as by an impulse.
+"""Locate times at which C_t or b jumps: the end of a ramp in a drive, say, where velocities change as by an impulse.
 
-Steps see forces, and an impulse is none: at a jump of C_t methods that restore the dependents leave the independents
-as they were, which no momentum balance allows. So a step whose velocities change by more than its accelerations
-explain is looked at, C_t and b at thirteen times along a line: what a polynomial of degree 11 leaves of them is next
-to nothing where they are smooth on the scale of the step, and falls by 2^12 where an interval is halved. Of a jump it
-is the jump, in one of the halves, however short they are.
+Steps see forces, and a jump causes an impulse instead: methods that restore the dependent coordinates leave the
+independent ones unchanged, which no momentum balance allows. So a step is checked if its velocities change by more than
+its accelerations explain: C_t and b are sampled at thirteen times along a line. What a polynomial of degree 11 leaves
+of them is almost zero if they are smooth on the scale of the step, and falls by 2^12 where an interval is halved. At a
+jump it is the size of the jump, in one of the halves, however short they are.
 """
 
 import numpy as np
@@ -15,14 +15,15 @@ from twoloop.kernels.evaluation.constraints import constraint_rates
 from twoloop.kernels.linalg.symbolic_factorization import jacobian_of
 
 N_PARTS = 12
-# the twelfth difference
+# coefficients of the twelfth difference
 BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.0, 66.0, -12.0, 1.0)
 HALVINGS = 60
-RATE_ROUNDING = 1e-11  # of C_t: what that may be for rounding's sake
-TIME_ROUNDING = 5e3  # the same, times the rounding of t and the slope
-STEEPNESS = 4.0  # times the mean slope over the step: a ramp that the step is too long for, unless it is at most ...
-MAX_RAMP_SHARE = 0.125  # ... this share of it
-MIN_SPACINGS = 8.0  # spacings of floating-point numbers: no interval is halved below this length
+RATE_ROUNDING = 1e-11  # relative to C_t: rounding errors of the twelfth difference
+TIME_ROUNDING = 5e3  # times the slope and the rounding of t: rounding errors as well
+# times the mean slope over the step: a steeper part is a ramp for which the step is too long, if it is at most ...
+STEEPNESS = 4.0
+MAX_RAMP_SHARE = 0.125  # ... this share of the step
+MIN_SPACINGS = 8.0  # shortest interval that is halved, in spacings of floating-point numbers
 SMOOTH, RAMP, JUMP = range(3)
 
 
@@ -34,7 +35,7 @@ def _sample(f, w, t, q, way, begin, end):
         for m in range(q.size):
             w.x[m] = q[m] + (time - t) * way[m]
         constraint_rates(f, w, time, w.x, w.rates[k])
-        if not finite_vector(w.rates[k]):  # as the derivative of |t| at 0: the value next to it
+        if not finite_vector(w.rates[k]):  # such as the derivative of |t| at 0: take the value next to it
             constraint_rates(f, w, time + np.spacing(abs(time)), w.x, w.rates[k])
 
 
@@ -48,7 +49,7 @@ def _twelfth_difference(w, row):
 
 @compiled
 def _slope_and_size(w, row, length):
-    """Return the mean slope of a row over the samples, its sign left out, and its largest value."""
+    """Return the mean absolute slope of a row over the samples, and its largest value."""
     change = 0.0
     largest = abs(w.rates[0, row])
     for k in range(N_PARTS):
@@ -59,7 +60,7 @@ def _slope_and_size(w, row, length):
 
 @compiled
 def _allowed(f, w, tolerances, x, row):
-    """Return the error that the tolerances of coordinates, or velocities, x allow in a row."""
+    """Return the error in a row that the tolerances of coordinates, or velocities, x allow."""
     largest = 0.0
     if f.flags[FORM] == STATIC:
         rows, columns, _ = jacobian_of(f.static_program)
@@ -89,8 +90,8 @@ def unexplained_velocity_change(tolerances, h, state, new_state, n):
 def locate_discontinuity(f, w, t, end, q, v, way, tolerances):
     """Return SMOOTH, RAMP or JUMP, and the interval from t to `end` in which the least smooth row rises.
 
-    RAMP: a step of at most that length is next. Methods whose accelerations at both ends are zero see nothing of a ramp
-    that fills their step.
+    After RAMP, the next step is at most as long as the interval. Methods whose accelerations at both ends are zero see
+    nothing of a ramp that fills their step.
     """
     begin = t
     h = end - t
@@ -98,7 +99,7 @@ def locate_discontinuity(f, w, t, end, q, v, way, tolerances):
     row, limit, mean, most = -1, 0.0, 0.0, 1.0
     for i in range(w.Rate.size):
         bend = _twelfth_difference(w, i)
-        if bend == 0.0:  # of a row that does not depend on time
+        if bend == 0.0:  # a row that does not depend on time
             continue
         slope, size = _slope_and_size(w, i, h)
         least = max(

@@ -1,4 +1,4 @@
-"""The inner loop as the steps call it: one compiled function, so that no step compiles it again.
+"""Compile the inner loop once, as one function that all steps call, so that no step compiles it again.
 
 A step gets a `Kit`, the callbacks and this function; the helpers here name its tasks.
 """
@@ -42,12 +42,12 @@ from twoloop.kernels.evaluation.partition import (
 )
 from twoloop.kernels.linalg.dense import has_new_entries, largest_of
 
-ROUNDING_OF_Q = 2e-14  # a hundred roundings, see rounding_floor
+ROUNDING_OF_Q = 2e-14  # about a hundred times the rounding of q, see rounding_floor
 
 
 @merged
 def _verify_pattern(w):
-    """Write new programs if the Jacobian has a new entry: what was evaluated on the way is wrong then."""
+    """Write new programs if the Jacobian has a new entry: values computed without it are wrong."""
     if not record_entries(w):
         return DONE
     return INNER_DIVERGED if write_programs(w) else SINGULAR
@@ -73,10 +73,10 @@ def _other_task(f, w, task, t, q, v):
 
 @kernel(INNER)
 def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
-    """Do a task, named in tasks.py, at (t, q, v); see the functions below."""
+    """Do a task, named in tasks.py, at (t, q, v); the functions below describe each."""
     if task >= tasks.FIND_NULL_SPACE:
         return _other_task(f, w, task, t, q, v)
-    if task == tasks.EVALUATE_AS_GIVEN:  # this and the next: of methods that integrate all coordinates
+    if task == tasks.EVALUATE_AS_GIVEN:  # this task and PROJECT serve methods that integrate all coordinates
         return accelerate_at(f, w, t, q, v, a)
     if task == tasks.PROJECT:
         return project_state(f, w, t, q, v, tolerance, a, lam)
@@ -100,7 +100,7 @@ def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
 
 @merged
 def evaluate(f, w, t, q, v, tolerance, a):
-    """Evaluate the right-hand side: dependents of q and v from their independents, then a.
+    """Evaluate the right-hand side: dependent q and v from the independent ones, then a.
 
     Velocities and accelerations are those of a Jacobian whose position is off by w.notes[REUSE] at most.
     """
@@ -115,13 +115,13 @@ def evaluate_state(f, w, t, q, v, tolerance, a, lam):
 
 @merged
 def evaluate_as_given(f, w, t, q, v, a):
-    """Evaluate accelerations at (q, v) as they are, which need not be on the constraints."""
+    """Evaluate accelerations at (q, v) without a projection; the state need not be on the constraints."""
     return f.inner(f, w, tasks.EVALUATE_AS_GIVEN, t, q, v, 0.0, a, w.lam)
 
 
 @merged
 def project(f, w, t, q, v, theta, a, lam):
-    """Move (q, v) to the constraints, with a and lam; the last correction of a position is at most theta."""
+    """Project (q, v) onto the constraints, with a and lam; the last correction of a position is at most theta."""
     code = f.inner(f, w, tasks.PROJECT, t, q, v, theta, a, lam)
     if code == DONE and has_new_entries(w.G, w.pattern):
         code = f.inner(f, w, tasks.VERIFY_PATTERN, t, q, v, theta, a, lam)
@@ -130,7 +130,7 @@ def project(f, w, t, q, v, theta, a, lam):
 
 @merged
 def restore(f, w, t, q, v, tolerance):
-    """Restore dependents of q and v from their independents; leaves w ready for `accelerations` at this state."""
+    """Restore dependent q and v from the independent ones; leaves w ready for `accelerations` at this state."""
     return f.inner(f, w, tasks.RESTORE, t, q, v, tolerance, w.x, w.lam)
 
 
@@ -142,7 +142,7 @@ def accelerations(f, w, t, q, v, a, lam):
 
 @merged
 def multipliers(f, w, t, q, v, a, lam):
-    """Compute the multipliers that belong to the accelerations found just before."""
+    """Compute the multipliers of the accelerations that were computed just before."""
     return f.inner(f, w, tasks.MULTIPLIERS, t, q, v, 0.0, a, lam)
 
 
@@ -160,7 +160,7 @@ def prepare_mass(f, w, t, q):
 
 @merged
 def renew_partition(f, w, t, q):
-    """Choose a partition at an accepted state, and note the sign of det C_qd that its motion has to keep."""
+    """Choose a partition at an accepted state, and record the sign of det C_qd that its motion has to keep."""
     return f.inner(f, w, tasks.RENEW_PARTITION, t, q, q, 0.0, w.x, w.lam)
 
 
@@ -172,7 +172,7 @@ def adopt_midpoint_partition(f, w, t_mid, state, new_state):
 
 @merged
 def check_redundant(f, w, t, q, v):
-    """Check whether the rows that were left out hold at an accepted state."""
+    """Check whether the redundant rows hold at an accepted state."""
     return f.inner(f, w, tasks.CHECK_REDUNDANT, t, q, v, 0.0, w.x, w.lam)
 
 
@@ -184,7 +184,7 @@ def rounding_floor(q):
 
 @kernel(INNER)
 def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
-    """Do a task by the mechanism's generated code; what it does not do, or cannot, is left to the general loop."""
+    """Do a task by the mechanism's generated code; leave other tasks, and failures, to the general loop."""
     if task == tasks.EVALUATE_AS_GIVEN:
         w.counters[N_EVALUATIONS] += 1
         w.counters[N_FACTORIZATIONS] += 1
@@ -216,6 +216,6 @@ def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
         if f.own_redundant(t, q, v, f.numbers, a):
             return DONE
         f.general(f, w, tasks.FIND_NULL_SPACE, t, q, v, theta, a, lam)  # leaves the rows there in w
-    elif task <= tasks.MULTIPLIERS:  # of methods that need a good partition at every step
+    elif task <= tasks.MULTIPLIERS:  # tasks of methods that need a good partition at every step
         w.notes[BY_GENERAL] = 1.0
     return f.general(f, w, task, t, q, v, theta, a, lam)

@@ -1,4 +1,4 @@
-"""LU coordinate partitioning: choose independent coordinates and the rows that count, and restore the dependent ones.
+"""Partition coordinates by LU: choose independent coordinates and rows, and restore the dependent coordinates.
 
 Dependent positions follow by Newton's method, dependent velocities by a linear solve: the inner loop of the paper.
 Equation numbers are those of Zhang & Zhang (2016), doi 10.1007/s11071-016-2682-8.
@@ -54,9 +54,9 @@ from twoloop.kernels.linalg.markowitz_lu import (
 )
 
 RANK_TOLERANCE = 1e-11  # a pivot below this counts as zero; rows are scaled to 1
-CHANGED = -1  # returned beside DONE: there is another partition now
-MAX_ROWS_ELIMINATED = 200  # rows, which are not eliminated only to see how near a singular position is
-SENSITIVITY_GROWTH = 3.0  # a partition is renewed when max|C_qd^-1 C_qi| exceeds this multiple of what it was at first
+CHANGED = -1  # returned like DONE: the partition has changed
+MAX_ROWS_ELIMINATED = 200  # largest number of rows that are eliminated only to measure how near a singular position is
+SENSITIVITY_GROWTH = 3.0  # growth of max|C_qd^-1 C_qi| since the choice of a partition above which it is renewed
 
 
 @compiled
@@ -83,9 +83,9 @@ def _largest_from(row, first):
 def full_pivoting(A, order, row_order, largest, first, last, most):
     """Eliminate A by Gauss with full pivoting, in place: pivots `first`, first + 1, ... from rows up to `last`.
 
-    At most until there are `most` pivots. `order` and `row_order` become the order of columns and rows. Returns the
-    number of pivots there are then, the numerical rank. `largest` is scratch: the largest entry of each row, looked for
-    again where a row has changed.
+    The elimination ends with `most` pivots. `order` and `row_order` become the order of columns and rows. Returns the
+    number of pivots, the numerical rank. `largest` is scratch: the largest entry of each row, updated where a row has
+    changed.
     """
     n_q = A.shape[1]
     k = first
@@ -123,10 +123,10 @@ def full_pivoting(A, order, row_order, largest, first, last, most):
 
 @compiled
 def least_pivot(f, w, t, q):
-    """Return the smallest over the largest of the pivots at a position, of the rows as they are; the partition stays.
+    """Return the smallest over the largest pivot at a position, without scaling of rows; the partition stays.
 
-    Nothing is scaled: a row, or a column, may be short as the position is singular. That of factors, or of too many
-    rows, is the smallest of the last partition.
+    Nothing is scaled, because a row or a column may be short at a singular position. With sparse factors, or too many
+    rows, it is the smallest pivot of the last partition.
     """
     if f.flags[FORM] == STATIC or w.rows_v.size > MAX_ROWS_ELIMINATED:
         return w.notes[PIVOT]
@@ -150,9 +150,9 @@ def least_pivot(f, w, t, q):
 
 @compiled
 def _eliminate(w, most, most_v):
-    """Order rows and columns of w.Gx: first what the constraints C need, then what the rows A add to it.
+    """Order rows and columns of w.Gx: first those of the constraints C, then those that the rows A add.
 
-    Returns the rank of C_q and that of C_q and A together, neither counted beyond what is asked for.
+    Returns the rank of C_q and that of C_q and A together, counted up to `most` and `most_v`.
     """
     G, order, row_order = w.Gx, w.order, w.row_order
     n_c, n_rows = w.C.size, w.Rate.size
@@ -165,7 +165,7 @@ def _eliminate(w, most, most_v):
     w.notes[PIVOT] = abs(G[rank - 1, rank - 1]) if rank > 0 else 1.0
     if n_rows == n_c:
         return rank, rank
-    last = rank  # rows of A come next, in the place of what is redundant in C
+    last = rank  # rows of A come next, in the place of the redundant rows of C
     for i in range(n_c, n_rows):
         row_order[last], row_order[i] = row_order[i], row_order[last]
         for j in range(G.shape[1]):
@@ -186,9 +186,9 @@ def _insert_sorted(source, target):
 
 @compiled
 def _adopt_order(w):
-    """Make the order that `_eliminate` found the partition; return False if C_qd is singular by its pattern."""
+    """Adopt the order of `_eliminate` as the partition; return False if C_qd is singular by its pattern."""
     rank, rank_v = w.rows.size, w.rows_v.size
-    # ascending, so that the same set is always the same partition
+    # ascending, so that equal sets give equal partitions
     _insert_sorted(w.row_order[:rank], w.rows)
     _insert_sorted(w.order[:rank], w.dependent)
     _insert_sorted(w.order[rank:], w.independent)
@@ -203,7 +203,7 @@ def _adopt_order(w):
     if w.G_of_S.size > 0:
         w.G_of_S[0, 0] = np.nan
     if rank_v < w.Rate.size:
-        w.index_a[SIZE] = 0  # there may be other rows that count
+        w.index_a[SIZE] = 0  # the independent rows may be others
     return write_programs(w)
 
 
@@ -234,7 +234,7 @@ def _record_places(w):
 
 @compiled
 def record_entries(w):
-    """Record the entries of w.G; return whether there are new ones, so that its programs must be written anew."""
+    """Record the entries of w.G; return whether there are new ones, so that its programs must be written again."""
     if not note_pattern(w.G, w.pattern):
         return False
     w.index_a[SIZE] = 0
@@ -243,10 +243,10 @@ def record_entries(w):
 
 @compiled
 def choose_partition(f, w, t, q):
-    """Choose dependent and independent coordinates at (t, q), and the rows that count.
+    """Choose dependent and independent coordinates at (t, q), and the independent rows.
 
-    SINGULAR where the rank is less than that of the partition before; RANK_DIFFERS, with the ranks in w.notes, where
-    the workspace is made for others and this is the first partition.
+    Returns SINGULAR if the rank is less than that of the partition before; RANK_DIFFERS, with the ranks in w.notes, if
+    this is the first partition and the workspace has other ranks.
     """
     w.entries[:] = 0.0
     constraint_rows(f, w, t, q, w.G)
@@ -272,7 +272,7 @@ def partition_of_midpoint(f, w, t_mid, state, new_state):
     Both directions of a step have the same middle, so that the choice, and with it the map of a symmetric tableau,
     is symmetric in time: where the partition changes, no direction is preferred, as it is by waiting until it has to be
     renewed.
-    The middle is that of the attempt made under the current partition, and is not looked at again once the step has
+    The middle is that of the attempt made under the current partition, and is not checked again once the step has
     been redone under the new one: where two choices tie to within the difference of the two attempts, O(h^(p+1)), the
     reverse step may choose the other.
     """
@@ -305,7 +305,7 @@ def _same_set(a, b):
 
 @compiled
 def choose_oriented_partition(f, w, t, q):
-    """Choose a partition at an accepted state, and note the sign of det C_qd that its motion has to keep."""
+    """Choose a partition at an accepted state, and record the sign of det C_qd that its motion has to keep."""
     code = choose_partition(f, w, t, q)
     w.notes[ORIENTATION] = 0.0
     if code != DONE:
@@ -319,7 +319,7 @@ def choose_oriented_partition(f, w, t, q):
 
 @compiled
 def _largest_share(w):
-    """Return the largest share of a row that counts in a redundant one, all scaled to 1, from w.minimum."""
+    """Return the largest coefficient of an independent row in a redundant one (rows scaled to 1), from w.minimum."""
     rows = rows_of(w.index_v)
     largest = 0.0
     place = 0
@@ -340,17 +340,18 @@ def partition_is_poor(w):
     """Return whether dependents move much faster per independent than when the partition was chosen.
 
     Measures max|C_qd^-1 C_qi|, which is in w.D. Full pivoting leaves it near 1; it grows without bound where the
-    independent coordinates stop being valid. So does the share that rows which count have in a redundant one, where
-    they come to depend on each other: C_qd is singular there, but not C_q.
+    independent coordinates stop being valid. So do the coefficients of independent rows in a redundant one, where they
+    come to depend on each other: C_qd is singular there, but not C_q.
     """
     largest = 0.0
     for j in range(w.independent_v.size):
         largest = max(largest, largest_of(w.D[j]))
-    if w.notes[SENSITIVITY] == 0.0:  # first look at a new partition
+    if w.notes[SENSITIVITY] == 0.0:  # first check of a new partition
         w.notes[SENSITIVITY] = max(largest, 1.0)
     if not largest <= SENSITIVITY_GROWTH * w.notes[SENSITIVITY]:
         return True
-    if w.rows_v.size == w.Rate.size or w.factors.size > 0:  # whose rows that count are chosen at every state
+    # the static form chooses its independent rows at every state
+    if w.rows_v.size == w.Rate.size or w.factors.size > 0:
         return False
     share = _largest_share(w)
     if w.notes[LEANING] == 0.0:
@@ -361,12 +362,12 @@ def partition_is_poor(w):
 MAX_ITERATIONS = 25  # Newton iterations; quadratic convergence needs 2 to 5
 CONTRACTION = 0.5  # each correction must be at most this times the one before
 ROUNDING_OF_CORRECTIONS = 1e-12  # relative to the largest value: changes of this size no longer shrink
-MAX_VIOLATION = 1e-7  # relative to the mechanism's size: what a redundant row may be violated by
+MAX_VIOLATION = 1e-7  # relative to the mechanism's size: largest violation of a redundant row
 
 
 @compiled
 def _factor_anew(w, t, q):
-    """Factor by another order of elimination, or return why there are no factors."""
+    """Factor by a new order of elimination, or return why that failed."""
     record_entries(w)
     if not finite(w.G):
         return not_finite(w.notes, JACOBIAN, t, q)
@@ -385,7 +386,7 @@ def factor_rows(w, t, q):
     if w.Rate.size > w.C.size:
         ratio = min(ratio, factor(w.entries, w.index_v, w.values_v))
         w.counters[N_FACTORIZATIONS] += 1
-    # else the order of elimination suits these numbers no longer, or there are none
+    # small pivots: the order of elimination no longer suits these numbers, or they are not finite
     return DONE if ratio > RANK_TOLERANCE else _factor_anew(w, t, q)
 
 
@@ -434,8 +435,8 @@ def restore_positions(f, w, t, q, v, tolerance, reuse):
             return DONE
         converged = correction <= tolerance
         if not converged and correction > CONTRACTION * before:
-            # at large coordinates rounding may stand above the tolerance; else this is no longer Newton's region,
-            # and to go on could end on another assembly of the mechanism
+            # rounding of large coordinates may exceed the tolerance; otherwise Newton's method has left its region, and
+            # could converge to another assembly of the mechanism
             converged = correction <= ROUNDING_OF_CORRECTIONS * largest_of(q)
             if not converged:
                 return INNER_DIVERGED
@@ -487,7 +488,7 @@ def restore_velocities(f, w, t, q, v, reuse):
 
 @compiled
 def redundant_rows_hold(f, w, t, q, v):
-    """Check whether the rows that were left out hold at an accepted state; needs C_q and A there in w.G."""
+    """Check whether the redundant rows hold at an accepted state; needs C_q and A there in w.G."""
     w.C[:] = 0.0
     f.constraint(t, q, f.p, w.C)
     size, speed = max(1.0, largest_of(q)), max(1.0, largest_of(v))

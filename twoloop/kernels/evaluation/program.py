@@ -1,4 +1,4 @@
-"""Interpret traced programs: the walk over an operation table in numbers.
+"""Interpret traced programs: evaluate an operation table in numbers.
 
 Programs compute C_q and Gamma where no callback gives them (generate/derived_callbacks.py), and forces, motions and
 rows of models that are functions (bodies/program_results.py). An exact derivative may overflow where the callback does
@@ -37,7 +37,7 @@ def operation(kind, x, y):
 
 @exact
 def affine(nodes, table, columns, numbers, coefficients, constant, begin, end):
-    """Return a constant plus the multiples of nodes that are terms begin to end."""
+    """Return a constant plus the multiples of nodes in terms begin to end."""
     total = numbers[constant]
     for k in range(begin, end):
         total = total + numbers[coefficients + k] * nodes[int(table[columns + k])]
@@ -65,7 +65,7 @@ def run_table(table, rows, n_rows, columns, numbers, coefficients, constants, no
 
 @exact
 def _run(program, numbers, nodes, t, q, v):
-    """Compute all nodes of a program of a system."""
+    """Compute all nodes of a system's program."""
     n_rows = program[op.N_ROWS]
     columns = op.HEAD + op.N_COLUMNS * n_rows
     run_table(program, op.HEAD, n_rows, columns, numbers, 2 * n_rows, 0, nodes, 0, t, q, v)
@@ -73,14 +73,14 @@ def _run(program, numbers, nodes, t, q, v):
 
 @exact
 def _results(program):
-    """Return the number of results, their first node, and where their entries stand."""
+    """Return the number of results, their first node, and the place of their entries."""
     n = program[op.N_RESULTS]
     return n, program[op.N_NODES] - n, op.HEAD + op.N_COLUMNS * program[op.N_ROWS] + program[op.N_TERMS]
 
 
 @compiled
 def gamma_by_program(f, w, t, q, v):
-    """Compute rows of Gamma that no callback gives; return whether there is a program and all are finite."""
+    """Compute the rows of Gamma that no callback gives; return whether there is a program and all are finite."""
     program = f.gamma_program
     if program.size == 0:
         return False

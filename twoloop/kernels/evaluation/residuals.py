@@ -1,4 +1,4 @@
-"""What callbacks say of states that other code has found: how far the equations of motion are from holding there."""
+"""Compute the residuals of the equations of motion at given states, by the callbacks."""
 
 import numpy as np
 from numba import types
@@ -12,7 +12,7 @@ TABLE, STATES = types.float64[:, ::1], types.float64[:, :, ::1]
 
 @compiled
 def _relative_residual(value, allowed):
-    """Divide a residual by what is allowed."""
+    """Divide a residual by its allowed size."""
     if not np.isfinite(value):
         return np.inf
     if value == 0.0:

@@ -1,10 +1,10 @@
-"""The inner loop of large systems, by sparse factors whose order of elimination is chosen once.
+"""Inner loop of large systems, by sparse factors whose order of elimination is chosen once.
 
-There is no partition: all coordinates are integrated, and evaluated as they stand. Wherever others restore dependent
-coordinates, all are moved to the nearest state on the constraints, nearest in the metric of M. What these factors
-cannot decide is NEEDS_DENSE: a run then goes on with the forms of saddle_point.py, as it does for methods that need a
-partition. Nothing here has the size of n_c times n_q where callbacks give values of entries. Dense callbacks fill dense
-arrays, from which the entries are taken.
+There is no partition: all coordinates are integrated, and evaluated without a projection. Tasks for which other forms
+restore dependent coordinates move all coordinates to the nearest state on the constraints, in the metric of M. If these
+factors cannot decide, a task returns NEEDS_DENSE: the run then continues with the forms of saddle_point.py, as it does
+for methods that need a partition. Nothing here has the size of n_c times n_q if callbacks give values of entries. Dense
+callbacks fill dense arrays, from which the entries are taken.
 
 Multipliers of least norm, where rows are redundant: of all lam with the same G^T lam = b, the least is G x for some x.
 It solves
@@ -66,11 +66,12 @@ from twoloop.kernels.linalg.dense import copy, has_new_entries, largest_of
 from twoloop.kernels.linalg.sparse_ldl import factor, load, solve, solve_refined
 from twoloop.kernels.linalg.symbolic_factorization import N_OFF, N_PIVOTS, jacobian_of, mass_of, order_of
 
-SUSPECT_PIVOT = 1e-6  # a pivot below this share of its size is looked at: that of a redundant row is rounding
-MIN_PIVOT = 1e-10  # ... and one below this share no factors with pivots of one row can do with
-DEPENDENT = 1e-11  # sine of the angle to the other rows, found without cancellation, up to which a row is redundant
-PROJECT_STAGES = 2.0  # of NEARLY_SINGULAR: stages are put on the constraints, as it matters how well they keep to these
-REFINED_ONCE, REFINED_TWICE = 1e-3, 1e-7  # the smallest share, below which solutions are refined, and refined again
+SUSPECT_PIVOT = 1e-6  # a pivot below this share of its size is checked: that of a redundant row is rounding
+MIN_PIVOT = 1e-10  # ... and below this share the factorization fails, as it has pivots of one row only
+DEPENDENT = 1e-11  # sine of the angle to the other rows, computed without cancellation, up to which a row is redundant
+PROJECT_STAGES = 2.0  # value of NEARLY_SINGULAR: project stages onto the constraints, whose errors matter there
+# smallest pivot over its size below which solutions are refined once, and twice
+REFINED_ONCE, REFINED_TWICE = 1e-3, 1e-7
 
 
 @compiled
@@ -118,7 +119,7 @@ def _factor(f, w, least):
 
 @compiled
 def _factor_fault(w, t, q):
-    """Return which values are not finite; else whether M is singular, as dense forms may accept, or the rows."""
+    """Return why factors failed: values that are not finite, a singular M (which dense forms accept), or the rows."""
     if not finite_vector(w.mass_values):
         return not_finite(w.notes, MASS, t, q)
     if not finite_vector(w.jacobian_values):
@@ -128,7 +129,7 @@ def _factor_fault(w, t, q):
 
 @compiled
 def factor_at(f, w, t, q):
-    """Factor at (t, q), with the rows that count."""
+    """Factor at (t, q), with the independent rows."""
     if f.flags[CONSTANT_MASS] == 0:
         fill_mass_values(f, w, t, q)
     fill_jacobian_values(f, w, t, q)
@@ -137,14 +138,14 @@ def factor_at(f, w, t, q):
         return _factor_fault(w, t, q)
     if _count(w.counts) == w.rows_v.size:
         return DONE
-    w.counters[N_PARTITIONS] += 1  # rows that count have come to depend on one another: others may do in their place
+    w.counters[N_PARTITIONS] += 1  # independent rows have become dependent: others may replace them
     code = _choose_rows(f, w, t, q)
     return _adopt_rows(w) if code == DONE else code
 
 
 @compiled
 def solve_values(f, w, times):
-    """Solve for the right-hand side in w.unknowns, in its place, refined `times` times."""
+    """Solve in place for the right-hand side in w.unknowns, refined `times` times."""
     n = f.static_program[N_PIVOTS]
     scratch = w.solutions
     return solve_refined(
@@ -164,14 +165,14 @@ def solve_values(f, w, times):
 
 @compiled
 def n_refinements(w):
-    """Return how often solutions with these factors are to be refined."""
+    """Return the number of refinements that solutions with these factors need."""
     smallest = w.notes[SMALLEST]
     return 0 if smallest > REFINED_ONCE else 1 if smallest > REFINED_TWICE else 2
 
 
 @compiled
 def _sine(f, w, row, size):
-    """Return the sine of the angle of a row that does not count to those that do; `size` is g M^-1 g^T."""
+    """Return the sine of the angle of a redundant row to the independent ones; `size` is g M^-1 g^T."""
     x, part = w.unknowns, 0.0
     x[:] = 0.0
     rows, columns, _ = jacobian_of(f.static_program)
@@ -195,16 +196,16 @@ def _count(counts):
 
 @compiled
 def _choose_rows(f, w, t, q):
-    """Choose the rows that count, into w.counts, and factor with them; return DONE, or why that cannot be said.
+    """Choose the independent rows, into w.counts, and factor with them; return DONE, or why that failed.
 
-    Rows with small pivots are left out at first, and taken one after another if they are independent of those that
-    count by then.
+    Rows with small pivots are left out at first, and added one after another if they are independent of the rows chosen
+    so far.
     """
     w.counts[:] = 1.0
     if not _factor(f, w, SUSPECT_PIVOT) > 0.0:
         return _factor_fault(w, t, q)
     order, n_q = order_of(f.static_program), w.Q.size
-    copy(w.counts, w.z)  # 0 for rows to look at
+    copy(w.counts, w.z)  # 0 for rows to be checked
     for k in range(order.size):
         row = order[k] - n_q
         if row < 0 or w.z[row] != 0.0:
@@ -222,7 +223,7 @@ def _choose_rows(f, w, t, q):
 
 @compiled
 def _adopt_rows(w):
-    """Make the rows that count those of the workspace, which has room for so many."""
+    """Adopt the chosen rows as those of the workspace; return SINGULAR if their number differs."""
     if _count(w.counts) != w.rows_v.size:
         return SINGULAR
     place = 0
@@ -235,7 +236,7 @@ def _adopt_rows(w):
 
 @compiled
 def choose_rows(f, w, t, q):
-    """Choose the rows that count at (t, q); return RANK_DIFFERS if the workspace is made for another number of them."""
+    """Choose the independent rows at (t, q); return RANK_DIFFERS if the workspace has another number of them."""
     w.counters[N_PARTITIONS] += 1
     fill_mass_values(f, w, t, q)
     fill_jacobian_values(f, w, t, q)
@@ -250,15 +251,15 @@ def choose_rows(f, w, t, q):
     return _adopt_rows(w)
 
 
-REGULARIZATION = 1e-11  # of the squares of a column of G: W
-CONVERGED_RESIDUAL = 1e-14  # of the largest force: what may be left of b
-MAX_RESIDUAL = 1e-9  # ... and what may be left where it no longer shrinks
-MAX_SOLUTIONS = 30  # solutions
+REGULARIZATION = 1e-11  # W, relative to the squares of a column of G
+CONVERGED_RESIDUAL = 1e-14  # relative to the largest force: residual at which the refinement ends ...
+MAX_RESIDUAL = 1e-9  # ... and largest residual that is accepted if it no longer shrinks
+MAX_SOLUTIONS = 30  # largest number of solutions, i.e. refinements
 
 
 @compiled
 def _load(program, jacobian, n_q, weights, values):
-    """Put the numbers of the matrix into their slots; `weights` is room for n_q numbers."""
+    """Copy the entries of the matrix to their slots; `weights` is scratch for n_q numbers."""
     rows, columns, slots = jacobian_of(program)
     for j in range(n_q):
         weights[j] = 0.0
@@ -388,7 +389,7 @@ def _equilibrate(f, w, lam):
 
 @compiled
 def _move(f, w, x):
-    """Add the least correction in the metric of M to x that takes -w.g away from G x; return its largest entry."""
+    """Add to x the least correction in the metric of M that changes G x by w.g; return its largest entry."""
     n = x.size
     w.unknowns[:n] = 0.0
     copy(w.g, w.unknowns[n:])
@@ -404,7 +405,7 @@ def _move(f, w, x):
 
 @compiled
 def _to_constraints(f, w, t, q, v, theta):
-    """Move (q, v) to the constraints as accelerations.py does; the factors are those before the last correction."""
+    """Project (q, v) onto the constraints as accelerations.py does; factors are those before the last correction."""
     before = np.inf
     theta = max(theta, MIN_CORRECTION * w.notes[ROUNDED])
     for _ in range(MAX_ITERATIONS):
@@ -445,7 +446,7 @@ def _mass_pattern_holds(w):
 
 @compiled
 def _redundant_rows_hold(f, w, t, q, v):
-    """Check whether the rows that were left out hold at an accepted state, whose entries stand in w."""
+    """Check whether the redundant rows hold at an accepted state, whose entries are in w."""
     w.C[:] = 0.0
     f.constraint(t, q, f.p, w.C)
     size, speed = max(1.0, largest_of(q)), max(1.0, largest_of(v))
@@ -465,7 +466,7 @@ def _redundant_rows_hold(f, w, t, q, v):
 
 @compiled
 def _solve(f, w, r, c, a, lam):
-    """Solve for any right-hand side, by the current factors."""
+    """Solve for any right-hand side by the current factors."""
     n = r.size
     copy(r, w.unknowns[:n])
     copy(c, w.unknowns[n:])
@@ -493,7 +494,7 @@ def _other_task(f, w, task, t, q, v, a, lam):
 
 @kernel(INNER)
 def sparse_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
-    """Do a task at (t, q, v), see inner_loop.py; of SOLVE, q and v are the right-hand side."""
+    """Do a task at (t, q, v), see inner_loop.py; for SOLVE, q and v are the right-hand side."""
     if task in (tasks.EVALUATE, tasks.EVALUATE_AS_GIVEN):
         code = DONE
         if task == tasks.EVALUATE and w.notes[NEARLY_SINGULAR] == PROJECT_STAGES:

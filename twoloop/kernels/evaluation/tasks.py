@@ -1,4 +1,4 @@
-"""What the steps may ask an inner loop for; inner_loop.py has a function for each."""
+"""Tasks of an inner loop; inner_loop.py has a function for each."""
 
 (
     EVALUATE,
@@ -14,5 +14,5 @@
     ADOPT_MIDPOINT,
     VERIFY_PATTERN,
     CHECK_REDUNDANT,
-    SOLVE,  # of large systems alone, see sparse_inner_loop.py
+    SOLVE,  # large systems only, see sparse_inner_loop.py
 ) = range(14)

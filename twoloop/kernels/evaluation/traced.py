@@ -14,7 +14,7 @@ from twoloop.kernels.evaluation.program import operation
 VALUE, BOUND = range(2)  # rows of `nodes`
 
 EPS = 2.0**-52
-SAME = 1e-9  # relative to the largest number: a difference beyond it counts unless it may be rounding, which is ...
+SAME = 1e-9  # relative to the largest number: a larger difference counts unless it may be rounding, which is ...
 ROUNDED = 200.0 * EPS  # ... this multiple of the bound
 
 
@@ -84,7 +84,7 @@ def _differences(called, traced, bounds):
     i8(KIT, INTEGERS, INTEGERS, MATRIX, types.int64[:, ::1], INTEGERS, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, MATRIX)
 )
 def compare(f, sizes, which, states, program, columns, coefficients, constants, nodes, called, traced, bounds):
-    """Call callbacks at states [t, q, v] and run their traces, with bounds of rounding, a row a state.
+    """Compare callbacks at states [t, q, v] with their traces, with bounds of rounding; each row is a state.
 
     Returns how many numbers differ by more than SAME of the largest at these states plus ROUNDED times the bound.
 

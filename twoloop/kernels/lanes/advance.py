@@ -1,7 +1,7 @@
-"""The course of runs in lanes: each lane has steps of its own, and takes the next run when its own has ended.
+"""Integration loop of runs in lanes: each lane has its own steps, and takes the next run when its run has ended.
 
-What lanes cannot do is left to a run of its own: a condition of the code that does not hold, a step that is refused
-again and again. How a step is made is the kit's.
+A run leaves its lane, and is repeated on its own, if a condition of the code does not hold, or if a step is rejected
+again and again. `CODE.step` makes the steps.
 """
 
 import numpy as np
@@ -48,12 +48,13 @@ TABLE, STATES = types.float64[:, ::1], types.float64[:, :, ::1]
 
 @compiled
 def _refill(code, order, control, work, n, n_rows, numbers, q0, v0, next_run, status):
-    """Give new runs to lanes that have none; return the number of the next run, and how many run."""
+    """Give new runs to idle lanes; return the number of the next run, and how many lanes run."""
     state, new, _, _, _, _, own, _ = places_of(n, n_rows, numbers.shape[1])
     n_fresh, n_running = 0, 0
     for k in range(LANES):
         last = int(work[RUN * LANES + k])
-        if work[RUNNING * LANES + k] == 0.0 and last >= 0 and status[last] == UNDECIDED:  # as a series leaves it
+        # generated code of a series ends runs without a reason, which is set here
+        if work[RUNNING * LANES + k] == 0.0 and last >= 0 and status[last] == UNDECIDED:
             status[last] = OFTEN_REFUSED if work[REFUSED * LANES + k] < np.inf else NO_VALUES
         work[FINE * LANES + k] = work[FRESH * LANES + k] = 0.0
         if work[RUNNING * LANES + k] == 0.0 and next_run < numbers.shape[0]:
@@ -121,13 +122,13 @@ def _write_ends(work, control, n, n_rows, new, a, last, out_q, out_v, out_a, sta
         work[RUNNING * LANES + k], status[run] = 0.0, ENDED
         for j in range(n):
             out_q[run, j, last], out_v[run, j, last] = work[(new + j) * LANES + k], work[(new + n + j) * LANES + k]
-        for j in range(n + n_rows):  # LAM is behind A
+        for j in range(n + n_rows):  # LAM follows A
             out_a[run, j] = work[(a + j) * LANES + k]
 
 
 @compiled
 def _count(settings, work, n_evaluations):
-    """Count evaluations of steps, accepted or not, and one at their ends; runs that are left out do not count."""
+    """Count evaluations of steps, accepted or not, and one at their ends; runs that left their lanes do not count."""
     for k in range(LANES):
         if work[RUNNING * LANES + k] == 1.0:
             made = settings[N_EVALUATIONS] + int(work[EVALUATED * LANES + k])
@@ -154,9 +155,8 @@ def advance_lanes(
 ):
     """Integrate runs, one for each row of `numbers`, from t0 to t1.
 
-    times : (n_t,) at which states are wanted, the last of them t1; out_q, out_v : (n_runs, n, n_t); out_a : (n_runs,
-    n + n_rows), accelerations and multipliers at t1. n_evaluations : counts go on from what is there. options : of the
-    method.
+    times : (n_t,) output times, the last of them t1; out_q, out_v : (n_runs, n, n_t); out_a : (n_runs, n + n_rows),
+    accelerations and multipliers at t1. n_evaluations : counts are added to those in it. options : those of the method.
     """
     n, n_rows, order = settings[N], settings[N_ROWS], settings[ORDER]
     _, new, _, _, a, _, _, _ = places_of(n, n_rows, numbers.shape[1])

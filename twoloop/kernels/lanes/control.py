@@ -1,4 +1,4 @@
-"""Control the steps of Runge-Kutta methods in lanes by an estimate of the error, each lane for itself."""
+"""Control the steps of Runge-Kutta methods in lanes by estimated errors, separately for each lane."""
 
 import numpy as np
 
@@ -44,16 +44,17 @@ from twoloop.kernels.lanes.layout import (
 )
 from twoloop.kernels.lanes.operations import enlarge, project_lanes
 
-# what `options` begin with, before those of the single step: the rule of controller.py, then
-# ROUGH: how many times less than its error the estimate of a step may be where a force jumps
-# FIRST: step, of the shortest time scale of the start; LEAST: tolerance
+# `options` begin with the rule of step-size control, then ROUGH: factor by which errors may exceed their estimates
+# where a force jumps; FIRST: first step, relative to the shortest time scale of the start; LEAST: tolerance. Options of
+# the single step follow
 ROUGH, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
 
-SUDDEN, SHORTENED, WHOLE = 10.0, 0.95, 1e-10  # as in advance.py
-LIMIT_FACTOR, LIMIT_MEMORY = 0.7, 10.0  # as of a Plan
-RESOLVED = 20.0 * SHORTEST  # of the time at the start: the first step is no shorter
-MOST_REFUSED = 30  # one after another, by estimates that may say little of how much shorter a stiff step has to be
-MOST_STEPS = 100_000  # of a run in lanes, which nothing interrupts
+# as UNFORESEEN, REFUSED and the rounding of the last step in kernels/advance.py and step_size.py
+SUDDEN, SHORTENED, WHOLE = 10.0, 0.95, 1e-10
+LIMIT_FACTOR, LIMIT_MEMORY = 0.7, 10.0  # as in the Plan of a run
+RESOLVED = 20.0 * SHORTEST  # relative to the time at the start: lower bound of the first step
+MOST_REFUSED = 30  # rejected steps in a row: estimates may say little about how much shorter a stiff step has to be
+MOST_STEPS = 100_000  # largest number of steps of a run in lanes, which nothing can interrupt
 
 
 @inlined
@@ -63,7 +64,7 @@ def _past(work, k):
 
 @compiled
 def _first_step(options, control, work, n, state, a, k):
-    """Return a share of the time in which velocities and accelerations change the coordinates as a whole."""
+    """Return the first step: a share of the time in which the state moves by the size of its coordinates."""
     far, fast, sharp, least = 0.0, 0.0, 0.0, np.inf
     for j in range(n):
         far = max(far, abs(work[(state + j) * LANES + k]))
@@ -96,7 +97,7 @@ def begin_control(options, control, work, n, state, a, start):
 
 @compiled
 def choose_steps(work, control, status, n_steps):
-    """Choose H and X of each lane, at most the gap, 0 where none runs; FINE are those that run."""
+    """Choose H and X of each lane, at most the gap, 0 in lanes without a run; FINE marks lanes with a run."""
     t1 = control[T1]
     for k in range(LANES):
         work[H * LANES + k], t = 0.0, work[T * LANES + k]
@@ -128,10 +129,10 @@ def set_end(work, control):
 
 @compiled
 def end_steps(code, settings, control, work, predicted_v):
-    """Project NEW; ERROR is at least how far it was predicted from there, in positions and velocities.
+    """Project NEW; ERROR is at least the distance of the prediction, in positions and velocities.
 
-    Velocities that the constraints change by more than the tolerances show a drive that jumps, or turns, between the
-    stages. `predicted_v`: work for velocities.
+    Velocities that the constraints change by more than the tolerances show a drive that jumps or bends between the
+    stages. `predicted_v`: scratch for velocities.
     """
     n, order = settings[N], settings[ORDER]
     state, new, predicted, _, _, _, _, _ = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
@@ -159,7 +160,7 @@ def _accepted(options, work, k):
         work[H_NEXT * LANES + k], work[H_LIMIT * LANES + k] = 0.5 * h, LIMIT_FACTOR * h
         work[LIMIT_AGE * LANES + k] = 0.0
         return False
-    # at a jump the embedded formula may agree by chance: until the place is passed, the estimate has to be smaller
+    # at a jump the embedded formula may agree by chance: until ROUGH_TO the estimated error has to be smaller
     strict = options[ROUGH] if t < work[ROUGH_TO * LANES + k] else 1.0
     accepted = error * strict <= 1.0
     if error > SUDDEN and not accepted:

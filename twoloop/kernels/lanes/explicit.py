@@ -1,7 +1,7 @@
 """Steps of explicit methods in lanes, by DOP853 and by Taylor series.
 
-Stages are free, as in `explicit_step`: the end alone is put on the constraints. Step-size control of a series is code
-made for the mechanism, see generate/lane_code.py.
+Stages are not projected, as in `explicit_step`: only the end is projected onto the constraints. Step-size control of a
+series is code generated for the mechanism, see generate/lane_code.py.
 """
 
 import numpy as np
@@ -42,7 +42,7 @@ def memory_size(s: int, n: int) -> int:
 
 @kernel(STEP)
 def step_by_dop853(code, settings, control, options, work, status, n_steps, within):
-    """Make a step, at most the gap without evaluations, or states within one by shorter steps."""
+    """Make a step that is not longer than the largest gap between evaluations, or compute states within a step."""
     n = settings[N]
     state, _, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     start = memory + START * n
@@ -60,19 +60,19 @@ def step_by_dop853(code, settings, control, options, work, status, n_steps, with
 
 @kernel(STEP)
 def step_by_series(code, settings, control, options, work, status, n_steps, within):
-    """Make a step by the series about its beginning, or states within one."""
+    """Make a step by the series about its beginning, or compute states within one."""
     order = settings[ORDER]
     if within:
         for k in range(LANES):
             work[X * LANES + k] = work[X * LANES + k] / work[UNIT * LANES + k]
         code.evaluate(order, control, work)
         return
-    for k in range(LANES):  # of stiff motion, steps are as many as its time scales
+    for k in range(LANES):  # stiff motion takes as many steps as its time scales
         if work[RUNNING * LANES + k] == 1.0 and n_steps[int(work[RUN * LANES + k])] >= MOST_STEPS:
             leave_run(work, status, k, MANY_STEPS)
     code.series(order, control, work)
     code.lengths(order, control, work)
-    for k in range(LANES):  # at places within the step
+    for k in range(LANES):  # evaluations at places within the step
         if work[FINE * LANES + k] == 1.0 and work[H * LANES + k] > control[GAP]:
             work[EVALUATED * LANES + k] = np.ceil(work[H * LANES + k] / control[GAP]) - 1.0
     code.check_within(order, control, work)

@@ -1,4 +1,4 @@
-"""Layout of the memory that runs in lanes work in, what kernels call, and how a run in a lane may end.
+"""Layout of the memory of runs in lanes, the functions that kernels call, and codes for how a run ends.
 
 What kernels call are functions made for a mechanism, and the step of a method.
 """
@@ -13,90 +13,90 @@ from twoloop.kernels.compile.generated_functions import GeneratedFunctions, has_
 from twoloop.kernels.compile.reference import Reference
 from twoloop.kernels.data.common import INTEGERS, merged
 
-# how a run ends: it reaches the end of the span, or is left to a run of its own for one of these reasons
+# how a run ends: at the end of the span, or in a run of its own outside the lanes, for one of these reasons
 UNDECIDED, ENDED = 0, 1
 NO_START, NO_STATE, NO_VALUES, OFTEN_REFUSED, MANY_STEPS, UNLIKE = range(-6, 0)
 
 
-LANES = 8 if has_wide_vectors() else 4  # runs side by side: of two vectors each number would take two registers
+LANES = 8 if has_wide_vectors() else 4  # runs side by side; with two vectors, each number would take two registers
 
-# vectors in `work`, one number for each lane; behind them STATE, NEW, PREDICTED, ... as `places` has it
+# vectors in `work`, with one number for each lane; followed by STATE, NEW, PREDICTED, ..., see `places`
 (
     T,
     AHEAD,
     UNIT,
     H,
     X,
-    FINE,  # 1: of the lanes that a task is for; what it leaves 1 could be done
+    FINE,  # 1 in the lanes for which a task runs; it leaves 1 where it succeeded
     DEFECT,
     OFF,
     LENGTH,
-    LONGEST,  # that the step may be, s
-    REQUESTED,  # 1: the lanes that begin a run, or in which a state is wanted
+    LONGEST,  # longest step allowed, s
+    REQUESTED,  # 1 in lanes that begin a run, or for which a state within a step is requested
     WORST,  # defect within the step
-    REFUSED,  # steps, one after another
+    REFUSED,  # number of rejected steps in a row
     RUNNING,
-    RUN,  # run
-    REACHED,  # of the times at which states are wanted
+    RUN,  # index of the run in this lane
+    REACHED,  # number of output times reached
     LEFT_TO_MOVE,
     MOVED_BEFORE,
     ACCEPTED,
-    FRESH,  # 1: lanes whose run has not taken a step yet
-    ERROR,  # of a step, over the tolerances
-    WANTED,  # step, before it is cut short by the end of the run
+    FRESH,  # 1 in lanes whose run has not taken a step yet
+    ERROR,  # error of a step, over the tolerances
+    WANTED,  # size of the step before the end of the run shortens it
     H_NEXT,
-    H_LIMIT,  # of steps, after one that failed ...
-    LIMIT_AGE,  # ... so many steps ago
-    ROUGH_TO,  # where the last step ended that was refused for a sudden error
-    SHIFT,  # by which places within a step are moved
-    EVALUATED,  # how often the equations were in the step, besides what `settings` tell
-    PAST,  # of controller.py, of one lane after the other
+    H_LIMIT,  # limit of the step size after a step that failed ...
+    LIMIT_AGE,  # ... and number of accepted steps since then
+    ROUGH_TO,  # end of the last step that was rejected for a sudden error
+    SHIFT,  # shift of places within a step
+    EVALUATED,  # number of evaluations within the step, besides those that `settings` give
+    PAST,  # history of step-size control, lane by lane, see control/step_size.py
     _MORE_PAST,
     N_FIELDS,
 ) = range(31)
-# functions made for a mechanism, (order, control, work), on what lies in `work`
+# functions generated for a mechanism, (order, control, work), which work on the vectors of `work`
 TASKS = (
-    "approach",  # positions of NEW, at AHEAD, moved towards the constraints, of the lanes that are FINE
-    "refine",  # the same of those that are LEFT_TO_MOVE, and velocities, and A and LAM there; FINE: there by now
-    "redundant",  # whether rows that do not count hold at NEW
-    "departure",  # OFF: of a step H from STATE by PREDICTED to NEW
+    "approach",  # move positions of NEW, at AHEAD, towards the constraints, in lanes that are FINE
+    "refine",  # move those that are LEFT_TO_MOVE, and velocities, and compute A and LAM there; FINE: converged by now
+    "redundant",  # check whether redundant rows hold at NEW
+    "departure",  # OFF: departure of a step H from STATE by PREDICTED to NEW
     "commit",  # NEW becomes STATE where ACCEPTED
 )
 TASKS_OF_STARTS = (
     "rows",
-)  # C, C_t, entries of C_q at NEW and AHEAD, in the memory of the method; FINE: where they have values
-TASKS_OF_STAGES = ("accelerate",)  # A at NEW as it stands
-# NEW, X after the BEGIN of the step, and ERROR, if that is the whole step; FINE stays where it could be done
+)  # C, C_t, entries of C_q at NEW and AHEAD, in the memory of the method; FINE: all of them are finite
+TASKS_OF_STAGES = ("accelerate",)  # A at NEW, without a projection
+# NEW, X after the BEGIN of the step, and ERROR if that is the whole step; FINE stays 1 where that succeeded
 TASKS_OF_EXPLICIT = ("stages",)
 TASKS_OF_SERIES = (
     "series",  # coefficients about STATE at T, in units of time UNIT
-    "lengths",  # LENGTH in units, H and X of the steps of the lanes that can go on, which are FINE
+    "lengths",  # LENGTH in units, H and X of the steps of the lanes that can continue, which are FINE
     "check_within",  # WORST: the largest defect within a step H; AHEAD: its end
-    "evaluate",  # NEW, PREDICTED and FOUND: the state and its accelerations by the series, X units of time on
-    "defect",  # DEFECT: of A at NEW, the end of a step H
-    "judge",  # ACCEPTED: the steps that are, and how long the next one may be
+    "evaluate",  # NEW, PREDICTED and FOUND: the state and its accelerations by the series, after X units of time
+    "defect",  # DEFECT: defect of A at NEW, the end of a step H
+    "judge",  # ACCEPTED: 1 for accepted steps; chooses the size of the next one
 )
 CODE = Reference("LaneKit", {})
 ALL_TASKS = (*TASKS, *TASKS_OF_STARTS, *TASKS_OF_STAGES, *TASKS_OF_EXPLICIT, *TASKS_OF_SERIES)
 CODE.add_llvm_functions(dict.fromkeys(ALL_TASKS, types.none(types.int64, VECTOR, VECTOR)))
-# of a method, (code, settings, control, options, work, status, n_steps, within): a step H of each lane that runs, and
-# whether it is ACCEPTED, with its end in NEW, A and LAM; or, `within` the step that was just accepted, NEW, X seconds
-# after its beginning, of the lanes that FINE names, off the constraints as yet
+# step of a method, (code, settings, control, options, work, status, n_steps, within): a step H of each lane that runs,
+# and whether it is ACCEPTED, with its end in NEW, A and LAM. With `within`, the state X seconds after the beginning of
+# the step that was just accepted, in NEW, for lanes that are FINE, not yet projected
 STEP = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[INTEGERS] * 2, types.boolean)
 CODE.add_function("step", STEP)
 
-# of the memory of an explicit method, in n vectors: accelerations at STATE, the state at which the step begins (twice
-# n), velocities before they are put on the constraints, and accelerations of the stages
+# offsets in the memory of an explicit method, in n vectors: accelerations at STATE, the state at the beginning of the
+# step (twice n), velocities before the projection, and accelerations of the stages
 START, BEGIN, _BEGIN_V, PREDICTED_V, SLOPES = range(5)
 
-N, N_ROWS, ORDER, CHECKS_REDUNDANT, N_NUMBERS, N_EVALUATIONS = range(6)  # in `settings`
-T0, T1, GAP, RTOL, ATOL = range(5)  # in `control`; from ATOL on a tolerance for each coordinate
+N, N_ROWS, ORDER, CHECKS_REDUNDANT, N_NUMBERS, N_EVALUATIONS = range(6)  # indices in `settings`
+T0, T1, GAP, RTOL, ATOL = range(5)  # indices in `control`; from ATOL on a tolerance for each coordinate
 
-SHORTEST = 1e-13  # step, of the time
+SHORTEST = 1e-13  # shortest step, relative to the time
 
 
 class LaneKit:
-    """Hold the functions made for a mechanism and the step of a method, as kernels get them."""
+    """Functions generated for a mechanism and the step of a method, as kernels get them."""
 
     def __init__(self, own: GeneratedFunctions, step: Any = None):
         self.__dict__.update(dict.fromkeys(ALL_TASKS, 0))
@@ -112,9 +112,9 @@ def _type_of_kit(value: Any, context: Any) -> Any:
 
 
 def places(n, n_rows, n_numbers):
-    """Return where STATE, NEW, PREDICTED, FOUND, A, LAM, the numbers of the code and the memory of the method begin.
+    """Return where STATE, NEW, PREDICTED, FOUND, A, LAM, the numbers of the code and the method's memory begin.
 
-    Counted in vectors.
+    Offsets are counted in vectors.
     """
     state = N_FIELDS
     new = state + 2 * n
@@ -138,6 +138,6 @@ def fill_field(work, field, value):
 
 @merged
 def leave_run(work, status, k, reason):
-    """Leave the run of a lane to a run of its own."""
+    """Take a run out of its lane, to be repeated on its own outside the lanes."""
     work[RUNNING * LANES + k] = 0.0
     status[int(work[RUN * LANES + k])] = reason

@@ -1,11 +1,12 @@
-"""Steps of implicit Runge-Kutta methods in lanes by Newton's method, as `newton_step` has them, for stiff motion.
+"""Steps of implicit Runge-Kutta methods in lanes by Newton's method, as in `newton_step`, for stiff motion.
 
 The unknowns are the accelerations a_j of all coordinates at the stages,
 
     F(t_j, Q_j, V_j) - a_j = 0,  Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k,  V_j = v + h sum_k A_jk a_k,
 
-F being the accelerations at a state as it stands: stages are off the constraints by the error of the formula, and the
-end of the step alone is put on them. Derivatives are differences, made for all lanes at once and anew for each step.
+F being the accelerations at a state without a projection: stages are off the constraints by the error of the formula,
+and only the end of the step is projected. Derivatives are differences, computed for all lanes at once and again for
+each step.
 """
 
 import numpy as np
@@ -57,23 +58,23 @@ from twoloop.kernels.steps.newton_systems import DIFFERENCE, MAX_ITERATIONS, STA
 from twoloop.kernels.steps.stages import FARTHEST, OUTER_TOL, middle_node, tableau_of
 from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STEPS_TO_DECAY
 
-# of the method's memory, in vectors: one number for each lane, ...
+# fields of the method's memory, in vectors: first one number for each lane, ...
 (
     TO_GO,  # 1: lanes in which the iteration has not ended
-    DONE,  # 1: it has converged
-    BEFORE,  # the correction before
+    DONE,  # 1 in lanes whose iteration has converged
+    BEFORE,  # size of the previous correction
     SCALE_Q,
     SCALE_V,
-    LARGEST_Q,  # of the corrections
+    LARGEST_Q,  # largest correction of positions; LARGEST_V: of velocities
     LARGEST_V,
-    H_PREVIOUS,  # step that PREVIOUS belongs to; 0: none
-    CONSTANT,  # 1: the stages are predicted as the accelerations at the beginning
-    DURATION,  # s: how long an error of velocity lasts; 0: not known
+    H_PREVIOUS,  # size of the step to which PREVIOUS belongs; 0: none
+    CONSTANT,  # 1: the stages are predicted as constant accelerations, those at the beginning
+    DURATION,  # s: duration of an error of velocity; 0: not known
     N_OF_LANES,
 ) = range(11)
-# ... then n for each of these: accelerations at STATE; q, v and a at the beginning of the step; sums; a state in the
-# middle of the step, and its accelerations; the estimate of the error, and that of velocities as it was and filtered
-# once; and a vector whose imaginary part follows
+# ... then blocks of n: accelerations at STATE; q, v and a at the beginning of the step; sums; a state in the middle of
+# the step, and its accelerations; the estimated error; the error of velocities, unfiltered and filtered once; and a
+# complex vector, real part first
 (
     START,
     BEGIN_Q,
@@ -91,8 +92,9 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     _IMAGINARY,
     N_VECTORS,
 ) = range(15)
-STAGES, PREVIOUS, RESIDUAL, CHANGES, N_BLOCKS = range(5)  # (s, n) each; then weights (s, s)
-BY_Q, BY_V, SYSTEMS = range(3)  # (n, n) each; of a system the real and the imaginary parts, then all pivots
+STAGES, PREVIOUS, RESIDUAL, CHANGES, N_BLOCKS = range(5)  # blocks of (s, n); followed by weights (s, s)
+# matrices (n, n); each system has its real and its imaginary part; the pivots of all systems follow
+BY_Q, BY_V, SYSTEMS = range(3)
 
 
 def memory_size(s: int, n: int) -> int:
@@ -151,9 +153,9 @@ def _middle(code, settings, control, c, work, new, a, memory):
 
 @compiled
 def find_derivatives(code, settings, control, c, work):
-    """Difference the accelerations by positions and velocities, in the middle of the step, of lanes that are FINE.
+    """Difference the accelerations by positions and velocities, in the middle of the step, in lanes that are FINE.
 
-    At the time of a stage, so that they see nothing of a force that the stages do not see.
+    The time is that of a stage, so that the differences see no force that the stages do not see.
     """
     n, order = settings[N], settings[ORDER]
     _, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
@@ -200,7 +202,7 @@ def factor_systems_of_lanes(settings, own, s, work):
 
 @compiled
 def predict_stages(settings, c, work, begins):
-    """Predict stages by the polynomial of the step before, or constant; `begins` 0: by that of the step itself."""
+    """Predict stages by the polynomial of the last step, or as constant; `begins` 0: by the polynomial of this step."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     s = c.size
@@ -231,7 +233,7 @@ def predict_stages(settings, c, work, begins):
 
 @compiled
 def _residuals(code, settings, control, A, A2, c, work):
-    """Compute the residuals of the stages; FINE where they have values, and the largest entries."""
+    """Compute the residuals of the stages and the largest entries; FINE stays 1 in lanes with finite values."""
     n, order = settings[N], settings[ORDER]
     _, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     s = c.size
@@ -264,7 +266,7 @@ def _residuals(code, settings, control, A, A2, c, work):
 
 @compiled
 def _correct(settings, own, s, work):
-    """Compute corrections of the stages into CHANGES; add them in lanes in which the iteration goes on."""
+    """Compute corrections of the stages into CHANGES; add them in lanes that still iterate."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     n_systems, place = count_eigenvalues(own, s), eigen_place(s)
@@ -321,7 +323,7 @@ def _largest_corrections(settings, A, A2, work):
 
 @merged
 def _end_iteration(options, work, memory, iteration, k):
-    """Return whether the iteration of a lane ends; DONE: whether it has converged."""
+    """Return whether the iteration of a lane ends; DONE becomes 1 if it has converged."""
     x, tolerance = work[X * LANES + k], options[N_HEAD + OUTER_TOL]
     floor = STAGNATION * options[LEAST]
     fast = x * work[(memory + LARGEST_V) * LANES + k] / work[(memory + SCALE_V) * LANES + k]
@@ -348,7 +350,7 @@ def _end_iteration(options, work, memory, iteration, k):
 
 @compiled
 def solve_stages(code, settings, control, options, own, A, A2, c, work):
-    """Solve the stages of a step X, predicted, in lanes that are FINE; FINE where they converged."""
+    """Solve the predicted stages of a step X in lanes that are FINE; FINE stays 1 where they converged."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     to_go, done = memory + TO_GO, memory + DONE
@@ -400,7 +402,7 @@ def _allowed(control, work, state, new, j, place, k):
 
 @compiled
 def _embedded(settings, own, A, work, memory):
-    """Compute the embedded estimate of the error, not filtered, into E_Q and E_V."""
+    """Compute the embedded estimate of the error, unfiltered, into E_Q and E_V."""
     n, s = settings[N], A.shape[0]
     place = eigen_place(s)
     gamma0, e = own[place + GAMMA0], own[place + N_EIGEN_SCALARS : place + N_EIGEN_SCALARS + s]
@@ -444,7 +446,7 @@ def _filter(settings, own, s, work, memory):
 
 @compiled
 def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
-    """Return what an error of the velocities adds to the positions, see velocity_errors.py."""
+    """Return the error that an error of the velocities causes in the positions, see velocity_errors.py."""
     raw, once, twice = vector_at(memory, n, RAW), vector_at(memory, n, ONCE), vector_at(memory, n, E_V)
     begin = vector_at(memory, n, BEGIN_V)
     largest = turn = fastest = change = 0.0
@@ -487,7 +489,7 @@ def _motion_time(control, work, n, memory, k):
 
 @compiled
 def _slow_error(settings, control, own, s, work):
-    """Raise ERROR to what an error of the velocities, in E_V, leaves in slow directions, as in newton_step.py."""
+    """Raise ERROR to the error that velocity errors, in E_V, leave in slow directions, as in newton_step.py."""
     n = settings[N]
     state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     e_v, most, fine = vector_at(memory, n, E_V), memory + LARGEST_V, memory + TO_GO
@@ -513,7 +515,7 @@ def _slow_error(settings, control, own, s, work):
     solve_lanes(work, matrix, pivots, n, 0, e_v)
     for k in range(LANES):
         error = work[most * LANES + k]
-        if work[FINE * LANES + k] == 1.0:  # where the motion is unstable the solution may be large
+        if work[FINE * LANES + k] == 1.0:  # the solution may be large where the motion is unstable
             long = _motion_time(control, work, n, memory, k)
             error = min(error, _velocity_error(control, work, n, e_v, long, state, new, k))
         work[FINE * LANES + k] = work[fine * LANES + k]
@@ -551,7 +553,7 @@ def _estimate(settings, control, own, A, work):
 
 @compiled
 def _keep_stages(work, memory, n, s):
-    """Keep the stages of accepted steps, from which the next ones and states within the step are predicted."""
+    """Store the stages of accepted steps, which predict the next ones and states within the step."""
     stages, previous = block_at(memory, n, s, STAGES), block_at(memory, n, s, PREVIOUS)
     for k in range(LANES):
         if work[ACCEPTED * LANES + k] == 1.0:
@@ -562,7 +564,7 @@ def _keep_stages(work, memory, n, s):
 
 @kernel(STEP, vectorized=True)
 def step_by_newton(code, settings, control, options, work, status, n_steps, within):
-    """Make a step, at most the gap without evaluations, or states within one by shorter steps."""
+    """Make a step that is not longer than the largest gap between evaluations, or compute states within a step."""
     n = settings[N]
     state, _, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     own = options[N_HEAD:]

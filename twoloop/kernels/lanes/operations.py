@@ -1,6 +1,7 @@
-"""Operations in lanes: vectors of which each lane has its own, LU factors of a matrix a lane, and projections.
+"""Operations on vectors with one number for each lane: LU factors of one matrix per lane, and projections.
 
-Places are counted in vectors; of a complex number the imaginary part stands `imaginary` further on, 0: it is real.
+Places are counted in vectors. The imaginary part of a complex number is `imaginary` vectors behind the real part; 0:
+the number is real.
 """
 
 from twoloop.kernels.data.common import compiled, inlined, merged
@@ -21,14 +22,14 @@ def table(work, begin, rows, count):
 
 @compiled
 def copy_vectors(work, source, target, count):
-    """Copy vectors to another place."""
+    """Copy vectors from source to target."""
     for i in range(count * LANES):
         work[target * LANES + i] = work[source * LANES + i]
 
 
 @compiled
 def sum_rows(weights, rows, total):
-    """Compute the sum of weights[k] rows[k], four rows at once, which LLVM makes vectors of."""
+    """Compute the sum of weights[k] rows[k], four rows at once, so that LLVM vectorizes it."""
     first = weights.size % 4
     for m in range(total.size):
         total[m] = 0.0
@@ -51,7 +52,7 @@ def _add_four(work, t, p, q, sign):
 
 @compiled
 def add_product(work, target, x, y, sign):
-    """Add sign x y to target in each lane; four are read before they are written, as LLVM cannot tell places apart."""
+    """Add sign x y to target in each lane; read four before writing, because LLVM cannot rule out that they overlap."""
     for k in range(0, LANES, 4):
         _add_four(work, target * LANES + k, x * LANES + k, y * LANES + k, sign)
 
@@ -111,7 +112,7 @@ def _size(work, place, imaginary, k):
 
 @compiled
 def _pivot(work, matrix, pivots, n, imaginary, c):
-    """Exchange rows so that the largest of a column is the pivot, and invert it; FINE where there is one."""
+    """Exchange rows so that the largest entry of a column is the pivot, and invert it; clear FINE if all are zero."""
     for k in range(LANES):
         best, top = c, _size(work, matrix + c * n + c, imaginary, k)
         for i in range(c + 1, n):
@@ -137,7 +138,7 @@ def _pivot(work, matrix, pivots, n, imaginary, c):
 
 @compiled
 def factor_lanes(work, matrix, pivots, n, imaginary):
-    """Replace a matrix (n, n) by its LU factors, rows exchanged in each lane as it needs."""
+    """Replace a matrix (n, n) by its LU factors; each lane exchanges its own rows."""
     for c in range(n):
         _pivot(work, matrix, pivots, n, imaginary, c)
         for i in range(c + 1, n):
@@ -149,7 +150,7 @@ def factor_lanes(work, matrix, pivots, n, imaginary):
 
 @compiled
 def solve_lanes(work, matrix, pivots, n, imaginary, x):
-    """Replace a right-hand side x (n), and then n imaginary parts, by the solution."""
+    """Replace a right-hand side x (n), followed by n imaginary parts, by the solution."""
     apart = n if imaginary > 0 else 0
     for c in range(n):
         for k in range(LANES):
@@ -172,7 +173,7 @@ MOST_PASSES = 10
 
 @compiled
 def project_lanes(code, order, control, work):
-    """Project NEW of the lanes that are FINE onto the constraints; FINE where it converged."""
+    """Project NEW of the lanes that are FINE onto the constraints; FINE stays 1 where it converged."""
     code.approach(order, control, work)
     for _ in range(MOST_PASSES):
         code.refine(order, control, work)

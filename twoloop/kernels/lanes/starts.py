@@ -1,4 +1,4 @@
-"""Starts in lanes: guesses put on the constraints by the least change, and whether another assembly is about as near.
+"""Project starts onto the constraints by the least change, in lanes, and check for another assembly about as near.
 
 The least change follows from Cholesky's factors of G G^T, rows of G of length 1. Redundant rows depend on one another
 on the constraints, and beside them only nearly: combinations of rows that vanish there, the vectors Z, are left out, as
@@ -28,11 +28,11 @@ from twoloop.kernels.lanes.layout import (
 )
 from twoloop.kernels.lanes.operations import copy_vectors
 
-LEAST = 1e-15  # is added to G G^T, so that it has an inverse ...
-MORE = 1e-8  # ... where some of its eigenvalues vanish
-WEAK = 1e-4  # eigenvalue, of the largest, from which on redundant rows count
+LEAST = 1e-15  # added to the diagonal of G G^T, so that it has an inverse ...
+MORE = 1e-8  # ... and for inverse iteration, when some of its eigenvalues vanish
+WEAK = 1e-4  # eigenvalue of redundant rows, relative to the largest, above which they count as independent
 REDUNDANT_ITERATIONS = (
-    5  # of inverse iteration for eigenvectors of eigenvalues that do not count, which are far smaller
+    5  # number of inverse iterations for eigenvectors of redundant rows, whose eigenvalues are far smaller
 )
 GOLDEN = 0.6180339887498949
 
@@ -137,7 +137,7 @@ def _find_redundant(work, pattern, n_rows, n_redundant, row, factors):
             _remove_redundant(work, n_rows, w, Z, z, spare)
         normalise(work, z, n_rows, spare)
         for k in range(LANES):
-            if not work[spare * LANES + k] < WEAK:  # the eigenvalue and MORE
+            if not work[spare * LANES + k] < WEAK:  # `spare` is the eigenvalue plus MORE
                 work[z * LANES + k] = np.nan
 
 
@@ -199,12 +199,14 @@ def least_change(work, pattern, n, n_rows, n_redundant, factors, x, change):
 
 
 MOST_ITERATIONS = 12
-AT_ROUNDING = 64.0  # times rounding of its terms: an equation of a start that holds
-STRAIGHT = 0.25  # of a displacement: how far its projection may end from where C_q sends it
-SINGULAR = 1e-12  # smallest eigenvalue of G G^T, rows of length 1, that counts
-WEAKEST_ITERATIONS = 10  # of inverse iteration for the eigenvector of the smallest eigenvalue that counts
-N_REDUNDANT = 5  # in `settings`, behind those of layout.py: rows that depend on others
-WAYS = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))  # off a state that was found: parts of the guess's way, of the weakest
+AT_ROUNDING = 64.0  # times the rounding of its terms: an equation of a start holds within this
+STRAIGHT = 0.25  # relative to a displacement: largest distance of its projection from where C_q sends it
+SINGULAR = 1e-12  # smallest eigenvalue of G G^T, rows of length 1, of independent rows
+# number of inverse iterations for the eigenvector of the smallest eigenvalue of independent rows
+WEAKEST_ITERATIONS = 10
+N_REDUNDANT = 5  # in `settings`, behind those of layout.py: number of redundant rows
+# displacements from the state found: factors of the way of the guess, and of the weakest direction
+WAYS = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
 
 def places_of_starts(n, n_rows, n_entries, n_redundant):
@@ -235,7 +237,7 @@ def _largest(work, place, count, k):
     largest = 0.0
     for j in range(count):
         size = abs(work[(place + j) * LANES + k])
-        largest = largest if size <= largest else size  # NaN stays
+        largest = largest if size <= largest else size  # keeps NaN
     return largest
 
 
@@ -254,7 +256,7 @@ def _holds(work, pattern, n, n_rows, C, G, new, k):
 
 @compiled
 def _gauss_newton(code, settings, control, pattern, moves, work):
-    """Move NEW onto the constraints by steps of least change; RUNNING stays where that converges."""
+    """Move NEW onto the constraints by steps of least change; RUNNING stays 1 in lanes where that converges."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = places_of(n, n_rows, settings[N_NUMBERS])
     G, x, change, _, _, _, _, row, _, here, _ = _places(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
@@ -276,7 +278,7 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
                 continue
             for j in range(n):
                 work[(new + j) * LANES + k] += work[(change + j) * LANES + k]
-            # after the change, which is applied to the last bit
+            # check after the change, which is applied to the last bit
             if _holds(work, pattern, n, n_rows, memory, G, new, k):
                 work[LEFT_TO_MOVE * LANES + k] = 0.0
             else:
@@ -290,7 +292,7 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
 
 @compiled
 def _change_velocities(code, settings, control, pattern, moves, work):
-    """Move velocities of NEW onto the rows at its positions, whose factors are kept."""
+    """Move velocities of NEW onto the rows at its positions; keeps their factors."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = places_of(n, n_rows, settings[N_NUMBERS])
     G, x, change, _, _, _, _, row, there, _, _ = _places(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
@@ -298,7 +300,7 @@ def _change_velocities(code, settings, control, pattern, moves, work):
     fill_field(work, FINE, 1.0)
     code.rows(0, control, work)
     factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors)
-    for _ in range(2):  # once more for what rounding of a large change leaves
+    for _ in range(2):  # the second pass removes the rounding errors of a large change
         for i in range(n_rows):
             fill_field(work, x + i, 0.0)
             subtract_row(work, x + i, G, pattern, i, new + n)
@@ -314,7 +316,7 @@ def _change_velocities(code, settings, control, pattern, moves, work):
 
 @compiled
 def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, moved, weakest):
-    """Find the direction that rows determine least, scaled to how far the guess moved; else RUNNING is cleared."""
+    """Find the direction that rows determine least, scaled to the way of the guess; clear RUNNING if rows depend."""
     spare = factors + pattern[n_rows] - pattern[0] + n_rows * (1 + n_rows + n_redundant)
     for i in range(n_rows):
         fill_field(work, x + i, 0.5 + (GOLDEN * (i + 1)) % 1.0)
@@ -324,7 +326,7 @@ def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, m
     normalise(work, x, n_rows, spare)
     least = SINGULAR if n_redundant == 0 else WEAK * n_rows
     for k in range(LANES):
-        if not work[spare * LANES + k] > least:  # the smallest eigenvalue
+        if not work[spare * LANES + k] > least:  # `spare` is the smallest eigenvalue
             work[RUNNING * LANES + k] = 0.0
         share = _largest(work, moved, n, k) / max(_largest(work, weakest, n, k), LEAST)
         for j in range(n):
@@ -350,7 +352,7 @@ def _compare_with_other_starts(code, settings, control, pattern, moves, work):
         for i in range(n_rows):
             fill_field(work, x + i, 0.0)
             subtract_row(work, x + i, factors, pattern, i, way)
-        # the part of the way that rows leave nothing of
+        # the part of the way that is normal to the constraints
         along_rows(work, pattern, n, n_rows, n_redundant, factors, x, change)
         for k in range(LANES):
             apart, rounding = 0.0, AT_ROUNDING * np.finfo(np.float64).eps * _largest(work, found, n, k)
@@ -367,10 +369,10 @@ _START = types.void(CODE, INTEGERS, VECTOR, *[INTEGERS] * 2, *[types.float64[:, 
 
 @kernel(_START, vectorized=True)
 def start_lanes(code, settings, control, pattern, moves, numbers, q, v, fine, work):
-    """Put states, one for each row of `numbers`, on the constraints at t0, in place; `fine`: 1 on success.
+    """Project states, one for each row of `numbers`, onto the constraints at t0, in place; `fine`: 1 on success.
 
-    pattern : where in it the columns of the entries of each row of G begin, and end, and these columns. moves : (n,)
-    1 for coordinates that may.
+    pattern : where in it the columns of the entries of each row of G begin, and end, and these columns. moves : (n,) 1
+    for coordinates that may move.
     """
     n, n_rows, n_redundant, n_runs = settings[N], settings[N_ROWS], settings[N_REDUNDANT], numbers.shape[0]
     _, new, _, _, _, _, own, memory = places_of(n, n_rows, numbers.shape[1])

@@ -1,1 +1,1 @@
-"""Matrices: dense, banded, sparse; factors and solutions in place."""
+"""Linear algebra of dense, banded and sparse matrices: factors and solutions, computed in place."""

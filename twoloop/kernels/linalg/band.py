@@ -19,7 +19,7 @@ from twoloop.kernels.data.common import compiled, inlined, merged
 from twoloop.kernels.data.indices import BANDWIDTH, DIAGONAL_MASS, DONE, MASS_NOT_DEFINITE, SINGULAR
 from twoloop.kernels.linalg.dense import lu_factor, lu_solve
 
-# places in `lapack_addresses`: Cholesky of a banded matrix and its solve, LU with row exchanges real and complex
+# indices in `lapack_addresses`: Cholesky of a banded matrix and its solve, LU with row exchanges, real and complex
 ROUTINES = ("dpbtrf", "dpbtrs", "dgbtrf", "dgbtrs", "zgbtrf", "zgbtrs")
 DPBTRF, DPBTRS, DGBTRF, DGBTRS, ZGBTRF, ZGBTRS, N_ROUTINES = range(7)
 
@@ -43,7 +43,7 @@ def lapack_addresses() -> list[int]:
 
 @intrinsic
 def call_lapack(typing_context, address, arguments):
-    """Call the routine at `address` with Fortran's conventions; its last argument, `info`, is added and returned.
+    """Call the LAPACK routine at `address` with Fortran's conventions; add its last argument, `info`, and return that.
 
     `arguments` is a tuple of arrays, given by their first element, and of integers, given by a 32-bit copy, which
     stands for a character too (the machines that numba knows have the low byte first).
@@ -68,8 +68,8 @@ def call_lapack(typing_context, address, arguments):
     return types.int64(address, arguments), generate
 
 
-# From so many coordinates on a Newton step by banded algebra is the faster one: measured 36 to 75, on chains of
-# bandwidth 1 to 11 and on beams. Evaluations alone, as a fixed-point iteration makes them, gain from about 150 on and
+# number of coordinates from which on a Newton step by banded algebra is faster: measured 36 to 75, on chains of
+# bandwidth 1 to 11 and on beams. Evaluations alone, as a fixed-point iteration makes them, gain from about 150 on, and
 # lose a third here
 BANDED_FROM = 56
 
@@ -81,7 +81,7 @@ def banded_pays(n_q: int, n_c: int, bandwidth: int) -> bool:
 
 @merged
 def banded_mass(f):
-    """Return whether M is factored as a band (a diagonal M is simpler still)."""
+    """Return whether M is factored as a band; a diagonal M is simpler still."""
     return f.flags[BANDWIDTH] >= 0 and f.flags[DIAGONAL_MASS] == 0
 
 
@@ -100,7 +100,7 @@ def _mass_diagonals(w, b):
 
 @compiled
 def factor_banded_mass(f, w):
-    """Factor w.M by Cholesky; its factor and its diagonals stand in the memory of w.L."""
+    """Factor w.M by Cholesky; its factor and its diagonals are stored in the memory of w.L."""
     n = w.Q.size
     b = f.flags[BANDWIDTH]
     band = _mass_band(w, b)
@@ -124,7 +124,7 @@ def solve_banded_mass(f, w, x):
 
 @compiled
 def add_banded_mass_times(f, w, x, y):
-    """Add M x to y along the diagonals: rows of a band are too short to be fast."""
+    """Add M x to y along the diagonals, because rows of a band are too short to be fast."""
     n = w.Q.size
     for i in range(n):
         y[i] += w.M[i, i] * x[i]
@@ -169,7 +169,7 @@ def _scratch(numbers, n, n_c, b):
 
 @compiled
 def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
-    """Factor the system whose B stands in lu_band(numbers) by xGBTRF and xGBTRS of its kind."""
+    """Factor the system whose B is in lu_band(numbers) by xGBTRF and xGBTRS of its kind."""
     n_c, n = Cq.shape
     band = lu_band(numbers, n, b)
     rows = pivots[: n - n_c].view(np.int32)

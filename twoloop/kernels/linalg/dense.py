@@ -1,4 +1,4 @@
-"""Factor small dense matrices in place, without allocation, and note where matrices have entries.
+"""Factor small dense matrices in place, without allocation, and record where matrices have entries.
 
 All loops run along rows and skip zero factors: constraint Jacobians are sparse even where they are small.
 """
@@ -15,7 +15,7 @@ def copy(source, target):
 
 @merged
 def copy_matrix(source, target):
-    """Copy row by row, as far as both have rows."""
+    """Copy row by row, up to the smaller number of rows."""
     for i in range(min(source.shape[0], target.shape[0])):
         for j in range(source.shape[1]):
             target[i, j] = source[i, j]
@@ -32,7 +32,7 @@ def largest_of(x):
 
 @merged
 def contains(numbers, number):
-    """Return whether a number is among others."""
+    """Return whether a number is among the given ones."""
     found = False
     for each in numbers:
         found = found or each == number
@@ -193,7 +193,7 @@ def ldl_solve_rows(A, B):
 def has_new_entries(G, pattern):
     """Return whether an entry of G outside its pattern is not zero."""
     entries, seen = G.reshape(G.size), pattern.reshape(pattern.size)
-    unseen = 0.0  # a sum without a branch: there is nothing new at nearly every look
+    unseen = 0.0  # a sum without a branch, because new entries are rare
     for i in range(seen.size):
         unseen += abs(entries[i]) * (1.0 - seen[i])
     return unseen != 0.0  # also true for NaN
@@ -201,7 +201,7 @@ def has_new_entries(G, pattern):
 
 @compiled
 def note_pattern(G, pattern):
-    """Add the entries of G that are not zero to its pattern; return whether there are new ones."""
+    """Add the nonzero entries of G to its pattern; return whether there are new ones."""
     if not has_new_entries(G, pattern):
         return False
     new = False

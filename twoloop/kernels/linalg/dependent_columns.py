@@ -1,24 +1,25 @@
-"""Which coordinates follow from the others by rows of G: pivots, in blocks of one or two, of the code for these rows.
+"""Choose coordinates that follow from the others by rows of G: pivots, in blocks of one or two, of generated code.
 
-Entries that are numbers come first, as they need no division and stay what they are. Of the others that are large
-enough, those with the least fill are taken, not the largest ones, so that neighbouring positions have mostly the same.
+Constant entries come first: they need no division and do not change. Among other entries that are large enough, those
+with the least fill are chosen instead of the largest, so that neighbouring positions mostly have the same.
 """
 
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, i8, kernel
 
 NONE, NUMBER, VARIES = 0, 1, 2  # kinds of entries
-ROWS_SEARCHED = 4  # rows, of which two are searched for a block: with all of them it takes milliseconds for 60 rows
-# Limits of a block: the sum of squares of what the other coordinates, each moved by 1, do to its own; and the square of
-# the sine between its columns, or of one pivot over its column of G. With the first ones pivots stay large for most of
-# a turn (spatial four-bar: 98 % of the time, 34 % with the second ones); the last ones are far enough from LEAST of
-# generate/null_space.py
+# number of rows of which two are searched for a block: a search of all takes milliseconds for 60 rows
+ROWS_SEARCHED = 4
+# limits of a block. MAX_SQUARES: sum of squares of the changes of its coordinates, if each other one moves by 1.
+# MIN_SINE_SQUARES: square of the sine between its columns, or of one pivot over its column of G. With the first tier
+# pivots stay large for most of a turn (spatial four-bar: 98 % of the time, 34 % with the second tier); the last tier is
+# far enough from LEAST of generate/null_space.py
 MAX_SQUARES, MIN_SINE_SQUARES = (4.0, 20.0, 200.0), (0.2**2, 0.1**2, 0.04**2)
-SMALL = 1e-3  # of the largest entry of its row: a number that is not divided by
-CANCELLATION = 1e-12  # what is left of numbers that cancel
+SMALL = 1e-3  # relative to the largest entry of its row: a smaller number is no divisor
+CANCELLATION = 1e-12  # relative: remainder of numbers that cancel
 
 
 def room_size(n_rows: int, n: int) -> tuple[int, int]:
-    """Return how many numbers, and integers, `choose_dependent_columns` takes for scratch."""
+    """Return the numbers of scratch reals, and integers, for `choose_dependent_columns`."""
     return n_rows * n + n, n_rows * n + 3 * n_rows + 2 * n
 
 
@@ -67,11 +68,11 @@ def _is_pivot_block(R, column_left, squares, i, k, j, l, largest, parallel):
 
 @compiled
 def _find_varying_pivots(R, K, row_left, column_left, squares, rows, column_sizes, found):
-    """Find pivots among entries that vary: `found` gets two rows and two columns, or one of each twice."""
+    """Find pivots among entries that vary; `found` becomes two rows and two columns, or one of each, twice."""
     m, n = R.shape
     n_rows = 0
     column_sizes[:] = 0
-    for i in range(m):  # the shortest ones, sorted
+    for i in range(m):  # the shortest rows, sorted
         if row_left[i]:
             size = 0
             for j in range(n):
@@ -139,9 +140,9 @@ def _subtract(R, K, column_left, row_sizes, column_sizes, r, j, i):
 
 @compiled
 def _eliminate(R, K, row_left, column_left, row_sizes, column_sizes, i, k, j, l):
-    """Solve rows i and k for columns j and l, or one for one, and eliminate these from the other rows.
+    """Solve rows i and k for columns j and l, or one row for one column, and eliminate these from the other rows.
 
-    `row_sizes` and `column_sizes` are kept of single rows: how many entries there are.
+    `row_sizes` and `column_sizes` hold the numbers of entries; they are updated for single rows only.
     """
     m, n = R.shape
     row_left[i] = row_left[k] = column_left[j] = column_left[l] = 0

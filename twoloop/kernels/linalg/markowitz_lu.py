@@ -1,13 +1,12 @@
-"""LU factors of the dependent columns of the constraint Jacobian, by a program for their pattern.
+"""Factor the dependent columns of the constraint Jacobian by LU, with a program for their pattern.
 
 A mechanism's Jacobian has few entries, always in the same places. The order of elimination is chosen once for each
-partition (Markowitz's rule with a threshold), and with it a list of what is to be multiplied and subtracted: to factor
-again is to run down this list, without a search for pivots and without a look at zeros. Multipliers that have grown
-show that the order suits the numbers no longer. Where the list would be as long as that of a full matrix, the factors
-are dense with row exchanges.
+partition (Markowitz's rule with a threshold), and with it the list of operations: later factorizations run down this
+list, without a search for pivots and without tests for zeros. Multipliers that have grown show that the order no longer
+suits the numbers. If the list would be as long as that of a full matrix, the factors are dense with row exchanges.
 
-To choose an order, entries stand in lists by row and by column, and a step of the elimination looks at the lists it
-changes alone: ordering takes work in proportion to size times entries, where full matrices would take the third power
+To choose an order, entries are stored in lists by row and by column, and each step of the elimination uses only the
+lists that it changes: the work is proportional to size times entries, whereas full matrices would take the third power
 of the size.
 
 The factors of one matrix are two arrays: `index`, the program, and `values`. Vectors to solve for are in the order of
@@ -17,25 +16,26 @@ elimination: entry k belongs to row rows_of(index)[k] of the Jacobian, that of t
 from twoloop.kernels.data.common import compiled, inlined, merged
 from twoloop.kernels.linalg.dense import copy, lu_factor, lu_sign, lu_solve
 
-THRESHOLD = 0.1  # of the largest entry in its column, which a pivot must have
-FULL = 0.5  # of the subtractions of a full matrix, from which on factors are dense
-SMALL = 3  # rows up to which they never are
+THRESHOLD = 0.1  # smallest pivot, relative to the largest entry in its column
+FULL = 0.5  # share of the operations of a dense factorization above which a dense one is used
+SMALL = 3  # number of rows up to which factors are never dense
 ZERO = 1e-11  # a pivot below this fraction of the largest one counts as zero
-MIN_SUBTRACTIONS, PER_ROW = 2000, 100  # a list has at most LONGEST + PER_ROW r subtractions: what memory there is
+# a list has at most MIN_SUBTRACTIONS + PER_ROW r subtractions, for which there is memory
+MIN_SUBTRACTIONS, PER_ROW = 2000, 100
 MAX_ENTRIES_PER_LINE = 64  # entries that a row or a column of the factors may have
 
-ORDERED, SINGULAR_MATRIX, TOO_MANY = range(3)  # what `order` finds; the last: too many entries to be worth it
+ORDERED, SINGULAR_MATRIX, TOO_MANY = range(3)  # results of `order`; TOO_MANY: too many entries for sparse factors
 
-# places in `index`: the size r, whether the factors are dense, the sign of the permutations, how many entries the
-# factors have, the first that is L's, and the columns of the Jacobian; then rows (r), columns (r), row exchanges of
-# dense factors (r), where rows of U begin (r) and end (r) and where rows of L begin (r + 1); then of every entry its
-# row, its column, and where it comes from; then the targets of the subtractions. Entries: the diagonal, U from its last
-# row up, L from its first. Behind that, lists for the time of ordering
+# places in `index`: the size r, whether the factors are dense, the sign of the permutations, the number of entries of
+# the factors, the first entry of L, and the number of columns of the Jacobian; then rows (r), columns (r), row
+# exchanges of dense factors (r), where rows of U begin (r) and end (r) and where rows of L begin (r + 1); then the row,
+# the column and the source of each entry; then the targets of the subtractions. Entries: the diagonal, U from its last
+# row up, L from its first. The lists for ordering follow
 SIZE, DENSE, SIGN, N_SLOTS, FIRST_LOWER, WIDTH, N_HEAD = range(7)
-# of every row and column of the matrix: entries in its list, from which a column loses those of eliminated rows; of a
-# row, entries that are left; places in the order so far; and of a row where in the list of a column it is, from 1 on
+# of every row and column of the matrix: number of entries in its list (a column loses those of eliminated rows); of a
+# row, number of entries left; places in the order so far; and of a row, its place in the list of a column, from 1 on
 ROW_SIZE, COLUMN_SIZE, ROW_LEFT, ROW_PLACE, COLUMN_PLACE, FOUND, N_COUNTS = range(7)
-COLUMNS, SOURCES, ROWS, N_LISTS = range(4)  # of a row: columns and sources of its entries; of a column: rows
+COLUMNS, SOURCES, ROWS, N_LISTS = range(4)  # lists of a row: columns and sources of its entries; list of a column: rows
 
 
 def index_size(r: int) -> int:
@@ -49,7 +49,7 @@ def values_size(r: int, may_be_dense: bool = True) -> int:
 
 
 def max_subtractions(r: int) -> int:
-    """Return how many subtractions a program may have: what memory there is."""
+    """Return the largest number of subtractions of a program, for which there is memory."""
     return min(r * r * (r + 1) // 2, MIN_SUBTRACTIONS + PER_ROW * r)
 
 
@@ -116,7 +116,7 @@ def clear_lists(index, r):
 
 @compiled
 def put_entry(matrix, i, j, number, source):
-    """Add entry (i, j), which is not in the lists yet; return whether there was room."""
+    """Add entry (i, j), which is not in the lists yet; return whether it fits."""
     counts, lists, numbers = matrix
     n, m = counts[ROW_SIZE, i], counts[COLUMN_SIZE, j]
     if n == numbers.shape[1] or m == numbers.shape[1]:
@@ -133,7 +133,7 @@ def put_entry(matrix, i, j, number, source):
 def _choose_pivot(matrix, rows, columns, k):
     """Return row and column of pivot k: the one with the least fill among those large enough; (-1, -1): none.
 
-    Among equals it is the largest, then the first in the order so far.
+    Among equal ones it is the largest, then the first in the order so far.
     """
     counts, lists, numbers = matrix
     r = rows.size
@@ -162,7 +162,7 @@ def _choose_pivot(matrix, rows, columns, k):
 
 @merged
 def _exchange(order, place, k, chosen):
-    """Move `chosen` to place k; return -1, or 1 if it is there already: the sign of the permutation."""
+    """Move `chosen` to place k; return the sign of the permutation: -1, or 1 if `chosen` is already there."""
     p, other = place[chosen], order[k]
     order[k], order[p] = chosen, other
     place[chosen], place[other] = k, p
@@ -171,7 +171,7 @@ def _exchange(order, place, k, chosen):
 
 @compiled
 def _subtract(matrix, row, column, pivot, j, nothing):
-    """Subtract the pivot's row from the others in column j, and remove it from there; return whether there was room."""
+    """Subtract the pivot's row from the others in column j, and remove it from that list; return whether all fit."""
     counts, lists, numbers = matrix
     for m in range(counts[COLUMN_SIZE, j]):
         counts[FOUND, lists[ROWS, j, m]] = m + 1
@@ -199,8 +199,8 @@ def _subtract(matrix, row, column, pivot, j, nothing):
 def order(index, matrix, nothing, zero):
     """Eliminate the entries in the lists with free choice of pivots, and write the program of that order.
 
-    Fill-in is gathered from place `nothing`, where there is a zero. A pivot of at most `zero` of the largest counts as
-    none. Returns ORDERED, with rows and columns of the matrix in `index`, SINGULAR_MATRIX or TOO_MANY.
+    New entries get the source `nothing`, where there is a zero. A pivot of at most `zero` times the largest counts as
+    zero. Returns ORDERED, with rows and columns of the matrix in `index`, SINGULAR_MATRIX or TOO_MANY.
     """
     counts, lists, numbers = matrix
     r = index[SIZE]
@@ -242,7 +242,7 @@ def _sort(columns, sources, size, place):
 
 @compiled
 def _size_of_program(rows, counts, lists):
-    """Return how many entries the factors have, and how many subtractions make them; sort the lists of the rows.
+    """Count the entries of the factors and the subtractions that compute them; sort the lists of the rows.
 
     Leaves the number of entries of U of the row at each place in counts[ROW_LEFT].
     """
@@ -262,7 +262,7 @@ def _size_of_program(rows, counts, lists):
 
 @compiled
 def _write(index, counts, lists):
-    """Write the program; return whether it is short enough: False if that of a full matrix would be quicker."""
+    """Write the program; return whether it is short enough: False if dense factors would be faster."""
     r = index[SIZE]
     rows = rows_of(index)
     n_slots, subtractions = _size_of_program(rows, counts, lists)
@@ -301,7 +301,7 @@ def _write(index, counts, lists):
     return True
 
 
-GROWTH = 1e3  # largest multiplier before the order of elimination is chosen anew
+GROWTH = 1e3  # largest multiplier; if one is larger, the order of elimination is chosen again
 
 
 @compiled
@@ -336,10 +336,10 @@ def make_program(G, pattern, rows, columns, index, values):
 
 @merged
 def factor(entries, index, values):
-    """Factor G[rows][:, columns]; 1/pivots stand on the diagonal. `entries` are those of G (n, n_q), last row zero.
+    """Factor G[rows][:, columns], with 1/pivots on the diagonal; `entries` are those of G (n, n_q), last row zero.
 
-    Returns the ratio of the smallest to the largest pivot; negative where a pivot is zero or not finite, or multipliers
-    have grown, and the order must be chosen anew.
+    Returns the ratio of the smallest to the largest pivot. It is negative if a pivot is zero or not finite, or if
+    multipliers have grown: the order must then be chosen again.
     """
     r = index[SIZE]
     if index[DENSE] == 1:
@@ -357,7 +357,7 @@ def factor(entries, index, values):
 
 @merged
 def run_program(index, values):
-    """Run the program with the entries in `values`; return what `factor` does."""
+    """Run the program with the entries in `values`; return the same as `factor`."""
     r, n_slots = index[SIZE], index[N_SLOTS]
     in_column = begin_entries(r) + n_slots
     target = in_column + 2 * n_slots
@@ -381,7 +381,7 @@ def run_program(index, values):
     if not growth <= GROWTH:
         return -1.0
     in_row = begin_entries(r)
-    for u in range(r, index[FIRST_LOWER]):  # rows of U with 1 on the diagonal are quicker to solve with
+    for u in range(r, index[FIRST_LOWER]):  # rows of U with 1 on the diagonal make solutions faster
         values[u] *= values[index[in_row + u]]
     return smallest / largest if r > 0 else 1.0
 

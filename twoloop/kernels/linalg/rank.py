@@ -1,4 +1,4 @@
-"""Choose which rows of G count and which help M to an inverse, and bound pivots and solutions with these rows."""
+"""Choose independent rows of G and rows that make M invertible, and bound pivots and solutions with these rows."""
 
 import math
 
@@ -7,9 +7,9 @@ from numba import types
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, f8, i8, kernel, merged
 from twoloop.kernels.linalg.dense import copy_matrix, ldl_factor, ldl_solve, ldl_solve_rows
 
-# what rounding adds to a product of rows, over the sum of squares of all entries, for each row
+# rounding errors of a product of rows, relative to the sum of squares of all entries, for each row
 ROUNDING_OF_SQUARES = 4.0 * 2.0**-52
-MOST_OF_SQUARE = 0.5  # of the square of a row's length: with more left, what is left is orthogonal to rounding
+MOST_OF_SQUARE = 0.5  # relative to the square of a row's length: if more is left, the rest is orthogonal up to rounding
 
 
 @compiled
@@ -22,7 +22,7 @@ def _dot(x, y):
 
 @compiled
 def _without_parts(basis, n, rest, parts):
-    """Subtract a row's parts along n orthonormal rows; return the square of the length that is left."""
+    """Subtract a row's parts along n orthonormal rows; return the squared length of the rest."""
     for i in range(n):
         part = _dot(basis[i], rest)
         if part != 0.0:
@@ -34,12 +34,12 @@ def _without_parts(basis, n, rest, parts):
 
 @merged
 def select_rows(G, least, basis, factors, kept):
-    """Select the first rows that are independent of those before, into `kept`; return how many they are.
+    """Select the first rows that are independent of those before, into `kept`; return their number.
 
     Such a row keeps more than the share `least` of its length without its part in those before, by Gram-Schmidt
     orthogonalisation, repeated if most of the row is lost. `basis` gets orthonormal rows, and `factors` the lower
-    triangle that makes the selected rows of them. Both have as many rows as can be independent, and one more for
-    scratch.
+    triangle whose product with them gives the selected rows. Both have as many rows as can be independent, and one more
+    for scratch.
     """
     n_kept = 0
     for k in range(len(G)):
@@ -71,7 +71,7 @@ def independent_rows(G, least, basis, factors, kept):
 
 @merged
 def _find_shares(n, basis, factors, row, shares):
-    """Express a row as a combination of n selected rows, by least squares if it is none."""
+    """Express a row as a combination of the n selected rows, by least squares."""
     for k in range(n):
         shares[k] = _dot(basis[k], row)
     for k in range(n - 1, -1, -1):
@@ -84,8 +84,8 @@ def _find_shares(n, basis, factors, row, shares):
 def size_of_inverse(factors, n, column):
     """Return the Frobenius norm of the inverse of a lower triangle of n rows; `column` is scratch.
 
-    Solutions of least norm with independent rows, or with these and others that depend on them, are at most so many
-    times as large as the right-hand side.
+    It bounds solutions of least norm, relative to the right-hand side, with independent rows, or with these and
+    redundant ones.
     """
     total = 0.0
     for j in range(n):
@@ -120,10 +120,10 @@ def shares_of_others(rows, order, least, others, basis, factors, kept, shares, l
 
 @kernel(i8(MATRIX, VECTOR, f8, MATRIX, MATRIX, INTEGERS, MATRIX, MATRIX, MATRIX, VECTOR), vectorized=True)
 def least_solution(rows, values, least, basis, factors, kept, shares, gram, parts, x):
-    """Compute the x of least norm that gives rows these values, by least squares; return how many rows count.
+    """Compute the x of least norm that gives rows these values, by least squares; return how many are independent.
 
-    Where S are the shares that the rows y that count have in the others, of values b, these are least squares for
-    y + S^T z with (1 + S S^T) z = b - S y. `values` become what x leaves of them; `parts` has room for y and z.
+    S are the shares of the independent rows y in the others, of values b: these are least squares for y + S^T z with (1
+    + S S^T) z = b - S y. `values` become the residuals; `parts` is scratch for y and z.
     """
     n, m = select_rows(rows, least, basis, factors, kept), 0
     y, z = parts[0], parts[1]
@@ -156,34 +156,35 @@ def least_solution(rows, values, least, basis, factors, kept, shares, gram, part
 
 @kernel(types.boolean(MATRIX, f8, MATRIX), vectorized=True)
 def singular_values_exceed(rows, ratio, gram):
-    """Return whether all singular values are above this share of the largest, by factoring G G^T less its square.
+    """Return whether all singular values exceed this share of the largest, by factoring G G^T less its square.
 
-    The Frobenius norm stands for the largest; `gram` is scratch.
+    The Frobenius norm replaces the largest; `gram` is scratch.
     """
     n, total = len(rows), 0.0
     for i in range(n):
         for j in range(i + 1):
-            gram[j, i] = _dot(rows[i], rows[j])  # its upper triangle is what counts
+            gram[j, i] = _dot(rows[i], rows[j])  # only its upper triangle is used
         total += gram[i, i]
     for i in range(n):
         gram[i, i] -= (ratio * ratio + ROUNDING_OF_SQUARES * n) * total
     return math.isfinite(total) and ldl_factor(gram)
 
 
-BOUND_ROUNDING = 1e-12  # relative: what a bound may be missed by
+BOUND_ROUNDING = 1e-12  # relative: a bound may be missed by this much
 NOT_DEFINITE, STAYS_SINGULAR = -1, -2
 TINY = 1e-300
-# smallest over largest eigenvalue of M, from which on pivots that keep one of the bounds, 1e-5 at least, say that all
-# rows count and none has to help M: what is left of a row is 1e-6 of it then, where 1e-9 would do
+# smallest over largest eigenvalue of M. Above it, pivots that keep one of the bounds, 1e-5 at least, show that all rows
+# are independent and that M needs none: the rest of a row is then 1e-6 of it, where 1e-9 would do
 SIMILAR_EIGENVALUES = 1e-7
-# largest share that a row which counts has in a redundant one, both scaled to length 1: above it the two change places.
-# Where the share passes zero on the way, the rows that count depend on one another, as at each dead centre of the
-# slider-crank with two rods; so it is to be far from zero. Above 1, as rows often have equal shares
+# largest share of an independent row in a redundant one, both scaled to length 1: above it the two change places. If
+# the share passes zero on the way, the independent rows become dependent, as at each dead centre of the slider-crank
+# with two rods; so choose rows whose share is far from zero. The limit is above 1, because dependent rows often have
+# equal shares
 MAX_SHARE = 1.5
 
 
 def room_size(n_rows: int, n: int) -> int:
-    """Return how many numbers `choose_rows` takes for scratch."""
+    """Return the number of scratch numbers for `choose_rows`."""
     most = min(n_rows, n) + 1
     return most * (n + most) + 2 * n * n + n_rows * (2 * n + 2 * n_rows + 1) + n
 
@@ -208,7 +209,7 @@ def _factor_and_count_negative(A):
 
 @compiled
 def _count_weak(mass, weak, A):
-    """Count eigenvalues of M below a share of the largest, or of what bounds it; leave the factors without it in A."""
+    """Count eigenvalues of M below a share of (a bound of) the largest; leave the factors of M less that share in A."""
     largest = 0.0
     for i in range(len(mass)):
         total = 0.0
@@ -235,7 +236,7 @@ def _dominates(mass):
 
 @merged
 def _scale(mass, G):
-    """Return the power of two that brings G^T G to the size of M."""
+    """Return the power of two that scales G^T G to the size of M."""
     largest, longest = 0.0, 0.0
     for i in range(len(mass)):
         for j in range(len(mass)):
@@ -248,7 +249,7 @@ def _scale(mass, G):
 
 @merged
 def _sort_by_entries(G, order, counts):
-    """Sort the places of the rows, those of few entries first."""
+    """Sort the places of the rows by their number of entries, few first."""
     for k in range(len(G)):
         count, i = 0.0, k
         for j in range(G.shape[1]):
@@ -261,7 +262,7 @@ def _sort_by_entries(G, order, counts):
 
 @merged
 def _removes_weak_eigenvalue(A, g, scale, x):
-    """Return whether adding g g^T makes one eigenvalue less negative, by the sign of the determinant."""
+    """Return whether adding g g^T leaves one negative eigenvalue less, by the sign of the determinant."""
     for j in range(x.size):
         x[j] = g[j]
     ldl_solve(A, x)
@@ -273,7 +274,7 @@ def _removes_weak_eigenvalue(A, g, scale, x):
 
 @merged
 def _add_rows(mass, G, weak, scale, A, x, order, added):
-    """Add rows to M until no eigenvalue is weak, and record them; return how many, or STAYS_SINGULAR."""
+    """Add rows to M until no eigenvalue is weak, and record them; return their number, or STAYS_SINGULAR."""
     n_added = 0
     while _count_weak(mass, weak, A) > 0:
         found = -1
@@ -295,9 +296,9 @@ def _add_rows(mass, G, weak, scale, A, x, order, added):
 
 @compiled
 def _exchange_rows(G, n_kept, basis, factors, kept, order, shares, others):
-    """Exchange rows that count for redundant ones in which they have large shares, so that they stay independent.
+    """Exchange independent rows for redundant ones in which they have large shares, so that they stay independent.
 
-    An exchange multiplies the volume that the rows which count span by the share. `basis`, `factors` and `kept` are as
+    An exchange multiplies the volume that the independent rows span by the share. `basis`, `factors` and `kept` are as
     `select_rows` left them; `order` and `shares` (n_rows each) and `others` (n, n) are scratch.
     """
     for _ in range(2 * (len(G) - n_kept)):
@@ -315,7 +316,7 @@ def _exchange_rows(G, n_kept, basis, factors, kept, order, shares, others):
                     largest, leaves, enters = share, k, i
         if leaves < 0:
             return
-        k = leaves  # the others move up, or down, so that they stay sorted
+        k = leaves  # the other rows move up, or down, so that they stay sorted
         while k + 1 < n_kept and kept[k + 1] < enters:
             kept[k] = kept[k + 1]
             k += 1
@@ -359,7 +360,7 @@ def _first_bound_kept(mass, G, kept, n_rows, bounds, factors, solved_room, S_roo
     less = S[n_rows:]
     for place in range(bounds.size):
         for i in range(n_rows):
-            for k in range(i, n_rows):  # its upper triangle is what counts
+            for k in range(i, n_rows):  # only its upper triangle is used
                 less[i, k] = S[i, k]
             less[i, i] -= bounds[place] * (1.0 - BOUND_ROUNDING)
         if ldl_factor(less):
@@ -369,12 +370,12 @@ def _first_bound_kept(mass, G, kept, n_rows, bounds, factors, solved_room, S_roo
 
 @kernel(i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS), vectorized=True)
 def choose_rows(given, G, least, weak, bounds, room, chosen):
-    """Choose the rows of G that count and those that help M to an inverse; return the place of the first bound kept.
+    """Choose the independent rows of G and the rows that make M invertible; return the place of the first bound kept.
 
-    Rows of G count as in `select_rows` for `least`, but for exchanges; others help M if eigenvalues of it are below the
-    share `weak` of the largest, 0 if that is known not to be. `chosen`, of 2 + 3 n_rows numbers, begins with how many
-    count and how many help, then has these, and those, each in n_rows places; `room` begins with their factor. See
-    generate/choices.py.
+    Rows of G are independent as in `select_rows` for `least`, except for exchanges. Rows are added to M if eigenvalues
+    of it are below the share `weak` of the largest; 0: none is. `chosen`, of 2 + 3 n_rows numbers, begins with the
+    numbers of independent and of added rows, then lists them, each list in n_rows places. `room` begins with the factor
+    of the added rows. See generate/choices.py.
     """
     n_rows, n = G.shape
     most = min(n_rows, n) + 1
@@ -390,7 +391,7 @@ def choose_rows(given, G, least, weak, bounds, room, chosen):
         for k in range(n_rows):
             kept[k] = k
         place = _first_bound_kept(given, G, kept, n_rows, bounds, A, solved, S, sizes)
-        if 0 <= place < bounds.size:  # no row is nearly a sum of others, and M has an inverse
+        if 0 <= place < bounds.size:  # the rows are clearly independent, and M has an inverse
             chosen[0], chosen[1], room[0] = n_rows, 0, 1.0
             return place
     n_kept = select_rows(G, least, basis, factors, kept)

@@ -1,4 +1,4 @@
-"""The linear problem on the velocities that the constraints allow: for few degrees of freedom.
+"""Solve the linear problem of accelerations on the velocities that the constraints allow: for few degrees of freedom.
 
 With T = [I; D^T], D^T = -G_d^-1 G_i, whose columns are these velocities, a = g + T x, where g, with G g = c, has no
 independent entries, and (T^T M T) x = T^T (r - M g): M need only be positive definite on these velocities.
@@ -118,7 +118,7 @@ def solve_reduced(f, w, r, c, a):
     for k in range(rows.size):
         z[k] = c[rows[k]]
     solve_dependent(w.index_v, w.values_v, z)
-    copy(r, a)  # for a while: r - M g
+    copy(r, a)  # temporarily: r - M g
     for k in range(columns.size):
         m = columns[k]
         if f.flags[DIAGONAL_MASS] == 1:
@@ -143,7 +143,7 @@ def solve_reduced(f, w, r, c, a):
 
 @merged
 def reduced_multipliers(f, w, r, a, lam):
-    """Compute the multipliers of the rows that count: G^T lam = r - M a in the dependent columns."""
+    """Compute the multipliers of the independent rows: G^T lam = r - M a in the dependent columns."""
     rows, columns, z = rows_of(w.index_v), columns_of(w.index_v), w.z
     for k in range(columns.size):
         m = columns[k]
@@ -161,7 +161,7 @@ def reduced_multipliers(f, w, r, a, lam):
 
 @merged
 def factor_mass(f, w):
-    """Invert a constant w.M, which is quicker to apply, or factor one that varies."""
+    """Invert a constant w.M, because the inverse is faster to apply, or factor one that varies."""
     if banded_mass(f):
         definite = factor_banded_mass(f, w) == DONE
     else:
@@ -174,7 +174,7 @@ def factor_mass(f, w):
 
 @merged
 def _times_inverse_mass(f, w, x, y):
-    """Compute y = M^-1 x; they may be one array unless M is constant, dense and not diagonal."""
+    """Compute y = M^-1 x; x and y may be one array unless M is constant, dense and not diagonal."""
     n = x.size
     if f.flags[DIAGONAL_MASS] == 1:
         for i in range(n):
@@ -204,7 +204,7 @@ def _equal(A, B):
 
 @merged
 def factor_schur(f, w):
-    """Compute and factor S = G M^-1 G^T of the rows that count; with a constant M only if G has changed."""
+    """Compute and factor S = G M^-1 G^T of the independent rows; with a constant M only if G has changed."""
     keep = f.flags[CONSTANT_MASS] == 1
     if keep and _equal(w.G, w.G_of_S):
         return DONE
@@ -230,7 +230,7 @@ def factor_schur(f, w):
 
 @merged
 def solve_schur(f, w, r, c, a):
-    """Solve M a + G^T lam = r and G a = c for a; the multipliers of the rows that count go into w.z."""
+    """Solve M a + G^T lam = r and G a = c for a; the multipliers of the independent rows go into w.z."""
     rows, solved = w.rows_v, w.W
     _times_inverse_mass(f, w, r, a)
     for i in range(rows.size):
@@ -244,13 +244,14 @@ def solve_schur(f, w, r, c, a):
             a[j] -= solved[i, j] * w.z[i]
 
 
-MIN_ROWS = 8  # rows, and degrees of freedom, from which on this is the fastest form of a chain: measured, about 7
-# coordinates, from which on it is with few degrees of freedom, too, unless M is diagonal: about 30
+MIN_ROWS = 8  # smallest number of rows and of freedoms for which this form is the fastest (measured on chains: about 7)
+# smallest number of coordinates for which it is the fastest with few degrees of freedom, too, unless M is diagonal:
+# measured about 30
 MIN_COORDINATES = 32
 
 
 def sparse_pays(n_q: int, n_rows: int, diagonal: bool) -> bool:
-    """Return whether this form is faster than the dense ones for a sparse pattern; `diagonal`: M is and stays so."""
+    """Return whether this form is faster than the dense ones for a sparse pattern; `diagonal`: M stays diagonal."""
     return n_rows >= MIN_ROWS and (n_q - n_rows >= MIN_ROWS or (n_q >= MIN_COORDINATES and not diagonal))
 
 
@@ -319,7 +320,7 @@ def factor_sparse(f, w):
 
 @compiled
 def solve_sparse(w, r, c, a):
-    """Solve M a + G^T lam = r and G a = c for a; the multipliers of the rows that count go into w.z."""
+    """Solve M a + G^T lam = r and G a = c for a; the multipliers of the independent rows go into w.z."""
     n, size, scale = r.size, w.index_a[at.SIZE], w.notes[MASS_SCALE]
     x, y = w.right[:size], w.right[size:]
     for j in range(n):
@@ -351,7 +352,7 @@ def _factor_sparse(f, w):
 
 @merged
 def factor(f, w):
-    """Factor for the current w.M and the rows, factors and null space of G; return DONE, or why it cannot be done."""
+    """Factor for the current w.M and the rows, factors and null space of G; return DONE, or why that failed."""
     if w.notes[FACTORED] == 1.0:
         return DONE
     code = _factor_sparse(f, w) if f.flags[FORM] == AUGMENTED else DONE
@@ -381,7 +382,7 @@ def solve(f, w, r, c, a):
 
 @merged
 def multipliers(f, w, r, a, lam):
-    """Compute the multipliers that belong to the a just found; those of rows that do not count stay as they are."""
+    """Compute the multipliers of the accelerations just computed; those of redundant rows stay unchanged."""
     if f.flags[FORM] == NULL_SPACE:
         reduced_multipliers(f, w, r, a, lam)
     else:
@@ -398,9 +399,9 @@ def solve_both(f, w, r, c, a, lam):
 
 @compiled
 def least_norm(w, lam):
-    """Remove from lam its part in the null space of G^T, so that its norm is least.
+    """Remove the null space of G^T from lam, so that its norm is least.
 
-    Redundant row i is sum_k Z[i, k] of the rows that count. The null space is spanned by n_i = e_i - sum_k Z[i, k] e_k,
+    Redundant row i is sum_k Z[i, k] of independent rows. The null space is spanned by n_i = e_i - sum_k Z[i, k] e_k,
     and lam -= N (N^T N)^-1 N^T lam.
     """
     rows, columns = rows_of(w.index_v), columns_of(w.index_v)

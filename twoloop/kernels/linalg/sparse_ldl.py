@@ -1,14 +1,14 @@
-"""Factors of the matrix of a large system by its program, see symbolic_factorization.py, and solutions with them.
+"""Factor and solve the matrix of a large system by its program, see symbolic_factorization.py.
 
-A row of G that counts has a negative pivot, the square of what is left of it beside the rows before. Over what the
-bodies put into it, that is the sine squared of the angle between the row and those before, in the metric of M^-1:
-`smallest` is the least of these. A row that does not count has 0 in the place of 1 / pivot, which takes it out of the
-solution without another program. Solutions lose as many digits as the smallest pivot has; refined against M and G they
-have them again.
+An independent row of G has a negative pivot, the square of the part of the row that the rows before do not span.
+Divided by the sum of the bodies' contributions, it is the squared sine of the angle between the row and those before,
+in the metric of M^-1: `smallest` is the least of these. A redundant row has 0 in the place of 1 / pivot, which removes
+it from the solution without another program. Solutions lose as many digits as the smallest pivot has; refinement
+against M and G recovers them.
 
-Where a body's M is singular, as with four Euler parameters, rows that touch this body alone stiffen it: with
-M + s g g^T accelerations are the same, as g a is given, and the multiplier of g is less by s g a. So M need not be
-positive definite but on what such rows allow.
+If a body's M is singular, as with four Euler parameters, rows that touch this body alone stiffen it: with M + s g g^T
+accelerations are the same, as g a is given, and the multiplier of g is less by s g a. So M need only be positive
+definite on the velocities that such rows allow.
 """
 
 from twoloop.kernels.data.common import compiled, merged
@@ -23,12 +23,12 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     targets_of,
 )
 
-NOT_DEFINITE = -1.0  # what stands for the smallest pivot where one of M is not positive
+NOT_DEFINITE = -1.0  # returned instead of the smallest pivot if a pivot of M is not positive
 
 
 @compiled
 def _find_stiffness(program, mass, jacobian, counts, stiffness, scratch):
-    """Compute how much each row stiffens M: as much as the largest entry on its diagonal, of the rows that count."""
+    """Compute how much each independent row stiffens M: as much as the largest diagonal entry of M that it touches."""
     n_q = program[N_COORDINATES]
     for k in range(program[N_PIVOTS]):
         scratch[k] = 0.0
@@ -54,7 +54,7 @@ def _find_stiffness(program, mass, jacobian, counts, stiffness, scratch):
 
 @merged
 def load(program, mass, jacobian, counts, values, stiffness, scratch):
-    """Put the numbers of M and G into their slots."""
+    """Copy the numbers of M and G to their slots."""
     for s in range(values.size):
         values[s] = 0.0
     _, _, slots = mass_of(program)
@@ -72,11 +72,11 @@ def load(program, mass, jacobian, counts, values, stiffness, scratch):
 
 @compiled
 def factor(program, counts, values, sizes, least):
-    """Factor the numbers in their place, 1/pivot on the diagonal; return the smallest pivot of a row over its size.
+    """Factor the numbers in place, with 1/pivot on the diagonal; return the smallest pivot of a row over its size.
 
-    Returns NOT_DEFINITE if M is not positive definite on what the rows so far allow. `counts` is 0 for rows that do not
-    count, and becomes 0 for those whose pivot is below `least` of its size; these are not among the smallest.
-    `sizes` is scratch.
+    Returns NOT_DEFINITE if M is not positive definite on what the rows so far allow. `counts` is 0 for redundant rows,
+    and becomes 0 for those whose pivot is below `least` of its size; these are not among the smallest. `sizes` is
+    scratch.
     """
     (n_q, n) = program[N_COORDINATES], program[N_PIVOTS]
     order, targets = order_of(program), targets_of(program)
@@ -115,9 +115,9 @@ def factor(program, counts, values, sizes, least):
 
 @compiled
 def solve(program, values, stiffness, x, y):
-    """Solve for x = [r, c] in its place, by the factors; y is scratch."""
+    """Solve in place for x = [r, c] by the factors; y is scratch."""
     n, order, n_q = program[N_PIVOTS], order_of(program), program[N_COORDINATES]
-    # of M + s g g^T: the right-hand side is r + s g c, and the multiplier less by s c, so that r serves
+    # with M + s g g^T the right-hand side is r + s g c, and the multiplier is less by s c, so that r can be used
     begin, row_of = columns_of(program)
     for k in range(n):
         y[k] = x[order[k]]
@@ -137,7 +137,7 @@ def solve(program, values, stiffness, x, y):
 
 @compiled
 def subtract_product(program, mass, jacobian, counts, x, b):
-    """Subtract [M x_q + G^T x_c, G x_q] from b; rows that do not count stay zero."""
+    """Subtract [M x_q + G^T x_c, G x_q] from b in place; redundant rows stay zero."""
     n_q = program[N_COORDINATES]
     rows, columns, _ = mass_of(program)
     for k in range(rows.size):
@@ -154,9 +154,9 @@ def subtract_product(program, mass, jacobian, counts, x, b):
 
 @compiled
 def solve_refined(program, mass, jacobian, counts, values, stiffness, x, times, right, residual, y):
-    """Solve for x = [r, c] in its place and refine the solution `times` times; the rest is scratch.
+    """Solve in place for x = [r, c] and refine the solution `times` times; the other arrays are scratch.
 
-    Returns the largest of the last correction over the largest of the solution; 0 without refinement.
+    Returns the largest entry of the last correction over the largest of the solution; 0 without refinement.
     """
     n_q, change = program[N_COORDINATES], 0.0
     for k in range(x.size):

@@ -1,4 +1,4 @@
-"""Factors of Newton's matrix of a large system, which is not symmetric, by a static program; and how it is differenced.
+"""Factor Newton's matrix of a large system, which is not symmetric, by a static program, and group its columns.
 
     [M - z^2 K - z D  G^T]
     [G                 0 ]  = L U
@@ -32,7 +32,7 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     targets_of,
 )
 
-MIN_PIVOT = 1e-11  # of what it is the difference of: a smaller pivot is rounding
+MIN_PIVOT = 1e-11  # relative to the numbers of which the pivot is the difference: a smaller one is rounding
 
 
 def newton_program(
@@ -57,18 +57,18 @@ def newton_program(
 
 
 def grouped_entries(tangents: Entries, n_q: int) -> Entries:
-    """Sort the entries by group."""
+    """Sort the entries by group of columns."""
     sequence = np.argsort(column_groups(tangents, n_q)[tangents[1]], kind="stable")
     return tangents[0][sequence], tangents[1][sequence]
 
 
 def column_groups(entries: Entries, n_q: int) -> Integers:
-    """Return the group of each column."""
+    """Return the group of each column; columns of a group have no entry in the same row."""
     rows_of: list[list[int]] = [[] for _ in range(n_q)]
     for i, j in zip(*(each.tolist() for each in entries), strict=True):
         rows_of[j].append(i)
     found = np.zeros(n_q, dtype=np.int64)
-    by_row: list[set[int]] = [set() for _ in range(n_q)]  # groups that have an entry in a row
+    by_row: list[set[int]] = [set() for _ in range(n_q)]  # groups of the columns with an entry in a row
     for j, own in enumerate(rows_of):
         used = set().union(*(by_row[i] for i in own))
         found[j] = group = next(k for k in range(n_q) if k not in used)
@@ -88,7 +88,7 @@ def tangents_of(program):
 
 @compiled
 def load(program, mass, jacobian, K, D, z, stiffness, values):
-    """Put the numbers of the matrix for z into their slots."""
+    """Copy the numbers of the matrix for z to their slots."""
     for s in range(values.size):
         values[s] = 0.0
     off = program[N_OFF]
@@ -111,9 +111,9 @@ def load(program, mass, jacobian, K, D, z, stiffness, values):
 
 @compiled
 def factor(program, counts, values, sizes):
-    """Factor the numbers in their place, 1/pivot on the diagonal; return whether all pivots were large enough.
+    """Factor the numbers in place, with 1/pivot on the diagonal; return whether all pivots are large enough.
 
-    Rows that do not count, 0 in `counts`, have 0 there and no part in it. `sizes` is scratch, real numbers.
+    Redundant rows, 0 in `counts`, have 0 on the diagonal and do not take part. `sizes` is scratch of real numbers.
     """
     n_q, n, off = program[N_COORDINATES], program[N_PIVOTS], program[N_OFF]
     order, targets = order_of(program), targets_of(program)
@@ -136,7 +136,7 @@ def factor(program, counts, values, sizes):
         values[k] = inverse
         for s in range(first, last):
             one, other = values[s] * inverse, values[s + off] * inverse
-            target = targets[u]  # of the diagonal
+            target = targets[u]  # target on the diagonal
             change = one * values[s + off]
             values[target] -= change
             sizes[target] += abs(change)
@@ -152,7 +152,7 @@ def factor(program, counts, values, sizes):
 
 @compiled
 def solve(program, values, x, y):
-    """Solve for x = [r, c] in its place, by the factors; y is scratch."""
+    """Solve in place for x = [r, c] by the factors; y is scratch."""
     n, off, order = program[N_PIVOTS], program[N_OFF], order_of(program)
     begin, row_of = columns_of(program)
     for k in range(n):

@@ -24,13 +24,13 @@ from numpy.typing import NDArray
 
 from twoloop.kernels.data.common import inlined
 
-MAX_JOINTS = 4  # of a body that comes before its joints
+MAX_JOINTS = 4  # largest number of joints of a body that comes before its joints
 
 Integers = NDArray[np.int64]
 
 
 class _DisjointSets:
-    """Hold disjoint sets of the numbers below n (union-find)."""
+    """Disjoint sets of the numbers below n (union-find)."""
 
     def __init__(self, n: int):
         self.parent = list(range(n))
@@ -48,15 +48,16 @@ class _DisjointSets:
 
 
 class _Supports:
-    """Track what supports the parts that eliminated bodies and joints make up: the ground, and hubs still to come."""
+    """Supports of the parts that eliminated bodies and joints form: the ground, and hubs not eliminated yet."""
 
     def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int], lone: AbstractSet[int]):
-        self.joints, self.hubs = joints, set(hubs)  # those that are left
-        self.lone = lone  # single coordinates, of whose body nothing else is known: no part of these is surely free
+        self.joints, self.hubs = joints, set(hubs)  # hubs that are not eliminated yet
+        self.lone = lone  # bodies of one known coordinate only: no part with one of them is surely free
         self.parts = _DisjointSets(n_bodies)
         self.grounded = [False] * n_bodies
         self.hangs: list[set[int]] = [set() for _ in range(n_bodies)]
-        self.hanging: dict[int, list[int]] = {hub: [] for hub in hubs}  # bodies whose parts hang, or hung, on a hub
+        # bodies whose parts hang, or have hung, on a hub
+        self.hanging: dict[int, list[int]] = {hub: [] for hub in hubs}
 
     def lets(self, joint: int) -> bool:
         """Return whether a joint may be eliminated."""
@@ -160,7 +161,7 @@ def elimination_order(
 
 
 def bodies_of(n_q: int, mass_entries: tuple[Integers, Integers], together: Iterable[Sequence[int]]) -> list[int]:
-    """Return the first coordinate of the body of each coordinate."""
+    """Return, for each coordinate, the first coordinate of its body."""
     pairs = np.array([(first, other) for first, *others in together for other in others], dtype=np.int64).reshape(-1, 2)
     ones, others = (np.concatenate([entries, column]) for entries, column in zip(mass_entries, pairs.T, strict=True))
     first_of, before = np.arange(n_q), np.full(n_q, -1)
@@ -182,7 +183,7 @@ def _minimum_degree(
     pairs: Iterable[tuple[int, int]],
     lone: AbstractSet[int],
 ) -> list[int]:
-    """Order joints, and hubs as len(joints) + their place: each time one with fewest neighbours of those allowed.
+    """Order joints, and hubs as len(joints) + their place: always the allowed one with the fewest neighbours.
 
     `pairs`: hubs that are coupled beside their joints. `lone`: see `_Supports`.
     """
@@ -213,9 +214,9 @@ def _minimum_degree(
     while heap:
         known, node = heapq.heappop(heap)
         if done[node] or known != degree(node):
-            continue  # there is a newer entry
+            continue  # the heap has a newer entry
         if node < n_joints and not holds.lets(node):
-            continue  # it comes up again when a hub is gone that others before it hang on: the two are neighbours
+            continue  # it comes up again once the hub is eliminated on which its parts hang: the two are neighbours
         done[node] = True
         order.append(node)
         changed = near[node]
@@ -233,11 +234,11 @@ def _minimum_degree(
 
 Entries = tuple[Integers, Integers]  # rows and columns
 
-# places in the program; then what `_sections` names
+# places in the program; the sections that the functions below return follow
 N_COORDINATES, N_PIVOTS, N_OFF, N_UPDATES, N_OF_MASS, N_OF_JACOBIAN, N_STIFFENED, N_HEAD = range(8)
-ALWAYS_ALLOWED_UPDATES = 3_000_000  # multiplications of a program: up to here, it pays for any matrix of this kind ...
-MAX_UPDATE_SHARE = 1e-3  # ... and beyond, where they are at most this share of n^3 ...
-MAX_UPDATES = 30_000_000  # ... and no more than this, for their memory: four bytes each
+ALWAYS_ALLOWED_UPDATES = 3_000_000  # largest number of updates (multiplications) for which a program always pays ...
+MAX_UPDATE_SHARE = 1e-3  # ... above it, a program pays up to this share of n^3 ...
+MAX_UPDATES = 30_000_000  # ... and up to this number, because of memory: four bytes for each
 
 
 def factorization_program(
@@ -267,7 +268,7 @@ def factorization_program(
 def program_in_order(
     order: Integers, n_q: int, mass: Entries, jacobian: Entries, stiff_rows: Sequence[int], both: bool = False
 ) -> NDArray[np.int32] | None:
-    """Return the program for a given order. `both`: of unsymmetric factors, with U N_OFF places behind L."""
+    """Return the program for a given order; with `both` for unsymmetric factors, with U N_OFF places behind L."""
     n = len(order)
     position = np.empty(n, dtype=np.int64)
     position[order] = np.arange(n)
@@ -295,7 +296,8 @@ def program_in_order(
     targets = slots(np.concatenate(firsts), np.concatenate(seconds))
     source = slots(low, high)
     n_mass = len(mass[0])
-    above = rows[:n_mass] < columns[:n_mass]  # the other triangle: without U, of a slot that is never read
+    # entries of the other triangle: without U, they get a slot that is never read
+    above = rows[:n_mass] < columns[:n_mass]
     source[:n_mass][above] = source[:n_mass][above] + len(keys) if both else n + len(keys)
     which, first, second = _products(jacobian[0], stiff_rows)
     one, other = (position[jacobian[1][each]] for each in (first, second))
@@ -306,7 +308,7 @@ def program_in_order(
 
 
 def _products(rows: Integers, chosen: Sequence[int]) -> tuple[Integers, Integers, Integers]:
-    """Return all products of two entries of one of these rows: the row, and where the entries are."""
+    """Return all products of two entries of one of these rows: the row, and the places of both entries."""
     parts: list[tuple[Integers, Integers, Integers]] = [(rows[:0], rows[:0], rows[:0])]
     where = np.argsort(rows, kind="stable")
     ordered = rows[where]
@@ -322,14 +324,14 @@ _PAIRS: dict[int, Entries] = {}
 
 
 def _pairs(m: int) -> Entries:
-    """Return first and second of all pairs of m things, each with itself too."""
+    """Return first and second index of all pairs of m things, including each with itself."""
     if m not in _PAIRS:
         _PAIRS[m] = tuple(each.astype(np.int64) for each in np.triu_indices(m))  # type: ignore[assignment]
     return _PAIRS[m]
 
 
 def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]:
-    """Return the rows below the diagonal of each column of L: a column passes its rows on to the first of them."""
+    """Return the rows below the diagonal of each column of L; each column passes its rows to the first of them."""
     below: list[set[int]] = [set() for _ in range(n)]
     for column, row in zip(low.tolist(), high.tolist(), strict=True):
         below[column].add(row)

@@ -1,1 +1,1 @@
-"""The procedures of the paper of 2016: implicit Runge-Kutta, Newmark and BDF steps with an outer and an inner loop."""
+"""Procedures of the paper of 2016: implicit Runge-Kutta, Newmark and BDF steps with an outer and an inner loop."""

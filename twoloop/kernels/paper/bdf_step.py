@@ -1,4 +1,4 @@
-"""A step of the backward differentiation formulas, orders 1 to 5, for (q_i, v_i), its outer loop by fixed point.
+"""Step of the backward differentiation formulas, orders 1 to 5, for (q_i, v_i), its outer loop by fixed point.
 
 The history is kept in modified divided differences (Krogh), which are scaled to the step as in DASSL and IDA (fixed
 leading coefficient): any step size may follow any other, and with equal steps they are backward differences. They are
@@ -19,25 +19,25 @@ from twoloop.kernels.paper.iterations import iterate_accelerations
 from twoloop.kernels.steps.stages import options_array as gauss_options
 
 MAX_ORDER = 5
-N_DIFFERENCES = MAX_ORDER + 2  # of orders 0 to MAX_ORDER + 1
-STARTER_STAGES = 3  # of the Gauss steps that begin a run of fixed steps
+N_DIFFERENCES = MAX_ORDER + 2  # differences of orders 0 to MAX_ORDER + 1
+STARTER_STAGES = 3  # number of stages of the Gauss steps that begin a run of fixed steps
 MAX_ITERATIONS = 60
-SAFETY = 0.9  # of a step factor
+SAFETY = 0.9  # safety factor of the step factor
 LEAST_FACTOR = 0.2
-STRICT = 10.0  # an estimate counts as this times itself: errors of many short steps add up, to near the tolerance then
-BIAS = 6.0  # an error estimate times this chooses the step size, as in VODE; with less, more steps are rejected
-NEIGHBOUR = 1.4  # ... and that of another order once more times this, so that the order does not flutter
-HOLD = 1.2  # a step that could grow by less keeps its size
-GROWTH = 2.0  # the most by which a step grows
+STRICT = 10.0  # factor on an estimate: errors of many short steps add up, and then come close to the tolerance
+BIAS = 6.0  # factor on the estimate that chooses the step size, as in VODE; with less, more steps are rejected
+NEIGHBOUR = 1.4  # ... and a further factor for another order, so that the order does not flutter
+HOLD = 1.2  # a step that could grow by less than this keeps its size
+GROWTH = 2.0  # largest growth of a step
 
 # places in `options`: scalars, then the parameter block of the Gauss steps
 HIGHEST, INNER_TOL, OUTER_TOL, N_SCALARS = range(4)
 # places in `memory`: scalars, rows of coefficients, then vectors; see _coefficients and _blocks
 (
-    HAS_TRIAL,  # whether the last attempt left differences at its end
+    HAS_TRIAL,  # 1: the last attempt left differences at its end
     ORDER,
-    DEPTH,  # the highest difference there is
-    AGE,  # accepted steps since the order changed or the error test failed
+    DEPTH,  # highest difference in the history
+    AGE,  # number of accepted steps since the order changed or the error test failed
     NEXT_ORDER,
     NEXT_DEPTH,
     N_MEMORY_SCALARS,
@@ -77,7 +77,7 @@ def _blocks(memory, n):
 
 @kernel(SETTLE)
 def settle_bdf(f, w, options, memory, tolerances, accepted):
-    """Make the trial differences the history if the attempt was accepted."""
+    """Make the trial differences the history if the attempt was accepted; otherwise choose the next order."""
     differences, trial, _, _, _ = _blocks(memory, w.Q.size)
     left = memory[HAS_TRIAL]
     memory[HAS_TRIAL] = 0.0
@@ -97,7 +97,7 @@ def settle_bdf(f, w, options, memory, tolerances, accepted):
 
 @compiled
 def _begin(memory, differences, state, h, order):
-    """Begin a history: with order 1 from the state and its rate, with order 0 from the state alone."""
+    """Start a history: with order 1 from the state and its rate, with order 0 from the state alone."""
     size = differences.shape[1]
     for m in range(size):
         differences[0, m] = state[m]
@@ -146,13 +146,13 @@ def _spread(h, k):
 
 @compiled
 def _correct(f, w, options, t, c, prediction, rate, new_state, a_new):
-    """Solve y = prediction + c (y' - rate) at t for the independents: a fixed-point iteration on their accelerations.
+    """Solve y = prediction + c (y' - rate) at t for the independents, by fixed-point iteration on their accelerations.
 
     On return the whole new state is consistent.
     """
     n = w.Q.size
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    copy(prediction, new_state[: 2 * n])  # dependents: where Newton starts
+    copy(prediction, new_state[: 2 * n])  # dependents: start values of Newton's method
     copy(rate[n:], a1)
     before = np.inf
     for iteration in range(MAX_ITERATIONS):
@@ -169,7 +169,7 @@ def _correct(f, w, options, t, c, prediction, rate, new_state, a_new):
             change = max(change, difference / max(abs(v1[m]), 1.0))
             change = max(change, c * difference / max(abs(q1[m]), 1.0))
         copy(a_new, a1)
-        # the first iteration evaluates the prediction, never to be accepted: extrapolation alone is unstable
+        # the first iteration evaluates the prediction, which is never accepted: extrapolation alone is unstable
         if iteration > 0 and (change <= options[OUTER_TOL] or (change >= before and change <= rounding_floor(q1))):
             for k in range(w.dependent.size):
                 m = w.dependent[k]
@@ -194,11 +194,11 @@ def _norm(tolerances, y, y1, d, sign, difference):
 
 @compiled
 def _judge(options, memory, tolerances, trial, y, y1, d):
-    """Estimate the error from d = y1 - prediction, choose the next order, into memory, and the step factor."""
+    """Estimate the error from d = y1 - prediction; choose the next order, into memory, and the step factor."""
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, constants = _coefficients(memory, NEW_SPANS), _coefficients(memory, ERROR_CONSTANTS)
     norm = STRICT * _norm(tolerances, y, y1, d, 0.0, d)
-    # with unequal steps also the interpolation of the history has an error; the larger counts (as in DASSL)
+    # with unequal steps the interpolation of the history has an error as well; the larger one counts (as in DASSL)
     interpolation = spans[0] / spans[k]
     for j in range(k):
         interpolation += spans[0] / spans[j] - 1.0 / (j + 1.0)
@@ -215,7 +215,7 @@ def _judge(options, memory, tolerances, trial, y, y1, d):
             memory[NEXT_ORDER] = k - 1
         return error, max(SAFETY * error ** (-1.0 / (k + 1)), LEAST_FACTOR)
     factor = (BIAS * here) ** (-1.0 / (k + 1))
-    if memory[AGE] >= k:  # the estimates come from k + 1 steps of this order
+    if memory[AGE] >= k:  # the estimates require k + 1 steps of this order
         lower, higher = (BIAS * below) ** (-1.0 / k), (BIAS * above) ** (-1.0 / (k + 2))
         if lower > max(factor, higher):
             memory[NEXT_ORDER] = k - 1
@@ -247,7 +247,7 @@ def _extend(memory, trial, y1, d):
 
 @compiled
 def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
-    """Make a step of the starter, of order 6."""
+    """Take a step of the starter, of order 6."""
     s, n = STARTER_STAGES, w.Q.size
     q1, v1 = new_state[:n], new_state[n : 2 * n]
     A_stage = scratch[: s * n].reshape((s, n))
@@ -280,7 +280,7 @@ def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
 def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt a step: predict from the history, correct, and choose the order and the size of the next step.
 
-    Fixed steps are of the highest order; the history that it needs comes from as many Gauss steps.
+    Fixed steps use the highest order; the history that it needs comes from as many Gauss steps.
     """
     n = w.Q.size
     differences, trial, prediction, rate, scratch = _blocks(memory, n)

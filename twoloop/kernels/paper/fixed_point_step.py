@@ -22,7 +22,7 @@ from twoloop.kernels.steps.stages import (
 
 @kernel(SETTLE)
 def settle_runge_kutta(f, w, options, memory, tolerances, accepted):
-    """Keep the stages of an accepted step, from which the next ones are predicted."""
+    """Store the stages of an accepted step, which predict the next ones."""
     s, n = int(options[STAGES]), w.Q.size
     if accepted and memory[at.HAS_TRIAL] == 1.0:
         previous, trial = block(memory, s, n, at.PREVIOUS), block(memory, s, n, at.TRIAL)
@@ -36,7 +36,7 @@ def settle_runge_kutta(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step by fixed-point iteration; to estimate the error, a step of h and two of h/2.
+    """Attempt a step by fixed-point iteration; to estimate the error, take a step of h and two of h/2.
 
     The result is that of the half steps, or with EXTRAPOLATION = 1 / (2^order - 1) their extrapolation with the whole
     step, put back on the constraints. Stages are predicted from the polynomial through the stage accelerations of the
@@ -83,7 +83,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
         )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
-        off = max(off, off_mid)  # of the two half steps, from which the run goes on
+        off = max(off, off_mid)  # the distance of the two half steps, from which the run continues
         code, error = conclude(
             f, w, options[EXTRAPOLATION], options[INNER_TOL], t + h, tolerances, q, v, q_full, v_full, q1, v1
         )

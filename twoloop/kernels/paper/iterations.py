@@ -1,9 +1,8 @@
-"""Where the parts of the `memory` of fixed_point_step.py and paper_step.py are.
-
-Two outer loops of implicit Runge-Kutta steps by fixed point, compiled in the steps that call them.
+"""Iterate implicit Runge-Kutta steps by fixed point: two outer loops, and the layout of their `memory`.
 
 `iterate_accelerations` iterates on the stage accelerations alone (the tableau applied twice to q'' = a),
-`iterate_first_order` is the paper's loop on y_i = [v_i, q_i]. Equation numbers are the paper's.
+`iterate_first_order` is the paper's loop on y_i = [v_i, q_i]. They are compiled in the steps that call them,
+fixed_point_step.py and paper_step.py. Equation numbers are the paper's.
 
 Richardson's estimate: the difference of one step and two half steps is the error, and may improve the result.
 """
@@ -17,8 +16,8 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, restore, rounding_fl
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TEST, OUTER_TOL, tableau_of
 
-# rows of REST, for the compensated sums of fixed steps: what rounding took from q and from v, at the last accepted step
-# and in this attempt. Without them the energy of a symmetric method wanders with the number of steps
+# rows of REST, for the compensated sums of fixed steps: rounding errors of q and of v, at the last accepted step and in
+# this attempt. Without them the energy of a symmetric method drifts with the number of steps
 N_RESTS = 4
 
 # scalars, then stage blocks (s, n_q) and vectors (n_q)
@@ -55,15 +54,15 @@ def rests_of(memory, s, n, tolerances):
 
 @merged
 def keep_rest(rest):
-    """Keep the rests of an accepted attempt for the next step."""
+    """Store the rests of an accepted attempt for the next step."""
     for i in range(rest.shape[0] // 2):
         copy(rest[rest.shape[0] // 2 + i], rest[i])
 
 
 MAX_ITERATIONS = 60
-MAX_ITERATIONS_PAPER = 200  # the paper names no limit; (33) ends a divergent loop long before
-GROWTH = 1e3  # the differences may first grow (the iteration is not normal), but not by more than this
-PATIENCE = 8  # iterations after which a difference that grows again means divergence
+MAX_ITERATIONS_PAPER = 200  # the paper gives no limit; (33) ends a divergent loop long before
+GROWTH = 1e3  # largest growth of the differences: they may grow at first, because the iteration is not normal
+PATIENCE = 8  # number of iterations after which a difference that grows again means divergence
 UNDECIDED, CONVERGED, DIVERGED = range(3)
 
 
@@ -84,7 +83,7 @@ def _judge(change, before, first, iteration, tolerance, q):
 
 @exact
 def _compensated(x, rest, increment):
-    """Return the sum of the three, and what rounding takes from it (W. Kahan, Commun. ACM 8 (1965), 40)."""
+    """Return the sum of the three, and its rounding error (W. Kahan, Commun. ACM 8 (1965), 40)."""
     increment += rest
     total = x + increment
     return total, increment - (total - x)
@@ -92,7 +91,7 @@ def _compensated(x, rest, increment):
 
 @merged
 def _forget(coordinates, rest):
-    """Clear the rests of coordinates that the constraints give."""
+    """Clear the rests of coordinates that the constraints determine."""
     for i in range(N_RESTS // 2, rest.shape[0]):
         for m in coordinates:
             rest[i, m] = 0.0
@@ -122,7 +121,7 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
     verdict = UNDECIDED
     for iteration in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1
-        # all stages are set before any is evaluated: Gauss-Seidel would converge for smaller h only
+        # set all stages before any is evaluated: Gauss-Seidel would converge for smaller h only
         for j in range(s):
             for m in w.independent:
                 in_q = 0.0
@@ -243,7 +242,7 @@ def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage,
 def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
     """Return the difference of one step and two half steps over (26), for all positions and velocities.
 
-    Its largest component, or the root mean square (27).
+    It is the largest component, or the root mean square (27).
     """
     rtol = tolerances[RTOL]
     total = 0.0

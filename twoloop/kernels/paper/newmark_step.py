@@ -1,4 +1,4 @@
-"""A Newmark step, its outer loop by fixed point on the independent accelerations. Equation numbers are the paper's."""
+"""Newmark step, with an outer loop by fixed point on independent accelerations. Equation numbers are the paper's."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from twoloop.kernels.evaluation.inner_loop import evaluate_state, rounding_floor
 from twoloop.kernels.linalg.dense import copy
 
 MAX_ITERATIONS = 60
-GROWN = 2.0  # times the size before a step
+GROWN = 2.0  # ratio of the size to that before the step above which most of it comes from this step
 TINY = 1e-300  # a mechanism at rest at the origin has neither size nor rate
 
 # places in `memory` before the new accelerations
@@ -28,10 +28,11 @@ def _largest(x, least):
 
 @compiled
 def _rate(memory, gap, q, v, a, q1, v1, a1):
-    """Return 1 / the time in which velocities and accelerations change the coordinates as a whole.
+    """Return the reciprocal of the time in which velocities and accelerations change the coordinates as a whole.
 
-    Of the largest of each so far: at one time alone, coordinates are near zero wherever the origin is. Where most of
-    their size comes of this step, as from rest at the origin, it says nothing of that time, which is `gap` then.
+    It uses the largest values so far, because at a single time coordinates may be near zero, wherever the origin is. If
+    most of their size comes from this step, as from rest at the origin, they say nothing of that time, which is then
+    taken as at least `gap`.
     """
     memory[SIZE] = _largest(q, memory[SIZE])
     memory[SPEED] = _largest(v, memory[SPEED])
@@ -47,8 +48,8 @@ def _rate(memory, gap, q, v, a, q1, v1, a1):
 def _error(options, tolerances, rate, h, q, v, a, a1):
     """Return e = |beta - 1/6| h^2 |a1 - a|, the leading local error of q for gamma = 1/2, over the tolerances.
 
-    The largest component of e / h over rate * atol + rtol |v|: the error per unit step, of order h^2 like the error of
-    the run. With ERROR_TOL > 0 the 2-norm of e over ERROR_TOL (the paper's err_out).
+    It is the largest component of e / h over rate * atol + rtol |v|: the error per unit step, of order h^2 like the
+    error of the run. With ERROR_TOL > 0 it is the 2-norm of e over ERROR_TOL (the paper's err_out).
     """
     factor = abs(options[BETA] - 1.0 / 6.0) * h
     total = 0.0
@@ -62,7 +63,7 @@ def _error(options, tolerances, rate, h, q, v, a, a1):
 
 @kernel(ATTEMPT)
 def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step: (12) for the independents, inner loop, accelerations, until these stop changing."""
+    """Attempt a step: (12) for the independents, inner loop, accelerations, until these no longer change."""
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
@@ -70,7 +71,7 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
     a_new = memory[N_MEMORY_SCALARS : N_MEMORY_SCALARS + n]
     for m in range(n):
         a1[m] = a[m]
-        q1[m] = q[m] + h * v[m] + 0.5 * h * h * a[m]  # dependents: where Newton starts
+        q1[m] = q[m] + h * v[m] + 0.5 * h * h * a[m]  # dependents: start values of Newton's method
     before = np.inf
     for _ in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1

@@ -1,4 +1,4 @@
-"""The paper's steps: implicit Runge-Kutta, its outer loop a fixed point of the first-order form."""
+"""Steps of the paper: implicit Runge-Kutta, with an outer loop by fixed point of the first-order form."""
 
 import numpy as np
 
@@ -11,12 +11,12 @@ from twoloop.kernels.paper import iterations as at
 from twoloop.kernels.paper.iterations import block, conclude, iterate_first_order, vector
 from twoloop.kernels.steps.stages import END_ERROR_WEIGHT, EXTRAPOLATION, INNER_TOL, end_error, tableau_of
 
-SUDDEN = 10.0  # value of `end_error` from which on it counts; the paper's procedure has no such estimate
+SUDDEN = 10.0  # value of `end_error` above which it counts; the paper's procedure has no such estimate
 
 
 @kernel(ATTEMPT)
 def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step as in Sects. 3.1-3.3: a step of h, two of h/2, their difference is the error."""
+    """Attempt a step as in Sects. 3.1-3.3: take a step of h and two of h/2; their difference is the error."""
     s, _, _, _, _, _ = tableau_of(options)
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]

@@ -1,1 +1,1 @@
-"""One file an outer loop: a step of a method, and what it is made of."""
+"""Steps of the integration methods: one file for each outer loop, and files for their parts."""

@@ -1,9 +1,9 @@
-"""A step of the Adams methods, orders 1 to 12, for all coordinates: predict, evaluate, correct, evaluate.
+"""Step of the Adams methods, orders 1 to 12, for all coordinates: predict, evaluate, correct, evaluate.
 
 Variable order and step in modified divided differences of a, as Krogh's DVDQ and Shampine and Gordon's STEP have them,
 for second-order equations: positions are the double integral of the polynomial through the accelerations, velocities
-the single one. The first evaluation stands where the prediction is, off the constraints by its error; the second ends
-on them. Differences are of all coordinates, so that a new partition needs no conversion.
+the single one. The first evaluation is at the prediction, off the constraints by its error; the second is at the
+corrected state, projected onto them. Differences are of all coordinates, so that a new partition needs no conversion.
 
 With t_n the times of the accepted steps, psi_i(n) = t_n - t_{n-i}, and i counted from 1 as in the literature:
 beta_i = prod_{j<i} psi_j(n+1) / psi_j(n), and on the step, s from 0 to 1, the polynomial through the last k
@@ -18,14 +18,14 @@ from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, inlined,
 from twoloop.kernels.data.indices import ATOL, DONE, N_OUTER, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate_as_given, project
 
-HIGHEST = 12  # order; with orders above 13 the nodes below would not do
-N_TERMS = HIGHEST + 2  # differences that a step makes, and coefficients g and G
-STRICT = 5.0  # an estimate counts as this times itself: errors of many short steps add up, to near the tolerance then
-SAFETY = 0.8  # of a step factor
+HIGHEST = 12  # largest order; above 13 the nodes below would not be exact
+N_TERMS = HIGHEST + 2  # number of differences of a step, and of coefficients g and G
+STRICT = 5.0  # factor on an estimate: errors of many short steps add up, and then come close to the tolerance
+SAFETY = 0.8  # safety factor of the step factor
 GROWTH, SHRINKAGE = 1.2, 0.5  # limits of the step factor ...
 START_GROWTH = 2.0  # ... while the order still rises with every step
-LEAST_FACTOR = 0.1  # after a step whose dependents are far from the prediction
-RESTART_AFTER = 3  # failures in a row, after which the method begins again with order 1
+LEAST_FACTOR = 0.1  # smallest step factor after a step whose dependents are far from the prediction
+RESTART_AFTER = 3  # number of failures in a row after which the method restarts with order 1
 
 # eight Gauss nodes on [0, 1]: exact for c_i and (1 - s) c_i up to i = 15
 NODES, WEIGHTS = (0.5 * (1.0 + x) if k == 0 else 0.5 * x for k, x in enumerate(np.polynomial.legendre.leggauss(8)))
@@ -40,18 +40,19 @@ def _equal_steps():
     return np.abs(made)
 
 
-EQUAL_STEPS = _equal_steps()  # a step much shorter than those before has less, but not where the force jumps within it
+# error constants; a step much shorter than those before has smaller ones, but not if the force jumps within it
+EQUAL_STEPS = _equal_steps()
 
 # places in `options`
 THETA, N_OPTIONS = range(2)  # a second evaluation that moved a position by more is repeated
-# places in `memory`: scalars, rows of coefficients (N_TERMS + 1 each), then tables; see _tables
+# places in `memory`: scalars, rows of coefficients (N_TERMS + 1 each), then tables; see _table
 (
-    WHICH,  # of the two tables, that of the last accepted step
+    WHICH,  # index of the table of the last accepted step
     ORDER,
-    DEPTH,  # accelerations in the history
-    AGE,  # steps accepted at this order
+    DEPTH,  # number of accelerations in the history
+    AGE,  # number of steps accepted at this order
     STARTING,  # 1: the order rises with every step
-    FAILED,  # attempts in a row that were refused
+    FAILED,  # number of rejected attempts in a row
     NEXT_ORDER,
     N_SCALARS,
 ) = range(8)
@@ -83,7 +84,7 @@ def _table(memory, n, which):
 
 @inlined
 def _scratch(memory, n):
-    """Return two rows, of velocities and of positions: means over the step, then 1 over the tolerances."""
+    """Return two rows, for velocities and for positions: means over the step, later reciprocals of the tolerances."""
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + 2 * (N_TERMS + 1) * width
     return memory[start : start + width], memory[start + width : start + 2 * width]
@@ -91,7 +92,7 @@ def _scratch(memory, n):
 
 @kernel(SETTLE)
 def settle_adams(f, w, options, memory, tolerances, accepted):
-    """Make an accepted attempt the history; else note that it failed."""
+    """Make an accepted attempt part of the history; otherwise record that it failed."""
     if not accepted:
         memory[FAILED] += 1.0
         memory[AGE] = 0.0
@@ -113,7 +114,7 @@ def settle_adams(f, w, options, memory, tolerances, accepted):
 
 @merged
 def _begin(memory, n, state):
-    """Begin a history of one acceleration."""
+    """Start a history with one acceleration."""
     table = _table(memory, n, memory[WHICH])
     table[:, :] = 0.0
     for m in range(n):
@@ -133,7 +134,7 @@ def _coefficients(memory, h, k):
     for i in range(N_TERMS):
         new_psi[i + 1] = psi[i] + h
     beta[0] = 1.0
-    for i in range(k):  # all quotients first: none waits for the one before
+    for i in range(k):  # all quotients first, so that none waits for the one before
         beta[i + 1] = new_psi[i] / psi[i] if psi[i] > 0.0 else 0.0
     for i in range(k):
         beta[i + 1] *= beta[i]
@@ -155,12 +156,12 @@ def _coefficients(memory, h, k):
 
 @merged
 def _predict(memory, h, k, old, new, state, q1, v1, n):
-    """Compute the prediction (q1, v1), and in `new` what the differences would be if it were exact."""
+    """Compute the prediction (q1, v1), and into `new` the differences for an exact prediction."""
     beta, g, G = _row(memory, BETA), _row(memory, SPEED), _row(memory, PLACE)
     in_v, in_q = _scratch(memory, n)
     for m in range(0, old.shape[1], 4):
         d0, d1, d2, d3 = old[N_TERMS, m], old[N_TERMS, m + 1], old[N_TERMS, m + 2], old[N_TERMS, m + 3]
-        # what the acceptance of this step will add d to: phi_k+2 = d - beta_k+1 phi_k+1
+        # an accepted step adds d to this: phi_k+2 = d - beta_k+1 phi_k+1
         b = beta[k]
         new[k + 1, m] = -b * (old[k, m] + d0)
         new[k + 1, m + 1] = -b * (old[k, m + 1] + d1)
@@ -211,7 +212,7 @@ def _predict(memory, h, k, old, new, state, q1, v1, n):
 
 @merged
 def _error(g, G, h, order, largest_v, largest_q):
-    """Return the local error of an order from the largest of its difference over the tolerances."""
+    """Return the local error of an order from its largest difference over the tolerances."""
     return max(h * abs(g[order - 1] - g[order]) * largest_v, h * h * abs(G[order - 1] - G[order]) * largest_q)
 
 
@@ -219,7 +220,7 @@ def _error(g, G, h, order, largest_v, largest_q):
 def _next(memory, h, k, table, d, n):
     """Return the largest error of the attempt over the tolerances and the step factor; choose the next order.
 
-    Order rules as in STEP: lower where the error would not be larger, higher where it would be smaller, after k + 1
+    Order rules are those of STEP: lower if the error would not be larger; higher if it would be smaller, after k + 1
     steps at order k; while the method starts, higher with every step.
     """
     g, G = _row(memory, SPEED), _row(memory, PLACE)
@@ -276,7 +277,7 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
     old, new = _table(memory, n, memory[WHICH]), _table(memory, n, 1.0 - memory[WHICH])
     _coefficients(memory, h, k)
     _predict(memory, h, k, old, new, state, q1, v1, n)
-    memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # if the evaluation fails
+    memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # used if the evaluation fails
     code = evaluate_as_given(f, w, t + h, q1, v1, a1)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)

@@ -35,15 +35,16 @@ from twoloop.kernels.linalg.dense import copy
 
 # places in `options`, then A, A A, Legendre coefficients and interpolation from the other nodes (S, S each); b, b A, c
 INNER_TOL, THETA, N_SCALARS = range(3)
-S = 8  # nodes
-LEFT = 0.01  # of the tolerances: what iteration may leave ...
-STAGNANT, NOISE = 0.5, 0.3  # ... or NOISE of them, where changes fall no further
-MOST, FEW = 40, 8  # sweeps; and those after which a node is left out
-UNSEEN, UNSEEN_WITHOUT = 0.1834, 0.3545  # of a step, the longest part without a node: of all, and with one left out
-ORDER, SHARE = 12.0, 0.5  # of the estimate; and what it counts
-ROUNDING = 1e-13  # relative: what a step without an estimate is iterated to
-NEARER = 0.5  # of the smallest pivot at the start of a step, which there must be at its end
-LEAST = 1e-300  # in place of a coefficient of zero
+S = 8  # number of nodes
+LEFT = 0.01  # relative to the tolerances: change at which the iteration ends ...
+STAGNANT, NOISE = 0.5, 0.3  # ... or NOISE of them, if a change is at least STAGNANT times the one before
+MOST, FEW = 40, 8  # largest number of sweeps; and number of sweeps after which a node is left out
+# longest part of a step without a node, relative to the step: with all nodes, and with one left out
+UNSEEN, UNSEEN_WITHOUT = 0.1834, 0.3545
+ORDER, SHARE = 12.0, 0.5  # order of the estimated error; and factor on it
+ROUNDING = 1e-13  # relative: accuracy of the iteration in steps without an estimate
+NEARER = 0.5  # smallest ratio of the pivots at the end and at the start of a step
+LEAST = 1e-300  # replaces a coefficient of zero
 
 
 def options_array(A, b, c, inner_tol, theta):
@@ -118,7 +119,7 @@ def _integrate(h, c, A, AA, a, q, v, q_end, v_end):
 
 @merged
 def _choose_partition_at_end(f, w, t, q, pivot):
-    """Choose the partition at the end of a step; SINGULAR where the next step would begin nearer to the position.
+    """Choose the partition at the end of a step; return SINGULAR if the next step would begin nearer to the position.
 
     `pivot` is the smallest pivot at the beginning.
     """
@@ -165,14 +166,15 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
                     code = project(f, w, time, q_stage, v_stage, options[THETA], a_stage, w.lam)
                 if renews or w.notes[BY_GENERAL] == 0.0:
                     break
-                # pivots of the generated code are too small: the general one took over, with another stage's partition
+                # pivots of the generated code are too small: the general code took over, with the partition of another
+                # stage
                 renews, generated = True, False
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
             for m in range(n):
                 change = max(change, h * abs(a_stage[m] - a[j, m]) * _weight(tolerances, m, n, h, state))
             copy(a_stage, a[j])
-            if sweep == 0:  # those that follow are extrapolated
+            if sweep == 0:  # extrapolate the accelerations at the following nodes
                 for k in range(j + 1, S):
                     for m in range(n):
                         a[k, m] = a[j, m]
@@ -183,12 +185,14 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if change <= LEFT or (sweep > 2 and STAGNANT * change_before <= change <= NOISE):
             converged = True
             break
-        if sweep == 0 and estimated:  # most steps that are refused are so for their end, which is known well enough now
+        # most rejected steps are rejected for their end, which is known well enough by now
+        if sweep == 0 and estimated:
             _integrate(h, 1.0, b, bA, a, q, v, q1, v1)
             code = _choose_partition_at_end(f, w, t + h, q1, pivot)
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
-        if sweep == FEW:  # accelerations nearest to the singular position are rounding: they follow from the others
+        # accelerations nearest to the singular position are rounding: interpolate them from the others
+        if sweep == FEW:
             if estimated and UNSEEN_WITHOUT * h > tolerances[GAP] * (1.0 + ROUNDING):
                 return Attempt(OUTER_DIVERGED, np.inf, 0.0)
             left_out = nearest

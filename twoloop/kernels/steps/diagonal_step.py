@@ -15,7 +15,7 @@ The dense matrix of one iteration from tangents is factored as it stands, T^T (M
 is applied to the derivatives, as newton_systems.py does for many systems. This is half the work where a matrix serves
 one iteration only.
 
-With step-size control TR-BDF2 goes on from its embedded formula of order 3, the difference to it filtered three times,
+With step-size control TR-BDF2 continues from the embedded formula of order 3, with the difference filtered three times,
 which leaves the method L-stable: so the errors of many short steps add up to the tolerance, and not to their number
 times it.
 """
@@ -63,7 +63,7 @@ from twoloop.kernels.steps.velocity_errors import (
     velocity_error,
 )
 
-ASYMMETRY = 1e-12  # of the largest entry: what counts as rounding
+ASYMMETRY = 1e-12  # relative to the largest entry: a smaller asymmetry is rounding
 
 
 @compiled
@@ -102,7 +102,7 @@ def factor_again(w, memory, z):
         if ldl_factor(H):
             memory[at.SYMMETRIC] = 1.0
             return DONE
-        _fill(w, memory, n, m, z, numbers)  # not definite, as of a compressed beam
+        _fill(w, memory, n, m, z, numbers)  # not definite, such as for a compressed beam
     return DONE if lu_factor(H, pivots_of(memory, 1, n, 0)) > 0.0 else SINGULAR
 
 
@@ -143,7 +143,7 @@ def _solve_iteration(w, memory, x):
 
 @compiled
 def solve_iteration(w, memory, residual, a):
-    """Add the correction to the independents of a; it replaces the residual (n_q)."""
+    """Add the correction to the independent coordinates of a; it replaces the residual (n_q)."""
     n = w.Q.size
     m = w.independent.size
     N, x = square(space(w, n, at.SYSTEMS), m), vector(memory, 1, n, at.V_MOVED)[:m]
@@ -175,10 +175,10 @@ def filter_by_iteration(w, memory, z, e_q, e_v):
 
 
 MAX_ITERATIONS = 8
-GROWTH = 2.0  # of a correction, from which the iteration is given up
-SHARE_IF_LINEAR = 0.01  # of the tolerance of the outer loop, where it does not converge quadratically
-KEPT_WHILE = 0.1  # contraction up to which derivatives that were differenced serve on
-SHARE_OF_VELOCITY = 0.1  # what a correction counts as by the position that its velocity leads to
+GROWTH = 2.0  # growth of a correction above which the iteration fails
+SHARE_IF_LINEAR = 0.01  # relative to the tolerance of the outer loop, if the iteration does not converge quadratically
+KEPT_WHILE = 0.1  # contraction up to which differenced derivatives are reused
+SHARE_OF_VELOCITY = 0.1  # weight of a correction measured by the position error that its velocity causes
 
 
 @inlined
@@ -201,7 +201,7 @@ def gamma_of(options):
 
 @merged
 def _place(z, q_bar, v_bar, a, Q, V):
-    """Set the independents of Q and V from the acceleration a of the stage, and where Newton starts for the others."""
+    """Set the independent Q and V from the acceleration a of the stage, and start values of the dependent ones."""
     for m in range(Q.size):
         V[m] = v_bar[m] + z * a[m]
         Q[m] = q_bar[m] + z * V[m]
@@ -209,7 +209,7 @@ def _place(z, q_bar, v_bar, a, Q, V):
 
 @merged
 def has_dense_tangents(f, w):
-    """Return whether each iteration has a matrix of its own, which is factored as it stands."""
+    """Return whether each iteration has its own matrix, which is factored in the form T^T (M - z^2 K - z D) T."""
     return (
         f.flags[FORCE_BY_Q_GIVEN] == 1
         and f.flags[BANDWIDTH] < 0
@@ -226,7 +226,7 @@ def one_stage_of(options):
 
 @compiled
 def _prepare(f, w, options, memory, t, h, Q, V, F):
-    """Prepare factors for an iteration at (Q, V), evaluated just before with accelerations F: DONE, or why not."""
+    """Prepare factors for an iteration at (Q, V), evaluated just before, with accelerations F; return the code."""
     if f.flags[FORCE_BY_Q_GIVEN] == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
         memory[at.HAS_JACOBIAN] = 1.0
@@ -244,7 +244,7 @@ def _prepare(f, w, options, memory, t, h, Q, V, F):
 
 @compiled
 def solve_stage(f, w, options, memory, t, h, A_stage):
-    """Solve one stage by Newton's method from A_stage (1, n_q): DONE, or why not; (Q, V) in Q_MID, V_MID."""
+    """Solve one stage by Newton's method from A_stage (1, n_q); return the code; (Q, V) are in Q_MID, V_MID."""
     n = w.Q.size
     z = h * gamma_of(options)
     q_bar, v_bar = block(memory, 1, n, at.PREVIOUS)[0], block(memory, 1, n, at.TRIAL)[0]
@@ -265,7 +265,7 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
         for m in w.independent:
             scale_q = max(scale_q, abs(Q[m]))
             scale_v = max(scale_v, abs(V[m]))
-        if f.flags[FORM] != STATIC:  # where none is dependent
+        if f.flags[FORM] != STATIC:  # with the static form no coordinate is dependent
             for m in w.dependent:
                 a[m] = F[m]
         code = _prepare(f, w, options, memory, t, h, Q, V, F)
@@ -305,9 +305,11 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
     return DONE
 
 
-FILTERED = 3  # times: with fewer the extrapolated method is unstable for vibrations, see tests/kernels/test_diagonal.py
+# number of filters: with fewer the extrapolated method is unstable for vibrations, see tests/kernels/test_diagonal.py
+FILTERED = 3
 
-AT_JUMP = 0.174  # of the width of accelerations that jump: when `lower` misses as much, its difference counts in full
+# relative to the width of accelerations that jump: if `lower` misses this much, its difference counts in full
+AT_JUMP = 0.174
 
 
 @compiled
@@ -333,7 +335,7 @@ def _factor_filter(f, w, options, memory, h):
 
 @compiled
 def _difference(w, h, V_stage, A_stage, weights, share, e_q, e_v):
-    """Compute `share` times the weighted sum of the stages for the independents; n_dof numbers each."""
+    """Compute `share` times the weighted sum of the stages for the independent coordinates; n_dof numbers each."""
     for i in range(w.independent.size):
         j = w.independent[i]
         in_q, in_v = 0.0, 0.0
@@ -369,7 +371,7 @@ def _renew(f, w, options, memory, t, h, new_state):
 def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, weights, share):
     """Return the largest component of `share` times the weighted sum of stages, over atol + rtol |value|.
 
-    It is filtered by the last factors (Hosea and Shampine 1996): what is stiff has no part in it.
+    The sum is filtered by the last factors (Hosea and Shampine 1996), so that stiff components do not count.
     """
     n = w.Q.size
     q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
@@ -404,7 +406,7 @@ def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A
 
 @compiled
 def _extrapolate(f, w, options, memory, h, q1, v1):
-    """Go from the end of the step to that of the embedded formula; the difference was filtered twice already."""
+    """Replace the end of the step by that of the embedded formula; the difference has already been filtered twice."""
     e_q, e_v = vector(memory, 1, w.Q.size, at.E_Q), vector(memory, 1, w.Q.size, at.E_V)
     for _ in range(2, FILTERED):
         _filter(f, w, options, memory, h, e_q, e_v)
@@ -415,7 +417,7 @@ def _extrapolate(f, w, options, memory, h, q1, v1):
 
 @compiled
 def _slow_error(f, w, options, memory, h, tolerances, state, new_state, A_stage):
-    """Return what an error of the velocities, in E_V, leaves in slow directions, as in newton_step.py."""
+    """Return the error that an error of the velocities, in E_V, leaves in slow directions, as in newton_step.py."""
     n = w.Q.size
     e_q, e_v = vector(memory, 1, n, at.E_Q), vector(memory, 1, n, at.E_V)
     longest = motion_time(w, tolerances, state, state[2 * n :])
@@ -429,7 +431,7 @@ def _slow_error(f, w, options, memory, h, tolerances, state, new_state, A_stage)
     longer = STEPS_TO_DECAY * h / gamma_of(options)
     if _factor_filter(f, w, options, memory, longer) == DONE:
         _filter(f, w, options, memory, longer, e_q, e_v)
-        # where the motion is unstable the system may be nearly singular, and the solution large
+        # if the motion is unstable the system may be nearly singular, and the solution large
         error = min(error, velocity_error(w, tolerances, e_v, longest, state, new_state))
     memory[at.H_FACTORED] = 0.0
     return error
@@ -439,9 +441,9 @@ def _slow_error(f, w, options, memory, h, tolerances, state, new_state, A_stage)
 def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, lower):
     """Return the error by `lower`, weights of another embedded formula, for jumps of accelerations.
 
-    Those of the first one are so small at the stages of the first half that a jump there hardly shows. `lower` is exact
-    for accelerations quadratic in time; where these are smooth, what it misses of their width is small, and its
-    difference counts less by that factor, so that it is of a higher order than the first estimate.
+    The weights of the first formula are so small at the stages of the first half that a jump there hardly shows.
+    `lower` is exact for accelerations quadratic in time. If these are smooth, it misses a small share of their width,
+    and its difference counts less by that factor, so that it is of a higher order than the first estimate.
     """
     n = w.Q.size
     missed, widest = 0.0, 0.0
@@ -465,11 +467,11 @@ def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V
 
 @kernel(SETTLE)
 def settle_diagonal(f, w, options, memory, tolerances, accepted):
-    """Keep the last stage of an accepted step, which is the first of the next one."""
+    """Store the last stage of an accepted step, which is the first of the next one."""
     if accepted:
         s = int(options[TAIL])
         _, A_stage, a_end = stages_of(memory, s, w.Q.size)
-        copy(A_stage[s - 1], a_end)  # F at the state would magnify what Newton's method left by stiffness
+        copy(A_stage[s - 1], a_end)  # F at the state would magnify the residual of Newton's method by the stiffness
         memory[at.FRESH] = 0.0
 
 
@@ -515,7 +517,7 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
             return Attempt(code, np.inf, 0.0)
         copy(V, V_stage[j])
     copy(V, v1)
-    for m in w.dependent:  # as the formula has them, beside those that the constraints give
+    for m in w.dependent:  # by the formula, to be compared with those that the constraints give
         q1[m] = q_bar[m] + h * A[s - 1, s - 1] * V[m]
     for m in w.independent:
         q1[m] = Q[m]

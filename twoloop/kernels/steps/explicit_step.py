@@ -1,9 +1,9 @@
-"""A step of an explicit Runge-Kutta method for (q_i, v_i): every stage is one evaluation, and there is no outer loop.
+"""Step of an explicit Runge-Kutta method for (q_i, v_i): every stage is one evaluation, without an outer loop.
 
 The tableau is any whose first stage is the state itself and that estimates its error by two embedded formulas. The
-inner loop restores the dependents of every stage, so that the step never leaves the constraints. Or, which departs from
-the paper's procedure, all coordinates are integrated alike, stages stand where the formula puts them, off the
-constraints by its error, and the end of the step alone is put back on them.
+inner loop restores the dependents of every stage, so that the step never leaves the constraints. With FREE, unlike in
+the paper's procedure, all coordinates are integrated alike: stages are not projected, but off the constraints by the
+error of the formula; only the end of the step is projected.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_as_given, e
 from twoloop.kernels.linalg.dense import copy
 
 # places in `options`: scalars, then A (s, s), b (s), c (s) and the weights of the two estimates (s each)
-STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)  # FREE: stages are left where they are
+STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)  # FREE: stages are not projected
 # vectors in `memory`, then the slopes of the stages. Each has 2 n_q numbers, and zeros up to a multiple of BLOCK
 STAGE, FINE, COARSE, N_VECTORS = range(4)
 BLOCK = 8
@@ -152,7 +152,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
     stage, one, other = _vector(memory, n, STAGE), _vector(memory, n, FINE), _vector(memory, n, COARSE)
     slopes = _slopes(memory, s, n)
-    # near a singular position it matters on which side of it a stage is, and how well velocities keep to the rows
+    # near a singular position it matters on which side of it a stage is, and how exactly velocities satisfy the rows
     near = options[FREE] == 1.0 and w.notes[NEARLY_SINGULAR] != 0.0
     free = options[FREE] == 1.0 and not near
     longer = times_gap(tolerances, h)
@@ -161,7 +161,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.counters[N_OUTER] += 1
     copy(state[n : 3 * n], slopes[0])
     for j in range(1, s):
-        _move(y, h, A[j, :j], slopes, stage, stage)  # dependents too: where Newton starts
+        _move(y, h, A[j, :j], slopes, stage, stage)  # dependents too, as start values of Newton's method
         v_stage, a_stage = slopes[j, :n], slopes[j, n : 2 * n]
         copy(stage[n : 2 * n], v_stage)
         if free:

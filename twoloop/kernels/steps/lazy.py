@@ -1,4 +1,4 @@
-"""Steps that are loaded when a run needs them: implicit ones take a third of the time of a cold first run."""
+"""Load steps when a run needs them, because implicit ones take a third of the time of a cold first run."""
 
 from importlib import import_module
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ PLACEHOLDER = Step(stop_to_load, commit_nothing)
 
 
 class LazyStep(NamedTuple):
-    """Name a step by its module, such as "steps.newton_step", and its name there."""
+    """Name of a step: its module, such as "steps.newton_step", and its name there."""
 
     module: str
     name: str

@@ -66,16 +66,18 @@ THETA, N_ITERATED, N_ROWS, FREE, N_OPTIONS = range(5)
 WANTED_START = 0.12  # contraction aimed at in the first step, between the limits of collocation_code.py
 MOST_STARTS = 4
 SHORTER, SAFETY = 0.6, 0.75
-# steps limited by convergence, after which another method goes on: then the motion is stiff; and the value of CURVED
-# below which accelerations hardly vary within a step
+# number of steps limited by convergence after which another method takes over, because the motion is stiff; and the
+# value of CURVED below which accelerations hardly vary within a step
 LIMITED, STRAIGHT = 24.0, 0.1
-N_CHECKED, MUCH_NEARER = 4, 0.4  # parts of a step at whose ends pivots are checked, and their least ratio to the first
-# tolerance below which another method goes on behind a singular position: here five more runs of A02 were wrong
+# number of parts of a step at whose ends pivots are checked, and their least ratio to the first
+N_CHECKED, MUCH_NEARER = 4, 0.4
+# tolerance below which another method takes over behind a singular position: here five more runs of A02 were wrong
 TIGHT = 1e-8
-REFUSALS = 12.0  # of UNMADE, which each accepted step lessens by 1 and each that did not converge raises by 2
-BETWEEN = 0.0908  # of a step, the longest part that an audit leaves unseen: half that between two nodes
+REFUSALS = 12.0  # limit of UNMADE: each accepted step lowers it by 1 and each step that did not converge raises it by 2
+# longest part of a step without an evaluation after an audit, relative to the step: half that between two nodes
+BETWEEN = 0.0908
 EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
-GROWTH_AT_ONCE = 30.0  # after a step at the beginning that needed a single sweep
+GROWTH_AT_ONCE = 30.0  # largest factor after a step at the beginning that needed a single sweep
 LEAST_TREND, FAR = 0.4, 3.0
 _places = merged(places)
 
@@ -93,7 +95,7 @@ def _room(memory):
 
 @merged
 def _keep_refused(f, room, state):
-    """Let the polynomial of a step whose error is too large predict the shorter one in its place."""
+    """Let the polynomial of a step whose error is too large predict the shorter step that replaces it."""
     f.retry_nodes(room, state)
     if room[room_at.KEPT_DEGREE] == 0.0:
         room[room_at.KEPT_DEGREE] = max(room[room_at.DEGREE], 3.0)
@@ -102,7 +104,7 @@ def _keep_refused(f, room, state):
 
 @compiled
 def _collocate(f, w, options, room, tolerances, t, h, state):
-    """Iterate the stages of a step; return how that ended, the error, and the factor for the next step size."""
+    """Iterate the stages of a step; return how the iteration ended, the error, and the factor of the next step size."""
     first, estimated = room[room_at.PREDICTS] == 0.0, tolerances[ESTIMATE] == 1.0
     longest = tolerances[LOOK] / BETWEEN
     if estimated and h > longest * (1.0 + SLACK):
@@ -145,7 +147,7 @@ def _collocate(f, w, options, room, tolerances, t, h, state):
         most = min(most, of_defect)
     most = min(most, longest / h)
     beyond = room[room_at.SWEEPS] - room[room_at.TARGETED]
-    # stiff: accelerations hardly vary within the step, and yet it takes about all its sweeps
+    # stiff: accelerations hardly vary within the step, and yet it takes almost all its sweeps
     limited = room[room_at.CURVED] < STRAIGHT and beyond >= -1.0
     room[room_at.LIMITED] = max(0.0, room[room_at.LIMITED] + (1.0 if limited else -1.0))
     factor = room[room_at.FACTOR]
@@ -173,7 +175,7 @@ def _accept(room):
 
 @merged
 def _is_unsuited(w, room, tolerances):
-    """Return whether another method is to go on: near a singular position, and where stiffness limits the steps."""
+    """Return whether another method takes over: near a singular position, and if stiffness limits the steps."""
     stiff = room[room_at.LIMITED] >= LIMITED or room[room_at.UNMADE] >= REFUSALS
     near = w.notes[NEAR_NOW] == 1.0 or tolerances[LEAST] < TIGHT
     return stiff or (w.notes[NEARLY_SINGULAR] == 1.0 and near)
@@ -183,8 +185,8 @@ def _is_unsuited(w, room, tolerances):
 def _passes_singular(f, w, t, h, state, new_state):
     """Return whether C_q is much nearer to losing rank within a step than at its beginning.
 
-    Stages beside the constraints have wrong accelerations near a singular position; other steps are to cross it. The
-    motion within the step is taken for the cubic through its ends.
+    Stages off the constraints have wrong accelerations near a singular position: other steps have to cross it. The
+    motion within the step is approximated by the cubic through its ends.
     """
     n, pivot = w.Q.size, w.notes[PIVOT]
     for k in range(1, N_CHECKED):
@@ -228,7 +230,7 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if code == DONE:
         error = max(error, departure(w, tolerances, h, state[:n], state[n : 2 * n], q1))
     if code == DONE and error <= 1.0 and w.notes[NEARLY_SINGULAR] == 1.0 and tolerances[ESTIMATE] == 1.0:
-        w.notes[NEAR_NOW] = 2.0  # pivots are to be looked at behind the step, too
+        w.notes[NEAR_NOW] = 2.0  # pivots are checked behind the step, too
         if _passes_singular(f, w, t, h, state, new_state):
             code = SINGULAR
     return Attempt(code, error, factor if error <= 1.0 else 0.0)
@@ -236,7 +238,7 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
 
 @merged
 def _project_all(f, w, options, room, n, n_ends, out_t, out_state):
-    """Project the first n_ends rows onto the constraints, one in each lane, and find accelerations and multipliers."""
+    """Project the first n_ends rows onto the constraints, one in each lane; compute accelerations and multipliers."""
     ends = _places(n, int(options[N_ITERATED]), int(options[N_ROWS]))[5]
     for k in range(LANES):
         row = min(k, n_ends - 1)
@@ -262,7 +264,7 @@ def _project_all(f, w, options, room, n, n_ends, out_t, out_state):
 
 @merged
 def _take(f, w, options, room, tolerances, driven, n, k, t, row, state):
-    """Replace `row` by its projection, that of lane k; return whether the projection moved it by the tolerance at most.
+    """Replace `row` by its projection in lane k; return whether the projection moved it by the tolerance at most.
 
     Where constraints depend on time (`driven`), velocities are compared, too: a change that the accelerations at the
     nodes do not explain may come from a discontinuity of the drive, see drive_discontinuities.py.
@@ -302,7 +304,7 @@ def _may_follow(w, room, tolerances, control, clock, h):
 
 @merged
 def _make(f, w, options, room, tolerances, control, clock, goal, state, n_most, out_t, out_state, out_steps):
-    """Take at most n_most steps in a row without projecting their ends; return how many."""
+    """Take at most n_most steps in a row without projecting their ends; return their number."""
     n, t, n_ends = w.Q.size, clock[at.T], 0
     while n_ends < n_most and t < goal:
         wanted = min(clock[at.H_NEXT], control[at.MAX_STEP])
@@ -334,10 +336,10 @@ def _make(f, w, options, room, tolerances, control, clock, goal, state, n_most, 
 def lobatto_steps(
     f, w, options, memory, tolerances, control, clock, goal, state, new_state, out_t, out_state, out_steps
 ):
-    """Take steps in a row, at most as many as there are lanes, and project their ends together; return how many.
+    """Take steps in a row, at most as many as there are lanes, and project their ends together; return their number.
 
-    A group ends where the number of accepted steps is a multiple of the lanes, whatever else makes the integrator
-    pause: which steps are projected together depends on the run alone, so that results can be repeated.
+    A group ends if the number of accepted steps is a multiple of the lanes, whatever else makes the integrator pause:
+    which steps are projected together depends on the run alone, so that results can be repeated.
     """
     room, n = _room(memory), w.Q.size
     if out_t.size < LANES or w.notes[NEARLY_SINGULAR] == 1.0:

@@ -1,4 +1,4 @@
-"""Where the parts of newton_step's `options` and `memory` are; both keep to these places."""
+"""Layout of the `options` and `memory` of newton_step and diagonal_step."""
 
 from typing import Any
 
@@ -8,9 +8,9 @@ from numpy.typing import ArrayLike, NDArray
 from twoloop.kernels.data.common import inlined, merged
 from twoloop.kernels.steps.stages import N_SCALARS, options_array
 
-# `options` is that of stages.py, then these scalars, the weights e (s) of the estimate and for each eigenvalue
-# its real and imaginary part, the row of T^-1 and the column of T that belong to it (s real, s imaginary parts each)
-# VELOCITIES: 1 if their error is tested, too
+# `options` is that of stages.py, then these scalars, the weights e (s) of the estimate, and for each eigenvalue its
+# real and imaginary part, and its row of T^-1 and column of T (s real, s imaginary parts each). VELOCITIES: 1 if their
+# error is tested, too
 N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
 
 # places in `memory`
@@ -20,26 +20,26 @@ N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
     HAS_PREVIOUS,
     H_PREVIOUS,
     HAS_JACOBIAN,
-    FRESH,  # the derivatives are those of the present state
+    FRESH,  # 1: the derivatives are those of the present state
     PARTITION_NUMBER,
     H_FACTORED,
-    CONTRACTION,  # of the last iteration
+    CONTRACTION,  # contraction of the last iteration
     DAMPED,  # 0: no derivative by v
     SYMMETRIC,  # 1: the matrix of diagonal_step.py was factored as a symmetric one
-    DURATION,  # s: how long an error of velocity lasts; 0: not known
-    CHANGED,  # 1: in diagonal_step.py: derivatives were renewed at the end of the step
+    DURATION,  # s: duration of an error of velocity; 0: not known
+    CHANGED,  # 1: diagonal_step.py has renewed derivatives at the end of the step
     N_MEMORY_SCALARS,
 ) = range(14)
 PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
-# spaces in w.matrices, of n_q^2 numbers each; those from SYSTEMS on go in pairs, complex, one for each eigenvalue
+# spaces in w.matrices, of n_q^2 numbers each; from SYSTEMS on a complex pair for each eigenvalue
 BY_Q, BY_V, FILTER, SYSTEMS = range(4)
 
 
 def newton_options(
     A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], velocities: bool
 ) -> NDArray[np.float64]:
-    """Return what `options` holds behind those of stages.py; A has a basis of eigenvectors.
+    """Return the part of `options` that follows that of stages.py; A has a basis of eigenvectors.
 
     velocities : whether the error of velocities is tested.
     """
@@ -56,9 +56,9 @@ def newton_options(
 
 
 def _estimate_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: float) -> NDArray[np.float64]:
-    """Return weights e: gamma0 f(y_n) + sum_j e_j f(Y_j) is a quadrature of order s less the method's own.
+    """Return weights e: gamma0 f(y_n) + sum_j e_j f(Y_j) is a quadrature of order s less that of the method.
 
-    Hairer & Wanner II, (IV.8.16). With c_1 = 0 the stages hold f(y_n) already: then the last stage is left out.
+    Hairer & Wanner II, (IV.8.16). With c_1 = 0 the stages already contain f(y_n): then the last stage is left out.
     """
     s = len(b)
     moments = 1.0 / np.arange(1.0, s + 1.0)
@@ -78,12 +78,12 @@ def memory_size(n_eigenvalues: int, s: int, n_q: int) -> int:
 
 
 def n_matrices(n_eigenvalues: int) -> int:
-    """Return how many spaces of n_q^2 numbers w.matrices needs."""
+    """Return the number of spaces of n_q^2 numbers that w.matrices needs."""
     return SYSTEMS + 2 * n_eigenvalues
 
 
-# `options` are those of a Newton method of one stage, A = [[gamma]]; then this method's stages, A, c and b - b^, and 1
-# if steps with an error estimate go on from the embedded formula
+# `options` are those of a Newton method of one stage, A = [[gamma]]; then the stages, A, c and b - b^ of this method,
+# and 1 if steps with an error estimate continue from the embedded formula
 PLACE = N_SCALARS + 2 + 5
 TAIL = PLACE + N_EIGEN_SCALARS + 1 + 2 + 4
 
@@ -100,8 +100,8 @@ def diagonal_options(
 ) -> NDArray[np.float64]:
     """Return the parameter block: A (s, s) has zeros in its first row, then gamma on the diagonal; b is its last row.
 
-    `lower`: weights of the estimate where accelerations jump.
-    `embedded`: the embedded formula is the one of higher order, from which steps go on.
+    `lower`: weights of the estimate for accelerations that jump. `embedded`: the embedded formula is the one of higher
+    order, from which steps continue.
     """
     A, c, weights, lower = (np.asarray(x, dtype=np.float64) for x in (A, c, weights, lower))
     gamma = A[-1, -1]
@@ -111,9 +111,9 @@ def diagonal_options(
 
 
 def diagonal_memory(s: int, n_q: int) -> NDArray[np.float64]:
-    """Make `memory`: that of a Newton method of one stage, then velocities and accelerations (s, n_q).
+    """Allocate `memory`: that of a Newton method of one stage, then velocities and accelerations (s, n_q).
 
-    Last come the accelerations (n_q) that the last stage of the last accepted step ended with.
+    The accelerations (n_q) of the last stage of the last accepted step follow.
     """
     return np.zeros(memory_size(1, 1, n_q) + (2 * s + 1) * n_q)
 
@@ -178,5 +178,5 @@ def pivots_of(memory, s, n, k):
 
 @inlined
 def complex_vector(memory, s, n, n_eigen, which):
-    """Return complex scratch (n), `which` being 0 or 1."""
+    """Return a complex scratch vector (n); `which` is 0 or 1."""
     return _tail(memory, s, n, 1 + n_eigen + 2 * which).view(np.complex128)

@@ -39,7 +39,7 @@ STAGNATION_FIXED = 1e-9  # as STAGNATION, for fixed steps, relative to max(1, |v
 
 @compiled
 def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
-    """Solve for the stage accelerations, predicted in A_stage, by Newton's method: DONE, or why not."""
+    """Solve for the stage accelerations, predicted in A_stage, by Newton's method; return the code."""
     s, A, A2, _, _, c = tableau_of(options)
     n = q.size
     residual = block(memory, s, n, at.RESIDUAL)
@@ -66,7 +66,7 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
                 return code
             for m in range(n):
                 residual[j, m] = a_new[m] - A_stage[j, m]
-            if f.flags[FORM] != STATIC:  # where none is dependent
+            if f.flags[FORM] != STATIC:  # with the static form no coordinate is dependent
                 for m in w.dependent:
                     A_stage[j, m] = a_new[m]
         scale_q, scale_v = 1.0, 1.0
@@ -77,7 +77,7 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
         correct(f, w, options, memory, s, residual, A_stage)
         largest_q, largest_v = 0.0, 0.0
         for j in range(s):
-            in_q, in_v = Q_stage[j], V_stage[j]  # their numbers are not needed any more
+            in_q, in_v = Q_stage[j], V_stage[j]  # reused as scratch
             for m in range(n):
                 in_q[m] = 0.0
                 in_v[m] = 0.0
@@ -98,7 +98,7 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
                 return DONE if change <= floor else OUTER_DIVERGED
             if contraction / (1.0 - contraction) * change <= options[OUTER_TOL]:
                 return DONE
-            # will it get there in time?
+            # fail early if the remaining iterations cannot reach the tolerance
             left = MAX_ITERATIONS - 1 - iteration
             if change * contraction**left / (1.0 - contraction) > max(options[OUTER_TOL], floor):
                 return OUTER_DIVERGED
@@ -161,10 +161,10 @@ def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
 
 @compiled
 def _slow_error(f, w, options, memory, h, tolerances, state, new_state):
-    """Return what an error of the velocities, in E_V, leaves in directions that are slow beside the step.
+    """Return the error that an error of the velocities, in E_V, leaves in directions that are slow beside the step.
 
-    How long all of it lasts is known from its fastest part. What is left of it a few steps later lasts as long as
-    the motion itself.
+    The fastest part of an error shows how long all of it lasts. The part left a few steps later lasts as long as the
+    motion itself.
     """
     s, n = int(options[STAGES]), w.Q.size
     z = STEPS_TO_DECAY * h / options[eigen_place(s) + at.GAMMA0]
@@ -177,7 +177,7 @@ def _slow_error(f, w, options, memory, h, tolerances, state, new_state):
         e_q[i] = 0.0
     if factor_filter(f, w, options, memory, s, z) == DONE:
         filter_error(f, w, options, memory, s, z, e_q, e_v)
-        # where the motion is unstable the system may be nearly singular, and the solution large
+        # if the motion is unstable the system may be nearly singular, and the solution large
         error = min(error, velocity_error(w, tolerances, e_v, longest, state, new_state))
     if factor_filter(f, w, options, memory, s, h) != DONE:
         memory[at.H_FACTORED] = 0.0
@@ -186,7 +186,7 @@ def _slow_error(f, w, options, memory, h, tolerances, state, new_state):
 
 @kernel(SETTLE)
 def settle_newton(f, w, options, memory, tolerances, accepted):
-    """Keep the stages of an accepted step, from which the next ones are predicted."""
+    """Store the stages of an accepted step, which predict the next ones."""
     s, n = int(options[STAGES]), w.Q.size
     if accepted:
         memory[at.FRESH] = 0.0
@@ -216,8 +216,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     node = middle_node(c)
     while True:
         if memory[at.HAS_JACOBIAN] == 0.0:
-            # stiff directions turn as the body moves: halfway they are at most half a step's turn from any stage's; at
-            # the time of a stage, so that this sees nothing of a force that the stages do not see
+            # stiff directions turn as the body moves: in the middle they are at most half a step's turn from any
+            # stage's. The time is that of a stage, so that the derivatives see no force that the stages do not see
             x = node * h
             for m in range(n):
                 q_mid[m] = q[m] + x * (v[m] + 0.5 * x * a[m])
@@ -248,7 +248,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             break
         if memory[at.FRESH] == 1.0 and (node == 0.0 or code != OUTER_DIVERGED):
             return Attempt(code, np.inf, 0.0)
-        if memory[at.FRESH] == 1.0:  # halfway by the accelerations may be far off, where friction is no longer stiff
+        # the middle by the accelerations may be far off, for example where friction is no longer stiff
+        if memory[at.FRESH] == 1.0:
             node = 0.0
         memory[at.HAS_JACOBIAN] = 0.0
     for m in range(n):

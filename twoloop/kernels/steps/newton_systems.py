@@ -23,7 +23,7 @@ Three storages serve:
 - sparse, for large systems, of which all coordinates count as independent: static factors of the matrix with the
   border, its right-hand side [M r; G r]. K and D are differenced in groups of columns. Each time, the change that they
   predict is compared with a displacement of all coordinates at once: if entries are missing, which no position showed
-  when the pattern was made, another storage has to go on.
+  when the pattern was made, another storage has to take over.
 """
 
 import numpy as np
@@ -90,19 +90,19 @@ from twoloop.kernels.steps.newton_memory import (
 from twoloop.kernels.steps.stages import INNER_TOL
 
 MAX_ITERATIONS = 15
-SAME_STEP = 1e-9  # relative: steps are differences of times, and the same step is rounded otherwise at another time
-STAGNATION = 0.1  # of the step tolerance: corrections of this size that no longer shrink are rounding
+SAME_STEP = 1e-9  # relative: steps are differences of times, so that equal steps are rounded differently at other times
+STAGNATION = 0.1  # relative to the step tolerance: corrections of this size that no longer shrink are rounding
 
 DIFFERENCE = 1e-7  # displacement for derivatives, relative to max(1, |value|)
-# factors by which displacements differ that are made at a time, so that their effects do not cancel
+# factors between displacements that are made at once, so that their effects do not cancel
 UNEQUAL, N_UNEQUAL = 0.37, 7
 
-# --- tangents: K and D, of which only the band |i - j| <= b counts
+# --- tangents: K and D, of which only the band |i - j| <= b is used
 
 
 @inlined
 def displaced_with_all(value, place):
-    """Displace a coordinate or velocity while all are displaced, unlike its neighbours, so that nothing cancels."""
+    """Displace a coordinate or velocity along with all others, by unequal amounts, so that nothing cancels."""
     return value + DIFFERENCE * max(1.0, abs(value)) * (1.0 + UNEQUAL * (place % N_UNEQUAL))
 
 
@@ -124,7 +124,7 @@ def _finite(A, b):
 
 @compiled
 def _constraints_bend(f, w, t, q):
-    """Return whether C_q at q, which is left in w.Gx, differs from w.G."""
+    """Return whether C_q at q differs from w.G; leaves it in w.Gx."""
     w.Gx[:, :] = 0.0
     constraint_rows(f, w, t, q, w.Gx)
     for i in range(w.C.size):
@@ -136,7 +136,7 @@ def _constraints_bend(f, w, t, q):
 
 @compiled
 def _subtract_reaction_differences(f, w, t, q, moved, b, K):
-    """Subtract d(Cq^T lam)/dq from K, by displacing coordinates j, j + 2 b + 1, ... at a time."""
+    """Subtract d(Cq^T lam)/dq from K, by displacing coordinates j, j + 2 b + 1, ... at once."""
     n = q.size
     for j in range(n):
         moved[j] = displaced_with_all(q[j], j)
@@ -174,7 +174,7 @@ def tangent_by_q(f, w, t, q, v, b, moved, K, R):
 
 @compiled
 def tangent_by_v(f, t, q, v, b, D):
-    """Compute the band of D (n_q, n_q); it is left alone if the force does not depend on v."""
+    """Compute the band of D (n_q, n_q); leave it unchanged if the force does not depend on v."""
     if f.flags[FORCE_BY_V_GIVEN] == 0:
         return DONE
     _clear(D, b)
@@ -214,7 +214,7 @@ def _dense_from_tangents(f, w, memory, s, t, q, v):
     n = q.size
     m = w.independent.size
     w.counters[N_JACOBIANS] += 1
-    # factors are not needed any more: their spaces hold K or D, then T^T M T and T^T A
+    # factors are no longer needed: their spaces hold K or D, then T^T M T and T^T A
     K, R = square(space(w, n, FILTER), n), square(space(w, n, SYSTEMS), n)
     code = tangent_by_q(f, w, t, q, v, n - 1, vector(memory, s, n, Q_MOVED), K, R)
     if code != DONE:
@@ -261,7 +261,7 @@ def _dense_derivatives(f, w, options, memory, s, t, q, v, a):
         for row in range(m):
             i = w.independent[row]
             Jq[row, column] = (a_new[i] - a[i]) / size
-    # one displacement of all velocities tells whether there is anything to difference
+    # one displacement of all velocities shows whether there is anything to difference
     copy(q, q_moved)
     for column in range(m):
         j = w.independent[column]
@@ -330,7 +330,7 @@ def _band(numbers, n, b):
 
 @inlined
 def _border(w, n, r, b):
-    """Return what stands behind K: rows of C_q that count, w.D, and the columns of its entries, at the same state."""
+    """Return the arrays behind K: independent rows of C_q, w.D, and the columns of its entries, at the same state."""
     numbers = space(w, n, BY_Q)
     start = n * (2 * b + 1)
     Cq = numbers[start : start + r * n].reshape((r, n))
@@ -355,7 +355,7 @@ def _banded_residual(f, w, t, q, v):
 
 @compiled
 def _difference_groups(f, w, t, q, v, by_v, base, moved, b, band):
-    """Difference columns j, j + 2 b + 1, ... at a time: DONE, or NOT_FINITE."""
+    """Difference columns j, j + 2 b + 1, ... at once; return DONE, or NOT_FINITE."""
     n = q.size
     given = v if by_v else q
     for group in range(2 * b + 1):
@@ -420,7 +420,7 @@ def _banded_derivatives(f, w, memory, s, t, q, v):
     code = _difference_groups(f, w, t, q, v, False, base, moved, b, _band(space(w, n, BY_Q), n, b))
     if code != DONE:
         return code
-    # one displacement of all velocities tells whether there is anything to difference
+    # one displacement of all velocities shows whether there is anything to difference
     for j in range(n):
         moved[j] = displaced_with_all(v[j], j)
     _banded_residual(f, w, t, q, moved)
@@ -452,7 +452,7 @@ def _factor_banded(w, memory, s, b, which, z, numbers, factorize, substitute):
 
 @compiled
 def _all_coordinates(w, b, x, X):
-    """Compute X = T x; of x (n_q) the first n_dof numbers count, the others are scratch."""
+    """Compute X = T x; only the first n_dof numbers of x (n_q) are used, the others are scratch."""
     n_dof = w.independent.size
     _, D, columns = _border(w, w.Q.size, w.rows.size, b)
     for i in columns:
@@ -465,7 +465,7 @@ def _all_coordinates(w, b, x, X):
 
 @compiled
 def _solve_for_independents(w, b, numbers, pivots, substitute, x):
-    """Solve with the full right-hand side x (n_q); its first n_dof numbers become the independents of the solution."""
+    """Solve with the full right-hand side x (n_q); its first n_dof numbers become the independent coordinates."""
     Cq, _, _ = _border(w, x.size, w.rows.size, b)
     solve_bordered(w, b, Cq, numbers, pivots, substitute, x)
     for k in range(w.independent.size):  # ascending, so that none is overwritten before its turn
@@ -474,7 +474,7 @@ def _solve_for_independents(w, b, numbers, pivots, substitute, x):
 
 @compiled
 def _solve_banded(f, w, b, numbers, pivots, substitute, X, x):
-    """Solve for the independents; x (n_q): the first n_dof numbers count, the others and X (n_q) are scratch."""
+    """Solve for the independent part; only the first n_dof numbers of x (n_q) are used, the rest and X are scratch."""
     _all_coordinates(w, b, x, X)
     x[:] = 0.0
     add_banded_mass_times(f, w, X, x)
@@ -500,13 +500,14 @@ def _filter_banded(f, w, options, memory, s, h, e_q, e_v):
 
 
 # --- sparse storage, of all coordinates
-MISSED = 0.2  # of the change that the entries of a row predict: a larger difference shows that entries are missing
-NOISE = 1e-13  # of the largest force: what rounding may add to a difference
-N_SPARSE_VECTORS = 3  # of all coordinates: the force, the same displaced, and what is displaced
+# relative to the change that the entries of a row predict: a larger difference shows that entries are missing
+MISSED = 0.2
+NOISE = 1e-13  # relative to the largest force: rounding errors of a difference
+N_SPARSE_VECTORS = 3  # number of vectors of all coordinates: the force, the displaced force, and the displaced state
 
 
 def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_eigenvalues: int) -> int:
-    """Return how many numbers w.matrices has: see _sparse_state, _sparse_vectors and _sparse_factors."""
+    """Return the length of w.matrices: see _sparse_state, _sparse_vectors and _sparse_factors."""
     n = int(program[N_PIVOTS])
     n_tangents = int(program[N_OF_MASS]) - n_mass
     one = n + 2 * int(program[N_OFF])
@@ -515,7 +516,7 @@ def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_eigenvalu
 
 @inlined
 def _sparse_state(f, w):
-    """Return numbers of M, G, K and D, and of each row whether it counted and what it stiffens M by."""
+    """Return the numbers of M, G, K and D, and for each row whether it was independent and how much it stiffens M."""
     n_mass, n_jacobian, n_rows = w.mass_values.size, w.jacobian_values.size, w.counts.size
     a = n_mass + n_jacobian
     b = a + mass_of(f.newton_program)[0].size - n_mass
@@ -562,7 +563,7 @@ def _sparse_factors(f, w, k):
 
 @compiled
 def _sparse_residual(f, w, t, q, v, moved, out):
-    """Compute Q - G^T lam into `out`; `moved`: evaluate G anew. Return the largest number added."""
+    """Compute Q - G^T lam into `out`; with `moved`, evaluate G again. Return the largest number added."""
     w.counters[N_EVALUATIONS] += 1
     out[:] = 0.0
     f.force(t, q, v, f.p, out)
@@ -581,7 +582,7 @@ def _sparse_residual(f, w, t, q, v, moved, out):
 
 @compiled
 def _sparse_differences(f, w, t, q, v, by_v, base, other, moved, entries):
-    """Difference the entries of K, or of D, group by group: DONE, or NOT_FINITE."""
+    """Difference the entries of K, or of D, group by group; return DONE, or NOT_FINITE."""
     rows, columns, begins = tangents_of(f.newton_program)
     given = v if by_v else q
     for group in range(begins.size - 1):
@@ -618,7 +619,7 @@ def _explains(f, base, other, given, moved, largest, entries, predicted):
 
 @compiled
 def _sparse_derivatives(f, w, memory, t, q, v):
-    """Compute K and D at a state that was evaluated just before; NEEDS_DENSE: entries are missing."""
+    """Compute K and D at a state that was evaluated just before; return NEEDS_DENSE if entries are missing."""
     if f.newton_program.size == 0:
         return NEEDS_DENSE
     w.counters[N_JACOBIANS] += 1
@@ -693,7 +694,7 @@ def _filter_sparse(f, w, options, s, h, e_q, e_v):
     copy(x[: e_v.size], e_v)
 
 
-# --- what steps call, whatever the storage
+# --- functions that steps call, for any storage
 
 
 @compiled
@@ -814,7 +815,7 @@ def correct(f, w, options, memory, s, residual, A_stage):
     n_eigen = count_eigenvalues(options, s)
     x = complex_vector(memory, s, n, n_eigen, 0)
     place += N_EIGEN_SCALARS + s
-    d = block(memory, s, n, Q_STAGE)  # free between two evaluations
+    d = block(memory, s, n, Q_STAGE)  # unused between two evaluations
     d[:, :] = 0.0
     for k in range(n_eigen):
         row = place + 2

@@ -1,4 +1,4 @@
-"""Interpret the program of a Taylor series (generate/series.py), order by order, where no code is generated.
+"""Interpret the program of a Taylor series (generate/series.py), order by order, if no code is generated.
 
 See taylor_step.py for the equations.
 """
@@ -11,14 +11,14 @@ from twoloop.kernels.evaluation import operations as op
 from twoloop.kernels.evaluation.tasks import SOLVE
 from twoloop.kernels.linalg.saddle_point import solve_both
 
-# places in `options`: scalars, ORDER being that of the series of q; where each array of the program begins, and where
-# the last ends; then the arrays, integers by their bits
-# KEEP: steps follow one another by the same series, about the first state, as between the ends of a step
+# places in `options`: scalars (ORDER is that of the series of q); where each array of the program begins, and where the
+# last ends; then the arrays, integers by their bits. KEEP: steps follow one another by the same series, about the first
+# state, as between the ends of a step
 ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, N_SCALARS = range(7)
 # arrays of a table; arrays of sums as twoloop.generate.series.Sums has them
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
-PLACES = N_SUMS  # behind the arrays of sums: which they are
+PLACES = N_SUMS  # behind the arrays of sums: the entries that they compute
 EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
 BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
 KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns of GROUPS
@@ -26,24 +26,25 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns o
 # places in `memory`: scalars, two series of q (ORDER + 1, n_q), then scratch, see arrays_of
 (
     KNOWN,  # 1: there is a series about the state
-    WHICH,  # of the two it is
-    UNIT,  # of time, of the two series, s
+    WHICH,  # index of the series about the state
+    UNIT,  # unit of time of each series, s
     NEXT_UNIT,
-    LENGTH,  # of the step that each allows, in that unit
+    LENGTH,  # length of the step that each series allows, in its unit
     NEXT_LENGTH,
     TRIED,  # 1: the last attempt left a series that takes over if it was accepted
     PASSED,  # with KEEP: time since the state of the series, s
-    TARGET,  # which of the two series is to be found
-    SHORTER,  # of LENGTH, what the distance of its end from the constraints allowed of the step before; 0: not known
-    ATTEMPTS,  # at steps, so that each looks at other places
-    SUSPECTED,  # 1: a step was refused for the defect at the time SUSPECT, which no step has passed since
+    TARGET,  # index of the series that is computed
+    # ratio of the step to LENGTH that the distance of its end from the constraints allowed before; 0: not known
+    SHORTER,
+    ATTEMPTS,  # number of attempts, so that each attempt checks other places
+    SUSPECTED,  # 1: a step was rejected for the defect at the time SUSPECT, which no step has passed since
     SUSPECT,
     N_MEMORY_SCALARS,
 ) = range(14)
 
 
 def memory_size(order: int, n_q: int, n_rows: int, n_nodes: int, early: int, late: int) -> int:
-    """Length of `memory`."""
+    """Return the length of `memory`."""
     rows = order + 2
     scratch = rows * (n_nodes + 2 * early + 2 * late) + early + late + n_q + n_rows
     return N_MEMORY_SCALARS + 2 * (order + 1) * n_q + scratch + n_q
@@ -51,7 +52,7 @@ def memory_size(order: int, n_q: int, n_rows: int, n_nodes: int, early: int, lat
 
 @inlined
 def accelerations_found(memory, n):
-    """Return the last numbers of `memory`, which hold the accelerations of the series at one time."""
+    """Return the last numbers of `memory`: the accelerations of the series at one time."""
     return memory[memory.size - n :]
 
 
@@ -68,7 +69,7 @@ def _numbers(options, which):
 
 @inlined
 def series_of(memory, order, n, which):
-    """Return one of the two series of q, row by row: numba calls a function for an array of two dimensions."""
+    """Return one of the two series of q as a vector, row by row: numba calls a function for a two-dimensional array."""
     begin = N_MEMORY_SCALARS + int(which) * (order + 1) * n
     return memory[begin : begin + (order + 1) * n]
 
@@ -125,7 +126,7 @@ def _sum(options, sums, scale, values, out):
 
 @compiled
 def begin_operations(options, table, values, z, x, y):
-    """Compute order zero of the operations of a table by their functions; pending products stay zero."""
+    """Compute order zero of the operations of a table; pending products stay zero."""
     groups = _integers(options, table + GROUPS)
     constant, constant_2 = _numbers(options, table + FIRST + CONSTANT), _numbers(options, table + SECOND + CONSTANT)
     for g in range(0, groups.size, N_GROUP):
@@ -160,7 +161,7 @@ def begin_operations(options, table, values, z, x, y):
 
 @merged
 def _operate(options, table, K, values, z, x, y, x0, y0, total):
-    """Compute order K > 0 of the operations of a table; of pending products the part known before the solution."""
+    """Compute order K > 0 of the operations of a table; for pending products the part known before the solution."""
     groups = _integers(options, table + GROUPS)
     inverse = 1.0 / K
     for g in range(0, groups.size, N_GROUP):

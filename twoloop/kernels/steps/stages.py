@@ -1,4 +1,4 @@
-"""Parameter block, prediction of stages and error at jumps, which all implicit Runge-Kutta steps share."""
+"""Common parts of all implicit Runge-Kutta steps: parameter block, prediction of stages, and error at jumps."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -6,7 +6,8 @@ from numpy.typing import ArrayLike, NDArray
 from twoloop.kernels.data.common import allowed, compiled, inlined, merged
 
 FARTHEST = 3.0  # largest step ratio over which the old stage polynomial is extrapolated
-END_ERROR_WEIGHT = 0.01  # of `end_error` beside Richardson's estimate: it is there for jumps between ends and stages
+# weight of `end_error` beside Richardson's estimate, because it serves jumps between ends and stages
+END_ERROR_WEIGHT = 0.01
 
 # places in `options`: scalars, then A (s, s), A A (s, s), b (s), b A (s), c (s) and two rows (s) for `end_error`
 # EXTRAPOLATION: 1 / (2^order - 1), or 0 without; POWER: order - 1
@@ -50,7 +51,7 @@ def tableau_of(options):
 
 @merged
 def middle_node(c):
-    """Return the node next to the middle."""
+    """Return the node nearest to the middle."""
     nearest = 0
     for j in range(c.size):
         if abs(c[j] - 0.5) < abs(c[nearest] - 0.5):

@@ -1,4 +1,4 @@
-"""A step by the Taylor series of the motion, found from the index-3 equations themselves.
+"""Step by the Taylor series of the motion, computed from the index-3 equations themselves.
 
 With G = [C_q; A] the motion obeys G v + G_t = 0 and M a + G^T lam = Q. Written for the coefficients of the series, of
 order k in a and lam and of order k + 1 in v, all but the last coefficients of a, lam and v are known, and these solve
@@ -38,15 +38,17 @@ from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps import recurrences as at
 from twoloop.kernels.steps.recurrences import accelerations_found, expand, series_of
 
-ALLOWED = 0.3  # of the tolerances: how far from the constraints the end of a step is to be before it is moved there
-LOUDEST, LOUDER = 1e4, 10.0  # a defect up to LOUDEST is rounding, where one near the beginning is a LOUDER-th of it
-NEAR_BEGIN = 1e-5  # of the step: no force changes within it
-GOLDEN = 0.6180339887498949  # multiples of it, less their integers, lie evenly between 0 and 1
-BEYOND = 1e300  # in place of an infinite defect, where a function has no value within the step
-MOST_SHORTENED = 0.1  # a step that is refused for its defect
-GROWTH = 5.0  # of the step from one to the next, at most: coefficients belong to the unit of the step before
-FARTHEST = 1e6  # of the guess for the first step: no power of it overflows
-TOO_SHORT = 2.0  # the error of a first step that is not made, as the series allows a longer one
+# relative to the tolerances: distance of the unprojected end of a step from the constraints that is aimed at
+ALLOWED = 0.3
+# a defect up to LOUDEST is rounding if the one near the beginning is at least a LOUDER-th of it
+LOUDEST, LOUDER = 1e4, 10.0
+NEAR_BEGIN = 1e-5  # relative to the step: distance from its start within which no force is taken to change
+GOLDEN = 0.6180339887498949  # fractional parts of its multiples are evenly distributed between 0 and 1
+BEYOND = 1e300  # replaces an infinite defect, if a function has no value within the step
+MOST_SHORTENED = 0.1  # smallest factor of a step that is rejected for its defect
+GROWTH = 5.0  # largest ratio of two steps in a row: coefficients belong to the unit of the step before
+FARTHEST = 1e6  # relative to the guess of the first step: largest factor, so that no power of it overflows
+TOO_SHORT = 2.0  # error of a first step that is not made, because the series allows a longer one
 
 
 @merged
@@ -54,7 +56,7 @@ def _find_series(f, w, options, memory, t, state, unit, which):
     """Compute the series about a state that was projected just before, into one of the two places."""
     n = w.Q.size
     memory[at.TARGET] = which
-    if f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0:  # code made for the mechanism leaves no factors in w
+    if f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0:  # generated code leaves no factors in w
         q, v, a = state[:n], state[n : 2 * n], accelerations_found(memory, n)
         code = f.general(f, w, EVALUATE_AS_GIVEN, t, q, v, 0.0, a, w.lam)
         if code != DONE:
@@ -83,7 +85,7 @@ def _length(tolerances, series, unit, order, n):
 
 @merged
 def _evaluate(series, unit, order, x, q, v, a):
-    """Evaluate q, v and a at x units of time by Horner's scheme; four coordinates at once, or two.
+    """Evaluate q, v and a at x units of time by Horner's scheme, four or two coordinates at a time.
 
     The recurrence of the second derivative gives half of it.
     """
@@ -118,7 +120,7 @@ def _evaluate(series, unit, order, x, q, v, a):
 
 @compiled
 def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
-    """Return the defect at the share s of the step over what is allowed; infinite if there is none."""
+    """Return the defect at the share s of the step over the allowed one; infinite if it cannot be evaluated."""
     found = accelerations_found(memory, q.size)
     _evaluate(series, memory[at.UNIT], order, s * h / memory[at.UNIT], q, v, found)
     if evaluate_as_given(f, w, t + s * h, q, v, a) != DONE:
@@ -128,7 +130,7 @@ def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
 
 @compiled
 def _is_noise(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
-    """Return whether a defect is rounding: it is as large near the beginning, where the series is exact."""
+    """Return whether a defect is rounding, i.e. as large near the beginning, where the series is exact."""
     if defect > LOUDEST:
         return False
     noise = 0.0
@@ -139,9 +141,9 @@ def _is_noise(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
 
 @compiled
 def _refused_within(f, w, memory, t, h, tolerances, series, order, q, v, a):
-    """Return the defect for which the step is rejected before its end is evaluated, or 0. Note the largest one.
+    """Return the defect for which the step is rejected before its end is evaluated, or 0; record the largest one.
 
-    The places looked at are not the same in each attempt, but for the last at which a step was refused.
+    Each attempt checks other places, except for the last place at which a step was rejected.
     """
     look, shift = tolerances[LOOK], memory[at.ATTEMPTS] * GOLDEN % 1.0
     n_places = 0
@@ -169,7 +171,7 @@ def _shortened(defect, order):
 
 @kernel(SETTLE)
 def settle_taylor(f, w, options, memory, tolerances, accepted):
-    """Keep the series about the end of an accepted step for the next one."""
+    """Store the series about the end of an accepted step for the next one."""
     if accepted and memory[at.TRIED] == 1.0:
         memory[at.WHICH] = 1.0 - memory[at.WHICH]
         memory[at.UNIT], memory[at.LENGTH] = memory[at.NEXT_UNIT], memory[at.NEXT_LENGTH]
@@ -199,12 +201,12 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     x = (memory[at.PASSED] + h) / unit
     error, checked, found = 0.0, False, accelerations_found(memory, n)
     if estimated:
-        error = x / memory[at.LENGTH]  # larger than the estimate of the error, which is a power of it
+        error = x / memory[at.LENGTH]  # larger than the estimated error, which is a power of it
         if error > 1.0 + SLACK:
             return Attempt(DONE, error, 1.0 / error)
         error = min(error, 1.0)
-        singular = w.notes[NEARLY_SINGULAR] != 0.0  # it stays so to the end of the run
-        checked = w.notes[NEAR_NOW] == 0.0  # near such a position accelerations off the constraints say nothing
+        singular = w.notes[NEARLY_SINGULAR] != 0.0  # it stays so until the end of the run
+        checked = w.notes[NEAR_NOW] == 0.0  # near such a position accelerations off the constraints are meaningless
         w.notes[NEAR_NOW] = 0.0 if checked else 2.0
         longer = times_gap(tolerances, h)
         if longer > 0.0 and singular:
@@ -227,7 +229,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
         return Attempt(DONE, 0.0, 0.0)
     off = departure(w, tolerances, h, q, v, q1)
     memory[at.SHORTER], allowed = 1.0, np.inf
-    if off > 0.0:  # where growth, or a force ahead, cut the step short of LENGTH, how far short says nothing
+    if off > 0.0:  # if growth, or a force ahead, made the step shorter than LENGTH, its length says nothing
         allowed = (ALLOWED / off) ** (1.0 / order)
         memory[at.SHORTER] = min(1.0, max(x / memory[at.LENGTH], 1.0 / GROWTH) * allowed)
     if off > 1.0:

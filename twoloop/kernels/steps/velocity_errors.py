@@ -1,4 +1,4 @@
-"""Estimates of what an error of the velocities adds to the positions, for methods that pass over vibrations.
+"""Estimate the position errors that errors of the velocities cause, for methods that pass over vibrations.
 
 An error e of the velocities moves the positions until it turns back or decays. J J e, J being the Jacobian of (v, F),
 shows the square of the rate at which it does. So the error of a force that jumps within a step is found, and vibrations
@@ -20,21 +20,22 @@ from twoloop.kernels.steps.newton_memory import block, vector
 from twoloop.kernels.steps.newton_systems import DIFFERENCE
 from twoloop.kernels.steps.stages import INNER_TOL
 
-# An error that turns back as slowly as the motion itself is not that of a vibration, and errors of the next steps go
-# the same way: its duration counts so many times
+# factor on the duration of an error that turns back as slowly as the motion itself: it is no vibration, and errors of
+# the next steps have the same sign
 SLOW_FACTOR = 10.0
-LONGEST_GAPS = 10.0  # times GAP: the longest duration of an error
-STEPS_TO_DECAY = 10.0  # steps, after which nothing is left of an error that is fast beside the step
-FAST = 20.0  # steps: an error of the velocities of a shorter duration is fast
-UNLIKE = 0.3  # relative difference of accelerations, from which derivatives are not those of a state
+LONGEST_GAPS = 10.0  # times GAP: longest duration of an error
+STEPS_TO_DECAY = 10.0  # number of steps after which an error that is fast beside the step has decayed
+FAST = 20.0  # in steps: an error of the velocities of a shorter duration is fast
+UNLIKE = 0.3  # relative difference of accelerations above which derivatives do not belong to a state
 
 
 @compiled
 def filtered_velocity_error(w, memory, tolerances, z, raw, once, twice, state, new_state, a_end):
     """Return the largest component of an error, filtered by (I - z J)^-1 `once` and `twice`, over the tolerances.
 
-    Over that of a position where it has turned back or decayed before it is off by more, else over that of a velocity.
-    `a_end`: accelerations at the end, where a contact that begins in the step shows how fast the motion changes.
+    A velocity error counts as the smaller of two values: itself over the tolerance of the velocity, or the position
+    error that it causes until it turns back or decays, over that of the position. `a_end`: accelerations at the end,
+    where a contact that begins in the step shows how fast the motion changes.
     """
     n = w.Q.size
     v, a = state[n : 2 * n], state[2 * n : 3 * n]
@@ -55,7 +56,7 @@ def filtered_velocity_error(w, memory, tolerances, z, raw, once, twice, state, n
 
 @compiled
 def velocity_error(w, tolerances, e_v, duration, state, new_state):
-    """Return the largest component of an error of the velocities of some duration, over the tolerances."""
+    """Return the largest component of a velocity error of the given duration, over the tolerances."""
     n = w.Q.size
     error = 0.0
     for i in range(w.independent.size):
@@ -68,7 +69,7 @@ def velocity_error(w, tolerances, e_v, duration, state, new_state):
 
 @compiled
 def motion_time(w, tolerances, state, a):
-    """Return the time in which accelerations like these change the velocities of the motion, s."""
+    """Return the time in which such accelerations change the velocities of the motion, s."""
     n = w.Q.size
     fastest = change = 0.0
     for j in w.independent:
@@ -82,9 +83,9 @@ def motion_time(w, tolerances, state, a):
 def _derivatives_matter(w, memory, tolerances, z, raw, longest, state, new_state):
     """Return whether it matters if J is not that of the end of the step.
 
-    It does where an error of the velocities, `raw`, would count if it lasted longer than J says, and where J has
-    directions that are fast beside the step while Newton's method, which it serves, contracts no better than if they
-    were slow.
+    It matters if an error of the velocities, `raw`, would count if it lasted longer than J says; and if J has
+    directions that are fast beside the step while Newton's method, which uses J, contracts no better than if they were
+    slow.
     """
     duration = memory[at.DURATION]
     if duration < min(longest, FAST * z) and memory[at.CONTRACTION] * duration * duration > UNLIKE * z * z:
@@ -96,8 +97,8 @@ def _derivatives_matter(w, memory, tolerances, z, raw, longest, state, new_state
 def derivatives_agree(f, w, options, memory, s, t, z, tolerances, raw, e_q, e_v, state, new_state, a_end):
     """Return whether J is that of the end of the step, at time t, as far as it matters.
 
-    (e_q, e_v) is (I - z J)^-1 of the error, and `raw` its velocities; J times it is compared with a difference of
-    accelerations.
+    (e_q, e_v) is (I - z J)^-1 of the error, and `raw` its velocities; the product with J is compared with a difference
+    of accelerations.
     """
     n = w.Q.size
     longest = max(motion_time(w, tolerances, state, state[2 * n :]), motion_time(w, tolerances, state, a_end))
