@@ -159,17 +159,17 @@ class SampledRun:
             self._return()
         end, began = self.times[-1] + dt, time.process_time()
         self._failed = True  # until the end is reached, as a callback may raise
-        for left in range(MOST, -1, -1):
+        for _ in range(MOST):
             self._go_to(end)
-            run = self.run
-            if left == 0 or not may_have_missed_changes(run):
+            if not may_have_missed_changes(self.run):
                 break
             if len(self.times) > 1:  # earlier samples may have missed something, and are not repeated
-                warn_of_missed_changes(run)
-            self._every = closer(run)
+                warn_of_missed_changes(self.run)
+            self._every = closer(self.run)
             self._return()
         else:
-            warn_of_missed_changes(run)
+            self._go_to(end)
+            warn_of_missed_changes(self.run)
         self.cpu += time.process_time() - began
         self._note(end)
         return self.state
