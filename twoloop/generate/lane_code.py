@@ -288,7 +288,7 @@ def _threes(values: list[Value]) -> Iterator[tuple[Value, Value, Value]]:
 
 
 def common(emit: LaneEmitter, control: Value, place: int) -> Value:
-    """Return a number of `control`, broadcast to all lanes."""
+    """Return one entry of the array `control`, broadcast to all lanes."""
     return emit.splat(emit.builder.load(emit.builder.gep(control, integer(place))))
 
 

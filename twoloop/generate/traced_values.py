@@ -39,7 +39,7 @@ LOST = 16.0 * np.finfo(float).eps  # relative to the largest term of a kind: a s
 CLEAR = 1e-6
 NEXT = 1e-7  # ... which differ by this relative change
 NEIGHBOURS = 12
-MARGIN = 0.01  # margin of a CheckedRegion, as a share of its sides: states of a run lie farther apart
+MARGIN = 0.01  # margin of a CheckedRegion, as a share of its sides; small beside the distance between states of a run
 AT_REST = 1e-9  # margin relative to the longest side (time excluded): for coordinates at rest
 
 

@@ -105,7 +105,7 @@ class Interpolator:
         system, t0, row = self.made_of[:3]
         q0, static = row[: system.n_q], self.static
         for plan in self.plans.values():
-            loaded(plan.second)  # a kit must serve as long as the solution
+            loaded(plan.second)  # loaded now, as the solution calls it for as long as it lives
         self.kits = {kind: kit_of(system, t0, q0, plan, static) for kind, plan in self.plans.items()}
         self.kit = kit_of(system, t0, q0, None, static)
         pattern = pattern_of(system, t0, q0) if static is None else np.zeros((0, 0))

@@ -88,7 +88,7 @@ BELOW = 0.4  # relative to LIMIT: if h rho is below this, the explicit method is
 STRICT = 10.0
 MEAN = 0.8  # weight of the previous mean in the mean step
 SETTLED = 5.0  # number of accepted steps of a trial before its cost is measured
-WINDOW = 10.0  # number of accepted steps over which its cost is measured
+WINDOW = 10.0  # number of accepted steps over which the cost of the method on trial is measured
 GAIN = 1.2  # ratio of costs above which the method on trial replaces the other
 PATIENCE = 4.0  # number of estimates before the next trial
 

@@ -246,7 +246,7 @@ def _note_entries_near(f, t, q, ways, place, rows, n_c, pattern):
 
 @exact
 def _definite(mass, least, factors):
-    """Return whether no eigenvalue is below this share of the largest entry."""
+    """Return whether all eigenvalues of a symmetric matrix are at least `least` times its largest entry."""
     n, largest = len(mass), 0.0
     for i in range(n):
         for j in range(n):

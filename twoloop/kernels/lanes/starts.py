@@ -72,7 +72,7 @@ def _scale(work, target, factor):
 
 @compiled
 def _invert_gram(work, pattern, n_rows, n_redundant, row, factors, shift):
-    """Compute Cholesky factors of the sum of G G^T, shift and z z^T of each z, with inverse diagonals."""
+    """Factor G G^T + shift + Z Z^T by Cholesky in each lane; the diagonal is stored inverted."""
     n_entries = pattern[n_rows] - pattern[0]
     gram = factors + n_entries + n_rows
     Z = gram + n_rows * n_rows
