@@ -193,7 +193,7 @@ class CachedIntegrator:
                 return None
             interrupts.listen()
             n_rows, n = arrays.filled.tolist()
-            finished = self._finished(system, t1, q0, v0, output, interrupts, due, fields)
+            finished = self._finish(system, t1, q0, v0, output, interrupts, due, fields)
             if not isinstance(finished, tuple):
                 return finished
             (at_times,) = finished
@@ -203,7 +203,7 @@ class CachedIntegrator:
         region.count()  # runs that the loop ends are counted there
         return fields
 
-    def _finished(
+    def _finish(
         self,
         system: ConstrainedSystem,
         t1: float,
