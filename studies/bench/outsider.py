@@ -1,16 +1,10 @@
-"""Solvers from files: `simulate(problem, times, tolerance)` of `twoloop.testing`, each in a process of its own.
-
-The process has an environment of its own where the file asks for one (`own_environment`).
-"""
+"""Solvers from files: `simulate(problem, times, tolerance)` of `twoloop.testing`, each in a process of its own."""
 
 import hashlib
-import json
+import multiprocessing
 import os
 import signal
-import subprocess
-import sys
 from contextlib import suppress
-from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -20,16 +14,15 @@ import numpy as np
 
 from references import as_shown
 from references.driver import user_call
-from studies.bench.cli import CLONE, ROOT, StudyError
+from studies.bench.cli import StudyError
 from studies.bench.collector import FILE, Case, NotApplicable, Solver
-from studies.bench.own_environment import dependencies, environment
+from studies.bench.outsider_process import serve
 from studies.bench.solvers import TOLERANCES
 from twoloop import Result, Statistics, Status
 
 SHOWN = Path(as_shown.__file__).parent
 N_TIMES = 101  # states that a solver is asked for, the first of which is the start
 START = 300.0  # s that the process may take to load twoloop, the mechanism and the solver
-CHILD = "import sys; sys.path.insert({}, {!r}); from studies.bench.outsider_process import main; main({}, *{!r})"
 
 
 class Outsider:
@@ -40,7 +33,7 @@ class Outsider:
     `name`: in rows. `digest`: of the file. `calibrated`: s of the calibration beside the last call
     (`twoloop.rows.row_format`).
 
-    Raises StudyError if there is no such file, its header cannot be read or obeyed.
+    Raises StudyError if there is no such file.
     """
 
     def __init__(self, where: str, mechanism: str):
@@ -50,12 +43,11 @@ class Outsider:
         if not self.function.isidentifier() or not self.path.is_file():
             known = ", ".join(sorted(each.stem for each in SHOWN.glob("[!_]*.py")))
             raise StudyError(f"--solver takes FILE.py:FUNCTION, a file that there is, or one of {known}; given {where}")
-        data = self.path.read_bytes()
-        self.name, self.digest = f"{self.path.name}:{self.function}", hashlib.sha256(data).hexdigest()[:10]
+        self.name = f"{self.path.name}:{self.function}"
+        self.digest = hashlib.sha256(self.path.read_bytes()).hexdigest()[:10]
         model, _, maker = mechanism.rpartition(":")  # a file, as it is found from another folder
         self.mechanism, self.calibrated = f"{Path(model).resolve()}:{maker}" if model else mechanism, float("nan")
-        self._python = environment(dependencies(data.decode("utf-8", "replace"), self.path))
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: Any = None
         self._pipe: Connection | None = None
         self._spent, self._said = "", list[str]()  # the last line of its errors
 
@@ -65,14 +57,12 @@ class Outsider:
 
     def start(self) -> None:
         """Start the process, which loads the file. Raises StudyError if it cannot."""
-        self._pipe, there = Pipe()
-        given = (str(self.path), self.function, self.mechanism)
-        code = CHILD.format(0 if CLONE else len(sys.path), str(ROOT), there.fileno(), given)
-        # a group of its own, so that what it starts ends with it
-        options: dict[str, Any] = {"pass_fds": [there.fileno()], "start_new_session": True, "cwd": self.path.parent}
-        options |= dict.fromkeys(("stdin", "stdout"), subprocess.DEVNULL)
+        context = multiprocessing.get_context("fork")  # which has twoloop loaded
+        self._pipe, there = context.Pipe()
         self._errors = TemporaryFile()  # noqa: SIM115  # until the file is loaded; `end` closes it
-        self._process = subprocess.Popen([self._python, "-P", "-c", code], stderr=self._errors, **options)
+        given = there, self._pipe, self._errors.fileno(), self.path, self.function, self.mechanism
+        self._process = context.Process(target=serve, args=given)
+        self._process.start()
         there.close()
         try:
             said = self._asked({}, START) or {"failure": f"not loaded in {START:g} s"}
@@ -87,8 +77,7 @@ class Outsider:
         system, (t0, _), q0, v0 = case.start
         if system.n_a:
             raise NotApplicable("a solver from a file gets no constraints of velocities alone")
-        ask = {"t0": t0, "t_end": case.t_end, "q0": q0.tolist(), "v0": v0.tolist()}
-        ask |= {"value": tolerance, "n_times": N_TIMES}
+        ask = {"t0": t0, "t_end": case.t_end, "q0": q0, "v0": v0, "value": tolerance, "n_times": N_TIMES}
         if self._spent:
             return _failed(case, self._spent)
         answer = self._asked(ask, case.time_limit)
@@ -102,9 +91,9 @@ class Outsider:
             raise RuntimeError("it returns positions alone; return (q, v)")
         user_call.seconds = answer["seconds"]
         self.calibrated = answer["calibration_s"]
-        q, v = np.array(answer["q"]).T, np.array(answer["v"]).T
+        q, v = answer["q"].T, answer["v"].T
         none = np.full_like(q, np.nan)
-        lam = np.full((system.n_c, N_TIMES), np.nan) if answer["l"] is None else np.array(answer["l"]).T
+        lam = np.full((system.n_c, N_TIMES), np.nan) if answer["lam"] is None else answer["lam"].T
         times, counts = np.linspace(t0, t0 + case.t_end, N_TIMES), {"n_evaluations": answer["n_forces"] or None}
         stats = Statistics(**counts, cpu_time=answer["seconds"])
         return Result(times, q, v, none, lam, np.empty(0), Status.REACHED_END, f"{self.name} returned.", stats)
@@ -119,15 +108,15 @@ class Outsider:
         assert self._pipe is not None and self._process is not None
         try:
             if ask:
-                self._pipe.send_bytes(json.dumps(ask).encode())
+                self._pipe.send(ask)
             if not self._pipe.poll(limit):
                 self.end()
                 return None
-            return dict(json.loads(self._pipe.recv_bytes()))
-        except (EOFError, OSError, ValueError):  # it has died, or writes into the pipe
+            return dict(self._pipe.recv())
+        except (EOFError, OSError):  # it has died
             process = self._process
             self.end()
-            code = process.returncode
+            code = process.exitcode
             why = f"by {signal.Signals(-code).name}" if code < 0 else f"with status {code}"
             raise RuntimeError(f"the process of the solver ended {why}") from None
 
@@ -136,11 +125,10 @@ class Outsider:
         if self._process is None or self._pipe is None:
             return
         self._pipe.close()
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(0.2)  # it ends by itself where it has died, or listens
+        self._process.join(0.2)  # it ends by itself where it has died, or listens
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, signal.SIGKILL)
-        self._process.wait()
+        self._process.join()
         with self._errors:
             self._errors.seek(0)
             self._said = self._errors.read().decode("utf-8", "replace").strip().splitlines()[-1:]

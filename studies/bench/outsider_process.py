@@ -1,10 +1,10 @@
 """The process in which a solver from a file runs: it calls the solver whenever it is asked, and times each call.
 
-Asked and answered in JSON, over a pipe: what the solver prints, imports or breaks stays here.
+It is a fork of the process of the study: what the solver prints, imports or breaks stays here.
 """
 
+import faulthandler
 import importlib.util
-import json
 import os
 import sys
 from collections.abc import Callable
@@ -56,7 +56,7 @@ def loaded(path: Path, function: str) -> Callable[..., Any]:
 
 def run(simulate: Callable[..., Any], problem: Problem, ask: dict[str, Any]) -> dict[str, Any]:
     """What a call returned, and what it took."""
-    posed = known_problem(problem, ask["t0"], np.array(ask["q0"]), np.array(ask["v0"]), ask["t_end"])
+    posed = known_problem(problem, ask["t0"], ask["q0"], ask["v0"], ask["t_end"])
     n_forces, force, seconds = 0, posed.force, 0.0
 
     def counted(t: float, q: Array, v: Array) -> Array:
@@ -80,23 +80,31 @@ def run(simulate: Callable[..., Any], problem: Problem, ask: dict[str, Any]) -> 
         return {"failure": str(error)}
     if found.error or not found.complete:
         return {"failure": found.error or "numbers that are not finite"}
-    arrays = {"q": found.q.tolist()}
-    arrays |= {name: None if part is None else part.tolist() for name, part in (("v", found.v), ("l", found.lam))}
-    return arrays | {"seconds": seconds, "calibration_s": min(calibration, calibration_s()), "n_forces": n_forces}
+    seconds_of_calibration = min(calibration, calibration_s())
+    counts = {"seconds": seconds, "calibration_s": seconds_of_calibration, "n_forces": n_forces}
+    return {"q": found.q, "v": found.v, "lam": found.lam, **counts}
 
 
-def main(descriptor: int, file: str, function: str, mechanism: str) -> None:
-    connection = Connection(descriptor)
+def serve(connection: Connection, parent: Connection, errors: int, path: Path, function: str, mechanism: str) -> None:
+    """Load a solver and answer calls until the study ends; `parent`: the end of the pipe that is the study's."""
+    parent.close()
+    faulthandler.disable()  # a crash is a row, not a traceback of the study
+    os.setsid()  # a group of its own, so that what it starts ends with it
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for stream, target in ((0, nothing), (1, nothing), (2, errors)):
+        os.dup2(target, stream)
+    sys.stdout, sys.stderr = os.fdopen(1, "w", closefd=False), os.fdopen(2, "w", closefd=False)  # pytest's are others
+    os.chdir(path.parent)
     try:
-        problem, simulate = problem_from(mechanism), loaded(Path(file), function)
+        problem, simulate = problem_from(mechanism), loaded(path, function)
         failure = ""
     except BaseException as error:  # whatever a file does when it is imported
         failure = f"{type(error).__name__}: {error}"
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # what runs print is dropped
-    connection.send_bytes(json.dumps({"failure": failure}).encode())
+    os.dup2(nothing, 2)  # what runs print is dropped
+    connection.send({"failure": failure})
     while not failure:
         try:
-            ask = json.loads(connection.recv_bytes())
+            ask = connection.recv()
         except EOFError:
             return
-        connection.send_bytes(json.dumps(run(simulate, problem, ask)).encode())
+        connection.send(run(simulate, problem, ask))

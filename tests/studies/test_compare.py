@@ -22,7 +22,7 @@ SOLVERS = ("DOP853 (twoloop)", "Exudyn, GeneralizedAlpha")
 @pytest.fixture
 def file(tmp_path):
     (tmp_path / "swing.py").write_text(PLAIN)
-    (tmp_path / "my_solver.py").write_text(SOLVER.partition("# ///\n")[2])  # without an environment of its own
+    (tmp_path / "my_solver.py").write_text(SOLVER)
     return tmp_path / "swing.py"
 
 

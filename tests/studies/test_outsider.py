@@ -1,17 +1,14 @@
 """Solvers from files: what they return, and everything that can go wrong with them, which is a row."""
 
-import subprocess
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from studies.bench import own_environment
 from studies.bench.cli import StudyError
 from studies.bench.collector import Case, Run, attempt
 from studies.bench.outsider import Outsider
 from studies.bench.outsider_process import loaded
-from studies.bench.own_environment import dependencies, environment
 from twoloop.mechanisms import pendulum
 
 SOLVERS = '''
@@ -128,55 +125,10 @@ def test_a_process_that_dies_while_it_loads_says_why(tmp_path):
         Outsider(f"{path}:solve", "pendulum").start()
 
 
-def test_an_environment_has_the_editable_installs_of_the_present_one(tmp_path, monkeypatch):
-    present, elsewhere = tmp_path / "present", tmp_path / "elsewhere"
-    for folder in (present, elsewhere):
-        folder.mkdir()
-    (present / "mine.pth").write_text(f"{elsewhere}\n")
-    (elsewhere / "my_package.py").write_text("")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(own_environment.site, "getsitepackages", lambda: [str(present)])
-    subprocess.run([environment([]), "-c", "import my_package"], check=True)
-
-
 def test_files_that_are_not_there(tmp_path):
     for where in ("mine.py:solve", str(tmp_path), f"{tmp_path}:solve"):
         with pytest.raises(StudyError, match=r"--solver takes FILE\.py:FUNCTION"):
             Outsider(where, "pendulum")
-
-
-HEADER = "# /// script\n# requires-python = '{python}'\n# dependencies = [{names}]\n# ///\n"
-
-
-def test_headers(tmp_path):
-    assert dependencies("import numpy\n", tmp_path) is None
-    assert dependencies(HEADER.format(python=">=3.8", names='"numpy", "six<2"'), tmp_path) == ["numpy", "six<2"]
-    for text, says in (
-        (HEADER.format(python="<3", names=""), "asks for Python <3"),
-        (HEADER.format(python="three", names=""), "cannot be read"),
-        (HEADER.format(python=">=3", names="3"), "list of texts"),
-        ("# /// script\n# dependencies = [\n# ///\n", "cannot be read"),
-        (2 * (HEADER.format(python=">=3", names="") + "x = 1\n"), "2 headers"),
-    ):
-        with pytest.raises(StudyError, match=says):
-            dependencies(text, tmp_path)
-
-
-@pytest.mark.slow  # pip
-def test_a_header_gets_an_environment_on_top_of_this_one(tmp_path, monkeypatch, case):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setenv("PIP_NO_INDEX", "1")
-    monkeypatch.setattr(own_environment.shutil, "which", lambda name: None)  # uv knows no packages of the present one
-    path = tmp_path / "mine.py"
-    where = "import sys\nassert sys.prefix != sys.base_prefix and 'environments' in sys.prefix\n"
-    path.write_text(HEADER.format(python=">=3.11", names='"numpy"') + where + SOLVERS)
-    outsider = Outsider(f"{path}:solve", "pendulum")
-    assert attempt(Run(case, outsider.solver(), 1e-12), 0)[1] == "REACHED_END"
-    outsider.end()
-    made = environment(["numpy"])
-    assert "environments" in made and environment(None) != made
-    with pytest.raises(StudyError, match="no-such-package-of-anyone cannot be made"):
-        environment(["no-such-package-of-anyone"])
 
 
 @pytest.mark.slow
