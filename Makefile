@@ -10,6 +10,9 @@ export OMP_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
 export VECLIB_MAXIMUM_THREADS := 1
 
+# bytecode is kept even where the environment forbids it: without it every process takes seconds to read its modules
+unexport PYTHONDONTWRITEBYTECODE
+
 RUN := .venv/bin/python
 STAMP := .venv/installed
 PIP := -m pip --disable-pip-version-check --quiet
@@ -78,14 +81,14 @@ reports: install ## all studies into reports/
 compile: install ## compile the kernels, and the callbacks of bodies, mechanisms and studies, on two cores
 	@echo "Compiling (once, on both cores) the kernels, and the callbacks of bodies, mechanisms and studies"
 	@$(RUN) -c "from twoloop.kernels.evaluation import inner_loop; from twoloop.kernels.control import step_size"
-	@$(RUN) -c "from twoloop.kernels.steps import diagonal_step, newton_step; \
+	@$(RUN) -c "from twoloop.kernels.steps import diagonal_step, newton_step, taylor_step; \
 	from twoloop.kernels.evaluation import sparse_inner_loop; from twoloop.bodies.spatial import callbacks, programs; \
 	from studies.bench import sharp_callbacks; $(CALLBACKS_OF_TESTS)" & \
 	$(RUN) -c "from twoloop.kernels import advance, interpolation, cached_run; \
 	from twoloop.kernels.linalg import dependent_columns, rank; from twoloop.kernels.control import stiffness; \
 	from twoloop.kernels.evaluation import checks, residuals, traced; \
 	from twoloop.kernels.lanes import advance, explicit, starts; \
-	from twoloop.kernels.steps import adams_step, crossing_step, explicit_step, lazy, lobatto_step, taylor_step; \
+	from twoloop.kernels.steps import adams_step, crossing_step, explicit_step, lazy, lobatto_step; \
 	from twoloop.kernels.paper import bdf_step, fixed_point_step, newmark_step, paper_step; \
 	from twoloop.bodies.planar import callbacks, programs; \
 	from twoloop.mechanisms import *; from studies.honesty import traps; $(CALLBACKS_OF_MORE_TESTS)" && wait $$!

@@ -215,7 +215,7 @@ def test_bodies_that_are_given_at_rest_on_one_that_is_driven(on=("belt", "belt",
     np.testing.assert_allclose(v0, 0.3 * np.eye(len(v0))[0], atol=1e-15)
 
 
-@pytest.mark.parametrize("made", [lambda: in_space(ladder(30), 0.0), lambda: in_space(grid(30), 0.3)])
+@pytest.mark.parametrize("made", [slow(lambda: in_space(ladder(30), 0.0)), lambda: in_space(grid(30), 0.3)])
 def test_the_freedom_of_large_models_is_that_by_full_matrices(made, monkeypatch):
     def by_full_matrices(system, t, q, rows):
         raise AssertionError("full matrices")

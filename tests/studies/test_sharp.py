@@ -10,6 +10,7 @@ from studies.bench.sharp_forces import DRIVE_A, SIZE, T_END, families, force_alo
 from studies.bench.sharp_mechanisms import bars, chain, row, slider_in_space
 from studies.bench.sharp_motion import Motion, march, off, positions
 from tests.differential_motions import LOOSENESS, RIGHT, SAID, SILENT, allowed, crank_force, judged, slider_crank
+from tests.marks import slow
 from twoloop import solve_dae
 from twoloop.mechanisms import four_bar, spatial_slider_crank
 
@@ -36,7 +37,7 @@ def test_their_machine_code_is_kept_on_disk():
         assert force.stats.cache_path is not None
 
 
-@pytest.mark.parametrize("name", MECHANISMS)
+@pytest.mark.parametrize("name", [slow(name) if name == "in space" else name for name in MECHANISMS])
 def test_callbacks_and_independent_coordinates_agree(name):
     mechanism = MECHANISMS[name](FORCE)
     truth = known(mechanism)
