@@ -23,8 +23,8 @@ Each table below belongs to one function or class.
 # what stands above the table of a group
 MEANT = {
     "result.certify": """\
-If a certificate passes, a different method has recomputed the run, and no step ends more than 200 tolerances from the
-recomputed state. If it does not pass, a `CertificateWarning` says where. [The certificate](certificate.md) explains
+If a certificate passes, a different method has recomputed the run, and no state is more than 100 tolerances from the
+recomputed one. If it does not pass, a `CertificateWarning` says where. [The certificate](certificate.md) explains
 what it proves and what it can miss.
 """
 }

@@ -14,7 +14,7 @@ from tests.compiled import PENDULUM
 from tests.problems import at_one, quick, run
 from twoloop import CertificateWarning, ConstrainedSystem, Statistics, callback, mechanisms, solve_dae
 
-END = 3.0
+END, COLUMNS = 3.0, ("t", "q", "v", "a", "lam")
 
 
 @callback("force")
@@ -113,6 +113,24 @@ def test_constant_steps_are_measured_by_the_tolerance_that_is_asked_for(default_
 def test_a_run_that_an_event_ended(default_four_bar):
     for options in ({}, {"dense_output": True}, {"t_eval": np.linspace(0.0, 5.0, 51)}):
         assert silently(run(default_four_bar, 5.0, events=at_one(True), **options))
+
+
+@pytest.mark.parametrize(("method", "tolerance"), [("TRBDF2", 1e-6), ("ESDIRK4", 1e-6), ("auto", 1e-4), ("auto", 1e-9)])
+def test_small_errors_that_add_up_and_fields_that_are_wrong(method, tolerance):
+    result = swung(method, tolerance, swing(0.2, 1.5, 9.0))  # a steady force of 2 % of the weight more
+    right = swung(method, tolerance)
+    assert silently(right) and not silently(replace(right, **{name: getattr(right, name)[..., :9] for name in COLUMNS}))
+    for wrong in (
+        replace(result, system=right.system),
+        replace(right, lam=2.0 * right.lam),
+        replace(right, a=result.a),
+    ):
+        with pytest.warns(CertificateWarning, match="Not passed"):
+            assert wrong.certify().faults
+    with pytest.warns(CertificateWarning, match="small errors add up|missed a feature"):
+        assert (
+            replace(result, system=right.system, a=math.nan * result.a, lam=math.nan * result.lam).certify().error > 99
+        )
 
 
 def test_a_result_of_another_solver(default_four_bar):

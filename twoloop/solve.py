@@ -239,7 +239,7 @@ def solve_dae(
             every, spent, run = closer(run), spent + record.stats.cpu_time, None
         if spent > 0.0:
             record = replace(record, stats=replace(record.stats, cpu_time=spent + record.stats.cpu_time))
-        result = record_of(Result, fields_of(record, options, system, with_code))
+        result = record_of(Result, fields_of(record, options, system, with_code, t1))
         if isinstance(kept, FileStore):
             end_folder(kept, result)
         return result

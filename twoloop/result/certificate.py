@@ -12,11 +12,16 @@ from numpy.typing import ArrayLike, NDArray
 from twoloop.checks.arguments import Array, check_positive, check_tolerance
 from twoloop.kernels.data.indices import APART
 from twoloop.problem.system import ConstrainedSystem
+from twoloop.result.field_faults import NEAR, all_states, end_of_run, field_faults
 from twoloop.run.record import Record
-from twoloop.run.rerun import IndependentRerun, RerunPiece, explicit, implicit, tighter
+from twoloop.run.rerun import FINEST, IndependentRerun, RerunPiece, explicit, implicit, tighter
 
 PIECES = 200  # the run is divided into at least this many intervals, also the bound of the step size
-LIMIT = 200.0  # tolerances: in tests correct steps had at most 140, wrong ones at least 590 (of TRBDF2: 107)
+LIMIT = 100.0  # tolerances: largest defect of a step, and largest error of a state, of a run that passes
+FASTEST = 10.0  # 1/s: largest rate of the motion by which errors of velocities are divided; of untested ones, always
+CLOSER = 0.1  # relative to the tolerances of the other reruns: those of the second run, whose errors grow
+STIFF = 4  # explicit steps per step of the run above which untested velocities are vibrations that it passed over
+CHAOTIC = 10.0  # errors up to this many times those that grow from a tolerance at the start are explained by growth
 ROUNDING = 1e-14  # relative to the largest coordinate or velocity: deviation attributed to rounding
 SPLIT = 100.0  # defect of an interval above which its steps are checked one by one
 MAX_WRONG = 3  # wrong steps after which the rest of an interval is skipped
@@ -50,16 +55,22 @@ class Certificate:
         Largest distance between a stored state and the state obtained by integration from the previous stored state,
         divided by the tolerance of a step.
     t : float
-        Start of the step with the largest defect, s.
+        Start of the step with the largest defect, s; if all steps pass, time of the largest error.
+    error : float
+        Largest distance between a stored state and the state obtained by integration from the first stored state,
+        divided by the tolerance; of velocities also by the rate of the motion, max |a| / max |v|, if that is above
+        1/s, up to 10/s.
+    faults : tuple of str
+        Fields of the result that contradict the equations or one another.
     gap : float
         Longest time between two evaluations of the equations, s: shorter features may be missed.
     limit : float
-        Largest `defect` of a run that passes.
+        Largest `defect` and largest `error` of a run that passes.
     unseen : tuple of (float, float)
         Start and end, s, of intervals that could not be verified: reintegration failed, e.g. near a singular position,
-        or errors grow more than 200-fold within a step.
+        errors of a tolerance grow beyond the limit, or the result ends before the run.
     passed : bool
-        True if `defect` is at most `limit` and `unseen` is empty.
+        True if `defect` and `error` are at most `limit`, and `unseen` and `faults` are empty.
     message : str
         The outcome in words.
 
@@ -81,6 +92,8 @@ class Certificate:
     unseen: tuple[tuple[float, float], ...]
     passed: bool
     message: str
+    error: float = 0.0
+    faults: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
         return self.passed
@@ -102,6 +115,28 @@ def certify(result: Record, rtol: float | None, atol: ArrayLike | None) -> Certi
             f"{': certify its parts, result.arcs' if result.arcs else ''}"
         )
     checker = _Checker(result, result.system, *_tolerances(result, result.system.n_q, rtol, atol))
+    faults = tuple(field_faults(result, result.system, checker.rtol, checker.atol, LIMIT))
+    defect, t_worst, unseen = _local(checker)
+    error, t_error, t_grown = checker.errors() if defect <= LIMIT else (defect, t_worst, np.inf)
+    if t_grown < np.inf:  # errors of a tolerance at the start grow to this: the steps may be right
+        unseen = [*((start, end) for start, end in unseen if end <= t_grown), (t_grown, float(checker.t[-1]))]
+    end = end_of_run(result)
+    last = max(float(result.t[-1]), *(float(t[-1]) for t in result.t_events or () if len(t)), -np.inf)
+    if result.success and end > last + NEAR * abs(end - checker.t[0]):
+        unseen.append((last, end))
+    gap = max([checker.gap, *(end - start for start, end in unseen)])
+    wrong = defect > LIMIT or (error > LIMIT and t_grown == np.inf)
+    t_worst = t_worst if defect > LIMIT else t_error
+    outcome = _Outcome(defect, error, t_worst, gap, unseen, faults, wrong)
+    message = outcome.message(result)
+    if wrong or faults:
+        warnings.warn(message, CertificateWarning, stacklevel=3)
+    passed = not wrong and error <= LIMIT and not unseen and not faults
+    return Certificate(defect, t_worst, gap, LIMIT, tuple(unseen), passed, message, error, faults)
+
+
+def _local(checker: _Checker) -> tuple[float, float, list[tuple[float, float]]]:
+    """Return the largest defect, the start of its step, and the intervals that could not be verified."""
     defect, t_worst = 0.0, float(checker.t[0])
     unseen: list[tuple[float, float]] = []
     for i, j, interval_defect in checker.pieces():
@@ -110,12 +145,7 @@ def certify(result: Record, rtol: float | None, atol: ArrayLike | None) -> Certi
             unseen.append((start, float(checker.t[j])))
         elif interval_defect > defect:
             defect, t_worst = interval_defect, float(checker.t[i])
-    gap = max([checker.gap, *(end - start for start, end in unseen)])
-    passed = defect <= LIMIT and not unseen
-    message = _message(result, defect, t_worst, gap, unseen)
-    if defect > LIMIT:
-        warnings.warn(message, CertificateWarning, stacklevel=3)
-    return Certificate(defect, t_worst, gap, LIMIT, tuple(unseen), passed, message)
+    return defect, t_worst, unseen
 
 
 def _tolerances(result: Record, n_q: int, rtol: float | None, atol: ArrayLike | None) -> tuple[float, Array]:
@@ -138,20 +168,18 @@ class _Checker:
     Attributes
     ----------
     t, states : ndarray (n,), (n, 2 n_q)
-        All states known, as rows [q, v].
+        All states known, as rows [q, v], at different times.
+    every_state, place : ndarray (m, 2 n_q), (m,)
+        The same with states of equal times, and the index in `t` of each.
     gap : float
         Longest time between evaluations so far, s.
     """
 
     def __init__(self, result: Record, system: ConstrainedSystem, rtol: float, atol: Array):
         self.result, self.sol, self.system, self.rtol, self.atol = result, result.sol, system, rtol, atol
-        self.t, self.states = result.t, np.vstack([result.q, result.v]).T
-        if result.sol is not None:  # add the states at the steps
-            table = result.sol.table
-            inside = table.t <= result.sol.t_max
-            states = np.vstack([self.states, table.states[inside, : self.states.shape[1]]])
-            self.t, first = np.unique(np.append(self.t, table.t[inside]), return_index=True)
-            self.states = states[first]
+        every_t, self.every_state = all_states(result)
+        self.t, first, self.place = np.unique(every_t, return_index=True, return_inverse=True)
+        self.states = self.every_state[first]
         self.n_steps, self.untested = self._steps(result)
         self.longest = float(self.t[-1] - self.t[0]) / PIECES
         blocks = np.nan_to_num(np.abs(self.states), posinf=0.0).reshape(len(self.t), 2, len(atol))
@@ -175,11 +203,7 @@ class _Checker:
 
     def pieces(self) -> Iterator[tuple[int, int, float]]:
         """Yield first and last state of each interval and its defect; infinite if reintegration fails."""
-        i, last = 0, len(self.t) - 1
-        while i < last:
-            j = i + 1
-            while j < last and self.t[j + 1] - self.t[i] <= self.longest and self.untested[j] == self.untested[i]:
-                j += 1
+        for i, j in self._intervals():
             defect = self._defect(i, j)
             if SPLIT < defect < np.inf and j > i + 1:
                 yield from self._single_steps(i, j)
@@ -187,7 +211,67 @@ class _Checker:
                     yield i, j, defect / (j - i)
             else:
                 yield i, j, defect
+
+    def _intervals(self) -> Iterator[tuple[int, int]]:
+        """Yield first and last state of intervals that are as long as possible up to `longest`."""
+        i, last = 0, len(self.t) - 1
+        while i < last:
+            j = i + 1
+            while j < last and self.t[j + 1] - self.t[i] <= self.longest and self.untested[j] == self.untested[i]:
+                j += 1
+            yield i, j
             i = j
+
+    def errors(self) -> tuple[float, float, float]:
+        """Return the largest error of a state over the tolerance, its time, and the time from which growth explains it.
+
+        The errors are the distances from a second run, which starts from the first state and never uses another one.
+        Where none exceeds the limit, or growth does not explain it, the last number is infinite.
+        """
+        reference, tested = self._second_run(self.states[0])
+        with np.errstate(invalid="ignore"):  # states that are not finite give NaN
+            errors = np.abs(self.every_state - reference[self.place]) / self._allowed(reference[self.place])
+        n = len(self.atol)
+        errors[:, n:] *= tested[self.place, None]
+        errors[:, n:][tested[self.place] == 0.0] = 0.0
+        largest = np.nan_to_num(errors.max(axis=1), nan=0.0)  # `pieces` reports states that are not finite
+        if not largest.max() > LIMIT:
+            return float(largest.max()), float(self.t[self.place[largest.argmax()]]), np.inf
+        perturbed, _ = self._second_run(self._perturbed(0))
+        growth = np.maximum.accumulate((np.abs(perturbed - reference) / self._allowed(reference)).max(axis=1))
+        explained = largest <= CHAOTIC * growth[self.place]
+        t = self.t[self.place]
+        worst = largest.argmax()
+        if (explained | (largest <= LIMIT)).all():
+            return float(largest.max()), float(t[worst]), float(t[largest > LIMIT].min())
+        return float(largest.max()), float(t[worst]), np.inf
+
+    def _second_run(self, start: Array) -> tuple[Array, Array]:
+        """Return the states of a run from `start` at all times, and the weights of errors of velocities there.
+
+        Where it fails, e.g. near a singular position, it goes on from the stored state; `pieces` reports such places.
+        """
+        states, weights = np.empty_like(self.states), np.full(len(self.t), 1.0 / self._rate())
+        states[0] = start
+        newton = bool(self.result.stats.n_jacobians)
+        for i, j in self._intervals():
+            stiff = "positions" if self.untested[i] else "all"
+            tries = [(method, looser) for looser in (CLOSER, 1.0, *LOOSER) for method in ("explicit", stiff)]
+            for method, looser in tries:
+                rerun = self._remake(method, looser, states[i], i, j, self.t[i + 1 : j + 1])
+                if rerun is not None:
+                    break
+            states[i + 1 : j + 1] = self.states[i + 1 : j + 1] if rerun is None else rerun.states
+            if self.untested[i] and newton:
+                most = STIFF * max(j - i, int(self.n_steps[i:j].sum()))
+                resolved = rerun is not None and method == "explicit" and rerun.n_steps <= most
+                weights[i + 1 : j + 1] = 1.0 / FASTEST if resolved else 0.0
+        return states, weights
+
+    def _rate(self) -> float:
+        """Return the rate of the motion, 1/s: an error of positions makes one of velocities that is so much larger."""
+        largest = [np.abs(np.nan_to_num(x, posinf=0.0, neginf=0.0)).max() for x in (self.result.a, self.result.v)]
+        return float(np.clip(largest[0] / max(largest[1], np.finfo(float).tiny), 1.0, FASTEST))
 
     def _single_steps(self, i: int, j: int) -> Iterator[tuple[int, int, float]]:
         """Yield the same for the steps of an interval with a large defect: many small errors, or a few wrong steps."""
@@ -225,12 +309,14 @@ class _Checker:
 
     def _defect_by(self, method: str, looser: float, i: int, j: int) -> float:
         """Return the defect from state i to state j by one method, with tolerances relaxed by a factor."""
-        rerun = self._remake(method, looser, self.states[i], i, j)
+        between, end = self._check_time(i, j), float(self.t[j])
+        times = np.array([between, end] if self.t[i] < between < end else [end])
+        rerun = self._remake(method, looser, self.states[i], i, j, times)
         if rerun is None:
             return np.inf
-        end_defect = self._distance(rerun.end, self.states[j], i, j)
-        n_steps = 1 if j > i + 1 else int(self.n_steps[i])  # steps without stored states between them
-        return max(end_defect, self._deviation_between(rerun.between, i, j)) / float(np.sqrt(n_steps))
+        end_defect = self._distance(rerun.states[-1], self.states[j], i, j)
+        n_steps = 1 if j > i + 1 else max(1, int(self.n_steps[i]))  # steps without stored states between them
+        return max(end_defect, self._deviation_between(rerun.states[0], i, j)) / float(np.sqrt(n_steps))
 
     def _deviation_between(self, state: Array, i: int, j: int) -> float:
         """Return the deviation of the dense solution from a reintegrated state, divided by the tolerance."""
@@ -246,9 +332,13 @@ class _Checker:
     def _growth(self, method: str, i: int, j: int) -> float:
         """Return the factor by which an error of the size of the tolerance grows from state i to state j."""
         reference, perturbed = (
-            self._remake(method, 1.0, start, i, j) for start in (self.states[i], self._perturbed(i))
+            self._remake(method, 1.0, start, i, j, self.t[j : j + 1]) for start in (self.states[i], self._perturbed(i))
         )
-        return np.inf if reference is None or perturbed is None else self._distance(reference.end, perturbed.end, i, j)
+        return (
+            np.inf
+            if reference is None or perturbed is None
+            else self._distance(reference.states[-1], perturbed.states[-1], i, j)
+        )
 
     def _perturbed(self, i: int) -> Array:
         """Return a state on the constraints that differs from state i by about the tolerances."""
@@ -270,20 +360,22 @@ class _Checker:
             error = np.abs(state - reference) / self._allowed(reference)
         return float((error[: len(self.atol)] if self.untested[i:j].any() else error).max())
 
-    def _remake(self, method: str, looser: float, start: Array, i: int, j: int) -> RerunPiece | None:
-        """Integrate from `start` at the time of state i to state j; None if that fails."""
+    def _remake(self, method: str, looser: float, start: Array, i: int, j: int, times: Array) -> RerunPiece | None:
+        """Integrate from `start` at the time of state i to state j, landing on `times`; None if that fails."""
         key = (method, looser)
         if key not in self.remakers:
             chosen = explicit() if method == "explicit" else implicit(method == "all")
             q, v = self.states[0].reshape(2, -1).copy()
-            rtol, atol = looser * float(tighter(self.rtol)), looser * tighter(self.atol)
-            self.remakers[key] = IndependentRerun(self.system, float(self.t[0]), q, v, chosen, rtol, atol, self.longest)
+            rtol, atol = (np.maximum(looser * tighter(each), FINEST) for each in (self.rtol, self.atol))
+            self.remakers[key] = IndependentRerun(
+                self.system, float(self.t[0]), q, v, chosen, float(rtol), atol, self.longest
+            )
         remaker = self.remakers[key]
         t0, t1 = float(self.t[i]), float(self.t[j])
         max_attempts = MAX_ATTEMPTS + MAX_ATTEMPTS_PER_STEP * (
             int(self.n_steps[i:j].sum()) + int((t1 - t0) / self.longest)
         )
-        rerun = remaker.to(t0, start, self._check_time(i, j), t1, max_attempts if looser == 1.0 else MAX_ATTEMPTS)
+        rerun = remaker.to(t0, start, times, max_attempts if looser == 1.0 else MAX_ATTEMPTS)
         if rerun is not None:
             self.gap = max(self.gap, rerun.longest * remaker.spacing)
         return rerun
@@ -296,29 +388,52 @@ class _Checker:
         return float(0.5 * (self.t[k] + self.t[k + 1]))
 
 
-def _message(result: Record, defect: float, t_worst: float, gap: float, unseen: list[tuple[float, float]]) -> str:
-    """Return the outcome in words."""
-    method = result.method or "the run"
-    parts = []
-    if defect > LIMIT:
+@dataclass(frozen=True)
+class _Outcome:
+    """Outcome of the checks, and its description."""
+
+    defect: float
+    error: float
+    t: float
+    gap: float
+    unseen: list[tuple[float, float]]
+    faults: tuple[str, ...]
+    wrong: bool
+
+    def message(self, result: Record) -> str:
+        """Return the outcome in words."""
+        method = result.method or "the run"
+        parts = []
+        if self.defect > LIMIT:
+            parts.append(
+                f"Not passed: the step of {method} that starts at t = {self.t:.6g} ends {self.defect:.2g} times its "
+                f"tolerance away from the solution of the equations (limit: {LIMIT:g}). It missed a feature, or the "
+                "tolerance is not met: limit max_step, or use another method."
+            )
+        elif self.wrong:
+            parts.append(
+                f"Not passed: at t = {self.t:.6g} the state is {self.error:.2g} times the tolerance away from a second "
+                f"run from the same start (limit: {LIMIT:g}), although no step deviates more than {self.defect:.2g} "
+                "times: small errors add up. Use smaller tolerances or another method."
+            )
+        elif self.faults:
+            parts.append("Not passed.")
+        else:
+            parts.append(
+                f"{'Passed' if not self.unseen else 'Passed in part'}: reintegrated from the stored states, no part of "
+                f"the run ends more than {self.defect:.2g} times the tolerance of a step away from the next stored "
+                f"state, and a second run from the first state ends at most {min(self.error, LIMIT):.2g} tolerances "
+                f"away (limit of both: {LIMIT:g})."
+            )
+        parts.extend(f"{fault[0].upper()}{fault[1:]}." for fault in self.faults)
+        if self.unseen:
+            spans = [f"{start:.6g} to {end:.6g}" for start, end in self.unseen[:3]] + ["..."] * (len(self.unseen) > 3)
+            parts.append(
+                f"Not verified: t = {', '.join(spans)}, where reintegration failed, errors of a tolerance grow beyond "
+                "the limit, or the result has no states."
+            )
         parts.append(
-            f"Not passed: the step of {method} that starts at t = {t_worst:.6g} ends {defect:.2g} times its tolerance "
-            f"away from the solution of the equations (limit: {LIMIT:g}). It missed a feature, or the tolerance is not "
-            "met: limit max_step, or use another method."
+            f"The equations were evaluated every {self.gap:.2g} s or closer: shorter features may be missed. The model "
+            "is not certified."
         )
-    else:
-        parts.append(
-            f"{'Passed' if not unseen else 'Passed in part'}: reintegrated from the stored states, no part of the run "
-            f"ends more than {defect:.2g} times the tolerance of a step away from the next stored state (limit: "
-            f"{LIMIT:g})."
-        )
-    if unseen:
-        spans = ", ".join(f"{start:.6g} to {end:.6g}" for start, end in unseen[:3]) + (", ..." if unseen[3:] else "")
-        parts.append(
-            f"Not verified: t = {spans}, where reintegration failed, or errors grow too fast to detect a wrong step."
-        )
-    parts.append(
-        f"The equations were evaluated every {gap:.2g} s or closer: shorter features may be missed. Neither the growth "
-        "of errors over the run nor the model is certified."
-    )
-    return " ".join(parts)
+        return " ".join(parts)

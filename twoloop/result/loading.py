@@ -194,7 +194,7 @@ class SavedFields:
             self._check("atol", bool((self._finite("atol", (n_q,)) > 0.0).all()), "positive")
         self.numbers = {name: self._number(name) for name in NUMBERS if metadata.get(name) is not None}
         for name, value in self.numbers.items():
-            self._check_value(name, value >= 0.0, "a number that is not negative")
+            self._check_value(name, value >= 0.0 or name == "t_end", "a number that is not negative")
         self.rank = self._whole("rank", 0, min(n_q, n_rows), or_none=True)
         if "redundant" in arrays:
             rows = self._array("redundant", (None,), np.int64)

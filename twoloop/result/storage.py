@@ -17,7 +17,7 @@ from twoloop.run.recorder import OF_STEPS, FileStore
 FORMAT = "twoloop result 1"
 STATES = ("q", "v", "a", "lam")
 COUNTS = ("rejected_error", "rejected_convergence", "partitioned")
-NUMBERS = ("rtol", "defect", "widest_gap")  # each may be None
+NUMBERS = ("rtol", "defect", "widest_gap", "t_end")  # each may be None
 EVENT_FIELDS = ("t_events", "q_events", "v_events")
 REQUIRED = ("t", *STATES, "h")
 OPTIONAL = (*COUNTS, "redundant", "atol", "untested")

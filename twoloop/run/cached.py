@@ -237,7 +237,7 @@ class CachedIntegrator:
             record = loop.to_end(self.check_derivatives)
             if record.status >= 0 and may_have_missed_changes(run):
                 return Missed(closer(run), record.stats.cpu_time)
-            return fields_of(record, self.options, system, self.of_run[-1])
+            return fields_of(record, self.options, system, self.of_run[-1], t1)
         at_times = None
         kinds = interval_kinds(run, steps) if output.dense or output.between is not None else NO_KINDS
         if output.between is not None:
@@ -304,9 +304,12 @@ class CachedIntegrator:
         return True
 
 
-def fields_of(record: Record, options: Options, system: ConstrainedSystem, compiled: bool) -> dict[str, Any]:
+def fields_of(
+    record: Record, options: Options, system: ConstrainedSystem, compiled: bool, t_end: float
+) -> dict[str, Any]:
     """Return the fields of the result of a run that the loop integrated to its end."""
     fields = vars(record) | options.metadata | {"system": system, "atol": options.atol.copy(), "compiled": compiled}
+    fields["t_end"] = t_end
     if (own := options.own_tolerance) is not None:  # Newmark tests positions by a tolerance of its own
         fields |= {"rtol": own, "atol": np.full(system.n_q, own), "untested": np.ones(len(record.h), dtype=bool)}
     return fields
@@ -334,7 +337,7 @@ def _field(
     rank, redundant, own = of_run
     defect = float(data[loops.DEFECT]) if data[loops.CHECKED] else None
     fields = {"rank": rank, "redundant": redundant.copy(), "defect": defect, "compiled": own}
-    fields |= {"widest_gap": float(data[loops.WIDEST]), "system": system, "atol": options.atol.copy()}
+    fields |= {"widest_gap": float(data[loops.WIDEST]), "system": system, "atol": options.atol.copy(), "t_end": t1}
     t, rows = (data[loops.N_HEAD : begin], data[end:].reshape(n_states, -1)) if at_times is None else at_times
     return OTHERS | state_fields(system.n_q, t, rows) | fields | options.metadata
 

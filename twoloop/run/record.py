@@ -155,6 +155,7 @@ class Record:
     v_events: list[Array] | None = None
     defect: float | None = None
     widest_gap: float | None = None
+    t_end: float | None = None
     system: ConstrainedSystem | None = None
     method: str = ""
     compiled: bool | None = None

@@ -23,6 +23,7 @@ CHUNK = 256  # attempts at steps in one call of `advance`
 FIRST_TRY = 0.1  # relative to a piece: its first step, if no step of a piece before is known
 SHARE = 0.1  # relative to the tolerances of the run: those of the pieces ...
 FINEST = 1e-13  # ... but not below this, because of rounding
+MOST_NUMBERS = 100_000  # size of the buffer of states
 
 
 def tighter(tolerance: ArrayLike) -> Array:
@@ -42,11 +43,11 @@ def implicit(velocities: bool) -> tuple[Method, Array]:
 
 
 class RerunPiece(NamedTuple):
-    """Result of a piece: states [q, v] at a time within it and at its end, and the longest step, s."""
+    """Result of a piece: states [q, v] at the times asked for, the longest step, s, and the number of steps."""
 
-    between: Array
-    end: Array
+    states: Array
     longest: float
+    n_steps: int
 
 
 class IndependentRerun:
@@ -84,30 +85,31 @@ class IndependentRerun:
         control[a.MAX_STEP], control[a.BRIDGE], control[a.STORE_ALL] = max_step, 0.0, 0.0
         control[a.MAX_ATTEMPTS] = CHUNK
         self.run.work.notes[indices.GAMMA_REQUIRED] = np.inf  # the run has checked the accuracy of its differences
-        rows = (np.empty(len(RerunPiece._fields)), np.empty((len(RerunPiece._fields), len(self.run.state))))
+        n_rows = max(2, min(CHUNK, MOST_NUMBERS // len(self.run.state)))
+        rows = (np.empty(n_rows), np.empty((n_rows, len(self.run.state))))
         self.buffers, self.filled = (*rows, np.empty((CHUNK, a.N_STEP_COLUMNS))), np.zeros(2, dtype=np.int64)
         self.next_step = np.inf
 
-    def to(self, t0: float, state: Array, between: float, t1: float, most: int) -> RerunPiece | None:
-        """Integrate from a state [q, v] at t0; return None if t1 is not reached within `most` attempts at steps."""
+    def to(self, t0: float, state: Array, times: Array, most: int) -> RerunPiece | None:
+        """Integrate from a state [q, v] at t0 and land on `times`; return None if that takes over `most` attempts."""
         run, a, n = self.run, self.run.a, len(state)
         first_step, self.next_step = self.next_step, np.inf
         if run.restart(t0, state[: n // 2], state[n // 2 :]) != indices.DONE:
             return None
+        t1 = float(times[-1])
         run.clock[a.H_NEXT] = first_step if first_step < np.inf else FIRST_TRY * (t1 - t0)
         run.work.notes[indices.KINK_AFTER] = t1
-        times = np.array([between, t1] if t0 < between < t1 else [t1])
         found: list[Array] = []
-        longest = 0.0
+        longest, n_total = 0.0, 0
         buffers, filled = self.buffers, self.filled
-        for _ in range(0, most, CHUNK):
+        for _ in range(0, most + len(times), len(buffers[0])):
             code = run.advance(times, buffers, filled)
             n_rows, n_steps = filled.tolist()
-            found.extend(buffers[1][:n_rows, :n].copy())
-            longest = max(longest, float(buffers[2][:n_steps, a.H].max(initial=0.0)))
+            found.append(buffers[1][:n_rows, :n].copy())
+            longest, n_total = max(longest, float(buffers[2][:n_steps, a.H].max(initial=0.0))), n_total + n_steps
             if code == a.ALL_OUTPUT_DONE:
                 self.next_step = float(run.clock[a.H_NEXT])
-                return RerunPiece(found[0], found[-1], longest)
+                return RerunPiece(np.concatenate(found), longest, n_total)
             if code != a.PAUSED and not (code == a.AT_DISCONTINUITY and apply_jump(run, t1)):
                 break
         return None

@@ -1,0 +1,148 @@
+"""Check the fields of a result against the equations and against one another, for `result.certify()`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.dense import Interpolator, ranks_at
+from twoloop.run.record import Record, Status
+
+Array = NDArray[np.float64]
+
+NEAR = 1e-9  # relative to the length of the run: times that close are equal
+ROUNDING = 1e-9  # relative to the largest acceleration or multiplier: deviation attributed to rounding
+PATTERNS = 3  # number of perturbed states by which the effect of a tolerance on accelerations is measured
+
+
+def all_states(result: Record) -> tuple[Array, Array]:
+    """Return times and states [q, v] of a result: those of `t`, of its events and of the steps of its solution."""
+    times, states = [result.t], [np.vstack([result.q, result.v]).T]
+    if result.sol is not None:
+        table = result.sol.table
+        inside = table.t <= result.sol.t_max
+        times.append(table.t[inside])
+        states.append(table.states[inside, : states[0].shape[1]])
+    for t, q, v in zip(result.t_events or (), result.q_events or (), result.v_events or (), strict=True):
+        inside = t >= result.t[0]
+        times.append(t[inside])
+        states.append(np.hstack([q, v])[inside])
+    return np.concatenate(times), np.concatenate(states)
+
+
+def end_of_run(result: Record) -> float:
+    """Return the time that the run claims to have reached; -inf if it is not known."""
+    if result.status == Status.EVENT:
+        return max((float(t[-1]) for t in result.t_events or () if len(t)), default=-np.inf)
+    return -np.inf if result.t_end is None else result.t_end
+
+
+def field_faults(result: Record, system: ConstrainedSystem, rtol: float, atol: Array, limit: float) -> Iterator[str]:
+    """Yield the contradictions of a result, as clauses; errors up to `limit` tolerances are none."""
+    shapes = list(_wrong_shapes(result, system))
+    yield from shapes
+    if shapes:
+        return
+    yield from _times_and_steps(result)
+    yield from _start(result, system, rtol, atol, limit)
+    yield from _accelerations(result, system, rtol, atol, limit)
+
+
+def _wrong_shapes(result: Record, system: ConstrainedSystem) -> Iterator[str]:
+    """Yield the fields whose shapes do not fit the system and the times."""
+    n_t, n_rows = len(result.t), system.n_c + system.n_a
+    for name, n in (("q", system.n_q), ("v", system.n_q), ("a", system.n_q), ("lam", n_rows)):
+        shape = np.shape(getattr(result, name))
+        if shape != (n, n_t):
+            yield f"{name} has shape {shape} instead of {(n, n_t)}"
+
+
+def _times_and_steps(result: Record) -> Iterator[str]:
+    """Yield the contradictions between times, steps, counts and status."""
+    t, h = result.t, result.h
+    length = abs(float(t[-1] - t[0]))
+    if not (np.diff(t) >= 0.0).all():
+        yield "the times of the result do not increase"
+    if len(h) and not (np.isfinite(h).all() and (h >= 0.0).all()):
+        yield "the sizes of the steps, h, are not all positive numbers"
+    elif len(h) and h.sum() < length * (1.0 - NEAR):
+        yield f"the steps, h, add up to {h.sum():.6g} s, and the result covers {length:.6g} s"
+    n_accepted = result.stats.n_accepted
+    if len(h) and n_accepted is not None and n_accepted != len(h):
+        yield f"stats counts {n_accepted} accepted steps, and h has {len(h)}"
+    if result.status == Status.EVENT and end_of_run(result) == -np.inf:
+        yield "the status says that an event ended the run, and the result has no events"
+    if result.t_end is None:
+        return
+    near = NEAR * max(abs(result.t_end - float(t[0])), abs(result.t_end))
+    if t[-1] > result.t_end + near:
+        yield f"the result goes on to t = {t[-1]:.6g}, beyond the end of the run at t = {result.t_end:.6g}"
+    start = float(t[0]) if result.sol is None else result.sol.t_min
+    if result.status == Status.REACHED_END and len(h) and start + h.sum() < result.t_end - near:
+        yield f"the status says that the end was reached, and the steps, h, end at t = {start + h.sum():.6g}"
+
+
+def _start(result: Record, system: ConstrainedSystem, rtol: float, atol: Array, limit: float) -> Iterator[str]:
+    """Yield how the first state violates the constraints: those after it are compared with integrated states."""
+    t, q, v = float(result.t[0]), result.q[:, 0], result.v[:, 0]
+    if system.n_c + system.n_a == 0 or not np.isfinite([q, v]).all():
+        return
+    rows = np.abs(system.rows(t, q))
+    allowed_q, allowed_v = (limit * (atol + rtol * np.abs(x)) for x in (q, v))
+    off = np.abs(system.constraint(t, q))
+    if (off > rows[: system.n_c] @ allowed_q + ROUNDING).any():
+        yield f"the first state violates the constraints by {off.max():.2g}"
+    off = np.abs(system.velocity_constraint(t, q, v))
+    if (off > rows @ allowed_v + np.abs(rows).sum(axis=1) * allowed_q.max() * np.abs(v).max() + ROUNDING).any():
+        yield f"the first velocities violate the constraints by {off.max():.2g}"
+
+
+def _accelerations(result: Record, system: ConstrainedSystem, rtol: float, atol: Array, limit: float) -> Iterator[str]:
+    """Yield how a and lam deviate from those at the stored states.
+
+    They may deviate by what `limit` tolerances of the state change: measured by states that differ by a tolerance.
+    """
+    n, t = system.n_q, np.ascontiguousarray(result.t)
+    states, stored = np.vstack([result.q, result.v]).T.copy(), np.vstack([result.a, result.lam]).T
+    known = ~np.isnan(stored).all(axis=1) & np.isfinite(states).all(axis=1)
+    if not known.any():
+        return
+    t, states, stored = t[known], states[known], stored[known]
+    first = np.concatenate([states[0], np.zeros(n)])
+    ranks = ranks_at(system, float(t[0]), states[0, :n], states[0, n:], rtol)
+    interpolator = Interpolator(system, float(t[0]), first, rtol, atol, ranks)
+    interpolator.tells = False
+
+    def evaluated(times: Array, rows: Array) -> Array:
+        out = np.full(stored.shape, np.nan)
+        interpolator.complete(times, rows, out)
+        return out
+
+    exact = evaluated(t, states)
+    change = np.tile(atol, 2) + rtol * np.abs(states)
+    effect = rtol * np.abs(exact)
+    span = NEAR * float(t[-1] - t[0])
+    for k in range(PATTERNS):
+        signs = np.where((np.arange(2 * n) * (2 * k + 1)) % (k + 3) < (k + 3) / 2, 1.0, -1.0)
+        for sign in (1.0, -1.0):
+            with np.errstate(invalid="ignore"):
+                effect = np.fmax(effect, np.abs(evaluated(t + sign * span, states + sign * signs * change) - exact))
+    largest = np.nanmax(np.abs(exact), axis=0, initial=0.0)
+    blocks = np.concatenate(
+        [np.full(n, largest[:n].max(initial=0.0)), np.full(len(largest) - n, largest[n:].max(initial=0.0))]
+    )
+    allowed = limit * effect + ROUNDING * blocks
+    with np.errstate(invalid="ignore"):
+        off = np.abs(stored - exact)
+        wrong = np.isfinite(exact) & ~(off <= allowed)
+    for name, part in (("a", slice(0, n)), ("lam", slice(n, None))):
+        if wrong[:, part].any():
+            i, k = np.argwhere(wrong[:, part])[0]
+            values = stored[i, part][k], exact[i, part][k]
+            yield (
+                f"{name}[{k}] is {values[0]:.6g} at t = {t[i]:.6g}, where the equations give {values[1]:.6g} at the "
+                "stored state"
+            )
