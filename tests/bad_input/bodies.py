@@ -97,9 +97,38 @@ def two_drives():
     return model.problem()
 
 
-def half_a_turn():
+def hinged():
     model = spatial()
     model.revolute("ground", "bar", at=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0), name="hinge")
+    return model
+
+
+def sleeve():
+    model = spatial()
+    model.cylindrical("ground", "bar", at=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0), name="sleeve")
+    return model
+
+
+def loop(*points):
+    """A loop of bars between points of the ground, on pins A, B, C, ..."""
+    model, last = PlanarModel(name="loop"), len(points) - 1
+    for k in range(last):
+        model.rod(f"bar {k}", points[k], points[k + 1], mass=1.0)
+        model.revolute(f"bar {k - 1}" if k else "ground", f"bar {k}", at=points[k], name="ABCDE"[k])
+    model.revolute(f"bar {last - 1}", "ground", at=points[last], name="ABCDE"[last])
+    return model
+
+
+def four_bar(positions=None, rates=None):
+    return loop((0, 0), (0, 1), (2, 1.5), (2.5, 0)).problem(positions=positions, rates=rates)
+
+
+def five_bar(positions):
+    return loop((0, 0), (0, 1), (1, 1.8), (2, 1), (2, 0)).problem(positions=positions)
+
+
+def half_a_turn():
+    model = hinged()
     model.drive("hinge", lambda t: 2.5 + t)
     return model.problem()
 
@@ -170,6 +199,18 @@ BODIES: list[Case] = [
     of_problem("a velocity across a skate", sideways).says("do not allow the velocities given: the rate of y of sledge is given as 1", "give one along the blade"),
     of_problem("two drives that contradict", two_drives, "the motion is over-constrained", "leave one of them out"),
     of_problem("a drive that begins far away", half_a_turn).says("assembled half a turn from it", "give the bodies near to where the motion begins"),
+    of_problem("a position that a loop does not permit", lambda: four_bar({"A": 1.0, "D": 0.2})).says("do not permit 0.2 rad as the angle of D together with those of 'A'; the nearest value found is", "give one of them: the other follows"),
+    of_problem("a position of one of two cranks", lambda: five_bar({"A": 0.1})).says("do not determine the joint 'D', which has to move with those given", "give the other crank, too"),
+    of_problem("rates that do not agree", lambda: four_bar(rates={"A": 1.0, "D": 0.2})).says("do not permit 0.2 rad/s as the rate of the angle of D together", "give one of them"),
+    of_problem("a rate beside the velocity of the body", lambda: (m := planar(), m.body("arm", mass=1.0, inertia=1.0, position=(0, 0), angular_velocity=2.0), m.revolute("ground", "arm", at=(0, 0), name="j"), m.problem(rates={"j": 1.0}))).says(
+        "do not agree with the velocities given with its bodies", "give one of both"
+    ),
+    of_problem("`positions=1.0`", lambda: planar().problem(positions=1.0), "positions must be a mapping from joints", "give {joint: value}", TypeError),
+    of_problem("the position of a distance").when(lambda: (m := planar(), m.problem(positions={m.distance("bar", (0, 0), "block", (1, 0)): 1.0}))).says("positions needs a revolute or prismatic or cylindrical or screw joint", "give those of joints with a coordinate"),
+    of_problem("a position after two turns in space", lambda: hinged().problem(positions={"hinge": 13.0})).says("must be within 0.95 of a turn", "give the position within the turn"),
+    of_problem("the displacement of a hinge", lambda: hinged().joint_coordinate("hinge", "displacement")).says("'hinge', which is revolute, has the coordinates \"angle\"", "leave it out"),
+    of_problem("the coordinate of an unknown joint", lambda: hinged().problem().joint_coordinate("hing")).says("joint must be one of 'spatial model' that has a coordinate, 'hinge'; given 'hing'", "give its name"),
+    of_problem("a coordinate of a sleeve", lambda: sleeve().problem().joint_coordinate("sleeve")).says("has an angle and a displacement: say which", "give one of both"),
     of_problem("`energy` of rows", lambda: rough(1.9).energy(0.0, np.zeros((9, 6)), np.zeros((9, 6)))).says(r"q must have shape \(6,\) or \(6, n_t\); given shape \(9, 6\)", "give states as columns: q.T"),
     of_problem("an unknown parameter", lambda: rough(1.9).with_parameters({"mass of three": 1.0})).says("'arms' has no parameter 'mass of three'", "take a name from problem.parameters"),
     of_problem("a mass that becomes negative", lambda: rough(1.9).with_parameters({"mass of two": -1.0})).says("mass of two must be positive", "give a positive mass"),

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.bodies.collection import Collection, add, documented
+from twoloop.bodies.collection import add, documented
+from twoloop.bodies.coordinates import Coordinates
 from twoloop.bodies.frames import angle_of, point_of, vector_of
 from twoloop.bodies.functions import Function, RowFunction, SpringFunction, motion_function, spring_function
 from twoloop.bodies.parameter_layout import (
@@ -29,7 +30,7 @@ Row = Callable[[Any], Any]  # of the coordinates; zero where the constraint hold
 
 
 @documented
-class Loads(Collection):
+class Loads(Coordinates):
     """Adds springs, forces, motors and drives to a model."""
 
     def _drive_row(self, joint: ModelJoint, motion: Function) -> JointRow:

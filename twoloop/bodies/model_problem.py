@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.bodies import assembly
+from twoloop.bodies import assembly, joint_state
 from twoloop.bodies.assembly import Freedom, note_of
+from twoloop.bodies.coordinates import KINDS, JointCoordinate, SpatialAngle
 from twoloop.bodies.drawings import drawing_of
 from twoloop.bodies.energy import ModelEnergy
 from twoloop.bodies.functions import motion_function
+from twoloop.bodies.joint_state import Request
 from twoloop.bodies.loads import Gears
 from twoloop.bodies.parts import Body, DryFriction, ModelJoint, Numbers
 from twoloop.bodies.system import check_forces, check_loads, joints_of, system_of
@@ -24,6 +26,13 @@ from twoloop.checks.arguments import Array, check_finite, check_positive, check_
 from twoloop.problem.description import Stop
 from twoloop.problem.problem import Problem
 from twoloop.problem.system import ConstrainedSystem
+
+Given = tuple[tuple[str, str, float], ...]  # joint, "angle" or "displacement", value
+UNCOUNTED = (
+    ("revolute", "angle"),
+    ("cylindrical", "angle"),
+)  # angles in space of which a state does not know the turns
+MOST_TURNED = 0.95 * 2.0 * np.pi  # rad
 
 
 @dataclass(frozen=True)
@@ -54,8 +63,47 @@ class ModelProblem(Problem):
 
     model: Model | None = field(default=None, repr=False)
     keep: tuple[int, ...] = field(default=(), repr=False)
+    given: tuple[Given, Given] = field(default=((), ()), repr=False)  # positions and rates of joints
     freedom: Freedom = field(default_factory=lambda: Freedom(0, 0, ()))
     stops: tuple[Stop, ...] = ()
+    joint_coordinates: tuple[JointCoordinate, ...] = field(default=(), repr=False)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.system.description = replace(self.system.description, joint_coordinates=self.joint_coordinates)
+
+    def joint_coordinate(self, joint: ModelJoint | str, which: str | None = None) -> JointCoordinate:
+        """Return the angle or displacement of a joint, which gives its position and rate in states of this problem.
+
+        Parameters
+        ----------
+        joint : ModelJoint or str
+            A revolute, prismatic, cylindrical or screw joint, or its name.
+        which : str, optional
+            "angle" or "displacement" of a cylindrical or screw joint. None: the only one, or the angle of a screw.
+
+        Returns
+        -------
+        JointCoordinate
+
+        Raises
+        ------
+        ValueError
+            If there is no such coordinate.
+        """
+        name = joint.name if isinstance(joint, ModelJoint) else joint
+        own = [each for each in self.joint_coordinates if each.joint == name and which in (None, each.which)]
+        if not own:
+            names = list(dict.fromkeys(repr(each.joint) for each in self.joint_coordinates))
+            raise ValueError(
+                f"joint must be one of {self.name!r} that has {'a coordinate' if which is None else shown(which)}, "
+                f"{', '.join(names) or 'but there is none'}; given {shown(name)}"
+            )
+        if len(own) > 1 and isinstance(own[0], SpatialAngle):
+            raise ValueError(
+                f'{name!r} has an angle and a displacement: say which, as joint_coordinate({name!r}, "angle")'
+            )
+        return own[0]  # of a screw the angle
 
     def place(self, name: str) -> int:
         """Return the index of a parameter in `system.parameters`, by its name with or without the unit.
@@ -95,7 +143,7 @@ class ModelProblem(Problem):
                 f"{self.name!r} came from another process without its model, whose functions cannot travel: make it "
                 "again, or give them names at the top level of a module"
             )
-        return self.model.assemble(self.t_span, self.name, self.keep, values, self.q0)
+        return self.model.assemble(self.t_span, self.name, self.keep, values, self.q0, *self.given)
 
     def __getstate__(self) -> dict[str, Any]:
         state = dict(vars(self))
@@ -125,12 +173,19 @@ class Model(Gears):
     coordinate_names: tuple[str, ...]
 
     def problem(
-        self, t_span: tuple[float, float] = (0.0, 10.0), *, name: str | None = None, keep: Sequence[Body | str] = ()
+        self,
+        t_span: tuple[float, float] = (0.0, 10.0),
+        *,
+        name: str | None = None,
+        keep: Sequence[Body | str] = (),
+        positions: Mapping[Any, float] | None = None,
+        rates: Mapping[Any, float] | None = None,
     ) -> ModelProblem:
         """Assemble the model.
 
         Bodies whose poses do not quite fit are moved as little as possible until all joints close. Velocities given
-        with the bodies are kept; the others minimise the kinetic energy subject to the joints and drives.
+        with the bodies are kept; the others minimise the kinetic energy subject to the joints and drives. With `rates`,
+        the others minimise the rates in the other joints instead.
 
         Parameters
         ----------
@@ -140,6 +195,11 @@ class Model(Gears):
             None: the name of the model.
         keep : sequence of Body or str
             Bodies that must not move during the assembly.
+        positions, rates : mapping, optional
+            Initial angles and displacements of joints from the position given, and their rates, by the joint or its
+            name: rad, m, rad/s and m/s. The key of a coordinate of a cylindrical or screw joint is a pair, such as
+            ("sleeve", "displacement"). Joints that are not given do not move in an open chain, and move as little as
+            possible in a loop.
 
         Returns
         -------
@@ -149,8 +209,8 @@ class Model(Gears):
         Raises
         ------
         TypeError, ValueError
-            If the model has no bodies, a joint cannot close (the message names it), or the velocities given violate the
-            constraints.
+            If the model has no bodies, a joint cannot close (the message names it), the velocities given violate the
+            constraints, or positions or rates of joints cannot be reached or do not determine the others in their loop.
         """
         span = check_span(t_span)
         name = self.name if name is None else check_text("name", name)
@@ -159,7 +219,43 @@ class Model(Gears):
         if not isinstance(keep, (tuple, list)):
             raise TypeError(f"keep must be a list of bodies, or of their names; given {shown(keep)}")
         kept = tuple(j for each in keep for j in self._moving_body("keep", each).coordinates)
-        return self.assemble(span, name, kept, None, None)
+        given = tuple(self._given(*each) for each in (("positions", positions), ("rates", rates)))
+        return self.assemble(span, name, kept, None, None, *given)
+
+    def _given(self, what: str, given: Any) -> Given:
+        """Return the positions or rates of joints that are given."""
+        if given is None:
+            return ()
+        if not isinstance(given, Mapping):
+            raise TypeError(f"{what} must be a mapping from joints, or their names, to numbers; given {shown(given)}")
+        values: dict[tuple[str, str], float] = {}
+        for key, value in given.items():
+            pair = key if isinstance(key, tuple) and len(key) == 2 else (key, None)
+            joint, which = self._which(pair[0], pair[1], what)
+            if (joint.name, which) in values:
+                raise ValueError(f"{what} must have each joint once; given {joint.name!r} twice")
+            values[joint.name, which] = number = check_finite(f"{what}[{joint.name!r}]", value)
+            uncounted = self.dimension == 3 and what == "positions" and (joint.kind, which) in UNCOUNTED
+            if uncounted and abs(number) > MOST_TURNED:
+                raise ValueError(
+                    f"positions[{joint.name!r}] must be within 0.95 of a turn, {MOST_TURNED:.6g} rad, as coordinates "
+                    f"in space do not count turns; given {number!r}"
+                )
+        return tuple((*key, value) for key, value in values.items())
+
+    def _request(self, given: Given, coordinates: Sequence[JointCoordinate]) -> Request:
+        """Return which coordinates have which values, and which are not given."""
+        values = {key[:2]: key[2] for key in given}
+        chosen = [each for each in coordinates if (each.joint, each.which) in values]
+        held = {(each.joint, each.which) for each in chosen}
+        for joint in self.joints:
+            if joint.kind == "screw":  # one of both is enough
+                held |= {(joint.name, "displacement")}
+                held |= {(joint.name, "angle")} if (joint.name, "displacement") in values else set()
+        others = [each for each in coordinates if (each.joint, each.which) not in held]
+        joints = tuple(each for each in self.joints if each.kind != "drive")
+        targets = np.array([values[each.joint, each.which] for each in chosen])
+        return Request(self.name, tuple(chosen), targets, tuple(others), joints, self._turning())
 
     def assemble(
         self,
@@ -168,6 +264,8 @@ class Model(Gears):
         keep: tuple[int, ...],
         values: Mapping[str, float] | None,
         guess: Array | None,
+        placed: Given = (),
+        moving: Given = (),
     ) -> ModelProblem:
         """Assemble the model with other parameter values and a guess of the positions; see `problem`."""
         if not self.bodies:
@@ -191,9 +289,18 @@ class Model(Gears):
         closed = q = assembly.positions(still, t_span[0], start, self._turning(), keep, driveless.rows, coordinates)
         if driveless is not tables:
             q = assembly.follow_drives(system, t_span[0], q, keep)
+        measured = tuple(
+            self.coordinate_of(joint, which, tables.of) for joint in self.joints for which in KINDS.get(joint.kind, ())
+        )
+        if placed:
+            q = joint_state.positions(system, t_span[0], q, self._request(placed, measured), keep)
         self._check_branches(t_span[0], q)
         given, is_given = self._velocities(q)
-        v = assembly.velocities(system, t_span[0], q, given, is_given, coordinates)
+        if moving:
+            request = self._request(moving, measured)
+            v = joint_state.velocities(system, t_span[0], q, request, given, is_given, lambda j: coordinates[j])
+        else:
+            v = assembly.velocities(system, t_span[0], q, given, is_given, coordinates)
         check_forces(tables, t_span[0], q, v)
         freedom = assembly.freedom(system, t_span[0], q, tables.rows)
         check_loads(tables, freedom.redundant, system.force(t_span[0], q, v))
@@ -212,8 +319,10 @@ class Model(Gears):
             drawing=drawing_of(tables),
             model=self._copy(),
             keep=keep,
+            given=(placed, moving),
             freedom=freedom,
             stops=tuple(self.stops),
+            joint_coordinates=measured,
         )
 
     def mode(
@@ -285,10 +394,6 @@ class Model(Gears):
 
     def _check_branches(self, t: float, q: Array) -> None:
         """Raise if a drive starts half a turn away from its value, or a gear at another tooth."""
-
-    def _start(self) -> Array:
-        """Return the coordinates in the position given, (n_q,)."""
-        raise NotImplementedError
 
     def _velocities(self, q: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Return the velocities given, (n_q,), and a mask of those that are given."""

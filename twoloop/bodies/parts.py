@@ -151,6 +151,7 @@ class ModelJoint:
     point_a: Numbers = field(repr=False)  # in body axes
     point_b: Numbers = field(repr=False)
     axes: tuple[Array, ...] = field(default=(), repr=False)  # spatial joints: the axis in the axes of a and of b
+    pitch: float = field(default=0.0, repr=False)  # of a screw: displacement per turn, m
 
     @property
     def body(self) -> Body:

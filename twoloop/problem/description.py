@@ -112,12 +112,15 @@ class Description:
         Whether the energy is an invariant; None: not known.
     drawing : Drawing or None
         What to draw.
+    joint_coordinates : tuple of JointCoordinate
+        Angles and displacements of the joints of a model.
     """
 
     coordinates: tuple[str, ...] = ()
     energy: Callable[[Any, Any, Any], Any] | None = None
     conserved: bool | None = None
     drawing: Drawing | None = None
+    joint_coordinates: tuple[Any, ...] = ()
 
     def with_parameters(self, p: NDArray[Any]) -> Description:
         """Return the description for other parameters, without an energy or a drawing that may enclose the old ones."""

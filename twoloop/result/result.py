@@ -132,7 +132,9 @@ class Result(Record):
         -------
         pandas.DataFrame
             Indexed by "t (s)". Columns: coordinates by name, such as "x of crank (m)", their velocities "x of crank,
-            velocity (m/s)" and accelerations, the multipliers lam0, lam1, ..., and "energy (J)" if it is known.
+            velocity (m/s)" and accelerations, the multipliers lam0, lam1, ..., "energy (J)" if it is known, and in
+            models of bodies the joint coordinates "angle of hinge (rad)", counted over turns, and "angle of hinge, rate
+            (rad/s)". An angle in space is NaN from where stored times are too far apart to count its turns.
 
         Raises
         ------
@@ -144,8 +146,9 @@ class Result(Record):
     def plot(self, path: str | os.PathLike[str] | None = None) -> Any:
         """Plot the coordinates, the energy and the violation of the constraints over time; needs no display.
 
-        One panel per unit of the coordinates; the energy, minus its initial value if it is an invariant; the largest
-        violation of the position and of the velocity constraints at each time of `t`. Unknown quantities are omitted.
+        One panel per unit of the coordinates, and of the joint coordinates of a model of bodies; the energy, minus its
+        initial value if it is an invariant; the largest violation of the position and of the velocity constraints at
+        each time of `t`. Unknown quantities are omitted.
 
         Parameters
         ----------

@@ -28,6 +28,9 @@ def to_dataframe(result: Record) -> Any:
     columns |= {f"lam{k}": row for k, row in enumerate(result.lam)}
     if result.description.energy is not None:
         columns["energy (J)"] = result.energy
+    for joint in result.description.joint_coordinates:
+        columns[f"{joint.name} ({joint.unit})"] = joint.history(result)
+        columns[_derivative(f"{joint.name} ({joint.unit})", "rate", "s")] = joint.rate(result.q, result.v)
     return pandas.DataFrame(columns, index=pandas.Index(result.t, name="t (s)"))
 
 
@@ -52,14 +55,21 @@ def plot(result: Record, path: str | os.PathLike[str] | None) -> Any:
     for k, coordinate in enumerate(result.coordinates):
         units.setdefault(name_and_unit(coordinate)[1], []).append(k)
     description = result.description
-    n_panels = len(units) + (description.energy is not None) + (result.system is not None)
+    joints: dict[str, list[Any]] = {}
+    for joint in description.joint_coordinates:
+        joints.setdefault(joint.unit, []).append(joint)
+    n_panels = len(units) + len(joints) + (description.energy is not None) + (result.system is not None)
     figure = figure_class(figsize=(PANEL_WIDTH, PANEL_HEIGHT * n_panels + 0.5), layout="constrained")
     if file is not None and file.suffix and file.suffix[1:].lower() not in figure.canvas.get_supported_filetypes():
         raise ValueError(f"path must end in .png, .svg, .pdf or another format of matplotlib; given {str(path)!r}")
     panels = list(np.atleast_1d(figure.subplots(n_panels, 1, sharex=True)))
     remaining = iter(panels)
     for unit, indices in units.items():
-        _coordinates(next(remaining), result, unit, indices)
+        curves = [(name_and_unit(result.coordinates[k])[0], result.q[k]) for k in indices]
+        _curves(next(remaining), result.t, f"q ({unit})" if unit else "q", curves, "coordinates")
+    for unit, coordinates in joints.items():
+        curves = [(each.name, each.history(result)) for each in coordinates]
+        _curves(next(remaining), result.t, f"joints ({unit})", curves, "joint coordinates")
     if description.energy is not None:
         energy, panel = result.energy, next(remaining)
         panel.plot(result.t, energy - energy[0] if description.conserved else energy, color="tab:red")
@@ -74,14 +84,14 @@ def plot(result: Record, path: str | os.PathLike[str] | None) -> Any:
     return figure
 
 
-def _coordinates(panel: Any, result: Record, unit: str, indices: list[int]) -> None:
-    for k in indices:
-        panel.plot(result.t, result.q[k], lw=1.0, label=name_and_unit(result.coordinates[k])[0])
-    panel.set_ylabel(f"q ({unit})" if unit else "q")
-    if len(indices) <= MAX_LEGEND:
+def _curves(panel: Any, t: Array, label: str, curves: list[tuple[str, Array]], what: str) -> None:
+    for name, values in curves:
+        panel.plot(t, values, lw=1.0, label=name)
+    panel.set_ylabel(label)
+    if len(curves) <= MAX_LEGEND:
         panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="x-small")
     else:
-        panel.set_title(f"{len(indices)} coordinates", fontsize="x-small")
+        panel.set_title(f"{len(curves)} {what}", fontsize="x-small")
 
 
 def _violation(panel: Any, result: Record) -> None:

@@ -17,6 +17,7 @@ from twoloop.bodies.model_problem import Model
 from twoloop.bodies.parameter_layout import RATE_FUNCTION, ROW_FUNCTION
 from twoloop.bodies.parts import Body, JointRow, ModelJoint, Numbers
 from twoloop.bodies.rotation import euler_parameters, perpendiculars
+from twoloop.bodies.rotation_rates import cross, euler_product, parameters_of, spin_of
 from twoloop.checks.arguments import Array, check_positive, check_vector
 
 MOST_TEETH = 1000
@@ -74,6 +75,14 @@ class SpatialCouplings(Model):
 
         return row
 
+    def _zero(self, joint: ModelJoint) -> Array:
+        """Return the relative Euler parameters of a hinge in the position given, with the sign of the initial ones."""
+        axis_a, axis_b = joint.axes
+        zero = euler_parameters(relative(joint.a, axis_a, joint.b, axis_b))
+        e_a, e_b = (euler_parameters(body.rotation) for body in (joint.a, joint.b))
+        given = euler_product((e_a[0], *-e_a[1:]), e_b)
+        return zero if zero @ given > 0.0 else -zero
+
     def _check_branches(self, t: float, q: Array) -> None:
         """Raise if assembly has moved a gear to another tooth."""
         for joint in self.joints:
@@ -122,11 +131,8 @@ class SpatialCouplings(Model):
 
         def slip(q: Any, v: Any, along: Any) -> Any:
             cosine, size = _upright(n, d := vector_of(q, on.number, axle))
-            e, u = ([x[j] for j in on.coordinates[3:]] for x in (q, v))
-            both = _cross(e[1:], u[1:])
-            spin = [2.0 * (e[0] * u[i + 1] - u[0] * e[i + 1] + both[i]) for i in range(3)]
             arm = [-radius / size * (n[i] - cosine * d[i]) for i in range(3)]
-            turning = _cross(spin, arm)
+            turning = cross(spin_of(q, v, on.number), arm)
             return sum(along[i] * (v[on.coordinates[i]] + turning[i]) for i in range(3))
 
         columns = on.coordinates
@@ -168,25 +174,13 @@ def _rotation(q: Any, joint: ModelJoint) -> Complex:
     """Return cosine and sine of the rotation of b on a since the position given."""
     axis_a, axis_b = joint.axes
     zero = euler_parameters(relative(joint.a, axis_a, joint.b, axis_b))
-    w, *e = _product(_product(_parameters(q, joint.a, -1.0), _parameters(q, joint.b)), (zero[0], *-zero[1:]))
+    w, *e = euler_product(
+        euler_product(parameters_of(q, joint.a.number, -1.0), parameters_of(q, joint.b.number)), (zero[0], *-zero[1:])
+    )
     half = w, sum(n * x for n, x in zip(axis_a, e, strict=True))
     c, s = _times(half, half)
     size = half[0] * half[0] + half[1] * half[1]
     return c / size, s / size
-
-
-def _parameters(q: Any, body: Body, sign: float = 1.0) -> Any:
-    """Return the Euler parameters of a body, or with sign -1 those of the inverse rotation."""
-    if body.number < 0:
-        return 1.0, 0.0, 0.0, 0.0
-    w, *e = (q[j] for j in body.coordinates[3:])
-    return w, *(sign * x for x in e)
-
-
-def _product(one: Any, other: Any) -> Any:
-    from twoloop.bodies.spatial.forces import product  # compiled on import
-
-    return product.py_func(*one, *other)
 
 
 def _times(a: Complex, b: Complex) -> Complex:
@@ -215,7 +209,3 @@ def _upright(n: Any, axle: Any) -> tuple[Any, Any]:
     """Return cosine and sine of the angle between a normal and the axle."""
     cosine = sum(one * other for one, other in zip(n, axle, strict=True))
     return cosine, np.sqrt(1.0 - cosine * cosine)
-
-
-def _cross(a: Any, b: Any) -> list[Any]:
-    return [a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2] for i in range(3)]

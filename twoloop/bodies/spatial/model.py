@@ -342,13 +342,7 @@ class SpatialModel(SpatialCouplings):
         )
 
     def _torsion(self, name: str, joint: ModelJoint, numbers: Numbers) -> Force:
-        axis_a, axis_b = joint.axes
-        zero = euler_parameters(relative(joint.a, axis_a, joint.b, axis_b))
-        e_a, e_b = (euler_parameters(body.rotation) for body in (joint.a, joint.b))
-        w = e_a[0] * e_b[0] + e_a[1:] @ e_b[1:]
-        x = e_a[0] * e_b[1:] - e_b[0] * e_a[1:] - np.cross(e_a[1:], e_b[1:])
-        zero = zero if zero @ np.append(w, x) > 0.0 else -zero  # the sign of the initial Euler parameters
-        axis, start = Numbers(tuple(axis_a)), Numbers(tuple(zero))
+        axis, start = Numbers(tuple(joint.axes[0])), Numbers(tuple(self._zero(joint)))
         return Force(name, TORSION_SPRING, joint.a, joint.b, axis, start, numbers, joint=joint)
 
     def _motor(self, name: str, joint: ModelJoint, unit: str, f: Any) -> Force:

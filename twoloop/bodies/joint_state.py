@@ -1,0 +1,322 @@
+"""Assemble a model at given joint coordinates and rates.
+
+What is given becomes further rows. Of all states that satisfy these and the joints, the one is taken in which the other
+joints move least: in an open chain they do not move at all, in a loop they move as little as closing it takes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import null_space
+
+from twoloop.bodies.coordinates import TURN, JointCoordinate, velocity_apart
+from twoloop.bodies.frames import angle_of, point_of, vector_of
+from twoloop.bodies.parts import ModelJoint
+from twoloop.bodies.rotation_rates import cross, euler_product, parameters_of, spin_of
+from twoloop.checks.arguments import Array
+from twoloop.problem.system import ConstrainedSystem
+
+STEP = 0.25  # rad, or of the size of the model: first continuation step towards the positions given
+LEAST_STEP = 1e-3  # of the way: shortest continuation step
+ITERATIONS, LAST_ITERATIONS = 8, 60  # of Newton's method in each continuation step, and in the last one
+LONGEST = 0.5  # rad, or of the size of the model: longest Newton step, shorter than from one branch to another
+CONVERGED = 1e-13  # relative: a shorter Newton step is rounding
+SINGULAR = 1e-9  # singular values below this fraction of the largest count as zero
+OFF = 1e-6  # relative: largest difference from a value given, of which six digits may come from a table
+MOVES = 1e-6  # rad, or of the size of the model: smaller displacements count as none
+STIFF = 1e3  # weight of displacements of the other joints against their changes in a Newton step
+
+
+@dataclass(frozen=True)
+class Request:
+    """Hold the values given for some coordinates of joints, and the coordinates that are not given."""
+
+    name: str  # of the model
+    given: tuple[JointCoordinate, ...]
+    values: Array
+    others: tuple[JointCoordinate, ...]
+    joints: tuple[ModelJoint, ...]  # that are not drives
+    turning: NDArray[np.bool_]  # which coordinates of bodies are rotations
+
+    def scales(self, q: Array) -> tuple[Array, float]:
+        """Return the units of the coordinates of bodies, and the length among them."""
+        places = np.abs(q[~self.turning]).max(initial=0.0)
+        points = [np.abs((*each.point_a.values, *each.point_b.values)).max() for each in self.joints]
+        length = float(max(places, *points, 1e-6)) if points else float(max(places, 1.0))
+        return np.where(self.turning, 1.0, length), length
+
+
+def positions(system: ConstrainedSystem, t: float, start: Array, request: Request, keep: Sequence[int]) -> Array:
+    """Return the coordinates of the bodies at which the joints have the positions given.
+
+    `start` closes all joints; the coordinates in `keep` do not change. Raises ValueError, with the name of a joint, if
+    the joints do not permit the positions, or do not determine where the bodies are.
+    """
+    units, length = request.scales(start)
+    columns = np.where(np.isin(np.arange(system.n_q), keep), 0.0, units)
+    sizes, other_sizes = (_sizes(each, length) for each in (request.given, request.others))
+    begin, others_begin = _positions(request.given, start), _positions(request.others, start)
+
+    def solved(q: Array, target: Array, iterations: int) -> tuple[Array, float]:
+        """Return the coordinates after iterations of Newton's method, and how far they are from joints and targets."""
+        last = np.inf
+        for _ in range(iterations):
+            rows = np.vstack([system.jacobian(t, q), _gradients(request.given, q) / sizes[:, None]]) * columns
+            off = np.append(system.constraint(t, q), (_positions(request.given, q) - target) / sizes)
+            back = (others_begin - _positions(request.others, q)) / other_sizes
+            step = _least(rows, -off, _motions(request, q, length, STIFF) * columns, STIFF * back)[0]
+            step *= min(1.0, LONGEST / max(float(np.abs(step).max()), LONGEST))
+            q = q + columns * step
+            size = float(np.abs(step).max())
+            if size < CONVERGED or (size < OFF and size > 0.5 * last):  # or rounding errors are left
+                break
+            last = size
+        return q, max(_open(system, t, q) / max(1.0, length), _off(request, q, target, sizes))
+
+    carried = _carried(start, request)
+    closes = _open(system, t, carried) <= OFF * max(1.0, length) and not (carried != start)[list(keep)].any()
+    if closes and _off(request, carried, request.values, sizes) <= OFF:
+        start = carried
+    chosen = [] if start is carried else _independent(system, t, start, request, columns)
+    if 0 < len(chosen) < len(request.given):  # along a straight way to all values they contradict each other
+        given = tuple(request.given[k] for k in chosen)
+        start = positions(system, t, start, replace(request, given=given, values=request.values[chosen]), keep)
+        carried = start
+    if start is carried:
+        begin = request.values
+    q, done, part = start, 0.0, min(1.0, STEP / max(float(np.abs((request.values - begin) / sizes).max()), STEP))
+    while done < 1.0 and part > LEAST_STEP:
+        to = 1.0 if done + part > 1.0 - LEAST_STEP else done + part
+        new, left = solved(q, begin + to * (request.values - begin), ITERATIONS)
+        if left <= OFF and np.abs((new - q) / units).max() <= LONGEST:
+            q, done = new, to
+        else:  # perhaps towards another branch
+            part *= 0.5
+    reached = [_positions(request.given, q)]
+    if done == 1.0:
+        q, _ = solved(q, request.values, LAST_ITERATIONS)
+    for _ in range(ITERATIONS):  # the joints close, also where a value given has six digits
+        rows = system.jacobian(t, q) * columns
+        q = q - columns * np.linalg.lstsq(rows, system.constraint(t, q), rcond=SINGULAR)[0]
+    if not _off(request, q, request.values, sizes) <= OFF or not _open(system, t, q) <= OFF * max(1.0, length):
+        reached.append(_positions(request.given, q))
+        nearest = min(reached, key=lambda values: float(np.abs((values - request.values) / sizes).max()))
+        raise ValueError(_not_reached(request, nearest, np.abs(nearest - request.values) / sizes, "positions"))
+    moved = np.abs((_positions(request.others, q) - others_begin) / other_sizes)
+    rows = np.vstack([system.jacobian(t, q), _gradients(request.given, q) / sizes[:, None]]) * columns
+    _check_determined(request, q, rows, columns, other_sizes, moved, "positions")
+    return q
+
+
+TREE = ("revolute", "prismatic", "cylindrical", "screw", "fixed", "spherical", "universal")
+
+
+def _carried(q: Array, request: Request) -> Array:
+    """Return the coordinates after the joints of a spanning tree have moved, each carrying what follows it."""
+    steps = {
+        (each.joint, each.which): x - each.position(q) for each, x in zip(request.given, request.values, strict=True)
+    }
+    axes = {each.joint: each.axis for each in (*request.given, *request.others) if hasattr(each, "axis")}
+    width = 3 if len(request.joints[0].point_a.values) == 2 else 7
+    new = q.copy()
+    edges = [joint for joint in request.joints if joint.kind in TREE]
+    placed, waiting = {-1}, set(range(len(q) // width))
+    while waiting:
+        ends = next((x for x in edges if (x.a.number in placed) != (x.b.number in placed)), None)
+        if ends is None:  # a body that hangs on no joint, or on others only, stays
+            placed.add(min(waiting))
+            waiting.remove(min(waiting))
+            continue
+        turn, slide = (float(steps.get((ends.name, which), 0.0)) for which in ("angle", "displacement"))
+        if ends.kind == "screw":
+            turn, slide = turn + slide * TURN / ends.pitch, slide + turn * ends.pitch / TURN
+        a, b = ends.a.number, ends.b.number
+        axis = np.array(axes.get(ends.name, (0.0, 0.0) if width == 3 else (0.0, 0.0, 0.0)))
+        body = b if a in placed else a
+        new[width * body : width * (body + 1)] = _along_joint(q, new, ends, axis, turn, slide, body == a)
+        placed.add(body)
+        waiting.discard(body)
+    return new
+
+
+def _along_joint(
+    q: Array, new: Array, joint: ModelJoint, axis: Array, turn: float, slide: float, backwards: bool
+) -> Array:
+    """Return the coordinates of b after its joint on a, which is at `new`, has moved; or, backwards, those of a."""
+    a, b = joint.a.number, joint.b.number
+    on_a, on_b = (np.array(each.values) for each in (joint.point_a, joint.point_b))
+    apart = np.subtract(point_of(q, b, on_b), point_of(q, a, on_a))
+    if len(on_a) == 2:
+        angle_a, angle_b = (float(angle_of(q, body)) for body in (a, b))
+        s, c = np.sin(angle_a), np.cos(angle_a)
+        apart = np.array([c * apart[0] + s * apart[1], c * apart[1] - s * apart[0]]) + slide * axis
+        if backwards:
+            here = np.zeros(3 * (a + 1))
+            here[-1] = new[3 * b + 2] - angle_b + angle_a - turn
+            here[-3:-1] = np.subtract(point_of(new, b, on_b), vector_of(here, a, apart)) - vector_of(here, a, on_a)
+        else:
+            here = np.zeros(3 * (b + 1))
+            here[-1] = (angle_of(new, a) - angle_a) + angle_b + turn
+            here[-3:-1] = np.add(point_of(new, a, on_a), vector_of(new, a, apart)) - vector_of(here, b, on_b)
+        return here[-3:]
+    inverse = [0.0] * 7
+    inverse[3:] = parameters_of(q, a, -1.0)
+    apart = np.array(vector_of(inverse, 0, apart)) + slide * axis
+    half = 0.5 * (-turn if backwards else turn)
+    rotation = [np.cos(half), *(np.sin(half) * axis)]
+    if backwards:
+        here = np.zeros(7 * (a + 1))
+        relative = euler_product(euler_product(parameters_of(q, b, -1.0), parameters_of(q, a)), rotation)
+        here[-4:] = euler_product(parameters_of(new, b), relative)
+        here[-7:-4] = np.subtract(point_of(new, b, on_b), vector_of(here, a, apart)) - vector_of(here, a, on_a)
+    else:
+        here = np.zeros(7 * (b + 1))
+        relative = euler_product(rotation, euler_product(parameters_of(q, a, -1.0), parameters_of(q, b)))
+        here[-4:] = euler_product(parameters_of(new, a), relative)
+        here[-7:-4] = np.add(point_of(new, a, on_a), vector_of(new, a, apart)) - vector_of(here, b, on_b)
+    return here[-7:]
+
+
+def _independent(system: ConstrainedSystem, t: float, q: Array, request: Request, columns: Array) -> list[int]:
+    """Return which of the coordinates given do not follow from those before them."""
+    free = null_space(system.jacobian(t, q) * columns, rcond=SINGULAR)
+    rows = _gradients(request.given, q) * columns @ free
+    chosen: list[int] = []
+    for k in range(len(rows)):
+        if np.linalg.matrix_rank(rows[[*chosen, k]], MOVES) > len(chosen):
+            chosen.append(k)
+    return chosen
+
+
+def _open(system: ConstrainedSystem, t: float, q: Array) -> float:
+    return float(np.abs(system.constraint(t, q)).max(initial=0.0))
+
+
+def _off(request: Request, q: Array, target: Array, sizes: Array) -> float:
+    off = np.abs(_positions(request.given, q) - target) / np.maximum(sizes, np.abs(target))
+    return float(off.max()) if np.isfinite(off).all() else np.inf
+
+
+def velocities(
+    system: ConstrainedSystem,
+    t: float,
+    q: Array,
+    request: Request,
+    given: Array,
+    is_given: NDArray[np.bool_],
+    of_bodies: Callable[[int], str],
+) -> Array:
+    """Return the velocities at which the joints have the rates given, and bodies the velocities given with them.
+
+    Raises ValueError, with the name of a joint or body, if the joints do not permit them, or do not determine all.
+    """
+    units, length = request.scales(q)
+    sizes, other_sizes = (_sizes(each, length) for each in (request.given, request.others))
+    rows = np.vstack([system.rows(t, q), _gradients(request.given, q) / sizes[:, None]]) * units
+    right = np.append(-system.rates(t, q), request.values / sizes)
+    rows, right = np.vstack([rows, np.eye(system.n_q)[is_given]]), np.append(right, (given / units)[is_given])
+    motions = _motions(request, q, length, 1.0) * units
+    v, left = _least(rows, right, motions, np.zeros(len(request.others)))
+    v = v * units
+    speed = max(1.0, float(np.abs(v / units).max(initial=0.0)))
+    if left > OFF * speed:
+        reached = _gradients(request.given, q) @ v
+        off = np.abs(reached - request.values) / sizes / speed
+        of_body = np.where(is_given, np.abs(v - given) / units, 0.0)
+        if of_body.max(initial=0.0) > max(OFF * speed, 1.0 * off.max(initial=0.0) * speed):
+            j = int(of_body.argmax())
+            raise ValueError(
+                f"the rates given for joints of {request.name!r} do not agree with the velocities given with its "
+                f"bodies: the rate of {of_bodies(j)} is given as {given[j]:.6g}, and the nearest admissible value is "
+                f"{v[j]:.6g}. Give one of both"
+            )
+        raise ValueError(_not_reached(request, reached, off, "rates"))
+    moved = np.abs(_gradients(request.others, q) @ v / other_sizes)
+    _check_determined(request, q, rows, units, other_sizes, moved, "rates")
+    return np.asarray(v)
+
+
+def _not_reached(request: Request, reached: Array, off: Array, what: str) -> str:
+    """Return the message that names the joint whose value is farthest from the one given."""
+    worst = int(np.argmax(off))
+    unit = request.given[worst].unit + ("/s" if what == "rates" else "")
+    name = request.given[worst].name if what == "positions" else f"rate of the {request.given[worst].name}"
+    several = f" together with those of {_names(request, worst)}" if len(request.given) > 1 else ""
+    return (
+        f"{what} of {request.name!r}: the joints do not permit {request.values[worst]:.6g} {unit} as the "
+        f"{name}{several}; the nearest value found is {reached[worst]:.6g} {unit}. Give fewer "
+        f"{what} (those of other joints in a loop follow), or others"
+    )
+
+
+def _names(request: Request, but: int) -> str:
+    return ", ".join(repr(each.joint) for k, each in enumerate(request.given) if k != but)
+
+
+def _check_determined(
+    request: Request, q: Array, rows: Array, units: Array, sizes: Array, moved: Array, what: str
+) -> None:
+    """Raise if joints that had to move could have moved otherwise."""
+    free = null_space(rows, rcond=SINGULAR)
+    free = free[:, np.abs(free * units[:, None]).max(axis=0) > 0.0] if free.size else free
+    if not free.shape[1] or not (moved > MOVES).any():
+        return
+    could = np.abs(_gradients(request.others, q) * units / sizes[:, None] @ free).max(axis=1)
+    could = np.where(moved > MOVES, could, 0.0)
+    if could.max() > MOVES:
+        name = request.others[int(could.argmax())].joint
+        raise ValueError(
+            f"{what} of {request.name!r} do not determine the joint {name!r}, which has to move with those given but "
+            f"can move in several ways: give its {what[:-1]}, or that of another joint, too"
+        )
+
+
+def _least(rows: Array, right: Array, motions: Array, back: Array) -> tuple[Array, float]:
+    """Solve rows x = right with the least motions x - (back, 0), and then the least x; return also the residual."""
+    lengths = np.linalg.norm(rows, axis=1)
+    weights = 1.0 / np.where(lengths > 0.0, lengths, 1.0)
+    x = np.linalg.lstsq(rows * weights[:, None], right * weights, rcond=SINGULAR)[0]
+    left = float(np.abs(rows @ x - right).max(initial=0.0))
+    free = null_space(rows * weights[:, None], rcond=SINGULAR)
+    if free.shape[1]:
+        target = np.append(back, np.zeros(len(motions) - len(back)))
+        x = x + free @ np.linalg.lstsq(motions @ free, target - motions @ x, rcond=SINGULAR)[0]
+    return np.asarray(x), left
+
+
+def _sizes(coordinates: Sequence[JointCoordinate], length: float) -> Array:
+    return np.array([length if each.unit == "m" else 1.0 for each in coordinates])
+
+
+def _positions(coordinates: Sequence[JointCoordinate], q: Array) -> Array:
+    return np.array([float(each.position(q)) for each in coordinates])
+
+
+def _gradients(coordinates: Sequence[JointCoordinate], q: Array) -> Array:
+    """Return the derivatives of coordinates by those of the bodies, (n, n_q): their rates at unit velocities."""
+    unit = np.eye(len(q))
+    return np.array([each.rate(q, unit) for each in coordinates]).reshape(len(coordinates), len(q))
+
+
+def _motions(request: Request, q: Array, length: float, stiff: float) -> Array:
+    """Return the rows whose squares are minimised: rates of the other coordinates, and all motions in joints."""
+    n_q, unit = len(q), np.eye(len(q))
+    rows = [stiff * _gradients(request.others, q) / _sizes(request.others, length)[:, None]]
+    for joint in request.joints:
+        a, b = joint.a.number, joint.b.number
+        ends = [np.array(each.values) for each in (joint.point_a, joint.point_b)]
+        slip = velocity_apart(q, unit, a, ends[0], b, ends[1])
+        apart = [y - x for x, y in zip(point_of(q, a, ends[0]), point_of(q, b, ends[1]), strict=True)]
+        if len(apart) == 2:
+            turn = angle_of(unit, a) * np.ones(n_q)
+            carried, spins = [-turn * apart[1], turn * apart[0]], [angle_of(unit, b) - turn]
+        else:
+            turn_a = [x * np.ones(n_q) for x in spin_of(q, unit, a)]
+            carried = cross(turn_a, apart)
+            spins = [x - y for x, y in zip(spin_of(q, unit, b), turn_a, strict=True)]
+        rows += [(np.array(slip) - np.array(carried)) / length, np.array(spins)]
+    return np.vstack(rows)
