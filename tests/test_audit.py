@@ -93,7 +93,7 @@ class TestInMuJoCo:
         out = [str(tmp_path / name) for name in ("audit.json", "audit.csv")]
         main(["audit", str(path), "--t-end", "0.5", "--error", "1e-3", "--out", *out])
         said = capsys.readouterr().out
-        assert "Neither motion has: actuator: position." in said and 'integrator="RK4"' in said
+        assert "Neither motion has: the forces of actuators." in said and 'integrator="RK4"' in said
         known = json.loads((tmp_path / "audit.json").read_text())
         first, *_, last = known["audits"]
         assert first["floor"] > 1e-2 and first["reaching"] is None and last["reaching"]["error"] < 1e-3
@@ -142,6 +142,9 @@ class TestInMuJoCo:
             ("<worldbody>", '<worldbody><body pos="0 0 3"><freejoint/><geom type="box" size=".3 .2 .1" mass="3"/>'),
             ("</worldbody>", "</body></worldbody>"),
         ],
+        "chain": [
+            ('<joint name="pivot"/>', '<joint name="pivot" armature="0.3"/><joint axis="1 0 0" damping="0.2"/>'),
+        ],
         "polynomial": [('name="elbow"', 'name="elbow" stiffness="3 1 2" damping="0.1"')],
     }
 
@@ -157,8 +160,7 @@ class TestInMuJoCo:
             ([("<connect", '<connect active="false"')], "no loop"),
             ([('timestep="0.002"/>', 'timestep="0.002"><flag equality="disable"/></option>')], "no loop"),
             ([('timestep="0.002"/>', 'timestep="0.002"><flag constraint="disable"/></option>')], "no loop"),
-            ([("<default>", '<compiler settotalmass="5"/><default>')], "settotalmass of the compiler, which"),
-            ([('name="elbow"', 'name="elbow" springdamper="0.1 1"')], "springdamper of joint 'elbow', which"),
+            ([("</worldbody>", '<composite type="cable"/></worldbody>')], "<composite> is not read"),
             ([('timestep="0.002"', 'timestep="0.002" gravity="0 0 0"')], "nothing moves"),
             ([('name="pivot"/>', 'name="pivot" axis="0 1"/>')], "axis of joint 'pivot' must be 3"),
         ],

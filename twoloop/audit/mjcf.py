@@ -15,18 +15,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from twoloop.audit.simulator import Audit, AuditedRun, audit_simulator
-from twoloop.bodies.file_parts import IgnoredWarning
+from twoloop.bodies.file_parts import IgnoredWarning, about
 from twoloop.bodies.mjcf_reader import from_mjcf
 from twoloop.bodies.model_problem import ModelProblem
-from twoloop.bodies.rotation import euler_parameters, euler_rates
+from twoloop.bodies.rotation import euler_parameters, euler_rates, rotation_matrix
 from twoloop.bodies.spatial.model import SpatialModel
 from twoloop.checks.arguments import Array, check_positive
 from twoloop.run.projection import consistent_state
 
 # prefixes of ignored parts that can be disabled in MuJoCo
 DISABLED_PARTS = (
-    *("contacts between", "contact", "limits of", "armature of", "frictionloss of", "actuator", "sensor", "keyframe"),
-    *("gravcomp of", "stiffness and damping of joint", "equality", "tendon"),
+    *("contacts between", "contact", "limits of", "frictionloss of", "actuator", "the command of", "sensor"),
+    *("forcerange of actuator", "ctrlrange of actuator", "stiffness and damping of joint", "equality", "tendon"),
     *("density of the", "viscosity of the", "wind of the"),
 )
 DISABLE_FLAGS = ("CONTACT", "LIMIT", "FRICTIONLOSS", "ACTUATION")
@@ -67,19 +67,27 @@ class MujocoModel:
         if unsupported := [part for part in model.ignored if not part.startswith(DISABLED_PARTS)]:
             raise ValueError(
                 f"the model of rigid joints lacks {'; '.join(unsupported)}, which cannot be disabled in MuJoCo: "
-                "remove it from the file, or expand it (MuJoCo's mj_saveLastXML)"
+                "remove it from the file"
             )
         try:
             self.engine = self.mujoco.MjModel.from_xml_path(os.fspath(path))
         except ValueError as error:
             raise ValueError(f"MuJoCo rejects the file: {' '.join(str(error).split())}") from None
         self.model = model
+        model.forces = [each for each in model.forces if not any(each is other for other in model.actuators)]
         self._disable_parts()
         engine = self.engine
         self.loops = np.flatnonzero(engine.eq_active0)
-        self.bodies = np.flatnonzero(engine.body_jntnum > 0)
-        if len(self.bodies) != len(model.bodies):
-            raise ValueError(f"MuJoCo has {len(self.bodies)} bodies with joints, the model {len(model.bodies)}")
+        heavy, moving = sum(body.inertia.any() for body in model.bodies), np.flatnonzero(engine.body_jntnum > 0)
+        if len(moving) != heavy:
+            raise ValueError(f"MuJoCo has {len(moving)} bodies with joints, the model {heavy}")
+        # the body of MuJoCo for each of the model, of which massless ones move with its first joints only
+        following = np.cumsum([0, *(body.inertia.any() for body in model.bodies)])[:-1]
+        self.bodies = moving[following]
+        self.n_joints = [
+            k + 1 - int(np.flatnonzero(following == following[k])[0]) if not body.inertia.any() else 0
+            for k, body in enumerate(model.bodies)
+        ]
         if not len(self.loops):
             raise ValueError(
                 "no connect and no weld is active: the file has no loop, and the joints of a tree cannot open"
@@ -102,16 +110,17 @@ class MujocoModel:
         for name in DISABLE_FLAGS:
             engine.opt.disableflags |= getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")
         engine.opt.density = engine.opt.viscosity = 0.0
-        engine.body_gravcomp[:] = 0.0
         if engine.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_EQUALITY | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT):
             engine.eq_active0[:] = 0
-        loops = np.isin(engine.eq_type, (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD))
+        kept = [mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD]
+        kept += [mujoco.mjtEq.mjEQ_JOINT] if any(each.kind == "coupling" for each in self.model.joints) else []
+        loops = np.isin(engine.eq_type, kept)
         engine.eq_active0[~loops] = 0
         scalar_joints = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
         for k in range(engine.njnt):
             dofs = engine.dof_jntid == k
             higher = engine.jnt_stiffnesspoly[k].any() or engine.dof_dampingpoly[dofs].any()
-            if higher or engine.body_jntnum[engine.jnt_bodyid[k]] > 1 or int(engine.jnt_type[k]) not in scalar_joints:
+            if higher or (int(engine.jnt_type[k]) not in scalar_joints and engine.jnt_stiffness[k]):
                 engine.jnt_stiffness[k] = engine.jnt_stiffnesspoly[k] = 0.0
                 engine.dof_damping[dofs] = engine.dof_dampingpoly[dofs] = 0.0
         for k in range(engine.ntendon):
@@ -120,10 +129,6 @@ class MujocoModel:
             lengths = engine.tendon_lengthspring[k]
             if not sites or engine.tendon_limited[k] or lengths[0] != lengths[1]:
                 engine.tendon_stiffness[k] = engine.tendon_damping[k] = 0.0
-        if engine.dof_armature.any() or engine.tendon_armature.any():
-            engine.dof_armature[:] = 0.0
-            engine.tendon_armature[:] = 0.0
-            mujoco.mj_setConst(engine, mujoco.MjData(engine))
 
     @property
     def keyframes(self) -> list[str]:
@@ -176,13 +181,38 @@ class MujocoModel:
         for k, body in enumerate(self.bodies):
             q[k] = self._pose(data, k)
             self.mujoco.mj_jac(self.engine, data, translation, rotation, q[k, :3], body)
+            for dof in self._later_dofs(k):
+                translation[:, dof] = rotation[:, dof] = 0.0
             by_v[k, :3] = translation
             by_v[k, 3:] = np.array([euler_rates(q[k, 3:], column) for column in rotation.T]).T
         return q.reshape(-1), by_v.reshape(-1, nv)
 
     def _pose(self, data: Any, k: int) -> Array:
         R = data.xmat[self.bodies[k]].reshape(3, 3)
-        return np.append(data.xpos[self.bodies[k]] + R @ self.centres[k], euler_parameters(R))
+        if not self.n_joints[k]:
+            return np.append(data.xpos[self.bodies[k]] + R @ self.centres[k], euler_parameters(R))
+        engine, own = self.engine, self._joint(k)
+        place = data.xanchor[own].copy()
+        if engine.jnt_type[own] == self.mujoco.mjtJoint.mjJNT_SLIDE:
+            place += (data.qpos - engine.qpos0)[engine.jnt_qposadr[own]] * data.xaxis[own]
+        last = engine.body_jntadr[self.bodies[k]] + engine.body_jntnum[self.bodies[k]] - 1
+        for joint in range(last, own, -1):
+            at = engine.jnt_qposadr[joint]
+            if engine.jnt_type[joint] == self.mujoco.mjtJoint.mjJNT_HINGE:
+                R = R @ about(engine.jnt_axis[joint], engine.qpos0[at] - data.qpos[at])
+            elif engine.jnt_type[joint] == self.mujoco.mjtJoint.mjJNT_BALL:
+                R = R @ rotation_matrix(data.qpos[at : at + 4]).T
+        return np.append(place, euler_parameters(R))
+
+    def _joint(self, k: int) -> int:
+        """Return the number in MuJoCo of the joint that a massless body has."""
+        return int(self.engine.body_jntadr[self.bodies[k]]) + self.n_joints[k] - 1
+
+    def _later_dofs(self, k: int) -> list[int]:
+        """Return the velocities in MuJoCo of the joints of a body that do not move a massless one before it."""
+        engine = self.engine
+        own = engine.dof_bodyid == self.bodies[k]
+        return np.flatnonzero(own & (engine.dof_jntid > self._joint(k))).tolist() if self.n_joints[k] else []
 
     def compare(self, problem: ModelProblem, start: Array) -> None:
         """Raise ValueError if masses, forces, dampers or loops differ from those of the model of rigid joints.
@@ -486,7 +516,8 @@ def audit_mjcf(
             f"Even stiff loops with RK4 have an error of {floor:.2g}, much more than expected: neighbouring motions "
             "diverge too fast, or MuJoCo's mechanism differs from the one that was read. Do not trust this audit."
         )
-    left_out = tuple(item for item in model.ignored if not item.startswith(("sensor", "keyframe")))
+    left_out = tuple(item for item in model.ignored if not item.startswith("sensor"))
+    left_out += ("the forces of actuators",) if model.actuators else ()
     start = "the pose of the file" if key is None else f"the keyframe {key!r}"
     advice = _advice(mujoco_model, audits)
     as_it_is = _error_at_step(audits[0], mujoco_model.step)

@@ -110,6 +110,8 @@ def drawing_of(tables: Tables) -> Drawing:
 def _size(body: Body) -> Array:
     """Return the edges of the box or square with the mass and moments of inertia of a body."""
     mass, moments = body.inertia[0], body.inertia[1:4]
+    if mass == 0.0:
+        return np.zeros(len(body.position))
     if len(moments) == 1:
         return np.full(2, np.sqrt(6.0 * moments[0] / mass))
     return np.asarray(np.sqrt(np.maximum(6.0 * (moments.sum() - 2.0 * moments) / mass, 0.0)))

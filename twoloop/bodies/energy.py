@@ -46,7 +46,7 @@ class ModelEnergy:
 
     def __call__(self, t: Any, q: Array, v: Array) -> Any:
         """Evaluate the energies of one state, or of many given as columns."""
-        flat = np.asarray(q)
+        flat, flat_v = np.asarray(q), v
         n_q = self._n * (3 if self.dimension == 2 else 7)
         check_columns("q", flat, n_q)
         check_columns("v", np.asarray(v), n_q)
@@ -74,7 +74,9 @@ class ModelEnergy:
         for kind, i, at_i, j, at_j, more, first_result, on_first in self._forces:
             if first_result >= 0:  # no potential is known
                 continue
-            if kind in (layout.SPRING, layout.ZERO_LENGTH_SPRING):
+            if kind in (layout.HINGE_ROTOR, layout.SLIDE_ROTOR):
+                total += 0.5 * self.p[more] * self._rate(flat, np.asarray(flat_v), kind, i, at_i, j, at_j) ** 2
+            elif kind in (layout.SPRING, layout.ZERO_LENGTH_SPRING):
                 length = np.sqrt((between(i, at_i, j, at_j) ** 2).sum(axis=0))
                 total += 0.5 * self.p[more] * (length - (self.p[more + 2] if kind == layout.SPRING else 0.0)) ** 2
             elif kind == layout.TORSION_SPRING:
@@ -97,6 +99,33 @@ class ModelEnergy:
         first, n = head[layout.FORCES], head[layout.N_FORCES]
         table = self.p[first : first + layout.FORCE_WIDTH * n].reshape(-1, layout.FORCE_WIDTH).astype(int)
         return table.tolist()
+
+    def _rate(self, q: Array, v: Array, kind: int, i: int, at_i: int, j: int, at_j: int) -> Any:
+        """Return the rate of a joint with a rotor."""
+        if self.dimension == 2:
+            return angle_of(v, j) - angle_of(v, i)
+        from twoloop.bodies.rotation import half_spin  # compiled on import
+
+        def spin(body: int) -> Any:
+            if body < 0:
+                return np.zeros((3, *q.shape[1:]))
+            e, u = (x[7 * body + 3 : 7 * body + 7] for x in (q, v))
+            return 2.0 * on_grid(q, vector_of(q, body, half_spin.py_func(*e, *u)))
+
+        def cross(a: Any, b: Any) -> Any:
+            return np.cross(a, b, axis=0)
+
+        axis = on_grid(q, vector_of(q, i, self.p[at_i : at_i + 3]))
+        spins = spin(i), spin(j)
+        if kind == layout.HINGE_ROTOR:
+            return (axis * (spins[1] - spins[0])).sum(axis=0)
+        arm = on_grid(q, vector_of(q, j, self.p[at_j : at_j + 3]))
+        still = np.zeros((3, *q.shape[1:]))
+        (x_i, u_i), (x_j, u_j) = (
+            (still, still) if body < 0 else (q[7 * body : 7 * body + 3], v[7 * body : 7 * body + 3]) for body in (i, j)
+        )
+        speed = u_j + cross(spins[1], arm) - u_i - cross(spins[0], x_j + arm - x_i)
+        return (axis * speed).sum(axis=0)
 
     def _turned(self, q: Array, i: int, j: int, axis: int, zero: int) -> Any:
         if self.dimension == 2:

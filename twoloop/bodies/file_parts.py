@@ -49,6 +49,10 @@ class Pose:
         """Return a point of this frame in the outer one."""
         return np.asarray(self.x + self.R @ place)
 
+    def inverse(self) -> Pose:
+        """Return the pose of the outer frame in this one."""
+        return Pose(-self.R.T @ self.x, self.R.T)
+
 
 @dataclass(frozen=True)
 class Lump:
@@ -82,16 +86,41 @@ def root_of(path: str | os.PathLike[str], tag: str) -> Element:
         root = ElementTree.parse(check_path(path)).getroot()
     except ElementTree.ParseError as error:
         raise ValueError(f"{os.fspath(path)!r} is not XML: {error}") from None
+    for each in root.iter():  # without namespaces, which some exporters declare
+        if isinstance(each.tag, str):
+            each.tag = each.tag.rpartition("}")[2]
     if root.tag != tag:
         raise ValueError(f"{os.fspath(path)!r} must begin with <{tag}>; it begins with <{root.tag}>")
     return root
 
 
+# what is ignored, in the order of its effect on the motion: by the words that its name contains
+EFFECTS = (
+    ("the mass of", "compiler", "shellinertia", "armature of"),
+    ("equality", "joints of", "mimic of"),
+    ("tendon", "springdamper of", "stiffness", "damping of", "gravcomp of", "medium"),
+    ("actuator", "command", "forcerange", "ctrlrange", "transmission", "deformable", "mocap of"),
+    ("frictionloss of", "friction of"),
+    ("limits of", "safety_controller of"),
+    ("contact",),
+)
+
+
+def by_effect(ignored: list[str]) -> list[str]:
+    """Return what is ignored in the order of its effect on the motion, unknown things last."""
+
+    def effect(what: str) -> int:
+        known = (k for k, words in enumerate(EFFECTS) if any(word in what for word in words))
+        return next(known, len(EFFECTS))
+
+    return sorted(dict.fromkeys(ignored), key=effect)
+
+
 def record_ignored(path: str | os.PathLike[str], model: Any, ignored: list[str]) -> None:
     """Record in the model what was ignored in its file, and warn the caller of the caller."""
-    model.ignored = tuple(ignored)
+    model.ignored = tuple(by_effect(ignored))
     if ignored:
-        warnings.warn(f"{os.fspath(path)!r}: ignored are {'; '.join(ignored)}", IgnoredWarning, stacklevel=3)
+        warnings.warn(f"{os.fspath(path)!r}: ignored are {'; '.join(model.ignored)}", IgnoredWarning, stacklevel=3)
 
 
 def numbers(text: str, n: int, what: str) -> Array:
@@ -126,7 +155,7 @@ def _rotation(given: Mapping[str, str], what: str, unit: float, sequence: str) -
         return _of_quaternion(numbers(given["quat"], 4, f"quat of {what}"))
     if "axisangle" in given:
         *axis, angle = numbers(given["axisangle"], 4, f"axisangle of {what}")
-        return _about(np.array(axis), unit * angle)
+        return about(np.array(axis), unit * angle)
     if "xyaxes" in given:
         first, second = numbers(given["xyaxes"], 6, f"xyaxes of {what}").reshape(2, 3)
         x = first / np.linalg.norm(first)
@@ -138,11 +167,11 @@ def _rotation(given: Mapping[str, str], what: str, unit: float, sequence: str) -
         across, cosine = np.cross((0.0, 0.0, 1.0), z), z[2] / np.linalg.norm(z)
         if np.linalg.norm(across) < 1e-12 * np.linalg.norm(z):
             return np.eye(3) if cosine > 0.0 else np.diag([1.0, -1.0, -1.0])
-        return _about(across, float(np.arccos(np.clip(cosine, -1.0, 1.0))))
+        return about(across, float(np.arccos(np.clip(cosine, -1.0, 1.0))))
     if "euler" in given:
         R = np.eye(3)
         for letter, turn in zip(sequence, numbers(given["euler"], 3, f"euler of {what}"), strict=True):
-            part = _about(np.eye(3)["xyz".index(letter.lower())], unit * turn)
+            part = about(np.eye(3)["xyz".index(letter.lower())], unit * turn)
             R = R @ part if letter.islower() else part @ R  # lower case: intrinsic rotation
         return R
     return np.eye(3)
@@ -152,7 +181,8 @@ def _of_quaternion(quaternion: Array) -> Array:
     return rotation_matrix(quaternion / np.linalg.norm(quaternion))
 
 
-def _about(axis: Array, angle: float) -> Array:
+def about(axis: Array, angle: float) -> Array:
+    """Return the rotation matrix of a turn about an axis."""
     direction = axis / np.linalg.norm(axis)
     return _of_quaternion(np.append(np.cos(0.5 * angle), np.sin(0.5 * angle) * direction))
 
@@ -220,26 +250,49 @@ _VOLUMES = {"sphere": _sphere, "capsule": _capsule, "cylinder": _cylinder, "box"
 SAME = 1e-9  # tolerance of directions, and of positions in m
 
 
-@dataclass(frozen=True)
+@dataclass
 class FileJoint:
-    """A joint of MJCF: kind (hinge, slide, ball), position and axis in space, and other attributes."""
+    """A joint of MJCF or URDF: kind (hinge, slide, ball, free), position and axis in space, and other attributes.
+
+    `position` and `rate` are those of the start, from the reference pose of the file: numbers of a hinge or slide, a
+    rotation matrix and an angular velocity in body axes of a ball, a pose and both velocities of a free joint.
+    """
 
     name: str
     kind: str
     at: Array
     axis: Array
     attributes: dict[str, str]
+    position: Any = None
+    rate: Any = None
+    start_at: Array = field(default_factory=lambda: np.zeros(3))  # position and axis at the start
+    start_axis: Array = field(default_factory=lambda: np.zeros(3))
+    joint: ModelJoint | None = None  # of the model; None: the body is free
+
+    @property
+    def displacement(self) -> float:
+        """Return the angle or displacement at the start, from the reference pose."""
+        return 0.0 if self.position is None else float(self.position)
 
 
 @dataclass
 class Part:
-    """A moving body with everything fixed to it: parent, frame, joints and masses, all in space."""
+    """A moving body with everything fixed to it: parent, frame, joints and masses, all in the reference pose in space.
+
+    `start`, `velocity` and `spin` are the pose and the velocities at the start. A massless part carries one of several
+    joints of a body.
+    """
 
     name: str
     parent: Part | None
     pose: Pose
     freed: list[FileJoint] = field(default_factory=list)
     lumps: list[Lump] = field(default_factory=list)
+    massless: bool = False
+    start: Pose | None = None
+    velocity: Array = field(default_factory=lambda: np.zeros(3))
+    spin: Array = field(default_factory=lambda: np.zeros(3))
+    moves: bool = False  # a rate of this part or of a parent is given
     body: Body | None = None
 
 
@@ -250,43 +303,119 @@ def body_of(model: Any, part: Part | None) -> Body:
     return body
 
 
+def start_point(part: Part | None, point: Array) -> Array:
+    """Return a point of a part, given in the reference pose, at the start."""
+    if part is None:
+        return point
+    assert part.start is not None
+    return part.start.point(part.pose.inverse().point(point))
+
+
+def place(part: Part) -> None:
+    """Compute the pose and the velocities of a part at the start from those of its parent."""
+    still = Pose(np.zeros(3), np.eye(3))
+    outer, moving = (still, still) if part.parent is None else (part.parent.pose, part.parent.start)
+    assert moving is not None
+    inner, back = outer.inverse().then(part.pose), part.pose.inverse()
+    start = moving.then(inner)
+    spin, turned, slid = np.zeros(3), [], np.zeros(3)
+    if part.parent is not None:
+        spin, part.moves = part.parent.spin.copy(), part.parent.moves
+    for freed in part.freed:
+        local, axis = back.point(freed.at), back.R @ freed.axis
+        freed.start_at, freed.start_axis = start.point(local), start.R @ axis
+        if freed.rate is not None:
+            part.moves = True
+        if freed.kind == "free":
+            start = start if freed.position is None else freed.position
+            if freed.rate is not None:
+                slid, spin = np.array(freed.rate[:3]), start.R @ np.array(freed.rate[3:])
+        elif freed.kind == "slide":
+            start = Pose(start.x + freed.displacement * freed.start_axis, start.R)
+            slid = slid + (0.0 if freed.rate is None else float(freed.rate)) * freed.start_axis
+        else:
+            turn = about(axis, freed.displacement) if freed.kind == "hinge" else freed.position
+            R = start.R if turn is None else start.R @ turn
+            start = Pose(freed.start_at - R @ local, R)
+            if freed.rate is not None:
+                rate = R @ np.array(freed.rate) if freed.kind == "ball" else float(freed.rate) * freed.start_axis
+                spin = spin + rate
+                turned.append((rate, freed.start_at))
+    part.start, part.spin = start, spin
+    part.velocity = slid + sum((np.cross(rate, start.x - at) for rate, at in turned), np.zeros(3))
+    if part.parent is not None and part.parent.start is not None:
+        part.velocity += part.parent.velocity + np.cross(part.parent.spin, start.x - part.parent.start.x)
+
+
 def add_part(model: Any, part: Part) -> ModelJoint | None:
     """Add the body of a part and its joint to a model; return the joint, or None if the body is free."""
+    place(part)
+    assert part.start is not None
     lump = combined(part.lumps)
-    if not lump.mass > 0.0:
-        raise ValueError(f"the body {part.name!r} has joints but no mass: give it an <inertial>, or a geom with volume")
-    R = part.pose.R
-    part.body = model.body(part.name, mass=lump.mass, inertia=R.T @ lump.J @ R, position=lump.centre, rotation=R)
-    return add_joints(model, body_of(model, part.parent), part.body, part.freed)
+    R, motion = part.start.R, {}
+    if part.massless:
+        centre = part.freed[0].start_at
+        if part.moves:
+            motion = {"velocity": part.velocity + np.cross(part.spin, centre - part.start.x)}
+            motion["angular_velocity"] = part.spin
+        part.body = Body(part.name, len(model.bodies), centre, R, np.zeros(7), **motion)
+        model.bodies.append(part.body)
+    else:
+        if not lump.mass > 0.0:
+            raise ValueError(
+                f"the body {part.name!r} has joints but no mass: give it an <inertial>, or a geom with volume"
+            )
+        centre = start_point(part, lump.centre)
+        if part.moves:
+            motion = {"velocity": part.velocity + np.cross(part.spin, centre - part.start.x)}
+            motion["angular_velocity"] = part.spin
+        J = part.pose.R.T @ lump.J @ part.pose.R
+        part.body = model.body(part.name, mass=lump.mass, inertia=J, position=centre, rotation=R, **motion)
+    joint = add_joints(model, body_of(model, part.parent), part.body, part.freed)
+    for freed in part.freed:
+        freed.joint = joint
+    return joint
 
 
 def add_joints(model: Any, parent: Body, child: Body, freed: list[FileJoint]) -> ModelJoint | None:
-    """Add the joint equivalent to several MJCF joints; return it, or None if the body is free."""
-    kinds = sorted(each.kind for each in freed)
-    slid = np.array([each.axis for each in freed if each.kind == "slide"])
-    if len(slid) > 1 and np.linalg.svd(slid, compute_uv=False)[-1] < SAME:
-        raise ValueError(f"the slides of the body {child.name!r} must have axes that do not follow from one another")
-    if kinds in (["free"], ["ball", "slide", "slide", "slide"]):
+    """Add the joint equivalent to several joints of a file; return it, or None if the body is free."""
+    kind, name, first = counterpart(freed), freed[0].name, freed[0]
+    if kind == "free":
         return None
+    at, axis = first.start_at, first.start_axis
+    if kind == "spherical":
+        return model.spherical(parent, child, at=at, name=name)
+    if kind == "universal":
+        return model.universal(parent, child, at=at, axes=[each.start_axis for each in freed], name=name)
+    if kind in ("cylindrical", "planar"):
+        hinge = next(each for each in freed if each.kind == "hinge")
+        at, axis = hinge.start_at, hinge.start_axis
+    return getattr(model, kind)(parent, child, at=at, axis=axis, name=name)
+
+
+def counterpart(freed: list[FileJoint]) -> str:
+    """Return the kind of joint of a model that has the freedoms of several joints of a file, or "" if there is none."""
+    kinds = sorted(each.kind for each in freed)
+    single = {"free": "free", "ball": "spherical", "hinge": "revolute", "slide": "prismatic"}
+    if len(kinds) == 1:
+        return single.get(kinds[0], "")
+    if kinds == ["ball", "slide", "slide", "slide"]:
+        return "free"
     hinges, slides = ([each for each in freed if each.kind == kind] for kind in ("hinge", "slide"))
-    name, first = freed[0].name, freed[0]
-    if kinds == ["ball"]:
-        return model.spherical(parent, child, at=first.at, name=name)
-    if kinds == ["hinge"]:
-        return model.revolute(parent, child, at=first.at, axis=first.axis, name=name)
-    if kinds == ["slide"]:
-        return model.prismatic(parent, child, at=first.at, axis=first.axis, name=name)
     if kinds == ["hinge", "slide"] and _parallel(hinges[0], slides[0]):
-        return model.cylindrical(parent, child, at=hinges[0].at, axis=hinges[0].axis, name=name)
+        return "cylindrical"
     if kinds == ["hinge", "hinge"] and _across(*hinges) and np.abs(hinges[0].at - hinges[1].at).max() < SAME:
-        return model.universal(parent, child, at=first.at, axes=[each.axis for each in hinges], name=name)
+        return "universal"
     if kinds == ["hinge", "slide", "slide"] and all(_across(hinges[0], slide) for slide in slides):
-        return model.planar(parent, child, at=hinges[0].at, axis=hinges[0].axis, name=name)
-    raise ValueError(
-        f"the joints of the body {child.name!r} ({', '.join(each.kind for each in freed)}) have no counterpart in a "
-        "model: one hinge, slide or ball; a slide and a hinge along one axis; two hinges that cross at right angles; "
-        "two slides and a hinge across both; all six. Put a body with mass between them"
-    )
+        return "planar"
+    return ""
+
+
+def check_slides(body: str, freed: list[FileJoint]) -> None:
+    """Raise if the axes of slides of one body are linearly dependent."""
+    slid = np.array([each.axis for each in freed if each.kind == "slide"])
+    if len(slid) > 1 and (len(slid) > 3 or np.linalg.svd(slid, compute_uv=False)[-1] < SAME):
+        raise ValueError(f"the slides of the body {body!r} must have axes that do not follow from one another")
 
 
 def _parallel(a: FileJoint, b: FileJoint) -> bool:

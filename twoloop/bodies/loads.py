@@ -17,7 +17,9 @@ from twoloop.bodies.parameter_layout import (
     AXIAL_SPRING,
     FORCE,
     HINGE_FRICTION,
+    HINGE_ROTOR,
     ROW_FUNCTION,
+    SLIDE_ROTOR,
     SPRING,
     TORQUE,
     ZERO_LENGTH_SPRING,
@@ -287,6 +289,27 @@ class Loads(Coordinates):
         moved = self._joint(joint, ("revolute", "prismatic"), "motor")
         name = self._new_name(f"motor of {moved.name}", name)
         return add(self.forces, self._motor(name, moved, "N m" if moved.kind == "revolute" else "N", f))
+
+    def rotor(self, joint: ModelJoint | str, inertia: float, *, name: str | None = None) -> Force:
+        """Add the inertia of a motor's rotor to a revolute joint, or in space to a prismatic joint.
+
+        The kinetic energy grows by inertia / 2 times the square of the rate of the joint. This is the armature of
+        MuJoCo.
+
+        Parameters
+        ----------
+        joint : ModelJoint or str
+        inertia : float
+            kg m^2, or kg for a prismatic joint: the moment of inertia of the rotor times the square of the gear ratio.
+        """
+        kinds = ("revolute",) if self.dimension == 2 else ("revolute", "prismatic")
+        moved = self._joint(joint, kinds, "rotor")
+        name = self._new_name(f"rotor of {moved.name}", name)
+        turns = moved.kind == "revolute"
+        unit = "kg m^2" if turns else "kg"
+        numbers = Numbers((check_not_negative("inertia", inertia),), (f"inertia of {name} ({unit})",))
+        ends = self._motor(name, moved, "", 0.0)
+        return add(self.forces, replace(ends, kind=HINGE_ROTOR if turns else SLIDE_ROTOR, more=numbers))
 
     def drive(
         self,

@@ -1,8 +1,10 @@
-"""Read models from MJCF, the format of MuJoCo: bodies, hinges, slides, balls; loops closed by connect and weld."""
+"""Read models from MJCF, the format of MuJoCo: bodies, joints, masses; loops and loads are read by `mjcf_loads`."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
 
@@ -14,43 +16,69 @@ from twoloop.bodies.file_parts import (
     Part,
     Pose,
     add_part,
-    body_of,
+    check_slides,
+    combined,
+    counterpart,
     geom_lump,
     numbers,
     pose_of,
     record_ignored,
-    root_of,
     tensor_of,
     text_of,
 )
-from twoloop.bodies.parts import Body, ModelJoint
+from twoloop.bodies.meshes import fitted, mesh_lump, mesh_triangles
+from twoloop.bodies.mjcf_expand import compiler_of, expanded
+from twoloop.bodies.mjcf_loads import ACTUATORS, Loads, actuator_law
 from twoloop.bodies.spatial.model import SpatialModel
-from twoloop.checks.arguments import Array
+from twoloop.checks.arguments import Array, check_flag
 
 SEEN_ONLY = {"asset", "visual", "statistic", "size", "custom", "camera", "light"}  # without effect on the motion
-KNOWN = {"compiler", "option", "default", "worldbody", "equality", "tendon"}
-SOFT = ("armature", "frictionloss")
-DEFAULT_OF = {"spatial": "tendon", "fixed": "tendon", "connect": "equality", "weld": "equality"}  # elements of defaults
+KNOWN = {"compiler", "option", "default", "worldbody", "equality", "tendon", "actuator", "keyframe"}
+DEFAULT_OF = {"spatial": "tendon", "fixed": "tendon"} | dict.fromkeys(("connect", "weld"), "equality")
 TURNS = {"quat", "axisangle", "xyaxes", "zaxis", "euler"}  # alternative orientations of an element
-AGREES = 1e-6  # tolerance of the pose that a weld prescribes
+INERT = {"armature", "stiffness", "damping", "frictionloss", "springdamper"}  # what needs the coordinate of a joint
+FITTED = ("sphere", "capsule", "cylinder", "box", "ellipsoid")
+UNWEIGHED = ("plane", "hfield", "sdf")
 
 
-def from_mjcf(path: str | os.PathLike[str]) -> SpatialModel:
-    """Read a model from an MJCF file, in the reference pose of the file (qpos0).
+def from_mjcf(
+    path: str | os.PathLike[str],
+    *,
+    key: str | int | None = None,
+    commands: Mapping[str, Any] | None = None,
+    limits: bool = False,
+) -> SpatialModel:
+    """Read a model from an MJCF file, in the reference pose of the file (qpos0) or in a keyframe.
 
-    The reader supports bodies with inertials or with masses from their geoms; hinge, slide, ball and free joints, and
-    the combinations for which `SpatialModel` has a joint; stiffness, damping, ref and springref of hinges and slides;
-    the equalities connect and weld, which are exact here and soft in MuJoCo; tendons between two sites as springs; and
-    gravity. Bodies without joints are merged with their parents.
+    The reader supports
+
+    - included files, frames, replicates, default classes and the settings of the compiler;
+    - bodies with inertials, or with masses of their geoms and of meshes in STL, OBJ and MSH files;
+    - hinge, slide, ball and free joints, any number to a body: where a model has no joint with the same freedoms,
+      massless bodies carry one joint each;
+    - armature, stiffness, damping, springref; frictionloss, for `solve_with_friction`;
+    - the equalities connect and weld, which are exact here and soft in MuJoCo, and joint equalities;
+    - tendons between two sites as springs, gravcomp, and gravity;
+    - position, velocity, motor and general actuators of hinges and slides.
+
+    Bodies without joints are merged with their parents.
 
     Parameters
     ----------
     path : path-like
+    key : str or int, optional
+        Keyframe, by its name or its number from 0, whose qpos, qvel and ctrl are the start.
+    commands : mapping, optional
+        Commands (ctrl) of actuators, by their names: numbers, or functions of t. Default: those of the keyframe, or
+        zero. In the parameters of the problem, the command of a position servo is its "angle of NAME (rad)" or
+        "length of NAME (m)"; that of another actuator is "value of NAME", which includes its gain.
+    limits : bool
+        If True, limits of slides, and of hinges if the model supports these, become stops, for `solve_with_stops`.
 
     Returns
     -------
     SpatialModel
-        `model.ignored` lists what was ignored: contacts, limits, actuators, armatures, ...
+        `model.ignored` lists what was ignored, by its effect on the motion: masses, equalities, ..., contacts.
 
     Warns
     -----
@@ -59,8 +87,8 @@ def from_mjcf(path: str | os.PathLike[str]) -> SpatialModel:
 
     Raises
     ------
-    ValueError
-        If the file is not MJCF, includes other files, or has joints or welds that a model does not support.
+    TypeError, ValueError
+        If the file is not MJCF, has joints or welds that a model does not support, or an argument is invalid.
 
     Notes
     -----
@@ -88,24 +116,25 @@ def from_mjcf(path: str | os.PathLike[str]) -> SpatialModel:
     >>> model.problem((0.0, 1.0)).freedom.degrees
     1
     """
-    root = root_of(path, "mujoco")
-    reader = _Reader(root)
+    check_flag("limits", limits)
+    reader = _Reader(path, key, dict(commands or {}), limits)
     reader.read()
     record_ignored(path, reader.model, reader.ignored)
     return reader.model
 
 
 class _Reader:
-    def __init__(self, root: Element):
-        self.root, self.ignored = root, list[str]()
-        compiler = {key: value for each in root.findall("compiler") for key, value in each.attrib.items()}
+    def __init__(self, path: str | os.PathLike[str], key: Any, commands: dict[str, Any], limits: bool):
+        self.root, self.ignored = expanded(path), list[str]()
+        root = self.root
+        compiler = self.compiler = compiler_of(root)
         self.degrees, self.sequence = compiler.get("angle", "degree") == "degree", compiler.get("eulerseq", "xyz")
         self.from_geoms = compiler.get("inertiafromgeom", "auto")
-        for key in ("settotalmass", "balanceinertia", "boundmass", "boundinertia", "alignfree"):
-            if compiler.get(key, "0") not in ("0", "-1", "false"):
-                self.ignored.append(f"{key} of the compiler")
-        if compiler.get("inertiagrouprange", "0 5").split() != ["0", "5"]:
-            self.ignored.append("inertiagrouprange of the compiler")
+        groups = compiler.get("inertiagrouprange", "0 5").split()
+        self.groups = range(int(groups[0]), int(groups[1]) + 1)
+        folder = compiler.get("meshdir", compiler.get("assetdir", ""))
+        self.folder = Path(path).parent / folder
+        self.strip = compiler.get("strippath", "false") == "true"
         if compiler.get("coordinate", "local") != "local":
             raise ValueError("coordinates of an MJCF file must be local; global ones were dropped by MuJoCo in 2.3.4")
         self.defaults: dict[str, dict[str, dict[str, str]]] = {"main": {}}
@@ -114,132 +143,205 @@ class _Reader:
         gravity = np.array([0.0, 0.0, -9.81])
         for each in root.findall("option"):
             gravity = numbers(each.get("gravity", "0 0 -9.81"), 3, "gravity") if each.get("gravity") else gravity
-            for key in ("density", "viscosity", "wind"):
-                if any(float(x) for x in each.get(key, "0").split()):
-                    self.ignored.append(f"{key} of the surrounding medium")
+            for name in ("density", "viscosity"):
+                if any(float(x) for x in each.get(name, "0").split()):
+                    self.ignored.append(f"{name} of the surrounding medium")
         flags = {
-            key: value for flag in root.findall("option/flag") for key, value in flag.attrib.items()
+            name: value for flag in root.findall("option/flag") for name, value in flag.attrib.items()
         }  # the last one counts
-        disabled = {key for key, value in flags.items() if value == "disable"}
-        gravity = np.zeros(3) if "gravity" in disabled else gravity
-        self.without_loops = bool(disabled & {"constraint", "equality"})
-        self.without = {"stiffness"} if "spring" in disabled else set()
-        self.without |= {"damping"} if "damper" in disabled else set()
-        self.without |= {"stiffness", "damping"} if "passive" in disabled else set()  # one flag, before MuJoCo 3.4
+        self.disabled = {name for name, value in flags.items() if value == "disable"}
+        gravity = np.zeros(3) if "gravity" in self.disabled else gravity
+        self.without = {"stiffness"} if "spring" in self.disabled else set()
+        self.without |= {"damping"} if "damper" in self.disabled else set()
+        self.without |= {"stiffness", "damping"} if "passive" in self.disabled else set()  # one flag, before 3.4
+        self.without |= {"frictionloss"} if self.disabled & {"frictionloss", "constraint"} else set()
         self.model = SpatialModel(gravity, name=root.get("model", "MuJoCo Model"))
         self.frames: dict[str, tuple[Part | None, Pose]] = {"world": (None, Pose(np.zeros(3), np.eye(3)))}
         self.sites: dict[str, tuple[Part | None, Array]] = {}
+        self.joints: dict[str, FileJoint] = {}  # by their names in the file
+        self.ordered: list[FileJoint] = []  # as in qpos
         self.parts: list[Part] = []
-        self.n_geoms = 0
+        self.gravcomp: list[tuple[Part | None, Lump, float, str]] = []
+        self.meshes: dict[str, Element] = {}
+        for asset in root.findall("asset"):
+            for mesh in asset.findall("mesh"):
+                self.meshes[mesh.get("name", Path(mesh.get("file", "")).stem)] = mesh
+        self.triangles: dict[str, Array | None] = {}
+        self.n_geoms, self.n_bodies, self.total = 0, 0, 0.0
         self.taken = {"ground", *(each.get("name", "") for each in root.iter("body"))}
+        acting = [each for tag in ("equality", "actuator", "tendon") for group in root.findall(tag) for each in group]
+        self.referred = {
+            value for each in acting for part in each.iter() for name, value in part.attrib.items() if "joint" in name
+        }
+        self.key, self.commands, self.limits = key, commands, limits and "limit" not in self.disabled
 
     def read(self) -> None:
         """Read the whole file."""
         for each in self.root:
-            if each.tag == "include":
-                raise ValueError(
-                    f"the file includes {each.get('file')!r}; write all into one file (MuJoCo saves such a one)"
-                )
             if each.tag not in SEEN_ONLY | KNOWN:
-                self.ignored += [f"{each.tag}: {_called(part)}" for part in each] or [each.tag]
+                self.ignored += [f"{each.tag}: {called(part)}" for part in each] or [each.tag]
         for each in self.root.findall("worldbody"):
             self._within(each, None, Pose(np.zeros(3), np.eye(3)), "main")
+        total = float(self.compiler.get("settotalmass", -1.0))
+        scale = total / self.total if total > 0.0 and self.total > 0.0 else 1.0
+        loads = Loads(self)
+        loads.start(self.key)
         for part in self.parts:
-            self._add(part)
-        for each in self.root.findall("equality"):
-            for equality in each:
-                self._equality(equality)
-        for each in self.root.findall("tendon"):
-            for tendon in each:
-                self._tendon(tendon)
-        if self.n_geoms > 1:
+            part.lumps = [Lump(scale * each.mass, each.centre, scale * each.J) for each in part.lumps]
+            add_part(self.model, part)
+        loads.read(scale)
+        if self.n_geoms > 1 and not self.disabled & {"contact", "constraint"}:
             self.ignored.append("contacts between geoms")
 
     def _default(self, element: Element, name: str, inherited: dict[str, dict[str, str]]) -> None:
         name = element.get("class", name)
         merged = {tag: dict(values) for tag, values in inherited.items()}
         for each in element:
-            if each.tag != "default":
+            if each.tag in ACTUATORS:
+                merged["actuator"] = actuator_law(each.tag, merged.get("actuator", {}), each.attrib)
+            elif each.tag != "default":
                 merged[each.tag] = _merged(merged.get(each.tag, {}), each.attrib)
         self.defaults[name] = merged
         for each in element.findall("default"):
             self._default(each, name, merged)
 
-    def _attributes(self, element: Element, childclass: str) -> dict[str, str]:
+    def attributes(self, element: Element, childclass: str) -> dict[str, str]:
+        """Return the attributes of an element with those of its default class."""
         name = element.get("class", childclass)
         if name not in self.defaults:
-            raise ValueError(f"{_called(element)} is of the class {name!r}, which no default has")
+            raise ValueError(f"{called(element)} is of the class {name!r}, which no default has")
+        if element.tag in ACTUATORS:
+            return actuator_law(element.tag, self.defaults[name].get("actuator", {}), element.attrib)
         given = _merged(self.defaults[name].get(DEFAULT_OF.get(element.tag, element.tag), {}), element.attrib)
         return {key: value for key, value in given.items() if key not in self.without}
 
-    def _pose(self, attributes: dict[str, str], what: str) -> Pose:
+    def pose(self, attributes: Mapping[str, str], what: str) -> Pose:
+        """Return the pose of an element in that around it."""
         return pose_of(attributes, what, self.degrees, self.sequence)
 
     def _within(self, element: Element, part: Part | None, pose: Pose, childclass: str) -> None:
         """Read the children of a body, or of the world."""
+        contents = self._contents(element, childclass)
+        inertial = next((each for each, _, _ in contents if each.tag == "inertial" and self.from_geoms != "true"), None)
+        weigh = element.tag == "body" and inertial is None and self.from_geoms != "false"  # mass from the geoms
         lumps: list[Lump] = []
-        inertial = element.find("inertial") if self.from_geoms != "true" else None
-        weigh = part is not None and inertial is None and self.from_geoms != "false"  # mass from the geoms
-        for each in element:
-            given = self._attributes(each, childclass)
+        for each, frame, name in contents:
+            given = self.attributes(each, name)
             if each.tag == "body":
-                self._body(each, part, pose, each.get("childclass", childclass))
+                self._body(each, part, pose.then(frame), each.get("childclass", name))
             elif each.tag == "geom":
-                lump = self._geom(given, _called(each), weigh)
-                lumps += [] if lump is None else [lump]
+                lump = self._geom(given, called(each), weigh)
+                lumps += [] if lump is None or not weigh else [lump.transformed(frame)]
             elif each.tag == "site":
                 if "fromto" in given:
-                    ends = numbers(given["fromto"], 6, f"fromto of {_called(each)}")
+                    ends = numbers(given["fromto"], 6, f"fromto of {called(each)}")
                     given["pos"] = text_of(0.5 * (ends[:3] + ends[3:]))
-                place = pose.point(self._pose(given, _called(each)).x)
-                self.sites[each.get("name", f"site {len(self.sites)}")] = part, place
-            elif each.tag in ("frame", "replicate", "attach", "composite", "flexcomp"):
-                raise ValueError(f"<{each.tag}> is not read; MuJoCo saves a file in which it is written out")
+                place = pose.then(frame).then(self.pose(given, called(each)))
+                self.sites[each.get("name", f"site {len(self.sites)}")] = part, place.x
+                self.frames[f"site {each.get('name', len(self.sites))}"] = part, place
+            elif each is inertial:
+                lumps = [self._inertial(each, element.get("name", "?")).transformed(frame)]
+            elif each.tag in ("attach", "composite", "flexcomp"):
+                raise ValueError(
+                    f"<{each.tag}> is not read: load the file in MuJoCo and save it, where bodies are written out "
+                    "(mujoco.mj_saveLastXML), and remove what is deformable"
+                )
             elif each.tag not in SEEN_ONLY | {"inertial", "joint", "freejoint"}:
-                self.ignored.append(_called(each))
-        if not weigh:
-            lumps = [] if inertial is None else [self._inertial(inertial, element.get("name", "?"))]
-        if part is not None:
-            part.lumps += [lump.transformed(pose) for lump in lumps]
+                self.ignored.append(called(each))
+        if element.tag == "body":
+            lump = self._bounded(combined(lumps))
+            self.total += lump.mass
+            gravcomp = float(element.get("gravcomp", 0.0))
+            if part is not None:
+                part.lumps.append(lump.transformed(pose))
+                if gravcomp and lump.mass:
+                    self.gravcomp.append((part, part.lumps[-1], gravcomp, element.get("name", "body")))
+
+    def _contents(self, element: Element, childclass: str) -> list[tuple[Element, Pose, str]]:
+        """Return the children of a body and of its frames, each with the pose of its frame and its class."""
+        contents: list[tuple[Element, Pose, str]] = []
+        for each in element:
+            if each.tag != "frame":
+                contents.append((each, Pose(np.zeros(3), np.eye(3)), childclass))
+                continue
+            outer = self.pose(each.attrib, called(each))
+            within = self._contents(each, each.get("childclass", childclass))
+            contents += [(child, outer.then(inner), name) for child, inner, name in within]
+        return contents
+
+    def _bounded(self, lump: Lump) -> Lump:
+        """Return a mass with the bounds that the compiler sets."""
+        least, least_moment = (float(self.compiler.get(key, 0.0)) for key in ("boundmass", "boundinertia"))
+        balance = self.compiler.get("balanceinertia", "false") == "true"
+        if not (least or least_moment or balance):
+            return lump
+        moments, axes = np.linalg.eigh(lump.J)
+        moments = np.maximum(moments, least_moment)
+        if balance and moments[0] + moments[1] < moments[2]:
+            moments = np.full(3, moments.mean())
+        return Lump(max(lump.mass, least), lump.centre, axes @ np.diag(moments) @ axes.T)
 
     def _body(self, element: Element, parent: Part | None, outer: Pose, childclass: str) -> None:
-        name = element.get("name", f"body {len(self.frames)}")
+        self.n_bodies += 1
+        name = element.get("name", f"body {self.n_bodies}")
         name = "ground of the file" if name == "ground" else name  # "ground" is reserved
-        pose, part = outer.then(self._pose(dict(element.attrib), f"body {name!r}")), parent
-        for key in ("mocap", "gravcomp"):
-            if element.get(key, "0") not in ("0", "false"):
-                self.ignored.append(f"{key} of body {name!r}")
-        joints = [each for each in element if each.tag in ("joint", "freejoint")]
-        if joints:
-            part = Part(name, parent, pose)
-            self.parts.append(part)
-            for each in joints:
-                part.freed.append(self._joint(each, pose, childclass, name, len(part.freed)))
+        pose, part = outer.then(self.pose(element.attrib, f"body {name!r}")), parent
+        if element.get("mocap", "false") != "false":
+            self.ignored.append(f"mocap of body {name!r}")
+        moved: list[FileJoint] = []
+        for each, frame, class_name in self._contents(element, childclass):
+            if each.tag in ("joint", "freejoint"):
+                moved.append(self._joint(each, pose.then(frame), class_name, name, len(moved)))
+        if moved:
+            part = self._chain(name, parent, pose, moved)
         self.frames[element.get("name", name)] = part, pose
         self._within(element, part, pose, childclass)
 
+    def _chain(self, name: str, parent: Part | None, pose: Pose, moved: list[FileJoint]) -> Part:
+        """Return the part of a body, behind massless ones that carry its first joints if no single joint has all."""
+        check_slides(name, moved)
+        plain = not any(self._has_coordinate(each) for each in moved)
+        kind = counterpart(moved)
+        if len(moved) > 1 and (not kind or not (plain or kind == "free")):
+            if any(each.kind == "free" for each in moved):
+                raise ValueError(f"the body {name!r} must have no other joint beside its free one")
+            for each in moved[:-1]:
+                own = self.free(None, f"{name} after {each.name}")
+                parent = Part(own, parent, pose, [each], massless=True)
+                self.parts.append(parent)
+            moved = moved[-1:]
+        part = Part(name, parent, pose, moved)
+        self.parts.append(part)
+        return part
+
+    def _has_coordinate(self, joint: FileJoint) -> bool:
+        """Return True if something acts on the coordinate of a joint, which must then be that of a joint of its own."""
+        acting = any(any(float(x) for x in joint.attributes.get(key, "0").split()) for key in INERT)
+        return acting or joint.attributes.get("name") in self.referred or (self.limits and self.limited(joint))
+
+    def limited(self, joint: FileJoint) -> bool:
+        """Return True if a joint has limits."""
+        limited = joint.attributes.get("limited", "auto")
+        automatic = self.compiler.get("autolimits", "true") == "true"
+        return limited == "true" or (limited == "auto" and automatic and "range" in joint.attributes)
+
     def _joint(self, element: Element, pose: Pose, childclass: str, body: str, number: int) -> FileJoint:
-        given = self._attributes(element, childclass)
-        name = self._free(element.get("name"), f"joint of {body}" if number == 0 else f"joint {number + 1} of {body}")
+        given = {} if element.tag == "freejoint" else self.attributes(element, childclass)
+        name = self.free(element.get("name"), f"joint of {body}" if number == 0 else f"joint {number + 1} of {body}")
         kind = "free" if element.tag == "freejoint" else given.get("type", "hinge")
-        limited = given.get("limited", "auto")
-        if kind != "free" and (limited == "true" or (limited == "auto" and "range" in given)):
-            self.ignored.append(f"limits of joint {name!r}")
-        self._soft(given, f"joint {name!r}")
-        if "springdamper" in given and any(float(x) for x in given["springdamper"].split()):
-            self.ignored.append(f"springdamper of joint {name!r}")
+        if kind not in ("hinge", "slide", "ball", "free"):
+            raise ValueError(f"type of joint {name!r} must be hinge, slide, ball or free; given {kind!r}")
         axis = numbers(given.get("axis", "0 0 1"), 3, f"axis of joint {name!r}")
         if not axis.any():
             raise ValueError(f"axis of joint {name!r} must have a direction; given {given['axis']!r}")
         place = numbers(given.get("pos", "0 0 0"), 3, f"pos of joint {name!r}")
-        return FileJoint(name, kind, pose.point(place), pose.R @ axis / np.linalg.norm(axis), given)
+        joint = FileJoint(name, kind, pose.point(place), pose.R @ axis / np.linalg.norm(axis), given)
+        self.ordered.append(joint)
+        if element.get("name"):
+            self.joints[element.attrib["name"]] = joint
+        return joint
 
-    def _soft(self, given: dict[str, str], what: str) -> None:
-        for key in SOFT:
-            if any(float(x) for x in given.get(key, "0").split()):
-                self.ignored.append(f"{key} of {what}")
-
-    def _free(self, name: str | None, default: str) -> str:
+    def free(self, name: str | None, default: str) -> str:
         """Return an unused name; in MJCF a body, a joint and a tendon may share one."""
         name = default if name is None else name
         while name in self.taken:
@@ -248,16 +350,43 @@ class _Reader:
         return name
 
     def _geom(self, given: dict[str, str], what: str, weighs: bool) -> Lump | None:
+        """Return the mass of a geom in the frame of its body; None: it has none, or is unknown."""
         if float(given.get("contype", 1)) or float(given.get("conaffinity", 1)):
             self.n_geoms += 1
-        if given.get("shellinertia", "false") == "true" and weighs:
-            self.ignored.append(f"shellinertia of {what}")
-        kind = "mesh" if "mesh" in given else given.get("type", "sphere")  # else fitted to the mesh
-        lump = geom_lump(given, what, self.degrees, self.sequence) if kind != "mesh" else None
         weighs = weighs and float(given.get("mass", given.get("density", 1.0))) > 0.0
-        if lump is None and weighs and kind not in ("plane", "hfield"):
+        kind = given.get("type", "sphere")
+        if not weighs or int(float(given.get("group", 0))) not in self.groups or kind in UNWEIGHED:
+            return None
+        if given.get("shellinertia", "false") == "true":
+            self.ignored.append(f"shellinertia of {what}")
+        if kind != "mesh" and "mesh" not in given:
+            return geom_lump(given, what, self.degrees, self.sequence)
+        triangles, legacy = self._mesh(given.get("mesh", ""), what)
+        if triangles is None:
             self.ignored.append(f"the mass of {what}, which is a {kind}")
-        return lump
+            return None
+        pose, lump = self.pose(given, what), mesh_lump(triangles, legacy)
+        if kind in FITTED:
+            by_box = self.compiler.get("fitaabb", "false") == "true"
+            size, inner = fitted(triangles, legacy, kind, by_box)
+            own = {name: given[name] for name in ("mass", "density") if name in given}
+            at_origin = geom_lump(own | {"type": kind, "size": text_of(size)}, what, True, "xyz")
+            return None if at_origin is None else at_origin.transformed(pose.then(inner))
+        mass = float(given["mass"]) if "mass" in given else float(given.get("density", 1000.0)) * lump.mass
+        return Lump(mass, lump.centre, mass / lump.mass * lump.J).transformed(pose) if lump.mass else None
+
+    def _mesh(self, name: str, what: str) -> tuple[Array | None, bool]:
+        """Return the triangles of a mesh, and whether its pyramids are added up with positive volumes."""
+        if name not in self.meshes:
+            return None, True
+        given = self.attributes(self.meshes[name], "main")
+        if self.strip and "file" in given:
+            given["file"] = Path(given["file"]).name
+        if name not in self.triangles:
+            kinds = ("legacy", "convex", "exact")
+            readable = given.get("inertia", "legacy") in kinds
+            self.triangles[name] = mesh_triangles(given, self.folder, f"mesh {name!r}") if readable else None
+        return self.triangles[name], given.get("inertia", "legacy") == "legacy"
 
     def _inertial(self, element: Element, body: str) -> Lump:
         what = f"inertial of body {body!r}"
@@ -268,116 +397,22 @@ class _Reader:
             J = tensor_of(*numbers(given["fullinertia"], 6, f"fullinertia of {what}"))
         else:
             J = np.diag(numbers(given.get("diaginertia", ""), 3, f"diaginertia of {what}"))
-        return Lump(float(given["mass"]), np.zeros(3), J).transformed(self._pose(given, what))
+        return Lump(float(given["mass"]), np.zeros(3), J).transformed(self.pose(given, what))
 
-    def _add(self, part: Part) -> None:
-        """Add the body and the joint of a part."""
-        joint = add_part(self.model, part)
-        for freed in part.freed:
-            self._springs(freed, joint)
-
-    def _of(self, part: Part | None) -> Body:
-        return body_of(self.model, part)
-
-    def _springs(self, freed: FileJoint, joint: ModelJoint | None) -> None:
-        """Add the spring and damper of a joint; it is unstressed at springref, and the pose of the file is ref."""
-        stiffness, damping = (freed.attributes.get(key, "0").split() for key in ("stiffness", "damping"))
-        if not any(float(x) for x in (*stiffness, *damping)):
-            return
-        if joint is None or joint.kind not in ("revolute", "prismatic") or len(stiffness) > 1 or len(damping) > 1:
-            self.ignored.append(f"stiffness and damping of joint {freed.name!r}")
-            return
-        unit = np.pi / 180.0 if self.degrees and freed.kind == "hinge" else 1.0
-        rest = unit * (float(freed.attributes.get("springref", 0.0)) - float(freed.attributes.get("ref", 0.0)))
-        k, c = float(stiffness[0]), float(damping[0])
-        if joint.kind == "revolute":
-            self.model.torsion_spring(joint, stiffness=k, damping=c, angle=rest)
-        else:
-            self.model.axial_spring(joint, stiffness=k, damping=c, length=rest)
-
-    def _equality(self, element: Element) -> None:
-        given = self._attributes(element, "main")
-        if self.without_loops or given.get("active", "true") == "false":
-            return
-        if element.tag not in ("connect", "weld"):
-            self.ignored.append(f"equality: {_called(element)}")
-            return
-        if "site1" in given and element.tag == "weld":
-            raise ValueError(f"{_called(element)} between sites is not read; give bodies")
-        if "site1" in given:
-            (part_1, point_1), (part_2, point_2) = (self._site(given[key]) for key in ("site1", "site2"))
-            body_1, body_2 = self._of(part_1), self._of(part_2)
-            at: Any = body_1.point(*body_1.local_point(point_1)), body_2.point(*body_2.local_point(point_2))
-        else:
-            frames = [self._frame(given[key]) if key in given else self.frames["world"] for key in ("body1", "body2")]
-            body_1, body_2 = (self._of(part_1) for part_1, _ in frames)
-            if element.tag == "connect":
-                at = frames[0][1].point(numbers(given.get("anchor", ""), 3, f"anchor of {_called(element)}"))
-        if element.tag == "connect":
-            self.model.spherical(body_1, body_2, at=at, name=self._name_of(element, given, body_1, body_2))
-            return
-        if float(given.get("torquescale", 1.0)) == 0.0:
-            raise ValueError(
-                f"torquescale of {_called(element)} must not be zero: give a connect where bodies may turn"
-            )
-        wanted = numbers(given.get("relpose", "0 1 0 0 0 0 0"), 7, f"relpose of {_called(element)}")
-        if wanted[3:].any():
-            pose = pose_of({"pos": text_of(wanted[:3]), "quat": text_of(wanted[3:])}, _called(element), True, "xyz")
-            asked = frames[0][1].then(pose)
-            off = max(np.abs(asked.x - frames[1][1].x).max(), np.abs(asked.R - frames[1][1].R).max())
-            if off > AGREES:
-                raise ValueError(
-                    f"relpose of {_called(element)} must be the one that the bodies have; it is off by {off:.3g}"
-                )
-        self.model.fixed(body_1, body_2, name=self._name_of(element, given, body_1, body_2))
-
-    def _name_of(self, element: Element, given: dict[str, str], body_1: Body, body_2: Body) -> str:
-        return self._free(given.get("name"), f"{element.tag} of {body_1.name} and {body_2.name}")
-
-    def _tendon(self, element: Element) -> None:
-        given = self._attributes(element, "main")
-        rest = given.get("springlength", "-1").split()
-        stiffness, damping = (given.get(key, "0") for key in ("stiffness", "damping"))
-        plain = element.tag == "spatial" and [each.tag for each in element] == ["site", "site"]
-        plain &= len(stiffness.split()) == 1 == len(damping.split())
-        if not plain or len(rest) != 1 or given.get("limited", "false") == "true" or "range" in given:
-            self.ignored.append(f"tendon: {_called(element)}")
-            return
-        self._soft(given, _called(element))
-        (part_1, point_1), (part_2, point_2) = (self._site(each.get("site", "")) for each in element)
-        length = None if float(rest[0]) < 0.0 else float(rest[0])
-        if length is None and float(stiffness) and (moved := self._away(part_1) or self._away(part_2)):
-            raise ValueError(
-                f"{_called(element)} needs a springlength: MuJoCo takes that which it has where joints are at their "
-                f"springref, and that of {moved!r} is not its ref"
-            )
-        body_1, body_2 = self._of(part_1), self._of(part_2)
-        name = self._free(given.get("name"), f"spring of {body_1.name} and {body_2.name}")
-        values: dict[str, Any] = {"stiffness": float(stiffness), "damping": float(damping), "length": length}
-        self.model.spring(body_1, point_1, body_2, point_2, name=name, **values)
-
-    def _away(self, part: Part | None) -> str:
-        """Return the name of a joint between a part and the ground whose springref differs from its ref, or ""."""
-        while part is not None:
-            for freed in part.freed:
-                spring, given = (float(freed.attributes.get(key, 0.0)) for key in ("springref", "ref"))
-                if freed.kind in ("hinge", "slide") and spring != given:
-                    return freed.name
-            part = part.parent
-        return ""
-
-    def _site(self, name: str) -> tuple[Part | None, Array]:
+    def site(self, name: str) -> tuple[Part | None, Array]:
+        """Return the part and the position of a site."""
         if name not in self.sites:
             raise ValueError(f"the site {name!r} is not in the file")
         return self.sites[name]
 
-    def _frame(self, name: str) -> tuple[Part | None, Pose]:
+    def frame(self, name: str) -> tuple[Part | None, Pose]:
+        """Return the part and the frame of a body."""
         if name not in self.frames:
             raise ValueError(f"the body {name!r} is not in the file")
         return self.frames[name]
 
 
-def _merged(inherited: dict[str, str], own: dict[str, str]) -> dict[str, str]:
+def _merged(inherited: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:
     """Merge attributes of an element into its defaults; they have one orientation, and the last sizes stay."""
     kept = {key: value for key, value in inherited.items() if key not in TURNS or not own.keys() & TURNS}
     sizes = own.get("size", "").split()
@@ -385,5 +420,6 @@ def _merged(inherited: dict[str, str], own: dict[str, str]) -> dict[str, str]:
     return {**kept, **own, **({"size": " ".join(sizes)} if sizes else {})}
 
 
-def _called(element: Element) -> str:
+def called(element: Element) -> str:
+    """Return an element as messages name it."""
     return f"{element.tag} {element.get('name')!r}" if element.get("name") else element.tag

@@ -386,6 +386,8 @@ class Model(Gears):
     def _check_inertias(self, tables: Tables) -> None:
         for body in self.bodies:
             place = tables.places[f"mass of {body.name} (kg)"]
+            if not body.inertia.any() and not tables.p[place : place + len(body.inertia)].any():
+                continue  # a massless body of a file, whose joints determine its motion
             check_positive(f"mass of {body.name}", float(tables.p[place]))
             self._check_moments(body.name, tables.p[place + 1 : place + len(body.inertia)])
 

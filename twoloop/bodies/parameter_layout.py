@@ -26,5 +26,7 @@ POINT, PERPENDICULAR, PLANE, LENGTH, ANGLE_DRIVE = range(5)
 # kinds of forces in both: between two points; in a hinge, on a body; about and along an axis of body i
 SPRING, ZERO_LENGTH_SPRING, TORSION_SPRING, FORCE, TORQUE = range(5)
 AXIAL_TORQUE, AXIAL_FORCE, AXIAL_SPRING, HINGE_FRICTION, AXIAL_FRICTION = range(5, 10)
+# inertias of rotors, which add to the mass matrix, see `rotors`
+HINGE_ROTOR, SLIDE_ROTOR = range(10, 12)
 
 PLANAR_BODY, SPATIAL_BODY = 2, 7  # numbers of a body: mass, moment of inertia; mass, J_xx, J_yy, J_zz, J_xy, J_xz, J_yz

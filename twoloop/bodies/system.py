@@ -120,6 +120,7 @@ def _friction(c: Array, loads: list[Array]) -> Array:
     return f
 
 
+ROTORS = layout.HINGE_ROTOR, layout.SLIDE_ROTOR
 KINDS = ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")
 OF_JOINTS = ("constraint", "jacobian", "gamma")
 QUIET = np.errstate(divide="ignore", invalid="ignore")  # reported by name later
@@ -166,8 +167,11 @@ def system_of(
         return ConstrainedSystem.from_python(**options)
     kinds += ["kinematics"] if tables.n_rows and dimension == 2 else []
     if n_q >= LARGE and tables.n_rows:
-        kinds += ["mass_values", "jacobian_values"]
-        options |= {f"{kind}_entries": entries for kind, entries in entries_of(dimension, tables).items()}
+        entries = entries_of(dimension, tables)
+        if any(force.kind in ROTORS for force in tables.forces):
+            del entries["mass"]  # rotors couple bodies
+        kinds += [f"{kind}_values" for kind in entries]
+        options |= {f"{kind}_entries": places for kind, places in entries.items()}
     callbacks_by_kind = {kind: _callback(dimension, kind, tables) for kind in kinds}
     return ConstrainedSystem(**options, constant_mass=dimension == 2, **callbacks_by_kind)
 

@@ -13,8 +13,10 @@ from twoloop.bodies.parameter_layout import (
     AXIAL_SPRING,
     AXIAL_TORQUE,
     HINGE_FRICTION,
+    HINGE_ROTOR,
     NONE,
     RATE_FUNCTION,
+    SLIDE_ROTOR,
     SPRING,
     TORQUE,
     TORSION_SPRING,
@@ -104,7 +106,9 @@ class Tables:
                 numbers = numbers[1:2]  # the damping
             elif force.kind in (HINGE_FRICTION, AXIAL_FRICTION):
                 numbers = numbers[[0, *range(2, len(numbers))]]
-            if force.function is not None or (force.kind != ZERO_LENGTH_SPRING and numbers.any()):
+            if force.kind in (ZERO_LENGTH_SPRING, HINGE_ROTOR, SLIDE_ROTOR):
+                continue
+            if force.function is not None or numbers.any():
                 return False
         return all(is_constant(motion) for motion in self.motions)
 
@@ -119,7 +123,7 @@ class Tables:
                 what = name.split(" of ")[0]
                 if what == "speed" or (what == "length" and not rail):
                     check_positive(name, value)
-                elif what in ("stiffness", "damping") or rubs:
+                elif what in ("stiffness", "damping", "inertia") or rubs:
                     check_not_negative(name, value)
 
     def replaced(self, values: Mapping[str, float]) -> None:

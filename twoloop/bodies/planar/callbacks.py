@@ -13,6 +13,7 @@ from twoloop.bodies import read_tables as tables
 from twoloop.bodies.planar.frames import add, angle_of, direction, motion, place, turn
 from twoloop.bodies.program_results import result
 from twoloop.bodies.read_tables import fill_entries, put_entries
+from twoloop.bodies.rotors import put_planar_rotors
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
 
@@ -146,6 +147,8 @@ def fill_force(q, v, p, results, Q):
         Q[3 * body + 1] += mass * p[1]
     for k in tables.force_places(p):
         kind, i, at_i, j, at_j, more, first_result, point_i = tables.force_at(p, k)
+        if kind == layout.HINGE_ROTOR:
+            continue
         if kind in (layout.TORQUE, layout.TORSION_SPRING, layout.HINGE_FRICTION):
             rate = angle_of(v, j) - angle_of(v, i)
             if kind == layout.TORSION_SPRING:
@@ -238,6 +241,7 @@ def mass(t, q, p, M):
         at = WEIGHT + layout.PLANAR_BODY * body
         M[3 * body, 3 * body] = M[3 * body + 1, 3 * body + 1] = p[at]
         M[3 * body + 2, 3 * body + 2] = p[at + 1]
+    put_planar_rotors(p, M)
 
 
 @callback("mass_values", allocates=False)

@@ -16,6 +16,7 @@ import numpy as np
 from twoloop.bodies import parameter_layout as layout
 from twoloop.bodies.program_results import result
 from twoloop.bodies.read_tables import fill_entries, joint_at, joint_places, n_bodies, put_entries
+from twoloop.bodies.rotors import put_spatial_rotors
 from twoloop.bodies.spatial.forces import (
     WEIGHT,
     dot,
@@ -195,6 +196,7 @@ def fill_mass(q, p, body, M, first):
 def mass(t, q, p, M):
     for body in range(n_bodies(p)):
         fill_mass(q, p, body, M, 7 * body)
+    put_spatial_rotors(q, p, M)
 
 
 @callback("mass_values")

@@ -9,6 +9,7 @@ import math
 from twoloop.bodies import parameter_layout as layout
 from twoloop.bodies.read_tables import force_at, force_places, force_value, joint_force, n_bodies, spring_tension
 from twoloop.bodies.rotation import half_spin, pulled, rotated, rotated_rate, turned
+from twoloop.bodies.rotors import put_spatial_rotor_force
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.data.common import exact, inlined
 
@@ -234,6 +235,9 @@ def put_forces(q, v, p, results, Q):
     """Add springs, motors, friction, given forces and torques."""
     for k in force_places(p):
         kind, i, at_i, j, at_j, more, first_result, point_i = force_at(p, k)
+        if kind in (layout.HINGE_ROTOR, layout.SLIDE_ROTOR):
+            put_spatial_rotor_force(q, v, p, k, Q)
+            continue
         if kind in (layout.TORQUE, layout.FORCE):
             x, y = force_value(p, more, results, first_result, 0), force_value(p, more, results, first_result, 1)
             f = x, y, force_value(p, more, results, first_result, 2)

@@ -97,6 +97,8 @@ class SpatialModel(SpatialCouplings):
         The parts added so far.
     ignored : tuple of str
         Parts of a file that were ignored, see `from_mjcf`.
+    actuators : tuple of Force
+        Motors and springs that were read from the actuators of a file.
 
     Raises
     ------
@@ -115,6 +117,7 @@ class SpatialModel(SpatialCouplings):
 
     dimension = 3
     ignored: tuple[str, ...] = ()  # parts of a file without a counterpart
+    actuators: tuple[Force, ...] = ()  # forces of the actuators of a file
     coordinate_names = ("x (m)", "y (m)", "z (m)", "e0 (-)", "e1 (-)", "e2 (-)", "e3 (-)")
     distance_kind = LENGTH
 
