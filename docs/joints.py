@@ -128,6 +128,28 @@ PLANAR = (
         ({"b": (0.9, 0.0, 0.0)}, {"b": (0.0, 0.0, 0.5, 0.0, 0.25)}),
         lines=(np.column_stack([x := np.linspace(-1.2, 1.2, 100), 0.25 * np.cos(3.0 * x)]),),
     ),
+    Kind(
+        "Rope",
+        "A rope of constant length through points of bodies, here over two small pulleys of the ground.",
+        'model.rope([("a", (-0.5, -0.5)), ("ground", (-0.5, 0.5)), ("ground", (0.5, 0.5)), ("b", (0.5, -0.5))])',
+        {"a": [rectangle(-0.5, -0.6, 0.3, 0.2)], "b": [rectangle(0.5, -0.6, 0.3, 0.2)]},
+        ({"a": (0.0, 0.5, 0.0), "b": (0.0, -0.5, 0.0)},),
+        (
+            ("a", (-0.5, -0.5), "ground", (-0.5, 0.5)),
+            ("ground", (-0.5, 0.5), "ground", (0.5, 0.5)),
+            ("ground", (0.5, 0.5), "b", (0.5, -0.5)),
+        ),
+    ),
+    Kind(
+        "Coupling",
+        "A function of the coordinates of joints that stays zero, here of the angles of two hinges.",
+        'model.revolute("ground", "a", at=(-0.6, 0.0), name="one")\n'
+        'model.revolute("ground", "b", at=(0.6, 0.0), name="other")\n'
+        'model.coupling(["one", "other"], lambda x, y: y - 2.0 * x)',
+        {"a": [bar((-0.6, 0.0), (-0.1, 0.0))], "b": [bar((0.6, 0.0), (1.1, 0.0))]},
+        ({"a": (0.0, 0.0, 0.4, -0.6, 0.0), "b": (0.0, 0.0, 0.8, 0.6, 0.0)},),
+        only_forth=True,
+    ),
 )
 
 SPATIAL = (
@@ -250,6 +272,74 @@ SPATIAL = (
         ({"b": (0.9, 0.0, 0.0, 0.0, 0.9 / 0.4, 0.0)},),
         only_forth=True,
         below=True,
+    ),
+    Kind(
+        "Rolling ball",
+        "A ball that rolls on a plane of a body without slipping: non-holonomic.",
+        'model.rolling_ball("b", radius=0.3, foot=(0.0, 0.0, -0.3))',
+        {
+            "ground": box((0.4, 0.0, -0.35), (2.2, 1.2, 0.06)),
+            "b": [*box((0, 0, 0), (0.6, 0.05, 0.05)), *ball((0, 0, 0), 0.3)],
+        },
+        ({"b": (0.9, 0.0, 0.0, 0.0, 0.9 / 0.3, 0.0)},),
+        only_forth=True,
+        below=True,
+    ),
+    Kind(
+        "Screw",
+        "A thread: b slides along an axis of a in proportion to its rotation.",
+        'model.screw("ground", "b", at=(0.0, 0.0, 0.0), axis=(1.0, 0.0, 0.0), pitch=1.5)',
+        {"ground": tube((-1.1, 0, 0), (1.1, 0, 0), 0.12), "b": box((0.0, 0.0, 0.0), (0.4, 0.5, 0.5))},
+        ({"b": (1.5 * 0.4, 0.0, 0.0, 2.0 * np.pi * 0.4, 0.0, 0.0)},),
+    ),
+    Kind(
+        "Point on a line",
+        "A point of b stays on a line of a, as a pin in a straight slot.",
+        'model.point_on_line("ground", "b", at=(0.0, 0.0, 0.0), axis=(1.0, 0.0, 0.0))',
+        {
+            "ground": [*box((0.0, 0.12, 0.0), (2.2, 0.12, 0.12)), *box((0.0, -0.12, 0.0), (2.2, 0.12, 0.12))],
+            "b": [
+                *box((0.0, 0.0, 0.0), (0.24, 0.05, 0.05)),
+                *ball((0, 0, 0), 0.11),
+                *box((0.0, 0.0, 0.45), (0.12, 0.12, 0.7)),
+            ],
+        },
+        ({"b": (0.7, 0.0, 0.0, 0.0, 0.0, 0.0)}, {"b": (0.0, 0.0, 0.0, 0.0, 0.6, 0.0)}),
+    ),
+    Kind(
+        "Point on a curve",
+        "A point of b stays on a curve of a, where two functions are zero, or on a surface, where one is.",
+        "curve = lambda x, y, z: (y, z - 0.25 * np.cos(3.0 * x))\n"
+        'model.point_on_curve("ground", "b", at=(0.0, 0.0, 0.25), curve=curve)',
+        {
+            "ground": [x for k in range(-11, 12) for x in ball((0.1 * k, 0.0, 0.25 * np.cos(0.3 * k)), 0.04)],
+            "b": [*ball((0, 0, 0.25), 0.09), *box((0.0, 0.0, 0.65), (0.1, 0.1, 0.7))],
+        },
+        ({"b": (0.8, 0.0, 0.0, 0.0, 0.0, 0.0)},),
+    ),
+    Kind(
+        "Rope",
+        "A rope of constant length through points of bodies, here over two small pulleys of the ground.",
+        "x, z = 0.5, 0.5\n"
+        'over = [("a", (-x, 0.0, -z)), ("ground", (-x, 0.0, z)), ("ground", (x, 0.0, z)), ("b", (x, 0.0, -z))]\n'
+        "model.rope(over)",
+        {"a": box((-0.5, 0.0, -0.6), (0.3, 0.3, 0.2)), "b": box((0.5, 0.0, -0.6), (0.3, 0.3, 0.2))},
+        ({"a": (0.0, 0.0, 0.5, 0.0, 0.0, 0.0), "b": (0.0, 0.0, -0.5, 0.0, 0.0, 0.0)},),
+        (
+            ("a", (-0.5, 0.0, -0.5), "ground", (-0.5, 0.0, 0.5)),
+            ("ground", (-0.5, 0.0, 0.5), "ground", (0.5, 0.0, 0.5)),
+            ("ground", (0.5, 0.0, 0.5), "b", (0.5, 0.0, -0.5)),
+        ),
+    ),
+    Kind(
+        "Coupling",
+        "A function of the coordinates of joints that stays zero, here of a slide and a hinge.",
+        'model.prismatic("ground", "a", at=(-0.6, 0.0, 0.0), axis=(1.0, 0.0, 0.0), name="slide")\n'
+        'model.revolute("ground", "b", at=(0.6, 0.0, 0.0), axis=(0.0, 0.0, 1.0), name="hinge")\n'
+        'model.coupling(["slide", "hinge"], lambda x, angle: angle - 2.0 * x)',
+        {"a": box((-0.6, 0.0, 0.0), (0.4, 0.3, 0.3)), "b": box((0.9, 0.0, 0.0), (0.7, 0.16, 0.16))},
+        ({"a": (0.3, 0.0, 0.0, 0.0, 0.0, 0.0), "b": (0.0, 0.0, 0.0, 0.0, 0.0, 0.6, 0.6, 0.0, 0.0)},),
+        only_forth=True,
     ),
 )
 

@@ -349,7 +349,7 @@ def test_the_page_of_joints_shows_every_joint():
         methods = inspect.getmembers(model, inspect.isfunction)
         joints = {name for name, method in methods if inspect.signature(method).return_annotation == "ModelJoint"}
         shown = set(re.findall(r"model\.(\w+)\(", text))
-        assert {name for name in joints if name[0] != "_"} - {"drive"} == shown
+        assert {name for name in joints if name[0] != "_"} - {"drive", "drive_point"} == shown
     assert "With it, the body has 1 degree of freedom" in plane
     assert "With it, the body has 5 degrees of freedom" in space
 

@@ -103,6 +103,12 @@ def hinged():
     return model
 
 
+def particle():
+    model = planar()
+    model.particle("bob", mass=1.0, position=(2.0, 0.0))
+    return model
+
+
 def sleeve():
     model = spatial()
     model.cylindrical("ground", "bar", at=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0), name="sleeve")
@@ -193,6 +199,23 @@ BODIES: list[Case] = [
     of_spatial("`to_mjcf(3)`", lambda: spatial().to_mjcf(3)).says("path must be a file name or a path; given 3", "give the name of a file", TypeError),
     of_files("`from_mjcf(3)`", lambda: from_mjcf(3)).says("path must be a file name or a path; given 3", "give the name of a file", TypeError),
     of_files("`from_urdf(None)`", lambda: from_urdf(None)).says("path must be a file name or a path; given None", "give the name of a file", TypeError),
+    of_planar("a torque on a particle", lambda: particle().torque("bob", 1.0)).says("a torque on 'bob' has no effect, as a particle does not turn", "let it act on a body"),
+    of_planar("a particle fixed to a body", lambda: particle().fixed("bar", "bob")).says("'bob' is a particle, which does not turn: a fixed joint would keep 'bar' from turning", "use revolute(...), or add the mass to the body"),
+    of_planar("a rope of the ground alone", lambda: planar().rope([("ground", (0, 0)), ("ground", (1, 0))])).says("points of a rope must be on a body that moves", "put an end on a body"),
+    of_planar("a rope of one point", lambda: planar().rope([("bar", (0, 0))])).says("points must be a list of two or more pairs", "give [(body, point), ...]", TypeError),
+    of_planar("a rope of points alone", lambda: planar().rope([(0, 0), (1, 0)])).says(r"points\[0\] must be a body", "give [(body, point), ...]", TypeError),
+    of_planar("a rope whose points coincide", lambda: planar().rope([("bar", (1, 0)), ("block", (1, 0))])).says("neighbouring points of 'rope bar-block' coincide", "leave one out"),
+    of_planar("a rope that is too short", lambda: planar().rope([("bar", (0, 0)), ("bar", (1, 0)), ("block", (2, 0))], length=0.5)).says("length of 'rope bar-block' must exceed the 1 m between points of the same body", "give more"),
+    of_planar("a winch without a radius", lambda: planar().rope([("ground", (0, 0)), ("block", (1, 0))], winch="pin")).says("winch and radius go together", "give both, or neither", TypeError),
+    of_planar("a drum of radius zero", lambda: planar().rope([("ground", (0, 0)), ("block", (1, 0))], winch="pin", radius=0.0)).says("radius of the drum must not be zero", "leave winch and radius out"),
+    of_planar("a coupling of one name", lambda: planar().coupling("pin", lambda x: x)).says("joints must be a list of joints or their names", "give a list", TypeError),
+    of_planar("a coupling without a function", lambda: planar().coupling(["pin"], 2.0)).says("function must be a function of 1 coordinates", "give lambda x, y: y - 2.0 * x", TypeError),
+    of_planar("a coupling that branches", lambda: planar().coupling(["pin"], lambda x: x if x > 0.0 else 2.0 * x)).says("must be made of numpy's functions, without branches", "give a smooth function"),
+    of_problem("the forces of actuators without a drive", lambda: planar().problem().actuator_forces(None, ["pin"])).says("has no drive: prescribe the motion with drive", "drive what is to move as you want"),
+    of_spatial("a screw without a pitch", lambda: spatial().screw("ground", "bar", at=(0, 0, 0), axis=(0, 0, 1), pitch=0.0)).says("pitch must not be zero", "use revolute(...)"),
+    of_spatial("a motor in a sleeve", lambda: sleeve().motor("sleeve", 1.0)).says("'sleeve', which is cylindrical, has an angle and a displacement: say which", 'give coordinate="angle"'),
+    of_spatial("a curve of three values", lambda: spatial().point_on_curve("ground", "bar", at=(0, 0, 0), curve=lambda x, y, z: (x, y, z))).says("must return two values for a curve, or one for a surface; it returned 3", "use spherical(...) for a point"),
+    of_spatial("`curve=3`", lambda: spatial().point_on_curve("ground", "bar", at=(0, 0, 0), curve=3)).says("must be a function of x, y and z", "give lambda x, y, z: ...", TypeError),
     of_problem("a model without bodies", lambda: PlanarModel().problem(), "has no bodies", "add bodies first"),
     of_problem("a loop that cannot close", lambda: rough(2.3)).says(r"cannot be assembled: the joint '.*' does not close", "look at the lengths around the loop"),
     of_problem("a velocity that joints do not allow", locked).says("do not allow the velocities given: the rate of angle of bar is given as 2", "give velocities of fewer bodies"),
@@ -206,9 +229,9 @@ BODIES: list[Case] = [
         "do not agree with the velocities given with its bodies", "give one of both"
     ),
     of_problem("`positions=1.0`", lambda: planar().problem(positions=1.0), "positions must be a mapping from joints", "give {joint: value}", TypeError),
-    of_problem("the position of a distance").when(lambda: (m := planar(), m.problem(positions={m.distance("bar", (0, 0), "block", (1, 0)): 1.0}))).says("positions needs a revolute or prismatic or cylindrical or screw joint", "give those of joints with a coordinate"),
+    of_problem("the position of a distance").when(lambda: (m := planar(), m.problem(positions={m.distance("bar", (0, 0), "block", (1, 0)): 1.0}))).says("positions needs a revolute or prismatic joint", "give those of joints with a coordinate"),
     of_problem("a position after two turns in space", lambda: hinged().problem(positions={"hinge": 13.0})).says("must be within 0.95 of a turn", "give the position within the turn"),
-    of_problem("the displacement of a hinge", lambda: hinged().joint_coordinate("hinge", "displacement")).says("'hinge', which is revolute, has the coordinates \"angle\"", "leave it out"),
+    of_problem("the displacement of a hinge", lambda: hinged().joint_coordinate("hinge", "displacement")).says("'hinge', which is revolute, has the coordinate \"angle\"", "leave it out"),
     of_problem("the coordinate of an unknown joint", lambda: hinged().problem().joint_coordinate("hing")).says("joint must be one of 'spatial model' that has a coordinate, 'hinge'; given 'hing'", "give its name"),
     of_problem("a coordinate of a sleeve", lambda: sleeve().problem().joint_coordinate("sleeve")).says("has an angle and a displacement: say which", "give one of both"),
     of_problem("`energy` of rows", lambda: rough(1.9).energy(0.0, np.zeros((9, 6)), np.zeros((9, 6)))).says(r"q must have shape \(6,\) or \(6, n_t\); given shape \(9, 6\)", "give states as columns: q.T"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -69,6 +70,9 @@ Part = TypeVar("Part")
 
 AXES = ("x", "y", "z")
 WITHOUT_POINT = ("fixed", "rolling")  # joints whose point may be left out
+
+POINTS = {2: ("revolute",), 3: ("spherical", "point on line")}  # joints that do not hold rotations
+PARTICLE_RADIUS = 0.01  # m, of gyration; in no equation of motion, as particles do not turn, but drawn
 
 
 def add(parts: list[Part], part: Part) -> Part:
@@ -225,6 +229,13 @@ class Collection:
         """Return bodies, name and points of a joint; default point: the centre of mass of b, or of a on the ground."""
         body_a, body_b = self._body("a", a), self._body("b", b)
         self._different(f"{kind} joint", body_a, body_b)
+        for particle, other in ((body_a, body_b), (body_b, body_a)):
+            if particle.is_particle and other is not self.ground and kind not in POINTS[self.dimension]:
+                raise ValueError(
+                    f"{particle.name!r} is a particle, which does not turn: a {kind} joint would keep {other.name!r} "
+                    f"from turning. Use {POINTS[self.dimension][0]}(...) or distance(...); for a mass fixed to "
+                    f"{other.name!r}, add it to the mass and inertia of that body"
+                )
         name = self._new_name(kind, name, body_a, body_b)
         if at is None and kind in WITHOUT_POINT:
             at = body_a.position if body_b is self.ground else body_b.position
@@ -290,6 +301,45 @@ class Collection:
         long = Numbers((float(length),), (f"length of {name} (m)",))
         row = JointRow(self.distance_kind, 1, body_a, body_b, *points, long)
         return add(self.joints, ModelJoint(name, "distance", body_a, body_b, (row,), *points))
+
+    def particle(self, name: str, *, mass: float, position: ArrayLike, velocity: ArrayLike | None = None) -> Body:
+        """Add a point mass: a body that does not turn, so that it needs no inertia.
+
+        Parameters
+        ----------
+        name : str
+        mass : float
+            kg.
+        position : array_like (2,) or (3,)
+            m.
+        velocity : array_like (2,) or (3,), optional
+            Initial velocity, m/s. None: determined by the other velocities.
+
+        Examples
+        --------
+        >>> from twoloop.bodies import PlanarModel
+        >>> model = PlanarModel(name="pendulum")
+        >>> bob = model.particle("bob", mass=2.0, position=(1.0, 0.0))
+        >>> string = model.distance("ground", (0.0, 0.0), bob, (1.0, 0.0))
+        >>> model.problem().freedom.degrees
+        1
+        """
+        check_positive(f"mass of {name!r}", mass)
+        inertia = PARTICLE_RADIUS**2 * mass * np.ones(1 if self.dimension == 2 else 3)
+        model: Any = self
+        model.body(
+            name,
+            mass=mass,
+            inertia=inertia if self.dimension == 3 else inertia[0],
+            position=position,
+            velocity=velocity,
+        )
+        self.bodies[-1] = body = replace(self.bodies[-1], is_particle=True)
+        points = Numbers(tuple(body.position)), Numbers((0.0,) * self.dimension)
+        held = self._new_name(f"rotation of {name}", None)
+        rows = self._weld(held, self.ground, body, points)[1:]
+        self.joints.append(ModelJoint(held, "no rotation", self.ground, body, rows, *points))
+        return body
 
     def _new_body(self, name: str, mass: float, position: ArrayLike, velocity: ArrayLike | None) -> tuple[Any, ...]:
         """Check what bodies in the plane and in space have in common; return name, position, mass and velocity."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -234,12 +234,17 @@ class Coordinates(Collection):
         measured, which = self._which(joint, which, "joint_coordinate")
         return self.coordinate_of(measured, which, lambda numbers: np.array(numbers.values))
 
-    def _which(
-        self, joint: Any, which: Any, what: str, kinds: tuple[str, ...] = tuple(KINDS)
-    ) -> tuple[ModelJoint, str]:
+    def _which(self, joint: Any, which: Any, what: str) -> tuple[ModelJoint, str]:
         """Return a joint of the model that has coordinates, and which of its coordinates is meant."""
+        kinds = tuple(KINDS)[: 2 if self.dimension == 2 else None]
         measured = self._joint(joint, kinds, what)
         return measured, which_of(measured, which)
+
+    def _as_single(self, joint: Any, which: Any, what: str) -> ModelJoint:
+        """Return a joint as the revolute or prismatic joint of one of its coordinates."""
+        moved, which = self._which(joint, which, what)
+        kind = "revolute" if which == "angle" else "prismatic"
+        return moved if moved.kind == kind else replace(moved, kind=kind)
 
     def coordinate_of(self, joint: ModelJoint, which: str, values: Callable[[Numbers], Array]) -> JointCoordinate:
         """Return a coordinate of a joint; `values` gives the parameters of the joint."""
@@ -277,10 +282,14 @@ def which_of(joint: ModelJoint, which: Any) -> str:
     of_kind = KINDS[joint.kind]
     if which is None and (len(of_kind) == 1 or joint.kind == "screw"):
         return of_kind[0]
+    if which is None:
+        raise ValueError(
+            f"{joint.name!r}, which is {joint.kind}, has an angle and a displacement: say which, in mappings and lists "
+            f'as ({joint.name!r}, "angle")'
+        )
     if which not in of_kind:
         expected = " or ".join(f'"{each}"' for each in of_kind)
         raise ValueError(
-            f"{joint.name!r}, which is {joint.kind}, has the coordinates {expected}; given {shown(which)}. Say which, "
-            f'as ({joint.name!r}, "{of_kind[0]}") in a mapping'
+            f"{joint.name!r}, which is {joint.kind}, has the coordinate {expected}; given {shown(which)}: say which"
         )
     return str(which)

@@ -99,6 +99,9 @@ def drawing_of(tables: Tables) -> Drawing:
     for joint in tables.joints:
         if joint.kind == "revolute" and joint.a.number >= 0 and joint.b.number >= 0:
             sketch.trace(joint.a.number, tables.of(joint.point_a).copy())
+    for joint in tables.joints:
+        for (one, at_one), (other, at_other) in pairwise(joint.path):
+            sketch.line((one.number, at_one.values), (other.number, at_other.values))
     for force in tables.forces:
         if force.kind in (SPRING, ZERO_LENGTH_SPRING):
             assert force.on_first is not None and force.on_second is not None

@@ -16,7 +16,7 @@ from scipy.linalg import null_space
 from twoloop.bodies.coordinates import TURN, JointCoordinate, velocity_apart
 from twoloop.bodies.frames import angle_of, point_of, vector_of
 from twoloop.bodies.parts import ModelJoint
-from twoloop.bodies.rotation_rates import cross, euler_product, parameters_of, spin_of
+from twoloop.bodies.rotation_rates import cross, euler_product, parameters_of, rotated_by, spin_of
 from twoloop.checks.arguments import Array
 from twoloop.problem.system import ConstrainedSystem
 
@@ -163,9 +163,7 @@ def _along_joint(
             here[-1] = (angle_of(new, a) - angle_a) + angle_b + turn
             here[-3:-1] = np.add(point_of(new, a, on_a), vector_of(new, a, apart)) - vector_of(here, b, on_b)
         return here[-3:]
-    inverse = [0.0] * 7
-    inverse[3:] = parameters_of(q, a, -1.0)
-    apart = np.array(vector_of(inverse, 0, apart)) + slide * axis
+    apart = np.array(rotated_by(parameters_of(q, a, -1.0), apart)) + slide * axis
     half = 0.5 * (-turn if backwards else turn)
     rotation = [np.cos(half), *(np.sin(half) * axis)]
     if backwards:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copy
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from twoloop.bodies.collection import add, documented
-from twoloop.bodies.coordinates import Coordinates
+from twoloop.bodies.coordinates import Coordinates, JointCoordinate
 from twoloop.bodies.frames import angle_of, point_of, vector_of
 from twoloop.bodies.functions import Function, RowFunction, SpringFunction, motion_function, spring_function
 from twoloop.bodies.parameter_layout import (
@@ -110,7 +111,7 @@ class Loads(Coordinates):
         Parameters
         ----------
         joint : ModelJoint or str
-            A revolute joint, or its name.
+            A revolute, cylindrical or screw joint, or its name.
         stiffness, damping : float
             N m/rad and N m s/rad.
         angle : float
@@ -120,7 +121,7 @@ class Loads(Coordinates):
             In the place of stiffness, damping and angle: torque(angle, rate), N m, which acts on a, and against the
             angle on b. A linear spring has stiffness * angle + damping * rate.
         """
-        hinge = self._joint(joint, ("revolute",), "torsion_spring")
+        hinge = self._as_single(joint, "angle", "torsion_spring")
         name = self._new_name(f"torsion spring of {hinge.name}", name)
         function_of_length = _spring_function(f"torque of {name!r}", torque, stiffness, damping or angle)
         if function_of_length is not None:
@@ -144,7 +145,7 @@ class Loads(Coordinates):
         Parameters
         ----------
         joint : ModelJoint or str
-            A prismatic joint, or its name.
+            A prismatic, cylindrical or screw joint, or its name.
         stiffness, damping : float
             N/m and N s/m.
         length : float
@@ -153,7 +154,7 @@ class Loads(Coordinates):
             In the place of stiffness, damping and length: force(displacement, rate), N, which acts on a, and against
             the displacement on b. A linear spring has stiffness * displacement + damping * rate.
         """
-        slide = self._joint(joint, ("prismatic",), "axial_spring")
+        slide = self._as_single(joint, "displacement", "axial_spring")
         name = self._new_name(f"spring of {slide.name}", name)
         function_of_length = _spring_function(f"force of {name!r}", force, stiffness, damping or length)
         if function_of_length is not None:
@@ -273,20 +274,27 @@ class Loads(Coordinates):
             N m: a constant torque, or f(t) or f(t, q, v) that returns one.
         """
         on = self._moving_body("body", body)
+        if on.is_particle:
+            raise ValueError(f"a torque on {on.name!r} has no effect, as a particle does not turn; make it a body(...)")
         name = self._new_name(f"torque on {on.name}", name)
         function, more = self._function(name, f, 1 if self.dimension == 2 else 3, "N m")
         return add(self.forces, Force(name, TORQUE, self.ground, on, None, None, more, function))
 
-    def motor(self, joint: ModelJoint | str, f: Any, *, name: str | None = None) -> Force:
-        """Add a torque in a revolute joint, or a force along a prismatic joint, on b, with its reaction on a.
+    def motor(
+        self, joint: ModelJoint | str, f: Any, *, coordinate: str | None = None, name: str | None = None
+    ) -> Force:
+        """Add a torque about the axis of a joint, or a force along it, on b, with its reaction on a.
 
         Parameters
         ----------
         joint : ModelJoint or str
+            A revolute, prismatic, cylindrical or screw joint, or its name.
         f : float or callable
             N m or N: a number, or f(t) or f(t, q, v) that returns one.
+        coordinate : str, optional
+            "angle" or "displacement" of a cylindrical or screw joint. None: the only one, or the angle of a screw.
         """
-        moved = self._joint(joint, ("revolute", "prismatic"), "motor")
+        moved = self._as_single(joint, coordinate, "motor")
         name = self._new_name(f"motor of {moved.name}", name)
         return add(self.forces, self._motor(name, moved, "N m" if moved.kind == "revolute" else "N", f))
 
@@ -318,18 +326,22 @@ class Loads(Coordinates):
         *,
         rate: Any = None,
         acceleration: Any = None,
+        coordinate: str | None = None,
         name: str | None = None,
     ) -> ModelJoint:
-        """Prescribe the motion of a revolute or prismatic joint: the displacement of b on a from the position given.
+        """Prescribe the motion of a joint: the angle or displacement of b on a from the position given.
 
         Parameters
         ----------
         joint : ModelJoint or str
+            A revolute, prismatic, cylindrical or screw joint, or its name.
         motion : callable
             motion(t), rad or m. The bodies are assembled at its initial value.
         rate, acceleration : callable, optional
             First and second derivative as functions of t. None: they are derived exactly from the motion, which must
             then consist of numpy functions without branches.
+        coordinate : str, optional
+            "angle" or "displacement" of a cylindrical or screw joint. None: the only one, or the angle of a screw.
         name : str, optional
 
         Returns
@@ -342,10 +354,50 @@ class Loads(Coordinates):
         TypeError, ValueError
             If an argument is invalid, or the derivatives are neither given nor can be derived.
         """
-        moved = self._joint(joint, ("revolute", "prismatic"), "drive")
+        moved = self._as_single(joint, coordinate, "drive")
         name = self._new_name(f"drive of {moved.name}", name)
         row = self._drive_row(moved, motion_function(f"motion of {name!r}", motion, rate, acceleration))
         return add(self.joints, ModelJoint(name, "drive", moved.a, moved.b, (row,), moved.point_a, moved.point_b))
+
+    def drive_point(
+        self,
+        body: Body | str,
+        at: Any,
+        *,
+        axis: Any,
+        motion: Any,
+        rate: Any = None,
+        acceleration: Any = None,
+        name: str | None = None,
+    ) -> ModelJoint:
+        """Prescribe the motion of a point of a body along an axis of space, from the position given.
+
+        Parameters
+        ----------
+        body : Body or str
+        at : array_like (2,) or (3,)
+            The point, in space in the position given, m.
+        motion : callable
+            motion(t), m; for `rate` and `acceleration` see `drive`.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from twoloop.bodies import PlanarModel
+        >>> model = PlanarModel(name="arm")
+        >>> arm = model.rod("arm", (0.0, 0.0), (1.0, 0.0), mass=1.0)
+        >>> pin = model.revolute("ground", arm, at=(0.0, 0.0))
+        >>> lift = model.drive_point(arm, (1.0, 0.0), axis=(0.0, 1.0), motion=lambda t: 0.1 * np.sin(t))
+        >>> model.problem().freedom.degrees
+        0
+        """
+        on = self._moving_body("body", body)
+        name = self._new_name(f"drive of {on.name}", name)
+        model: Any = copy.copy(self)
+        model.joints, model.taken = [], []
+        slide = model.prismatic(self.ground, on, at=at, axis=axis, name=name)
+        row = self._drive_row(slide, motion_function(f"motion of {name!r}", motion, rate, acceleration))
+        return add(self.joints, ModelJoint(name, "drive", self.ground, on, (row,), slide.point_a, slide.point_b))
 
 
 def _spring_function(name: str, f: Any, stiffness: Any, more: Any) -> SpringFunction | None:
@@ -405,6 +457,19 @@ class TurnGap:
         return self.sign * (hinge_angle(q, self.joint) - self.limit)
 
 
+@dataclass(frozen=True, eq=False)
+class CoordinateGap:
+    """Measure the angle or displacement between a joint in space and its limit, rad or m."""
+
+    coordinate: JointCoordinate
+    limit: float
+    sign: float
+
+    def __call__(self, t: Any, q: Any) -> Any:
+        """Return what remains, for numbers or symbols."""
+        return self.sign * (self.coordinate.position(q) - self.limit)
+
+
 def hinge_angle(q: Any, joint: ModelJoint) -> Any:
     """Return the rotation of b relative to a in a planar joint since the position given."""
     return angle_of(q, joint.b.number) - angle_of(q, joint.a.number) - (joint.b.rotation - joint.a.rotation)
@@ -461,17 +526,22 @@ class Stops(Loads):
         lower: float | None = None,
         upper: float | None = None,
         restitution: float = 0.0,
+        coordinate: str | None = None,
         name: str | None = None,
     ) -> tuple[Stop, ...]:
-        """Add limits to a revolute joint in the plane or to a prismatic joint.
+        """Add limits to a joint, between which its angle or displacement stays.
 
         Parameters
         ----------
         joint : ModelJoint or str
+            A revolute, prismatic, cylindrical or screw joint, or its name. In space, an angle is limited to 0.95 of a
+            turn to either side of the position given; a run that goes farther raises an error.
         lower, upper : float, optional
             Bounds of the displacement of b on a from the position given, rad or m. None: unbounded.
         restitution : float
             Coefficient of restitution, from 0 to 1.
+        coordinate : str, optional
+            "angle" or "displacement" of a cylindrical or screw joint. None: the only one, or the angle of a screw.
         name : str, optional
             Prefix of the names "lower limit" and "upper limit". None: the name of the joint.
 
@@ -484,24 +554,25 @@ class Stops(Loads):
         TypeError, ValueError
             If an argument is invalid, or no limit is given.
         """
-        kinds = ("revolute", "prismatic") if self.dimension == 2 else ("prismatic",)
-        limited = self._joint(joint, kinds, "limit")
+        limited, which = self._which(joint, coordinate, "limit")
         bounds = {"lower": (lower, 1.0), "upper": (upper, -1.0)}
         if lower is None and upper is None:
             raise ValueError(f"limit of {limited.name!r} needs lower, upper, or both")
         if lower is not None and upper is not None and not lower < upper:
             raise ValueError(f"lower of the limit of {limited.name!r} must be below upper; given {lower!r}, {upper!r}")
         stops = []
-        for which, (value, sign) in bounds.items():
+        for bound, (value, sign) in bounds.items():
             if value is not None:
-                new = self._new_name(f"{which} limit of {limited.name if name is None else name}", None)
-                gap = self._gap(limited, check_finite(which, value), sign)
+                new = self._new_name(f"{bound} limit of {limited.name if name is None else name}", None)
+                gap = self._gap(limited, which, check_finite(bound, value), sign)
                 stops.append(add(self.stops, Stop(gap, restitution, new)))
         return tuple(stops)
 
-    def _gap(self, joint: ModelJoint, limit: float, sign: float) -> Any:
-        if joint.kind == "revolute":
+    def _gap(self, joint: ModelJoint, which: str, limit: float, sign: float) -> Any:
+        if joint.kind == "revolute" and self.dimension == 2:
             return TurnGap(joint, limit, sign)
+        if joint.kind != "prismatic":
+            return CoordinateGap(self.joint_coordinate(joint, which), limit, sign)
         axis = self._axis(joint)
         point = (
             joint.b.in_space(np.array(joint.point_b.values)) if joint.b.number >= 0 else np.array(joint.point_b.values)
@@ -558,12 +629,18 @@ class Gears(Stops):
         if factor == 0.0:
             raise ValueError("radius must not be zero: the slide would be held; use fixed(...) for that")
         name = self._new_name(f"rack of {joint_1.name} and {joint_2.name}", name)
-        return self._coupled(name, "rack", joint_2, [self._rack_row(joint_1, joint_2, factor)], joint_1)
+        slid = self.joint_coordinate(joint_2)
+        start = slid.position(self._start())
+        if self.dimension == 2:
+            self._axis(joint_2)  # is taken as it is
+        row = self._wound_row(joint_1, lambda q: slid.position(q) - start, factor)
+        return self._coupled(name, "rack", joint_2, [row], joint_1)
 
     def _gear_row(self, one: ModelJoint, other: ModelJoint, ratio: float) -> Row:
         raise NotImplementedError
 
-    def _rack_row(self, pinion: ModelJoint, slide: ModelJoint, radius: float) -> Row:
+    def _wound_row(self, pinion: ModelJoint, moved: Row, radius: float) -> Row:
+        """Return the row by which a displacement is a radius times the rotation of a hinge since the position given."""
         raise NotImplementedError
 
     def _two(self, one: Any, kind: str, other: Any, other_kind: str, what: str) -> tuple[ModelJoint, ModelJoint]:
@@ -574,13 +651,19 @@ class Gears(Stops):
 
     def _coupled(self, name: str, kind: str, reacting: ModelJoint, rows: list[Row], other: ModelJoint) -> ModelJoint:
         """Add the joint whose rows are functions of the coordinates of the bodies of two joints."""
-        bodies = {reacting.a, reacting.b, other.a, other.b}
-        columns = tuple(sorted(j for body in bodies for j in body.coordinates))
-        places = listed(columns)
         ends = reacting.a, reacting.b, reacting.point_a, reacting.point_b
-        functions = (RowFunction(f"{kind} {name!r}", row, columns) for row in rows)
-        joint_rows = tuple(JointRow(ROW_FUNCTION, 1, *ends, places, function) for function in functions)
+        joint_rows = function_rows(f"{kind} {name!r}", rows, {reacting.a, reacting.b, other.a, other.b}, ends)
         return add(self.joints, ModelJoint(name, kind, *ends[:2], joint_rows, *ends[2:]))
+
+
+Ends = tuple[Body, Body, Numbers, Numbers]
+
+
+def function_rows(name: str, rows: Iterable[Row], bodies: Iterable[Body], ends: Ends) -> tuple[JointRow, ...]:
+    """Return rows that are functions of the coordinates of some bodies."""
+    columns = tuple(sorted(j for body in set(bodies) for j in body.coordinates))
+    functions = (RowFunction(name, row, columns) for row in rows)
+    return tuple(JointRow(ROW_FUNCTION, 1, *ends, listed(columns), function) for function in functions)
 
 
 def listed(columns: tuple[int, ...]) -> Numbers:

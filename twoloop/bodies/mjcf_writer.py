@@ -83,18 +83,19 @@ class _Writer:
         self.left_out = [f"the start velocity of {name!r}" for name in moving]
         self.left_out += [each.name for each in model.joints if each.kind == "drive"]
         self.left_out += [each.name for each in model.stops]
-        self.springs: dict[str, Force] = {}
+        self.springs: dict[tuple[str, str], Force] = {}  # by joint, and "hinge" or "slide"
         self.tendons: list[Force] = []
         for force in model.forces:
             if force.function is not None:
                 self.left_out.append(force.name)
             elif force.kind in (TORSION_SPRING, AXIAL_SPRING):
                 assert force.joint is not None
-                if force.joint.name in self.springs:
+                key = force.joint.name, "hinge" if force.kind == TORSION_SPRING else "slide"
+                if key in self.springs:
                     raise ValueError(
                         f"MJCF has one spring in a joint; {force.name!r} is the second of {force.joint.name!r}"
                     )
-                self.springs[force.joint.name] = force
+                self.springs[key] = force
             elif force.kind in (SPRING, ZERO_LENGTH_SPRING):
                 self.tendons.append(force)
             else:
@@ -152,23 +153,21 @@ class _Writer:
             moves += [("slide", axis)] if joint.kind in ("prismatic", "cylindrical") else []
             moves += [("slide", across) for across in np.linalg.svd(axis[None])[2][1:] if joint.kind == "planar"]
             moves += [("hinge", axis)] if joint.kind != "prismatic" else []
-        spring = self._stiffness(joint)
         for number, (kind, axis) in enumerate(moves, 1):
             name = joint.name if number == 1 else f"{joint.name} {number}"
-            _add(element, "joint", type=kind, axis=text_of(axis), name=name, pos=pos, **spring)
+            _add(element, "joint", type=kind, axis=text_of(axis), name=name, pos=pos, **self._stiffness(joint, kind))
 
-    def _stiffness(self, joint: ModelJoint) -> dict[str, str]:
-        force = self.springs.get(joint.name)
+    def _stiffness(self, joint: ModelJoint, kind: str) -> dict[str, str]:
+        force = self.springs.get((joint.name, kind))
         if force is None or force.more is None:
             return {}
         stiffness, damping, rest = map(repr, force.more.values)
         return {"stiffness": stiffness, "damping": damping, "springref": rest}
 
     def _loop(self, equality: Element, joint: ModelJoint) -> None:
-        if joint.name in self.springs:
-            raise ValueError(
-                f"the spring {self.springs[joint.name].name!r} is in a joint that closes a loop: MJCF has none there"
-            )
+        springs = [force.name for (name, _), force in self.springs.items() if name == joint.name]
+        if springs:
+            raise ValueError(f"the spring {springs[0]!r} is in a joint that closes a loop: MJCF has none there")
         body_1, body_2 = (joint.b, joint.a) if joint.a is self.model.ground else (joint.a, joint.b)
         ends = {"body1": body_1.name, **({} if body_2 is self.model.ground else {"body2": body_2.name})}
         point = np.array((joint.point_a if body_1 is joint.a else joint.point_b).values)

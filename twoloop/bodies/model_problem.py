@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.bodies import assembly, joint_state
+from twoloop.bodies import assembly, inverse_dynamics, joint_state
 from twoloop.bodies.assembly import Freedom, note_of
 from twoloop.bodies.coordinates import KINDS, JointCoordinate, SpatialAngle
 from twoloop.bodies.drawings import drawing_of
 from twoloop.bodies.energy import ModelEnergy
 from twoloop.bodies.functions import motion_function
 from twoloop.bodies.joint_state import Request
-from twoloop.bodies.loads import Gears
 from twoloop.bodies.parts import Body, DryFriction, ModelJoint, Numbers
+from twoloop.bodies.ropes import Ropes
 from twoloop.bodies.system import check_forces, check_loads, joints_of, system_of
 from twoloop.bodies.tables import Tables
 from twoloop.checks.arguments import Array, check_finite, check_positive, check_span, check_text, shown
@@ -105,6 +105,54 @@ class ModelProblem(Problem):
             )
         return own[0]  # of a screw the angle
 
+    def actuator_forces(self, result: Any, actuators: Sequence[Any]) -> Array:
+        """Return the forces with which motors elsewhere make the motion that the drives prescribe (inverse dynamics).
+
+        Parameters
+        ----------
+        result : Result
+            A run of this problem.
+        actuators : sequence of ModelJoint, str or (ModelJoint or str, str)
+            Joints with the motors, in the place of the drives; pairs as for `positions`.
+
+        Returns
+        -------
+        ndarray (n_actuators, n_t)
+            Torques and forces as of `motor`, N m or N. NaN at singular positions, where they do not determine
+            the motion.
+
+        Raises
+        ------
+        ValueError
+            If the model has no drive, or the actuators cannot make this motion: with fewer actuators than degrees of
+            freedom, a motion is in general only possible that the model would have to find itself.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from twoloop import solve_dae
+        >>> from twoloop.bodies import PlanarModel
+        >>> O, A, B, D = (0.0, 0.0), (0.0, 1.0), (2.0, 1.5), (2.5, 0.0)
+        >>> model = PlanarModel(name="linkage")
+        >>> for name, start, end in (("crank", O, A), ("coupler", A, B), ("rocker", B, D)):
+        ...     rod = model.rod(name, start, end, mass=1.0)
+        >>> for a, b, pin in (("ground", "crank", O), ("crank", "coupler", A), ("coupler", "rocker", B)):
+        ...     joint = model.revolute(a, b, at=pin, name=f"{a}-{b}")
+        >>> output = model.revolute("ground", "rocker", at=D, name="output")
+        >>> drive = model.drive(output, lambda t: 0.2 * np.sin(t) ** 2)
+        >>> problem = model.problem((0.0, 3.0))
+        >>> run = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0)
+        >>> problem.actuator_forces(run, ["ground-crank"]).shape == (1, run.t.size)
+        True
+        """
+        if self.model is None or not any(joint.kind == "drive" for joint in self.model.joints):
+            raise ValueError(f"{self.name!r} has no drive: prescribe the motion with drive(...) or drive_point(...)")
+        pairs = [each if isinstance(each, tuple) and len(each) == 2 else (each, None) for each in actuators]
+        coordinates = [self.joint_coordinate(*each) for each in pairs]
+        drives = {joint.name for joint in self.model.joints if joint.kind == "drive"}
+        rows = [row for joint in self.system.joints if joint.name in drives for row in joint.rows]
+        return inverse_dynamics.actuator_forces(self.system, result, rows, coordinates)
+
     def place(self, name: str) -> int:
         """Return the index of a parameter in `system.parameters`, by its name with or without the unit.
 
@@ -167,7 +215,7 @@ def _listed(names: Sequence[str]) -> str:
     return shown if len(names) <= 6 else f"{shown} and {len(names) - 6} more: see problem.parameters"
 
 
-class Model(Gears):
+class Model(Ropes):
     """Assemble models, in the plane and in space."""
 
     coordinate_names: tuple[str, ...]

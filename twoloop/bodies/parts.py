@@ -60,6 +60,7 @@ class Body:
     inertia: Array = field(repr=False)  # mass and moments, in the order of the parameters
     velocity: Array | None = field(default=None, repr=False)
     angular_velocity: Array | None = field(default=None, repr=False)
+    is_particle: bool = field(default=False, repr=False)  # a point mass, which does not turn
 
     @property
     def coordinates(self) -> tuple[int, ...]:
@@ -152,6 +153,7 @@ class ModelJoint:
     point_b: Numbers = field(repr=False)
     axes: tuple[Array, ...] = field(default=(), repr=False)  # spatial joints: the axis in the axes of a and of b
     pitch: float = field(default=0.0, repr=False)  # of a screw: displacement per turn, m
+    path: tuple[tuple[Body, Numbers], ...] = field(default=(), repr=False)  # of a rope: its points, as drawn
 
     @property
     def body(self) -> Body:

@@ -29,6 +29,13 @@ def euler_product(one: Any, other: Any) -> Components:
     return [w * u - sum(x * y for x, y in zip(e, f, strict=True)), *(w * f[i] + u * e[i] + across[i] for i in range(3))]
 
 
+def rotated_by(parameters: Any, vector: Any) -> Components:
+    """Return a vector rotated by Euler parameters."""
+    w, *e = parameters
+    across = [x + w * y for x, y in zip(cross(e, vector), vector, strict=True)]
+    return [x + 2.0 * y for x, y in zip(vector, cross(e, across), strict=True)]
+
+
 def spin_of(q: Any, v: Any, body: int) -> Components:
     """Return the angular velocity of a body in space."""
     if body < 0:

@@ -77,6 +77,8 @@ class Tables:
         rows = [row for joint in joints for row in joint.rows]
         for row in rows:
             self._place_all(row.on_first, row.on_second, row.more)
+        for joint in joints:
+            self._place_all(joint.point_a, joint.point_b)
         for force in forces:
             self._place_all(force.on_first, force.on_second, force.more)
         self._unit = Numbers((1.0,))

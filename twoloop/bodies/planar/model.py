@@ -35,15 +35,8 @@ class Couplings(Model):
     def _gear_row(self, one: ModelJoint, other: ModelJoint, ratio: float) -> Row:
         return lambda q: hinge_angle(q, other) - ratio * hinge_angle(q, one)
 
-    def _rack_row(self, pinion: ModelJoint, slide: ModelJoint, radius: float) -> Row:
-        angle = float(np.arctan2(*self._axis(slide)[::-1]))
-        ends = [np.array(point.values) for point in (slide.point_a, slide.point_b)]
-
-        def slid(q: Any) -> Any:
-            return _along(q, slide.a, angle, ends[0], slide.b, ends[1])
-
-        start = slid(self._start())
-        return lambda q: slid(q) - start - radius * hinge_angle(q, pinion)
+    def _wound_row(self, pinion: ModelJoint, moved: Row, radius: float) -> Row:
+        return lambda q: moved(q) - radius * hinge_angle(q, pinion)
 
     def rolling(
         self, a: Body | str, wheel: Body | str, *, radius: float, axis: Any, name: str | None = None

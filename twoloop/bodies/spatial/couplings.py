@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -12,12 +13,12 @@ from numpy.typing import ArrayLike
 from twoloop.bodies.collection import add, documented
 from twoloop.bodies.frames import point_of, vector_of
 from twoloop.bodies.functions import RateFunction, RowFunction
-from twoloop.bodies.loads import Row, listed
+from twoloop.bodies.loads import Row, function_rows, listed
 from twoloop.bodies.model_problem import Model
 from twoloop.bodies.parameter_layout import RATE_FUNCTION, ROW_FUNCTION
 from twoloop.bodies.parts import Body, JointRow, ModelJoint, Numbers
 from twoloop.bodies.rotation import euler_parameters, perpendiculars
-from twoloop.bodies.rotation_rates import cross, euler_product, parameters_of, spin_of
+from twoloop.bodies.rotation_rates import cross, euler_product, parameters_of, rotated_by, spin_of
 from twoloop.checks.arguments import Array, check_positive, check_vector
 
 MOST_TEETH = 1000
@@ -66,11 +67,9 @@ class SpatialCouplings(Model):
             )
         return GearRow(one, other, n, m)
 
-    def _rack_row(self, pinion: ModelJoint, slide: ModelJoint, radius: float) -> Row:
-        start = _slid(self._start(), slide)
-
+    def _wound_row(self, pinion: ModelJoint, moved: Row, radius: float) -> Row:
         def row(q: Any) -> Any:
-            turns, (c, s) = (_slid(q, slide) - start) / radius, _rotation(q, pinion)
+            turns, (c, s) = moved(q) / radius, _rotation(q, pinion)
             return radius * _angle(_times((np.cos(turns), np.sin(turns)), (c, -s)))
 
         return row
@@ -149,6 +148,129 @@ class SpatialCouplings(Model):
         )
         return add(self.joints, ModelJoint(name, "rolling", self.ground, on, rows, *points))
 
+    def rolling_ball(
+        self,
+        ball: Body | str,
+        *,
+        radius: float,
+        on: Body | str = "ground",
+        foot: Any = (0.0, 0.0, 0.0),
+        normal: Any = (0.0, 0.0, 1.0),
+        name: str | None = None,
+    ) -> ModelJoint:
+        """Let a ball, whose centre of mass is its centre, roll without slipping on a plane of a body (non-holonomic).
+
+        The ball may spin about the normal. The reaction is that on the body of the plane, or on the ball if this is the
+        ground.
+
+        Parameters
+        ----------
+        ball : Body or str
+        radius : float
+            m.
+        on : Body or str
+            The body with the plane, such as a turntable.
+        foot : array_like (3,) or BodyPoint
+            A point of the plane, m.
+        normal : array_like (3,) or BodyDirection
+            Normal of the plane, on the side of the ball.
+
+        Examples
+        --------
+        >>> from twoloop.bodies import SpatialModel
+        >>> model = SpatialModel(gravity=(0.0, -1.0, -9.8), name="slope")
+        >>> ball = model.sphere("ball", 0.1, mass=2.0, position=(0.0, 0.0, 0.1))
+        >>> contact = model.rolling_ball(ball, radius=0.1)
+        >>> model.problem().freedom.degrees
+        3
+        """
+        moving, plane = self._moving_body("ball", ball), self._body("on", on)
+        self._different("rolling ball", plane, moving)
+        name = self._new_name("rolling ball", name, plane, moving)
+        check_positive("radius", radius)
+        place, n = self._point("foot", foot, plane), self._direction("normal", normal, plane)
+
+        def height(q: Any) -> Any:
+            centre = (q[j] for j in moving.coordinates[:3])
+            apart = zip(vector_of(q, plane.number, n), centre, point_of(q, plane.number, place), strict=True)
+            return sum(x * (y - z) for x, y, z in apart) - radius
+
+        def slip(q: Any, v: Any, along: Any) -> Any:
+            down = [-radius * x for x in vector_of(q, plane.number, n)]
+            turning = cross(spin_of(q, v, moving.number), down)
+            rates = [v[j] + x for j, x in zip(moving.coordinates, turning, strict=False)]
+            if plane is not self.ground:
+                arm = [q[i] + x - q[j] for i, j, x in zip(moving.coordinates, plane.coordinates, down, strict=False)]
+                carried = cross(spin_of(q, v, plane.number), arm)
+                rates = [x - v[j] - y for x, j, y in zip(rates, plane.coordinates, carried, strict=False)]
+            return sum(x * y for x, y in zip(vector_of(q, plane.number, along), rates, strict=True))
+
+        ends = plane, moving, Numbers(tuple(place)), Numbers((0.0, 0.0, 0.0))
+        rows = function_rows(f"rolling ball {name!r}", [height], (plane, moving), ends)
+        columns = tuple(sorted((*plane.coordinates, *moving.coordinates)))
+        for along in perpendiculars(n):
+            rate = RateFunction(f"rolling ball {name!r}", lambda q, v, along=along: slip(q, v, along), columns)
+            rows += (JointRow(RATE_FUNCTION, 1, *ends, listed(columns), rate),)
+        return add(self.joints, ModelJoint(name, "rolling ball", *ends[:2], rows, *ends[2:]))
+
+    def point_on_curve(
+        self, a: Body | str, b: Body | str, *, at: Any, curve: Callable[[Any, Any, Any], Any], name: str | None = None
+    ) -> ModelJoint:
+        """Keep a point of b on a curve or surface of a, like a pin in a curved slot.
+
+        Parameters
+        ----------
+        at : array_like (3,) or BodyPoint
+            The point of b, in space in the position given, m.
+        curve : callable
+            curve(x, y, z): two values that are zero on a curve, or one that is zero on a surface, from numpy functions
+            without branches; x, y and z in the axes of a relative to its centre of mass (ground: in space), m. Their
+            gradients must not vanish there, nor be parallel.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is invalid, or the curve cannot be traced.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from twoloop.bodies import SpatialModel
+        >>> model = SpatialModel(name="bead on a helix")
+        >>> bead = model.particle("bead", mass=1.0, position=(1.0, 0.0, 0.0))
+        >>> wire = model.point_on_curve(
+        ...     "ground", bead, at=(1.0, 0.0, 0.0), curve=lambda x, y, z: (x - np.cos(z), y - np.sin(z))
+        ... )
+        >>> model.problem().freedom.degrees
+        1
+        """
+        body_a, body_b = self._body("a", a), self._body("b", b)
+        self._different("point_on_curve", body_a, body_b)
+        name = self._new_name("point on curve", name, body_a, body_b)
+        if not callable(curve):
+            raise TypeError(f"curve of {name!r} must be a function of x, y and z; given {curve!r}")
+        point_b = self._point("at", at, body_b)
+        point_a = body_a.local_point(body_b.in_space(point_b))
+        values = np.asarray(curve(*point_a.tolist()))
+        n_values = values.size
+        if n_values not in (1, 2):
+            raise ValueError(
+                f"curve of {name!r} must return two values for a curve, or one for a surface; it returned {n_values}"
+            )
+
+        def off(q: Any, k: int) -> Any:
+            here = point_of(q, body_b.number, point_b)
+            if body_a is not self.ground:
+                apart = [x - q[j] for x, j in zip(here, body_a.coordinates, strict=False)]
+                here = rotated_by(parameters_of(q, body_a.number, -1.0), apart)
+            value = curve(*here)
+            return value if values.ndim == 0 else value[k]
+
+        ends = body_a, body_b, Numbers(tuple(point_a)), Numbers(tuple(point_b))
+        rows = [lambda q, k=k: off(q, k) for k in range(n_values)]
+        joint_rows = function_rows(f"point on curve {name!r}", rows, ends[:2], ends)
+        return add(self.joints, ModelJoint(name, "point on curve", *ends[:2], joint_rows, *ends[2:]))
+
 
 def relative(a: Body, axis_a: Array, b: Body, axis_b: Array) -> Array:
     """Return the rotation of b relative to a that aligns their axes and is nearest to the one given."""
@@ -160,14 +282,6 @@ def relative(a: Body, axis_a: Array, b: Body, axis_b: Array) -> Array:
         return np.asarray((2.0 * np.outer(half, half) - np.eye(3)) @ given)
     cross = np.array([[0.0, -turn[2], turn[1]], [turn[2], 0.0, -turn[0]], [-turn[1], turn[0], 0.0]])
     return np.asarray((np.eye(3) + cross + cross @ cross / (1.0 + c)) @ given)
-
-
-def _slid(q: Any, slide: ModelJoint) -> Any:
-    """Return the displacement of b on a along the axis."""
-    ends = ((slide.a, slide.point_a), (slide.b, slide.point_b))
-    point_a, point_b = (point_of(q, body.number, np.array(point.values)) for body, point in ends)
-    axis = vector_of(q, slide.a.number, slide.axes[0])
-    return sum(n * (y - x) for n, x, y in zip(axis, point_a, point_b, strict=True))
 
 
 def _rotation(q: Any, joint: ModelJoint) -> Complex:

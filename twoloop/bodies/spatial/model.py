@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from twoloop.bodies.collection import Points, add, documented
 from twoloop.bodies.functions import Function
+from twoloop.bodies.loads import function_rows
 from twoloop.bodies.parameter_layout import (
     ANGLE_DRIVE,
     AXIAL_FORCE,
@@ -24,7 +26,7 @@ from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
 from twoloop.bodies.rotation import euler_parameters, euler_rates, perpendiculars, rotation_matrix
 from twoloop.bodies.spatial.couplings import SpatialCouplings, relative
 from twoloop.bodies.tables import TENSOR
-from twoloop.checks.arguments import Array, check_positive, check_real, check_vector, shown
+from twoloop.checks.arguments import Array, check_finite, check_positive, check_real, check_vector, shown
 
 
 def across(a: Body, axis_a: Array, b: Body, axis_b: Array) -> JointRow:
@@ -272,6 +274,59 @@ class SpatialModel(SpatialCouplings):
         axis_a, axis_b = self._directions(axis, body_a, body_b)
         rows = *on_line(body_a, axis_a, body_b, *points), *parallel(body_a, axis_a, body_b, axis_b)
         return add(self.joints, ModelJoint(name, "cylindrical", body_a, body_b, rows, *points, (axis_a, axis_b)))
+
+    def screw(
+        self, a: Body | str, b: Body | str, *, at: Any, axis: Any, pitch: float, name: str | None = None
+    ) -> ModelJoint:
+        """Add a screw: b slides along an axis of a in proportion to its rotation about it.
+
+        Parameters
+        ----------
+        pitch : float
+            Displacement of b along the axis per turn, m; negative for a left-handed thread.
+
+        Examples
+        --------
+        >>> from twoloop.bodies import SpatialModel
+        >>> model = SpatialModel(name="jack")
+        >>> nut = model.body("nut", mass=2.0, inertia=(0.01, 0.01, 0.02), position=(0.0, 0.0, 0.0))
+        >>> thread = model.screw("ground", nut, at=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0), pitch=0.01, name="thread")
+        >>> problem = model.problem(rates={thread: 2.0})  # rad/s
+        >>> round(float(problem.joint_coordinate(thread, "displacement").rate(problem.q0, problem.v0)), 6)
+        0.003183
+        """
+        body_a, body_b, name, points = self._pair("screw", a, b, name, at)
+        axis_a, axis_b = self._directions(axis, body_a, body_b)
+        if check_finite("pitch", pitch) == 0.0:
+            raise ValueError("pitch must not be zero: b would not slide; use revolute(...) for that")
+        rows = *on_line(body_a, axis_a, body_b, *points), *parallel(body_a, axis_a, body_b, axis_b)
+        sleeve = ModelJoint(name, "screw", body_a, body_b, rows, *points, (axis_a, axis_b), float(pitch))
+        slid = self.coordinate_of(sleeve, "displacement", lambda numbers: np.array(numbers.values))
+        start = slid.position(self._start())
+        thread = self._wound_row(sleeve, lambda q: slid.position(q) - start, float(pitch) / (2.0 * np.pi))
+        rows += function_rows(f"screw {name!r}", [thread], (body_a, body_b), (body_a, body_b, *points))
+        return add(self.joints, replace(sleeve, rows=rows))
+
+    def point_on_line(self, a: Body | str, b: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
+        """Keep a point of b on a line of a, like a pin in a straight slot.
+
+        Parameters
+        ----------
+        axis : array_like (3,) or BodyDirection
+            Direction of the line in a, of any length.
+
+        Examples
+        --------
+        >>> from twoloop.bodies import SpatialModel
+        >>> model = SpatialModel(name="bead on a wire")
+        >>> bead = model.particle("bead", mass=0.1, position=(0.0, 0.0, 0.0))
+        >>> wire = model.point_on_line("ground", bead, at=(0.0, 0.0, 0.0), axis=(1.0, 0.0, -1.0))
+        >>> model.problem().freedom.degrees
+        1
+        """
+        body_a, body_b, name, points = self._pair("point on line", a, b, name, at)
+        rows = on_line(body_a, self._direction("axis", axis, body_a), body_b, *points)
+        return add(self.joints, ModelJoint(name, "point on line", body_a, body_b, rows, *points))
 
     def prismatic(self, a: Body | str, b: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
         """Add a prismatic joint: b slides along an axis of a without rotating on it."""
