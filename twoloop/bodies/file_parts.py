@@ -352,7 +352,8 @@ def add_part(model: Any, part: Part) -> ModelJoint | None:
     place(part)
     assert part.start is not None
     lump = combined(part.lumps)
-    R, motion = part.start.R, {}
+    R = part.start.R
+    motion: dict[str, Any] = {}
     if part.massless:
         centre = part.freed[0].start_at
         if part.moves:
