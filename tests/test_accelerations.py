@@ -13,6 +13,7 @@ from tests.bodies.random_models import Both
 from tests.marks import slow
 from tests.problems import assert_same, quick, worst
 from twoloop import mechanisms, solve_dae
+from twoloop.bodies import PlanarModel
 from twoloop.generate.choices import Choice
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.compile_equations import generated_code, write_accelerations, write_function
@@ -271,3 +272,17 @@ def test_in_lanes_no_run_depends_on_those_beside_it():
 
 def test_the_limit_of_pivots_leaves_nine_digits():
     assert LEAST**-1.5 * 2.0**-52 < 1e-9
+
+
+@pytest.mark.parametrize("inertia", quick([2e-5, 1e-6]))
+def test_little_inertia_on_long_bars(inertia):
+    """A parallelogram of bars whose mass is in their middle: its coupler does not turn."""
+    A, B, C, D = (0.0, 0.0), (40.0, -60.0), (170.0, -60.0), (130.0, 0.0)
+    model = PlanarModel()
+    for name, a, b in (("left", A, B), ("coupler", B, C), ("right", D, C)):
+        model.body(name, mass=1.5, inertia=inertia, position=(0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1])))
+    for a, b, at in (("ground", "left", A), ("left", "coupler", B), ("coupler", "right", C), ("right", "ground", D)):
+        model.revolute(a, b, at=at)
+    problem = model.problem((0.0, 5.0))
+    result = solve_dae(problem.system, (0.0, 5.0), problem.q0, problem.v0, compiled=True, rtol=1e-9, atol=1e-9)
+    assert result.success and np.abs(result.a[5]).max() < 1e-9 and result.stats.n_rejected_error < 10

@@ -27,6 +27,12 @@ NEAR = 0.01  # smallest allowed pivot, relative to the smallest pivot of a row o
 # possible values of the smallest allowed pivot, down to those nearly lost to rounding
 LEAST = 10.0 ** np.arange(-2, -9, -1)
 BOUNDS = LEAST[:-1] / NEAR
+# places among the bounds of the smallest pivot from which on rows are added to M: for up to SMALL coordinates; if M is
+# singular, as Euler parameters lose two digits in sound models; for more coordinates, as the code becomes much longer
+POOR, POOR_SINGULAR, POOREST, SMALL = 4, 5, 6, 24
+# size of the added rows relative to M, and the number of places by which the pivot has to become larger: else the rows
+# are nearly dependent whatever M is
+STIFFER, FEWER = 16.0, 2
 # ratio of rows of G to coordinates above which it pays to express some coordinates by the others: below, the system of
 # the rows is the smaller one
 MOSTLY_ROWS = 2.0 / 3.0
@@ -146,7 +152,26 @@ class Chooser:
         decided = place, chosen.tobytes(), float(room[0])
         if decided != self._key:
             self._last, self._key = self._decode(place), decided
+        singular = bool(self._last.added)
+        if place >= ((POOR_SINGULAR if singular else POOR) if len(mass) <= SMALL else POOREST + singular):
+            return self._stiffened(mass, G, place)
         return self._last
+
+    def _stiffened(self, mass: Array, G: Array, place: int) -> Choice:
+        """Return the choice with all independent rows added to M, if that makes much larger pivots, else the last one.
+
+        Where bodies have little inertia about their joints, as a rod with its mass in its middle, the rows are nearly
+        dependent in the metric of M, and accelerations lose up to twice the digits of the smallest pivot. They are not
+        in that of M + s G^T G. M and s G^T G may differ by a few powers of ten: that many digits are lost instead.
+        """
+        last = self._last
+        rows = G[list(last.rows)]
+        scale = 2.0 ** np.round(np.log2(STIFFER * np.abs(mass).max() / np.abs(rows).max() ** 2))
+        room, chosen = np.zeros_like(self._room), np.zeros_like(self._chosen)
+        new = self._choose(mass + scale * rows.T @ rows, G, RANK, 0.0, BOUNDS, room, chosen)
+        if not 0 <= new <= place - FEWER or chosen[2 : 2 + chosen[0]].tolist() != list(last.rows):
+            return last
+        return replace(last, added=last.rows, scale=float(scale), least=float(LEAST[new]))
 
     def _decode(self, place: int) -> Choice:
         from twoloop.kernels.linalg.rank import STAYS_SINGULAR
