@@ -99,7 +99,7 @@ EFFECTS = (
     ("the mass of", "compiler", "shellinertia", "armature of"),
     ("equality", "joints of", "mimic of"),
     ("tendon", "springdamper of", "stiffness", "damping of", "gravcomp of", "medium"),
-    ("actuator", "command", "forcerange", "ctrlrange", "transmission", "deformable", "mocap of"),
+    ("actuator", "command", "forcerange", "ctrlrange", "deformable", "mocap of"),
     ("frictionloss of", "friction of"),
     ("limits of", "safety_controller of"),
     ("contact",),
@@ -309,6 +309,14 @@ def start_point(part: Part | None, point: Array) -> Array:
         return point
     assert part.start is not None
     return part.start.point(part.pose.inverse().point(point))
+
+
+def start_pose(part: Part | None, pose: Pose) -> Pose:
+    """Return a frame of a part, given in the reference pose, at the start."""
+    if part is None:
+        return pose
+    assert part.start is not None
+    return part.start.then(part.pose.inverse().then(pose))
 
 
 def place(part: Part) -> None:

@@ -8,7 +8,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from twoloop.bodies.file_parts import FileJoint, Part, Pose, body_of, numbers, pose_of, start_point, text_of
+from twoloop.bodies.file_parts import FileJoint, Part, Pose, body_of, numbers, pose_of, start_point, start_pose, text_of
 from twoloop.bodies.parameter_layout import HINGE_ROTOR, SLIDE_ROTOR
 from twoloop.bodies.parts import Body, Force, Numbers
 from twoloop.bodies.rotation import rotation_matrix
@@ -262,7 +262,7 @@ class Loads:
             pose = pose_of({"pos": text_of(wanted[:3]), "quat": text_of(wanted[3:])}, what, True, "xyz")
             asked = frame_1.then(pose)
         # the pose of body 2 relative to body 1 that the weld prescribes, in the axes of both at the start
-        meant, has = (_start_pose(part_1, asked), _start_pose(part_2, frame_2))
+        meant, has = (start_pose(part_1, asked), start_pose(part_2, frame_2))
         off = max(np.abs(meant.x - has.x).max(), np.abs(meant.R - has.R).max())
         if off > AGREES:
             raise ValueError(
@@ -479,14 +479,6 @@ class _Dragging:
 
 def _cross(a: Any, b: Any) -> list[Any]:
     return [a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2] for i in range(3)]
-
-
-def _start_pose(part: Part | None, pose: Pose) -> Pose:
-    """Return a frame of a part, given in the reference pose, at the start."""
-    if part is None:
-        return pose
-    assert part.start is not None
-    return part.start.then(part.pose.inverse().then(pose))
 
 
 def _away(part: Part | None) -> str:

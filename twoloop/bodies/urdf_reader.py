@@ -18,18 +18,24 @@ from twoloop.bodies.file_parts import (
     Pose,
     add_part,
     body_of,
+    combined,
     numbers,
     pose_of,
     record_ignored,
     root_of,
+    start_pose,
     tensor_of,
     text_of,
 )
+from twoloop.bodies.mjcf_loads import Polynomial
 from twoloop.bodies.parts import Body
+from twoloop.bodies.rotation import perpendiculars
 from twoloop.bodies.spatial.model import SpatialModel
 from twoloop.checks.arguments import Array, check_choice, check_finite, check_flag, check_vector
 
 KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "floating": "free", "fixed": ""}
+MORE = ("spherical", "planar")  # types beside these
+TURNING, SLIDING = ("revolute", "continuous"), ("prismatic",)
 CLOSING = ("spherical", "revolute", "universal", "cylindrical", "prismatic", "planar", "fixed")
 WITHOUT_EFFECT = {"link", "joint", "material"}  # supported elements, and colours
 
@@ -75,13 +81,16 @@ def from_urdf(
     *,
     loops: Sequence[Loop] = (),
     positions: Mapping[str, float] | None = None,
+    types: Mapping[str, str] | None = None,
+    limits: bool = False,
     free_base: bool = False,
     gravity: ArrayLike = (0.0, 0.0, -9.81),
 ) -> SpatialModel:
     """Read a model from a URDF file.
 
-    The reader supports links with inertials, joints of the types revolute, continuous, prismatic, floating and fixed,
-    and their damping. Links fixed to others are merged with them.
+    The reader supports links with inertials, joints of the types revolute, continuous, prismatic, planar, spherical,
+    floating and fixed, and their damping; friction, for `solve_with_friction`; and mimic joints. Links fixed to others
+    are merged with them. A massless link moves with its joints if there is mass beyond it; otherwise it is fixed.
 
     Parameters
     ----------
@@ -90,6 +99,10 @@ def from_urdf(
         Joints that close loops, which a URDF file cannot contain.
     positions : mapping, optional
         Angles or displacements by names of joints, rad or m, that define the position of the bodies. Default: zero.
+    types : mapping, optional
+        Types of joints by their names, where the file has others: many exporters write a ball as a fixed joint.
+    limits : bool
+        If True, limits of joints that a model supports become stops, for `solve_with_stops`.
     free_base : bool
         If True, the root link moves freely; otherwise it is fixed to the ground.
     gravity : array_like (3,)
@@ -99,7 +112,7 @@ def from_urdf(
     -------
     SpatialModel
         Its bodies have the names of the links and the axes of their frames. `model.ignored` lists what was ignored:
-        limits, friction, mimic joints, collisions, transmissions, ...
+        limits, collisions, transmissions, ..., in the order of the effect on the motion.
 
     Warns
     -----
@@ -109,7 +122,7 @@ def from_urdf(
     Raises
     ------
     TypeError, ValueError
-        If the file is not URDF or not a tree, a moving link has no mass, or an argument is invalid.
+        If the file is not URDF or not a tree, or an argument is invalid.
 
     Notes
     -----
@@ -146,7 +159,10 @@ def from_urdf(
     """
     root = root_of(path, "robot")
     check_flag("free_base", free_base)
-    reader = _Reader(root, dict(positions or {}), SpatialModel(gravity, name=root.get("name", "robot")))
+    check_flag("limits", limits)
+    model = SpatialModel(gravity, name=root.get("name", "robot"))
+    reader = _Reader(root, dict(positions or {}), model, dict(types or {}), limits)
+    reader.closed = {name for loop in loops for name in (loop.a, loop.b)}
     reader.read(free_base)
     for loop in loops:
         reader.close(loop)
@@ -155,8 +171,13 @@ def from_urdf(
 
 
 class _Reader:
-    def __init__(self, root: Element, positions: dict[str, Any], model: SpatialModel):
-        self.model, self.ignored = model, list[str]()
+    def __init__(
+        self, root: Element, positions: dict[str, Any], model: SpatialModel, types: dict[str, str], limits: bool
+    ):
+        self.model, self.ignored, self.types, self.limits = model, list[str](), types, limits
+        self.closed: set[str] = set()  # links at the ends of loops
+        self.moved: dict[str, FileJoint] = {}
+        self.parts: list[Part] = []
         self.links = {_name(each): each for each in root.findall("link")}
         if len(self.links) < len(root.findall("link")):
             names = [_name(each) for each in root.findall("link")]
@@ -172,6 +193,8 @@ class _Reader:
         unknown = self.positions.keys() - {_name(each) for each in self.joints}
         if unknown:
             raise ValueError(f"positions has {min(unknown)!r}, but the file has no joint of that name")
+        if unknown := types.keys() - {_name(each) for each in self.joints}:
+            raise ValueError(f"types has {min(unknown)!r}, but the file has no joint of that name")
         self.frames: dict[str, tuple[Part | None, Pose]] = {}
         self.collisions = 0
 
@@ -192,24 +215,21 @@ class _Reader:
         base = None
         if free_base:
             base = Part(roots[0], None, origin, [FileJoint("base", "free", np.zeros(3), np.array([0.0, 0.0, 1.0]), {})])
-        parts = [] if base is None else [base]
+        self.parts += [] if base is None else [base]
+        self.children = children
         self._link(roots[0], base, origin)
         waiting = [roots[0]]
         while waiting:
             name = waiting.pop(0)
             for joint in children[name]:
-                parts += self._joint(joint, *self.frames[name])
+                self._joint(joint, *self.frames[name])
                 waiting.append(self._end(joint, "child"))
-        for part in parts:
-            joint_of_part = add_part(self.model, part)
-            freed = part.freed[0]
-            (damping,) = numbers(freed.attributes.get("damping", "0"), 1, f"damping of joint {freed.name!r}")
-            if damping and joint_of_part is None:
-                self.ignored.append(f"damping of joint {freed.name!r}")
-            elif damping and joint_of_part is not None:
-                revolute = joint_of_part.kind == "revolute"
-                add_spring = self.model.torsion_spring if revolute else self.model.axial_spring
-                add_spring(joint_of_part, stiffness=0.0, damping=damping)
+        for part in self.parts:
+            part.massless = part.massless or not combined(part.lumps).mass > 0.0
+            add_part(self.model, part)
+        for joint in self.joints:
+            if _name(joint) in self.moved:
+                self._acting(joint, self.moved[_name(joint)])
         if self.collisions > 1:
             self.ignored.append("contacts between links")
 
@@ -217,6 +237,7 @@ class _Reader:
         """Add a joint that closes a loop."""
         kind = check_choice("kind of a loop", loop.kind, CLOSING) or loop.kind
         (part_a, frame_a), (part_b, frame_b) = (self._frame(name) for name in (loop.a, loop.b))
+        frame_a, frame_b = start_pose(part_a, frame_a), start_pose(part_b, frame_b)
         body_a, body_b = body_of(self.model, part_a), body_of(self.model, part_b)
         at: Any = frame_a.point(check_vector("at of a loop", loop.at, 3))
         if loop.at_b is not None:
@@ -246,43 +267,107 @@ class _Reader:
             raise ValueError(f"{which} of joint {_name(joint)!r} must be a link of the file; given {name!r}")
         return name
 
-    def _joint(self, joint: Element, parent: Part | None, outer: Pose) -> list[Part]:
-        """Read the child link of a joint; return its part if the link moves."""
-        name, kind = _name(joint), joint.get("type", "")
-        if kind not in KINDS:
-            raise ValueError(f"type of joint {name!r} must be one of {', '.join(KINDS)}; given {kind!r}")
-        child = self._end(joint, "child")
+    def _acting(self, element: Element, freed: FileJoint) -> None:
+        """Add damping, friction, limits and coupling of a joint."""
+        name, joint = _name(element), freed.joint
+        single = joint is not None and joint.kind in ("revolute", "prismatic")
+        damping, friction = (
+            numbers(freed.attributes.get(key, "0"), 1, f"{key} of joint {name!r}")[0] for key in ("damping", "friction")
+        )
+        if joint is not None and single:
+            if damping:
+                turns = joint.kind == "revolute"
+                add_spring = self.model.torsion_spring if turns else self.model.axial_spring
+                add_spring(joint, stiffness=0.0, damping=float(damping))
+            if friction:
+                self.model.dry_friction(joint, float(friction))
+                self.ignored.append(f"friction of joint {name!r} by solve_dae (solve_with_friction has it)")
+        else:
+            self.ignored += [f"damping of joint {name!r}"] if damping else []
+            self.ignored += [f"friction of joint {name!r}"] if friction else []
+        limit = element.find("limit")
+        if limit is not None and self._type(element) in ("revolute", "prismatic") and not self._limit(limit, freed):
+            self.ignored.append(f"limits of joint {name!r}")
+        if element.find("safety_controller") is not None:
+            self.ignored.append(f"safety_controller of joint {name!r}")
+        mimic = element.find("mimic")
+        if mimic is not None and not (single and self._mimic(mimic, freed)):
+            self.ignored.append(f"mimic of joint {name!r}")
+
+    def _limit(self, limit: Element, freed: FileJoint) -> bool:
+        """Add the stops of a joint; return False if they are not asked for, or a model has none there."""
+        if not self.limits or freed.joint is None:
+            return False
+        bounds = [numbers(limit.get(key, "0"), 1, f"{key} of joint {freed.name!r}")[0] for key in ("lower", "upper")]
+        low, high = (float(each - freed.displacement) for each in bounds)
+        try:
+            self.model.limit(freed.joint, lower=low, upper=high)
+        except ValueError:  # e.g. a hinge in space
+            return False
+        return True
+
+    def _mimic(self, mimic: Element, freed: FileJoint) -> bool:
+        """Couple a joint to the one that it follows; return False if a model cannot."""
+        leader = self.moved.get(mimic.get("joint", ""))
+        add_coupling = getattr(self.model, "coupling", None)
+        if add_coupling is None or leader is None or leader.joint is None:
+            return False
+        factor, offset = (
+            float(numbers(mimic.get(key, default), 1, f"{key} of the mimic of joint {freed.name!r}")[0])
+            for key, default in (("multiplier", "1"), ("offset", "0"))
+        )
+        row = Polynomial((offset, factor), (freed.displacement, leader.displacement))
+        add_coupling([freed.joint, leader.joint], row, name=f"mimic of {freed.name}")
+        return True
+
+    def _type(self, joint: Element) -> str:
+        name = _name(joint)
+        kind = self.types.get(name, joint.get("type", ""))
+        if kind not in (*KINDS, *MORE):
+            raise ValueError(f"type of joint {name!r} must be one of {', '.join((*KINDS, *MORE))}; given {kind!r}")
+        return kind
+
+    def _matters(self, link: str) -> bool:
+        """Return True if a link, or one beyond it, has mass or is an end of a loop."""
+        mass = self.links[link].find("inertial/mass")
+        heavy = mass is not None and numbers(mass.get("value", ""), 1, f"mass of link {link!r}")[0] > 0.0
+        return (
+            heavy or link in self.closed or any(self._matters(self._end(each, "child")) for each in self.children[link])
+        )
+
+    def _joint(self, joint: Element, parent: Part | None, outer: Pose) -> None:
+        """Read the child link of a joint."""
+        name, kind, child = _name(joint), self._type(joint), self._end(joint, "child")
         pose = outer.then(_origin(joint, f"origin of joint {name!r}"))
-        given = joint.find("axis")
-        axis = numbers("1 0 0" if given is None else given.get("xyz", "1 0 0"), 3, f"axis of joint {name!r}")
-        if not axis.any():
-            raise ValueError(f"axis of joint {name!r} must have a direction; given {axis.tolist()}")
-        axis = axis / np.linalg.norm(axis)
+        value = self.positions.get(name, 0.0)
+        if value and kind not in (*TURNING, *SLIDING):
+            raise ValueError(f"positions has {name!r}, a {kind} joint, which has no angle or displacement")
+        if kind == "fixed" or not self._matters(child):
+            if kind != "fixed":
+                self.ignored.append(f"joint {name!r}, beyond which there is no mass")
+            self._link(child, parent, pose)
+            return
+        axis = np.array([1.0, 0.0, 0.0])
+        if kind in (*TURNING, *SLIDING, "planar"):
+            given = joint.find("axis")
+            axis = numbers("1 0 0" if given is None else given.get("xyz", "1 0 0"), 3, f"axis of joint {name!r}")
+            if not axis.any():
+                raise ValueError(f"axis of joint {name!r} must have a direction; given {axis.tolist()}")
+            axis = axis / np.linalg.norm(axis)
         dynamics = joint.find("dynamics")
         attributes = {} if dynamics is None else dict(dynamics.attrib)
-        if float(attributes.get("friction", 0.0)):
-            self.ignored.append(f"friction of joint {name!r}")
-        if kind in ("revolute", "prismatic") and joint.find("limit") is not None:
-            self.ignored.append(f"limits of joint {name!r}")
-        for tag in ("mimic", "safety_controller"):
-            if joint.find(tag) is not None:
-                self.ignored.append(f"{tag} of joint {name!r}")
-        value = self.positions.get(name, 0.0)
-        if value and kind not in ("revolute", "continuous", "prismatic"):
-            raise ValueError(f"positions has {name!r}, a {kind} joint, which has no angle or displacement")
-        if kind == "fixed":
-            self._link(child, parent, pose)
-            return []
         own = f"joint {name}" if name in self.links else name  # in URDF a link and a joint may share a name
-        moved = FileJoint(own, KINDS[kind], pose.x, pose.R @ axis, attributes)
-        if kind == "prismatic":
-            pose = pose.then(Pose(value * axis, np.eye(3)))
-        elif kind != "floating":
-            turn = {"axisangle": text_of([*axis, value])}
-            pose = pose.then(pose_of(turn, f"joint {name!r}", False, "XYZ"))
-        part = Part(child, parent, pose, [moved])
+        normal = pose.R @ axis
+        if kind == "planar":
+            freed = [FileJoint(own, "slide", pose.x, each, attributes) for each in perpendiculars(normal)]
+            freed.append(FileJoint(own, "hinge", pose.x, normal, attributes))
+        else:
+            moved = "ball" if kind == "spherical" else KINDS[kind]
+            freed = [FileJoint(own, moved, pose.x, normal, attributes, position=value if value else None)]
+        part = Part(child, parent, pose, freed)
+        self.parts.append(part)
+        self.moved[name] = freed[-1]
         self._link(child, part, pose)
-        return [part]
 
     def _link(self, name: str, part: Part | None, pose: Pose) -> None:
         """Record the frame and the mass of a link."""
