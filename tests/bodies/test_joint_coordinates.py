@@ -6,16 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.bad_input.bodies import loop
 from tests.bodies.runs import by_hand, moved
-from twoloop.bodies import PlanarModel, SpatialModel
+from twoloop.bodies import SpatialModel
 
 KINDS = ("revolute", "prismatic", "cylindrical", "revolute")
-
-
-def keys_of(model):
-    """The coordinates of the joints of a model: kind and name."""
-    kinds = {"revolute": ["angle"], "prismatic": ["displacement"], "cylindrical": ["angle", "displacement"]}
-    return [(joint.name, which) for joint in model.joints for which in kinds[joint.kind]]
 
 
 def chain(rng):
@@ -31,7 +26,7 @@ def chain(rng):
 def test_an_open_chain_starts_as_given_and_its_other_joints_stand(seed):
     rng = np.random.default_rng(seed)
     model = chain(rng)
-    keys = keys_of(model)
+    keys = [(each.joint, each.which) for each in model.problem().joint_coordinates]
     wanted = [{key: rng.uniform(-5.0, 5.0) for key in keys if rng.random() < 0.7} for _ in range(2)]
     problem = model.problem(positions=wanted[0], rates=wanted[1])
     q, v, h = problem.q0, problem.v0, 1e-6
@@ -46,33 +41,25 @@ def test_an_open_chain_starts_as_given_and_its_other_joints_stand(seed):
     np.testing.assert_allclose([again.q0, again.v0], [q, v], atol=1e-12)
 
 
-def four_bar(a=0.3, b=1.0, c=0.8, d=0.9):
-    """A crank, coupler and rocker above the frame; and the angles of its pins from there at an angle of the crank."""
-
-    def angles(crank):
-        x, y = a * np.cos(crank) - d, a * np.sin(crank)
-        far = np.hypot(x, y)
-        rocker = np.arctan2(y, x) - np.arccos((far**2 + c**2 - b**2) / (2.0 * far * c))
-        coupler = np.arctan2(c * np.sin(rocker) - y, c * np.cos(rocker) - x)
-        return np.array([crank, coupler - crank, rocker - coupler, -rocker])
-
-    crank, coupler, rocker, _ = np.cumsum(angles(0.4))
-    ends = np.cumsum(
-        [(0.0, 0.0), *(x * np.array([np.cos(y), np.sin(y)]) for x, y in ((a, crank), (b, coupler)))], axis=0
-    )
-    model, names = PlanarModel(name="linkage"), ("ground", "crank", "coupler", "rocker", "ground")
-    for name, start, end in zip(names[1:-1], ends, [*ends[1:], (d, 0.0)], strict=True):
-        model.rod(name, start, end, mass=1.0)
-    for one, other, at in zip(names, names[1:], [*ends, (d, 0.0)], strict=False):
-        model.revolute(one, other, at=at, name=f"{one}-{other}")
-    assert rocker == pytest.approx(sum(angles(0.4)[:3]))
-    return model, lambda crank: angles(0.4 + crank) - angles(0.4)
+def angles_of_pins(crank, a=0.3, b=1.0, c=0.8, d=0.9):
+    """Angles of the pins of crank, coupler and rocker, which stand above the frame, at an angle of the crank."""
+    x, y = a * np.cos(crank) - d, a * np.sin(crank)
+    far = np.hypot(x, y)
+    rocker = np.arctan2(y, x) - np.arccos((far**2 + c**2 - b**2) / (2.0 * far * c))
+    coupler = np.arctan2(c * np.sin(rocker) - y, c * np.cos(rocker) - x)
+    return np.array([crank, coupler - crank, rocker - coupler, -rocker])
 
 
 @pytest.mark.parametrize("crank", [-9.0, 2.9])
 def test_a_loop_follows_its_crank_over_turns(crank):
-    model, angles = four_bar()
-    problem = model.problem(positions={"ground-crank": crank}, rates={model.joints[0]: 2.0})
+    start, (*_, rocker) = angles_of_pins(0.4), -angles_of_pins(0.4)
+    ends = [0.3 * np.exp(0.4j), 0.9 + 0.8 * np.exp(1j * rocker)]
+    model = loop((0.0, 0.0), *((z.real, z.imag) for z in ends), (0.9, 0.0))
+
+    def angles(crank):
+        return angles_of_pins(0.4 + crank) - start
+
+    problem = model.problem(positions={"A": crank}, rates={model.joints[0]: 2.0})
     found = [problem.joint_coordinate(joint) for joint in model.joints]
     away = np.array([each.position(problem.q0) for each in found]) - angles(crank)
     np.testing.assert_allclose(np.exp(1j * away), 1.0, atol=1e-12)  # but for turns: angles() is not continuous
@@ -82,17 +69,17 @@ def test_a_loop_follows_its_crank_over_turns(crank):
     np.testing.assert_allclose(model.problem(positions=full).q0, problem.q0, atol=1e-9)
 
 
-def ball_on_a_hinge(*more):
+def ball_on_a_hinge():
     """A ball that turns about a skew axis through its centre, with a moment of inertia of 0.1 kg m^2, and its angle."""
     model = SpatialModel(name="ball")
     ball = model.body("ball", mass=1.0, inertia=(0.1, 0.1, 0.1), position=(0.1, 0.2, 0.3))
-    hinge = model.revolute(*more, ball, at=(0.1, 0.2, 0.3), axis=(1.0, 2.0, -1.0), name="hinge")
+    hinge = model.revolute("ground", ball, at=(0.1, 0.2, 0.3), axis=(1.0, 2.0, -1.0), name="hinge")
     return model, hinge, model.joint_coordinate(hinge)
 
 
 def test_a_wheel_in_space_is_counted_over_turns():
     """Between the stored times of the table it turns up to three times."""
-    model, hinge, angle = ball_on_a_hinge("ground")
+    model, hinge, angle = ball_on_a_hinge()
     model.motor(hinge, lambda t, q, v: 0.5 * np.cos(t) - 0.01 * angle.rate(q, v))
     problem = model.problem((0.0, 3.0), positions={hinge: -0.5}, rates={"hinge": 60.0})
     result = moved(problem, t_eval=np.linspace(0.0, 3.0, 10))
@@ -108,7 +95,7 @@ def test_a_wheel_in_space_is_counted_over_turns():
 
 
 def test_a_motor_and_an_event_read_an_angle():
-    model, hinge, angle = ball_on_a_hinge("ground")
+    model, hinge, angle = ball_on_a_hinge()
     model.motor(hinge, lambda t, q, v: -1.6 * (angle.position(q) - 0.3) + 0.0 * t)
     problem = pickle.loads(pickle.dumps(model.problem((0.0, 2.0), positions={hinge: 5.3})))
     assert problem.note == "1 degree of freedom."  # it is traced
