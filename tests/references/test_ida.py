@@ -1,8 +1,5 @@
 """Test IDA without Python and on the beam: accuracy, the options that matter, failures, memory."""
 
-import ctypes
-import gc
-import resource
 from functools import cache
 
 import numpy as np
@@ -161,39 +158,6 @@ def test_python_functions_are_refused():
         solve_ida_c(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0])
 
 
-class _Mallinfo(ctypes.Structure):
-    """struct mallinfo2 of glibc: ten sizes, of which 4 and 7 are bytes in use in mapped and in other blocks."""
-
-    _fields_ = (("sizes", ctypes.c_size_t * 10),)
-
-
-def allocated():
-    """Bytes that malloc has given out."""
-    mallinfo = ctypes.CDLL(None).mallinfo2
-    mallinfo.restype = _Mallinfo
-    gc.collect()
-    sizes = mallinfo().sizes
-    return sizes[4] + sizes[7]
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallinfo2"), reason="needs glibc")
-@pytest.mark.usefixtures("collected_alone")
-def test_runs_leave_nothing_behind():
-    good, (failing, q0, v0) = pendulum()[0], pendulum(NAN)
-
-    def runs(count):
-        for _ in range(count):
-            assert solve_ida_c(good, (0.0, 0.05), q0, v0, 1e-6, 1e-6, t_eval=[0.05]).success
-            assert not solve_ida_c(failing, (0.0, 2.0), q0, v0, 1e-4, 1e-4, t_eval=[2.0]).success
-
-    runs(50)
-    before, highest = allocated(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    runs(50)
-    assert allocated() - before < 50 * 20  # the name of a flag takes 32 bytes, a context 330
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - highest < 300  # kB
-
-
 TIMES = np.arange(1, 21) / 10.0
 CASES = {
     "flexible": very_flexible_beam(),
@@ -237,13 +201,6 @@ def errors(name, result):
 @pytest.mark.slow
 def test_six_digits_of_the_stiff_beam_at_2_s():
     assert errors("stiff", run_beam("stiff", 1e-5))[1] < 3e-7
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("form", ["stabilised", "index1"])
-def test_the_same_through_python(form):
-    result = run_beam("flexible", 1e-7, solve_ida, form=form, t_eval=TIMES[:10])
-    assert errors("flexible", result)[0] < 3e-7
 
 
 @pytest.mark.slow

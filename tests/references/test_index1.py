@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from references.paper.four_bar_minimal import trajectory
 from references.scipy.index1 import STABILISATIONS, solve_index1
-from tests.kernels.adaptive import shared_run
 from tests.mechanisms.make_references import equations
 from tests.problems import LINKAGES, force_residual, pendulum, violations, worst
 from twoloop.run.record import Status
@@ -70,29 +68,3 @@ def test_failure_of_a_projection_comes_back_as_a_row():
     result = solve_index1(system, (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], stabilisation="projection")
     assert result.status is Status.SOLVER_FAILED and "the projection onto the constraints at t = 0.5" in result.message
     assert 0.0 < result.t[-1] <= 0.5
-
-
-@pytest.mark.slow
-def test_lsoda_does_not_step_towards_a_singularity_without_end():
-    system = pendulum(force=lambda t, q, v: np.array([0.0, -9.81 / max(0.0, 0.7 - t) ** 2]))
-    result = solve_index1(system, (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], "LSODA", 1e-4, 1e-4)
-    assert result.status is Status.SOLVER_FAILED and "the step has shrunk" in result.message
-    assert 0.69 < result.t[-1] <= 0.7 and result.stats.n_accepted < 20000
-
-
-@pytest.mark.slow
-def test_at_equal_error_the_projected_solver_costs_what_dop853_of_twoloop_does():
-    # the same tableau on q'' = a, projected after every step; cost over error on the log-log lines through the runs
-    target, counts = 1e-6, []
-    ours, theirs = [], []
-    for tol in (1e-5, 1e-7, 1e-9):
-        result, error = shared_run("DOP853", tol)
-        ours.append((error, result.stats.n_evaluations))
-        result = run("default", 10.0, "DOP853", tol, tol, stabilisation="projection")
-        theirs.append(
-            (worst(result.q, trajectory(LINKAGES["default"].parameters, result.t)[0]), result.stats.n_evaluations)
-        )
-    for line in (ours, theirs):
-        error, count = np.log(np.array(line)).T
-        counts.append(np.exp(np.polyval(np.polyfit(error, count, 1), np.log(target))))
-    assert 0.7 < counts[0] / counts[1] < 1.2

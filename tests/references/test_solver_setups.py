@@ -12,10 +12,8 @@ from references.driver import TimeLimit
 from references.equations.straight_line import exact_jacobian, straight_line
 from references.lines import Line, lines
 from references.scipy import fully_implicit, index1
-from references.scipy.index1 import solve_index1
 from references.sundials import cvode_c
-from references.sundials.cvode_c import solve_cvode, solve_cvode_c
-from references.sundials.ida import solve_ida_c
+from references.sundials.cvode_c import solve_cvode_c
 from studies.bench.collector import Case, Run, attempt
 from studies.bench.solvers import CATALOGUE
 from studies.validation.study import MAKE
@@ -41,13 +39,6 @@ def run(solve, problem, *arguments, t_end=None, **options):
 
 def error(problem, result):
     return np.abs(result.q[:, -1] - problem.reference.q).max()
-
-
-@pytest.mark.slow
-def test_ida_tests_positions_and_velocities_without_the_integrals_of_the_multipliers():
-    made = {test: run(solve_ida_c, FOUR_BAR, 1e-7, 1e-7, error_test=test) for test in ("states", "positions")}
-    assert 1e-9 < error(FOUR_BAR, made["states"]) < 2e-4
-    assert made["positions"].stats.n_accepted < 0.8 * made["states"].stats.n_accepted
 
 
 @callback("mass")
@@ -182,22 +173,6 @@ def test_every_solver_is_put_to_mechanisms_with_euler_parameters(name):
 
 
 # --- Jacobians
-@pytest.mark.slow
-def test_implicit_solvers_get_the_analytic_jacobian(monkeypatch):
-    """Without it as many evaluations more as there are unknowns, for every Jacobian; the motion is the same."""
-    at = start(PENDULUM, 2.0)
-    solvers = {
-        "Radau": lambda: solve_index1(*at, "Radau", 1e-7, 1e-7),
-        "CVODE": lambda: solve_cvode(*at, 1e-7, 1e-7),
-    }
-    exact = {name: solve() for name, solve in solvers.items()}
-    monkeypatch.setattr(index1.RightHandSide, "jacobian", lambda *_: None)
-    differenced = {name: solve() for name, solve in solvers.items()}
-    for name in solvers:
-        assert exact[name].success and exact[name].stats.n_evaluations < differenced[name].stats.n_evaluations, name
-        assert np.abs(exact[name].q[:, -1] - differenced[name].q[:, -1]).max() < 1e-4
-
-
 @pytest.mark.slow  # compiles right-hand sides and their Jacobian for seconds
 def test_a_jacobian_is_given_only_where_it_is_that_of_the_equations():
     system, q, v = PENDULUM.system, PENDULUM.q0, PENDULUM.v0

@@ -195,12 +195,6 @@ def test_two_timed_studies_do_not_run_at_once_on_a_machine(tmp_path, monkeypatch
         pass
 
 
-def test_every_row_has_its_processor(tmp_path):
-    with KeptRows(tmp_path / "x.partial.jsonl", {}) as kept:
-        kept.add("a", {"x": 1})
-        assert kept["a"] == {"x": 1, "processor": processor()}
-
-
 def test_no_text_tells_where_the_project_lies(tmp_path):
     with Output(call(tmp_path)) as output:
         output.save_rows(pd.DataFrame({"message": [f"refused ({ROOT / 'studies' / 'traps.py'}, line 56)"]}), STAMP)
