@@ -9,7 +9,7 @@ from twoloop.bodies import from_mjcf
 
 model = from_mjcf(Path(__file__).with_name("linkage.xml"))
 print(model)
-print(model.ignored)  # what was not read: contacts, limits, actuators, ...
+print(model.ignored)  # what was not read, in the order of its effect on the motion
 
 problem = model.problem(t_span=(0.0, 2.0))
 print(problem.freedom)  # degrees of freedom, and joints whose constraints depend on those of others

@@ -24,6 +24,7 @@ PAGES = {  # the page that explains a script, and prints all of it
     "run_linkage": "docs/start.md",
     "spatial_mechanism": "docs/spatial_mechanism.md",
     "from_mujoco": "docs/from_a_file.md",
+    "gripper": "docs/from_a_file.md",
     "ten_thousand_runs": "docs/many_runs.md",
     "sampled_controller": "docs/controller.md",
     "fit_parameters": "docs/fit_parameters.md",
@@ -178,6 +179,18 @@ def test_the_spatial_mechanism_has_the_geometry_and_the_power_of_its_drive(run):
     for k in range(5, turns.size - 5, 20):
         power = rate * (energy(turns[k] + 1e-3) - energy(turns[k] - 1e-3)) / 2e-3
         assert rate * names["torque"][k] == pytest.approx(power, abs=2e-4)
+
+
+def test_the_gripper_follows_its_command(run):
+    """Each finger has 20 g and 0.4 kg of armature, one servo and two dampers."""
+    names = run("gripper")
+
+    def slope(t, y):
+        command = names["opening"]["grip"](t)
+        return [y[1], (400.0 * (command - y[0]) - 30.2 * y[1]) / 0.84]
+
+    y = solve_ivp(slope, (0.0, 2.0), [0.0, 0.0], rtol=1e-11, atol=1e-13).y[0, -1]
+    np.testing.assert_allclose(names["fingers"], [y, y], atol=1e-8)
 
 
 def test_the_file_from_mujoco_moves_as_newton_and_euler_say(run):

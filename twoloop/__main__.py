@@ -14,10 +14,12 @@ from pathlib import Path
 
 from twoloop import Result, __version__, kernels, mechanisms, solve_dae
 from twoloop.audit.mjcf import audit_mjcf, check_ending
+from twoloop.bodies import from_mjcf, from_urdf
 from twoloop.checks.arguments import needed
 from twoloop.kernels.compile.caches import cache_folder
 from twoloop.mechanisms.registry import problem_from
 from twoloop.methods.presets import PRESETS
+from twoloop.problem.problem import Problem
 from twoloop.rows.leaderboard import leaderboard
 from twoloop.rows.row_format import MAX_ERRORS, find_errors, read_lines
 
@@ -25,6 +27,7 @@ NEEDED = ("numpy", "scipy", "numba")
 OPTIONAL = ("pandas", "pyarrow", "matplotlib", "pillow", "rich", "sympy", "dask")
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 TABLES, PICTURES, ANIMATIONS = (".csv", ".parquet"), (".png", ".svg", ".pdf"), (".html", ".gif", ".mp4")
+READERS = {".xml": from_mjcf, ".mjcf": from_mjcf, ".urdf": from_urdf}
 ENDINGS = (*TABLES, *PICTURES, *ANIMATIONS, ".npz")
 PACKAGES = {  # modules without which such files cannot be written, and the packages that have them
     ".csv": (("pandas", "pandas"),),
@@ -73,6 +76,12 @@ def compile_all() -> None:
     print(f"ready after {time.perf_counter() - began:.1f} s")
 
 
+def problem_of(where: str) -> Problem:
+    """Return the problem of a file of MuJoCo or URDF, of FILE.py:FUNCTION, or the ready mechanism of that name."""
+    reader = READERS.get(Path(where).suffix.lower())
+    return problem_from(where) if reader is None else reader(where).problem()
+
+
 def solve(given: argparse.Namespace) -> None:
     """Solve a problem, say how the run ended, and write what was asked for.
 
@@ -91,7 +100,7 @@ def solve(given: argparse.Namespace) -> None:
             raise ValueError(f"--out: there is no folder {file.parent.resolve()}")
         for module, package in PACKAGES.get(file.suffix.lower(), ()):
             needed(module, package, f"--out {file}")
-    problem = problem_from(given.where)
+    problem = problem_of(given.where)
     if problem.drawing is None and any(file.suffix.lower() in ANIMATIONS for file in files):
         raise ValueError(f"{given.where} makes a problem without a drawing: give it drawing=twoloop.Drawing(...)")
     t_span = (problem.t_span[0], problem.t_span[1] if given.t_end is None else given.t_end)
@@ -190,8 +199,8 @@ def parser() -> argparse.ArgumentParser:
     one.add_argument(
         "where",
         metavar="MECHANISM",
-        help="FILE.py:FUNCTION, a function without arguments that returns a twoloop.mechanisms.Problem, or the name of "
-        "a ready mechanism, such as four_bar",
+        help="FILE.py:FUNCTION, a function without arguments that returns a twoloop.mechanisms.Problem; MODEL.xml of "
+        "MuJoCo or MODEL.urdf; or the name of a ready mechanism, such as four_bar",
     )
     one.add_argument("--method", default="auto", choices=list(PRESETS), metavar="NAME", help=", ".join(PRESETS))
     one.add_argument("--rtol", type=float, default=1e-8, help="default: 1e-8")
