@@ -16,11 +16,10 @@ S = crossing_step.S
 def test_the_tables_are_exact_for_polynomials():
     tableau = gauss(S)
     options = crossing_step.options_array(tableau.A, tableau.b, tableau.c, 0.0, 0.0)[crossing_step.N_SCALARS :]
-    _, twice, legendre, without = options[: 4 * S * S].reshape(4, S, S)
-    _, end_twice, c = options[4 * S * S :].reshape(3, S)
+    _, twice, legendre = options[: 3 * S * S].reshape(3, S, S)
+    _, end_twice, c = options[3 * S * S :].reshape(3, S)
     for degree in range(S - 1):
         values, product = c**degree, (degree + 1) * (degree + 2)
-        np.testing.assert_allclose(without @ values, values, rtol=0, atol=1e-12)
         np.testing.assert_allclose(twice @ values, c ** (degree + 2) / product, rtol=0, atol=1e-13)
         np.testing.assert_allclose(end_twice @ values, 1.0 / product, rtol=0, atol=1e-13)
     for degree in range(S):
@@ -35,7 +34,7 @@ def test_runs_find_across_at_tight_tolerances(n):
     """Three passages in 5 s: stages beside the constraints let one run in four end at one of them."""
     m = mechanism(f"A02, N = {n}")
     ended = 0
-    for tolerance in (1e-8, 3e-9, 1e-9, 3e-10):
+    for tolerance in (1e-8, 1e-9, 1e-10, 1e-11):
         result = solve_dae(m.system(), (0.0, 5.0), *m.start, rtol=tolerance, atol=tolerance)
         ended += result.success
         assert not result.success or error(m, result) < 1e3 * tolerance

@@ -356,11 +356,17 @@ def _groups(table: Table, which: Groups) -> Groups:
     groups[:, names.FIRST_OWN], groups[:, names.LAST_OWN] = which, which + 1
     groups[:, names.KIND] = table.kinds[which]
     groups[:, names.HIGH] = len(table.t) - 1
+    # rounding may have changed the states before a step across a singular position: its polynomials leave them out
+    across = np.append(False, table.kinds == names.ACROSS)
+    (begins,) = (across[1:] & ~across[:-1]).nonzero()
+    if begins.size:
+        inner = across[which + 1]
+        groups[inner, names.LOW] = begins[np.searchsorted(begins, which[inner], side="right") - 1]
     (jumps,) = (table.kinds == names.JUMP).nonzero()
     if not jumps.size:
         return groups
     behind = np.searchsorted(jumps, which)
-    groups[:, names.LOW] = np.append(0, jumps + 1)[behind]
+    groups[:, names.LOW] = np.maximum(groups[:, names.LOW], np.append(0, jumps + 1)[behind])
     groups[:, names.HIGH] = np.append(jumps, len(table.t) - 1)[behind]
     return groups
 

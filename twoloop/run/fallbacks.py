@@ -13,12 +13,17 @@ from twoloop.methods.plan import INNER_TOL, LARGEST_MOVE, Plan
 from twoloop.methods.tableaux import gauss
 from twoloop.run.discontinuities import state_behind_jump
 from twoloop.run.run import Run
+from twoloop.run.singular_positions import Place, least_singular_value
 from twoloop.run.workspace import kit_of, kit_with
 
 Array = NDArray[np.float64]
 
 # lengths to try for a step across a singular position, on which no stage should fall, over the longest last step
 LENGTHS = tuple(0.85**k for k in range(28))
+LONGER = tuple(1.4**k for k in range(1, 7))  # ... and those to try if too few nodes of that one are beyond it
+FAR = 0.2  # relative to the largest pivot: a state farther from the singular position is a base of the polynomial
+LONGEST_PAST = 1.5  # relative to the longest of the last steps: no base is older
+SMALL = 1e-300  # avoids a division by zero
 CLEAR = 0.3  # relative to the largest pivot that C_q had: above it the run's own steps continue
 
 
@@ -62,24 +67,64 @@ def _renew_kit(run: Run) -> None:
     run.functions = run.kit.functions
 
 
-def cross_singularity(run: Run) -> tuple[Plan, Array]:
-    """Return the plan and the controls for steps across a singular position, see kernels/steps/crossing_step.py."""
+def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
+    """Return the plan and the controls for steps across a singular position, see kernels/steps/crossing_step.py.
+
+    `past`: states of the last accepted steps, oldest first; there may be none.
+    """
     a, clock = run.a, run.clock
-    run.crossings.append([(float(clock[a.T]), run.state.copy())])
-    from twoloop.kernels.steps.crossing_step import UNSEEN
+    from twoloop.kernels.steps.crossing_step import BACK, UNSEEN
 
     plan = _crossing_plan(run.system.n_q)
+    earliest, fixed = max(clock[a.T_START], clock[a.LAST_CHANGE], *run.jumps), run.control[a.FIXED_STEP] > 0.0
+    base = None if fixed else _state_farther_away(run, [place for place in past if place[0] >= earliest])
+    # a force that jumped may spoil nodes in the past, and beside the start of the run there may be too few of them
+    run.origins = [(earliest, base), (np.inf, None)]
+    if float(clock[a.T] - clock[a.T_START]) < clock[a.H_LONG] and not run.system.called_in_python:
+        run.origins.append((-np.inf, None))
+    run.crossings.append([base or (float(clock[a.T]), run.state.copy())])
     control = run.control.copy()
     control[: a.N_RULE] = plan.rule
     control[a.SYMMETRIC], control[a.BRIDGE], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
     control[a.MAY_SWITCH] = control[a.MAKES_MANY] = 0.0
     if control[a.FIXED_STEP] == 0.0:
-        control[a.MAX_EVALUATION_GAP] = 1.0 if run.narrow else UNSEEN
+        control[a.MAX_EVALUATION_GAP] = 1.0 if run.narrow else UNSEEN / (1.0 - BACK)
         control[a.MAX_STEP] = min(run.max_step, run.tolerances[indices.GAP] / control[a.MAX_EVALUATION_GAP])
-    clock[a.H_LIMIT], clock[a.LIMIT_AGE] = np.inf, 0.0
-    run.lengths = lengths_across(float(clock[a.H_LONG]), float(control[a.MAX_STEP]))
-    clock[a.H_NEXT] = run.lengths.pop(0)
+    clock[a.LIMIT_AGE] = 0.0
+    _next_origin(run, plan, control)
     return plan, control
+
+
+def _next_origin(run: Run, plan: Plan, control: Array) -> None:
+    """Prepare the first attempt with the next origin of the polynomial."""
+    from twoloop.kernels.steps.crossing_step import begin
+
+    a, clock = run.a, run.clock
+    begin(plan.memory, clock[a.LARGEST_PIVOT], *run.origins.pop(0))
+    longest, allowed = float(clock[a.H_LONG]), float(control[a.MAX_STEP])
+    run.lengths = lengths_across(longest, allowed)
+    run.longer = [longest * part for part in LONGER if longest * part <= allowed]
+    clock[a.H_NEXT], clock[a.H_LIMIT] = run.lengths.pop(0), np.inf
+    run.crossed = float(clock[a.H_NEXT])
+
+
+def _state_farther_away(run: Run, past: list[Place]) -> Place | None:
+    """Return the latest of these states that is well away from the singular position, else the farthest of them.
+
+    Rounding changes velocities by eps/s^2 at a distance s, as the smallest singular value measures it.
+    """
+    a, n, t = run.a, run.system.n_q, float(run.clock[run.a.T])
+    here = least_singular_value(run.system, t, run.state[:n], run.rank)
+    farthest = run.work.notes[indices.PIVOT] / max(float(run.clock[a.LARGEST_PIVOT]), SMALL)
+    scale = farthest / here if here > 0.0 else np.inf
+    found: Place | None = None
+    for time, state in reversed(past):
+        if farthest >= FAR or t - time > LONGEST_PAST * run.clock[a.H_LONG]:
+            break
+        distance = scale * least_singular_value(run.system, time, state[:n], run.rank)
+        if distance > farthest:
+            farthest, found = distance, (time, state.copy())
+    return found
 
 
 def lengths_across(longest: float, allowed: float) -> list[float]:
@@ -115,13 +160,43 @@ def crossing_kit(kit: Kit) -> Kit:
 
 
 def after_crossing(run: Run, plan: Plan, control: Array, code: int, accepted: int) -> tuple[Plan, Array, int]:
-    """Choose what follows an attempt at a step across: another length, another such step, or the run's own steps."""
-    a = run.a
-    if code == a.PAUSED and accepted == 0 and run.lengths:
-        run.clock[a.H_NEXT], run.clock[a.H_LIMIT] = run.lengths.pop(0), np.inf
-        return plan, control, code
-    if code == a.PAUSED and accepted > 0 and (run.work.notes[indices.PIVOT] < CLEAR * run.clock[a.LARGEST_PIVOT]):
-        run.lengths = lengths_across(float(run.clock[a.H_LONG]), float(control[a.MAX_STEP]))
+    """Choose what follows an attempt to step across: a piece of its polynomial, another length, or the run's steps."""
+    from twoloop.kernels.steps import crossing_step as kernels
+
+    a, clock = run.a, run.clock
+    end = float(plan.memory[-kernels.N_STORED :][kernels.END])  # of a polynomial that was found
+    # a piece may end a rounding before or after its time
+    now = float(clock[a.T] + kernels.ROUNDING * run.crossed + 4.0 * np.spacing(abs(clock[a.T])))
+    if code in (a.PAUSED, a.RANK_LOST) and end > now:
+        if not run.pieces:
+            run.pieces = kernels.piece_ends(plan.memory, plan.options[-kernels.S :], float(clock[a.T]))
+            if clock[a.T] > clock[a.T_START]:
+                run.state[: 3 * run.system.n_q] = kernels.state_at(plan.memory, plan.options, float(clock[a.T]))
+        elif accepted == 0:
+            run.pieces.pop(0)
+        run.pieces = [piece for piece in run.pieces if piece > now]
+        if run.pieces:
+            clock[a.H_NEXT], clock[a.H_LIMIT] = run.pieces[0] - clock[a.T], np.inf
+            return plan, control, a.PAUSED
+    run.pieces, plan.memory[-kernels.N_STORED :][kernels.END] = [], -np.inf
+    if accepted > 0:  # the longest of the last steps is that of the whole polynomial
+        clock[a.H_LONG] = max(clock[a.H_LONG], run.crossed)
+        clock[a.H_NEXT] = max(clock[a.H_NEXT], run.crossed)
+    if code == a.PAUSED and accepted == 0:
+        if clock[a.FAILURE_CODE] not in (indices.SINGULAR, indices.OUTER_DIVERGED):
+            run.longer = []
+        if run.longer or run.lengths:
+            clock[a.H_NEXT], clock[a.H_LIMIT] = (run.longer or run.lengths).pop(0), np.inf
+            run.crossed = float(clock[a.H_NEXT])
+            return plan, control, code
+        if run.origins:
+            _next_origin(run, plan, control)
+            return plan, control, code
+    if code == a.PAUSED and accepted > 0 and (run.work.notes[indices.PIVOT] < CLEAR * clock[a.LARGEST_PIVOT]):
+        proposal = clock[a.H_NEXT]
+        run.origins = [(float(clock[a.T]), None)]
+        _next_origin(run, plan, control)
+        clock[a.H_NEXT] = run.crossed = proposal
         return plan, control, code
     if code not in (a.PAUSED, a.STEP_TOO_SMALL, a.FIXED_STEP_FAILED, a.RANK_LOST):
         return plan, control, code

@@ -152,6 +152,7 @@ CHUNK_TO_EVENT = 16  # attempts per chunk if an event may end the run: steps com
 CHUNK_TIME = 0.05  # s of CPU; chunks that take longer do not grow, so that Ctrl-C is heard
 # statuses whose message may say that stability limited the steps
 EXPLAINED_BY_STIFFNESS = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
+MOST_PAST = 16  # largest number of accepted steps that a step across a singular position may begin from
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
 MOST_SPARE, LARGEST_SPARE = 16, 250_000  # largest number of buffers kept for later runs, and of numbers in each
 _spare: dict[tuple[int, int, int], Buffers] = {}  # buffers for the next run, by their sizes
@@ -209,6 +210,7 @@ class IntegrationLoop:
         self.between_looks = self.next_look = run.chunk
         self.plan, self.control, self.kit = run.plan, run.control, run.kit  # may differ from the run's own
         self.counts = BEFORE.copy()
+        self.latest: list[tuple[Array, Array]] = []  # times and rows of the last two chunks
         self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # steps that were not stored yet, after an empty array
         if self.request.store.finished:
             self._tell()
@@ -299,6 +301,8 @@ class IntegrationLoop:
         if self.request.store.finished:
             self._tell()
         self.recorder.add(t, rows, kinds)
+        if len(t):
+            self.latest = [*self.latest[-1:], (t, rows)]
 
     def _tell(self) -> None:
         """Store the fields that have one row per step."""
@@ -333,7 +337,7 @@ class IntegrationLoop:
             run.change_form()
             self.plan, self.kit, self.code = run.plan, run.kit, a.PAUSED
         elif may_cross(run, self.code):
-            self.plan, self.control = cross_singularity(run)
+            self.plan, self.control = cross_singularity(run, self._past())
             self.kit = crossing_kit(run.kit)
             self.code = a.PAUSED
         elif self.code == a.SWITCH_METHOD or self._stalls(across):
@@ -349,9 +353,29 @@ class IntegrationLoop:
         elif self.code == a.AT_DISCONTINUITY and not across and apply_jump(run, self.t1):
             self.code = a.PAUSED
         elif self.plan is not run.plan and self.code != a.ALL_OUTPUT_DONE:
+            found_before = bool(run.pieces)
             self.plan, self.control, self.code = after_crossing(run, self.plan, self.control, self.code, n_steps)
+            if run.pieces and not found_before:
+                self._correct_last()
             if self.plan is run.plan:
                 self.kit = run.kit
+
+    def _past(self) -> list[Place]:
+        """Return the states of the last accepted steps, oldest first, as far as they are stored."""
+        if not self.request.every_step:
+            return []
+        places = [(self.run.t0, self.start)] if len(self.latest) < 2 else []
+        for t, rows in self.latest:
+            places += zip(t[-MOST_PAST:].tolist(), rows[-MOST_PAST:], strict=True)
+        return places[-MOST_PAST:]
+
+    def _correct_last(self) -> None:
+        """Replace the last stored state by that of the polynomial that leads across: rounding had changed it more."""
+        run = self.run
+        t, row = float(run.clock[run.a.T]), run.state[: 3 * run.system.n_q]
+        self.recorder.correct_last(t, row)
+        if self.latest and len(self.latest[-1][0]) and self.latest[-1][0][-1] == t:
+            self.latest[-1][1][-1, : len(row)] = row
 
     def _stalls(self, across: bool) -> bool:
         """Return whether a method that has a substitute makes no step, though no singular position is near."""

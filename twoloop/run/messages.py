@@ -32,6 +32,10 @@ Array = NDArray[np.float64]
 NEARLY_SINGULAR = 1e-3  # smallest over largest singular value of C_q, below which a message says so
 LASTING = 100.0  # times the tolerances: larger errors of velocities along the way make a run untrustworthy
 LOST_AT_END = 1e-6  # ratio of singular values, in any units, below which the state at the end counts as not determined
+# what may help where no step leads across a singular position: rounding is larger there than tight tolerances
+_REMEDIES = (
+    "loosen rtol and atol, take another method or compiled=False, end t_span before, or change the geometry slightly"
+)
 CROSSINGS = "\0"  # placeholder for the description of singular positions that were crossed
 NEXT_TO_END = 1e-3  # relative to the run: if it stops so close to its end, the message says so
 
@@ -150,8 +154,8 @@ def outcome(run: "Run", code: int, t1: float, pace: StallDetector) -> tuple[Stat
         return (
             Status.RANK_LOST,
             f"{stopped}: the constraint Jacobian has lost rank there ({rows}), so no choice of independent "
-            "coordinates exists at this singular position, and no step led across: end t_span before, take another "
-            f"method, or change the geometry.{_end_is_near(run, t1)}",
+            f"coordinates exists at this singular position, and no step led across: {_REMEDIES}."
+            f"{_end_is_near(run, t1)}",
         )
     if failure == indices.GAMMA_INACCURATE:
         reached, required = run.work.notes[indices.GAMMA_ACCURACY], run.work.notes[indices.GAMMA_REQUIRED]
@@ -267,8 +271,7 @@ def _near_singular(run: "Run", t1: float) -> str:
         return ""
     return (
         f"The constraint Jacobian is close to losing rank there: its smallest singular value is "
-        f"{ratio:.1g} of the largest. No step led across: end t_span before, take another "
-        f"method, or change the geometry.{_end_is_near(run, t1)} "
+        f"{ratio:.1g} of the largest. No step led across: {_REMEDIES}.{_end_is_near(run, t1)} "
     )
 
 

@@ -219,6 +219,11 @@ class Recorder:
         if len(self._t) > self._waits_for:
             self._look(len(self._t) - WINDOW)
 
+    def correct_last(self, t: float, row: Array) -> None:
+        """Replace [q, v, a] of the last state, if it is that at t, for states between steps."""
+        if self.request.between_steps and len(self._t) and self._t[-1] == t:
+            self._rows[-1, : len(row)] = row
+
     def _add(self, t: Array, rows: Array, kinds: NDArray[np.int64]) -> None:
         request, store = self.request, self.request.store
         if request.times is None:

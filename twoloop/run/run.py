@@ -108,7 +108,13 @@ class Run:
         self.control[[loop_state.BY_TIME, loop_state.BY_STATE]] = self.sudden
         self.narrow = narrow or plan.unseen == 1.0
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and after steps across singular positions
-        self.lengths: list[float] = []  # step lengths that are still to be tried across such a position
+        # step lengths that are still to be tried across such a position, and where the polynomial may begin: the
+        # earliest time of nodes, and an earlier state
+        self.lengths: list[float] = []
+        self.longer: list[float] = []
+        self.crossed = 0.0  # length of the last attempt across, s
+        self.pieces: list[float] = []  # times at which the next pieces of its polynomial end
+        self.origins: list[tuple[float, tuple[float, Array] | None]] = []
         self.jumps: list[float] = []  # times at which velocities changed as by an impulse
         self.compared_until = [-np.inf]  # time up to which callbacks were compared, in this run or an equal one
         self.region: CheckedRegion | None = None  # shared by cached integrators: callbacks were compared there

@@ -53,6 +53,12 @@ def singular_ratio(system: ConstrainedSystem, t: float, q: Array, rank: int) -> 
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
 
 
+def least_singular_value(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
+    """Return the smallest singular value of the `rank` independent rows; 0 if there are none."""
+    values = np.linalg.svd(system.rows(t, q), compute_uv=False)[:rank]
+    return float(values[-1]) if len(values) else 0.0
+
+
 def _least_ratio(
     system: ConstrainedSystem, before: Place, behind: Place, rank: int, ratio: Ratio = singular_ratio
 ) -> float:

@@ -5,10 +5,15 @@ converge there, nor does iteration with stages off the constraints, though the m
 collocation at Gauss nodes whose stages are projected onto the constraints: there the accelerations are those of the
 motion, and the fixed-point iteration converges as it does elsewhere.
 
+- At a distance s from the position (relative, as pivots measure it) rounding changes positions by eps/s, velocities by
+  eps/s^2 and accelerations by eps/s^3. Nodes at which this would show are left out: the accelerations there are those
+  of the polynomial through the other nodes on both sides, because the motion through the position is analytic.
 - Of the state at the beginning only q and v enter the result: its accelerations may be rounding.
 - The end is put on the constraints with a partition of its own.
 - Stages are projected by the generated code of the mechanism. A partition is chosen at a stage only where there is no
   such code, or where its pivots are too small.
+- A stage that its projection moves by more than the tolerances is on another branch of the motion, or the polynomial
+  is not accurate: the step is rejected.
 """
 
 import numpy as np
@@ -21,6 +26,7 @@ from twoloop.kernels.data.indices import (
     DONE,
     ESTIMATE,
     GAP,
+    LEAST,
     N_OUTER,
     ORIENTATION,
     ORIENTATION_NEW,
@@ -33,34 +39,81 @@ from twoloop.kernels.data.indices import (
 from twoloop.kernels.evaluation.inner_loop import evaluate_state, project, renew_partition
 from twoloop.kernels.linalg.dense import copy
 
-# places in `options`, then A, A A, Legendre coefficients and interpolation from the other nodes (S, S each); b, b A, c
+# places in `options`, then A, A A, Legendre coefficients (S, S each); b, b A, c
 INNER_TOL, THETA, N_SCALARS = range(3)
-S = 8  # number of nodes
+S = 20  # number of nodes
 LEFT = 0.01  # relative to the tolerances: change at which the iteration ends ...
 STAGNANT, NOISE = 0.5, 0.3  # ... or NOISE of them, if a change is at least STAGNANT times the one before
-MOST, FEW = 40, 8  # largest number of sweeps; and number of sweeps after which a node is left out
-# longest part of a step without a node, relative to the step: with all nodes, and with one left out
-UNSEEN, UNSEEN_WITHOUT = 0.1834, 0.3545
+MOST, FEW = 40, 12  # largest number of sweeps; and number of sweeps after which more nodes are left out ...
+FARTHER = 2.0  # ... up to this times the distance
+MOST_LEFT_OUT = 9  # largest number of nodes that may be left out
+# relative to the largest pivot so far: nodes below NEAR_LEAST are left out, and those at which accelerations are
+# rounded by SHARE_OF_NOISE of the tolerances, up to NEAR_MOST
+NEAR_LEAST, NEAR_MOST, SHARE_OF_NOISE, EPS = 0.02, 0.1, 0.2, 2.0**-53
+# numbers at the end of `memory`: two that `begin` stores, the time of its base, and first time, length and end of the
+# polynomial that was found (-inf: none)
+LARGEST_PIVOT, EARLIEST, BASE, BEGIN, WHOLE, END, N_STORED = range(7)
+SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2  # of a polynomial, relative to its length
+# longest part of a step without a node, relative to the step, if all nodes are evaluated
+UNSEEN = 0.0767
+BACK = 0.4  # part of the polynomial before the state from which the step begins
 ORDER, SHARE = 12.0, 0.5  # order of the estimated error; and factor on it
-ROUNDING = 1e-13  # relative: accuracy of the iteration in steps without an estimate
+MOVED = 0.5  # weight of the correction of a stage by its projection, as an error
+ROUNDING = 1e-13  # relative: accuracy of the iteration in steps without an estimate, and of times
 NEARER = 0.5  # smallest ratio of the pivots at the end and at the start of a step
-LEAST = 1e-300  # replaces a coefficient of zero
+FOUND = 2.0  # error and factor returned with a polynomial that was found, so that its pieces follow
+SMALL = 1e-300  # replaces a coefficient of zero
 
 
 def options_array(A, b, c, inner_tol, theta):
     """Return the parameter block for a Gauss tableau."""
     degrees = np.arange(S)
     legendre = np.polynomial.legendre.legvander(2.0 * c - 1.0, S - 1).T * b * (2 * degrees + 1)[:, None]
-    gaps = c[:, None] - c + np.eye(S)
-    barycentric = 1.0 / gaps.prod(axis=1)
-    without = -barycentric / barycentric[:, None] * (1.0 - np.eye(S))
-    tables = [A, A @ A, legendre, without, b, b @ A, c]
-    return np.concatenate([[inner_tol, theta], *map(np.ravel, tables)])
+    return np.concatenate([[inner_tol, theta], *map(np.ravel, [A, A @ A, legendre, b, b @ A, c])])
 
 
 def memory_size(n):
-    """Return the length of `memory`."""
-    return (S + 3) * n
+    """Return the length of `memory`, which ends with the numbers that `begin` stores, N_STORED of them."""
+    return (S + 7) * n + 3 * S + N_STORED
+
+
+def begin(memory, largest_pivot, earliest, base=None):
+    """Store where the polynomial begins in `memory`.
+
+    Parameters
+    ----------
+    memory : ndarray
+        The memory of the step.
+    largest_pivot : float
+        Largest pivot of the run so far.
+    earliest : float
+        Earliest time at which nodes may lie, s.
+    base : (float, ndarray), optional
+        Time and state of an earlier step, farther from the singular position than the state from which the step
+        begins: q and v are then those of the polynomial through this earlier state. None: of the one at the beginning.
+    """
+    stored = memory[-N_STORED:]
+    stored[:] = np.nan
+    stored[LARGEST_PIVOT], stored[EARLIEST], stored[END] = largest_pivot, earliest, -np.inf
+    if base is not None:
+        n = (memory.size - 3 * S - N_STORED) // (S + 7)
+        stored[BASE], memory[(S + 5) * n : (S + 7) * n] = base[0], base[1][: 2 * n]
+
+
+def piece_ends(memory, c, t):
+    """Return the times after t at which the pieces of the polynomial end that `memory` holds.
+
+    They are times of nodes that are not left out: the first ones beside those, and some others between.
+    """
+    stored = memory[-N_STORED:]
+    left_out = memory[-N_STORED - 3 * S : -N_STORED - 2 * S] == 1.0
+    least, ends = (t - stored[BEGIN]) / stored[WHOLE], []
+    for j in range(1, S - 1):
+        since = c[j] - (ends[-1] if ends else least)
+        beside = left_out[j - 1] or left_out[j + 1] or since > LONGEST_PIECE
+        if not left_out[j] and beside and since > SHORTEST_PIECE and 1.0 - c[j] > SHORTEST_PIECE:
+            ends.append(c[j])
+    return [float(stored[BEGIN] + end * stored[WHOLE]) for end in ends] + [float(stored[END])]
 
 
 @compiled
@@ -80,28 +133,31 @@ def _weight(tolerances, m, n, h, state):
         return 1.0 / (ROUNDING * (1.0 + v))
     atol, rtol = tolerances[ATOL + m], tolerances[RTOL]
     of_v = atol + rtol * max(v, 0.5 * h * abs(state[2 * n + m]))
-    return 1.0 / max(min(of_v, (atol + rtol * max(q, 0.5 * h * v)) / h), LEAST)
+    return 1.0 / max(min(of_v, (atol + rtol * max(q, 0.5 * h * v)) / h), SMALL)
 
 
 @compiled
-def _error(tolerances, h, state, legendre, a, every_node):
-    """Estimate the error as collocation_code.py does, from the decay of the Legendre coefficients of a."""
+def _error(tolerances, h, state, legendre, a, n_kept):
+    """Estimate the error as collocation_code.py does, from the decay of the Legendre coefficients of a.
+
+    `n_kept`: number of nodes that are not left out; coefficients of higher degrees are rounding.
+    """
     n, largest = a.shape[1], 0.0
     for m in range(n):
         first = before = top = 0.0
-        for k in range(2, S):
+        for k in range(2, n_kept):
             value = 0.0
             for j in range(S):
                 value += legendre[k, j] * a[j, m]
-            if k < 4:
+            if k < n_kept - 4:
                 first = max(first, abs(value))
-            elif k < 6:
+            elif k < n_kept - 2:
                 before = max(before, abs(value))
             else:
                 top = max(top, abs(value))
-        before = max(before, top, LEAST)
+        before = max(before, top, SMALL)
         decay, far = top / before, top / max(first, before)
-        if every_node:
+        if n_kept == S:
             decay *= np.sqrt(decay)
         largest = max(largest, top * max(decay, far) * h * _weight(tolerances, m, n, h, state))
     return SHARE * largest
@@ -117,6 +173,30 @@ def _integrate(h, c, A, AA, a, q, v, q_end, v_end):
         v_end[m] = v[m] + h * v_end[m]
 
 
+@compiled
+def _interpolate(j, c, left_out, a):
+    """Set the accelerations at node j to those of the polynomial through the nodes that are not left out."""
+    a[j, :] = 0.0
+    for k in range(S):
+        if left_out[k] == 0.0:
+            weight = 1.0
+            for i in range(S):
+                if i != k and left_out[i] == 0.0:
+                    weight *= (c[j] - c[i]) / (c[k] - c[i])
+            for m in range(a.shape[1]):
+                a[j, m] += weight * a[k, m]
+
+
+@compiled
+def _widest_gap(c, c0, left_out):
+    """Return the longest part after c0 without a node that is evaluated, relative to the whole."""
+    widest, before = 0.0, c0
+    for k in range(S):
+        if left_out[k] == 0.0 and c[k] > c0:
+            widest, before = max(widest, c[k] - before), c[k]
+    return max(widest, 1.0 - before)
+
+
 @merged
 def _choose_partition_at_end(f, w, t, q, pivot):
     """Choose the partition at the end of a step; return SINGULAR if the next step would begin nearer to the position.
@@ -129,93 +209,254 @@ def _choose_partition_at_end(f, w, t, q, pivot):
     return code
 
 
-@kernel(ATTEMPT)
-def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt one step."""
-    n = w.Q.size
-    q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
-    a1, lam1 = new_state[2 * n : 3 * n], new_state[3 * n :]
-    A, AA, legendre, without = options[N_SCALARS : N_SCALARS + 4 * S * S].reshape((4, S, S))
-    b, bA, c = options[N_SCALARS + 4 * S * S :].reshape((3, S))
-    a, stage = memory[: S * n].reshape((S, n)), memory[S * n :].reshape((3, n))
-    q_stage, v_stage, a_stage = stage[0], stage[1], stage[2]
-    estimated, generated = tolerances[ESTIMATE] == 1.0, f.flags[STRAIGHT] == 1
-    w.counters[N_OUTER] += 1
-    code = renew_partition(f, w, t, q)
-    pivot = w.notes[PIVOT] if code == DONE else 0.0
-    for j in range(S):
-        copy(state[2 * n : 3 * n], a[j])
-    change_before, converged, left_out = np.inf, False, -1
-    for sweep in range(MOST):
-        change, nearest, least = 0.0, -1, np.inf
+@compiled
+def _weights_to_start(b, c, c0, to_v, to_q):
+    """Compute the weights of the integrals of the accelerations, once and twice, from the first end up to c0."""
+    to_v[:] = 0.0
+    to_q[:] = 0.0
+    for i in range(S):
         for j in range(S):
-            if j == left_out:
-                _combined(without[j], a, a_stage)
-                copy(a_stage, a[j])
-                continue
-            time = t + c[j] * h
-            renews = not generated or sweep == FEW
-            while True:
-                _integrate(h, c[j], A[j], AA[j], a, q, v, q_stage, v_stage)
-                code = DONE
-                if renews:
-                    code = renew_partition(f, w, time, q_stage)
-                    if w.notes[PIVOT] < least:
-                        nearest, least = j, w.notes[PIVOT]
-                if code == DONE:
-                    code = project(f, w, time, q_stage, v_stage, options[THETA], a_stage, w.lam)
-                if renews or w.notes[BY_GENERAL] == 0.0:
-                    break
-                # pivots of the generated code are too small: the general code took over, with the partition of another
-                # stage
-                renews, generated = True, False
-            if code != DONE:
-                return Attempt(code, np.inf, 0.0)
-            for m in range(n):
-                change = max(change, h * abs(a_stage[m] - a[j, m]) * _weight(tolerances, m, n, h, state))
-            copy(a_stage, a[j])
-            if sweep == 0:  # extrapolate the accelerations at the following nodes
-                for k in range(j + 1, S):
-                    for m in range(n):
-                        a[k, m] = a[j, m]
-                        if j > 0:
-                            a[k, m] += (a[j, m] - a[j - 1, m]) * (c[k] - c[j]) / (c[j] - c[j - 1])
-        if not np.isfinite(change):
-            return Attempt(OUTER_DIVERGED, np.inf, 0.0)
-        if change <= LEFT or (sweep > 2 and STAGNANT * change_before <= change <= NOISE):
-            converged = True
-            break
-        # most rejected steps are rejected for their end, which is known well enough by now
-        if sweep == 0 and estimated:
-            _integrate(h, 1.0, b, bA, a, q, v, q1, v1)
-            code = _choose_partition_at_end(f, w, t + h, q1, pivot)
-            if code != DONE:
-                return Attempt(code, np.inf, 0.0)
-        # accelerations nearest to the singular position are rounding: interpolate them from the others
-        if sweep == FEW:
-            if estimated and UNSEEN_WITHOUT * h > tolerances[GAP] * (1.0 + ROUNDING):
-                return Attempt(OUTER_DIVERGED, np.inf, 0.0)
-            left_out = nearest
-        change_before = change
-    if not converged and estimated:
-        return Attempt(OUTER_DIVERGED, np.inf, 0.0)
+            value = c0 * b[i]
+            for k in range(S):
+                if k != j:
+                    value *= (c0 * c[i] - c[k]) / (c[j] - c[k])
+            to_v[j] += value
+            to_q[j] += value * c0 * (1.0 - c[i])
+
+
+@merged
+def _set_base(h, c0, to_v, to_q, a, q, v, q_0, v_0):
+    """Set q_0 and v_0 to the state at the first node's side of the polynomial, which has the state q, v at c0."""
+    _combined(to_v, a, v_0)
+    _combined(to_q, a, q_0)
+    for m in range(q.size):
+        v_0[m] = v[m] - h * v_0[m]
+        q_0[m] = q[m] - h * (c0 * v_0[m] + h * q_0[m])
+
+
+@compiled
+def _extrapolate(j, c, last, a):
+    """Set the accelerations at node j to those of the polynomial through the nodes `last` (-1: none)."""
+    a[j, :] = 0.0
+    for k in last:
+        if k >= 0:
+            weight = 1.0
+            for i in last:
+                if i >= 0 and i != k:
+                    weight *= (c[j] - c[i]) / (c[k] - c[i])
+            for m in range(a.shape[1]):
+                a[j, m] += weight * a[k, m]
+
+
+@compiled
+def _evaluate(time, whole, b, c, a, q_0, v_0, to_v, to_q, q, v, acceleration):
+    """Set q, v and the accelerations to those of the polynomial, so much time after its first end."""
+    place = time / whole
+    _weights_to_start(b, c, place, to_v, to_q)
+    _combined(to_v, a, v)
+    _combined(to_q, a, q)
+    for m in range(q.size):
+        q[m] = q_0[m] + whole * (place * v_0[m] + whole * q[m])
+        v[m] = v_0[m] + whole * v[m]
+    acceleration[:] = 0.0
+    for k in range(S):
+        weight = 1.0
+        for i in range(S):
+            if i != k:
+                weight *= (place - c[i]) / (c[k] - c[i])
+        for m in range(q.size):
+            acceleration[m] += weight * a[k, m]
+
+
+@merged
+def _end_of_piece(f, w, t, near, options, tolerances, stage, state, new_state):
+    """Complete the state [q, v, a] in `stage`; where pivots are below `near`, it is not put on the constraints."""
+    n = w.Q.size
+    q, q1, v1 = state[:n], new_state[:n], new_state[n : 2 * n]
+    a1, lam1 = new_state[2 * n : 3 * n], new_state[3 * n :]
+    copy(stage[0], q1)
+    copy(stage[1], v1)
+    code = renew_partition(f, w, t, q1)
+    determined = code == DONE and w.notes[PIVOT] >= near
+    if code == DONE:
+        store_prediction(w, q1)
+        w.notes[ORIENTATION_NEW] = w.notes[ORIENTATION]
+        code = evaluate_state(f, w, t, q1, v1, options[INNER_TOL], a1, lam1)
+    if near > 0.0 and not (determined and code == DONE):
+        if code != DONE:
+            copy(state[3 * n :], lam1)
+        copy(stage[0], q1)
+        copy(stage[1], v1)
+        copy(stage[2], a1)
+        return Attempt(DONE, 0.0, 0.0)
     error = 0.0
-    if estimated:
-        error = _error(tolerances, h, state, legendre, a, left_out < 0)
-        if not error <= 1.0:
-            return Attempt(DONE, error, 0.0)
-    _integrate(h, 1.0, b, bA, a, q, v, q1, v1)
-    code = _choose_partition_at_end(f, w, t + h, q1, pivot)
-    if code != DONE:
-        return Attempt(code, np.inf, 0.0)
-    store_prediction(w, q1)
-    w.notes[ORIENTATION_NEW] = w.notes[ORIENTATION]
-    code = evaluate_state(f, w, t + h, q1, v1, options[INNER_TOL], a1, lam1)
     for k in range(w.dependent.size):
         m = w.dependent[k]
         scale = allowed(tolerances, m, q[m], q1[m])
         error = max(error, abs(w.predicted[k] - q1[m]) / scale * tolerances[ESTIMATE])
     return Attempt(code, error, 0.0)
+
+
+def state_at(memory, options, t):
+    """Return the state [q, v, a] of the polynomial that `memory` holds, at t."""
+    stored, n = memory[-N_STORED:], (memory.size - 3 * S - N_STORED) // (S + 7)
+    b, _, c = options[N_SCALARS + 3 * S * S :].reshape((3, S))
+    a, stage = memory[: S * n].reshape((S, n)), memory[S * n : (S + 5) * n].reshape((5, n))
+    place, whole, (q_0, v_0) = (t - stored[BEGIN]) / stored[WHOLE], stored[WHOLE], stage[3:]
+    weights = np.array(
+        [_lagrange(c, x) for x in (*(place * c), place)]
+    )  # at Gauss nodes of the part before t, and at t
+    to_v = place * b @ weights[:-1]
+    to_q = place**2 * (b * (1.0 - c)) @ weights[:-1]
+    q, v = q_0 + whole * (place * v_0 + whole * (to_q @ a)), v_0 + whole * (to_v @ a)
+    return np.concatenate([q, v, weights[-1] @ a])
+
+
+def _lagrange(c, x):
+    """Return the weights of values at the nodes in their interpolating polynomial at x."""
+    factors = (x - c) / (c[:, None] - c + np.eye(S))
+    np.fill_diagonal(factors, 1.0)
+    return factors.prod(axis=1)
+
+
+@kernel(ATTEMPT)
+def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """Attempt one step."""
+    n = w.Q.size
+    q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
+    A, AA, legendre = options[N_SCALARS : N_SCALARS + 3 * S * S].reshape((3, S, S))
+    b, bA, c = options[N_SCALARS + 3 * S * S :].reshape((3, S))
+    a, stage, place = memory[: S * n].reshape((S, n)), memory[S * n : (S + 5) * n].reshape((5, n)), (S + 7) * n
+    q_stage, v_stage, a_stage, q_0, v_0 = stage[0], stage[1], stage[2], stage[3], stage[4]
+    left_out, to_v, to_q = memory[place : place + 3 * S].reshape((3, S))
+    stored = memory[place + 3 * S :]
+    largest_pivot, earliest, time_of_base = stored[LARGEST_PIVOT], stored[EARLIEST], stored[BASE]
+    estimated, generated = tolerances[ESTIMATE] == 1.0, f.flags[STRAIGHT] == 1
+    near, whole = NEAR_LEAST, h
+    q_base, v_base = memory[(S + 5) * n : (S + 6) * n], memory[(S + 6) * n : (S + 7) * n]
+    if estimated:
+        near = min(max(near, (EPS / (SHARE_OF_NOISE * tolerances[LEAST])) ** (1.0 / 3.0)), NEAR_MOST)
+    if t + h <= stored[END] + ROUNDING * stored[WHOLE] + 4.0 * np.spacing(abs(t)):
+        begin, whole = stored[BEGIN], stored[WHOLE]
+        _evaluate(t + h - begin, whole, b, c, a, q_0, v_0, to_v, to_q, q_stage, v_stage, a_stage)
+        return _end_of_piece(f, w, t + h, near * largest_pivot, options, tolerances, stage, state, new_state)
+    stored[END] = -np.inf
+    if time_of_base <= t:
+        whole = t + h - time_of_base
+    else:
+        copy(q, q_base)
+        copy(v, v_base)
+        if estimated:
+            whole = h + max(0.0, min(h * BACK / (1.0 - BACK), t - earliest))
+    begin, c0 = t + h - whole, (whole - h) / whole
+    c_base = 0.0 if time_of_base <= t else c0  # where the polynomial has the state of the base
+    _weights_to_start(b, c, c_base, to_v, to_q)
+    n_back = 0  # number of nodes before the state from which the step begins
+    while n_back < S and c[n_back] < c_base:
+        n_back += 1
+    w.counters[N_OUTER] += 1
+    code = renew_partition(f, w, t, q)
+    pivot = w.notes[PIVOT] if code == DONE else 0.0
+    for j in range(S):
+        copy(state[2 * n : 3 * n], a[j])
+    left_out[:] = 0.0
+    change_before, converged, moved, n_kept = np.inf, False, 0.0, S
+    last_0, last_1, last_2 = -1, -1, -1  # nodes from which the first sweep extrapolates
+    for sweep in range(MOST):
+        change, moved = 0.0, 0.0
+        chooses = sweep in (0, 2, FEW)  # whether nodes are left out anew
+        if estimated and chooses and sweep == FEW:
+            near = min(FARTHER * near, NEAR_MOST)
+        for i in range(S):
+            # away from the state in both directions, first to where the motion comes from
+            j = n_back - 1 - i if i < n_back else i
+            if sweep == 0:
+                if i == n_back:
+                    last_0, last_1, last_2 = -1, -1, -1
+                    for k in range(n_back):
+                        if left_out[k] == 0.0:
+                            last_0, last_1, last_2 = k, last_0, last_1
+                if last_0 >= 0:
+                    for k in range(S):
+                        if k >= j if i >= n_back else k <= j or k >= n_back:
+                            _extrapolate(k, c, (last_0, last_1, last_2), a)
+            time = begin + c[j] * whole
+            _set_base(whole, c_base, to_v, to_q, a, q_base, v_base, q_0, v_0)
+            _integrate(whole, c[j], A[j], AA[j], a, q_0, v_0, q_stage, v_stage)
+            code = DONE
+            renews = not generated or chooses
+            if chooses:
+                code = renew_partition(f, w, time, q_stage)
+                left_out[j] = 0.0
+                if code == DONE:  # a run that begins near the position has not seen larger ones
+                    largest_pivot = max(largest_pivot, w.notes[PIVOT])
+                if estimated and (code != DONE or w.notes[PIVOT] < near * largest_pivot):
+                    left_out[j], code = 1.0, DONE
+            elif renews and left_out[j] == 0.0:
+                code = renew_partition(f, w, time, q_stage)
+            if left_out[j] == 1.0:
+                if not chooses:
+                    _interpolate(j, c, left_out, a)
+                continue
+            while True:
+                if code == DONE:
+                    code = project(f, w, time, q_stage, v_stage, options[THETA], a_stage, w.lam)
+                if renews or w.notes[BY_GENERAL] == 0.0:
+                    break
+                # pivots of the generated code are too small: the general code took over, with the partition of
+                # another stage
+                renews, generated = True, False
+                _integrate(whole, c[j], A[j], AA[j], a, q_0, v_0, q_stage, v_stage)
+                code = renew_partition(f, w, time, q_stage)
+            if code != DONE:
+                return Attempt(code, np.inf, 0.0)
+            _integrate(whole, c[j], A[j], AA[j], a, q_0, v_0, q1, v1)
+            for m in range(n):
+                weight = _weight(tolerances, m, n, h, state)
+                change = max(change, h * abs(a_stage[m] - a[j, m]) * weight)
+                moved = max(moved, abs(v1[m] - v_stage[m]) * weight, abs(q1[m] - q_stage[m]) / h * weight)
+            copy(a_stage, a[j])
+            last_0, last_1, last_2 = j, last_0, last_1
+        if not np.isfinite(change):
+            return Attempt(OUTER_DIVERGED, np.inf, 0.0)
+        if chooses:
+            n_kept = S - int(left_out.sum())
+            if n_kept < S - MOST_LEFT_OUT:
+                return Attempt(SINGULAR, np.inf, 0.0)
+            if estimated and _widest_gap(c, c0, left_out) * whole > tolerances[GAP] * (1.0 + ROUNDING):
+                return Attempt(OUTER_DIVERGED, np.inf, 0.0)
+            for j in range(S):
+                if left_out[j] == 1.0:
+                    _interpolate(j, c, left_out, a)
+        elif change <= LEFT or (sweep > 3 and STAGNANT * change_before <= change <= NOISE):
+            converged = True
+            break
+        _set_base(whole, c_base, to_v, to_q, a, q_base, v_base, q_0, v_0)
+        # most rejected steps are rejected for their end, which is known well enough by now
+        if sweep == 1 and estimated:
+            _integrate(whole, 1.0, b, bA, a, q_0, v_0, q1, v1)
+            code = _choose_partition_at_end(f, w, t + h, q1, pivot)
+            if code != DONE:
+                return Attempt(code, np.inf, 0.0)
+        change_before = change
+    if not converged and estimated:
+        return Attempt(OUTER_DIVERGED, np.inf, 0.0)
+    error = 0.0
+    if estimated:
+        error = max(_error(tolerances, h, state, legendre, a, n_kept), MOVED * moved)
+        if not error <= 1.0:
+            return Attempt(DONE, error, 0.0)
+    _set_base(whole, c_base, to_v, to_q, a, q_base, v_base, q_0, v_0)
+    _integrate(whole, 1.0, b, bA, a, q_0, v_0, q1, v1)
+    code = _choose_partition_at_end(f, w, t + h, q1, pivot)
+    if code != DONE:
+        return Attempt(code, np.inf, 0.0)
+    if estimated:  # the steps that are accepted are pieces of the polynomial
+        stored[BEGIN], stored[WHOLE], stored[END] = begin, whole, t + h
+        return Attempt(DONE, FOUND, FOUND)
+    copy(q1, q_stage)
+    copy(v1, v_stage)
+    return _end_of_piece(f, w, t + h, 0.0, options, tolerances, stage, state, new_state)
 
 
 CROSSING = Step(crossing_step, commit_nothing)
