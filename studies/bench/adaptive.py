@@ -18,8 +18,8 @@ import numpy as np
 import pandas as pd
 
 from studies.bench import headline
+from studies.bench.cli import Progress
 from studies.bench.collector import NOTHING_RUN, Run, Warm
-from studies.bench.progress import Progress
 from studies.bench.store import KeptRows, Row
 from studies.bench.tables import TIGHTEST
 from twoloop.rows.leaderboard import DECADE, LOOSEST, NEAR

@@ -18,7 +18,7 @@ from references.driver import user_call
 from references.lines import CannotRun
 from studies.bench import metrics
 from studies.bench.apart import Alarm
-from studies.bench.progress import say, track
+from studies.bench.cli import say, track
 from studies.bench.reference_motion import ReferenceMotion, make_reference
 from studies.bench.store import Array, KeptRows, Row
 from twoloop import ConstrainedSystem, Result, Statistics, solve_dae

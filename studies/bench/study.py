@@ -12,10 +12,9 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from studies.bench import cli, figures, tables
-from studies.bench.cli import Call, StudyError
+from studies.bench.cli import Call, StudyError, track
 from studies.bench.collector import Measure, Run, collect
 from studies.bench.index import write_index
-from studies.bench.progress import track
 from studies.bench.render import render, table
 from studies.bench.store import Output, Row, command_of
 

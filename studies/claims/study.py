@@ -10,14 +10,13 @@ from studies.bench.cli import StudyError
 from studies.bench.index import run_study, write_index
 from studies.bench.render import render
 from studies.bench.store import Output
-from studies.claims import beam_judges, experiments, judges
-from studies.claims.rows import STUDIES, Rows, read
-from studies.claims.verdicts import UNTESTABLE, Claim, Judgement, Verdict, load
+from studies.claims import experiments, judges
+from studies.claims.verdicts import STUDIES, UNTESTABLE, Claim, Judgement, Rows, Verdict, load, read
 from studies.reproduction.study import PARTS
 
 COLUMNS = ("section", "statement", "criterion", "fixed", "judge", "stand_in", "inputs", "circular", "assumed")  # of CSV
 Judged = Mapping[str, tuple[Claim, Judgement]]
-JUDGES: dict[str, Callable[..., Judgement]] = vars(judges) | vars(beam_judges)  # by the names that claims.toml has
+JUDGES: dict[str, Callable[..., Judgement]] = vars(judges)  # by the names that claims.toml has
 
 
 def judged(rows: Rows) -> Judged:

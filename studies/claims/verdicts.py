@@ -1,4 +1,7 @@
-"""What a claim is, and how its verdict comes from rows."""
+"""What a claim is, and how its verdict comes from the rows of the other studies.
+
+All that depends on how another study writes its rows stands here.
+"""
 
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
@@ -8,10 +11,104 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
+from studies.bench import tables
 from studies.bench.render import number
-from studies.bench.store import Array
-from studies.claims.rows import NotRun, Rows
+from studies.bench.store import Array, read_rows
+from studies.reproduction.beam import SOFT, STIFF
+from twoloop.mechanisms import four_bar
+
+STUDIES = ("table3_full", "energy", "motion", "step_size", "violation", "beam", "ablation")
+DEFAULT = four_bar().name
+LONG = 100.0  # s, the length of the paper's runs
+BEAM_END = 2.0  # s, of a full run of the beams
+BEAMS = (SOFT, STIFF)
+
+
+class NotRun(Exception):
+    """Raised where there is no row to judge by; the text says which."""
+
+
+def read(folder: Path) -> dict[str, pd.DataFrame]:
+    """Read one row a run of every study that has rows in the folder. Raises StudyError if a file is damaged."""
+    paths = [path for name in STUDIES if (path := folder / f"{name}.csv").is_file()]
+    return {path.stem: _one_a_run(path.stem, read_rows(path)[0]) for path in paths}
+
+
+def _one_a_run(name: str, table: pd.DataFrame) -> pd.DataFrame:
+    if name == "beam" and "error_tip" in table:  # the error by which the beams are judged
+        table["error_q"] = table["error_tip"]
+    if {"repeat", "error_q", "call_s"} <= set(table):
+        repeated = table[table["repeat"].notna()]
+        table = pd.concat([tables.medians(repeated), table[table["repeat"].isna()]], ignore_index=True)
+    for column in {"lost", "astray"} & set(table):  # no value: the run gave no result
+        table[column] = table[column].map(lambda x: str(x) not in ("False", "0", "0.0"))
+    return table.assign(floor=table["floor"].fillna(0.0) if "floor" in table else 0.0)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Hold what judges read: one row a run of each study, and the numbers of `experiments.py`."""
+
+    tables: Mapping[str, pd.DataFrame]
+    experiments: Mapping[str, float]
+
+    def number(self, key: str) -> float:
+        """Return a number of `experiments.py`."""
+        if self.experiments.get(key) is None:
+            raise NotRun(f"the experiment {key} was not made")
+        return float(self.experiments[key])
+
+    def pick(self, study: str, least: float = 0.0, named: str = "", **equal: Any) -> pd.DataFrame:
+        """Select the rows in which each column named has that value, or one of a tuple of values.
+
+        Of solvers whose name contains `named`; not run if none covers `least` seconds.
+        """
+        if study not in self.tables:
+            raise NotRun(f"there is no {study}.csv")
+        found = self.tables[study]
+        found = found[found["solver"].astype(str).str.contains(named, regex=False)]
+        found = tables.where(found, **equal)
+        if found.empty:
+            raise NotRun(f"{study}.csv has no row of {named} with {', '.join(f'{c} = {v}' for c, v in equal.items())}")
+        if least and not found["t_end"].max() >= least:
+            raise NotRun(f"quick rows: they cover {found['t_end'].max():g} s, and the claim is about {least:g} s")
+        return found
+
+    def long(self, study: str, named: str = "", **equal: Any) -> pd.DataFrame:
+        """Select rows of runs as long as the paper's."""
+        return self.pick(study, LONG, named, **equal)
+
+    def cell(self, group: str, err_in: float, err_out: float, problem: str = DEFAULT) -> pd.Series:
+        """Return a cell of Table 3."""
+        return self.long("table3_full", group=group, problem=problem, err_in=err_in, err_out=err_out).iloc[0]
+
+    def beam(self, case: str, named: str, **equal: Any) -> pd.DataFrame:
+        """Select full runs of a beam."""
+        return self.pick("beam", BEAM_END, named, case=case, group="run", **equal)
+
+
+def common_costs(
+    first: pd.DataFrame,
+    second: pd.DataFrame,
+    targets: tuple[float, ...],
+    cost: Callable[[pd.DataFrame, float], float] = tables.time_for,
+) -> list[float]:
+    """Divide times of the first solver by those of the second at errors that both reach; `cost`: cost(runs, error)."""
+    ratios = [cost(first, error) / cost(second, error) for error in targets]
+    ratios = [ratio for ratio in ratios if np.isfinite(ratio)]
+    if not ratios:
+        raise NotRun(f"{first['solver'].iloc[0]} and {second['solver'].iloc[0]} have no error in common")
+    return ratios
+
+
+def cheapest(runs: pd.DataFrame, target: float, what: str) -> float:
+    """Find the least cost of any solver at an error; NaN where none has it."""
+    return float(
+        np.fmin.reduce([tables.time_for(own, target, what) for _, own in runs.groupby("solver")], initial=np.nan)
+    )
+
 
 FILE = Path(__file__).with_name("claims.toml")
 

@@ -11,12 +11,12 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from references.paper.ablation import VARIANTS, solve_variant
-from studies.bench import figures, tables
-from studies.bench.cases import beam, four_bar
+from studies.bench import figures, four_bar, tables
 from studies.bench.cli import StudyError
 from studies.bench.collector import REPEATS, Case, Run, Solver
 from studies.bench.render import number
 from studies.bench.tables import where
+from studies.reproduction import beam
 from studies.reproduction.violation import KEPT
 from twoloop import Result
 from twoloop.methods.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
@@ -52,7 +52,7 @@ def solver(variant: str, tableau: Tableau, setting: str) -> Solver:
 def runs(quick: bool) -> list[Run]:
     """List every variant along tolerances: three tableaux on the linkage, the paper's on the very flexible beam."""
     t_end, timed = (T_END_QUICK, 0.0) if quick else (T_END, 0.02)
-    soft = beam.case(beam.SOFT, FLEXIBLE, quick, BEAM_END_QUICK if quick else BEAM_END)
+    soft = beam.case_of(beam.SOFT, FLEXIBLE, quick, BEAM_END_QUICK if quick else BEAM_END)
     cases = {LINKAGE: replace(four_bar.cases(quick)[0], t_end=t_end, timed=timed), FLEXIBLE: replace(soft, timed=timed)}
     listed = []
     for name, case in cases.items():

@@ -8,11 +8,10 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from studies.bench import figures
-from studies.bench.cases import four_bar
-from studies.bench.cases.four_bar import Y3
+from studies.bench import figures, four_bar
 from studies.bench.cli import StudyError
 from studies.bench.collector import Run
+from studies.bench.four_bar import Y3
 from studies.bench.metrics import deviation
 from studies.bench.solvers import CATALOGUE, GEAR_ORDERS, IRK, NEWMARK, gear
 from studies.bench.tables import where

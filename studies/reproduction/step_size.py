@@ -8,8 +8,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from studies.bench import figures
-from studies.bench.cases import four_bar
+from studies.bench import figures, four_bar
 from studies.bench.cli import StudyError
 from studies.bench.collector import Run
 from studies.bench.render import number

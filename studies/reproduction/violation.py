@@ -8,8 +8,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from references.scipy.index1 import ALPHAS, baumgarte
-from studies.bench import figures, solvers, tables
-from studies.bench.cases import four_bar
+from studies.bench import figures, four_bar, solvers, tables
 from studies.bench.cli import StudyError
 from studies.bench.collector import REPEATS, Run
 from studies.bench.metrics import violations

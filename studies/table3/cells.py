@@ -1,6 +1,5 @@
 """Table 3 of the paper: computation time of both two-loop procedures over their tolerances, beside IDA and Exudyn."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -13,8 +12,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
-from studies.bench import figures, tables
-from studies.bench.cases import four_bar
+from studies.bench import figures, four_bar, tables
 from studies.bench.cli import StudyError
 from studies.bench.collector import Case, Run, collect
 from studies.bench.metrics import ASTRAY, LOST
@@ -192,10 +190,3 @@ def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
 def study_of(geometry: Geometry | None = None) -> Study:
     """Return the study, with the geometry that is assumed or with another."""
     return Study("table3", __doc__, partial(make, geometry=geometry), findings_of, figures_of, tables_of, medians=True)
-
-
-def geometry_of(lengths: Sequence[float] | None, ground: float | None) -> Geometry | None:
-    """Return the geometry that --lengths and --ground give; neither: the assumed one."""
-    if (lengths is None) != (ground is None):
-        raise StudyError("--lengths L1 L2 L3 and --ground G go together: the paper's Table 2 has all four")
-    return None if lengths is None or ground is None else ((lengths[0], lengths[1], lengths[2]), ground)

@@ -2,14 +2,266 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
+from itertools import chain, product
+from typing import Any, Literal
 
-from studies.bench import cli
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from scipy.optimize import least_squares
+
+from studies.bench import adaptive, cli, figures, four_bar, solvers, tables
+from studies.bench.cli import StudyError
+from studies.bench.collector import REPEATS, Case, Run, Solver, Warm, collect, row_of
+from studies.bench.headline import OWN_CODE
 from studies.bench.index import write_index
-from studies.bench.store import Output
-from studies.bench.study import saved
-from studies.table3 import cells, full
+from studies.bench.render import number, power, table
+from studies.bench.solvers import CATALOGUE, ERR_IN, IRK, IRK_LINE, NEWMARK, OWN_EXPLICIT, PAPER_TOL, QUARTER
+from studies.bench.store import Output, Row
+from studies.bench.study import Study, saved
+from studies.bench.tables import where
+from studies.table3.cells import FAMILIES, PAPER_IRK, PRINTED, TOLERANCES, cell_runs, least, machine, study_of
+from twoloop import Result, RungeKutta, solve_dae
+from twoloop.methods.tableaux import gauss, sun_radau_iib
 
+UNEQUAL = 1.2  # times of the same run, largest over least, beyond which they are no result
+FLAT = 1.5  # a cause explains the pattern if the largest ratio over the smallest is at most this
+Reading = Literal["all", "independent"]
+READINGS: dict[Reading, str] = {"all": "all of z", "independent": "y_i only"}  # what criterion (32) is taken over
+
+
+def cells(rows: pd.DataFrame, exchanged: bool = False) -> pd.DataFrame:
+    """List cells of both: printed time, our least time and counts; exchanged: err_in and err_out of the IRK swapped."""
+    lines = []
+    for group, (i, e_in), (j, e_out) in product(FAMILIES, enumerate(TOLERANCES), enumerate(TOLERANCES)):
+        swapped = exchanged and group == "Table 3: IRK"
+        paper = PRINTED[group][j][i] if swapped else PRINTED[group][i][j]
+        ours = machine(rows, group, e_in, e_out)
+        if paper is not None and ours is not None:
+            attempts = float(ours["n_steps"]) + float(ours["n_rejected"])
+            lines.append((group, paper, least(ours), *ours[["n_evaluations", "n_inner"]].astype(float), attempts))
+    return pd.DataFrame(lines, columns=["group", "paper", "call_s", "evaluations", "inner", "attempts"])
+
+
+def span(ratio: pd.Series) -> float:
+    """Return the largest over the smallest: 1 if one factor explains all."""
+    return float(ratio.max() / ratio.min())
+
+
+def fit(table: pd.DataFrame) -> dict[str, float]:
+    """Fit, in logs, the cost model: printed time = e (evaluations + i inner iterations + p attempted steps).
+
+    i is at most 1: an evaluation contains inner iterations, so that one of them cannot cost more.
+    """
+
+    def cost(x: np.ndarray) -> np.ndarray:
+        scale, inner, attempt = np.exp(x)
+        model = scale * (table["evaluations"] + inner * table["inner"] + attempt * table["attempts"])
+        return np.asarray(np.log(model / table["paper"]), dtype=float)
+
+    found = least_squares(cost, np.log([2e-5, 0.2, 4.0]), bounds=(np.log(1e-9), np.log([1.0, 1.0, 1e3])))
+    residual = cost(found.x)
+    rms, span = np.sqrt(np.mean(residual**2)), np.exp(residual.max() - residual.min())
+    return {"attempt": float(np.exp(found.x[2])), "rms": float(rms), "span": float(span)}
+
+
+def partition_cost(rows: pd.DataFrame) -> float:
+    """Return the seconds of one partition by full pivoting, from runs with and without it in every step.
+
+    The partition is that of `partition="symmetric"`, in fixed steps of the midpoint rule, which has few evaluations.
+    """
+    solvers = (f"fixed step, {name}" for name in ("lasting", "symmetric"))
+    kept, every = (where(rows, group="partition", solver=name).iloc[0] for name in solvers)
+    evaluation = kept["call_s"] / kept["n_evaluations"]
+    # the two runs do not iterate equally often
+    extra = every["call_s"] - evaluation * every["n_evaluations"]
+    return float(extra / every["n_steps"])
+
+
+def _paper_irk(test: Reading, case: Case, err_out: float, repeat: int) -> Result:
+    method = RungeKutta(sun_radau_iib(3), "paper", "richardson-paper", ERR_IN, err_out, outer_test=test)
+    return solve_dae(*case.start, method=method, rtol=PAPER_TOL, atol=PAPER_TOL)
+
+
+def reading_runs(case: Case) -> list[Run]:
+    """List both readings of (32) along err_out, with err_in at its finest."""
+    made = []
+    for test, what in READINGS.items():
+        fixed, run = {"err_in": ERR_IN, "outer_test": test}, partial(_paper_irk, test)
+        solver = Solver(f"{IRK}, (32) on {what}", "two-loop", "compiled", True, "err_out", run, fixed=fixed)
+        made += [Run(case, solver, err_out, "reading", 1) for err_out in TOLERANCES]
+    return made
+
+
+def readings(rows: pd.DataFrame) -> list[dict[str, Any]]:
+    """Tell how far evaluations along err_out of each reading of (32) are from the printed row, and whether in phase."""
+    found = []
+    for what in READINGS.values():
+        runs = where(rows, group="reading", solver=f"{IRK}, (32) on {what}", err_in=ERR_IN)
+        runs = runs.set_index("err_out").reindex(TOLERANCES)
+        if runs["status"].eq("REACHED_END").all():
+            apart = np.log(runs["n_evaluations"].to_numpy(float) / PAPER_IRK[-1])
+            # about its mean, as the factor between both is free
+            found.append({"over": what, "rms": float(np.std(apart)), "astray": bool(runs["astray"].iloc[0])})
+    return found
+
+
+def causes(rows: pd.DataFrame) -> dict[str, Any]:
+    """Find the paper's times over ours by procedure, and what each cause and reading leaves of the pattern."""
+    table = cells(rows)
+    partition = partition_cost(rows)
+    by_time = table["paper"] / table["call_s"]
+    found: dict[str, Any] = {"flat": FLAT, "one_constant": span(by_time) <= FLAT, "span_time": span(by_time)}
+    by_count = span(table["paper"] / table["evaluations"])
+    by_partition = span(table["paper"] / (table["call_s"] + partition * table["attempts"]))
+    found |= {"span_evaluations": by_count, "evaluations_explain": by_count <= FLAT, "partition_us": 1e6 * partition}
+    found |= {"span_partition": by_partition, "partition_explains": by_partition <= FLAT}
+    found["fits"] = {"as labelled": fit(table), "exchanged": fit(cells(rows, exchanged=True))}
+    literal, exchanged = found["fits"].values()
+    found["exchanged_fits_better"] = exchanged["rms"] < literal["rms"]
+    return found | {"readings": readings(rows)}
+
+
+TARGETS = (1e-2, 1e-4, 1e-6)
+PAPER = (NEWMARK, QUARTER, IRK_LINE)
+LOOPS = (1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)  # err_out of Newmark
+EXPLICIT = (OWN_EXPLICIT, solvers.TAYLOR, solvers.ADAMS)  # all coordinates, projected: not the paper's procedure
+# for seconds: no quick runs
+COMPILED = (
+    *(OWN_CODE, solvers.HEYOKA, solvers.CYRK, solvers.CVODE_C, solvers.IDA_INDEX_1, "IDA, stabilised"),
+    *("LSODA, index 1", "DOP853, index 1", "DOP853, projected"),
+)
+OTHERS = (
+    *(solvers.DEFAULT, "SunRadau5", "Gauss6", "Gauss12", "BDF", *EXPLICIT, solvers.IDA_C, *COMPILED),
+    *("Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2"),
+)
+DRAWN = (OWN_CODE, NEWMARK, IRK_LINE, solvers.HEYOKA, solvers.CYRK, solvers.IDA_C)
 FOLDER = "given_lengths"  # in reports/, for another geometry: the reports there are of the assumed one
+STEP = 0.01  # s, of the runs that tell what a partition costs
+
+
+def _fixed(partition: str, case: Case, step: float, repeat: int) -> Result:
+    return solve_dae(*case.start, method=RungeKutta(gauss(1), partition=partition), step_size=step)  # type: ignore[arg-type]
+
+
+def runs(first: Case, second: Case, quick: bool) -> list[Run]:
+    """List the cells of the table, what a partition costs, both readings of (32), and the other solvers.
+
+    On the second geometry only the paper's procedures: `studies.work_precision` has the others there.
+    """
+    made, repeats = reading_runs(first), 1 if quick else REPEATS
+    made += cell_runs(first, repeats) + [run for run in cell_runs(second, 1) if run.solver.fixed["err_in"] == run.value]
+    for partition in ("lasting", "symmetric"):
+        solver = Solver(f"fixed step, {partition}", "two-loop", "compiled", True, "h", partial(_fixed, partition))
+        made.append(Run(first, solver, STEP, "partition", 3 if quick else 9))  # they differ by little
+    for case, names in ((first, (*PAPER, *OTHERS)), (second, () if quick else PAPER)):
+        for solver in (CATALOGUE[name] for name in names if not (quick and name in COMPILED)):
+            values = LOOPS if solver.name in (NEWMARK, QUARTER) else solver.grid(case)
+            made += [Run(case, solver, x, "comparison", repeats) for x in (values[1:3] if quick else values)]
+    return made
+
+
+def make(output: Output) -> pd.DataFrame:
+    """Make all rows, with the height of bar 3's centre, by which the paper judges energy."""
+
+    def highest(run: Run, result: Result) -> dict[str, float]:
+        return {"y3_max": float(result.q[four_bar.Y3].max()) if result.t.size else float("nan")}
+
+    def row(run: Run, repeat: int, built: Warm) -> Row:
+        return row_of(run, repeat, highest, built)
+
+    quick = output.call.quick
+    first, second = four_bar.cases(quick)
+    todo, errors = output.call.wanted(runs(first, second, quick)), () if quick else TARGETS
+    compared = [run for run in todo if run.group == "comparison"]
+    with output.kept() as kept:
+        rows = collect([run for run in todo if run.group != "comparison"], kept, highest)
+        more = adaptive.collect(compared, kept, row, lambda run: True, errors, adaptive.is_ours)
+    return pd.concat([rows, more], ignore_index=True)
+
+
+def first_of(rows: pd.DataFrame) -> pd.DataFrame:
+    """Select the rows of the first geometry."""
+    return rows[rows["problem"] == rows["problem"].iloc[0]]
+
+
+def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
+    """Compute what the report says, of the first geometry."""
+    first = first_of(rows)
+    same = tables.where(first, solver=NEWMARK, err_in=ERR_IN, err_out=ERR_IN)
+    times = [time for own in same["times"] for time in own]  # of all its repetitions, in whatever group
+    if not times:
+        raise StudyError("the rows lack cells of Table 3; make them again by python -m studies.table3 --full")
+    found: dict[str, Any] = {"t_end": float(first["t_end"].iloc[0]), "newmark_times": [min(times), max(times)]}
+    found["times_unequal"] = max(times) > UNEQUAL * min(times)
+    ratios = _newmark_over_irk(first)
+    over = list(chain(*ratios.values()))
+    found |= {"newmark_over_irk": [min(over), max(over)] if over else [], "newmark_errors": list(ratios)}
+    found["cheapest"] = [line for error in TARGETS if (line := _cheapest(_compared(first), error)) is not None]
+    dearer = [irk for each in found["cheapest"] if (irk := each["paper_times"])]
+    found |= {"paper_times": [min(dearer), max(dearer)] if dearer else [], "explicit": _explicit(first)}
+    failed = rows[rows["status"] != "REACHED_END"]
+    found |= {"failed": len(failed), "failed_two_loop": int((failed["family"] == "two-loop").sum())}
+    answer = "No error is reached by both the paper's Runge–Kutta procedure and another solver."
+    if dearer:
+        answer = "At equal error, the paper's Runge–Kutta procedure takes "
+        answer += " to ".join(map(number, found["paper_times"])) + " times as long as the cheapest solver."
+    return found | causes(first) | {"answer": answer}
+
+
+def _cheapest(first: pd.DataFrame, error: float) -> dict[str, Any] | None:
+    """Find the cheapest solver at an error, and how many times as long the paper's procedure takes."""
+    ranked = tables.ranking(first, error)
+    if ranked.empty:
+        return None
+    times = dict(zip(ranked["solver"], ranked["call_s"] / ranked["call_s"].iloc[0], strict=True))
+    return {"error": error, "paper_times": times.get(IRK_LINE)} | (tables.best(ranked) or {})
+
+
+def _newmark_over_irk(first: pd.DataFrame) -> dict[str, list[float]]:
+    """CPU time of Newmark, with either beta, over that of Runge-Kutta, at errors that both reach or pass."""
+    fine = _compared(first)
+    found: dict[str, list[float]] = {}
+    for target in (0.1, 0.03, 0.01, 0.003):  # a solution worse than these is of no use
+        half, quarter, irk = (
+            tables.time_for(runs_, target) if target <= runs_["error_q"].max() else np.nan
+            for runs_ in (fine[fine["solver"] == solver] for solver in PAPER)
+        )
+        ratios = [float(newmark / irk) for newmark in (half, quarter) if not np.isnan(newmark / irk)]
+        found |= {number(target): ratios} if ratios else {}
+    return found
+
+
+def _explicit(first: pd.DataFrame) -> list[float]:
+    """Divide the time of the paper's Runge-Kutta procedure by that of the cheapest explicit method of `EXPLICIT`."""
+    fine, over = _compared(first), []
+    for error in TARGETS:
+        paper, *explicit = (tables.time_for(fine[fine["solver"] == name], error) for name in (IRK_LINE, *EXPLICIT))
+        over.append(float(paper / np.fmin.reduce(explicit)))  # of those that get there
+    return [ratio for ratio in over if not np.isnan(ratio)]
+
+
+def _compared(first: pd.DataFrame) -> pd.DataFrame:
+    """The runs that are compared at equal error: of the cells of the table those with the finest inner loop."""
+    fine = first["err_in"].isna() | (first["err_in"] == ERR_IN)
+    return first[first["group"].isin(("comparison", *FAMILIES)) & fine]
+
+
+def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
+    """Draw CPU time over error."""
+    most = f"{' to '.join(map(number, found['paper_times']))} times" if found["paper_times"] else "more"
+    title = f"The paper's Runge–Kutta procedure takes {most} the least time"
+    return {"table3_full": figures.work_precision(_compared(first_of(rows)), DRAWN, title, coded=True)}
+
+
+def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
+    """Make the table of the report."""
+    lines = tables.work_precision(_compared(first_of(rows)), TARGETS, DRAWN, coded=True)
+    return {"work": table(["solver", *map(power, TARGETS)], [[solver, *times] for solver, _, *times in lines])}
+
+
+STUDY = Study("table3_full", __doc__, make, findings_of, figures_of, tables_of, medians=True)
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -21,16 +273,18 @@ def main(words: Sequence[str] | None = None) -> None:
         parser.add_argument("--lengths", nargs=3, type=float, metavar=("L1", "L2", "L3"), help="of the bars, m")
         parser.add_argument("--ground", type=float, metavar="G", help="distance of the ground joints, m")
         given = parser.parse_args(words)
-        geometry = cells.geometry_of(given.lengths, given.ground)
+        if (given.lengths is None) != (given.ground is None):
+            raise StudyError("--lengths L1 L2 L3 and --ground G go together: the paper's Table 2 has all four")
+        geometry = None if given.lengths is None else (tuple(given.lengths), given.ground)
         if geometry is not None and given.full:
-            raise cli.StudyError("--full is for the assumed geometry; leave it out with --lengths")
+            raise StudyError("--full is for the assumed geometry; leave it out with --lengths")
         if geometry is not None and given.out is None:
             given.out = cli.REPORTS / FOLDER
         call = cli.call_of("table3", given, words)
-        study = full.STUDY if given.full else cells.study_of(geometry)
-        with Output(replace(call, study=study.name)) as output:
-            study.report(output, *saved(output, study.make))
+        chosen = STUDY if given.full else study_of(geometry)
+        with Output(replace(call, study=chosen.name)) as output:
+            chosen.report(output, *saved(output, chosen.make))
             write_index(output)
-        print(f"wrote the files of {study.name} to {output.path}")
+        print(f"wrote the files of {chosen.name} to {output.path}")
 
     cli.main(inside, words)

@@ -15,10 +15,10 @@ import pandas as pd
 
 from references.paper.four_bar_minimal import MinimalFourBar
 from studies.bench import adaptive, headline
-from studies.bench.cases.four_bar import SECOND
 from studies.bench.cli import StudyError
 from studies.bench.collector import REPEATS, Run, Warm, warm_up
 from studies.bench.end_states import case_of, row_of
+from studies.bench.four_bar import SECOND
 from studies.bench.solvers import CATALOGUE, HEYOKA, OTHER_SOLVERS, OWN, TAYLOR
 from studies.bench.store import KeptRows, Row
 from studies.validation.study import MAKE

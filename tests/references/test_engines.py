@@ -11,7 +11,7 @@ from references.engines import rigid as catalogue
 from references.engines.rigid import rigid_of
 from studies.bench import closed_loops
 from studies.bench.closed_loops import ASKEW, LIGHTENED, SPATIAL
-from studies.bench.engine_runs import Loop, errors, gate
+from studies.engines import Loop, errors, gate
 from twoloop import audit
 from twoloop.audit.simulator import gaps
 from twoloop.bodies import PlanarModel, SpatialModel

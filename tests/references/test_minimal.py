@@ -12,7 +12,7 @@ from references.minimal import solvers as minimal_solvers
 from references.minimal.solvers import NoMinimalCoordinates, minimal
 from references.paper.four_bar_minimal import MinimalFourBar
 from references.scipy.beam_reduced import reduced_motion
-from studies.bench.cases.four_bar import SECOND
+from studies.bench.four_bar import SECOND
 from twoloop import mechanisms, solve_dae
 from twoloop.mechanisms import four_bar, very_flexible_beam
 

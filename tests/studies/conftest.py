@@ -7,8 +7,8 @@ import matplotlib as mpl
 import pandas as pd
 import pytest
 
+from studies import energy
 from studies.bench import collector, figures, store
-from studies.energy import study as energy
 
 
 @pytest.fixture(autouse=True)

@@ -9,12 +9,11 @@ import pytest
 
 from studies.bench.cli import StudyError
 from studies.bench.solvers import IRK
-from studies.claims import beam_judges, experiments, judges
+from studies.claims import experiments, judges
 from studies.claims import study as claims
-from studies.claims.beam_judges import kind_of
-from studies.claims.rows import BEAMS, Rows, read
+from studies.claims.judges import kind_of
 from studies.claims.study import JUDGES, judged
-from studies.claims.verdicts import Claim, Judgement, Verdict, load
+from studies.claims.verdicts import BEAMS, Claim, Judgement, Rows, Verdict, load, read
 from studies.reproduction import beam
 from studies.table3.cells import PAPER_IRK, PAPER_NEWMARK, TOLERANCES
 from tests.studies.claim_rows import EXPERIMENTS, MADE
@@ -203,9 +202,8 @@ def test_quick_rows_do_not_answer_what_is_about_long_runs(tables):
 def test_the_file_of_claims_is_complete():
     named = {
         name
-        for module in (judges, beam_judges)
-        for name, function in vars(module).items()
-        if getattr(function, "__module__", "") == module.__name__ and not name.startswith("_")
+        for name, function in vars(judges).items()
+        if getattr(function, "__module__", "") == judges.__name__ and not name.startswith("_")
     }
     assert {claim.judge for claim in CLAIMS.values()} == named - {"kind_of"}
     assert all(claim.fixed in ("before", "after") for claim in CLAIMS.values())

@@ -8,35 +8,43 @@ import pandas as pd
 import pytest
 
 from references.casadi.integrators import solve_sundials
+from studies import energy
 from studies.bench.cli import Call
 from studies.bench.collector import REPEATS, attempt
 from studies.bench.figures import STYLES
 from studies.bench.solvers import CVODE_C, CVODES, CYRK, DEFAULT, DIFFRAX, HEYOKA, IDA_C, IRK, OWN_EXPLICIT
 from studies.bench.store import Output
-from studies.energy import study as energy
-from studies.energy.drift import DRIFTS, IRREGULAR, IS_LOST, NO_DRIFT, ROUNDS, SLOWLY, drift, verdict, windows
-from studies.energy.runs import (
+from studies.energy import (
+    DRIFTS,
     EVEN,
     GAUSS,
+    IRREGULAR,
+    IS_LOST,
     LONG,
     MIDPOINT,
     NEWMARK,
+    NO_DRIFT,
     NOT_QUICK,
     ONE,
     OTHERS,
     QUICK,
     RADAU,
     REPEATED,
+    ROUNDS,
+    SLOWLY,
     SUN,
     SWITCHING,
     H,
     case_of,
+    drift,
     instants,
     linkage,
     measure,
+    pick,
     runs,
+    verdict,
+    windows,
 )
-from studies.energy.study import pick
 from tests.studies import of_study
 
 STUDIED = energy

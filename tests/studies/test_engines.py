@@ -8,10 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from studies import engines
 from studies.bench.closed_loops import ASKEW, LIGHTENED, MECHANISMS, bricard, four_bar
-from studies.bench.engine_runs import Loop
 from studies.bench.render import render
-from studies.engines import study as engines
+from studies.engines import Loop
 from twoloop.audit import audit_mjcf
 from twoloop.audit.simulator import order_and_floor
 
@@ -37,7 +37,7 @@ def said(*parts):
     head = pd.DataFrame(gates).assign(status=["PASSED", "NOT_AVAILABLE"], message=["", "drake is not installed"])
     head["version"] = ["4.0.0", "not installed"]
     rows = pd.concat([head, *parts], ignore_index=True)
-    found = engines.findings.findings_of(rows)
+    found = engines.findings_of(rows)
     return found, render("engines", found, {}, stamp="stamp", quick=False, rows=rows)
 
 

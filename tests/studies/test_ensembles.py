@@ -7,10 +7,9 @@ import pandas as pd
 import pytest
 
 from references.equations.many_at_once import by_diffrax, by_heyoka
+from studies import ensembles
 from studies.bench.cli import Call, StudyError, processor
-from studies.ensembles import linkages
-from studies.ensembles import study as ensembles
-from studies.ensembles.study import CVODE, CYRK, DIFFRAX, ENSEMBLE, ERRORS, HEYOKA, PROPAGATE, SINGLE, TOLERANCES
+from studies.ensembles import CVODE, CYRK, DIFFRAX, ENSEMBLE, ERRORS, HEYOKA, PROPAGATE, SINGLE, TOLERANCES
 from tests.studies.of_study import said
 from twoloop.mechanisms import double_pendulum
 
@@ -67,8 +66,8 @@ def rows(error=lambda way, tol: tol, **seconds):
         for k, tol in enumerate(TOLERANCES)
         for repeat in range(5)
     ]
-    whole = {"group": linkages.VARIED, "n_runs": 1e6, "n_threads": 2, "wall": 30.0, "cpu": 1.0, "n_failed": 0}
-    drawn = {"group": linkages.DRAWN, "n_runs": 99, "n_assembled": 90, "wall": 1.0, "n_failed": 0}
+    whole = {"group": ensembles.VARIED, "n_runs": 1e6, "n_threads": 2, "wall": 30.0, "cpu": 1.0, "n_failed": 0}
+    drawn = {"group": ensembles.DRAWN, "n_runs": 99, "n_assembled": 90, "wall": 1.0, "n_failed": 0}
     drawn |= {name: 1e-6 for name in ("energy_median", "energy_error", "end_error_hard", "end_error_any")}
     return pd.DataFrame([*made, whole | {"n_singly": 1}, drawn | {"n_singly": 0}])
 
@@ -125,47 +124,47 @@ def test_a_package_that_is_not_there_is_a_row(monkeypatch, few):
 def test_rows_have_their_processor(monkeypatch, tmp_path):
     made = rows(**{ENSEMBLE: 0.01, HEYOKA: 0.05}).to_dict("records")
     monkeypatch.setattr(ensembles, "rows_of", lambda of, names, quick: made[:-2])
-    monkeypatch.setattr(linkages, "rows", lambda quick: made[-2:])
+    monkeypatch.setattr(ensembles, "linkage_rows", lambda quick: made[-2:])
     call = Call("ensembles", True, tmp_path, False, "")
     table = ensembles.make(SimpleNamespace(call=call))
     assert (table["processor"] == processor()).all()
 
 
 def test_linkages_are_put_together_and_run():
-    row = linkages.varied_row(20, block=12)
+    row = ensembles.varied_row(20, block=12)
     assert row["n_runs"] == 20 and row["n_failed"] == 0 and row["wall"] > 0.0
 
 
 def test_draws_are_always_the_same_and_within_their_ranges():
-    one, more = linkages.drawn(5), linkages.drawn(9)
+    one, more = ensembles.drawn(5), ensembles.drawn(9)
     assert one == more[:5] and {each["branch"] for each in more} == {-1, 1}
-    assert all(low <= each[name] <= high for each in more for name, (low, high) in linkages.RANGES.items())
+    assert all(low <= each[name] <= high for each in more for name, (low, high) in ensembles.RANGES.items())
 
 
 def test_linkages_by_the_hundred_are_assembled_as_one_is():
-    given, q0 = linkages.assembled(60)
-    assert len(given) == len(q0) < 60 and (given[:15] == linkages.assembled(20)[0][:15]).all()
-    made = [linkages.linkage(*each[:5], int(each[5])).q0 for each in given]
+    given, q0 = ensembles.assembled(60)
+    assert len(given) == len(q0) < 60 and (given[:15] == ensembles.assembled(20)[0][:15]).all()
+    made = [ensembles.linkage(*each[:5], int(each[5])).q0 for each in given]
     assert np.abs(made - q0).max() < 1e-14
 
 
 @pytest.mark.slow
 def test_energies_and_ends_of_many_are_those_of_one(monkeypatch):
-    monkeypatch.setattr(linkages, "N_WORST", 2)
-    monkeypatch.setattr(linkages, "N_ANY", 3)
-    monkeypatch.setattr(linkages, "BLOCK", 12)
-    row, (given, q0), t = linkages.drawn_row(30, 1.0), linkages.assembled(30), np.array([0.5, 1.0])
+    monkeypatch.setattr(ensembles, "N_WORST", 2)
+    monkeypatch.setattr(ensembles, "N_ANY", 3)
+    monkeypatch.setattr(ensembles, "BLOCK", 12)
+    row, (given, q0), t = ensembles.drawn_row(30, 1.0), ensembles.assembled(30), np.array([0.5, 1.0])
     runs = ensembles.ensemble(
-        linkages.four_bar().system, (0.0, 1.0), q0, np.zeros(9), parameters=given[:, :4], t_eval=t
+        ensembles.four_bar().system, (0.0, 1.0), q0, np.zeros(9), parameters=given[:, :4], t_eval=t
     )
     for k in (0, 11):
-        problem = linkages.linkage(*given[k, :5], int(given[k, 5]))
+        problem = ensembles.linkage(*given[k, :5], int(given[k, 5]))
         known = problem.energy(0.0, runs.q[k], runs.v[k]) / (9.81 * (given[k, :3] ** 2).sum())
-        assert np.abs(linkages.energies(given[:, :3], runs.q, runs.v)[k] - known).max() < 1e-14
-    assert linkages.energy_errors(given, q0, runs).max() <= row["energy_error"] < 1e-7
+        assert np.abs(ensembles.energies(given[:, :3], runs.q, runs.v)[k] - known).max() < 1e-14
+    assert ensembles.energy_errors(given, q0, runs).max() <= row["energy_error"] < 1e-7
     assert row["n_failed"] == 0 and row["n_assembled"] == len(given)
     assert 0.0 < row["end_error_any"] < 1e-6 and 0.0 < row["end_error_hard"] < 1e-6
-    assert linkages.end_error(given[0], runs.q[0, :, -1] + 1e-3, 1.0) == pytest.approx(1e-3, rel=1e-3)
+    assert ensembles.end_error(given[0], runs.q[0, :, -1] + 1e-3, 1.0) == pytest.approx(1e-3, rel=1e-3)
 
 
 @pytest.mark.slow

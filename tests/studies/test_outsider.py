@@ -7,8 +7,7 @@ import pytest
 
 from studies.bench.cli import StudyError
 from studies.bench.collector import Case, Run, attempt
-from studies.bench.outsider import Outsider
-from studies.bench.outsider_process import loaded
+from studies.bench.outsider import Outsider, loaded
 from twoloop.mechanisms import pendulum
 
 SOLVERS = '''

@@ -2,7 +2,7 @@
 
 import pytest
 
-from studies.bench import progress
+from studies.bench import cli as progress
 
 
 @pytest.fixture

@@ -9,12 +9,11 @@ import pytest
 
 from references.scipy.index1 import baumgarte
 from studies.bench import collector, solvers, tables
-from studies.bench.cases.beam import MAKE, SOFT, STIFF
 from studies.bench.cli import StudyError
 from studies.bench.collector import Run
 from studies.bench.solvers import CATALOGUE, GEAR_ORDERS, IDA_C_ORDER_2, IRK, NEWMARK, OWN_EXPLICIT, QUARTER, gear
-from studies.reproduction import ablation, beam, beam_limits, motion, step_size, study, violation
-from studies.reproduction.beam_limits import PARAMETERS
+from studies.reproduction import ablation, beam, motion, step_size, study, violation
+from studies.reproduction.beam import MAKE, PARAMETERS, SOFT, STIFF
 from tests.studies.of_study import GOOD, line, told
 from twoloop import solve_dae
 from twoloop.methods.tableaux import gauss, sun_radau_iib
@@ -70,7 +69,7 @@ def of_beam(t_end=2.0):
             row |= {"tol": solvers.PAPER_TOL if solver == IRK and k == 3 else 10.0**-k, "h_median": 3e-4 / factor}
             row |= {"call_q1": row["call_s"], "call_q3": row["call_s"], "n_steps": 1e3 * factor}
             lines.append(common | row)
-    for case, change in product((SOFT, STIFF), (*PARAMETERS, beam_limits.MESH)):
+    for case, change in product((SOFT, STIFF), (*PARAMETERS, beam.MESH)):
         lines.append({"group": "sensitivity", "case": case, "solver": change, "before": 0.1, "largest": 0.4})
     return pd.DataFrame(lines)
 
@@ -294,7 +293,7 @@ def test_errors_are_those_of_the_tip_and_a_run_that_ends_early_has_none():
 
 
 def test_theory_of_fixed_point_iteration():
-    assert abs(beam_limits.gauss_seidel_limit(sun_radau_iib(3)) - 3.2211) < 1e-4
+    assert abs(beam.gauss_seidel_limit(sun_radau_iib(3)) - 3.2211) < 1e-4
     # with one stage there are no others, whose latest values could be used
-    assert beam_limits.gauss_seidel_limit(gauss(1)) == pytest.approx(2.0)
-    assert abs(beam_limits.frequencies(MAKE[SOFT]())[-1] - 3358.5) < 0.05
+    assert beam.gauss_seidel_limit(gauss(1)) == pytest.approx(2.0)
+    assert abs(beam.frequencies(MAKE[SOFT]())[-1] - 3358.5) < 0.05

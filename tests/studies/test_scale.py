@@ -4,10 +4,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from studies import scale
 from studies.bench.large import PLANAR, SPATIAL, open_chain
 from studies.bench.render import render
-from studies.scale import engines, runs
-from studies.scale import study as scale
 
 EXUDYN = "Exudyn, GeneralizedAlpha"
 
@@ -88,7 +87,7 @@ def test_a_failed_size_is_named_and_in_no_fit():
 
 
 def test_cvode_is_run_for_all_tolerances_of_the_default():
-    assert runs.solvers(20)[runs.OTHERS[20][0]] == runs.solvers(20)[scale.DEFAULT]
+    assert scale.solvers(20)[scale.OTHERS[20][0]] == scale.solvers(20)[scale.DEFAULT]
 
 
 @pytest.mark.parametrize("build", [*PLANAR, *SPATIAL])
@@ -107,7 +106,7 @@ def test_exudyns_bodies_move_as_those_of_twoloop():
     from twoloop import solve_dae
 
     made = open_chain(5)
-    problem = runs.problem_of(made, 0.2)
+    problem = scale.problem_of(made, 0.2)
     ends = [solve_pinned(problem, made.bodies, steps).q[:, -1] for steps in (100, 200)]
     ours = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, rtol=1e-9, atol=1e-9).q[:, -1]
     errors = [np.abs(end - ours).max() for end in ends]
@@ -116,7 +115,7 @@ def test_exudyns_bodies_move_as_those_of_twoloop():
 
 def test_engines_follow_the_rows():
     beside = [
-        {"group": engines.TREE, "case": "open chain", "solver": name, "n": n, "evaluation_us": us * n, "start_s": 1.0}
+        {"group": scale.TREE, "case": "open chain", "solver": name, "n": n, "evaluation_us": us * n, "start_s": 1.0}
         for name, us in (("MuJoCo", 0.5), ("Pinocchio", 0.25))
         for n in (10, 30, 600)
     ]

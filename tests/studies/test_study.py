@@ -6,11 +6,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from studies import energy
 from studies.bench import study as shared
 from studies.bench.cli import Call, StudyError, commit, processor
 from studies.bench.row_files import versions
 from studies.bench.store import Output, key
-from studies.energy import runs as energy
 from studies.reproduction import motion, step_size, violation
 from studies.work_precision import mechanisms, minimal
 from studies.work_precision import study as work_precision

@@ -8,13 +8,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies.bench.cases import four_bar
+from studies.bench import four_bar
 from studies.bench.solvers import IDA_C, IRK, IRK_LINE, NEWMARK, QUARTER
 from studies.table3 import cells as short
-from studies.table3 import full
-from studies.table3.causes import READINGS, causes, cells, fit
+from studies.table3 import study as full
 from studies.table3.cells import FAMILIES, PAPER_IRK, PAPER_NEWMARK, PRINTED, TOLERANCES
-from studies.table3.study import main
+from studies.table3.study import READINGS, causes, cells, fit, main
 from tests.studies.of_study import GOOD, found_of
 
 SHORT = SimpleNamespace(STUDY=short.study_of())
@@ -97,8 +96,7 @@ def test_runs_that_are_lost_or_fail_are_told(tmp_path):
     assert "3.600" not in (tmp_path / "table3.md").read_text()  # a shorter run is not compared with the paper's
 
 
-def test_another_geometry_needs_all_four_lengths_and_must_assemble(tmp_path, capsys):
-    assert short.geometry_of([1.0, 2.0, 1.5], 3.0) == ((1.0, 2.0, 1.5), 3.0) and short.geometry_of(None, None) is None
+def test_another_geometry_needs_all_four_lengths_and_must_assemble(tmp_path):
     for words in (
         ["--lengths", "1", "2", "1.5"],
         ["--lengths", "1", "2", "1.5", "--ground", "30"],

@@ -1,1 +1,0 @@
-"""The mechanisms of which several studies make cases."""

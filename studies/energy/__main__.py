@@ -1,3 +1,0 @@
-from studies.energy.study import STUDY
-
-STUDY.main()

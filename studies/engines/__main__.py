@@ -1,3 +1,0 @@
-from studies.engines.study import STUDY
-
-STUDY.main()

@@ -1,3 +1,0 @@
-from studies.ensembles.study import STUDY
-
-STUDY.main()

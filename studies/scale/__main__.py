@@ -1,3 +1,0 @@
-from studies.scale.study import STUDY
-
-STUDY.main()
