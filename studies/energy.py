@@ -428,8 +428,7 @@ def time_figure(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
     panels[0].set_ylabel("|mean energy error of a window| (J)")
     even = found["n_calm"]["even"] == found["n"]["even"] and not found["n_calm"]["lasting"]
     words = "Where the partition changes, only a symmetric choice of it keeps the energy"
-    figures.message(figure, words if even else "Energy errors of runs with fixed steps")
-    figures.label_lines(panels)
+    figures.message(figure, words if even else "Energy errors of runs with fixed steps", panels)
     return figure
 
 

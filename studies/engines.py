@@ -26,15 +26,7 @@ from references.engines.rigid import (
 )
 from studies.bench import figures, tables
 from studies.bench.cli import version_of
-from studies.bench.closed_loops import (
-    LIGHTENED,
-    LIGHTER,
-    MECHANISMS,
-    four_bar,
-    parallelogram,
-    parallelogram_motion,
-    rssr,
-)
+from studies.bench.closed_loops import LIGHTENED, LIGHTER, MECHANISMS, four_bar, parallelogram_motion, rssr
 from studies.bench.end_states import EXACT
 from studies.bench.render import number, power
 from studies.bench.solvers import GIVEN
@@ -44,7 +36,7 @@ from twoloop import ConstraintWarning, solve_dae
 from twoloop.audit.simulator import LOST, gaps, order_and_floor
 from twoloop.bodies.model_problem import ModelProblem
 
-PARALLEL = parallelogram().name
+PARALLEL = "parallelogram"  # the mechanism whose motion is known, as no method crosses its singular positions tightly
 INSTANTS = 50  # beside the start, at which motions are compared
 REFERENCE_TOL = 1e-12  # tolerance of both routes to a reference
 LIMIT = 1.0  # s of CPU that the next finer run may be expected to take
@@ -86,7 +78,7 @@ class Loop:
 
         Raises RuntimeError if one of them fails.
         """
-        if self.problem.name == PARALLEL:  # no method crosses its singular positions so tightly
+        if self.problem.name == PARALLEL:
             q, v, apart = parallelogram_motion(self.times)
             return self.motion(q, v), apart
         plain = partial(self.solve, REFERENCE_TOL, self.times, compiled=False)  # references are no reason to compile
@@ -494,8 +486,7 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
         panel.set(xscale="log", yscale="log", title=case, xlim=(1e-12, 10.0))
     panels[0, len(shown) // 2].set_xlabel("largest error of positions (m, or of the axes of bodies)")
     panels[0, 0].set_ylabel("CPU time of the call (ms)")
-    figures.message(figure, _message(found))
-    figures.label_lines(panels[0])
+    figures.message(figure, _message(found), panels[0])
     return {"engines": figure}
 
 

@@ -50,20 +50,15 @@ def linkage(L1: float, L2: float, L3: float, ground: float, theta3: float, branc
     return four_bar((L1, L2, L3), ground, theta3, branch)
 
 
-def varied(n: int, random: np.random.Generator) -> tuple[Array, Array, Array]:
-    """Vary the lengths of the four-bar by 2 %, and assemble n linkages by `consistent_states`."""
-    problem = mechanisms.four_bar()
-    p = problem.system.parameters * (1.0 + SPREAD * random.uniform(-1.0, 1.0, (n, 4)))
-    return p, *consistent_states(problem.system, 0.0, problem.q0, problem.v0, parameters=p, keep=[8])
-
-
 def varied_row(n: int, block: int = 2 * BLOCK) -> dict[str, Any]:
-    """Assemble and run n linkages on all cores, and time it."""
-    system, random = mechanisms.four_bar().system, np.random.default_rng(11)
+    """Vary the lengths of the four-bar, assemble and run n linkages on all cores, and time it."""
+    problem, random = four_bar(), np.random.default_rng(11)
     began, failed, singly, spent = time.perf_counter(), 0, 0, time.process_time()
     for first in range(0, n, block):
-        p, q, v = varied(min(block, n - first), random)
-        runs = ensemble(system, (0.0, SPAN), q, v, parameters=p)
+        varied = 1.0 + SPREAD * random.uniform(-1.0, 1.0, (min(block, n - first), 4))
+        p = problem.system.parameters * varied
+        q, v = consistent_states(problem.system, 0.0, problem.q0, problem.v0, parameters=p, keep=[8])
+        runs = ensemble(problem.system, (0.0, SPAN), q, v, parameters=p)
         failed, singly = failed + int((~runs.success).sum()), singly + int(runs.singly.sum())
     row = {"group": VARIED, "n_runs": n, "n_threads": threads_of(None), "wall": time.perf_counter() - began}
     return row | {"cpu": time.process_time() - spent, "n_failed": failed, "n_singly": singly}
@@ -281,22 +276,16 @@ def rows_of(of: Ensemble, names: Sequence[str], quick: bool) -> Iterator[dict[st
         for solve in chosen.values():  # which may build
             solve(tol)
         for repeat, (name, solve) in product(range(1 if quick else REPEATS), chosen.items()):
-            spent, ends = _timed(solve, tol)
+            user_call.forget()
+            began = time.process_time()
+            ends = solve(tol)
+            spent = time.process_time() - began if user_call.seconds is None else user_call.seconds
             errors = np.abs(ends - of.true[: len(ends)]).max(axis=1)
             row = head | {"way": name, "tol": tol, "repeat": repeat, "run_s": spent / len(ends)}
             row |= {"n_failed": int(np.isnan(errors).sum())}
             if not np.isnan(errors).all():
                 row |= {"error_median": float(np.nanmedian(errors)), "error_worst": float(np.nanmax(errors))}
             yield row
-
-
-def _timed(solve: Solve, tol: float) -> tuple[float, Array]:
-    """Return the CPU time of the call that a user writes, s, and the ends."""
-    user_call.forget()
-    began = time.process_time()
-    ends = solve(tol)
-    spent = time.process_time() - began
-    return spent if user_call.seconds is None else user_call.seconds, ends
 
 
 def make(output: Output) -> pd.DataFrame:

@@ -159,12 +159,6 @@ def solver_of(name: str) -> Solver:
     return replace(CATALOGUE[name], run=run)
 
 
-def error_of(n: int, t_end: float, result: Result) -> float:
-    """Return how far a chain ends from where it should, over max(1, max |q|)."""
-    expected = ends(n, t_end)[0]
-    return float(np.abs(result.q[:, -1] - expected).max() / max(1.0, np.abs(expected).max()))
-
-
 def chain_row(n: int, solver: str, value: float, repeat: int) -> Row:
     """Run a solver on a chain."""
     case, chosen = case_of(n, CHAINS[n])[0], solver_of(solver)
@@ -174,10 +168,11 @@ def chain_row(n: int, solver: str, value: float, repeat: int) -> Row:
     built = {run.key(0)} if solver in EXUDYN or solver == SPARSE_IDA else None  # before the call that is timed
     result, status, message, times = timed(run, repeat, built)  # type: ignore[arg-type]
     row |= {**times, "status": status, "message": message, "error_q": None, "floor": AGREE}
-    row["reference"] = ends(n, CHAINS[n])[1]
+    expected, row["reference"] = ends(n, CHAINS[n])
     if result is None or status != "REACHED_END":
         return row
-    return row | {"error_q": error_of(n, CHAINS[n], result), "n_evaluations": result.stats.n_evaluations}
+    error = np.abs(result.q[:, -1] - expected).max() / max(1.0, np.abs(expected).max())
+    return row | {"error_q": float(error), "n_evaluations": result.stats.n_evaluations}
 
 
 TREE = "tree"  # group of rows
@@ -332,8 +327,7 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     for each, color in zip(kinds, figures.shades(len(kinds)), strict=True):
         axes.plot(list(each["us"]), list(each["us"].values()), "o-", color=color, label=each["case"])
     axes.set(xscale="log", yscale="log", xlabel="bodies", ylabel="time of an evaluation (µs)")
-    figures.message(figure, _growth(found))
-    figures.label_lines(axes)
+    figures.message(figure, _growth(found), axes)
     chained = _chains(rows)
     second, panels = plt.subplots(1, len(chained), sharey=True, figsize=(9.6, 3.6), layout="constrained", squeeze=False)
     for panel, (n, medians) in zip(panels[0], chained.items(), strict=True):
@@ -345,17 +339,11 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
         panel.set(xscale="log", yscale="log", title=f"{n} bars")
     panels[0][len(chained) // 2].set_xlabel("error at the end, over max(1, max |q|)")
     panels[0][0].set_ylabel(figures.TIME)
-    figures.message(second, _of_chains(found))
-    figures.label_lines(panels[0])
-    return {"scale": figure, "scale_chains": second}
-
-
-def _of_chains(found: dict[str, Any]) -> str:
-    """Say on which chains another solver is faster at the error of the table, and by how much."""
     at = {each["n"]: each["fastest"].get(power(COMPARED)) for each in found["chains"]}
     parts = [f"{number(best['ratio'])} ({n} bars, {_short(best['solver'])})" for n, best in at.items() if best]
     text = f"At an error of {power(COMPARED)} the fastest other solver takes {listed(parts)} times as long as twoloop"
-    return text if parts else "No two solvers reach the same error"
+    figures.message(second, text if parts else "No two solvers reach the same error", panels[0])
+    return {"scale": figure, "scale_chains": second}
 
 
 def _short(solver: str) -> str:

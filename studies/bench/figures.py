@@ -81,10 +81,11 @@ def shades(n: int) -> list[Any]:
     return list(plt.get_cmap("viridis")(np.linspace(0.0, 0.85, n)))
 
 
-def message(figure: Figure, text: str) -> None:
-    """Write what the figure shows above it, as one sentence."""
+def message(figure: Figure, text: str, panels: Axes | Iterable[Axes] = ()) -> None:
+    """Write what the figure shows above it, as one sentence, and label the lines of its panels."""
     width = int(11.0 * figure.get_figwidth())  # letters that fit on a line
     figure.suptitle(textwrap.fill(text, width), x=0.01, ha="left", fontsize=11, fontweight="bold")
+    label_lines(panels)
 
 
 def label_lines(panels: Axes | Iterable[Axes]) -> None:
@@ -245,6 +246,5 @@ def work_precision(
         if len(runs):
             axes.plot(runs["error_q"].astype(float), runs["call_s"].astype(float), **look(runs.iloc[0], coded))
     axes.set(xscale="log", yscale="log", xlabel=error, ylabel=TIME)
-    message(figure, title)
-    label_lines(axes)
+    message(figure, title, axes)
     return figure

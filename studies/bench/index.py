@@ -6,35 +6,25 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import pandas as pd
 
 from studies.bench.cli import StudyError
 from studies.bench.render import listed, render
-from studies.bench.store import Output, read_rows
+from studies.bench.store import PARTS, Output, read_rows
 
-
-class Report(NamedTuple):
-    """A report of the index."""
-
-    question: str
-    rows: tuple[str, ...] = ()  # the files of its rows, NAME.csv, where these are called otherwise than the report
-
-
-REPORTS = {  # in the order of the index
-    "engines": Report("On closed loops, is twoloop faster than physics engines?"),
-    "validation": Report("Do the methods reproduce published mechanisms?"),
-    "honesty": Report("How often is a solver wrong without saying so?"),
-    "table3": Report("Does the paper's Table 3 come out again?"),
-    "claims": Report("Which of the paper's claims hold?"),
-    "energy": Report("Which methods keep the energy over long times?"),
-    "ensembles": Report("What do thousands of runs cost in one call?"),
-    "scale": Report("How do costs grow with the number of bodies?"),
-    "work_precision": Report("What does an accuracy cost, beside all other solvers?"),
-    "reproduction": Report(
-        "Do the paper's figures come out again?", ("motion", "step_size", "violation", "beam", "ablation")
-    ),
+REPORTS = {  # and their questions, in the order of the index
+    "engines": "On closed loops, is twoloop faster than physics engines?",
+    "validation": "Do the methods reproduce published mechanisms?",
+    "honesty": "How often is a solver wrong without saying so?",
+    "table3": "Does the paper's Table 3 come out again?",
+    "claims": "Which of the paper's claims hold?",
+    "energy": "Which methods keep the energy over long times?",
+    "ensembles": "What do thousands of runs cost in one call?",
+    "scale": "How do costs grow with the number of bodies?",
+    "work_precision": "What does an accuracy cost, beside all other solvers?",
+    "reproduction": "Do the paper's figures come out again?",
 }
 # claims reads the rows of the others
 STUDIES = (
@@ -67,12 +57,13 @@ def line_of(folder: Path, name: str) -> dict[str, Any] | None:
         answer = json.loads(path.read_text()).get("answer")
     except ValueError as error:
         raise StudyError(f"{path} cannot be read ({error}); run python -m studies.{name} again") from None
-    files = [file for rows in REPORTS[name].rows or (name,) if (file := folder / f"{rows}.csv").is_file()]
+    parts = PARTS if name == "reproduction" else (name,)
+    files = [file for rows in parts if (file := folder / f"{rows}.csv").is_file()]
     if not answer or not files:
         return None
     made = [made_on(*read_rows(file)) for file in files]
     dates, processors = sorted({date for date, _ in made}), list(dict.fromkeys(each for _, own in made for each in own))
-    told = {"name": name, "question": REPORTS[name].question, "answer": answer}
+    told = {"name": name, "question": REPORTS[name], "answer": answer}
     return told | {"date": " to ".join(dict.fromkeys((dates[0], dates[-1]))), "processor": listed(processors)}
 
 

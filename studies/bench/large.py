@@ -41,10 +41,10 @@ class Bars:
         """Return the place of an end of bar k; side is -1 or 1."""
         return self.centres[k] + side * self.half * np.array([np.cos(self.angles[k]), np.sin(self.angles[k])])
 
-    def hang(self, k: int, at: Array, on: int, side: float) -> None:
-        """Put the first end of bar k to a place, which is an end of bar `on`, or on the ground."""
+    def hang(self, k: int, at: Array, on: int) -> None:
+        """Put the first end of bar k to a place, the second end of bar `on`, or on the ground."""
         self.centres[k] = at - (self.end(k, -1.0) - self.centres[k])
-        self.bodies.pin(k, (-self.half, 0.0), on, tuple(at) if on == GROUND else (side * self.half, 0.0))
+        self.bodies.pin(k, (-self.half, 0.0), on, tuple(at) if on == GROUND else (self.half, 0.0))
 
     def assembly(self, name: str) -> Assembly:
         """Return the system and its position."""
@@ -60,7 +60,7 @@ def _hung(n: int, on: Callable[[int], int]) -> Bars:
     """Build bars of which the first hangs on a pin, and bar k on the end of bar on(k)."""
     bars = Bars(_leaning(n))
     for k in range(n):
-        bars.hang(k, bars.end(on(k), 1.0) if k else np.zeros(2), on(k) if k else GROUND, 1.0)
+        bars.hang(k, bars.end(on(k), 1.0) if k else np.zeros(2), on(k) if k else GROUND)
     return bars
 
 
@@ -84,9 +84,9 @@ def ladder(n: int) -> Assembly:
     for k in range(m):
         for side, start in ((0, np.zeros(2)), (1, across)):
             here = 2 * k + side
-            bars.hang(here, bars.end(here - 2, 1.0) if k else start, here - 2 if k else GROUND, 1.0)
+            bars.hang(here, bars.end(here - 2, 1.0) if k else start, here - 2 if k else GROUND)
         rung = 2 * m + k
-        bars.hang(rung, bars.end(2 * k, 1.0), 2 * k, 1.0)
+        bars.hang(rung, bars.end(2 * k, 1.0), 2 * k)
         bars.bodies.pin(rung, (bars.half, 0.0), 2 * k + 1, (bars.half, 0.0))
     return bars.assembly(f"ladder of {3 * m}")
 
@@ -124,7 +124,7 @@ def grid(n: int) -> Assembly:
             bars.bodies.pin(bar, (sign * bars.half, 0.0), bead, (float(at[0]), float(at[1])))
     for k in tail:
         on = k - 1 if k > tail.start else beads - 1
-        bars.hang(k, bars.end(on, 1.0), on, 1.0)
+        bars.hang(k, bars.end(on, 1.0), on)
     return bars.assembly(f"grid of {n}")
 
 

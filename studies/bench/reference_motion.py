@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from references.scipy.index1 import solve_index1
+from references.sundials.ida import solve_ida
 from studies.bench.cli import StudyError
 from studies.bench.store import Array
-from twoloop import Result, solve_dae
+from twoloop import solve_dae
 from twoloop.mechanisms import Problem
 
 TIGHT = 1e-13  # tolerance of both runs of the smooth pair
@@ -19,6 +20,7 @@ REFINED = 4  # parts of a step of the second run, at whose ends the first one is
 
 _explicit = partial(solve_index1, method="DOP853", stabilisation="projection")
 _own_explicit = partial(solve_dae, method="DOP853")
+_ida = partial(solve_ida, form="stabilised")
 
 
 @dataclass(frozen=True)
@@ -72,12 +74,6 @@ def make_reference(problem: Problem, t_end: float, time_limit: float | None = No
         floor = max(float(differ), motion.uncertainty(), 1e-15)
         return ReferenceMotion(motion, floor, f"{name}, tolerances {tolerance:.0e}, which differ by {differ:.1e}")
     raise StudyError(f"no reference for {problem.name!r}: {' / '.join(said)}")
-
-
-def _ida(*run: Any, **options: Any) -> Result:
-    from references.sundials.ida import solve_ida
-
-    return solve_ida(*run, "stabilised", **options)
 
 
 def check_published(problem: Problem, motion: ReferenceMotion, t_end: float) -> float | None:

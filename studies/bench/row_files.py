@@ -63,7 +63,7 @@ def in_format(run: Mapping[str, Any], columns: Mapping[str, str], versions: Mapp
     if family == "two-loop":
         row["version"] = ", ".join([__version__, *([run["commit"]] if "commit" in run else [])])
     else:
-        row["version"] = versions.get(run["solver"]) or versions.get(package_of(family)) or "unknown"
+        row["version"] = versions.get(run["solver"]) or versions.get(PACKAGES.get(family, family.lower())) or "unknown"
     row |= {"processor": run.get("processor") or processor(), "setting": setting, "value": run[setting]}
     row |= {"times_s": [rounded(time) for time in run["times"]] if done else []}
     row["evaluations"] = None if pd.isna(run["n_evaluations"]) else int(run["n_evaluations"])
@@ -76,11 +76,6 @@ def in_format(run: Mapping[str, Any], columns: Mapping[str, str], versions: Mapp
         row["astray"] = True if run["astray"] in (True, "True") else None
     known = {name: value for name, value in row.items() if value not in (None, "") and value == value}
     return {name: value if name in EXACT else rounded(value) for name, value in known.items()}
-
-
-def package_of(family: str) -> str:
-    """The package that the solvers of a family are of."""
-    return PACKAGES.get(family, family.lower())
 
 
 def rows_of_file(file: str) -> list[Row]:

@@ -32,10 +32,10 @@ NUMERICS = ("numpy", "scipy", "numba")
 # studies whose times are compared, so that no two run at once
 TIMED = (
     *("work_precision", "compare", "table3", "table3_full", "energy", "ensembles", "engines", "scale"),
-    *("beam", "violation", "ablation"),  # parts of the study of reproduction
+    *("beam", "violation", "ablation"),
 )
-MADE_BY = {part: f"reproduction {part}" for part in ("motion", "step_size", "violation", "beam", "ablation")}
-MADE_BY |= {"table3_full": "table3 --full"}
+PARTS = ("motion", "step_size", "violation", "beam", "ablation")  # of the study of reproduction, with rows of their own
+MADE_BY = {part: f"reproduction {part}" for part in PARTS} | {"table3_full": "table3 --full"}
 LOCK = "twoloop-timed.lock"  # in the machine's folder of temporary files
 NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 

@@ -124,10 +124,6 @@ def kept_rows(*parts: Callable[[bool], Iterable[tuple[str, Callable[[], Any]]]])
     return make
 
 
-def _nothing(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Any]:
-    return {}
-
-
 @dataclass(frozen=True)
 class Study:
     """What a study is made of."""
@@ -138,9 +134,9 @@ class Study:
     # findings(rows) -> what the report and the first screen say, `f` in the template
     findings: Callable[[pd.DataFrame], dict[str, Any]]
     # figures(rows, found) -> figures by the name of their file
-    figures: Callable[[pd.DataFrame, dict[str, Any]], dict[str, Figure]] = _nothing
+    figures: Callable[[pd.DataFrame, dict[str, Any]], dict[str, Figure]] = lambda rows, found: {}
     # tables(rows, found) -> ready markdown, `tables` in the template, which has `rows`, too
-    tables: Callable[[pd.DataFrame, dict[str, Any]], dict[str, str]] = _nothing
+    tables: Callable[[pd.DataFrame, dict[str, Any]], dict[str, str]] = lambda rows, found: {}
     # whether these are given medians (`tables.medians`), and the template `tables.failed`: the rows are of `collect`
     medians: bool = False
     curves: bool = False  # whether the figures are drawn of curves, in the column "series": by name, those of each row

@@ -42,12 +42,6 @@ def _columns(rows: pd.DataFrame, *more: str) -> dict[str, NDArray[Any]]:
     return found | {"setting": setting_of(rows), "astray": astray(rows).to_numpy()}
 
 
-def runs_with(rows: pd.DataFrame, what: str) -> Runs:
-    """Those of rows of one solver."""
-    solver = str(rows["solver"].iloc[0]) if len(rows) and "solver" in rows else ""
-    return Runs(_columns(rows, what), np.arange(len(rows)), what, solver)
-
-
 def by_solver(rows: pd.DataFrame, *costs: str) -> dict[str, Runs]:
     """Those of each solver, in order of appearance; runs without the first of the costs are left out."""
     columns = _columns(rows, *costs)
@@ -63,10 +57,6 @@ def used(run: pd.Series) -> str:
 def astray(runs: pd.DataFrame) -> pd.Series:
     """Which runs have another motion than the reference; none where that was not looked at."""
     return runs["astray"].isin((True, "True")) if "astray" in runs else pd.Series(False, runs.index)
-
-
-def errors_of(runs: pd.DataFrame) -> Array:
-    return np.maximum(runs["error_q"].to_numpy(float), runs["floor"].to_numpy(float))
 
 
 TIGHTEST = 1e-13  # tolerance of which tighter ones are of no use
@@ -124,7 +114,8 @@ def time_for(rows: pd.DataFrame, target: float, what: str = "call_s") -> float:
     not made to look expensive by it. NaN where no run is so good, where the solver was not asked for about so much, and
     where the target is below what the reference resolves.
     """
-    runs = runs_with(rows, what)
+    solver = str(rows["solver"].iloc[0]) if len(rows) and "solver" in rows else ""
+    runs = Runs(_columns(rows, what), np.arange(len(rows)), what, solver)
     place = locate_target(runs, target)
     return float("nan") if place is None else float(interpolate_cost(runs.column(what), place))
 
@@ -158,7 +149,7 @@ def costs_at(rows: pd.DataFrame | Mapping[str, Runs], target: float, doubt: bool
 
 def nearly_there(rows: pd.DataFrame, target: float) -> pd.DataFrame:
     """The runs of one case that miss an error by a factor of less than NEARLY, on the motion of the reference."""
-    errors = errors_of(rows)
+    errors = np.maximum(rows["error_q"].to_numpy(float), rows["floor"].to_numpy(float))
     near = (errors > target) & (errors <= NEARLY * target)
     return rows[near & ~astray(rows).to_numpy() & ~np.isnan(rows["call_s"].to_numpy(float))] if near.any() else rows[:0]
 

@@ -1,6 +1,7 @@
 """The judges, first those of the beams of Sect. 4.2: from rows to a verdict and the numbers that decide."""
 
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
@@ -10,20 +11,7 @@ from studies.bench.cli import StudyError
 from studies.bench.metrics import ASTRAY, LOST
 from studies.bench.solvers import GEAR_ORDERS, IDA_C, IRK, IRK_LINE, NEWMARK, OWN_BDF, QUARTER, gear
 from studies.bench.store import Array
-from studies.claims.verdicts import (
-    BEAM_END,
-    BEAMS,
-    DEFAULT,
-    LONG,
-    Judgement,
-    NotRun,
-    Rows,
-    cheapest,
-    common_costs,
-    decide,
-    span,
-    span_known,
-)
+from studies.claims.verdicts import BEAM_END, BEAMS, DEFAULT, LONG, Judgement, NotRun, Rows, decide, span, span_known
 from studies.energy import NO_DRIFT, verdict
 from studies.reproduction import ablation
 from studies.reproduction.beam import HALF_A_DECADE, PAPER_SECONDS, PAPER_STEPS, PARAMETERS
@@ -48,6 +36,27 @@ FIXED_POINT = (solvers.IRK, solvers.NEWMARK, solvers.QUARTER, solvers.CVODE_C, "
 CHOOSING = (solvers.DEFAULT, *solvers.COMPILED, "LSODA, index 1", "CyRK, LSODA")  # between explicit and implicit
 # in names of implicit methods by Newton's iteration
 BY_NEWTON = ("Radau", "Gauss", "BDF", "TRBDF2", "ESDIRK", "IDA", "CVODES", "collocation")
+
+
+def common_costs(
+    first: pd.DataFrame,
+    second: pd.DataFrame,
+    targets: tuple[float, ...],
+    cost: Callable[[pd.DataFrame, float], float] = tables.time_for,
+) -> list[float]:
+    """Divide times of the first solver by those of the second at errors that both reach; `cost`: cost(runs, error)."""
+    ratios = [cost(first, error) / cost(second, error) for error in targets]
+    ratios = [ratio for ratio in ratios if np.isfinite(ratio)]
+    if not ratios:
+        raise NotRun(f"{first['solver'].iloc[0]} and {second['solver'].iloc[0]} have no error in common")
+    return ratios
+
+
+def cheapest(runs: pd.DataFrame, target: float, what: str) -> float:
+    """Find the least cost of any solver at an error; NaN where none has it."""
+    return float(
+        np.fmin.reduce([tables.time_for(own, target, what) for _, own in runs.groupby("solver")], initial=np.nan)
+    )
 
 
 def kind_of(solver: str) -> str:

@@ -89,27 +89,6 @@ class Rows:
         return self.pick("beam", BEAM_END, named, case=case, group="run", **equal)
 
 
-def common_costs(
-    first: pd.DataFrame,
-    second: pd.DataFrame,
-    targets: tuple[float, ...],
-    cost: Callable[[pd.DataFrame, float], float] = tables.time_for,
-) -> list[float]:
-    """Divide times of the first solver by those of the second at errors that both reach; `cost`: cost(runs, error)."""
-    ratios = [cost(first, error) / cost(second, error) for error in targets]
-    ratios = [ratio for ratio in ratios if np.isfinite(ratio)]
-    if not ratios:
-        raise NotRun(f"{first['solver'].iloc[0]} and {second['solver'].iloc[0]} have no error in common")
-    return ratios
-
-
-def cheapest(runs: pd.DataFrame, target: float, what: str) -> float:
-    """Find the least cost of any solver at an error; NaN where none has it."""
-    return float(
-        np.fmin.reduce([tables.time_for(own, target, what) for _, own in runs.groupby("solver")], initial=np.nan)
-    )
-
-
 FILE = Path(__file__).with_name("claims.toml")
 
 

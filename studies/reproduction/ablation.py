@@ -131,6 +131,7 @@ def figure_of(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
     panels[0].set_ylabel("CPU time (s)")
     times = found["against"][PROJECTED]["time"]
     ratio = number(times[1]) if times else "an unknown number of"
-    figures.message(figure, f"Projecting once a step takes {ratio} times the time of the paper's method (median)")
-    figures.label_lines(panels)
+    figures.message(
+        figure, f"Projecting once a step takes {ratio} times the time of the paper's method (median)", panels
+    )
     return figure

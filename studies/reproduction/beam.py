@@ -236,6 +236,5 @@ def figure_of(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
     panels[0].set_ylabel("CPU time (s)")
     least, most = sorted(case["paper_over_fastest"] for case in found["cases"])
     over = f"{number(least)} and {number(most)}"
-    figures.message(figure, f"PaperIRK takes {over} times as long as the fastest solver within 1 mm")
-    figures.label_lines(panels)
+    figures.message(figure, f"PaperIRK takes {over} times as long as the fastest solver within 1 mm", panels)
     return figure

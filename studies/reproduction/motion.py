@@ -107,6 +107,5 @@ def figure_of(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
     panels[0].set_ylabel("height of bar 3's centre, y3 (m)")
     follow = "follow" if found["agree"] and found["agree_long"] else "do not all follow"
     lost = "; fixed-step BDF of order 2 loses it" if DRAWN_ORDER in found["gear"]["wrong_long"] else ""
-    figures.message(figure, f"The paper's procedures {follow} the true motion{lost}")
-    figures.label_lines(panels)
+    figures.message(figure, f"The paper's procedures {follow} the true motion{lost}", panels)
     return figure

@@ -73,6 +73,7 @@ def figure_of(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
     panel.axhline(LONG, color=figures.RED, lw=1.0, ls=":", label=f"{LONG:g} s")
     panel.set(xlabel="t (s)", ylabel="step size (s)", yscale="log")
     least, most = found["ratios"]
-    figures.message(figure, f"PaperIRK's steps are {number(least)} to {number(most)} times as long as PaperNewmark's")
-    figures.label_lines(panel)
+    figures.message(
+        figure, f"PaperIRK's steps are {number(least)} to {number(most)} times as long as PaperNewmark's", panel
+    )
     return figure

@@ -22,14 +22,6 @@ CURVES = ("motion", "step_size", "violation")  # parts whose figures are drawn o
 ERRATA = tomllib.loads(Path(__file__).with_name("errata.toml").read_text())["errata"]
 
 
-def make_rows(call: Call, name: str) -> None:
-    """Make the rows of a part, PART.csv."""
-    part = PARTS[name]
-    make = part.make if hasattr(part, "make") else rows_of(part.runs, getattr(part, "measure", lambda *of_run: {}))
-    with Output(replace(call, study=name)) as output:
-        output.save_rows(make(output), cli.stamp(call.command))
-
-
 def read_rows(call: Call, name: str) -> tuple[pd.DataFrame, str]:
     """Read the rows of a part, a row a run, and their stamp."""
     output = Output(replace(call, study=name))
@@ -83,7 +75,10 @@ def _work(words: Sequence[str] | None) -> None:
         parser.error(f"{', '.join(unknown)}: not a part; the parts are {', '.join(PARTS)}")
     call = cli.call_of(NAME, given, words)
     for name in () if call.redraw else given.parts or PARTS:
-        make_rows(call, name)
+        part = PARTS[name]
+        make = part.make if hasattr(part, "make") else rows_of(part.runs, getattr(part, "measure", lambda *of_run: {}))
+        with Output(replace(call, study=name)) as output:
+            output.save_rows(make(output), cli.stamp(call.command))
     missing = [name for name in PARTS if not (call.out / f"{name}.csv").is_file()]
     if given.parts and missing:
         print(f"wrote the rows of {', '.join(given.parts)} to {call.out}; the report needs {', '.join(missing)}, too")

@@ -125,6 +125,5 @@ def figure_of(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
         panel.plot(t, row["series"]["q"], **figures.look(row, coded=True) | {"marker": ""})
     panel.set(xlabel="t (s)", yscale="log", ylabel="largest violation |C| (m)")
     kept = "keep the constraints to rounding" if found["ours_q"] <= KEPT else "violate the constraints"
-    figures.message(figure, f"All methods of twoloop {kept}; solvers that do not project drift")
-    figures.label_lines(panel)
+    figures.message(figure, f"All methods of twoloop {kept}; solvers that do not project drift", panel)
     return figure

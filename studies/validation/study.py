@@ -1,7 +1,7 @@
 """Published mechanisms: which solver is right, to how many digits, on which of them."""
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -69,25 +69,20 @@ NO_FAILURES = ("L", "–")  # of these
 def runs(quick: bool) -> list[Run]:
     """List every problem, solver and tolerance."""
     made = [make for k, make in enumerate(MAKE) if not quick or k in QUICK]
-    solvers = (*OWN, *(QUICK_OTHERS if quick else OTHERS))
+    names = (*OWN, *(QUICK_OTHERS if quick else OTHERS))
     tolerances = QUICK_TOLERANCES if quick else TOLERANCES
     found = []
     for problem in (make() for make in made):
         case = case_of(problem)
-        found += [Run(case, CATALOGUE[name], value, repeats=1) for name in solvers for value in tolerances]
+        found += [Run(case, CATALOGUE[name], value, repeats=1) for name in names for value in tolerances]
         if problem.condition is not None and not quick:
             case = case_of(problem, judged=True)
-            found += [Run(case, CATALOGUE[name], tol, JUDGED, repeats=1) for name in solvers for tol in JUDGED_AT]
-    return found + list(modelled(made, quick))
-
-
-def modelled(made: Sequence[Callable[[], Problem]], quick: bool) -> Iterator[Run]:
-    """Yield the runs of Exudyn on the mechanisms of which it has a model of its own."""
+            found += [Run(case, CATALOGUE[name], tol, JUDGED, repeats=1) for name in names for tol in JUDGED_AT]
+    modelled = [CATALOGUE[f"Exudyn, {solver}"] for solver in solvers.EXUDYN[: 1 if quick else None]]
     for case in (replace(case_of(make()), time_limit=MODELLED_LIMIT) for make in made):
-        if case.name in MODELS:
-            for name in (f"Exudyn, {solver}" for solver in solvers.EXUDYN[: 1 if quick else None]):
-                for n in QUICK_STEPS if quick else STEPS:
-                    yield Run(case, CATALOGUE[name], case.t_end / n, MODELLED, repeats=1)
+        steps = [case.t_end / n for n in (QUICK_STEPS if quick else STEPS)] if case.name in MODELS else []
+        found += [Run(case, solver, step, MODELLED, repeats=1) for solver in modelled for step in steps]
+    return found
 
 
 def make(output: Output) -> pd.DataFrame:
@@ -165,7 +160,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     best = right[right["family"] != "two-loop"]["solver"].value_counts()
     found["best_other"] = {"solver": str(best.index[0]), "n": int(best.iloc[0])} if len(best) else None
     by = {side: set(right[right["solver"].isin(of["solver"])]["case"]) for side, of in sides.items()}
-    found["only"] = {side: [case for case in cases if case in by[side] - by[other]] for side, other in _PAIRS}
+    others = {"own": by["others"], "others": by["own"]}
+    found["only"] = {side: [case for case in cases if case in by[side] - others[side]] for side in by}
     found["none"] = [case for case in cases if case not in by["own"] | by["others"]]
     found["counts"] = {side: outcomes_of(of) for side, of in sides.items()}
     wrong = sides["others"][sides["others"]["outcome"] == "wrong"]
@@ -175,9 +171,6 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["wrong_others"] |= {"tight": int((~singular & (wrong["tol"] <= USUAL)).sum())}
     found |= {"models": models_of(models), "short": short_of_reach(rows), "aimed": list(AIMED)}
     return found | {"answer": answer_of(found)}
-
-
-_PAIRS = (("own", "others"), ("others", "own"))
 
 
 def answer_of(found: dict[str, Any]) -> str:

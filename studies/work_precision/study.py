@@ -27,12 +27,8 @@ def make(output: Output) -> pd.DataFrame:
     with output.kept() as kept:
         made = [mechanisms.collect(call.wanted(mechanisms.runs(call.quick)), kept)]
         made += [first_calls.collect(kept, call), minimal.collect(kept, call)]
-    return calibrated(pd.concat(made, ignore_index=True))
-
-
-def calibrated(rows: pd.DataFrame) -> pd.DataFrame:
-    """Add the time that a fixed calculation takes now, by which times of several processors can be compared."""
-    return rows.assign(calibration=CALIBRATION, calibration_s=calibration_s())
+    # the time of a fixed calculation, by which times of several processors can be compared
+    return pd.concat(made, ignore_index=True).assign(calibration=CALIBRATION, calibration_s=calibration_s())
 
 
 def part(rows: pd.DataFrame, group: str) -> pd.DataFrame:

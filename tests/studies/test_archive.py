@@ -5,7 +5,7 @@ import inspect
 import pandas as pd
 
 from studies.bench.cli import REPORTS
-from studies.bench.row_files import READY, mechanism_of, package_of, rounded
+from studies.bench.row_files import PACKAGES, READY, mechanism_of, rounded
 from studies.bench.store import read_rows
 from studies.work_precision import archive
 from studies.work_precision.study import with_one_name
@@ -20,7 +20,7 @@ def test_the_archive_is_of_the_rows_of_the_report():
     rows = with_one_name(read_rows(REPORTS / "work_precision.csv")[0])
     kept = [line for line in read_lines(ARCHIVE) if '"mechanism":"four_bar_second"' in line]
     versions = {row["family"]: row["version"] for row in find_errors(kept)[0] if row["family"] != "two-loop"}
-    versions |= {package_of(family): version for family, version in versions.items()}
+    versions |= {PACKAGES.get(family, family.lower()): version for family, version in versions.items()}
     made = archive.archived(rows[rows["case"] == "four-bar, second"], versions)
     assert format_rows(made).splitlines() == kept, AGAIN
     runs = rows[rows["group"] == archive.GROUP]
