@@ -27,7 +27,6 @@ class Line:
     setting: str = "tol"  # the number that varies; "h": a fixed step, which `solve` takes as `step`
     of_problem: bool = False  # solve(problem, t_end, ...), with equations of its own; otherwise of a system
     # as of `studies.bench.collector.Solver`
-    own_accelerations: bool = False
     traces: bool = False
     builds_each: bool = False
     builds_span: bool = False

@@ -143,7 +143,7 @@ def case_of(geometry: str, t_end: float) -> Case:
     problem, motion = linkage(geometry)
     known = ReferenceMotion(motion.states, FLOOR, "one-coordinate formulation of its own")
     n = math.ceil(t_end / (0.25 * GOLDEN * motion.period))
-    return Case(geometry, problem, t_end, lambda: known, n, time_limit=TIME_LIMIT, timed=0.0, tags=("long",))
+    return Case(geometry, problem, t_end, lambda: known, n, time_limit=TIME_LIMIT, timed=0.0)
 
 
 def instants(case: Case, h: float) -> Array | None:
@@ -348,16 +348,6 @@ def long_of(rows: pd.DataFrame) -> dict[str, Any]:
     return found | {"repeats": int(rows["repeats"].max()) if "repeats" in rows else 1}
 
 
-def fates_of(fixed: pd.DataFrame) -> list[dict[str, Any]]:
-    """Say in a word what the energy does with fixed steps, for each method in each of PLACES."""
-    found = []
-    for solver in dict.fromkeys(fixed["solver"]):
-        runs = [of(fixed[fixed["case"] == geometry], solver, partition) for geometry, partition in PLACES]
-        fates = ["–" if run.empty else FATES.get(run.iloc[0]["verdict"], "fails") for run in runs]
-        found.append({"solver": solver, "fates": fates})
-    return found
-
-
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """Describe what drifts, what a run without drift costs, and why."""
     rows = judged(rows)
@@ -367,7 +357,11 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found: dict[str, Any] = {"long": long_of(rows[rows["case"] == SWITCHING])}
     for name, solver in (("sun", SUN), ("gauss", GAUSS), ("radau", RADAU)):
         found[name] = told(pick(rows, ONE, solver))
-    found["fates"] = fates_of(rows[rows["group"] == "fixed"])
+    found["fates"] = []
+    for solver in dict.fromkeys(rows[rows["group"] == "fixed"]["solver"]):
+        runs = [of(where(rows, group="fixed", case=geometry), solver, partition) for geometry, partition in PLACES]
+        fates = ["–" if run.empty else FATES.get(run.iloc[0]["verdict"], "fails") for run in runs]
+        found["fates"].append({"solver": solver, "fates": fates})
     found["n"] = {name: int(which.sum()) for name, which in kinds.items()}
     found["n_calm"] = {name: int((fixed[which]["verdict"] == NO_DRIFT).sum()) for name, which in kinds.items()}
     found["uneven_drifts"] = bool(fixed[kinds["uneven"]]["verdict"].isin(DRIFTING).all())

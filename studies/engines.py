@@ -486,17 +486,15 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
         panel.set(xscale="log", yscale="log", title=case, xlim=(1e-12, 10.0))
     panels[0, len(shown) // 2].set_xlabel("largest error of positions (m, or of the axes of bodies)")
     panels[0, 0].set_ylabel("CPU time of the call (ms)")
-    figures.message(figure, _message(found), panels[0])
+    text = "No engine and twoloop reach the same error"
+    if ends := ends_of(found):
+        (loose, first), (tight, last) = ends
+        times = f"{number(last['ratio'])} times as long as twoloop (median)"
+        text = f"For an error of {tight} the fastest engine takes {times}"
+        if n := len(first["slower"]):
+            text += f"; for {loose} an engine is faster on {n} of {first['compared']} mechanisms"
+    figures.message(figure, text, panels[0])
     return {"engines": figure}
-
-
-def _message(found: dict[str, Any]) -> str:
-    if not (ends := ends_of(found)):
-        return "No engine and twoloop reach the same error"
-    (loose, first), (tight, last) = ends
-    text = f"For an error of {tight} the fastest engine takes {number(last['ratio'])} times as long as twoloop (median)"
-    n = len(first["slower"])
-    return text + (f"; for {loose} an engine is faster on {n} of {first['compared']} mechanisms" if n else "")
 
 
 STUDY = Study("engines", __doc__, make, findings_of, figures_of)

@@ -16,13 +16,14 @@ from references.engines.trees import ENGINES, TreeDynamics, end_by_pinocchio
 from references.exudyn.mechanisms import solve_pinned
 from references.sundials.ida_sparse import solve_ida_sparse
 from studies.bench import figures, tables
+from studies.bench.cli import track
 from studies.bench.collector import Case, Run, Solver, called_from, timed
 from studies.bench.large import PLANAR, SPATIAL, Assembly, open_chain, tree
 from studies.bench.names import label
 from studies.bench.render import listed, number, power
 from studies.bench.solvers import CATALOGUE, CVODE_C, CYRK, DEFAULT, HEYOKA, at_instants
-from studies.bench.store import Row
-from studies.bench.study import Study, kept_rows
+from studies.bench.store import Output, Row
+from studies.bench.study import Study
 from twoloop import Result, solve_dae
 from twoloop.mechanisms import Problem
 
@@ -240,6 +241,14 @@ OURS = "twoloop, compiled=False"
 ONE_OF = list(EXUDYN)[1:]  # Exudyn's other solver is much the same: it is in no figure
 
 
+def make(output: Output) -> pd.DataFrame:
+    """Make the rows of evaluations, of trees in engines, and of chains."""
+    keyed = [each for part in (evaluations, trees, chains) for each in part(output.call.quick)]
+    keyed = [each for each in keyed if output.call.wants(*each[0].split(" | "))]
+    with output.kept() as kept:
+        return pd.DataFrame([kept.made(key, run) for key, run in track(keyed, lambda each: each[0])])
+
+
 def slope(n: Any, times: Any) -> float | None:
     """Return p of cost ~ n^p over the sizes from FROM to TO; None: too few sizes."""
     n, times = np.asarray(n, dtype=float), np.asarray(times, dtype=float)
@@ -350,7 +359,7 @@ def _short(solver: str) -> str:
     return OURS if solver == DEFAULT else label(solver).split()[0].rstrip(",")
 
 
-STUDY = Study("scale", __doc__, kept_rows(evaluations, trees, chains), findings_of, figures_of)
+STUDY = Study("scale", __doc__, make, findings_of, figures_of)
 
 if __name__ == "__main__":
     STUDY.main()

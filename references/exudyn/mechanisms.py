@@ -257,7 +257,7 @@ def solve_pinned(
 
 
 def _line(name: str, options: dict[str, Any], **fields: Any) -> Line:
-    fields.update(own_accelerations=True, traces=True, setting="h", of_problem=True, stores_steps=True)
+    fields.update(traces=True, setting="h", of_problem=True, stores_steps=True)
     return Line(name, "exudyn", "Exudyn", solve_by_step, options, **fields)
 
 

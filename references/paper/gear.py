@@ -297,7 +297,7 @@ def name_of(order: int, start: str = "accurate") -> str:
     return f"GSTIFF stand-in, order {order}" + (", ramp" if start == "ramp" else "")
 
 
-HOW: dict[str, Any] = {"compared": False, "setting": "h", "stores_steps": True, "own_accelerations": True}
+HOW: dict[str, Any] = {"compared": False, "setting": "h", "stores_steps": True}
 LINES = tuple(
     Line(
         *(name_of(order, start), "twoloop", "stand-in", solve_gear_stored, {"order": order, "start": start}),

@@ -96,7 +96,7 @@ class Functions:
         return by_y, by_yp
 
 
-HOW: dict[str, Any] = {"called_from": "Python", "own_accelerations": True, "stores_steps": True}
+HOW: dict[str, Any] = {"called_from": "Python", "stores_steps": True}
 LINES = tuple(
     Line(
         *(f"{method}, solve_dae", "solve-dae", "solve_dae", solve_fully_implicit, {"method": method}),

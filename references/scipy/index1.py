@@ -437,7 +437,7 @@ LINES = (
     _line("RK45, projected", "RK45", "projection", keeps=True, compared=False),
     *(_line(f"{name}, index 1", name) for name in ("Pr9", "Radau", "BDF")),
     *(
-        _line(baumgarte(name, alpha), name, "baumgarte", compared=False, own_accelerations=True, fixed={"alpha": alpha})
+        _line(baumgarte(name, alpha), name, "baumgarte", compared=False, fixed={"alpha": alpha})
         for name in ("LSODA", "DOP853")
         for alpha in ALPHAS
     ),

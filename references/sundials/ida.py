@@ -290,7 +290,7 @@ def _compiled(parts: Parts, n: int, m: int, n_p: int, widths: tuple[int, int] | 
 
 
 def _line(name: str, solve: Any, options: dict[str, Any], **fields: Any) -> Line:
-    return Line(name, "scikit-sundae", "SUNDIALS", solve, options, own_accelerations=True, scatters=True, **fields)
+    return Line(name, "scikit-sundae", "SUNDIALS", solve, options, scatters=True, **fields)
 
 
 PYTHON: dict[str, Any] = {"called_from": "Python"}

@@ -63,7 +63,6 @@ class Case:
     tolerances: tuple[float, ...] | None = None
     time_limit: float = 60.0  # CPU seconds that the call of a run may use that its user writes
     timed: float = 0.1  # s of CPU time: a shorter run is timed by calling it again, CALLS times
-    tags: tuple[str, ...] = ()  # class of the problem, "smooth", "stiff", "long", for tables over several cases
     note: str = ""  # what is assumed
     # s, at which runs start; other than 0 for solvers of ours alone, which take their span from `start`
     t0: float = 0.0
@@ -123,7 +122,6 @@ class Solver:
     values: tuple[float, ...] = ()  # values of the setting, loose to tight. Empty: those of the case, for "h".
     # settings that do not vary, numbers or texts, for the row
     fixed: Mapping[str, float | str] = field(default_factory=dict)
-    own_accelerations: bool = False  # whether the accelerations in its results are not those of eq. (6) at its q and v.
     # whether it runs the mechanism's functions once, or has a model of its own, and calls none during a run
     traces: bool = False
     # used(value, result) -> what a solver that chooses among methods took, between which nothing is interpolated

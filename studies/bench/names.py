@@ -11,10 +11,6 @@ SUFFIX = " (twoloop)"  # of methods of twoloop, where another solver has such a 
 WITH, WITHOUT = "compiled", "not compiled"  # after a comma, of rows; without either: as a study runs its methods
 ON_SCIPY = "solve_dae"  # another project, whose methods have names of SciPy's
 SCIPY = ("LSODA, ", "DOP853, ", "Radau, ", "BDF, ", "RK45, ")  # how rows of SciPy's begin, which ours may, too
-OTHERS = {  # of studies that run few of ours
-    "solve_dae, compiled, one by one": "compiled=True, one by one",
-    "twoloop, default": f"twoloop, {GIVEN}",
-}
 
 
 def _parts(solver: str) -> tuple[str, str] | None:
@@ -37,7 +33,7 @@ def label(solver: str, coded: bool | None = None) -> str:
     parts = _parts(solver)
     if parts is None:
         name = solver.removesuffix(SUFFIX)
-        return OTHERS.get(solver, f"SciPy, {name}" if name.startswith(SCIPY) and ON_SCIPY not in name else name)
+        return f"SciPy, {name}" if name.startswith(SCIPY) and ON_SCIPY not in name else name
     method, option = parts[0], _option(*parts, coded)
     words = [] if method == DEFAULT else [method]
     words += [] if option is None else [f"compiled={option}"]

@@ -154,7 +154,7 @@ class Outsider:
 
     def solver(self) -> Solver:
         """Its entry in a catalogue."""
-        return Solver(self.name, FILE, "Python", True, "tol", self._run, TOLERANCES, own_accelerations=True)
+        return Solver(self.name, FILE, "Python", True, "tol", self._run, TOLERANCES)
 
     def start(self) -> None:
         """Start the process, which loads the file. Raises StudyError if it cannot."""

@@ -52,7 +52,7 @@ EXUDYN = tuple(EXUDYN_SOLVERS)
 HEYOKA, CYRK, CVODE_C, DIFFRAX = "heyoka", "CyRK, DOP853", "CVODE from C, Adams", "Dopri8, diffrax"
 CVODES = "CVODES, CasADi"
 CVODE_C_PROJECTED = "CVODE from C, BDF, projected"
-SAME_IN_LINES = ("own_accelerations", "traces", "builds_each", "builds_span", "fixed")
+SAME_IN_LINES = ("traces", "builds_each", "builds_span", "fixed")
 GEAR_ORDERS = tuple(range(1, HIGHEST + 1))
 
 # other projects' solvers, the same beside ours in every table: called from compiled code, then from Python

@@ -3,8 +3,6 @@
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -12,11 +10,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from studies.bench import cli, figures, tables
-from studies.bench.cli import Call, StudyError, track
+from studies.bench.cli import Call, StudyError
 from studies.bench.collector import Measure, Run, collect
 from studies.bench.index import write_index
 from studies.bench.render import render, table
-from studies.bench.store import Output, Row, command_of
+from studies.bench.store import Output, command_of
 
 Make = Callable[[Output], pd.DataFrame]
 NAMED = ("group", "case", "family", "solver", "way")  # columns by whose names rows are measured again
@@ -103,23 +101,6 @@ def rows_of(runs: Callable[[bool], Iterable[Run]], measure: Measure) -> Make:
     def make(output: Output) -> pd.DataFrame:
         with output.kept() as kept:
             return collect(output.call.wanted(runs(output.call.quick)), kept, measure)
-
-    return make
-
-
-def kept_rows(*parts: Callable[[bool], Iterable[tuple[str, Callable[[], Any]]]]) -> Make:
-    """What makes the rows of part(quick), of keys and of functions that return a row, or a list of rows."""
-
-    def kept_row(run: Callable[[], Any]) -> Row:
-        made = run()
-        return dict(made) if isinstance(made, dict) else {"rows": made}
-
-    def make(output: Output) -> pd.DataFrame:
-        keyed = list(chain.from_iterable(part(output.call.quick) for part in parts))
-        keyed = [each for each in keyed if output.call.wants(*each[0].split(" | "))]
-        with output.kept() as kept:
-            made = [kept.made(key, partial(kept_row, run)) for key, run in track(keyed, lambda each: each[0])]
-        return pd.DataFrame([row for each in made for row in each.get("rows", [each])])
 
     return make
 

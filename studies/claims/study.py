@@ -11,7 +11,7 @@ from studies.bench.index import run_study, write_index
 from studies.bench.render import render
 from studies.bench.store import Output
 from studies.claims import experiments, judges
-from studies.claims.verdicts import STUDIES, UNTESTABLE, Claim, Judgement, Rows, Verdict, load, read
+from studies.claims.judges import STUDIES, UNTESTABLE, Claim, Judgement, Rows, Verdict, load, read
 from studies.reproduction.study import PARTS
 
 COLUMNS = ("section", "statement", "criterion", "fixed", "judge", "stand_in", "inputs", "circular", "assumed")  # of CSV

@@ -95,12 +95,6 @@ def table_of(ran: pd.DataFrame) -> dict[str, dict[str, Any]]:
     return lines
 
 
-def kinds_of(ran: pd.DataFrame) -> list[dict[str, Any]]:
-    """Count the runs of each kind of solver."""
-    kinds = ran["solver"].map(kind_of)
-    return [{"kind": words} | graded(own) for kind, words in KINDS.items() if len(own := ran[kinds == kind])]
-
-
 def best_limited(ran: pd.DataFrame, shape: str) -> dict[str, Any] | None:
     """Return the solver with a largest step that misses the fewest short forces of a shape."""
     own = ran[ran["trap"].str.startswith(shape) & ran["solver"].str.endswith(LIMITED)]
@@ -128,7 +122,10 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """Count silent failures by kind of trap, and those under sharp forces by kind of solver."""
     ran = rows[rows["outcome"] != NOT_RUN]
     forces, short, mistakes, singular = (ran[ran["group"] == group] for group in GROUPS)
-    found: dict[str, Any] = {"table": table_of(ran), "kinds": kinds_of(forces), "pulses": pulses_of(short)}
+    found: dict[str, Any] = {"table": table_of(ran)}
+    of = {kind: forces[forces["solver"].map(kind_of) == kind] for kind in KINDS}
+    found["kinds"] = [{"kind": words} | graded(of[kind]) for kind, words in KINDS.items() if len(of[kind])]
+    found["pulses"] = pulses_of(short)
     found["n"] = int((~ran["group"].isin((PUBLISHED, AUTHORS))).sum())
     found |= {f"best_{shape}": best_limited(short, shape) for shape in traps.SHAPES}
     found["limited"] = graded(forces[forces["solver"].str.endswith(LIMITED)])

@@ -8,7 +8,7 @@ import pandas as pd
 from studies.bench.solvers import GEAR_ORDERS, IMPLICIT, IRK, IRK_LINE, NEWMARK, QUARTER, gear
 from studies.reproduction import ablation as study
 from studies.reproduction.beam import PARAMETERS
-from studies.table3.cells import FAMILIES, PAPER_IRK, PAPER_NEWMARK, TOLERANCES
+from studies.table3 import FAMILIES, PAPER_IRK, PAPER_NEWMARK, TOLERANCES
 from twoloop.mechanisms import four_bar
 
 FIRST, SECOND = four_bar().name, "another linkage"

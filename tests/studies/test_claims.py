@@ -11,11 +11,10 @@ from studies.bench.cli import StudyError
 from studies.bench.solvers import IRK
 from studies.claims import experiments, judges
 from studies.claims import study as claims
-from studies.claims.judges import kind_of
+from studies.claims.judges import BEAMS, Claim, Judgement, Rows, Verdict, kind_of, load, read
 from studies.claims.study import JUDGES, judged
-from studies.claims.verdicts import BEAMS, Claim, Judgement, Rows, Verdict, load, read
 from studies.reproduction import beam
-from studies.table3.cells import PAPER_IRK, PAPER_NEWMARK, TOLERANCES
+from studies.table3 import PAPER_IRK, PAPER_NEWMARK, TOLERANCES
 from tests.studies.claim_rows import EXPERIMENTS, MADE
 from twoloop import paper_irk, solve_dae
 from twoloop.mechanisms import four_bar
@@ -200,12 +199,9 @@ def test_quick_rows_do_not_answer_what_is_about_long_runs(tables):
 
 
 def test_the_file_of_claims_is_complete():
-    named = {
-        name
-        for name, function in vars(judges).items()
-        if getattr(function, "__module__", "") == judges.__name__ and not name.startswith("_")
-    }
-    assert {claim.judge for claim in CLAIMS.values()} == named - {"kind_of"}
+    returned = {name: getattr(made, "__annotations__", {}).get("return") for name, made in vars(judges).items()}
+    judging = {name for name, kind in returned.items() if kind is Judgement} - {"decide"}
+    assert {claim.judge for claim in CLAIMS.values()} == judging
     assert all(claim.fixed in ("before", "after") for claim in CLAIMS.values())
 
 

@@ -84,7 +84,7 @@ def test_the_studies_of_one_line_a_method_run_the_default(study, quick):
 
 def test_names_and_flags_agree():
     assert set(LINE_UP) <= set(CATALOGUE) and all(solver.name == name for name, solver in CATALOGUE.items())
-    assert CATALOGUE["SunRadau5"].family == "two-loop" and CATALOGUE["IDA, index1"].own_accelerations
+    assert CATALOGUE["SunRadau5"].family == "two-loop" and CATALOGUE["IDA, index1"].family == "SUNDIALS"
 
 
 @pytest.mark.slow

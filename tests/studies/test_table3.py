@@ -8,15 +8,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from studies import table3
 from studies.bench import four_bar
 from studies.bench.solvers import IDA_C, IRK, IRK_LINE, NEWMARK, QUARTER
-from studies.table3 import cells as short
-from studies.table3 import study as full
-from studies.table3.cells import FAMILIES, PAPER_IRK, PAPER_NEWMARK, PRINTED, TOLERANCES
-from studies.table3.study import READINGS, causes, cells, fit, main
+from studies.table3 import FAMILIES, PAPER_IRK, PAPER_NEWMARK, PRINTED, READINGS, TOLERANCES, causes, cells, fit, main
 from tests.studies.of_study import GOOD, found_of
 
-SHORT = SimpleNamespace(STUDY=short.study_of())
+SHORT = SimpleNamespace(STUDY=table3.study_of())
 PROBLEMS = ("four-bar 1, 2, 1.5 m on 3 m", "four-bar 0.8, 1.2, 1 m on 2 m")
 
 
@@ -107,10 +105,10 @@ def test_another_geometry_needs_all_four_lengths_and_must_assemble(tmp_path):
 
 
 def test_the_study_lists_all_cells_once():
-    runs = short.runs(four_bar.cases(False)[0], False)
+    runs = table3.short_runs(four_bar.cases(False)[0], False)
     assert sum(run.group in FAMILIES for run in runs) == 32 and len({run.key(0) for run in runs}) == len(runs)
     assert {run.solver.family for run in runs} >= {"SUNDIALS", "Exudyn"}
-    every = full.runs(*four_bar.cases(False), False)
+    every = table3.runs(*four_bar.cases(False), False)
     assert len({run.key(0) for run in every}) == len(every)
 
 
@@ -132,22 +130,22 @@ def test_the_quick_study_has_all_cells_and_is_drawn_again_as_it_was(tmp_path):
 
 @pytest.mark.usefixtures("unsaved")
 def test_one_machine_constant_is_told_from_more(tmp_path):
-    found = found_of(full, tmp_path, rows())
+    found = found_of(table3, tmp_path, rows())
     assert found["one_constant"] and found["span_time"] == pytest.approx(1.0)
-    assert not found_of(full, tmp_path, rows(step=2.0))["one_constant"]
+    assert not found_of(table3, tmp_path, rows(step=2.0))["one_constant"]
     found = causes(rows(step=2.0).query("problem == @PROBLEMS[0]"))
     assert found["span_time"] > 1.5 and not found["one_constant"] and found["partition_us"] == pytest.approx(2.0)
     assert found["span_partition"] == pytest.approx(1.0, abs=0.01) and found["partition_explains"]
     assert fit(cells(rows(step=2.0).query("problem == @PROBLEMS[0]")))["attempt"] == pytest.approx(2.0, rel=0.1)
     made = rows(step=2.0)
     made.loc[made["solver"] == "fixed step, symmetric", "call_s"] = 0.09  # too cheap to be measured
-    found = found_of(full, tmp_path, made)
+    found = found_of(table3, tmp_path, made)
     assert found["partition_us"] <= 0.0 and not found["partition_explains"]
 
 
 @pytest.mark.usefixtures("unsaved")
 def test_solvers_are_compared_at_equal_error(tmp_path):
-    found = found_of(full, tmp_path, rows())
+    found = found_of(table3, tmp_path, rows())
     assert found["newmark_over_irk"] == pytest.approx([3.0, 4.0]) and not found["times_unequal"]
     assert {at["solver"] for at in found["cheapest"]} == {"Gauss12"}
     made = rows()
@@ -155,31 +153,31 @@ def test_solvers_are_compared_at_equal_error(tmp_path):
     made.loc[made["solver"] == IDA_C, "call_s"] = 0.01
     failing = made.index[made["solver"] == IDA_C][-1]
     made.loc[failing, ["status", "error_q"]] = ["STEP_TOO_SMALL", np.nan]
-    found = found_of(full, tmp_path, made)
+    found = found_of(table3, tmp_path, made)
     assert found["newmark_over_irk"][0] < 1.0 and (found["failed"], found["failed_two_loop"]) == (1, 0)
     assert (found["cheapest"][0]["solver"], found["cheapest"][0]["ours"]) == (IDA_C, False)
 
 
 @pytest.mark.usefixtures("unsaved")
 def test_both_readings_of_the_stopping_test_are_compared_with_the_printed_row(tmp_path):
-    found = found_of(full, tmp_path, rows())["readings"]
+    found = found_of(table3, tmp_path, rows())["readings"]
     assert {line["over"]: line["astray"] for line in found} == {"all of z": False, "y_i only": True}
     every, independent = found
     assert independent["rms"] == pytest.approx(0.0, abs=1e-12) and every["rms"] > 0.1
     made = rows()
     made.loc[made["solver"].str.contains("y_i only"), "status"] = "RAISED"
-    assert len(found_of(full, tmp_path, made)["readings"]) == 1
+    assert len(found_of(table3, tmp_path, made)["readings"]) == 1
 
 
 @pytest.mark.usefixtures("unsaved")
 @pytest.mark.slow
 def test_the_exchanged_labels_fit_only_where_they_do(tmp_path):
-    assert not found_of(full, tmp_path, rows(step=2.0))["exchanged_fits_better"]
+    assert not found_of(table3, tmp_path, rows(step=2.0))["exchanged_fits_better"]
     made = rows()
     cells_ = made["group"] == "Table 3: IRK"
     paper = [PAPER_IRK[TOLERANCES.index(o)][TOLERANCES.index(i)] for i, o in made[cells_][["err_in", "err_out"]].values]
     made.loc[cells_, "n_evaluations"] = 1e5 * np.array(paper)
-    found = found_of(full, tmp_path, made)
+    found = found_of(table3, tmp_path, made)
     assert found["exchanged_fits_better"] and found["fits"]["exchanged"]["span"] <= found["flat"]
 
 

@@ -6,9 +6,12 @@ from functools import partial
 from itertools import chain, product
 from typing import Any, Literal
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 from scipy.optimize import least_squares
 
 from studies.bench import adaptive, cli, figures, four_bar, solvers, tables
@@ -16,14 +19,192 @@ from studies.bench.cli import StudyError
 from studies.bench.collector import REPEATS, Case, Run, Solver, Warm, collect, row_of
 from studies.bench.headline import OWN_CODE
 from studies.bench.index import write_index
+from studies.bench.metrics import ASTRAY, LOST
 from studies.bench.render import number, power, table
-from studies.bench.solvers import CATALOGUE, ERR_IN, IRK, IRK_LINE, NEWMARK, OWN_EXPLICIT, PAPER_TOL, QUARTER
-from studies.bench.store import Output, Row
+from studies.bench.solvers import CATALOGUE, ERR_IN, IRK, IRK_LINE, NEWMARK, QUARTER
+from studies.bench.store import Array, Output, Row
 from studies.bench.study import Study, saved
 from studies.bench.tables import where
-from studies.table3.cells import FAMILIES, PAPER_IRK, PRINTED, TOLERANCES, cell_runs, least, machine, study_of
 from twoloop import Result, RungeKutta, solve_dae
 from twoloop.methods.tableaux import gauss, sun_radau_iib
+
+Geometry = tuple[tuple[float, float, float], float]  # lengths of the bars and distance of the ground joints, m
+
+TOLERANCES = solvers.ERR_OUT  # of err_in, too
+FAMILIES = {"Table 3: IRK": IRK, "Table 3: Newmark": NEWMARK}
+# Table 3 as printed: [err_in][err_out] in seconds; None is the star, "no reasonable result in long time simulation"
+PAPER_IRK = ((1.95, 1.98, 2.00, 2.08), (2.12, 2.23, 2.31, 2.31), (2.64, 2.85, 2.85, 2.99), (3.37, 3.46, 3.55, 3.60))
+PAPER_NEWMARK = (
+    (None, 2.71, 12.62, 49.73),
+    (None, 2.74, 12.36, 49.68),
+    (None, 3.10, 12.68, 49.66),
+    (None, 3.09, 13.40, 50.93),
+)
+PRINTED: dict[str, tuple[tuple[float | None, ...], ...]] = dict(zip(FAMILIES, (PAPER_IRK, PAPER_NEWMARK), strict=True))
+PRINTED_RATIO = float(PAPER_NEWMARK[3][3] or 0.0) / PAPER_IRK[3][3]  # 50.93 s over 3.60 s
+PAPER_END = 100.0  # s, of the paper's runs
+CELL_REPEATS = 3  # the times of a cell differ by a few per cent; an odd number has a middle one
+BESIDE = {  # solver and settings, loose to tight: tolerances, or steps in s of Exudyn, whose run at 1e-4 s takes 10 s
+    solvers.GIVEN: (1e-4, 1e-6, 1e-8),
+    solvers.IDA_C: (1e-4, 1e-6, 1e-8, 1e-10),
+    "Exudyn, GeneralizedAlpha": (1e-2, 4e-3, 1e-3),
+    "Exudyn, TrapezoidalIndex2": (1e-2, 4e-3, 1e-3),
+}
+
+
+def machine(rows: pd.DataFrame, group: str, err_in: float, err_out: float) -> pd.Series | None:
+    """Return the run of a cell."""
+    found = where(rows, group=group, err_in=err_in, err_out=err_out)
+    return None if found.empty else found.iloc[0]
+
+
+def least(run: pd.Series) -> float:
+    """Return the least time of the repetitions of a run, the one that other processes have prolonged least."""
+    times = run.get("times")
+    return float(min(times) if isinstance(times, tuple) and times else run["call_s"])
+
+
+def cell_runs(case: Case, repeats: int) -> list[Run]:
+    """List the 32 cells."""
+    procedures = zip(FAMILIES, (solvers.paper_irk_at, solvers.paper_newmark_at), strict=True)
+    grid = product(procedures, TOLERANCES, TOLERANCES)
+    return [Run(case, at(e_in), e_out, group, repeats) for (group, at), e_in, e_out in grid]
+
+
+def short_runs(case: Case, quick: bool) -> list[Run]:
+    """List the cells and the solvers beside them, of which the default, with the shortest times, is repeated."""
+    repeats = 1 if quick else CELL_REPEATS
+    made = cell_runs(case, repeats)
+    for name, values in BESIDE.items():
+        each = repeats if name == solvers.GIVEN else 1
+        made += [Run(case, CATALOGUE[name], value, "beside", each) for value in (values[:1] if quick else values)]
+    return made
+
+
+def make_short(output: Output, geometry: Geometry | None = None) -> pd.DataFrame:
+    """Make all rows, of the assumed geometry or of another."""
+    try:
+        case = (
+            four_bar.cases(output.call.quick)[0] if geometry is None else four_bar.case_of(*geometry, output.call.quick)
+        )
+        _ = case.reference
+    except ValueError as error:
+        raise StudyError(f"no run with these lengths: {error}") from None
+    # the calls of a cell are long enough to be timed one by one
+    with output.kept() as kept:
+        rows = collect(output.call.wanted(short_runs(replace(case, timed=0.0), output.call.quick)), kept)
+    return rows.assign(assumed=geometry is None)
+
+
+def ratios(rows: pd.DataFrame, group: str) -> Array:
+    """Return the paper's time over our least, err_in by err_out; NaN where either has no result that is of use."""
+    found = np.array(PRINTED[group], dtype=float)
+    for (i, e_in), (j, e_out) in product(enumerate(TOLERANCES), repeat=2):
+        run = machine(rows, group, e_in, e_out)
+        found[i, j] /= np.nan if run is None or run["lost"] else least(run)
+    return found
+
+
+def short_findings(rows: pd.DataFrame) -> dict[str, Any]:
+    """Compute what the report says."""
+    irk, newmark = (machine(rows, group, ERR_IN, ERR_IN) for group in FAMILIES)
+    if irk is None or newmark is None:
+        raise StudyError("the rows lack cells of Table 3; make them again by python -m studies.table3")
+    found: dict[str, Any] = {"t_end": float(rows["t_end"].iloc[0]), "assumed": bool(rows["assumed"].iloc[0])}
+    for name, column in (("time_ratio", "call_s"), ("evaluation_ratio", "n_evaluations")):
+        found[name] = newmark[column] / irk[column]
+    for name, group in zip(("irk", "newmark"), FAMILIES, strict=True):
+        over, cells = ratios(rows, group), rows[rows["group"] == group]
+        kept = over[np.isfinite(over)]
+        found[f"{name}_over"] = [float(kept.min()), float(kept.max())] if kept.size else []
+        for what in ("lost", "astray"):
+            which = sorted(cells[cells[what].astype(bool)]["err_out"].unique(), reverse=True)
+            found[f"{name}_{what}"] = list(map(power, which))
+    found["newmark_only_astray"] = [e for e in found["newmark_astray"] if e not in found["newmark_lost"]]
+    found |= {"lost_limit": LOST, "astray_limit": ASTRAY, "failed": int((rows["status"] != "REACHED_END").sum())}
+    answer = f"Newmark takes {number(found['time_ratio'])} times as long as Runge–Kutta at the tightest tolerances"
+    if found["t_end"] == PAPER_END:
+        answer = f"The pattern comes out in part, not the times: {answer}, in the paper {number(PRINTED_RATIO)} times."
+    else:
+        answer += f"; the paper's {number(PRINTED_RATIO)} is for {number(PAPER_END)} s."
+    return found | {"answer": answer}
+
+
+def grid(rows: pd.DataFrame, group: str, paper: bool) -> str:
+    """Make a table of times in s, err_in by err_out: ours, or with `paper` those that are printed."""
+    lines = []
+    for e_in, own in zip(TOLERANCES, PRINTED[group], strict=True):
+        ours = [machine(rows, group, e_in, e_out) for e_out in TOLERANCES]
+        times = own if paper else [None if run is None else run["call_s"] for run in ours]
+        lines.append([power(e_in), *(number(time, 4 if paper else 2) for time in times)])
+    return table(["err_in \\ err_out", *map(power, TOLERANCES)], lines)
+
+
+def beside(rows: pd.DataFrame) -> str:
+    """Make a table of the solvers beside the procedures, with these at their tightest, from the largest error down."""
+    own = rows[rows["group"].isin(FAMILIES) & (rows["err_in"] == ERR_IN) & (rows["err_out"] == ERR_IN)]
+    chosen = pd.concat([own, rows[rows["group"] == "beside"]])
+    lines = []
+    for _, run in chosen.sort_values("error_q", ascending=False).iterrows():
+        lines.append([run["solver"], tables.setting(run), number(run["call_s"]), number(run["error_q"])])
+    return table(["solver", "setting", "CPU time (s)", "largest error (m, rad)"], lines)
+
+
+def short_figures(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
+    """Draw the paper's time over ours, of both procedures: one colour, were the machine all the difference.
+
+    Nothing of runs that are shorter than the paper's.
+    """
+    if found["t_end"] != PAPER_END:
+        return {}
+    known = {group: ratios(rows, group) for group in FAMILIES}
+    every = np.concatenate([np.ravel(each) for each in known.values()])
+    norm = LogNorm(np.nanmin(every), max(np.nanmax(every), 1.01 * np.nanmin(every)))
+    figure, panels = plt.subplots(1, 2, figsize=(7.4, 3.4), sharey=True, layout="constrained")
+    colours, labels = plt.get_cmap("viridis").with_extremes(bad="#e6e6e6"), [power(e) for e in TOLERANCES]
+    for axes, (group, name) in zip(panels, FAMILIES.items(), strict=True):
+        image = axes.imshow(known[group], norm=norm, cmap=colours)
+        for (i, j), value in np.ndenumerate(known[group]):
+            text, size = ("no result", 7) if np.isnan(value) else (number(value), None)
+            color = "black" if np.isnan(value) or norm(value) >= 0.6 else "white"
+            axes.text(j, i, text, ha="center", va="center", color=color, fontsize=size)
+        places = range(len(TOLERANCES))
+        axes.set(xticks=places, xticklabels=labels, yticks=places, yticklabels=labels, xlabel="err_out")
+        axes.set_title(name, fontsize=9)
+        axes.grid(False)
+    panels[0].set_ylabel("err_in")
+    ticks = LogLocator(subs=(1.0, 2.0, 3.0, 4.0, 6.0, 8.0))
+    scale = figure.colorbar(image, ax=panels, shrink=0.8, ticks=ticks, format=lambda value, _: number(value))
+    scale.set_label("paper's time / that of twoloop")
+    least_, most = number(np.nanmin(every)), number(np.nanmax(every))
+    figures.message(figure, f"The paper's times are {least_} to {most} times those of twoloop: not one factor")
+    return figure
+
+
+def short_tables(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
+    """Make the tables of the report, and print those of the times."""
+    ready = {"beside": beside(rows)}
+    for name, group in zip(("irk", "newmark"), FAMILIES, strict=True):
+        ready |= {name: grid(rows, group, paper=False), f"{name}_paper": grid(rows, group, paper=True)}
+        print(f"\n{group}, CPU time in s over {number(found['t_end'])} s\n{ready[name]}")
+        if found["t_end"] == PAPER_END:
+            print(f"as printed in the paper\n{ready[f'{name}_paper']}")
+    print(f"\nbeside them\n{ready['beside']}")
+    return ready
+
+
+def study_of(geometry: Geometry | None = None) -> Study:
+    """Return the study, with the geometry that is assumed or with another."""
+    return Study(
+        "table3",
+        __doc__,
+        partial(make_short, geometry=geometry),
+        short_findings,
+        short_figures,
+        short_tables,
+        medians=True,
+    )
+
 
 UNEQUAL = 1.2  # times of the same run, largest over least, beyond which they are no result
 FLAT = 1.5  # a cause explains the pattern if the largest ratio over the smallest is at most this
@@ -81,17 +262,7 @@ def partition_cost(rows: pd.DataFrame) -> float:
 
 def _paper_irk(test: Reading, case: Case, err_out: float, repeat: int) -> Result:
     method = RungeKutta(sun_radau_iib(3), "paper", "richardson-paper", ERR_IN, err_out, outer_test=test)
-    return solve_dae(*case.start, method=method, rtol=PAPER_TOL, atol=PAPER_TOL)
-
-
-def reading_runs(case: Case) -> list[Run]:
-    """List both readings of (32) along err_out, with err_in at its finest."""
-    made = []
-    for test, what in READINGS.items():
-        fixed, run = {"err_in": ERR_IN, "outer_test": test}, partial(_paper_irk, test)
-        solver = Solver(f"{IRK}, (32) on {what}", "two-loop", "compiled", True, "err_out", run, fixed=fixed)
-        made += [Run(case, solver, err_out, "reading", 1) for err_out in TOLERANCES]
-    return made
+    return solve_dae(*case.start, method=method, rtol=solvers.PAPER_TOL, atol=solvers.PAPER_TOL)
 
 
 def readings(rows: pd.DataFrame) -> list[dict[str, Any]]:
@@ -126,7 +297,11 @@ def causes(rows: pd.DataFrame) -> dict[str, Any]:
 TARGETS = (1e-2, 1e-4, 1e-6)
 PAPER = (NEWMARK, QUARTER, IRK_LINE)
 LOOPS = (1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)  # err_out of Newmark
-EXPLICIT = (OWN_EXPLICIT, solvers.TAYLOR, solvers.ADAMS)  # all coordinates, projected: not the paper's procedure
+EXPLICIT = (
+    solvers.OWN_EXPLICIT,
+    solvers.TAYLOR,
+    solvers.ADAMS,
+)  # all coordinates, projected: not the paper's procedure
 # for seconds: no quick runs
 COMPILED = (
     *(OWN_CODE, solvers.HEYOKA, solvers.CYRK, solvers.CVODE_C, solvers.IDA_INDEX_1, "IDA, stabilised"),
@@ -146,11 +321,15 @@ def _fixed(partition: str, case: Case, step: float, repeat: int) -> Result:
 
 
 def runs(first: Case, second: Case, quick: bool) -> list[Run]:
-    """List the cells of the table, what a partition costs, both readings of (32), and the other solvers.
+    """List the cells of the table, what a partition costs, both readings of (32) along err_out, and the other solvers.
 
     On the second geometry only the paper's procedures: `studies.work_precision` has the others there.
     """
-    made, repeats = reading_runs(first), 1 if quick else REPEATS
+    made, repeats = list[Run](), 1 if quick else REPEATS
+    for test, what in READINGS.items():
+        fixed, run = {"err_in": ERR_IN, "outer_test": test}, partial(_paper_irk, test)
+        solver = Solver(f"{IRK}, (32) on {what}", "two-loop", "compiled", True, "err_out", run, fixed=fixed)
+        made += [Run(first, solver, err_out, "reading", 1) for err_out in TOLERANCES]
     made += cell_runs(first, repeats) + [run for run in cell_runs(second, 1) if run.solver.fixed["err_in"] == run.value]
     for partition in ("lasting", "symmetric"):
         solver = Solver(f"fixed step, {partition}", "two-loop", "compiled", True, "h", partial(_fixed, partition))
@@ -288,3 +467,7 @@ def main(words: Sequence[str] | None = None) -> None:
         print(f"wrote the files of {chosen.name} to {output.path}")
 
     cli.main(inside, words)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,3 +1,0 @@
-from studies.table3.study import main
-
-main()
