@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
 from typing import Any
@@ -158,18 +158,15 @@ def instants(case: Case, h: float) -> Array | None:
     return np.append(interval * np.arange(n + 1, dtype=np.float64), case.t_end)
 
 
-def _solve(method: str | Method, case: Case, **options: Any) -> Result:
-    return solve_dae(*case.start, method=method, **options)
-
-
 def _fixed(method: Method, case: Case, h: float, repeat: int) -> Result:
-    return _solve(method, case, step_size=h, t_eval=instants(case, h))
+    return solve_dae(*case.start, method=method, step_size=h, t_eval=instants(case, h))
 
 
 def _controlled(method: str | Method, case: Case, tol: float, repeat: int, compiled: bool = False) -> Result:
     """Every step is stored, except where steps are much shorter than the intervals of the sampling instants."""
     short = (method == "DOP853" and tol < 1e-9) or isinstance(method, BDF)
-    return _solve(method, case, rtol=tol, atol=tol, t_eval=case.instants if short else None, compiled=compiled)
+    times = case.instants if short else None
+    return solve_dae(*case.start, method=method, rtol=tol, atol=tol, t_eval=times, compiled=compiled)
 
 
 def _index1(method: str, stabilisation: str, case: Case, tol: float, repeat: int) -> Result:
@@ -219,29 +216,25 @@ def _two_loop(name: str, setting: str, partition: str) -> Solver:
     return Solver(name, "two-loop", "compiled", True, setting, run, fixed={"partition": partition})
 
 
-def runs(quick: bool) -> Iterator[Run]:
+def runs(quick: bool) -> list[Run]:
     """All runs; those whose times are compared are repeated."""
-    for run in _once(quick):
-        compared = run.case.name == SWITCHING and run.solver.name in REPEATED and not quick
-        yield replace(run, repeats=REPEATS) if compared else run
-
-
-def _once(quick: bool) -> Iterator[Run]:
-    cases = {name: case_of(name, QUICK if quick else LONG) for name in GEOMETRIES}
+    found, cases = list[Run](), {name: case_of(name, QUICK if quick else LONG) for name in GEOMETRIES}
     for name, (values, run) in OTHERS.items():
         for value in () if quick and name in NOT_QUICK else reversed(values[:1] if quick else values):
-            yield Run(cases[SWITCHING], replace(solvers.CATALOGUE[name], run=run), value, "other", 1)
+            found.append(Run(cases[SWITCHING], replace(solvers.CATALOGUE[name], run=run), value, "other", 1))
     for geometry, controlled in CONTROLLED.items():
         for name, partition in controlled.items():
-            yield Run(cases[geometry], _two_loop(name, "tol", partition), TOL, "controlled", 1)
+            found.append(Run(cases[geometry], _two_loop(name, "tol", partition), TOL, "controlled", 1))
     for geometry, methods in FIXED.items():
         for name, partitions in methods.items():
             h = H_SMALL if name in (MIDPOINT, NEWMARK) else H
             for partition in partitions:
-                yield Run(cases[geometry], _two_loop(name, "h", partition), h, "fixed", 1)
+                found.append(Run(cases[geometry], _two_loop(name, "h", partition), h, "fixed", 1))
     for name, steps in COARSER.items():
         for h in () if quick else steps:
-            yield Run(cases[SWITCHING], _two_loop(name, "h", EVEN), h, "coarser", 1)
+            found.append(Run(cases[SWITCHING], _two_loop(name, "h", EVEN), h, "coarser", 1))
+    compared = {(SWITCHING, name) for name in REPEATED} if not quick else set()
+    return [replace(run, repeats=REPEATS) if (run.case.name, run.solver.name) in compared else run for run in found]
 
 
 def measure(run: Run, result: Result) -> dict[str, Any]:
@@ -267,13 +260,9 @@ PLACES = ((ONE, LASTING), (SWITCHING, LASTING), (SWITCHING, EVEN))  # of the tab
 
 
 def judged(rows: pd.DataFrame) -> pd.DataFrame:
-    """Add the verdict on each run, and the method's name."""
-    return rows.assign(verdict=rows.apply(verdict, axis=1), name=rows.apply(name_of, axis=1))
-
-
-def name_of(row: pd.Series) -> str:
-    """Name a method, with what is not the default."""
-    return ", ".join([row["solver"], *["symmetric partition"] * (row["partition"] == EVEN)])
+    """Add the verdict on each run, and the method's name, with what is not the default."""
+    name = rows["solver"] + rows["partition"].eq(EVEN).map({True: ", symmetric partition", False: ""})
+    return rows.assign(verdict=rows.apply(verdict, axis=1), name=name)
 
 
 def of(rows: pd.DataFrame, solver: str, partition: str = LASTING) -> pd.DataFrame:

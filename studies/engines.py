@@ -13,17 +13,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from references.engines.rigid import (
-    Motion,
-    Prepared,
-    Rigid,
-    coordinates,
-    engines,
-    largest_moment,
-    rigid_of,
-    states,
-    tensor,
-)
+from references.engines import rigid as parts
+from references.engines.rigid import Motion, Prepared, Rigid, engines, rigid_of
 from studies.bench import figures, tables
 from studies.bench.cli import version_of
 from studies.bench.closed_loops import LIGHTENED, LIGHTER, MECHANISMS, four_bar, parallelogram_motion, rssr
@@ -92,7 +83,7 @@ class Loop:
     def kinetic(self) -> float:
         """Return the largest kinetic energy of the reference, J."""
         known, bodies = self.reference[0], self.rigid.model.bodies
-        J = np.array([tensor(body.inertia) for body in bodies])
+        J = np.array([parts.tensor(body.inertia) for body in bodies])
         local = np.einsum("tkji,tkj->tki", known.R, known.w)
         m = np.array([body.inertia[0] for body in bodies])
         each = m * (known.v**2).sum(axis=2) + np.einsum("tki,kij,tkj->tk", local, J, local)
@@ -112,14 +103,14 @@ class Loop:
     ) -> Motion:
         """Return the motion of coordinates of the model, at the instants."""
         f = np.full((q.shape[1], 3), np.nan) if f is None else f
-        return Motion(self.times[: q.shape[1]], *states(self.rigid.planar, q, v), f, call_s, stepping_s)
+        return Motion(self.times[: q.shape[1]], *parts.states(self.rigid.planar, q, v), f, call_s, stepping_s)
 
     @cached_property
     def start_rates(self) -> dict[float, tuple[Array, Array]]:
         """Return the changes of v and w within the times of the checks, by these times."""
         spans = [0.0, *sorted({share * self.t_end for share, _ in GATES})]
         run = self.solve(REFERENCE_TOL, np.array(spans), method="DOP853", compiled=False)
-        _, _, v, w = states(self.rigid.planar, run.q, run.v)
+        _, _, v, w = parts.states(self.rigid.planar, run.q, run.v)
         return {span: (v[k] - v[0], w[k] - w[0]) for k, span in enumerate(spans)}
 
 
@@ -129,7 +120,7 @@ def gate(loop: Loop, prepared: Prepared) -> str:
     bodies = rigid.model.bodies
     for what, own, given in (
         ("mass", prepared.masses, [body.inertia[0] for body in bodies]),
-        ("largest moment of inertia", prepared.moments, [largest_moment(body.inertia) for body in bodies]),
+        ("largest moment of inertia", prepared.moments, [parts.largest_moment(body.inertia) for body in bodies]),
     ):
         for body, one, other in zip(bodies, own, given, strict=True):
             if abs(one - other) > SAME_INERTIA * other:
@@ -157,7 +148,7 @@ def _accelerated(loop: Loop, motion: Motion, span: float) -> str:
     """Say by how much accelerations at the start are off; angular ones at the bodies' radii of gyration."""
     dv, dw = loop.start_rates[span]
     bodies = loop.rigid.model.bodies
-    size = np.array([np.sqrt(np.trace(tensor(each.inertia)) / 2.0 / each.inertia[0]) for each in bodies])[:, None]
+    size = np.array([np.sqrt(np.trace(parts.tensor(each.inertia)) / 2.0 / each.inertia[0]) for each in bodies])[:, None]
     changes = (motion.v[1] - motion.v[0], dv), (size * (motion.w[1] - motion.w[0]), size * dw)
     largest = max(float(np.abs(expected).max()) for _, expected in changes)
     for name, (change, expected) in zip(("", "angular "), changes, strict=True):
@@ -172,7 +163,7 @@ def errors(loop: Loop, motion: Motion) -> Row:
     (known, _), rigid = loop.reference, loop.rigid
     off = max(np.abs(motion.x - known.x).max(), np.abs(motion.R - known.R).max())
     fastest = max(np.linalg.norm(known.v, axis=2).max(), 1e-12)
-    energies = [loop.problem.energy(each.t, *coordinates(each, rigid.planar)) for each in (motion, known)]
+    energies = [loop.problem.energy(each.t, *parts.coordinates(each, rigid.planar)) for each in (motion, known)]
     d = 2 if rigid.planar else 3  # what holds a mechanism in its plane is not unique
     f = np.abs(motion.f - known.f)[1:, :d].max() / np.abs(known.f[:, :d]).max()  # Drake's first step holds no loop
     values = {

@@ -331,9 +331,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     names = ("n_runs", "n_threads", "wall", "cpu", "n_failed", "n_singly")
     found["million"] = {name: float(many[name]) for name in names} | {"t_end": SPAN}
     about = rows[rows["group"].isin((VARIED, DRAWN))]
-    found["linkages"] = (
-        about.reindex(columns=LINKAGE_COLUMNS).astype(object).where(about.notna(), None).to_dict("records")
-    )
+    about = about.reindex(columns=LINKAGE_COLUMNS).astype(object)
+    found["linkages"] = about.where(about.notna(), None).to_dict("records")
     return found | {"answer": _answer(found)}
 
 

@@ -48,9 +48,8 @@ AGREE = 1e-7  # how far two unlike methods may end apart with it
 
 def problem_of(made: Assembly, t_end: float) -> Problem:
     """Return an assembly released from rest."""
-    q0 = made.q
-    energy = made.bodies.energy
-    return Problem(made.system.name, made.system, q0, np.zeros_like(q0), (0.0, t_end), energy, conserved=True)
+    start = made.q, np.zeros_like(made.q), (0.0, t_end)
+    return Problem(made.system.name, made.system, *start, made.bodies.energy, conserved=True)
 
 
 def evaluations(quick: bool) -> Keyed:

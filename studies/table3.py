@@ -84,15 +84,14 @@ def short_runs(case: Case, quick: bool) -> list[Run]:
 def make_short(output: Output, geometry: Geometry | None = None) -> pd.DataFrame:
     """Make all rows, of the assumed geometry or of another."""
     try:
-        case = (
-            four_bar.cases(output.call.quick)[0] if geometry is None else four_bar.case_of(*geometry, output.call.quick)
-        )
+        quick = output.call.quick
+        case = four_bar.cases(quick)[0] if geometry is None else four_bar.case_of(*geometry, quick)
         _ = case.reference
     except ValueError as error:
         raise StudyError(f"no run with these lengths: {error}") from None
     # the calls of a cell are long enough to be timed one by one
     with output.kept() as kept:
-        rows = collect(output.call.wanted(short_runs(replace(case, timed=0.0), output.call.quick)), kept)
+        rows = collect(output.call.wanted(short_runs(replace(case, timed=0.0), quick)), kept)
     return rows.assign(assumed=geometry is None)
 
 
@@ -178,7 +177,7 @@ def short_figures(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure
     scale.set_label("paper's time / that of twoloop")
     least_, most = number(np.nanmin(every)), number(np.nanmax(every))
     figures.message(figure, f"The paper's times are {least_} to {most} times those of twoloop: not one factor")
-    return figure
+    return {"table3_ratios": figure}
 
 
 def short_tables(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
@@ -360,26 +359,22 @@ def make(output: Output) -> pd.DataFrame:
     return pd.concat([rows, more], ignore_index=True)
 
 
-def first_of(rows: pd.DataFrame) -> pd.DataFrame:
-    """Select the rows of the first geometry."""
-    return rows[rows["problem"] == rows["problem"].iloc[0]]
-
-
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """Compute what the report says, of the first geometry."""
-    first = first_of(rows)
+    first = rows[rows["problem"] == rows["problem"].iloc[0]]
+    fine = _compared(rows)
     same = tables.where(first, solver=NEWMARK, err_in=ERR_IN, err_out=ERR_IN)
     times = [time for own in same["times"] for time in own]  # of all its repetitions, in whatever group
     if not times:
         raise StudyError("the rows lack cells of Table 3; make them again by python -m studies.table3 --full")
     found: dict[str, Any] = {"t_end": float(first["t_end"].iloc[0]), "newmark_times": [min(times), max(times)]}
     found["times_unequal"] = max(times) > UNEQUAL * min(times)
-    ratios = _newmark_over_irk(first)
+    ratios = _newmark_over_irk(fine)
     over = list(chain(*ratios.values()))
     found |= {"newmark_over_irk": [min(over), max(over)] if over else [], "newmark_errors": list(ratios)}
-    found["cheapest"] = [line for error in TARGETS if (line := _cheapest(_compared(first), error)) is not None]
+    found["cheapest"] = [line for error in TARGETS if (line := _cheapest(fine, error)) is not None]
     dearer = [irk for each in found["cheapest"] if (irk := each["paper_times"])]
-    found |= {"paper_times": [min(dearer), max(dearer)] if dearer else [], "explicit": _explicit(first)}
+    found |= {"paper_times": [min(dearer), max(dearer)] if dearer else [], "explicit": _explicit(fine)}
     failed = rows[rows["status"] != "REACHED_END"]
     found |= {"failed": len(failed), "failed_two_loop": int((failed["family"] == "two-loop").sum())}
     answer = "No error is reached by both the paper's Runge–Kutta procedure and another solver."
@@ -398,9 +393,8 @@ def _cheapest(first: pd.DataFrame, error: float) -> dict[str, Any] | None:
     return {"error": error, "paper_times": times.get(IRK_LINE)} | (tables.best(ranked) or {})
 
 
-def _newmark_over_irk(first: pd.DataFrame) -> dict[str, list[float]]:
+def _newmark_over_irk(fine: pd.DataFrame) -> dict[str, list[float]]:
     """CPU time of Newmark, with either beta, over that of Runge-Kutta, at errors that both reach or pass."""
-    fine = _compared(first)
     found: dict[str, list[float]] = {}
     for target in (0.1, 0.03, 0.01, 0.003):  # a solution worse than these is of no use
         half, quarter, irk = (
@@ -412,31 +406,31 @@ def _newmark_over_irk(first: pd.DataFrame) -> dict[str, list[float]]:
     return found
 
 
-def _explicit(first: pd.DataFrame) -> list[float]:
+def _explicit(fine: pd.DataFrame) -> list[float]:
     """Divide the time of the paper's Runge-Kutta procedure by that of the cheapest explicit method of `EXPLICIT`."""
-    fine, over = _compared(first), []
+    over = []
     for error in TARGETS:
         paper, *explicit = (tables.time_for(fine[fine["solver"] == name], error) for name in (IRK_LINE, *EXPLICIT))
         over.append(float(paper / np.fmin.reduce(explicit)))  # of those that get there
     return [ratio for ratio in over if not np.isnan(ratio)]
 
 
-def _compared(first: pd.DataFrame) -> pd.DataFrame:
-    """The runs that are compared at equal error: of the cells of the table those with the finest inner loop."""
-    fine = first["err_in"].isna() | (first["err_in"] == ERR_IN)
-    return first[first["group"].isin(("comparison", *FAMILIES)) & fine]
+def _compared(rows: pd.DataFrame) -> pd.DataFrame:
+    """Select the runs of the first geometry to compare at equal error: of the cells those of the finest inner loop."""
+    fine = (rows["err_in"].isna() | (rows["err_in"] == ERR_IN)) & (rows["problem"] == rows["problem"].iloc[0])
+    return rows[rows["group"].isin(("comparison", *FAMILIES)) & fine]
 
 
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     """Draw CPU time over error."""
     most = f"{' to '.join(map(number, found['paper_times']))} times" if found["paper_times"] else "more"
     title = f"The paper's Runge–Kutta procedure takes {most} the least time"
-    return {"table3_full": figures.work_precision(_compared(first_of(rows)), DRAWN, title, coded=True)}
+    return {"table3_full": figures.work_precision(_compared(rows), DRAWN, title, coded=True)}
 
 
 def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
     """Make the table of the report."""
-    lines = tables.work_precision(_compared(first_of(rows)), TARGETS, DRAWN, coded=True)
+    lines = tables.work_precision(_compared(rows), TARGETS, DRAWN, coded=True)
     return {"work": table(["solver", *map(power, TARGETS)], [[solver, *times] for solver, _, *times in lines])}
 
 

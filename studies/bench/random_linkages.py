@@ -29,7 +29,6 @@ class Drawn:
     """A linkage, its right state at the end, and how much an error at the start grows until then."""
 
     problem: Problem
-    kind: str  # one of KINDS
     q: Array  # (9,); positions at the end, the angles counted from those of the start
     sensitivity: float  # change of q over that of the initial angle of bar 3
 
@@ -66,4 +65,4 @@ def draw(kind: str, generator: np.random.Generator, t_end: float) -> Drawn | Non
         q, nudged = end_of(problem, t_end), end_of(problem, t_end, theta3 + NUDGE)
     except ValueError:
         return None
-    return Drawn(problem, kind, q, float(np.abs(nudged - q).max()) / NUDGE)
+    return Drawn(problem, q, float(np.abs(nudged - q).max()) / NUDGE)

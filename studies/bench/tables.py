@@ -11,17 +11,8 @@ from studies.bench.collector import NOTHING_RUN
 from studies.bench.names import label
 from studies.bench.render import number, power
 from studies.bench.store import Array
-from twoloop.rows.leaderboard import (
-    DECADE,
-    FEWEST,
-    INTERVAL,
-    LEAST,
-    Runs,
-    bootstrap_medians,
-    cheapest_run,
-    interpolate_cost,
-    locate_target,
-)
+from twoloop.rows import leaderboard
+from twoloop.rows.leaderboard import DECADE, FEWEST, INTERVAL, LEAST, Runs
 
 SETTINGS = ("err_out", "h", "tol")  # a procedure along err_out has a tol, too, which does not vary
 
@@ -116,8 +107,8 @@ def time_for(rows: pd.DataFrame, target: float, what: str = "call_s") -> float:
     """
     solver = str(rows["solver"].iloc[0]) if len(rows) and "solver" in rows else ""
     runs = Runs(_columns(rows, what), np.arange(len(rows)), what, solver)
-    place = locate_target(runs, target)
-    return float("nan") if place is None else float(interpolate_cost(runs.column(what), place))
+    place = leaderboard.locate_target(runs, target)
+    return float("nan") if place is None else float(leaderboard.interpolate_cost(runs.column(what), place))
 
 
 Costs = dict[str, tuple[float, Array]]  # by solver the time at an error, and draws of it (RESAMPLES,)
@@ -132,17 +123,17 @@ def costs_at(rows: pd.DataFrame | Mapping[str, Runs], target: float, doubt: bool
     """
     found = {}
     for solver, runs in (by_solver(rows, "call_s") if isinstance(rows, pd.DataFrame) else rows).items():
-        place = locate_target(runs, target, include_unaimed=True)
+        place = leaderboard.locate_target(runs, target, include_unaimed=True)
         if place is None:
             continue
-        if doubt and locate_target(runs, target) is None:
+        if doubt and leaderboard.locate_target(runs, target) is None:
             n_good = place[0]
             place = n_good + (n_good < len(runs.errors) and not runs.column("astray")[n_good]), None
         costs, drawn = runs.column("call_s"), runs.resamples
         known = not np.isnan(drawn[np.argmin(costs[: place[0]])]).any()  # of the cheapest
         found[solver] = (
-            float(interpolate_cost(costs, place)),
-            interpolate_cost(drawn if known else np.nan * drawn, place),
+            float(leaderboard.interpolate_cost(costs, place)),
+            leaderboard.interpolate_cost(drawn if known else np.nan * drawn, place),
         )
     return found
 
@@ -162,17 +153,8 @@ def near_misses(rows: pd.DataFrame, target: float) -> Costs:
 def each_run(runs: pd.DataFrame) -> Costs:
     """What runs take, each by itself: no solver's name, but that of the row."""
     times = runs["times"] if "times" in runs else len(runs) * [()]
-    costs = zip(runs["call_s"].astype(float), bootstrap_medians(times), strict=True)
+    costs = zip(runs["call_s"].astype(float), leaderboard.bootstrap_medians(times), strict=True)
     return {f"row {k}": cost for k, cost in zip(runs.index, costs, strict=True)}
-
-
-def _least(side: Costs) -> tuple[float, Array]:
-    """The time of the cheapest, and the least of each draw; NaN if the cheapest was run too few times to be drawn.
-
-    Others that were run too few times, as they are far behind, say nothing of the scatter.
-    """
-    best, drawn = min(side.values(), key=lambda each: each[0])
-    return best, np.fmin.reduce([each for _, each in side.values()]) if np.isfinite(drawn).all() else drawn
 
 
 def compared(own: Costs, others: Costs) -> dict[str, Any]:
@@ -186,8 +168,13 @@ def compared(own: Costs, others: Costs) -> dict[str, Any]:
     if not own or not others:
         verdict = "alone" if own else "missed" if others else "none"
         return {"ratio": None, "interval": None, "verdict": verdict}
-    least, drawn = zip(*(_least(side) for side in (own, others)), strict=True)
-    low, high = (float(x) for x in np.percentile(drawn[1] / drawn[0], INTERVAL))
+    least, draws = list[float](), list[Array]()
+    for side in (own, others):
+        best, drawn = min(side.values(), key=lambda each: each[0])
+        # NaN if the cheapest was run too few times to be drawn; others that were are far behind, and say nothing
+        draws.append(np.fmin.reduce([each for _, each in side.values()]) if np.isfinite(drawn).all() else drawn)
+        least.append(best)
+    low, high = (float(x) for x in np.percentile(draws[1] / draws[0], INTERVAL))
     verdict = "ahead" if low > LEAST else "behind" if high < 1.0 / LEAST else "undecided"
     return {"ratio": least[1] / least[0], "interval": None if np.isnan(low) else [low, high], "verdict": verdict}
 
@@ -202,9 +189,9 @@ def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
     lines = []
     for solver, runs in by_solver(rows, *COSTS).items():
         ours = len(runs.rows) > 0 and told["family"][runs.rows[0]] == "two-loop"
-        if (place := locate_target(runs, target, include_unaimed=ours)) is not None:
-            run = {name: column[cheapest_run(runs, place)] for name, column in told.items()}
-            line = run | {what: float(interpolate_cost(runs.column(what), place)) for what in COSTS}
+        if (place := leaderboard.locate_target(runs, target, include_unaimed=ours)) is not None:
+            run = {name: column[leaderboard.cheapest_run(runs, place)] for name, column in told.items()}
+            line = run | {what: float(leaderboard.interpolate_cost(runs.column(what), place)) for what in COSTS}
             lines.append(line | {"solver": solver, "setting": setting(run)})
     return pd.DataFrame(lines, columns=["solver", *RANKED, "setting"]).sort_values("call_s", ignore_index=True)
 

@@ -205,7 +205,7 @@ EXPLICIT = (
     *(solvers.OWN_EXPLICIT, solvers.ADAMS, solvers.HEYOKA, solvers.DIFFRAX, solvers.CYRK, "CyRK, Vern8"),
     *("DOP853, projected", "DOP853, index 1", "Pr9, index 1"),
 )
-FIXED_POINT = (solvers.IRK, solvers.NEWMARK, solvers.QUARTER, solvers.CVODE_C, "CVODE, Adams", "CVODES, CasADi, Adams")
+FIXED_POINT = (IRK, NEWMARK, QUARTER, solvers.CVODE_C, "CVODE, Adams", "CVODES, CasADi, Adams")
 CHOOSING = (solvers.DEFAULT, *solvers.COMPILED, "LSODA, index 1", "CyRK, LSODA")  # between explicit and implicit
 # in names of implicit methods by Newton's iteration
 BY_NEWTON = ("Radau", "Gauss", "BDF", "TRBDF2", "ESDIRK", "IDA", "CVODES", "collocation")
@@ -246,9 +246,7 @@ def kind_of(solver: str) -> str:
 def jacobian_difficult(rows: Rows) -> Judgement:
     """Compare costs only; whether Jacobians are hard to get was not tested."""
     counts = [rows.number(f"Newton over fixed point, {case}") for case in ("linkage", *BEAMS)]
-    seconds = [
-        [tables.as_good(rows.beam(case, name), TIPS[-1]) for name in ("SunRadau5", solvers.IRK)] for case in BEAMS
-    ]
+    seconds = [[tables.as_good(rows.beam(case, name), TIPS[-1]) for name in ("SunRadau5", IRK)] for case in BEAMS]
     times = [newton / paper for newton, paper in seconds]
     return decide((ratio > 1.0 for ratio in (*counts, *times)), evaluations=span(counts), times=span(times))
 
@@ -275,7 +273,7 @@ def implicit_needed(rows: Rows) -> Judgement:
 
 
 def _paper_on(rows: Rows, case: str) -> pd.Series:
-    return rows.beam(case, solvers.IRK, tol=solvers.PAPER_TOL).iloc[0]
+    return rows.beam(case, IRK, tol=solvers.PAPER_TOL).iloc[0]
 
 
 def step_order(rows: Rows, case: str) -> Judgement:
@@ -324,7 +322,6 @@ MAIN = 2.0  # times a logarithm must exceed another for its tolerance to be the 
 CHANGE = 1.1  # times the steps: a tolerance affects them
 TARGETS = (1e-1, *TIPS)
 FINER = (*TIPS, 1e-5, 1e-6)  # m, on the stiffer beam no run of Newmark's method is much worse
-BOTH_BETAS = (NEWMARK, QUARTER)
 # of the linkage's solvers: with multipliers for the velocities' constraints too, and independent coordinates alone
 PROJECTING = ("IDA, stabilised", IDA_C)
 STATE_SPACE = (IRK_LINE, NEWMARK, QUARTER, "SunRadau5", "Gauss6", "Gauss12", OWN_BDF)
@@ -537,7 +534,7 @@ def _newmark_over_irk(rows: Rows) -> dict[str, list[float]]:
     cheapest run counts that is at least as good.
     """
     ratios: dict[str, list[float]] = {"linkage": [], "soft": [], "stiff": []}
-    for name in BOTH_BETAS:
+    for name in (NEWMARK, QUARTER):
         for problem in dict.fromkeys(rows.long("table3_full")["problem"]):
             newmark, irk = (_along(rows, solver, problem) for solver in (name, IRK_LINE))
             ratios["linkage"] += common_costs(newmark, irk, tuple(e for e in ERRORS if e < newmark["error_q"].max()))

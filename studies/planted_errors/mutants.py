@@ -33,6 +33,7 @@ TESTS = {  # of a kernel whose change compiles nothing but itself, and what is r
     "newmark": ("tests/kernels/test_newmark.py", "tests/kernels/test_orders.py", "tests/test_fixed_step.py"),
 }
 OF_PAPER = ("bdf", "newmark")  # kernels in twoloop/kernels/paper/; the others are in twoloop/kernels/steps/
+IGNORED = shutil.ignore_patterns("*.partial.jsonl", "*.png", "*.svg")
 FOLDERS = ("twoloop", "references", "studies", "tests", "pyproject.toml", "docs", "reports")
 SEED, N_EACH, QUICK_EACH = 2016, 10, 1
 TIME_LIMIT = 900.0  # s of the tests of a mutant, longer than they take on a busy machine; none has to end
@@ -113,16 +114,6 @@ def sample(quick: bool) -> list[Mutant]:
     return chosen
 
 
-def copy_of_the_repository(folder: Path) -> None:
-    """What the tests need, with the compiled kernels, which a change of one file leaves valid."""
-    for name in FOLDERS:
-        source = ROOT / name
-        if source.is_dir():
-            shutil.copytree(source, folder / name, ignore=shutil.ignore_patterns("*.partial.jsonl", "*.png", "*.svg"))
-        elif source.is_file():
-            shutil.copy2(source, folder / name)
-
-
 def first_failure(folder: Path, tests: Sequence[str]) -> str:
     """The first test that fails in a process of its own, "" if none does; a crash and a time limit count as one."""
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", *tests]
@@ -165,7 +156,11 @@ def make(output: Output) -> pd.DataFrame:
             folder = Path(name) / kernel
             if not todo:
                 return ""
-            copy_of_the_repository(folder)
+            for source in (ROOT / each for each in FOLDERS):  # with the compiled kernels, which one change leaves valid
+                if source.is_dir():
+                    shutil.copytree(source, folder / source.name, ignore=IGNORED)
+                elif source.is_file():
+                    shutil.copy2(source, folder / source.name)
             for mutant in todo:
                 row = row_of(mutant, folder)
                 with lock:

@@ -150,11 +150,6 @@ def line_up() -> dict[str, Solver]:
     return {irk.name: irk} | {name: solvers.CATALOGUE[name] for name in names}
 
 
-def cases(quick: bool) -> dict[str, Case]:
-    """Return both beams by name."""
-    return {name: case_of(name, name, quick) for name in (SOFT, STIFF)}
-
-
 def runs(known: dict[str, Case], quick: bool) -> Iterator[Run]:
     """List the solvers at their settings on both beams."""
     for case, (name, solver) in product(known.values(), line_up().items()):
@@ -168,7 +163,7 @@ def runs(known: dict[str, Case], quick: bool) -> Iterator[Run]:
 def make(output: Output) -> pd.DataFrame:
     """Make the rows of these runs, and of those between them; twoloop's methods are run however slow."""
     quick = output.call.quick
-    known = cases(quick)
+    known = {name: case_of(name, name, quick) for name in (SOFT, STIFF)}
 
     def row(run: Run, repeat: int, built: Warm) -> Row:
         measured = row_of(run, repeat, measure, built)

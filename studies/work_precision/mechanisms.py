@@ -2,6 +2,8 @@
 
 Errors are those at the end of the reference, which is known there to more digits than by any motion between: the
 largest of a coordinate, over the largest coordinate where that exceeds 1. A part of `studies.work_precision`.
+
+heyoka, CyRK and CVODE in minimal coordinates are a group of rows of their own, which no ranking of DAE solvers sees.
 """
 
 from collections import Counter
@@ -13,13 +15,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from references.minimal.solvers import has_minimal
 from references.paper.four_bar_minimal import MinimalFourBar
 from studies.bench import adaptive, headline
-from studies.bench.cli import StudyError
+from studies.bench.cli import Call, StudyError
 from studies.bench.collector import REPEATS, Run, Warm, warm_up
 from studies.bench.end_states import case_of, row_of
 from studies.bench.four_bar import SECOND
-from studies.bench.solvers import CATALOGUE, HEYOKA, OTHER_SOLVERS, OWN, TAYLOR
+from studies.bench.solvers import CATALOGUE, HEYOKA, MINIMAL, OTHER_SOLVERS, OWN, TAYLOR
 from studies.bench.store import KeptRows, Row
 from studies.validation.study import MAKE
 from twoloop import mechanisms, solve_dae
@@ -48,6 +51,12 @@ TIME_LIMIT = 1.0  # s of CPU of a run
 COMPILING = 30.0  # s of what is built before
 TIGHT = 1e-12  # tolerance of the reference of the second geometry, well above rounding, which a third way holds ...
 FAR = 1e-11  # ... to so much
+MINIMAL_GROUP = "minimal coordinates"
+MINIMAL_TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
+HEYOKAS_OWN = float(np.finfo(float).eps)  # the tolerance that heyoka takes where none is given
+WRONG, ASKED = 0.1, 1e-4  # a run that ends with this error, though it was asked for a thousandth of it, is wrong
+MINIMAL_LIMIT = 10.0  # s of CPU; heyoka's loosest runs may be its slowest, and what passes it twice is not asked on
+PENDULUMS = {"A01 pendulum", "projection pendulum", "double pendulum"}  # no loops; from rest in a horizontal position
 
 
 @cache
@@ -223,4 +232,55 @@ def cells(made: Standings) -> list[dict[str, Any]]:
         at = [each[headline.GIVEN] for each in own[: len(RESOLVED)]]
         told = {key: [each[key] for each in at] for key in ("ratio", "verdict")}
         found.append({"case": case, "singular": case in singular(), **told})
+    return found
+
+
+def minimal_runs(quick: bool) -> list[Run]:
+    """List the runs of all solvers on the mechanisms whose loops close in closed form (`minimal.equations`)."""
+    found = []
+    for name, problem in problems(quick).items():
+        if not has_minimal(problem):
+            continue
+        case = replace(case_of(problem), name=name, time_limit=MINIMAL_LIMIT, timed=TIMED)
+        values = QUICK_TOLERANCES if quick else MINIMAL_TOLERANCES
+        repeats = 1 if quick else REPEATS
+        for solver in MINIMAL:
+            own = (HEYOKAS_OWN,) if solver.startswith(HEYOKA) and not quick else ()
+            found += [Run(case, CATALOGUE[solver], value, MINIMAL_GROUP, repeats) for value in (*values, *own)]
+    return found
+
+
+def collect_minimal(kept: KeptRows, call: Call) -> pd.DataFrame:
+    """Make the rows of the runs in minimal coordinates, the repetitions interleaved."""
+    todo, errors = call.wanted(minimal_runs(call.quick)), () if call.quick else RESOLVED
+    return adaptive.collect(todo, kept, row_at_end, lambda run: True, errors)
+
+
+def minimal_findings(rows: pd.DataFrame, everywhere: pd.DataFrame) -> list[dict[str, Any]]:
+    """Compare the ODE in minimal coordinates with the best of twoloop with constraints, by kind of mechanism.
+
+    `rows` and `everywhere` (of all solvers): medians.
+    """
+    if not len(rows):
+        return []
+    cases = rows["case"].astype(str)
+    crossing, pendulums = cases.isin(singular()), cases.isin(PENDULUMS)
+    kinds = {"loops": ~crossing & ~pendulums, "pendulums": pendulums, "singular positions": crossing}
+    return [{"kind": kind, **_of_kind(rows[own], everywhere)} for kind, own in kinds.items() if own.any()]
+
+
+def _of_kind(rows: pd.DataFrame, everywhere: pd.DataFrame) -> dict[str, Any]:
+    at = []
+    for case, own in rows.groupby("case", sort=False):
+        ours = everywhere[(everywhere["case"] == case) & (everywhere["family"] == "two-loop")]
+        at += [each[headline.BEST] for each in headline.of_errors(pd.concat([ours, own], ignore_index=True), RESOLVED)]
+    verdicts, ratios = [each["verdict"] for each in at], [each["ratio"] for each in at if each["ratio"] is not None]
+    found: dict[str, Any] = {"mechanisms": rows["case"].nunique(), "ours_faster": verdicts.count("ahead")}
+    found["slower"] = verdicts.count("behind") + verdicts.count("missed")  # with errors that only the ODE reaches
+    found["n"] = len(ratios) + verdicts.count("missed")
+    found["median"] = float(np.median(ratios)) if ratios else None
+    done = rows[rows["error_q"].notna() & (rows["tol"] <= ASKED)]
+    wrong = done[done["error_q"].astype(float) > WRONG]
+    by, of = wrong["solver"].value_counts(sort=False), done["solver"].value_counts()
+    found["wrong_by"] = {str(name): {"wrong": int(n), "n": int(of[name])} for name, n in by.items()}
     return found

@@ -77,18 +77,12 @@ def findings_of(table: pd.DataFrame, who: str = headline.OWN_CODE) -> list[dict[
     return found
 
 
-def rows_of(folder: Path) -> tuple[pd.DataFrame, str]:
-    """Read the rows of `work_precision` in a folder, and their stamp. Raises StudyError if there are none."""
-    path = folder / "work_precision.csv"
-    if not path.is_file():
-        raise StudyError(f"there is no {path}; run python -m studies.work_precision on the other machine")
-    return read_rows(path)
-
-
 def main(words: Sequence[str] | None = None) -> None:
     (folder,) = sys.argv[1:] if words is None else words
-    path = REPORTS / FILE
-    added(path, verdicts(*rows_of(Path(folder)))).to_csv(path, index=False)
+    path, rows = REPORTS / FILE, Path(folder, "work_precision.csv")
+    if not rows.is_file():
+        raise StudyError(f"there is no {rows}; run python -m studies.work_precision on the other machine")
+    added(path, verdicts(*read_rows(rows))).to_csv(path, index=False)
     print(f"added to {path}; python -m studies.work_precision --redraw puts it into the reports")
 
 

@@ -15,7 +15,7 @@ from studies.bench.index import short
 from studies.bench.render import number, power, render
 from studies.bench.row_files import versions
 from studies.bench.store import Output
-from studies.work_precision import first_calls, mechanisms, minimal, processors
+from studies.work_precision import first_calls, mechanisms, processors
 from studies.work_precision.mechanisms import HEADLINE, RESOLVED
 from twoloop.rows.row_format import CALIBRATION, calibration_s
 
@@ -26,7 +26,7 @@ def make(output: Output) -> pd.DataFrame:
     call = output.call
     with output.kept() as kept:
         made = [mechanisms.collect(call.wanted(mechanisms.runs(call.quick)), kept)]
-        made += [first_calls.collect(kept, call), minimal.collect(kept, call)]
+        made += [first_calls.collect(kept, call), mechanisms.collect_minimal(kept, call)]
     # the time of a fixed calculation, by which times of several processors can be compared
     return pd.concat(made, ignore_index=True).assign(calibration=CALIBRATION, calibration_s=calibration_s())
 
@@ -53,10 +53,12 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     """Write findings, figures and report."""
     rows = with_one_name(rows) if "processor" in rows else rows
     everywhere = tables.medians(part(rows, mechanisms.GROUP))
-    in_angles = on_the_same_processor(part(rows, minimal.GROUP), part(rows, mechanisms.GROUP))
+    in_angles = on_the_same_processor(part(rows, mechanisms.MINIMAL_GROUP), part(rows, mechanisms.GROUP))
     standings, firsts = mechanisms.standings_of(everywhere), part(rows, first_calls.GROUP)
     found = mechanisms.findings_of(standings, everywhere)
-    found["minimal"] = minimal.findings_of(tables.medians(in_angles) if len(in_angles) else in_angles, everywhere)
+    found["minimal"] = mechanisms.minimal_findings(
+        tables.medians(in_angles) if len(in_angles) else in_angles, everywhere
+    )
     found |= {"calls": headline.calls(everywhere, firsts, HEADLINE), "first_calls": first_calls.findings_of(firsts)}
     found["favourable"] = favourable(found)
     found["processors"] = [] if output.call.quick else processors.kept(output, rows, line, standings)

@@ -9,15 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies.bench.cli import Call
 from studies.bench.sharp_forces import families
 from studies.bench.sharp_motion import Motion
-from studies.bench.store import Output
-from studies.honesty import findings
 from studies.honesty import solvers as honesty_solvers
 from studies.honesty import study as honesty
-from studies.honesty.findings import HANG, NOT_RUN, RIGHT, SAID, SILENT
 from studies.honesty.solvers import DEFAULT, IDA, IDA_C, KINDS, LIMITED, LOOK, kind_of, own, solvers, why_not
+from studies.honesty.study import HANG, NOT_RUN, RIGHT, SAID, SILENT
 from studies.honesty.traps import (
     AGREE,
     FORCE,
@@ -37,7 +34,7 @@ from studies.honesty.traps import (
     traps,
     under_forces,
 )
-from tests.studies.of_study import said
+from tests.studies.of_study import found_of, said
 from twoloop import solve_dae
 from twoloop.methods.presets import PRESETS
 
@@ -192,7 +189,7 @@ def test_short_forces_come_at_random_times():
 
 
 OTHER, THEIRS = "BDF (twoloop)", "LSODA, index 1"
-WRONG, SLIGHT = 2.0 * findings.EXACT, 0.5 * findings.EXACT
+WRONG, SLIGHT = 2.0 * honesty.EXACT, 0.5 * honesty.EXACT
 
 
 def made_up(*lines):
@@ -222,21 +219,20 @@ def test_silent_failures_are_counted_by_trap_and_solver():
     assert found["answer"] == answer + "of the run, 0 of 1 at singular positions."
     assert f"**Answer**: {found['answer']}" in text and "|sharp forces¹|2|1|2|0|2|1|" in text
     assert found["wrong_traps"] == [{"trap": "dead point", "wrong": 1}] and found["pulses"]["wrong"] == [(1e-4, 1)]
-    (figure,) = findings.figures_of(pd.DataFrame(), found).values()
+    (figure,) = honesty.figures_of(pd.DataFrame(), found).values()
     assert [text.get_text() for text in figure.axes[0].texts][-3:] == ["  1 of 2", "  0 of 2", "  1 of 2"]
 
 
-def test_published_mechanisms_and_the_authors_conditions_stand_in_the_table(tmp_path):
+def test_published_mechanisms_and_the_authors_conditions_stand_in_the_table(tmp_path, unsaved):
     about = {"case": "A01", "family": "two-loop", "solver": "the default", "tol": 1e-8, "floor": 1e-14, "status": "x"}
     about |= {"group": np.nan, "outcome": "right", "error_q": 1e-9, "warnings": 0}
-    authors = about | {"group": findings.JUDGED}
+    authors = about | {"group": honesty.JUDGED}
     lines = [about, about | {"outcome": "inexact", "error_q": 2e-5}, about | {"outcome": SAID, "error_q": np.nan}]
     lines += [authors, authors | {"outcome": "wrong", "error_q": 1e-9}, authors | {"outcome": "wrong", "warnings": 1}]
     lines += [about | {"solver": "BDF (twoloop)", "outcome": NOT_RUN}, about | {"family": "SciPy", "solver": THEIRS}]
     pd.DataFrame(lines).to_csv(tmp_path / "x.csv", index=False)
     (tmp_path / "validation.csv").write_text("# full validation; stamp\n" + (tmp_path / "x.csv").read_text())
-    rows = honesty.validated(Output(Call("honesty", False, tmp_path, False, "")))
-    table = findings.findings_of(rows)["table"]
+    table = found_of(honesty, tmp_path, made_up((FORCE, "drag", DEFAULT, RIGHT, 1e-9)))["table"]
     got = {key: [line["default"][what] for what in ("n", "ended", "wrong", "gross")] for key, line in table.items()}
-    assert got == {"published": [3, 2, 1, 0], "authors": [3, 2, 1, 1]}
+    assert got == {"sharp": [1, 1, 0, 0], "published": [3, 2, 1, 0], "authors": [3, 2, 1, 1]}
     assert [table["published"][who]["n"] for who in ("own", "others")] == [0, 1]

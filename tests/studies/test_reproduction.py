@@ -213,7 +213,7 @@ def test_every_part_lists_its_runs_once():
     for part in (motion, step_size, violation, ablation):
         listed = part.runs(False)
         assert len({run.key(0) for run in listed}) == len(listed)
-    listed = list(beam.runs(beam.cases(False), False))
+    listed = list(beam.runs({name: beam.case_of(name, name, False) for name in (SOFT, STIFF)}, False))
     assert len({run.key(0) for run in listed}) == len(listed)
     names = {run.solver.name for run in listed}
     assert {name for name in solvers.OTHER_SOLVERS if not name.startswith("Exudyn")} <= names
@@ -281,7 +281,7 @@ def test_twoloop_keeps_the_constraints_and_forms_of_lower_index_their_own_level(
 
 
 def test_errors_are_those_of_the_tip_and_a_run_that_ends_early_has_none():
-    case = beam.cases(True)[SOFT]
+    case = beam.case_of(SOFT, SOFT, True)
     run, start = Run(case, beam.line_up()["RadauIIA5"], 1e-8, "run"), (case.problem.q0, case.problem.v0)
     result = solve_dae(case.problem.system, (0.0, case.t_end), *start, method="RadauIIA5", rtol=1e-8, atol=1e-8)
     assert beam.measure(run, result)["error_tip"] < 1e-8 and case.reference.floor < 1e-8

@@ -12,7 +12,7 @@ from studies.bench.cli import Call, StudyError, commit, processor
 from studies.bench.row_files import versions
 from studies.bench.store import Output, key
 from studies.reproduction import motion, step_size, violation
-from studies.work_precision import mechanisms, minimal
+from studies.work_precision import mechanisms
 from studies.work_precision import study as work_precision
 
 
@@ -82,10 +82,14 @@ def test_groups_of_other_commits_stand_beside_that_of_the_newest_rows():
 def test_a_study_makes_the_runs_that_are_wanted(tmp_path):
     call = Call("energy", True, tmp_path, False, "", ("heyoka",))
     assert call.wants("heyoka") and call.wants("other", "heyoka") and not call.wants("other")
-    for runs, only in ((mechanisms.runs, "four-bar"), (mechanisms.runs, "SUNDIALS"), (minimal.runs, minimal.GROUP)):
+    for runs, only in (
+        (mechanisms.runs, "four-bar"),
+        (mechanisms.runs, "SUNDIALS"),
+        (mechanisms.minimal_runs, mechanisms.MINIMAL_GROUP),
+    ):
         todo, wanted = runs(True), Call("x", True, tmp_path, False, "", (only,)).wanted(runs(True))
         assert {only} <= {name for run in wanted for name in (run.group, run.case.name, run.solver.family)}
-        assert (len(wanted) == len(todo)) == (only == minimal.GROUP) and wanted
+        assert (len(wanted) == len(todo)) == (only == mechanisms.MINIMAL_GROUP) and wanted
     assert Call("energy", True, tmp_path, False, "").wants("other")
 
 

@@ -17,7 +17,7 @@ from studies.bench.end_states import case_of
 from studies.bench.render import number, render
 from studies.bench.solvers import CATALOGUE, MINIMAL, MINIMAL_FAMILY, OTHER_SOLVERS, OWN
 from studies.bench.store import KeptRows
-from studies.work_precision import first_calls, mechanisms, minimal, processors, study
+from studies.work_precision import first_calls, mechanisms, processors, study
 from tests.studies.of_study import median
 from twoloop.mechanisms import andrews
 from twoloop.rows.leaderboard import LOOSEST
@@ -181,34 +181,34 @@ def everywhere():
 
 def in_angles(time, error=1e-3):
     made = rows((ANGLES, error, time), (CVODE, error, 2.0 * time))
-    return made.assign(group=minimal.GROUP, family=MINIMAL_FAMILY)
+    return made.assign(group=mechanisms.MINIMAL_GROUP, family=MINIMAL_FAMILY)
 
 
 @pytest.mark.parametrize(("time", "slower", "faster"), [(0.5, 1, 0), (3.0, 0, 1)])
 def test_our_best_is_compared_with_the_cheapest_in_minimal_coordinates(time, slower, faster):
-    (found,) = minimal.findings_of(in_angles(time), everywhere())
+    (found,) = mechanisms.minimal_findings(in_angles(time), everywhere())
     assert (found["kind"], found["n"], found["slower"], found["ours_faster"]) == ("loops", 1, slower, faster)
     assert found["median"] == time and found["mechanisms"] == 1 and found["wrong_by"] == {}
 
 
 def test_without_rows_of_minimal_coordinates_nothing_is_said():
-    assert minimal.findings_of(pd.DataFrame(), everywhere()) == []
-    (unmatched,) = minimal.findings_of(in_angles(1.0), everywhere().assign(case="other"))
+    assert mechanisms.minimal_findings(pd.DataFrame(), everywhere()) == []
+    (unmatched,) = mechanisms.minimal_findings(in_angles(1.0), everywhere().assign(case="other"))
     assert unmatched["median"] is None and unmatched["slower"] == 1  # only the ODE reaches it
 
 
 def test_a_run_in_angles_that_ends_with_a_wrong_state_is_told():
     wrong = pd.concat([in_angles(1.0), in_angles(0.1, error=0.7)], ignore_index=True).assign(tol=1e-9)
-    (found,) = minimal.findings_of(wrong, everywhere())
+    (found,) = mechanisms.minimal_findings(wrong, everywhere())
     assert found["wrong_by"] == {name: {"wrong": 1, "n": 2} for name in (ANGLES, CVODE)} and found["median"] == 1.0
-    assert minimal.findings_of(wrong.assign(tol=0.1), everywhere())[0]["wrong_by"] == {}
+    assert mechanisms.minimal_findings(wrong.assign(tol=0.1), everywhere())[0]["wrong_by"] == {}
 
 
 def test_pendulums_and_singular_positions_are_counted_apart():
     others = ("double pendulum", "A02, N = 1")
     both = pd.concat([in_angles(3.0), *(in_angles(0.5).assign(case=name) for name in others)], ignore_index=True)
     made = pd.concat([everywhere(), *(everywhere().assign(case=name) for name in others)], ignore_index=True)
-    found = minimal.findings_of(both, made)
+    found = mechanisms.minimal_findings(both, made)
     counts = [(each["kind"], each["slower"], each["ours_faster"]) for each in found]
     assert counts == [("loops", 0, 1), ("pendulums", 1, 0), ("singular positions", 1, 0)]
 
@@ -218,7 +218,7 @@ def test_no_ranking_of_solvers_with_constraints_sees_equations_in_angles():
     table = pd.concat([everywhere(), in_angles(0.1)], ignore_index=True)
     assert not set(MINIMAL) & set(study.part(table, mechanisms.GROUP)["solver"])
     assert not {name for name, solver in CATALOGUE.items() if solver.family == MINIMAL_FAMILY} ^ {*MINIMAL}
-    made = minimal.runs(True)
+    made = mechanisms.minimal_runs(True)
     assert {run.case.name for run in made} == {FOUR_BAR} and {run.solver.name for run in made} == {*MINIMAL}
     for solver in MINIMAL:
         row = mechanisms.row_at_end(Run(case_of(andrews()), CATALOGUE[solver], 1e-5, repeats=1), 0, set())
@@ -271,7 +271,7 @@ def test_rows_of_a_processor_replace_those_that_it_made_before(tmp_path):
     assert again["processor"].value_counts().to_dict() == {"A": len(again) // 2, "B": len(again) // 2}
     assert set(again[again["processor"] == "A"]["verdict"]) == {"behind"}
     with pytest.raises(StudyError, match="there is no"):
-        processors.rows_of(tmp_path)
+        processors.main([str(tmp_path)])
 
 
 def test_first_calls_are_told_by_solver():
