@@ -6,7 +6,7 @@ import pkgutil
 import platform
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from difflib import get_close_matches
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
@@ -14,7 +14,7 @@ from pathlib import Path
 
 from twoloop import Result, __version__, kernels, mechanisms, solve_dae
 from twoloop.audit.mjcf import audit_mjcf, check_ending
-from twoloop.bodies import from_mjcf, from_urdf
+from twoloop.bodies import SpatialModel, from_mjcf, from_urdf
 from twoloop.checks.arguments import needed
 from twoloop.kernels.compile.caches import cache_folder
 from twoloop.mechanisms.registry import problem_from
@@ -27,7 +27,7 @@ NEEDED = ("numpy", "scipy", "numba")
 OPTIONAL = ("pandas", "pyarrow", "matplotlib", "pillow", "rich", "sympy", "dask")
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 TABLES, PICTURES, ANIMATIONS = (".csv", ".parquet"), (".png", ".svg", ".pdf"), (".html", ".gif", ".mp4")
-READERS = {".xml": from_mjcf, ".mjcf": from_mjcf, ".urdf": from_urdf}
+READERS: dict[str, Callable[..., SpatialModel]] = {".xml": from_mjcf, ".mjcf": from_mjcf, ".urdf": from_urdf}
 ENDINGS = (*TABLES, *PICTURES, *ANIMATIONS, ".npz")
 PACKAGES = {  # modules without which such files cannot be written, and the packages that have them
     ".csv": (("pandas", "pandas"),),

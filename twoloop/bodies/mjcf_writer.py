@@ -83,6 +83,8 @@ class _Writer:
         self.left_out = [f"the start velocity of {name!r}" for name in moving]
         self.left_out += [each.name for each in model.joints if each.kind == "drive"]
         self.left_out += [each.name for each in model.stops]
+        if massless := [body.name for body in model.bodies if not body.inertia.any()]:
+            raise ValueError(f"MJCF has no massless body with joints, such as {massless[0]!r}: give it a small mass")
         self.springs: dict[tuple[str, str], Force] = {}  # by joint, and "hinge" or "slide"
         self.tendons: list[Force] = []
         for force in model.forces:
