@@ -82,7 +82,7 @@ compile: install ## compile the kernels, and the callbacks of bodies, mechanisms
 	@echo "Compiling (once, on both cores) the kernels, and the callbacks of bodies, mechanisms and studies"
 	@$(RUN) -c "from twoloop.kernels.evaluation import inner_loop; from twoloop.kernels.control import step_size"
 	@$(RUN) -c "from twoloop.kernels.steps import diagonal_step, newton_step, taylor_step; \
-	from twoloop.kernels.evaluation import sparse_inner_loop; from twoloop.bodies.spatial import callbacks, programs; \
+	from twoloop.kernels.evaluation import sparse_inner_loop; from twoloop.bodies import programs; \
 	from studies.bench import sharp_callbacks; $(CALLBACKS_OF_TESTS)" & \
 	$(RUN) -c "from twoloop.kernels import advance, interpolation, cached_run; \
 	from twoloop.kernels.linalg import dependent_columns, rank; from twoloop.kernels.control import stiffness; \
@@ -90,7 +90,6 @@ compile: install ## compile the kernels, and the callbacks of bodies, mechanisms
 	from twoloop.kernels.lanes import advance, explicit, starts; \
 	from twoloop.kernels.steps import adams_step, crossing_step, explicit_step, lazy, lobatto_step; \
 	from twoloop.kernels.paper import bdf_step, fixed_point_step, newmark_step, paper_step; \
-	from twoloop.bodies.planar import callbacks, programs; \
 	from twoloop.mechanisms import *; from studies.honesty import traps; $(CALLBACKS_OF_MORE_TESTS)" && wait $$!
 
 # kernels that slow tests alone need

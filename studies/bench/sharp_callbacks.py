@@ -3,8 +3,8 @@
 from typing import Any
 
 from studies.bench.sharp_forces import drive, force_along
+from twoloop.bodies.callbacks import force as model_force
 from twoloop.bodies.parameter_layout import HEAD
-from twoloop.bodies.spatial.callbacks import force as spatial_force
 from twoloop.kernels.compile.callbacks import callback
 
 GRAVITY = 9.81  # m/s^2
@@ -114,7 +114,7 @@ def four_bar_force(t, q, v, p, Q):  # type: ignore[no-untyped-def]
 
 @callback("force")
 def slider_force(t, q, v, p, Q):  # type: ignore[no-untyped-def]
-    spatial_force(t, q, v, p, Q)
+    model_force(t, q, v, p, Q)
     Q[14] += force_along(t, q[14], v[14], p[: p.size - HEAD])
 
 

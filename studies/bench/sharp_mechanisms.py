@@ -18,8 +18,8 @@ from studies.bench.sharp_callbacks import GRAVITY
 from studies.bench.sharp_forces import Sharp, drive, force_along
 from studies.bench.store import Array
 from twoloop import ConstrainedSystem
+from twoloop.bodies import callbacks as model_callbacks
 from twoloop.bodies.parameter_layout import HEAD
-from twoloop.bodies.spatial import callbacks as spatial_callbacks
 from twoloop.mechanisms import four_bar, spatial_slider_crank
 
 TINY = 1e-30  # imaginary step: derivatives without differences
@@ -185,7 +185,7 @@ def slider_in_space(sharp: Sharp) -> Mechanism:
     problem = spatial_slider_crank()
     q0, known = problem.q0, problem.parameters
     own = sharp.on(10.0, float(q0[14]), 0.1, 0.5)
-    rows = {name: getattr(spatial_callbacks, name) for name in ("mass", "constraint", "jacobian", "gamma")}
+    rows = {name: getattr(model_callbacks, name) for name in ("mass", "constraint", "jacobian", "gamma")}
     given = problem.system.parameters
     parameters = np.concatenate([given[:-HEAD], own, given[-HEAD:]])  # a model's parameters end with its head
     system = under_force(problem.system, callbacks.slider_force, parameters, **rows)

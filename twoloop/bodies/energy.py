@@ -9,6 +9,7 @@ import numpy as np
 
 from twoloop.bodies import parameter_layout as layout
 from twoloop.bodies.frames import angle_of, on_grid, point_of, vector_of
+from twoloop.bodies.rotation_rates import euler_product, parameters_of
 from twoloop.checks.arguments import Array, check_columns
 
 
@@ -130,11 +131,8 @@ class ModelEnergy:
     def _turned(self, q: Array, i: int, j: int, axis: int, zero: int) -> Any:
         if self.dimension == 2:
             return angle_of(q, j) - angle_of(q, i)
-        from twoloop.bodies.spatial.forces import product  # compiled on import
-
-        e_i, e_j = (q[7 * body + 3 : 7 * body + 7] if body >= 0 else (1.0, 0.0, 0.0, 0.0) for body in (i, j))
-        relative = product.py_func(e_i[0], -e_i[1], -e_i[2], -e_i[3], *e_j)
+        relative = euler_product(parameters_of(q, i, -1.0), parameters_of(q, j))
         start = self.p[zero : zero + 4]
-        c, *parts = product.py_func(*relative, start[0], *-start[1:])
+        c, *parts = euler_product(relative, (start[0], *-start[1:]))
         s = sum(x * part for x, part in zip(self.p[axis : axis + 3], parts, strict=True))
         return 4.0 * np.arctan(s / (c + np.sqrt(c * c + s * s)))

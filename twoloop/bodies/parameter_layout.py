@@ -6,8 +6,8 @@ offsets of all of these. Tables refer to numbers by their index in p.
 """
 
 # offsets in the head, which begins at p.size - HEAD
-BODIES, JOINTS, N_JOINTS, FORCES, N_FORCES, MOTION_PROGRAM, FORCE_PROGRAM = range(7)
-HEAD = 7
+BODIES, JOINTS, N_JOINTS, FORCES, N_FORCES, MOTION_PROGRAM, FORCE_PROGRAM, COORDINATES = range(8)
+HEAD = 8
 NONE = -1  # no program, function or number; as a body: the ground
 
 # A row of the table of joints: kind, row of C, body i, index of its numbers, body j, index of its numbers, index of
@@ -19,11 +19,17 @@ KIND, ROW, FIRST, FIRST_AT, SECOND, SECOND_AT, MORE, MOTION, JOINT_WIDTH = range
 # for a spring along an axis of i, the index of its point on i.
 F_KIND, F_FIRST, F_FIRST_AT, F_SECOND, F_SECOND_AT, F_MORE, F_RESULT, F_ON_FIRST, FORCE_WIDTH = range(9)
 
-# kinds of joint rows in the plane ...
-PIN, ACROSS, ALONG, ANGLE, DISTANCE, ROW_FUNCTION, RATE_FUNCTION = range(7)
-# ... and in space, where a row may be a function as well
-POINT, PERPENDICULAR, PLANE, LENGTH, ANGLE_DRIVE = range(5)
-# kinds of forces in both: between two points; in a hinge, on a body; about and along an axis of body i
+# Kinds of joint rows. A direction is three numbers in space, and the angle from the x axis of its body in the plane.
+POINT = 0  # a point of i and one of j coincide: two rows in the plane, three in space
+ALONG = 1  # displacement of a point of j from one of i along a direction of i (further numbers), minus the motion
+ACROSS = 2  # the same perpendicular to the direction, in the plane
+LENGTH = 3  # distance of two points
+ANGLE = 4  # angle of j against i, minus a number and the motion, in the plane
+PERPENDICULAR = 5  # a direction of i and one of j
+ANGLE_DRIVE = 6  # the same where the direction of i rotates by the motion from one to another
+ROW_FUNCTION, RATE_FUNCTION = 7, 8  # any function of the coordinates, or linear in the velocities
+
+# Kinds of forces: between two points; in a hinge, on a body; about and along an axis of body i
 SPRING, ZERO_LENGTH_SPRING, TORSION_SPRING, FORCE, TORQUE = range(5)
 AXIAL_TORQUE, AXIAL_FORCE, AXIAL_SPRING, HINGE_FRICTION, AXIAL_FRICTION = range(5, 10)
 # inertias of rotors, which add to the mass matrix, see `rotors`

@@ -1,12 +1,9 @@
 """Read the tables of a model from its parameters (see `parameter_layout`), and evaluate rows that are functions."""
 
-import math
-
 from twoloop.bodies import parameter_layout as layout
 from twoloop.bodies.parameter_layout import RATE_FUNCTION
-from twoloop.bodies.program_results import results_within
 from twoloop.kernels.compile.caches import helper
-from twoloop.kernels.data.common import exact, inlined
+from twoloop.kernels.data.common import exact
 
 
 @exact
@@ -41,64 +38,6 @@ def force_at(p, k):
     """Return a row of the table: kind, bodies i and j with indices of numbers, further numbers, result, point of i."""
     i, at_i, j, at_j = int(p[k + 1]), int(p[k + 2]), int(p[k + 3]), int(p[k + 4])
     return int(p[k]), i, at_i, j, at_j, int(p[k + 5]), int(p[k + 6]), int(p[k + 7])
-
-
-@exact
-def has_spring_function(p, k):
-    """Return True for a spring whose force is a function of its length and rate."""
-    return int(p[k + layout.F_RESULT]) >= 0 and int(p[k]) in (layout.SPRING, layout.TORSION_SPRING, layout.AXIAL_SPRING)
-
-
-@exact
-def n_spring_functions(p):
-    """Return the number of such springs."""
-    n = 0
-    for k in force_places(p):
-        if has_spring_function(p, k):
-            n += 1
-    return n
-
-
-@inlined
-def put_spring_lengths(spring_length, q, v, p, extended_q, extended_v):
-    """Write q and v, and the lengths and rates of the springs whose forces are functions of these."""
-    for k in range(q.size):
-        extended_q[k], extended_v[k] = q[k], v[k]
-    index = q.size
-    for k in force_places(p):
-        if has_spring_function(p, k):
-            extended_q[index], extended_v[index] = spring_length(q, v, p, k)
-            index += 1
-
-
-@inlined
-def evaluate_program(program, t, q, v, p):
-    """Return the results of a program of the model."""
-    return results_within(int(p[p.size - layout.HEAD + program]), t, q, v, p)
-
-
-@exact
-def force_value(p, more, results, first_result, i):
-    """Return a number of a force, or its function value if it is a function."""
-    if first_result >= 0:
-        return results[first_result + i]
-    return p[more + i]
-
-
-@exact
-def spring_tension(length, rate, p, more, results, first_result):
-    """Return the force of a spring and damper, or its function value if it is a function."""
-    if first_result >= 0:
-        return results[first_result]
-    return p[more] * (length - p[more + 2]) + p[more + 1] * rate
-
-
-@exact
-def joint_force(kind, rate, p, more, results, first_result):
-    """Return the force of friction or of a motor in a joint with the given rate."""
-    if kind in (layout.HINGE_FRICTION, layout.AXIAL_FRICTION):
-        return -p[more] * math.tanh(rate / p[more + 1])
-    return force_value(p, more, results, first_result, 0)
 
 
 @helper

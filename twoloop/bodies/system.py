@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -140,7 +139,8 @@ def system_of(
     dimension: int, tables: Tables, joints: list[Joint], name: str, start: tuple[float, Array, Array]
 ) -> ConstrainedSystem:
     """Return the system, after a check of its traced programs against the functions near the start."""
-    callbacks: Any = import_module(f"twoloop.bodies.{'planar' if dimension == 2 else 'spatial'}.callbacks")
+    from twoloop.bodies import callbacks  # compiled on import
+
     n_q = (3 if dimension == 2 else 7) * len(tables.bodies)
     kinds = [kind for kind in KINDS if kind in ("mass", "force") or (kind in OF_JOINTS and tables.n_rows)]
     kinds += ["nonholonomic", "nonholonomic_gamma"] if tables.n_rates else []
@@ -172,21 +172,16 @@ def system_of(
             del entries["mass"]  # rotors couple bodies
         kinds += [f"{kind}_values" for kind in entries]
         options |= {f"{kind}_entries": places for kind, places in entries.items()}
-    callbacks_by_kind = {kind: _callback(dimension, kind, tables) for kind in kinds}
+    callbacks_by_kind = {kind: _callback(kind, tables) for kind in kinds}
     return ConstrainedSystem(**options, constant_mass=dimension == 2, **callbacks_by_kind)
 
 
-def _callback(dimension: int, kind: str, tables: Tables) -> Any:
+def _callback(kind: str, tables: Tables) -> Any:
     """Return the callback of a kind, from the module of those that evaluate programs if it needs one."""
-    if kind == "force" and any(isinstance(each, SpringFunction) for each in tables.functions):
-        return _laws(dimension).force_with_spring_functions
-    programmed = tables.functions if kind == "force" else tables.motions
-    name = "programs" if programmed and kind not in ("mass", "mass_values") else "callbacks"
-    return getattr(import_module(f"twoloop.bodies.{'planar' if dimension == 2 else 'spatial'}.{name}"), kind)
+    from twoloop.bodies import callbacks, programs  # compiled on import
 
-
-def _laws(dimension: int) -> Any:
-    return import_module(f"twoloop.bodies.{'planar' if dimension == 2 else 'spatial'}.programs")
+    has_program = kind not in ("mass", "mass_values") and (tables.functions if kind == "force" else tables.motions)
+    return getattr(programs if has_program else callbacks, kind)
 
 
 def _with_spring_lengths(tables: Tables, q: Array, v: Array, p: Array) -> tuple[Array, Array]:
@@ -194,8 +189,10 @@ def _with_spring_lengths(tables: Tables, q: Array, v: Array, p: Array) -> tuple[
     n_spring_functions = sum(isinstance(each, SpringFunction) for each in tables.functions)
     if not n_spring_functions:
         return q, v
+    from twoloop.bodies.forces import fill_spring_lengths  # compiled on import
+
     extended_q, extended_v = np.zeros((2, len(q) + n_spring_functions))
-    _laws(len(tables.gravity)).fill_spring_lengths(q, v, p, extended_q, extended_v)
+    fill_spring_lengths(q, v, p, extended_q, extended_v)
     return extended_q, extended_v
 
 
@@ -205,7 +202,7 @@ def entries_of(dimension: int, tables: Tables) -> dict[str, NDArray[np.int64]]:
     blocks = [[k] for k in range(3)] + ([[3, 4, 5, 6]] if dimension == 3 else [])
     places = [(width * k + i, width * k + j) for k in range(n) for block in blocks for i in block for j in block]
     named = [(k, 7 * k + j) for k in range(n) for j in range(3, 7)] if dimension == 3 else []
-    turn_alone = (layout.ANGLE,) if dimension == 2 else (layout.PERPENDICULAR, layout.ANGLE_DRIVE)
+    turn_alone = layout.ANGLE, layout.PERPENDICULAR, layout.ANGLE_DRIVE
     row = len(named) // 4
     for part in (part for joint in tables.joints for part in joint.rows if part.kind != layout.RATE_FUNCTION):
         skipped = dimension if part.kind in turn_alone else 0

@@ -205,7 +205,7 @@ class Tables:
         begin = n_before + len(table)
         places = [begin if programs[0] else NONE, begin + len(programs[0]) if programs[1] else NONE]
         n_joint_rows = sum(len(joint.rows) for joint in self.joints)
-        head = [len(self.bodies), n_before, n_joint_rows, forces, len(self.forces), *places]
+        head = [len(self.bodies), n_before, n_joint_rows, forces, len(self.forces), *places, 3 if dimension == 2 else 7]
         parts = (self._values, self._constants, table, *programs, head)
         self.p = np.concatenate([np.asarray(part, dtype=float) for part in parts])
 

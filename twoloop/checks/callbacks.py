@@ -10,6 +10,7 @@ from __future__ import annotations
 import linecache
 import types
 import warnings
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from numba import njit
 
 from twoloop.checks.arguments import Array
 from twoloop.kernels.compile.callbacks import KINDS
-from twoloop.kernels.compile.dependencies import FunctionCopier, is_library
+from twoloop.kernels.compile.dependencies import FunctionCopier, is_library, is_ours
 from twoloop.kernels.compile.private import Dispatcher
 
 if TYPE_CHECKING:
@@ -88,7 +89,9 @@ def _index_error(
         try:
             with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore")
-                FunctionCopier(wrap).value(function)(t, *given, *(np.zeros(array.shape) for array in out))
+                is_own = wrap is _in_python and is_ours(function.__module__ or "")
+                copy = _own_in_python(function) if is_own else FunctionCopier(wrap).value(function)
+                copy(t, *given, *(np.zeros(array.shape) for array in out))
         except IndexError as error:
             return error
         except Exception:  # it may run only compiled; its own errors are raised when it is called
@@ -103,6 +106,12 @@ def _index_error(
 
 def _in_python(function: types.FunctionType, _: Any) -> Any:
     return function
+
+
+@lru_cache(256)
+def _own_in_python(function: Dispatcher) -> Any:
+    """Copy a callback of twoloop once for all systems: unlike a user's globals, what it names does not change."""
+    return FunctionCopier(_in_python).value(function)
 
 
 def _with_bounds_checked(function: types.FunctionType, _: Any) -> Any:

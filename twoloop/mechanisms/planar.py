@@ -18,7 +18,7 @@ import numpy as np
 
 from twoloop.bodies.drawings import Sketch
 from twoloop.bodies.energy import PlanarEnergy
-from twoloop.bodies.planar.frames import add, motion, place
+from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.problem.callbacks import LARGE, callbacks_in
 from twoloop.problem.description import Drawing, Joint, unused_name
@@ -30,6 +30,35 @@ DISTANCE = 1.0  # half the squared distance of the points is `value`: one row
 COORDINATE = 2.0  # q[i] = ax + ay t + bx sin(by t): one row
 N_NUMBERS = 9  # of a joint
 GROUND = -1
+
+
+@helper
+def place(q, body, p, at):
+    """Return the point of a body stored at index `at` of p and its derivative by the angle: x, y, dx, dy."""
+    a, b = p[at], p[at + 1]
+    if body < 0:
+        return a, b, 0.0, 0.0
+    s, c = math.sin(q[3 * body + 2]), math.cos(q[3 * body + 2])
+    x, y = c * a - s * b, s * a + c * b
+    return q[3 * body] + x, q[3 * body + 1] + y, -y, x
+
+
+@helper
+def motion(v, body, dx, dy):
+    """Return the velocity of a point and the part of its acceleration without v'; (dx, dy): derivative by the angle."""
+    if body < 0:
+        return 0.0, 0.0, 0.0, 0.0
+    w = v[3 * body + 2]
+    return v[3 * body] + w * dx, v[3 * body + 1] + w * dy, -w * w * dy, w * w * dx
+
+
+@helper
+def add(row, body, fx, fy, dx, dy):
+    """Add to a row (n_q,) the derivative of fx x + fy y of a point, i.e. the generalised force of (fx, fy) there."""
+    if body >= 0:
+        row[3 * body] += fx
+        row[3 * body + 1] += fy
+        row[3 * body + 2] += fx * dx + fy * dy
 
 
 @callback("mass")

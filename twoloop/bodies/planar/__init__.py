@@ -1,1 +1,1 @@
-"""Build planar models and evaluate their compiled callbacks."""
+"""Build planar models."""

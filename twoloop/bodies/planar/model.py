@@ -18,8 +18,8 @@ from twoloop.bodies.parameter_layout import (
     ALONG,
     ANGLE,
     AXIAL_FORCE,
-    DISTANCE,
-    PIN,
+    LENGTH,
+    POINT,
     RATE_FUNCTION,
     TORQUE,
     TORSION_SPRING,
@@ -185,7 +185,7 @@ class PlanarModel(Couplings):
     """
 
     dimension = 2
-    distance_kind = DISTANCE
+    distance_kind = LENGTH
     coordinate_names = ("x (m)", "y (m)", "angle (rad)")
 
     def __init__(self, gravity: ArrayLike = (0.0, -9.81), *, name: str = "planar model"):
@@ -357,7 +357,7 @@ class PlanarModel(Couplings):
 
 
 def _pin(a: Body, b: Body, on_a: Numbers, on_b: Numbers) -> JointRow:
-    return JointRow(PIN, 2, a, b, on_a, on_b)
+    return JointRow(POINT, 2, a, b, on_a, on_b)
 
 
 def _turn(name: str, a: Body, b: Body, angle: float) -> Numbers:

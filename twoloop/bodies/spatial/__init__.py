@@ -1,1 +1,1 @@
-"""Build spatial models and evaluate their compiled callbacks."""
+"""Build spatial models."""

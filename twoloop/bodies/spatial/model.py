@@ -13,12 +13,12 @@ from twoloop.bodies.collection import Points, add, documented
 from twoloop.bodies.functions import Function
 from twoloop.bodies.loads import function_rows
 from twoloop.bodies.parameter_layout import (
+    ALONG,
     ANGLE_DRIVE,
     AXIAL_FORCE,
     AXIAL_TORQUE,
     LENGTH,
     PERPENDICULAR,
-    PLANE,
     POINT,
     TORSION_SPRING,
 )
@@ -41,7 +41,7 @@ def parallel(a: Body, axis_a: Array, b: Body, axis_b: Array) -> tuple[JointRow, 
 
 def on_line(a: Body, axis_a: Array, b: Body, on_a: Numbers, on_b: Numbers) -> tuple[JointRow, ...]:
     """Keep a point of b on a line of a."""
-    return tuple(JointRow(PLANE, 1, a, b, Numbers(tuple(normal)), on_b, on_a) for normal in perpendiculars(axis_a))
+    return tuple(JointRow(ALONG, 1, a, b, on_a, on_b, Numbers(tuple(normal))) for normal in perpendiculars(axis_a))
 
 
 SYMMETRIC = 1e-9  # relative tolerance of the symmetry of an inertia tensor
@@ -349,7 +349,7 @@ class SpatialModel(SpatialCouplings):
         """
         body_a, body_b, name, points = self._pair("planar", a, b, name, at)
         axis_a, axis_b = self._directions(axis, body_a, body_b)
-        plane = JointRow(PLANE, 1, body_a, body_b, Numbers(tuple(axis_a)), points[1], points[0])
+        plane = JointRow(ALONG, 1, body_a, body_b, *points, Numbers(tuple(axis_a)))
         rows = plane, *parallel(body_a, axis_a, body_b, axis_b)
         return add(self.joints, ModelJoint(name, "planar", body_a, body_b, rows, *points, (axis_a, axis_b)))
 
@@ -392,7 +392,7 @@ class SpatialModel(SpatialCouplings):
         axis_a, axis_b = joint.axes
         if joint.kind == "prismatic":
             along = Numbers(tuple(axis_a))
-            return JointRow(PLANE, 1, joint.a, joint.b, along, joint.point_b, joint.point_a, motion)
+            return JointRow(ALONG, 1, joint.a, joint.b, joint.point_a, joint.point_b, along, motion)
         first, second = perpendiculars(axis_a)
         zero = relative(joint.a, axis_a, joint.b, axis_b).T @ first
         return JointRow(

@@ -1,0 +1,59 @@
+"""Evaluate the callbacks of models with motions, rows or forces that are functions, whose programs stand in p."""
+
+from twoloop.bodies.callbacks import (
+    fill_constraint,
+    fill_gamma,
+    fill_jacobian,
+    fill_kinematics,
+    fill_rate,
+    fill_values,
+    motion_results,
+)
+from twoloop.bodies.forces import fill_force, force_results
+from twoloop.bodies.read_tables import fill_nonholonomic, fill_nonholonomic_gamma
+from twoloop.kernels.compile.callbacks import callback
+
+
+@callback("force")
+def force(t, q, v, p, Q):
+    fill_force(q, v, p, force_results(t, q, v, p), Q)
+
+
+@callback("constraint")
+def constraint(t, q, p, C):
+    fill_constraint(q, p, motion_results(t, q, q, p), C)
+
+
+@callback("jacobian")
+def jacobian(t, q, p, Cq):
+    fill_jacobian(q, p, motion_results(t, q, q, p), Cq)
+
+
+@callback("jacobian_values")
+def jacobian_values(t, q, p, values):
+    fill_values(q, p, motion_results(t, q, q, p), values)
+
+
+@callback("constraint_rate")
+def constraint_rate(t, q, p, Ct):
+    fill_rate(q, p, motion_results(t, q, q, p), Ct)
+
+
+@callback("gamma")
+def gamma(t, q, v, p, Qd):
+    fill_gamma(q, v, p, motion_results(t, q, v, p), Qd)
+
+
+@callback("kinematics")
+def kinematics(t, q, v, p, C, Cq, Ct, Qd):
+    fill_kinematics(q, v, p, motion_results(t, q, v, p), C, Cq, Ct, Qd)
+
+
+@callback("nonholonomic")
+def nonholonomic(t, q, p, A):
+    fill_nonholonomic(p, motion_results(t, q, q, p), A)
+
+
+@callback("nonholonomic_gamma")
+def nonholonomic_gamma(t, q, v, p, Qa):
+    fill_nonholonomic_gamma(p, motion_results(t, q, v, p), Qa)
