@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from twoloop.bodies.functions import Function, force_function
-from twoloop.bodies.parameter_layout import NONE
+from twoloop.bodies.parameter_layout import LENGTH, NONE
 from twoloop.bodies.parts import (
     COINCIDE,
     Body,
@@ -86,7 +86,6 @@ class Collection:
     """Collect bodies, joints and forces, in the plane or in space."""
 
     dimension: int
-    distance_kind: int  # kind of the row of a distance, see `parameter_layout`
 
     def __init__(self, gravity: ArrayLike, name: str):
         self.gravity = check_vector("gravity", gravity, self.dimension)
@@ -299,7 +298,7 @@ class Collection:
                 raise ValueError(f"the points of {name!r} coincide in the position given; give a length or use a joint")
         check_positive(f"length of {name!r}", length)
         long = Numbers((float(length),), (f"length of {name} (m)",))
-        row = JointRow(self.distance_kind, 1, body_a, body_b, *points, long)
+        row = JointRow(LENGTH, 1, body_a, body_b, *points, long)
         return add(self.joints, ModelJoint(name, "distance", body_a, body_b, (row,), *points))
 
     def particle(self, name: str, *, mass: float, position: ArrayLike, velocity: ArrayLike | None = None) -> Body:

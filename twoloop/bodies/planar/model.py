@@ -18,7 +18,6 @@ from twoloop.bodies.parameter_layout import (
     ALONG,
     ANGLE,
     AXIAL_FORCE,
-    LENGTH,
     POINT,
     RATE_FUNCTION,
     TORQUE,
@@ -185,7 +184,6 @@ class PlanarModel(Couplings):
     """
 
     dimension = 2
-    distance_kind = LENGTH
     coordinate_names = ("x (m)", "y (m)", "angle (rad)")
 
     def __init__(self, gravity: ArrayLike = (0.0, -9.81), *, name: str = "planar model"):

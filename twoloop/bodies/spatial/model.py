@@ -17,7 +17,6 @@ from twoloop.bodies.parameter_layout import (
     ANGLE_DRIVE,
     AXIAL_FORCE,
     AXIAL_TORQUE,
-    LENGTH,
     PERPENDICULAR,
     POINT,
     TORSION_SPRING,
@@ -121,7 +120,6 @@ class SpatialModel(SpatialCouplings):
     ignored: tuple[str, ...] = ()  # parts of a file without a counterpart
     actuators: tuple[Force, ...] = ()  # forces of the actuators of a file
     coordinate_names = ("x (m)", "y (m)", "z (m)", "e0 (-)", "e1 (-)", "e2 (-)", "e3 (-)")
-    distance_kind = LENGTH
 
     def __init__(self, gravity: ArrayLike = (0.0, 0.0, -9.81), *, name: str = "spatial model"):
         super().__init__(gravity, name)
