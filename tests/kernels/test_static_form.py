@@ -12,6 +12,7 @@ from tests.large_systems import spatial_chain, started_run
 from tests.marks import slow
 from tests.problems import worst
 from twoloop import ConstrainedSystem, solve_dae
+from twoloop.bodies import SpatialModel
 from twoloop.checks.callbacks import MOST
 from twoloop.kernels import advance
 from twoloop.kernels.data import indices
@@ -149,6 +150,25 @@ def test_bodies_whose_mass_matrix_is_singular(any_size, both):
     assert (static_form(system, 0.0, q) is not None) and started_run(system, q).static is not None
     assert worst(one.q[:, -1], other.q[:, -1]) < 1e-11
     assert worst(one.lam[:, -1], other.lam[:, -1]) < 1e-9 * np.abs(one.lam[:, -1]).max()
+
+
+@pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
+def test_a_hub_whose_stiffening_row_other_rows_imply(any_size, both, monkeypatch):
+    monkeypatch.setattr(static_program, "MAX_JOINTS", 2)
+    model, axis = SpatialModel(gravity=(0.0, 0.0, -9.81)), (0.0, 1.0, 0.0)
+    model.body("hub", mass=2.0, inertia=(0.1, 0.1, 0.1), position=(0.0, 0.0, 0.0))
+    model.revolute("ground", "hub", at=(0.0, 0.0, 0.0), axis=axis)
+    for k, (x, z) in enumerate(((0.4, 0.5), (-0.3, 0.6), (0.2, -0.6))):
+        for name in ("link", "rocker"):
+            at = (x + 0.5, k, z + 0.2) if name == "link" else (x + 1.1, k, 0.5 * z + 0.2)
+            model.body(f"{name} {k}", mass=0.5, inertia=(0.02, 0.02, 0.02), position=at)
+        model.revolute("hub", f"link {k}", at=(x, k, z), axis=axis)
+        model.revolute(f"link {k}", f"rocker {k}", at=(x + 1.0, k, z + 0.4), axis=axis)
+        model.revolute(f"rocker {k}", "ground", at=(x + 1.2, k, 0.0), axis=axis)
+    problem = model.problem((0.0, 0.1))
+    one, other = both(lambda: solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, "DOP853", 1e-9, 1e-9))
+    assert one.success and started_run(problem.system, problem.q0).static is not None
+    assert worst(one.q[:, -1], other.q[:, -1]) < 1e-11
 
 
 def test_an_entry_that_comes_up_on_the_way_ends_the_static_form(both):

@@ -110,7 +110,7 @@ def _factor(f, w, least):
     """Factor the current values; return the smallest pivot over its size, see sparse_ldl.py."""
     w.counters[N_FACTORIZATIONS] += 1
     stiffness = w.solutions[3 * f.static_program[N_PIVOTS] :]
-    load(f.static_program, w.mass_values, w.jacobian_values, w.counts, w.factors, stiffness, w.pivot_sizes)
+    load(f.static_program, w.mass_values, w.jacobian_values, w.factors, stiffness, w.pivot_sizes)
     smallest = factor(f.static_program, w.counts, w.factors, w.pivot_sizes, least)
     w.notes[SMALLEST] = smallest
     w.notes[PIVOT] = np.sqrt(max(smallest, 0.0))

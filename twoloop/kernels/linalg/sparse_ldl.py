@@ -8,7 +8,8 @@ against M and G recovers them.
 
 If a body's M is singular, as with four Euler parameters, rows that touch this body alone stiffen it: with M + s g g^T
 accelerations are the same, as g a is given, and the multiplier of g is less by s g a. So M need only be positive
-definite on the velocities that such rows allow.
+definite on the velocities that such rows allow. Such a row stiffens M even where other rows imply it, as loops through
+a hub do; then s g (g a) goes to the right-hand side.
 """
 
 from twoloop.kernels.data.common import compiled, merged
@@ -27,8 +28,8 @@ NOT_DEFINITE = -1.0  # returned instead of the smallest pivot if a pivot of M is
 
 
 @compiled
-def _find_stiffness(program, mass, jacobian, counts, stiffness, scratch):
-    """Compute how much each independent row stiffens M: as much as the largest diagonal entry of M that it touches."""
+def _find_stiffness(program, mass, jacobian, stiffness, scratch):
+    """Compute how much each row stiffens M: as much as the largest diagonal entry of M that it touches."""
     n_q = program[N_COORDINATES]
     for k in range(program[N_PIVOTS]):
         scratch[k] = 0.0
@@ -48,12 +49,12 @@ def _find_stiffness(program, mass, jacobian, counts, stiffness, scratch):
     for u in range(which.size):
         row = which[u]
         if scratch[n_q + row] > 0.0:
-            stiffness[row] *= counts[row] / scratch[n_q + row]
+            stiffness[row] /= scratch[n_q + row]
             scratch[n_q + row] = 0.0
 
 
 @merged
-def load(program, mass, jacobian, counts, values, stiffness, scratch):
+def load(program, mass, jacobian, values, stiffness, scratch):
     """Copy the numbers of M and G to their slots."""
     for s in range(values.size):
         values[s] = 0.0
@@ -65,7 +66,7 @@ def load(program, mass, jacobian, counts, values, stiffness, scratch):
         values[slots[k]] += jacobian[k]
     which, first, second, slots = stiffened_of(program)
     if which.size > 0:
-        _find_stiffness(program, mass, jacobian, counts, stiffness, scratch)
+        _find_stiffness(program, mass, jacobian, stiffness, scratch)
         for u in range(which.size):
             values[slots[u]] += stiffness[which[u]] * jacobian[first[u]] * jacobian[second[u]]
 
@@ -136,6 +137,18 @@ def solve(program, values, stiffness, x, y):
 
 
 @compiled
+def add_redundant_stiffness(program, jacobian, counts, stiffness, c, right):
+    """Add s g^T c for the redundant rows g that stiffen M."""
+    n_q = program[N_COORDINATES]
+    _, columns, _ = jacobian_of(program)
+    which, first, second, _ = stiffened_of(program)
+    for u in range(which.size):
+        row, entry = which[u], first[u]
+        if entry == second[u] and counts[row] == 0.0:
+            right[columns[entry]] += stiffness[row] * jacobian[entry] * c[n_q + row]
+
+
+@compiled
 def subtract_product(program, mass, jacobian, counts, x, b):
     """Subtract [M x_q + G^T x_c, G x_q] from b in place; redundant rows stay zero."""
     n_q = program[N_COORDINATES]
@@ -161,6 +174,7 @@ def solve_refined(program, mass, jacobian, counts, values, stiffness, x, times, 
     n_q, change = program[N_COORDINATES], 0.0
     for k in range(x.size):
         right[k] = x[k]
+    add_redundant_stiffness(program, jacobian, counts, stiffness, right, x)
     for i in range(counts.size):
         if counts[i] == 0.0:
             x[n_q + i] = right[n_q + i] = 0.0

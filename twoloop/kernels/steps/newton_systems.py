@@ -59,6 +59,7 @@ from twoloop.kernels.linalg.band import (
 )
 from twoloop.kernels.linalg.dense import copy, copy_matrix, ldl_factor, ldl_solve_rows, lu_factor, lu_solve
 from twoloop.kernels.linalg.markowitz_lu import columns_of
+from twoloop.kernels.linalg.sparse_ldl import add_redundant_stiffness
 from twoloop.kernels.linalg.sparse_lu import factor as factor_lu
 from twoloop.kernels.linalg.sparse_lu import load, tangents_of
 from twoloop.kernels.linalg.sparse_lu import solve as solve_lu
@@ -668,8 +669,8 @@ def _factor_sparse(f, w, z, values):
 
 @compiled
 def _sparse_right_side(f, w, r, right):
-    """Compute [M r; G r]."""
-    mass, jacobian, _, _, _, _ = _sparse_state(f, w)
+    """Compute [M r; G r], with M as the matrix has it where redundant rows stiffen it."""
+    mass, jacobian, _, _, counts, stiffness = _sparse_state(f, w)
     right[:] = 0.0
     rows, columns, _ = mass_of(f.newton_program)
     for k in range(mass.size):
@@ -677,6 +678,7 @@ def _sparse_right_side(f, w, r, right):
     rows, columns, _ = jacobian_of(f.newton_program)
     for k in range(rows.size):
         right[w.Q.size + rows[k]] += jacobian[k] * r[columns[k]]
+    add_redundant_stiffness(f.newton_program, jacobian, counts, stiffness, right, right)
 
 
 @compiled
