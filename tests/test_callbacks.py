@@ -2,14 +2,17 @@
 
 import copy
 import inspect
+import itertools
 import multiprocessing
 import pickle
+import time
 
 import numba
 import numpy as np
 import pytest
 
 from tests.compiled import HEAVY_PENDULUM, centripetal, circle, heavy, radius, unit_mass, weight
+from tests.marks import slow
 from tests.problems import pendulum, quick
 from twoloop import ConstrainedSystem, Status, callback, solve_dae
 from twoloop.kernels.compile.callbacks import KINDS, OPTIONAL
@@ -292,9 +295,19 @@ def test_memory_is_named_at_the_start(make, method):
         solve_dae(pushed_by(make()), (0.0, 1.0), *BESIDE, method)
 
 
-@pytest.mark.slow
-def test_memory_that_shows_along_the_motion_is_named_at_its_end():
-    result = solve_dae(pushed_by(delayed()), (0.0, 1.0), *BESIDE, "DOP853")
+def tired(n):
+    calls = itertools.count()
+    return lambda t, q, v: -2.0 * v[0] * (1.0 if v[0] > 1e9 or next(calls) < n else 1.5)
+
+
+def timed():
+    return lambda t, q, v: -2.0 * v[0] if v[0] > 1e9 else time.monotonic()
+
+
+@pytest.mark.parametrize("make", [lambda: tired(60), lambda: tired(250), timed, slow(delayed)])
+def test_memory_that_shows_along_the_motion_is_named_at_its_end(make):
+    """The force changes once, so that two calls at the end of the run agree, or slowly, or late."""
+    result = solve_dae(pushed_by(make()), (0.0, 1.0), *BESIDE, "DOP853")
     assert result.status is Status.WRONG_TRACE and "when it is called again" in result.message
 
 

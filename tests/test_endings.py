@@ -253,6 +253,29 @@ def test_a_handler_of_the_users_own_stays():
     assert result.success and heard == [signal.SIGINT]
 
 
+class Alarm(Exception):
+    pass
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no timers that send signals")
+@pytest.mark.parametrize("after", [0.003, 0.0171, 0.0533])
+@pytest.mark.parametrize("error", [Alarm, KeyboardInterrupt])
+def test_an_exception_of_a_signal_handler_arrives_as_itself(error, after):
+    """Handlers run at any instruction of Python, also at those of numba between pieces of machine code."""
+
+    def ring(number, frame):
+        raise error
+
+    before, system = signal.signal(signal.SIGALRM, ring), pendulum()
+    try:
+        with pytest.raises(error):
+            signal.setitimer(signal.ITIMER_REAL, after)
+            while True:
+                solve_dae(system, (0.0, 10.0), *START, "RadauIIA5", 1e-6, 1e-6)
+    finally:
+        signal.signal(signal.SIGALRM, before)
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals to oneself")
 def test_real_signals_while_compiled_code_python_callbacks_and_events_run():

@@ -29,6 +29,7 @@ from twoloop.run.options import options_of
 from twoloop.run.record import Status, record_of
 from twoloop.run.recorder import FileStore, MemoryStore, OutputRequest
 from twoloop.run.run import Run
+from twoloop.run.signals import interrupted
 
 Array = NDArray[np.float64]
 
@@ -243,8 +244,8 @@ def solve_dae(
         if isinstance(kept, FileStore):
             end_folder(kept, result)
         return result
-    except KeyboardInterrupt:
-        if not interrupts.answers():
+    except (KeyboardInterrupt, SystemError) as error:
+        if not (interrupted(error) and interrupts.answers()):
             raise
     finally:
         interrupts.leave()

@@ -389,3 +389,20 @@ def test_ctrl_c_ends_all_runs_and_not_one(interruptible):
     with pytest.raises(KeyboardInterrupt):
         ensemble(system_of(parameters, force=force), SPAN, q, v, parameters=parameters)
     assert set(begun) == set(parameters[:3, 2])
+
+
+@pytest.mark.slow  # it takes the time of its limit
+@pytest.mark.parametrize("branches", [False, True])
+def test_a_run_that_does_not_end_takes_no_time_of_others(branches):
+    """Some springs are so stiff that their runs take hours; in lanes, and one at a time."""
+
+    def force(t, q, v, p):
+        return -p * q if not branches or q[0] < 10.0 else q
+
+    stiff = np.full((30, 1), 2.0)
+    stiff[[4, 11]] = 7e9
+    system = unconstrained(force, parameters=[2.0])
+    runs = ensemble(system, (0.0, 9.0), np.ones((30, 1)), [0.0], parameters=stiff, t_eval=[0.0, 9.0], time_limit=8.0)
+    assert set(np.flatnonzero(runs.status == Status.TIME_LIMIT)) >= {4, 11} and runs.success.sum() > 20
+    np.testing.assert_allclose(runs.q[runs.success, 0, -1], np.cos(9.0 * np.sqrt(2.0)), atol=1e-6)
+    assert (runs.q[:, 0, 0] == 1.0).all() and "time_limit" in runs.messages[4]

@@ -63,7 +63,7 @@ def test_a_box_rocks_to_rest_on_two_corners(restitution):
     box = model.box("box", (1.0, 0.4), mass=1.0, position=(0.0, 0.6), angle=0.3)
     for corner in ((0.5, 0.2), (0.5, -0.2), (-0.5, 0.2), (-0.5, -0.2)):
         model.stop(box, box.point(*corner), "ground", (0.0, 0.0), normal=(0.0, 1.0), restitution=restitution)
-    problem, result = moved(model, 5.0)
+    problem, result = moved(model, 5.0, law="moreau")
     np.testing.assert_allclose(result.q[1:, -1], [0.2, 0.0], atol=1e-9)
     assert (np.diff(result.energy) < 1e-9).all()
     assert min(stop.gap(0.0, q) for q in result.q.T for stop in problem.stops) > -1e-10
@@ -174,10 +174,59 @@ def test_rebounds_from_a_wall_towards_which_another_turns_the_load_die_out():
     """Without the wall on the left, the load would lift the body off the slope."""
     pressed = unconstrained(lambda t, q, v: np.array([-6.0, -1.0]), 2)
     groove = [Stop(lambda t, q: q[0], name="wall"), Stop(lambda t, q: 0.8 * q[1] - 0.6 * q[0], 0.5, "slope")]
-    result = solve_with_stops(pressed, (0.0, 3.0), [0.0, 0.1], [0.0, 0.0], groove, time_limit=20.0)
+    result = solve_with_stops(pressed, (0.0, 3.0), [0.0, 0.1], [0.0, 0.0], groove, law="moreau")
     assert result.success and np.abs(result.q[:, -1]).max() < 1e-9, result.message
     times = [impact.t for impact in result.impacts]
     assert len(times) < 40 and times[-1] == pytest.approx(np.sqrt(0.2) * (1.0 + 0.5) / (1.0 - 0.5), abs=1e-4)
+
+
+def line(masses, restitutions, wall=False):
+    """Balls on a line, and a wall on their left."""
+    n, first = len(masses), [Stop(lambda t, q: q[0], restitutions[0], "wall")] * wall
+    between = [Stop(lambda t, q, k=k: q[k + 1] - q[k], restitutions[k + wall], f"{k}-{k + 1}") for k in range(n - 1)]
+    return unconstrained(lambda t, q, v: np.zeros(n), n, mass=np.diag(masses)), first + between
+
+
+def one_by_one(masses, restitutions, x, v, t1, wall):
+    """Positions at t1, impact by impact."""
+    x, v, left = np.append([0.0] * wall, x), np.append([0.0] * wall, v), t1
+    inverse = np.append([0.0] * wall, 1.0 / np.array(masses))
+    while True:
+        gaps, rates = np.maximum(np.diff(x), 0.0), np.diff(v)
+        times = np.where(rates < -1e-14, gaps / np.maximum(-rates, 1e-300), np.inf)
+        k = int(times.argmin())
+        if times[k] > left:
+            return (x + left * v)[wall:]
+        x, left = x + times[k] * v, left - times[k]
+        impulse = -(1.0 + restitutions[k]) * rates[k] / (inverse[k] + inverse[k + 1])
+        v[k : k + 2] += impulse * np.array([-1.0, 1.0]) * inverse[k : k + 2]
+
+
+LINES = [([1.2, 0.015, 0.9], [0.45, 0.55], [0.0, 0.9, 1.6], [0.8, 0.1, -1.1], False)]
+LINES += [([0.07, 1.4], [0.4, 0.6], [0.4, 1.3], [0.2, -0.9], True)]
+LINES += [([2.0, 0.1], [0.9, 0.7], [1.0, 1.5], [-1.0, 0.3], True)]
+
+
+@pytest.mark.parametrize("tolerance", [1e-8, slow(1e-5), slow(1e-11)])
+@pytest.mark.parametrize(("masses", "restitutions", "x", "v", "wall"), LINES)
+def test_impacts_that_follow_ever_faster_come_one_by_one(masses, restitutions, x, v, wall, tolerance):
+    """A light ball between two others, or between a wall and a heavy one, collapses after infinitely many impacts."""
+    system, stops = line(masses, restitutions, wall)
+    options = {"rtol": tolerance, "atol": tolerance}
+    result = solve_with_stops(system, (0.0, 2.5), np.array(x), np.array(v, dtype=float), stops, **options)
+    known = one_by_one(masses, restitutions, x, v, 2.5, wall)
+    assert result.success and np.abs(result.q[:, -1] - known).max() < 10.0 * tolerance, result.message
+
+
+@pytest.mark.parametrize(("law", "after"), [("sequential", [0, 0, 0, 1.0]), ("moreau", [-0.5, 0.5, 0.5, 0.5])])
+def test_touching_balls_act_by_the_law(law, after):
+    system, stops = line([1.0] * 4, [1.0] * 3)
+    start = np.array([0.0, 1.0, 1.0, 1.0]), np.array([1.0, 0.0, 0.0, 0.0])
+    result = solve_with_stops(system, (0.0, 2.0), *start, stops, law=law)
+    np.testing.assert_allclose(result.v[:, -1], after, atol=1e-12)
+    with pytest.warns(match="small gap between the bodies or set law="):
+        default = solve_with_stops(system, (0.0, 2.0), *start, stops)
+    assert "depends on the law" in default.message and default.v[3, -1] == 0.5
 
 
 def test_a_stop_that_opens_is_hit_when_the_impact_at_another_turns_the_body_back():
@@ -286,7 +335,7 @@ def test_a_thrown_box_comes_to_rest():
             model.stop(box, box.point(x, y), "ground", (0.0, 0.0), **given)
     ends, problem = [], model.problem()
     for method in ("auto", "DOP853"):
-        result = slid(problem, 2.0, method, rtol=1e-8, atol=1e-8)
+        result = slid(problem, 2.0, method, rtol=1e-8, atol=1e-8, law="moreau")
         assert result.success, result.message
         energies = problem.energy(result.t, result.q, result.v)
         assert np.diff(energies).max() < 1e-9 * energies[0]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations  # ArrayLike stays a word in help()
 
+import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,6 +18,7 @@ from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.run.options import check_method
 from twoloop.run.record import Status
+from twoloop.run.signals import SignalHandlers
 from twoloop.solve import solve_dae
 
 Integers = NDArray[np.int64]
@@ -114,6 +117,8 @@ class LaneEnsemble:
         Why runs were left to `solve_dae`, by their numbers.
     why : str
         Why no run went in lanes, or none by the first method.
+    deadline : float
+        Time of `time.monotonic` after which no runs begin; compilation delays it.
     """
 
     system: ConstrainedSystem
@@ -130,6 +135,7 @@ class LaneEnsemble:
     methods: list[str] = field(default_factory=list)
     reasons: dict[int, str] = field(default_factory=dict)
     why: str = ""
+    deadline: float = np.inf
 
     def __post_init__(self) -> None:
         n_runs = len(self.starts.q)
@@ -162,7 +168,9 @@ class LaneEnsemble:
             if len(left) == 1:
                 break
             try:
+                began = time.monotonic()
                 lanes = LaneRuns(self.system, self.starts, each)
+                self.deadline += time.monotonic() - began
                 singly = len(left) * (first.stats.cpu_time + CALL)
                 if lanes.own.seconds_to_build > WORTH * singly:
                     raise Untraceable(f"to compile them does not pay for these runs, which take about {singly:.2g} s")
@@ -188,7 +196,7 @@ class LaneEnsemble:
         within = times[times > starts.t0]
         ends = within if within.size and within[-1] == t1 else np.append(within, t1)
         q, v = np.full((2, len(which), self.system.n_q, len(ends)), np.nan)
-        status, steps, evaluations, at_end = lanes.make(which, t1, ends, rtol, atol, threads, q, v)
+        status, steps, evaluations, at_end = lanes.make(which, t1, ends, rtol, atol, threads, q, v, self.deadline)
         fine = lanes.judge(which, status, t1, rtol, float(atol.min()), q, v, at_end)
         if fine[0] and first.success:
             known = first.q[:, -1:]
@@ -228,6 +236,10 @@ def of_run(run: int, error: ValueError) -> ValueError:
 
 SHOWN = 5  # largest number of runs that a message names
 FIRST = "the first, which checks the system"  # reason for which the first run is not in lanes
+ROUNDS = 3  # of runs that are integrated one at a time within a time limit
+LARGEST_SHARE, TIMES = 0.1, 3.0  # such a run may take this part of the remaining time, or of the longest run so far
+FIRST_SHARE = 0.5  # largest part of the time limit that the first run takes
+NOT_BEGUN = "The run was not begun: time_limit had ended. Raise time_limit, loosen rtol and atol, or shorten t_span."
 CLOSER, TIGHT = 0.1, 1e-9  # factor of the tolerances of the first run, unless these are as tight as TIGHT
 
 
@@ -244,6 +256,7 @@ def ensemble(
     method: str = "auto",
     events: Any = None,
     threads: int | None = None,
+    time_limit: float | None = None,
 ) -> Runs:
     """Integrate many runs of one system, each with parameters and a start of its own.
 
@@ -278,6 +291,10 @@ def ensemble(
         `Auto`.
     threads : int, optional
         None: one for each core that this process may use. Results do not depend on it.
+    time_limit : float, optional
+        Wall-clock time of all runs, s, without compilation. Runs that have not ended by then get the status TIME_LIMIT
+        and keep their states so far. Runs that are integrated one at a time share the time, so that a run that never
+        ends does not take that of others; a block of runs in lanes is not interrupted.
 
     Returns
     -------
@@ -315,8 +332,31 @@ def ensemble(
     >>> runs.q.shape, bool(runs.success.all())  # runs, coordinates, times
     ((3, 2, 3), True)
     """
+    with SignalHandlers():
+        given = {"parameters": parameters, "rtol": rtol, "atol": atol, "t_eval": t_eval, "method": method}
+        return _integrate(system, t_span, q0, v0, **given, events=events, threads=threads, time_limit=time_limit)
+
+
+def _integrate(
+    system: ConstrainedSystem,
+    t_span: tuple[float, float],
+    q0: ArrayLike,
+    v0: ArrayLike,
+    *,
+    parameters: ArrayLike | None,
+    rtol: float,
+    atol: ArrayLike,
+    t_eval: ArrayLike | None,
+    method: str,
+    events: Any,
+    threads: int | None,
+    time_limit: float | None,
+) -> Runs:
+    """Integrate the runs of `ensemble`."""
     check_system(system)
     t0, t1 = check_span(t_span)
+    if time_limit is not None:
+        check_positive("time_limit", time_limit)
     chosen = check_method(method)
     check_positive("rtol", rtol)
     tolerance = check_tolerance("atol", atol, system.n_q)
@@ -329,14 +369,16 @@ def ensemble(
     options = {"rtol": float(rtol), "atol": tolerance, "t_eval": times, "method": chosen, "events": events}
     messages: dict[int, str] = {}
 
-    def single(run: int, max_step: float = np.inf) -> Result:
-        result = _alone(system, starts, run, (t0, t1), options | {"max_step": max_step})
+    def single(run: int, max_step: float = np.inf, limit: float = np.inf) -> Result:
+        limited = {"time_limit": limit} if limit < np.inf else {}
+        result = _alone(system, starts, run, (t0, t1), options | {"max_step": max_step} | limited)
         if result.status is Status.INTERRUPTED:  # Ctrl-C ends all runs, as it does in lanes
             raise KeyboardInterrupt
         for out, found in ((runs.q, result.q), (runs.v, result.v)):
             out[run, :, : len(result.t)], out[run, :, len(result.t) :] = found, np.nan
         status[run], runs.n_steps[run] = int(result.status), result.stats.n_accepted or 0
         runs.n_evaluations[run] = result.stats.n_evaluations or 0
+        messages.pop(run, None)
         if not result.success:
             messages[run] = result.message
         return result
@@ -344,7 +386,9 @@ def ensemble(
     may_go = events is None and method in IN_LANES and n_runs > 1
     if may_go and float(rtol) > TIGHT and tolerance.min() > TIGHT:  # lanes are compared with the first run
         options |= {"rtol": CLOSER * float(rtol), "atol": CLOSER * tolerance}
-    first = single(0)  # checks the system, derivatives and all
+    total = np.inf if time_limit is None else float(time_limit)
+    first = single(0, limit=total if n_runs == 1 else FIRST_SHARE * total)  # checks the system, derivatives and all
+    runs.deadline = time.monotonic() + total - min(first.stats.cpu_time, FIRST_SHARE * min(total, 1e9))
     options |= {"rtol": float(rtol), "atol": tolerance}
     if events is not None:
         runs.why = "events are looked for in single runs only"
@@ -353,14 +397,34 @@ def ensemble(
     elif n_runs > 1:
         runs.make_in_lanes(str(method), first, n_threads)
     alone = ~runs.in_lanes
-    for run in np.flatnonzero(alone).tolist():
-        if run > 0:
-            single(run, runs.max_step(run))
+    _share_time(np.flatnonzero(alone).tolist(), single, status, messages, runs)
     reasons = {run: runs.reasons.get(run, runs.why) for run in np.flatnonzero(alone).tolist()}
     if runs.methods or not runs.why:
         reasons[0] = FIRST
     message, counts = _message(status, runs, reasons), (runs.n_steps, runs.n_evaluations)
     return Runs(times, runs.q, runs.v, status, *counts, alone, message, messages, reasons)
+
+
+def _share_time(
+    left: list[int], single: Callable[..., Result], status: Integers, messages: dict[int, str], runs: LaneEnsemble
+) -> None:
+    """Integrate runs one at a time; within a time limit none takes most of it, and later rounds what others leave."""
+    queue = [run for run in left if run > 0 or status[run] == Status.TIME_LIMIT]
+    had, longest = dict.fromkeys(queue, 0.0), 0.0
+    for _ in range(ROUNDS):
+        for place, run in enumerate(queue):
+            began = time.monotonic()
+            remaining = runs.deadline - began
+            limit = min(remaining, max(remaining / (len(queue) - place), LARGEST_SHARE * remaining, TIMES * longest))
+            if limit > 2.0 * had[run]:  # a run begins anew
+                had[run] = limit
+                if single(run, runs.max_step(run), limit).success:
+                    longest = max(longest, time.monotonic() - began)
+            elif had[run] == 0.0 and run > 0:
+                status[run], messages[run] = int(Status.TIME_LIMIT), NOT_BEGUN
+                if runs.times[0] == runs.starts.t0:
+                    runs.q[run, :, 0], runs.v[run, :, 0] = runs.starts.q[run], runs.starts.v[run]
+        queue = [run for run in queue if status[run] == Status.TIME_LIMIT]
 
 
 def _alone(

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
+import warnings
+from collections.abc import Sequence as Stops
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,6 +39,7 @@ from twoloop.impacts.friction import (
     responses,
 )
 from twoloop.impacts.joined import Impact, join_arcs
+from twoloop.impacts.sequence import Impacts, Sequence
 from twoloop.methods.plan import Method
 from twoloop.methods.presets import PRESETS
 from twoloop.methods.taylor import Taylor
@@ -47,6 +49,7 @@ from twoloop.result.result import Result
 from twoloop.run.discontinuities import corrected
 from twoloop.run.options import check_method
 from twoloop.run.record import Status
+from twoloop.run.signals import SignalHandlers
 from twoloop.solve import solve_dae
 
 if TYPE_CHECKING:
@@ -62,6 +65,18 @@ STALLED = 1e-13  # relative to max(1 s, t): shorter arcs count as stalled ...
 MAX_STALLED = 30  # ... and this many stalled arcs in a row end the motion
 RELEASED = 1e-7  # relative reduction of the static friction of a joint just released, which prevents chattering
 AT_MOST = 1e-9  # relative: margin of a joint held by its full friction
+EQUAL_GAPS = 4e-15  # relative to max(1, |q|): gaps of stops that close at once, which differ by rounding
+TIED = 0.01  # relative to the height LOW: gaps whose order the tolerance does not settle
+MOVED = 10.0  # in heights LOW: displacement during a sequence of impacts that are followed without integration
+WITHIN = 1e4  # in heights LOW: largest gap of a stop that such a sequence may reach
+LEAST_RATE = 1e-13  # relative to the velocities: smaller rates in such a sequence are rounding errors
+DIFFERS = 1e-6  # relative to the velocities: outcomes of laws of impact that differ by more do not agree
+LISTED = 100  # longest sequence of impacts that are listed one by one
+LAWS = ("moreau", "sequential")
+
+
+class ImpactWarning(UserWarning):
+    """Warn that the outcome of impacts depends on their law, or that they were too many to follow."""
 
 
 class Motion:
@@ -75,13 +90,26 @@ class Motion:
     t, q, v : float, ndarray (n_q,), ndarray (n_q,)
     options : dict
         Options of the runs.
+    law : "moreau", "sequential" or None
+        Law of impacts at stops that touch; None: Moreau's, with a warning where the other one gives other velocities.
     """
 
-    def __init__(self, stops: Sequence[Stop], modes: Modes, t: float, q: Array, v: Array, options: dict[str, Any]):
+    def __init__(
+        self,
+        stops: Stops[Stop],
+        modes: Modes,
+        t: float,
+        q: Array,
+        v: Array,
+        options: dict[str, Any],
+        law: str | None = None,
+    ):
         self.system, self.modes, self.stops, self.options = modes.system, modes, list(stops), options
         self.t, self.q, self.v = t, q, v
         self.e = np.array([stop.restitution for stop in stops])
         self.gaps, self.friction = Gaps("gap", stops, t, q), StopFriction(stops, t, q)
+        self.law, self.depends, self.unfinished = law, [], []  # type: ignore[var-annotated]
+        self.noise = EQUAL_GAPS * max(1.0, float(np.abs(q).max()))
         self.low = max(LOW * float(options["atol"].min()), ROUNDING * max(1.0, float(np.abs(q).max())))
         closed = np.flatnonzero(self.gaps.at(t, q, v).g < -100.0 * self.low)
         if closed.size:
@@ -98,6 +126,10 @@ class Motion:
 
     def integrate(self, t1: float, times: Array | None) -> Result:
         """Integrate to the end."""
+        with SignalHandlers():
+            return self._integrate(t1, times)
+
+    def _integrate(self, t1: float, times: Array | None) -> Result:
         stalled, self.sample_interval = 0, (t1 - self.t) / SAMPLES
         while True:
             t_before = self.t
@@ -121,6 +153,8 @@ class Motion:
                 return self._result(times, reason)
 
     def _result(self, times: Array | None, stagnated: str = "") -> Result:
+        if note := self._law_note():
+            warnings.warn(note.strip(), ImpactWarning, stacklevel=5)
         return join_arcs(self.system, self.arcs, self.impacts, times, stagnated, self._summary)
 
     def _is_stalled(self, before: float) -> bool:
@@ -128,6 +162,27 @@ class Motion:
 
     @property
     def _summary(self) -> str:
+        return f"{self._counts}{self._law_note()}"
+
+    def _law_note(self) -> str:
+        """Describe where the outcome depends on the law of impacts, or a sequence was left unfinished."""
+        note = ""
+        if self.depends:
+            t, stops = self.depends[0]
+            note = (
+                f" At t = {t:.6g} an impact reaches stops that touch ({', '.join(map(repr, stops))}), and the outcome "
+                "depends on the law: Moreau's law, used here, joins their impacts into one; impacts one after another, "
+                "as in Newton's cradle, give other velocities. For these, leave a small gap between the bodies or set "
+                'law="sequential"; law="moreau" confirms the choice.'
+            )
+        if self.unfinished:
+            t, stops = self.unfinished[0]
+            note += f" At t = {t:.6g} impacts at {', '.join(map(repr, stops))} were too many to follow: do not trust "
+            note += "the motion after them."
+        return note
+
+    @property
+    def _counts(self) -> str:
         changes = f"{len(self.arcs) - 1} changes between sliding and sticking."
         if self.stops and (self.modes.n or self.friction.place):
             return f"{len(self.impacts)} impacts, {len(self.arcs) - 1} changes of sliding, sticking or contact."
@@ -139,13 +194,18 @@ class Motion:
         near = np.flatnonzero(gap.g <= self.low)
         slow = np.zeros(near.size, dtype=bool)
         if near.size:
-            for _ in range(MAX_STALLED):
+            if self._follow_impacts(gap, near):
+                gap = self.gaps.at(self.t, self.q, self.v)
+                # a stop that has yet to close is hit later, by itself
+                awaited = (gap.g > self.noise) & (gap.u < -AT_REST * (np.abs(gap.W) @ self.speeds))
+                near = np.flatnonzero((gap.g <= self.low) & ~awaited)
+            for _ in range(MAX_STALLED if near.size else 0):
                 slow = self._apply_impulses(gap, near)
                 gap = self.gaps.at(self.t, self.q, self.v)
                 # the law lets a stop close that opened before: it is hit next
                 if not (gap.u[near] < -AT_REST * (np.abs(gap.W[near]) @ self.speeds)).any():
                     break
-            slow &= ~np.isin(near, self.opened)  # an opened stop has no force
+            slow = slow[: near.size] & ~np.isin(near, self.opened)  # an opened stop has no force
         closing = near[slow]
         signs, resting_joints = self._sliding(self.v)
         if not closing.size and not resting_joints:
@@ -206,15 +266,77 @@ class Motion:
             P = impulses(D, u, np.where(slow, 0.0, self.e[near]), tangents)
             v = before + X @ P
             slow = self._hardly_open(near, v)
-        hit = P[:n] > 0.0
-        if hit.any():
-            names = tuple(self.stops[k].name for k in near[hit])
-            friction_impulses = {k: float(x) for k, x in zip(touching, P[n:], strict=True)}
-            friction = np.array([friction_impulses.get(k, 0.0) for k in near[hit].tolist()])
-            self.impacts.append(Impact(self.t, names, before.copy(), v.copy(), P[:n][hit], friction))
-            self.still, self.released, self.friction.still, self.friction.released = set(), set(), set(), set()
         self.v = v
+        if (P[:n] > 0.0).any():
+            self._record_impact(before, near, P, touching)
         return slow
+
+    def _record_impact(self, before: Array, stops: NDArray[np.int64], P: Array, touching: list[int]) -> None:
+        """Record an impact after which the velocities are `self.v`; P: its impulses, of stops, then of friction."""
+        n = len(stops)
+        hit = P[:n] > 0.0
+        rubs = {k: float(x) for k, x in zip(touching, P[n:], strict=True)}
+        friction = np.array([rubs.get(k, 0.0) for k in stops[hit].tolist()])
+        names = tuple(self.stops[k].name for k in stops[hit])
+        self.impacts.append(Impact(self.t, names, before.copy(), self.v.copy(), P[:n][hit], friction))
+        self.still, self.released, self.friction.still, self.friction.released = set(), set(), set(), set()
+
+    def _follow_impacts(self, gap: Gap, near: NDArray[np.int64]) -> bool:
+        """Follow impacts that come faster than the motion between them can be integrated; return whether any did.
+
+        Stops that close at once share an impact by Moreau's law; all others are hit in the order in which they close,
+        however soon, because another order, or a joint impact, ends in other velocities.
+        """
+        rounding = LEAST_RATE * np.abs(gap.W).sum(axis=1) * float(self.speeds.max())
+        at_rest = AT_REST * (np.abs(gap.W) @ self.speeds) + rounding
+        reach = np.flatnonzero((gap.g <= WITHIN * self.low) | np.isin(np.arange(len(gap.g)), near))
+        first = near[gap.u[near] < -at_rest[near]]
+        if len(reach) < 2 or not first.size:
+            return False
+        touching, slide, tangents = self.friction.rows(reach.tolist(), self.t, self.q, self.v, self.speeds)
+        W = np.vstack([gap.W[reach], slide.W])
+        X = responses(self.system, self.t, self.q, W)
+        u = np.append(np.where(np.abs(gap.u) <= at_rest, 0.0, gap.u)[reach], slide.u)
+        impacts = Impacts(W @ X, self.e[reach], tangents, self.noise, rounding[reach])
+        a = self._free(*self._sliding(self.v), self.v)[0]
+        fast, pull = float(np.abs(self.v).max()), float(np.abs(a).max())
+        limit = min(MOVED * self.low / max(fast, 1e-300), np.sqrt(2.0 * self.low / max(pull, 1e-300)))
+        g, together = gap.g[reach].copy(), self.law != "sequential"
+        tied = np.flatnonzero(np.isin(reach, first) & (g <= max(self.noise, TIED * self.low)))
+
+        def differ(one: Sequence, other: Sequence) -> bool:
+            change = np.abs(X @ (one.impulses - other.impulses)).max()
+            return bool(change > DIFFERS * np.abs(X @ one.impulses).max())
+
+        ambiguous = False
+        if together and len(tied) > 1:
+            orders = []
+            for k in tied:
+                in_order = g.copy()
+                in_order[tied] = np.maximum(g[tied], 2.0 * self.noise)
+                in_order[k] = 0.0
+                orders.append(impacts.follow(in_order, u, limit, together))
+            ambiguous = any(differ(order, orders[0]) for order in orders)
+            if ambiguous:
+                g[tied] = 0.0
+        course = impacts.follow(g, u, limit, together)
+        P, before, n = course.impulses, self.v, len(reach)
+        names = [self.stops[k].name for k in reach[P[:n] > 0.0]]
+        if not course.ended:
+            self.unfinished.append((self.t, names))
+        touch = (g <= self.noise) & (u[: len(g)] <= 0.0)
+        compared = self.law is None and course.shared and not ambiguous
+        if compared and differ(impacts.follow(g, u, limit, False), course):
+            self.depends.append((self.t, [self.stops[k].name for k in reach[g <= self.noise]] or names))
+        at_once = {int(k) for k in reach[touch]}
+        if len(course.steps) <= 1 and set(near.tolist()) <= at_once:
+            return False  # one impact at all of these stops
+        self.q = self.q + before * course.duration + X @ course.drift
+        for step in course.steps if len(course.steps) <= LISTED else [P]:
+            self.v = self.v + X @ step
+            self._record_impact(before, reach, step, touching)
+            before = self.v
+        return True
 
     def _hardly_open(self, near: NDArray[np.int64], v: Array) -> NDArray[np.bool_]:
         """Return which stops would rebound by less than the relevant height, pressed together by the others."""
@@ -365,10 +487,11 @@ class Motion:
         """Return the event of a gap that is open or about to open; zero where it is as closed as at the start."""
         g0, u0, t0, low = float(start.g[k]), float(start.u[k]), self.t, self.low
         opens = u0 > 0.0 and u0 * u0 > low * 1e-6
+        noise, closing = self.noise, u0 < -AT_REST * float(np.abs(start.W[k]) @ self.speeds)
 
         def closes(t: float, q: Array, v: Array) -> float:
             g = float(self.gaps.at(t, q, v).g[k])
-            if g0 > low:
+            if g0 > low or (closing and g0 > noise):
                 return g
             if opens:
                 return (g - g0) / (t - t0) if t > t0 else u0
@@ -435,19 +558,21 @@ def solve_with_stops(
     t_span: tuple[float, float],
     q0: ArrayLike,
     v0: ArrayLike,
-    stops: Stop | Sequence[Stop],
+    stops: Stop | Stops[Stop],
     method: str | Method = "auto",
     rtol: float = 1e-8,
     atol: ArrayLike = 1e-8,
     *,
     t_eval: ArrayLike | None = None,
+    law: Literal["moreau", "sequential"] | None = None,
     **options: Any,
 ) -> Result:
     """Integrate a system with stops: impacts with restitution, rest in contact, and release.
 
     An impact changes the velocities by impulses at the closed stops and the impulses of all constraints:
-    M (v+ - v-) + C_q^T p = W^T P, with C_q v+ + C_t = 0. Where several stops are closed, the impulses follow from
-    Moreau's law. The rebound height decreases by the square of the restitution; a rebound below a hundredth of `atol`
+    M (v+ - v-) + C_q^T p = W^T P, with C_q v+ + C_t = 0. Stops that close one after another are hit one by one, however
+    soon, and infinitely many impacts are followed to their limit. Where several stops are closed already, as between
+    touching balls, the outcome depends on `law`. The rebound height decreases by the square of the restitution; a rebound below a hundredth of `atol`
     ends in contact: the gap is then a constraint as long as its force pushes.
 
     Stops with friction slide or stick while they are closed, by Coulomb's law. In an impact, the impulse of friction
@@ -464,6 +589,11 @@ def solve_with_stops(
         E.g. `Stop(lambda t, q: q[1], restitution=0.5)`, or `problem.stops` of a model.
     t_eval : array_like, optional
         Output times. None: the ends of steps, with two columns at an impact, before and after it.
+    law : "moreau" or "sequential", optional
+        Law of an impact that reaches stops which touch already. "moreau": they share one impact, by Moreau's law, which
+        keeps the symmetry of a box that lands flat. "sequential": impacts follow one another, the fastest first, as in
+        Newton's cradle and as with small gaps. None: Moreau's law, with an `ImpactWarning` where the other one gives
+        other velocities.
     **options
         Further keyword arguments of `solve_dae`: max_step, compiled, time_limit (of each arc), ...
 
@@ -504,7 +634,14 @@ def solve_with_stops(
         raise TypeError(f"stops must be a Stop or a list of them; given {shown(stops)}")
     options |= checked_options("solve_with_stops", options, method, rtol, atol, system.n_q)
     times = None if t_eval is None else check_times(t_eval, t0, t1, None)
-    return Motion(stops, Modes(system), t0, q, v, options).integrate(t1, times)
+    return Motion(stops, Modes(system), t0, q, v, options, check_law(law)).integrate(t1, times)
+
+
+def check_law(law: str | None) -> str | None:
+    """Return the name of a law of impacts; raise ValueError for an unknown one."""
+    if law is not None and law not in LAWS:
+        raise ValueError(f"law must be {' or '.join(map(repr, LAWS))}, or None; given {shown(law)}")
+    return law
 
 
 def checked_options(
@@ -527,6 +664,7 @@ def solve_with_friction(
     atol: ArrayLike = 1e-8,
     *,
     t_eval: ArrayLike | None = None,
+    law: Literal["moreau", "sequential"] | None = None,
     **options: Any,
 ) -> Result:
     """Integrate a model with dry friction, and with its stops: joints slide, stop, stick, and are released.
@@ -547,6 +685,8 @@ def solve_with_friction(
         As for `solve_dae`. While stops are closed, "auto" takes the place of "Taylor", which cannot trace their forces.
     t_eval : array_like, optional
         Output times. None: the ends of steps.
+    law : "moreau" or "sequential", optional
+        As for `solve_with_stops`.
     **options
         Further keyword arguments of `solve_dae`: max_step, compiled, time_limit (of each arc), ...
 
@@ -592,4 +732,4 @@ def solve_with_friction(
     options |= checked_options("solve_with_friction", options, method, rtol, atol, problem.system.n_q)
     times = None if t_eval is None else check_times(t_eval, t0, t1, None)
     start = t0, problem.q0.copy(), problem.v0.copy()
-    return Motion(problem.stops, FrictionModes(problem), *start, options).integrate(t1, times)
+    return Motion(problem.stops, FrictionModes(problem), *start, options, check_law(law)).integrate(t1, times)

@@ -172,6 +172,11 @@ class PythonFunctions:
 
     The handle, stored before the parameters, leads to them. It is valid in this process and its forks; unpickled
     elsewhere, the functions are registered again. Functions of the kinds in `taking` get the parameters.
+
+    Attributes
+    ----------
+    samples : list of (arguments, value)
+        Forces of the calls 1, 2, 4, 8, ... since `restart`, which have to come out again at the end of a run.
     """
 
     registry: ClassVar[WeakValueDictionary[float, "PythonFunctions"]] = WeakValueDictionary()
@@ -180,6 +185,12 @@ class PythonFunctions:
         self.name, self.functions, self.taking = name, functions, taking
         self.handle = secrets.randbits(HANDLE_BITS)
         self.registry[self.handle] = self
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the samples: a run begins."""
+        self.samples: list[tuple[tuple[Any, ...], Any]] = []
+        self._calls, self._next = 0, 1
 
     def call(self, kind: str, arguments: tuple[Any, ...], p: Address, out: Array) -> None:
         """Call one function with copies of the arrays, check what comes back and write it to `out`."""
@@ -192,6 +203,11 @@ class PythonFunctions:
             error.add_note(f"raised by {kind} of system {self.name!r} at t = {t!r}")
             raise
         store(kind, self.name, t, value, out)
+        if kind == "force":
+            self._calls += 1
+            if self._calls == self._next:
+                self._next *= 2
+                self.samples.append((tuple(np.copy(each) for each in arguments), out.copy()))
 
 
 def store(kind: str, name: str, t: float, value: Any, out: Array) -> None:

@@ -33,7 +33,12 @@ from twoloop.kernels.linalg.band import lapack_addresses
 from twoloop.methods.preparation import code_for, may_have_code, plans_for
 from twoloop.methods.presets import identity
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.comparison import checked_region_of, compare_callbacks_at, find_nondeterminism
+from twoloop.run.comparison import (
+    checked_region_of,
+    compare_callbacks_at,
+    find_nondeterminism,
+    python_functions,
+)
 from twoloop.run.dense import OutputInterpolation, Table, interpolator_of
 from twoloop.run.dense_solution import DenseSolution
 from twoloop.run.discontinuities import WITHIN, closer, may_have_missed_changes
@@ -576,6 +581,8 @@ def _new_run(
     fixed, given, new = options.step_size is not None, system, not system.checked
     if new:
         take_bounds(system)
+    if functions := python_functions(system):
+        functions.restart()
     _check_start(system, t0, q0, v0, options.check_derivatives)
 
     def check(traced: Traced) -> None:

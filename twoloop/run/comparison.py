@@ -10,6 +10,7 @@ from twoloop.checks.derivatives import wrong_derivative
 from twoloop.checks.structure import unlike_itself
 from twoloop.generate.derived_callbacks import exact_derivatives, generic_states
 from twoloop.generate.traced_values import CLEAR, FEW, CheckedRegion, Sample
+from twoloop.problem.callbacks import PythonFunctions
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.record import Status
 
@@ -71,7 +72,8 @@ def compare_callbacks_at(
             status, message = _derivatives_again(run, states, first, status, message)
         status, message = _traces(run, states, status, message)
         if status == before and run.system.called_in_python and run.control[run.a.FIXED_STEP] == 0.0:
-            unlike = find_nondeterminism(run.system, states[:: 1 + len(states) // FEW])
+            unlike = find_changed_force(run.system)
+            unlike = unlike or find_nondeterminism(run.system, states[:: 1 + len(states) // FEW])
             if unlike is not None:
                 status, message = Status.WRONG_TRACE, f"In the run {unlike}. {message}"
     if status == before:
@@ -113,9 +115,41 @@ def find_nondeterminism(system: ConstrainedSystem, states: Array) -> str | None:
     if not off.max() > CLEAR * np.abs(once[both]).max(initial=0.0):
         return None
     k, entry = np.unravel_index(off.argmax(), off.shape)
+    return _differs(system.name, float(states[k, 0]), int(entry), once[k, entry], again[k, entry])
+
+
+def python_functions(system: ConstrainedSystem) -> PythonFunctions | None:
+    """Return the functions of a system that are called in Python, or None."""
+    return PythonFunctions.registry.get(float(system.functions.p[0])) if system.called_in_python else None
+
+
+def find_changed_force(system: ConstrainedSystem) -> str | None:
+    """Describe how a force called in Python differs from what it was in the run for the same arguments, or None.
+
+    A force may change slowly, as with the clock, or once, as after 1000 calls: two calls at the end do not show that.
+    """
+    functions = python_functions(system)
+    samples = [] if functions is None else functions.samples.copy()
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        for arguments, value in samples:
+            assert functions is not None
+            try:
+                again = np.asarray(functions.functions["force"](float(arguments[0]), *map(np.copy, arguments[1:])))
+            except Exception:  # the state is outside the domain of the force
+                continue
+            both = np.isfinite(value) & np.isfinite(again)
+            off = np.abs(np.subtract(value, again, out=np.zeros(len(value)), where=both))
+            if off.max(initial=0.0) > CLEAR * np.abs(value[both]).max(initial=0.0):
+                entry = int(off.argmax())
+                return _differs(system.name, float(arguments[0]), entry, value[entry], again[entry])
+    return None
+
+
+def _differs(name: str, t: float, entry: int, once: float, again: float) -> str:
     return (
-        f"force of {system.name!r} gives something else when it is called again with the same t, q and v: at "
-        f"t = {states[k, 0]:.10g} entry {entry} is {once[k, entry]:.9g}, and then {again[k, entry]:.9g}. It must "
+        f"force of {name!r} gives something else when it is called again with the same t, q and v: at "
+        f"t = {t:.10g} entry {entry} is {once:.9g}, and then {again:.9g}. It must "
         "depend on its arguments alone: steps are tried, refused, and looked at ahead"
     )
 

@@ -22,8 +22,7 @@ from twoloop.generate.traced_values import Sample
 from twoloop.kernels.data import indices
 from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.indices import LONGEST_UNSEEN
-from twoloop.problem.callbacks import PythonFunctions
-from twoloop.problem.events import SAMPLES, Event
+from twoloop.problem.events import SAMPLES
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.comparison import compare_callbacks
 from twoloop.run.dense import interpolator_of
@@ -62,11 +61,11 @@ from twoloop.run.record import (
 )
 from twoloop.run.recorder import OF_STEPS, OutputRequest, Recorder
 from twoloop.run.run import Buffers, Run
+from twoloop.run.signals import SignalHandlers, within_a_users_function
 from twoloop.run.singular_positions import Place, turned_last
 
 Array = NDArray[np.float64]
 
-CALLS_A_USER = (PythonFunctions.call.__code__, Event.__call__.__code__)
 IMPATIENCE = 3  # signals after which the next one raises at once, even if the result is lost
 
 
@@ -82,9 +81,12 @@ class Interrupts:
     """
 
     asked, _stands_in = 0, False
+    handlers: SignalHandlers | None = None
 
     def listen(self) -> "Interrupts":
         """Store signals from here on, except those within functions of the user."""
+        if self.handlers is None:
+            self.handlers = SignalHandlers()
         if _signal.getsignal(signal.SIGINT) is signal.default_int_handler:
             with suppress(ValueError):  # raised in threads other than the main one, which get no signals
                 _signal.signal(signal.SIGINT, self._heard)
@@ -97,22 +99,16 @@ class Interrupts:
         return self._stands_in and self.asked <= IMPATIENCE
 
     def leave(self) -> None:
-        """Restore Python's own handler."""
+        """Restore all handlers, and raise what one of the user's raised."""
         if self._stands_in:
             _signal.signal(signal.SIGINT, signal.default_int_handler)
+        if self.handlers is not None:
+            self.handlers.leave()
 
     def _heard(self, number: int, frame: FrameType | None) -> None:
         self.asked += 1
-        if self.asked > IMPATIENCE or _within_a_users_function(frame):
+        if self.asked > IMPATIENCE or within_a_users_function(frame):
             raise KeyboardInterrupt
-
-
-def _within_a_users_function(frame: FrameType | None) -> bool:
-    while frame is not None:
-        if frame.f_code in CALLS_A_USER:
-            return True
-        frame = frame.f_back
-    return False
 
 
 def describe_interrupt(t: float, table: Array) -> str:
@@ -292,6 +288,8 @@ class IntegrationLoop:
                 self.code, self.raised = INTERRUPTED, None if self.interrupts.asked else error
                 if not run.system.called_in_python:
                     error.add_note(_where(run.system.name, float(run.clock[a.T]), error))
+        if self.interrupts.handlers is not None:
+            self.interrupts.handlers.check()
 
     def _take(self, t: Array, rows: Array, steps: Array, kinds: NDArray[np.int64]) -> None:
         """Store the states and the steps of a chunk."""

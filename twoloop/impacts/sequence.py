@@ -1,0 +1,129 @@
+"""Follow impacts that come faster than the motion between them can be integrated, one by one."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.arguments import Array
+from twoloop.impacts.friction import Tangents, impulses
+
+MAX_HITS = 20_000  # largest number of impacts of a sequence; more than one in 10,000 arises with masses of 1 to 1e8
+COLLAPSED = 1e-11  # relative to the first rates of closing: what is left of these when a sequence has died out
+
+
+class Sequence(NamedTuple):
+    """Impulses and course of a sequence of impacts.
+
+    Attributes
+    ----------
+    steps : list of ndarray (k + n_tangents,)
+        Impulses of each impact, of the stops and of their friction.
+    drift : ndarray (k + n_tangents,)
+        Integral of the impulses over the sequence: the displacement is v t + X drift.
+    duration : float
+        s.
+    shared : bool
+        Whether stops that touch shared an impact.
+    ended : bool
+        Whether the sequence ended or died out, within its duration and number of impacts.
+    """
+
+    steps: list[Array]
+    drift: Array
+    duration: float
+    shared: bool
+    ended: bool
+
+    @property
+    def impulses(self) -> Array:
+        """Sums over the sequence."""
+        return sum(self.steps, 0.0 * self.drift)
+
+
+class Impacts:
+    """Data of impacts at a fixed position: between them, gaps change at constant rates.
+
+    Parameters
+    ----------
+    D : ndarray (k + n_tangents, k + n_tangents)
+        Changes of the rates by unit impulses, of the stops and of their friction.
+    restitution : ndarray (k,)
+    tangents : Tangents
+    noise : float
+        Gaps below this are closed; those of several stops are then closed at the same time.
+    least : ndarray (k,)
+        Smaller rates are rounding errors.
+    """
+
+    def __init__(self, D: Array, restitution: Array, tangents: Tangents, noise: float, least: Array):
+        self.D, self.restitution, self.tangents = D, restitution, tangents
+        self.noise, self.least, self.n = noise, least, len(restitution)
+
+    def joint(self, stops: NDArray[np.int64], rates: Array, restitution: Array) -> Array:
+        """Return the impulses of an impact at these stops at once, by Moreau's law."""
+        P = np.zeros(len(rates))
+        place = {int(k): i for i, k in enumerate(stops)}
+        rub = [i for i, k in enumerate(self.tangents.normal.tolist()) if k in place]
+        if len(stops) == 1 and not rub:
+            k = stops[0]
+            P[k] = max(0.0, -(1.0 + restitution[k]) * rates[k] / self.D[k, k])
+            return P
+        rows = np.append(stops, [self.n + i for i in rub]).astype(np.int64)
+        normal = np.array([place[int(self.tangents.normal[i])] for i in rub], dtype=np.int64)
+        tangents = Tangents(normal, self.tangents.coefficient[rub], np.zeros(len(rub), dtype=np.int64))
+        P[rows] = impulses(self.D[np.ix_(rows, rows)], rates[rows], restitution[stops], tangents)
+        return P
+
+    def follow(self, gaps: Array, rates: Array, limit: float, together: bool) -> Sequence:
+        """Follow the impacts until no stop closes within the time limit, or their rates have died out.
+
+        Parameters
+        ----------
+        gaps, rates : ndarray (k,), ndarray (k + n_tangents,)
+        limit : float
+            Longest duration, s.
+        together : bool
+            Whether stops that touch share an impact by Moreau's law. False: the one that closes fastest is hit first.
+        """
+        n, D = self.n, self.D
+        g, u = np.maximum(gaps, 0.0), rates.copy()
+        total, drift, elapsed = np.zeros(len(u)), np.zeros(len(u)), 0.0
+        steps: list[Array] = []
+        shared = False
+        closing = u[:n] < -self.least
+        # the rates that remain of a collapse are compared with the largest ones so far
+        fastest, involved = float(-u[:n].min(initial=0.0)), np.zeros(n, dtype=bool)
+        for _ in range(MAX_HITS):
+            closing = u[:n] < -self.least
+            if not closing.any():
+                return Sequence(steps, drift, elapsed, shared, True)
+            times = np.full(n, np.inf)
+            times[closing] = np.where(g[closing] <= self.noise, 0.0, g[closing] / -u[:n][closing])
+            wait = float(times.min())
+            if elapsed + wait > limit:
+                return Sequence(steps, drift, elapsed, shared, True)
+            drift += total * wait
+            elapsed += wait
+            g = np.maximum(g + wait * u[:n], 0.0)
+            due = closing & (times <= wait)
+            g[due] = 0.0
+            if together:
+                stops = np.flatnonzero((g <= self.noise) & (u[:n] <= self.least))
+                shared |= len(stops) > 1
+            else:
+                stops = np.array([int(np.flatnonzero(due)[np.argmin(u[:n][due])])])
+            P = self.joint(stops, u, self.restitution)
+            u += D @ P
+            total += P
+            steps.append(P)
+            involved[stops] = True
+            if len(steps) > 2 and np.abs(u[:n][involved & (g <= limit * fastest)]).max() <= COLLAPSED * fastest:
+                break
+        else:
+            return Sequence(steps, drift, elapsed, shared, False)
+        # the limit of infinitely many impacts: what is left of the rates of closing vanishes
+        P = self.joint(np.flatnonzero(involved & (g <= limit * fastest)), u, np.zeros(n))
+        return Sequence([*steps, P], drift, elapsed, shared, True)
