@@ -226,7 +226,7 @@ def test_touching_balls_act_by_the_law(law, after):
     np.testing.assert_allclose(result.v[:, -1], after, atol=1e-12)
     with pytest.warns(match="small gap between the bodies or set law="):
         default = solve_with_stops(system, (0.0, 2.0), *start, stops)
-    assert "depends on the law" in default.message and default.v[3, -1] == 0.5
+    assert "depends on the law" in default.message and abs(default.v[3, -1] - 0.5) < 1e-12
 
 
 def test_a_stop_that_opens_is_hit_when_the_impact_at_another_turns_the_body_back():

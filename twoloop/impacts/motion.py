@@ -572,8 +572,8 @@ def solve_with_stops(
     An impact changes the velocities by impulses at the closed stops and the impulses of all constraints:
     M (v+ - v-) + C_q^T p = W^T P, with C_q v+ + C_t = 0. Stops that close one after another are hit one by one, however
     soon, and infinitely many impacts are followed to their limit. Where several stops are closed already, as between
-    touching balls, the outcome depends on `law`. The rebound height decreases by the square of the restitution; a rebound below a hundredth of `atol`
-    ends in contact: the gap is then a constraint as long as its force pushes.
+    touching balls, the outcome depends on `law`. The rebound height decreases by the square of the restitution; a
+    rebound below a hundredth of `atol` ends in contact: the gap is then a constraint as long as its force pushes.
 
     Stops with friction slide or stick while they are closed, by Coulomb's law. In an impact, the impulse of friction
     stops the sliding, if the coefficient times the impulse of the stop suffices; otherwise it has that value and
