@@ -1,8 +1,9 @@
 """Compare solvers on a mechanism of your own, or a solver of your own: methods of twoloop beside other projects."""
 
+import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -32,6 +33,7 @@ GROUP = "compare"
 FOLDER = "compare"  # of the report, unless --out is given
 ERRORS = (1e-2, 1e-4, 1e-6, 1e-8)
 QUICK = (1e-3, 1e-6, 1e-9)  # values of tolerances in a quick comparison
+TICK = 10.0  # s between two lines that say that the reference is still being made
 REFERENCE_LIMIT = 300.0  # s of wall-clock time for each run of the reference
 
 
@@ -51,7 +53,8 @@ def known_of(problem: Problem, t_end: float, limit: float) -> ReferenceMotion:
     print(f"making the reference of {problem.name!r} to {t_end:g} s, at most {limit:g} s a run ...", flush=True)
     began = time.perf_counter()
     try:
-        made = make_reference(problem, t_end, limit)
+        with _ticking():
+            made = make_reference(problem, t_end, limit, partial(print, flush=True))
     except StudyError as error:
         raise StudyError(f"{error}. Choose a shorter --t-end, or more than --reference-limit {limit:g}") from None
     except Exception as error:  # of the mechanism's functions
@@ -59,6 +62,24 @@ def known_of(problem: Problem, t_end: float, limit: float) -> ReferenceMotion:
         raise StudyError(f"no reference for {problem.name!r}: {said}") from error
     print(f"... made in {time.perf_counter() - began:.1f} s; it holds to {made.floor:.0e}", flush=True)
     return made
+
+
+@contextmanager
+def _ticking() -> Iterator[None]:
+    """Print the time that has passed every few seconds."""
+    ended, began = threading.Event(), time.perf_counter()
+
+    def tick() -> None:
+        while not ended.wait(TICK):
+            print(f"  ... {time.perf_counter() - began:.0f} s", flush=True)
+
+    thread = threading.Thread(target=tick, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 def runs_of(case: Case, solvers: Iterable[str | Solver], quick: bool) -> list[Run]:

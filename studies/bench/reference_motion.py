@@ -11,7 +11,7 @@ from references.scipy.index1 import solve_index1
 from references.sundials.ida import solve_ida
 from studies.bench.cli import StudyError
 from studies.bench.store import Array
-from twoloop import solve_dae
+from twoloop import Status, solve_dae
 from twoloop.mechanisms import Problem
 
 TIGHT = 1e-13  # tolerance of both runs of the smooth pair
@@ -32,7 +32,9 @@ class ReferenceMotion:
     source: str  # where it comes from
 
 
-def make_reference(problem: Problem, t_end: float, time_limit: float | None = None) -> ReferenceMotion:
+def make_reference(
+    problem: Problem, t_end: float, time_limit: float | None = None, report: Callable[[str], object] = len
+) -> ReferenceMotion:
     """Integrate by two unlike methods; their largest difference over the run, positions, is the floor.
 
     Tried first is Gauss16 (twoloop) beside SciPy's DOP853 on the projected index-1 equations, at 1e-13, or, where the
@@ -40,34 +42,43 @@ def make_reference(problem: Problem, t_end: float, time_limit: float | None = No
     fails, RadauIIA5 (two-loop, Newton's method) beside IDA on the stabilised index-1 form, at 1e-11. The first of a
     pair is stored at four instants in each step of the second, between which the quintic in q, v and a is used.
 
-    `t_end`: s. `time_limit`: wall-clock time that each run may take, s. None: no limit.
+    Where SciPy's run fails before its time limit, as at redundant rows and singular positions, DOP853 of two-loop takes
+    its place as well: it leaves out rows that depend on others.
+
+    `t_end`: s. `time_limit`: wall-clock time that each run may take, s. None: no limit. `report` takes lines that say
+    which run begins, and which has failed.
 
     Raises StudyError if no pair reaches t_end.
     """
     run = problem.system, (0.0, t_end), problem.q0, problem.v0
-    said, smooth = [], False
+    said: list[str] = []
+    slow = False
     for name, second, method, tolerance in (
         ("Gauss16 (twoloop) and SciPy's DOP853, projected", _explicit, "Gauss16", TIGHT),
         ("Gauss16 and DOP853 (both two-loop)", _own_explicit, "Gauss16", TIGHT),
         ("RadauIIA5 (twoloop) and IDA, stabilised", _ida, "RadauIIA5", STIFF),
     ):
-        if second is _own_explicit and smooth:
+        if second is _own_explicit and slow:
             continue
+        report(f"  {name}, tolerances {tolerance:.0e}")
         options: dict[str, Any] = {"rtol": tolerance, "atol": tolerance, "time_limit": time_limit}
         try:
             other = second(*run, **options)
         except (ValueError, RuntimeError) as error:  # it does not take this mechanism, or is not installed
             said.append(str(error))
+            report(f"  ... failed: {error}")
             continue
-        smooth = True  # SciPy's solver takes the mechanism
+        slow = other.status == Status.TIME_LIMIT  # another explicit method would take as long
         if not other.success:
             said.append(other.message)
+            report(f"  ... failed: {other.message}")
             continue
         parts = [other.t[:-1] + k / REFINED * np.diff(other.t) for k in range(REFINED)]
         fine = np.append(np.sort(np.concatenate(parts)), t_end)
         first = solve_dae(*run, method, t_eval=fine, **options)
         if not first.success:
             said.append(first.message)
+            report(f"  ... failed: {first.message}")
             continue
         motion = Quintic(first.t, first.q, first.v, first.a)
         differ = np.abs(motion(other.t)[0] - other.q).max()

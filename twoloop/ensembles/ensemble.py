@@ -333,8 +333,20 @@ def ensemble(
     ((3, 2, 3), True)
     """
     with SignalHandlers():
-        given = {"parameters": parameters, "rtol": rtol, "atol": atol, "t_eval": t_eval, "method": method}
-        return _integrate(system, t_span, q0, v0, **given, events=events, threads=threads, time_limit=time_limit)
+        return _integrate(
+            system,
+            t_span,
+            q0,
+            v0,
+            parameters=parameters,
+            rtol=rtol,
+            atol=atol,
+            t_eval=t_eval,
+            method=method,
+            events=events,
+            threads=threads,
+            time_limit=time_limit,
+        )
 
 
 def _integrate(

@@ -39,7 +39,7 @@ from twoloop.impacts.friction import (
     responses,
 )
 from twoloop.impacts.joined import Impact, join_arcs
-from twoloop.impacts.sequence import Impacts, Sequence
+from twoloop.impacts.sequence import Impacts, ImpactWarning, Sequence
 from twoloop.methods.plan import Method
 from twoloop.methods.presets import PRESETS
 from twoloop.methods.taylor import Taylor
@@ -73,10 +73,6 @@ LEAST_RATE = 1e-13  # relative to the velocities: smaller rates in such a sequen
 DIFFERS = 1e-6  # relative to the velocities: outcomes of laws of impact that differ by more do not agree
 LISTED = 100  # longest sequence of impacts that are listed one by one
 LAWS = ("moreau", "sequential")
-
-
-class ImpactWarning(UserWarning):
-    """Warn that the outcome of impacts depends on their law, or that they were too many to follow."""
 
 
 class Motion:

@@ -14,6 +14,17 @@ MAX_HITS = 20_000  # largest number of impacts of a sequence; more than one in 1
 COLLAPSED = 1e-11  # relative to the first rates of closing: what is left of these when a sequence has died out
 
 
+class ImpactWarning(UserWarning):
+    """Warn that the outcome of impacts depends on their law, or that they were too many to follow.
+
+    Examples
+    --------
+    >>> import warnings
+    >>> from twoloop.impacts.sequence import ImpactWarning
+    >>> warnings.simplefilter("ignore", ImpactWarning)  # or set `law` of `solve_with_stops`
+    """
+
+
 class Sequence(NamedTuple):
     """Impulses and course of a sequence of impacts.
 
