@@ -54,12 +54,11 @@ class SignalHandlers:
         """Call handlers that wait; raise what a handler raised."""
         while self._waiting and self._raised is None:
             self._call(*self._waiting.pop(0))
-        if self._raised is not None:
-            error, self._raised = self._raised, None
-            raise error.with_traceback(None) from None
+        if self._raised is not None:  # it stays, because handlers of Ctrl-C may catch it
+            raise self._raised from None
 
     def leave(self) -> None:
-        """Restore the handlers, unless the user has set others meanwhile, and check."""
+        """Restore the handlers, unless the user has set others meanwhile, and check; once for each object."""
         for number, handler in self._before.items():
             if _signal.getsignal(number) == self._receive:
                 _signal.signal(number, handler)
