@@ -2,13 +2,10 @@
 
 import numpy as np
 import pytest
-from numba import njit
 
-from references.paper import gear
 from references.paper.four_bar_minimal import trajectory
 from references.paper.gear import HIGHEST, STARTS, _formulas, solve_gear
-from tests.problems import force_residual, moving_pivot, moving_pivot_state, pendulum, violations, worst
-from twoloop.kernels.compile.caches import digests_of
+from tests.problems import force_residual, moving_pivot, moving_pivot_state, violations, worst
 from twoloop.mechanisms import four_bar
 from twoloop.run.record import Status
 
@@ -45,12 +42,6 @@ def test_order_with_an_accurate_start(order):
     assert np.abs(slopes(order, (4e-3, 2e-3), start="accurate") - order).max() < 0.3
 
 
-@pytest.mark.parametrize("order", [2, 4, 6])
-@pytest.mark.slow
-def test_the_ramp_limits_the_order_to_two(order):
-    assert np.abs(slopes(order, (4e-3, 2e-3)) - 2.0).max() < 0.1
-
-
 @pytest.mark.parametrize("start", STARTS)
 @pytest.mark.parametrize("order", range(1, HIGHEST + 1))
 @pytest.mark.slow
@@ -60,19 +51,6 @@ def test_positions_keep_the_constraints_and_velocities_nearly(order, start):
     before, after = (violations(PROBLEM.system, result)[1] for result in (coarse, fine))
     assert 1e-6 < after < before / 1.5  # asked for by nothing, an error of the formula
     assert force_residual(PROBLEM.system, fine) < 1e-8
-
-
-@pytest.mark.slow
-def test_ramp_begins_with_half_of_the_centripetal_acceleration():
-    """On a unit circle without gravity lam = v^2 = 4, at any step."""
-    system = pendulum(force=lambda t, q, v: np.zeros(2))
-    for step in (1e-2, 1e-3):
-        ramp, accurate = (
-            solve_gear(system, (0.0, 20 * step), [0.0, -1.0], [2.0, 0.0], step, 3, start=start).lam[0]
-            for start in ("ramp", "accurate")
-        )
-        assert ramp[0] == pytest.approx(4.0) and ramp[1] == pytest.approx(2.0, rel=1e-3)
-        assert worst(ramp[-5:], 4.0) < 0.01 and worst(accurate, 4.0) < 0.01
 
 
 @pytest.mark.parametrize("order", [2, 3])
@@ -87,37 +65,9 @@ def test_time_dependent_constraints(order):
     assert errors[0] < 3e-3 and abs(np.log2(errors[0] / errors[1]) - order) < 0.3
 
 
-@pytest.mark.parametrize("start", STARTS)
-@pytest.mark.slow
-def test_stores_every_step_or_those_asked_for(start):
-    full = run(0.5, 0.01, 3, start=start)
-    assert full.t.size == 51 and full.h.size == full.stats.n_accepted == 50 and full.t[-1] == pytest.approx(0.5)
-    assert full.q.shape == full.v.shape == full.a.shape == (9, 51) and full.lam.shape == (8, 51)
-    assert np.array_equal(full.q[:, 0], PROBLEM.q0) and np.isfinite(full.a).all() and np.isfinite(full.lam).all()
-    some = run(0.5, 0.01, 3, start=start, t_eval=[0.01, 0.2, 0.5])
-    assert np.array_equal(some.q, full.q[:, [1, 20, 50]]) and np.array_equal(some.lam, full.lam[:, [1, 20, 50]])
-    assert np.allclose(some.t, [0.01, 0.2, 0.5], rtol=0.0, atol=1e-12) and some.h.size == 50
-
-
-@pytest.mark.slow
-def test_machine_code_on_disk_follows_the_factorisations_that_it_holds(monkeypatch):
-    before = digests_of(gear._integrate.py_func)
-    assert before is not None and digests_of(gear._integrate.py_func) == before
-    monkeypatch.setattr(gear, "lu_factor", njit(lambda A, pivots: True))
-    assert digests_of(gear._integrate.py_func) != before
-
-
 @pytest.mark.slow
 def test_too_large_a_step_comes_back_as_a_row():
     result = run(10.0, 0.1, 3)
     assert result.status is Status.SOLVER_FAILED and not result.success
     assert "order 3 failed in the step to t = 1:" in result.message and "smaller step" in result.message
     assert result.t[-1] == pytest.approx(0.9) and result.stats.n_accepted == result.h.size == result.t.size - 1 == 9
-
-
-@pytest.mark.slow
-def test_failure_of_the_accurate_start_comes_back_as_a_row():
-    system = pendulum(force=lambda t, q, v: np.array([0.0, -9.81 if t < 0.015 else np.nan]))
-    result = solve_gear(system, (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], 0.01, 4, start="accurate")
-    assert result.status is Status.SOLVER_FAILED and "The accurate start failed. DOP853" in result.message
-    assert np.array_equal(result.t, [0.0, 0.01])

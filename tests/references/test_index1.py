@@ -6,8 +6,7 @@ from scipy.integrate import solve_ivp
 
 from references.scipy.index1 import STABILISATIONS, solve_index1
 from tests.mechanisms.make_references import equations
-from tests.problems import LINKAGES, force_residual, pendulum, violations, worst
-from twoloop.run.record import Status
+from tests.problems import LINKAGES, force_residual, violations, worst
 
 
 def run(name, t_end, *args, **options):
@@ -57,14 +56,3 @@ def test_accelerations_and_multipliers_are_those_of_the_equations_solved(stabili
     for t, q, v, a in zip(result.t, result.q.T, result.v.T, result.a.T, strict=True):
         feedback = 2.0 * alpha * system.velocity_constraint(t, q, v) + alpha**2 * system.constraint(t, q)
         assert worst(system.jacobian(t, q) @ a, system.gamma(t, q, v) - feedback) < 1e-11
-
-
-@pytest.mark.slow
-def test_failure_of_a_projection_comes_back_as_a_row():
-    def constraint(t, q):
-        return np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0) + (5.0 if t > 0.5 else 0.0)])
-
-    system = pendulum(constraint=constraint)
-    result = solve_index1(system, (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], stabilisation="projection")
-    assert result.status is Status.SOLVER_FAILED and "the projection onto the constraints at t = 0.5" in result.message
-    assert 0.0 < result.t[-1] <= 0.5

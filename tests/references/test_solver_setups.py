@@ -19,12 +19,10 @@ from studies.bench.solvers import CATALOGUE
 from studies.validation.study import MAKE
 from tests.marks import slow, slow_but
 from tests.problems import pendulum
-from tests.processes import run_python
 from twoloop import ConstrainedSystem, callback, mechanisms
-from twoloop.mechanisms import double_pendulum, four_bar, projection_pendulum, spatial_slider_crank
+from twoloop.mechanisms import double_pendulum, projection_pendulum, spatial_slider_crank
 from twoloop.problem.callbacks import callbacks_in
 
-FOUR_BAR = four_bar()
 PENDULUM = projection_pendulum()
 DOUBLE = double_pendulum()
 SPATIAL = spatial_slider_crank()
@@ -35,10 +33,6 @@ def run(solve, problem, *arguments, t_end=None, **options):
     result = solve(problem.system, (0.0, end), problem.q0, problem.v0, *arguments, t_eval=[0.0, end], **options)
     assert result.success, result.message
     return result
-
-
-def error(problem, result):
-    return np.abs(result.q[:, -1] - problem.reference.q).max()
 
 
 @callback("mass")
@@ -112,22 +106,6 @@ def test_cvode_takes_the_analytic_jacobian(monkeypatch):
         assert 1e-13 < np.abs(result.q[:, -1] - PENDULUM.q0).max() < 1e-5 and result.stats.n_jacobians > 1
     more = [each.stats.n_evaluations - each.stats.n_outer for each in (exact, differenced)]
     assert more[0] < exact.stats.n_jacobians and more[1] >= 4 * differenced.stats.n_jacobians  # one for each unknown
-
-
-def kept(system, t, q, v):
-    """The largest residual of the constraints on positions, and on velocities."""
-    rates = system.jacobian(t, q) @ v + system.constraint_rate(t, q)
-    return np.abs(system.constraint(t, q)).max(), np.abs(rates).max()
-
-
-@pytest.mark.slow
-def test_cvode_keeps_the_constraints_that_it_projects_onto():
-    problem = PENDULUM
-    free, made = (run(solve_cvode_c, problem, "BDF", 1e-8, 1e-8, projected=each) for each in (False, True))
-    assert 1e-14 < error(problem, made) < 6e-5
-    end = problem.reference.t
-    assert max(kept(problem.system, end, made.q[:, -1].copy(), made.v[:, -1].copy())) < 1e-13
-    assert max(kept(problem.system, end, free.q[:, -1].copy(), free.v[:, -1].copy())) > 1e-11
 
 
 def start(problem, t_end):
@@ -206,25 +184,3 @@ def test_a_file_in_the_folder_is_enough(tmp_path, monkeypatch):
     found = lines.__wrapped__()
     monkeypatch.delitem(sys.modules, "references.newcomer")
     assert [line.name for line in found] == ["newcomer"] and isinstance(found[0], Line)
-
-
-@pytest.mark.slow
-def test_a_package_that_is_not_installed_leaves_the_others():
-    told = run_python(
-        """
-        import sys
-        for name in ("exudyn", "sksundae", "heyoka", "casadi", "diffrax", "solve_dae", "extensisq", "CyRK"):
-            sys.modules[name] = None
-        from references.lines import lines
-        from references.sundials.ida import solve_ida
-        from twoloop.mechanisms import projection_pendulum
-        problem = projection_pendulum()
-        print(len(lines()))
-        try:
-            solve_ida(problem.system, (0.0, 1.0), problem.q0, problem.v0)
-        except RuntimeError as error:
-            print(error)
-        """
-    )
-    said = "scikit-sundae is not installed: pip install 'twoloop[references]'"
-    assert told.stdout.splitlines() == [str(len(lines())), said]

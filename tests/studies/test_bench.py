@@ -157,17 +157,6 @@ def test_a_run_past_its_limit_is_a_row(kept, marked, said):
     assert rows["status"].tolist() == ["TIME_LIMIT"] and said in rows["message"][0]
 
 
-@pytest.mark.slow
-def test_the_limit_is_that_of_the_users_call_and_not_of_what_an_adapter_does_beside_it(kept):
-    def run(case, value, repeat):
-        if case.t_end == T_END:
-            spend(0.8)  # building, the output
-        with user_call:
-            return ours(case, value, repeat)
-
-    assert row(kept, run, case(time_limit=0.5))["status"] == "REACHED_END"
-
-
 @pytest.mark.parametrize("made", ["raised", "failed", "ended"])
 def test_a_limit_is_one_whatever_a_foreign_library_makes_of_it(kept, made):
     def run(case, value, repeat):

@@ -116,32 +116,3 @@ def test_a_run_that_cannot_be_measured_is_a_row(mechanisms, monkeypatch):
     found = dict(zip(rows["solver"], zip(rows["status"], rows["message"], strict=True), strict=True))
     assert found["Gauss12"][0] == "REACHED_END" and found["DOP853 (twoloop)"][0] == "NOT_MEASURED"
     assert found["DOP853 (twoloop)"][1] == "REACHED_END, but it cannot be measured: LinAlgError: Singular matrix"
-
-
-@pytest.mark.slow  # the accelerations of its mechanisms are compiled
-@pytest.mark.parametrize(
-    ("call", "kept"),
-    [
-        ("swinging(0.0)", True),
-        ("swinging(0.1)", False),
-        ("swinging(1e-6)", False),
-        ("still()", False),
-        ("top()", True),
-    ],
-)
-def test_whether_the_energy_is_an_invariant_is_found(mechanisms, call, kept):
-    names = {}
-    exec(MECHANISMS, names)
-    problem = eval(call, names)
-    assert problem.conserved is None
-    case = Case("case", problem, min(0.5, problem.t_span[1]), n_instants=50)
-    assert (case.scale.kinetic is not None) == kept
-
-
-@pytest.mark.slow
-def test_a_problem_that_says_so_is_believed(mechanisms):
-    names = {}
-    exec(MECHANISMS, names)
-    for said in (True, False):
-        case = Case("case", names["swinging"](0.0, conserved=said), 0.1, n_instants=10)
-        assert (case.scale.kinetic is not None) == said

@@ -47,7 +47,6 @@ from studies.energy import (
 )
 from tests.studies import of_study
 
-STUDIED = energy
 REPORTS = Path(__file__).parents[2] / "reports"
 PERIOD = 2.2489859198
 
@@ -167,25 +166,6 @@ def test_freedom_from_drift_pays_where_it_is_cheaper(rows):
     assert found["ratios"] is None and all(at["no_drift"]["own"] is None for at in found["at"])
 
 
-@pytest.mark.slow
-def test_times_of_energy_are_ranked_by_the_rule_of_the_other_comparisons(rows):
-    """Five repetitions, beyond 5 %, also against runs whose error is a little too large; a single run ranks nothing."""
-    here = rows["case"] == SWITCHING
-    rows = changed(rows, f"case == '{SWITCHING}'", energy=1e-9, slope=1.0, slope_error=0.0)
-    own = rows["family"] == "two-loop"
-    for seconds, ranked in ((1.0, "ahead"), (3.0, "behind"), (2.0, "undecided")):
-        made = rows.assign(call_s=np.where(own, seconds, 2.0))
-        assert {at["verdict"] for at in long_found(repeated(made))["at"]} == {ranked}
-        assert {at["verdict"] for at in long_found(made.assign(repeats=1))["at"]} == {"undecided"}
-    level = 1e-5 * float(rows.loc[here, "kinetic"].iloc[0])
-    near = rows.index[here & ~own & (rows["solver"] == IDA_C)][:1]
-    made = repeated(made.assign(call_s=np.where(own, 1.0, 2.0)))
-    made.loc[near, "energy"], made.loc[near, "call_s"] = 1.1 * level, 1.0
-    made.at[near[0], "times"] = (1.0,) * 5
-    verdicts = [at["verdict"] for at in long_found(made)["at"]]
-    assert verdicts == ["undecided", "undecided", "ahead"]  # it is good enough, nearly good enough, and not
-
-
 def test_runs_have_keys_and_those_that_set_the_price_are_repeated():
     listed = list(runs(False))
     assert len({run.key(0) for run in listed}) == len(listed) < 125 and {run.case.t_end for run in listed} == {LONG}
@@ -295,25 +275,6 @@ PACKAGES = {HEYOKA: "heyoka", CYRK: "CyRK", CVODE_C: "sksundae", CVODES: "casadi
 def test_the_other_solvers_are_among_the_runs():
     full, quick = ({run.solver.name for run in runs(short)} for short in (False, True))
     assert set(PACKAGES) <= full and quick == full - set(NOT_QUICK) and set(PACKAGES) <= set(STYLES)
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name == DIFFRAX else ()) for name in PACKAGES]
-)
-def test_the_energy_of_another_solver_is_followed(name):
-    """Where tolerances are tight the energy changes less, and the motion is the true one."""
-    pytest.importorskip(PACKAGES[name])
-    run = next(run for run in runs(False) if run.solver.name == name)
-    case, found = case_of(SWITCHING, QUICK), {}
-    for tol in (1e-6, 1e-10):
-        short = type(run)(case, run.solver, tol, "other", 1)
-        result, status, message, _ = attempt(short, 0)
-        assert status == "REACHED_END", message
-        found[tol] = max(
-            abs(case.problem.energy(result.t, result.q, result.v) - case.problem.energy(0.0, *start(case)))
-        )
-        assert measure(short, result)["slope_error"] > 0.0 and result.t.size > 300
-    assert found[1e-10] < 1e-3 * case.scale.kinetic and found[1e-10] < 0.01 * found[1e-6]
 
 
 def start(case):

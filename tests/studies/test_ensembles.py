@@ -1,14 +1,12 @@
 """Many runs in one call: every way ends where the equation in one coordinate does; sentences follow the rows."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pandas as pd
 import pytest
 
 from references.equations.many_at_once import by_diffrax, by_heyoka
 from studies import ensembles
-from studies.bench.cli import Call, StudyError, processor
+from studies.bench.cli import StudyError
 from studies.ensembles import CVODE, CYRK, DIFFRAX, ENSEMBLE, ERRORS, HEYOKA, PROPAGATE, SINGLE, TOLERANCES
 from tests.studies.of_study import said
 from twoloop.mechanisms import double_pendulum
@@ -118,16 +116,6 @@ def test_a_package_that_is_not_there_is_a_row(monkeypatch, few):
     monkeypatch.setattr(ensembles, "by_heyoka", missing)
     (row,) = ensembles.rows_of(few, (HEYOKA,), True)
     assert row["way"] == HEYOKA and "not installed" in row["message"]
-
-
-@pytest.mark.slow
-def test_rows_have_their_processor(monkeypatch, tmp_path):
-    made = rows(**{ENSEMBLE: 0.01, HEYOKA: 0.05}).to_dict("records")
-    monkeypatch.setattr(ensembles, "rows_of", lambda of, names, quick: made[:-2])
-    monkeypatch.setattr(ensembles, "linkage_rows", lambda quick: made[-2:])
-    call = Call("ensembles", True, tmp_path, False, "")
-    table = ensembles.make(SimpleNamespace(call=call))
-    assert (table["processor"] == processor()).all()
 
 
 def test_linkages_are_put_together_and_run():

@@ -3,10 +3,6 @@
 import json
 import os
 import re
-import subprocess
-import sys
-import textwrap
-import time
 
 import numpy as np
 import pandas as pd
@@ -149,29 +145,6 @@ def test_rows_of_changed_sources_are_not_used(tmp_path, monkeypatch):
     monkeypatch.setattr(store, "sources", lambda: "others")
     with KeptRows(path, {}) as kept:
         assert "a" not in kept
-
-
-@pytest.mark.slow
-def test_rows_survive_a_kill(tmp_path):
-    path = tmp_path / "x.partial.jsonl"
-    code = f"""
-        import time
-        from pathlib import Path
-        from studies.bench.store import KeptRows
-        with KeptRows(Path({str(path)!r}), {{}}) as kept:
-            kept.add("a", {{"x": 1}})
-            time.sleep(60)
-    """
-    process = subprocess.Popen([sys.executable, "-c", textwrap.dedent(code)], cwd=ROOT)
-    try:
-        end = time.monotonic() + 60.0
-        while time.monotonic() < end and not (path.exists() and '"x": 1' in path.read_text()):
-            time.sleep(0.05)
-    finally:
-        process.kill()
-        process.wait()
-    with KeptRows(path, {}) as kept:
-        assert kept["a"]["x"] == 1
 
 
 def test_what_json_does_not_hold_is_refused():

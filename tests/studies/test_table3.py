@@ -169,18 +169,6 @@ def test_both_readings_of_the_stopping_test_are_compared_with_the_printed_row(tm
     assert len(found_of(table3, tmp_path, made)["readings"]) == 1
 
 
-@pytest.mark.usefixtures("unsaved")
-@pytest.mark.slow
-def test_the_exchanged_labels_fit_only_where_they_do(tmp_path):
-    assert not found_of(table3, tmp_path, rows(step=2.0))["exchanged_fits_better"]
-    made = rows()
-    cells_ = made["group"] == "Table 3: IRK"
-    paper = [PAPER_IRK[TOLERANCES.index(o)][TOLERANCES.index(i)] for i, o in made[cells_][["err_in", "err_out"]].values]
-    made.loc[cells_, "n_evaluations"] = 1e5 * np.array(paper)
-    found = found_of(table3, tmp_path, made)
-    assert found["exchanged_fits_better"] and found["fits"]["exchanged"]["span"] <= found["flat"]
-
-
 def test_printed_times_are_the_papers():
     assert PAPER_IRK[3] == (3.37, 3.46, 3.55, 3.60) and PAPER_NEWMARK[3][1:] == (3.09, 13.40, 50.93)
     exchanged = cells(rows(), exchanged=True)

@@ -157,24 +157,6 @@ class Kept(dict):
     add, made = dict.__setitem__, KeptRows.made
 
 
-@pytest.mark.slow
-def test_repetitions_are_interleaved_and_what_is_refused_is_asked_once():
-    todo = [run for run in mechanisms.runs(True) if run.solver.name in ("DOP853 (twoloop)", "CVODE from C, Adams")]
-    pytest.importorskip("sksundae")
-    pytest.importorskip("solve_dae")  # whose adapter has no rows A v + b = 0
-    like = (run for run in todo if run.case.name == "knife edge" and run.solver.name == "CVODE from C, Adams")
-    todo += [replace(run, solver=CATALOGUE["Radau, solve_dae"]) for run in like]
-    kept = Kept()
-    table = mechanisms.collect(todo, kept)
-    refused = table[table["solver"] == "Radau, solve_dae"]
-    assert len(refused) == 1 and refused["status"].iloc[0] == "RAISED"
-    good = table[table["case"] == FOUR_BAR]
-    assert (good["error_q"].astype(float) < 0.1).all() and (good["call_s"] > 0.0).all()
-    n_rows = len(kept)
-    mechanisms.collect(todo, kept)  # goes on from what is kept
-    assert len(kept) == n_rows
-
-
 def everywhere():
     return rows(("auto", 1e-3, 4.0), ("auto, compiled", 1e-3, 1.0), ("Taylor", 1e-3, 9.0), ("heyoka", 1e-3, 2.0))
 
