@@ -93,7 +93,7 @@ def test_starts_that_ask_for_other_code_keep_no_arrays_out(name, taken, by_the_l
     solution = solve_dae(problem.system, (0.0, span), problem.q0, problem.v0, dense_output=True).sol
     states = [solution(t) for t in np.random.default_rng(3).uniform(0.0, span, 60)]
     by_arrays = runs(problem, states, 0.1)
-    *_, kept = problem.system.made["runs"][1].values()
+    *_, kept = problem.system.derived["runs"][1].values()
     assert len({id(each.code) for each in kept}) > 1 and sum(taken) > 30
     by_the_loop()
     for one, long in zip(by_arrays, runs(other, states, 0.1), strict=True):
@@ -359,7 +359,7 @@ def test_what_is_shown_where_an_entry_vanishes_lets_no_start_pass_where_it_does_
 
     known = ConstrainedSystem(n_q=3, n_c=2, constant_mass=True, **callbacks)
     assert not refused(known, 1e-9, 1e-9)
-    assert "sizes" in known.made
+    assert "sizes" in known.derived
     places = [(angle, off) for angle in (1e-9, 1e-3, 0.3, 1.0) for off in (1e-7, 1e-6, 1e-5, 1e-4)]
     assert all(refused(known, *place) for place in places)
 

@@ -1,6 +1,6 @@
 """Two-loop state-space integration of constrained mechanical systems, M q'' + C_q^T lam = Q, C(q, t) = 0.
 
-A name is imported when it is asked for: `twoloop.testing` does without numba and SciPy, and `callback` without solvers.
+A name is imported at its first use: `twoloop.testing` does without numba and SciPy, and `callback` without solvers.
 """
 
 from importlib import import_module

@@ -83,7 +83,7 @@ def problem_of(where: str) -> Problem:
 
 
 def solve(given: argparse.Namespace) -> None:
-    """Solve a problem, say how the run ended, and write what was asked for.
+    """Solve a problem, say how the run ended, and write the requested files.
 
     Raises
     ------
@@ -143,7 +143,7 @@ def write(result: Result, file: Path) -> None:
 
 
 def audit(given: argparse.Namespace) -> None:
-    """Compare MuJoCo's motion of a file with that of rigid loops, and write what was asked for.
+    """Compare MuJoCo's motion of a file with that of rigid loops, and write the requested files.
 
     Raises
     ------
@@ -154,12 +154,12 @@ def audit(given: argparse.Namespace) -> None:
         check_ending(file)
         if not file.parent.is_dir():
             raise ValueError(f"--out: there is no folder {file.parent.resolve()}")
-    made = audit_mjcf(given.file, error=given.error, t_end=given.t_end, key=given.key)
-    print(made)
+    audit = audit_mjcf(given.file, error=given.error, t_end=given.t_end, key=given.key)
+    print(audit)
     for file in given.out:
-        made.write(file)
+        audit.write(file)
         print(f"wrote {file}")
-    if not made.advice:
+    if not audit.advice:
         raise SystemExit(1)
 
 
@@ -191,8 +191,8 @@ def check_rows(files: Sequence[Path]) -> None:
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    made = argparse.ArgumentParser(prog="python -m twoloop", description=__doc__)
-    commands = made.add_subparsers(dest="command", required=True)
+    parser = argparse.ArgumentParser(prog="python -m twoloop", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("info", help="versions, where compiled code is kept, threads")
     commands.add_parser("compile", help="compile all kernels now: the first run then starts at once")
     one = commands.add_parser("solve", help="solve a mechanism and write tables, figures, animations")
@@ -225,7 +225,7 @@ def parser() -> argparse.ArgumentParser:
     board.add_argument("--t-end", type=float, help="s; default: all ends that there are rows of")
     board.add_argument("--with", dest="files", nargs="+", default=[], type=Path, metavar="FILE", help="further rows")
     board.add_argument("--out", type=Path, metavar="FILE", help=f"a picture, by ending: {', '.join(PICTURES)}")
-    return made
+    return parser
 
 
 def main(words: Sequence[str] | None = None) -> None:

@@ -207,16 +207,16 @@ def solve_dae(
         if folder is event_functions is options.own_tolerance is None and in_time and not progress:
             is_plain = times is time_limit is None and not dense_output
             output = STEPS if is_plain else Output(times, at_ends, bool(dense_output), time_limit)
-            made = cached_result(system, t0, t1, q0, v0, options, output, interrupts)
-            if isinstance(made, tuple) and (not interrupts.asked or made[0]["status"] == Status.INTERRUPTED):
-                fields, rows_warning = made
+            outcome = cached_result(system, t0, t1, q0, v0, options, output, interrupts)
+            if isinstance(outcome, tuple) and (not interrupts.asked or outcome[0]["status"] == Status.INTERRUPTED):
+                fields, rows_warning = outcome
                 if rows_warning:
                     warnings.warn(rows_warning, ConstraintWarning, stacklevel=2)
                 return record_of(Result, fields)
-            if isinstance(made, Missed):
-                every, spent, repeats = made.every, made.cpu_time, MOST - 1
-            elif isinstance(made, Run):
-                run = made
+            if isinstance(outcome, Missed):
+                every, spent, repeats = outcome.every, outcome.cpu_time, MOST - 1
+            elif isinstance(outcome, Run):
+                run = outcome
         interrupts.listen()
         q0, v0 = check_vector("q0", q0, system.n_q), check_vector("v0", v0, system.n_q)
         deadline = None if time_limit is None else time.monotonic() + time_limit

@@ -1,6 +1,6 @@
 """Build mechanisms from bodies, joints and forces; a model becomes a `Problem` with its equations of motion.
 
-A name is imported when it is asked for: what ready mechanisms need of this package imports next to nothing.
+A name is imported at its first use: what ready mechanisms need of this package imports next to nothing.
 """
 
 from importlib import import_module

@@ -74,10 +74,10 @@ def surely_consistent(
 
 def _surely_small(rows: Array, values: Array, scales: Scales, per_row: Array) -> bool:
     """Return whether the correction for some values, and its residual, are far below the limits."""
-    found = least_solution(scales.scaled(rows), values / scales.rows)
-    if found is None:
+    solution = least_solution(scales.scaled(rows), values / scales.rows)
+    if solution is None:
         return False
-    x, left = found
+    x, left = solution
     allowed = SURELY * CONSISTENT * scales.by_coordinate(per_row, rows)
     small = np.abs(scales.columns * x) <= allowed
     return bool(small.all() and (np.abs(left) <= SURELY * CONSISTENT * per_row).all())
@@ -103,8 +103,8 @@ def _noise(q: Array, change: Callable[[Array], Array], rows: Array, largest: flo
     noise = np.zeros(len(rows))
     for k in range(NEIGHBOURS):
         noise = np.maximum(noise, np.abs(change(q * (1.0 + EPS * np.roll(signs(len(q)), k)))))
-    most = MOST_NOISE * largest * np.abs(rows).max(axis=1, initial=0.0)
-    return np.where(np.isfinite(noise), np.minimum(noise, most), 0.0)
+    limit = MOST_NOISE * largest * np.abs(rows).max(axis=1, initial=0.0)
+    return np.where(np.isfinite(noise), np.minimum(noise, limit), 0.0)
 
 
 def _without_constraints(system: ConstrainedSystem, t: float, q: Array, v: Array, columns: Array) -> Array:
@@ -119,8 +119,8 @@ def _without_constraints(system: ConstrainedSystem, t: float, q: Array, v: Array
             inertia = np.maximum(inertia, np.abs(np.diag(each)))
     units = np.divide(1.0, np.sqrt(inertia), out=np.zeros(len(q)), where=inertia > 0.0)
     force = system.force(t, q, v)
-    found: Array = units * np.linalg.lstsq(units[:, None] * mass * units, units * force, rcond=NO_INERTIA)[0]
-    return found
+    accelerations: Array = units * np.linalg.lstsq(units[:, None] * mass * units, units * force, rcond=NO_INERTIA)[0]
+    return accelerations
 
 
 class Violation:
@@ -327,20 +327,20 @@ class Look:
         looked, *arrays = self.arrays.values()
         looked.fill(0.0)
         try:
-            found: int = self._look(self.system.kit, t, q, v, self.sizes(), *arrays)
+            bits: int = self._look(self.system.kit, t, q, v, self.sizes(), *arrays)
         except Exception:  # a callback raised: it is called on its own afterwards, which gives the message
             return 0
-        self.definite = bool(found & definite) if found & (definite | indefinite) else None
-        return found
+        self.definite = bool(bits & definite) if bits & (definite | indefinite) else None
+        return bits
 
     def sizes(self) -> Array:
         """Return sizes of coordinates at earlier starts (see `Scales.keep`): lower limits for rounding errors."""
-        sizes: Array = self.system.made.get("sizes", NONE)
+        sizes: Array = self.system.derived.get("sizes", NONE)
         return sizes
 
-    def is_surely(self, found: int, t: float, q: Array, v: Array) -> bool:
+    def is_surely(self, bits: int, t: float, q: Array, v: Array) -> bool:
         """Return whether `Violation` would certainly accept the last state, whose evaluation returned `found`."""
-        if found & self.flags.CONSISTENT:
+        if bits & self.flags.CONSISTENT:
             return True
         n, n_c, n_rows = self.system.n_q, self.system.n_c, len(self.rows)
         force, C, rates = np.split(self._room[: n + n_c + n_rows], (n, n + n_c))
@@ -352,15 +352,15 @@ def _in_order(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
     if system.called_in_python or system.entries:
         return False
     look = Look(system)
-    found = look.at(t, np.ascontiguousarray(q, dtype=np.float64), np.ascontiguousarray(v, dtype=np.float64))
-    if not found & look.flags.IN_ORDER:
+    bits = look.at(t, np.ascontiguousarray(q, dtype=np.float64), np.ascontiguousarray(v, dtype=np.float64))
+    if not bits & look.flags.IN_ORDER:
         return False
     place = (t, q.tobytes())
     system.remember_at("pattern", place, look.pattern)
     system.remember_at("mass and rows", place, (look.mass, look.rows))
     if look.definite is not None:
         system.remember_at("definite mass", place_of_mass(system, t, q), look.definite)
-    return look.is_surely(found, t, q, v)
+    return look.is_surely(bits, t, q, v)
 
 
 @cache

@@ -100,8 +100,8 @@ def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
     spacing = _spacing(t, q, generic)
     suspicious = False
     if n_c > 0:
-        found = _along_a_run(lambda s: system.constraint(t + s, q + s * generic), scale, noise, given, spacing)
-        suspicious = found.disagrees(given, EPS * (abs(jacobian) @ np.abs(generic))[:n_c]).max() > 1.0
+        estimate = _along_a_run(lambda s: system.constraint(t + s, q + s * generic), scale, noise, given, spacing)
+        suspicious = estimate.disagrees(given, EPS * (abs(jacobian) @ np.abs(generic))[:n_c]).max() > 1.0
     for kind, rows in _gammas(system):
         if suspicious:
             break
@@ -109,14 +109,16 @@ def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
         if right is None:
             return None
         noise = EPS * (abs(jacobian) @ np.abs(generic) + np.abs(rate))[rows]
-        found = _along_a_run(_slowing(system, t, q, generic, rows), scale, noise, right, spacing)
-        suspicious = found.disagrees(right, 0.0 * right).max() > 1.0
+        estimate = _along_a_run(_slowing(system, t, q, generic, rows), scale, noise, right, spacing)
+        suspicious = estimate.disagrees(right, 0.0 * right).max() > 1.0
     return _wrong_constraint(system, t, q, ANYWHERE, generic) if suspicious else None
 
 
 def _along_a_run(function: Function, scale: float, noise: Array, given: Array, spacing: float) -> Estimate:
     largest = np.abs(given)
-    return differentiate(function, 0.0, scale, noise, given, largest, spacing=spacing, sides=ANYWHERE, most=ALONG_A_RUN)
+    return differentiate(
+        function, 0.0, scale, noise, given, largest, spacing=spacing, sides=ANYWHERE, max_widths=ALONG_A_RUN
+    )
 
 
 @dataclass(frozen=True)

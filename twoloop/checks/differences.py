@@ -128,7 +128,7 @@ def differentiate(
     *,
     spacing: float = 0.0,
     sides: tuple[int, ...] = (0,),
-    most: int = SMALLER + LARGER + 1,
+    max_widths: int = SMALLER + LARGER + 1,
 ) -> Estimate:
     """Differentiate at a place until each entry is known well enough to judge the given one.
 
@@ -147,7 +147,7 @@ def differentiate(
     sides : tuple of int
         0: around the place; 1: after it; -1: before it. The next side is tried if the function is undefined on this
         one.
-    most : int
+    max_widths : int
         Largest number of half-widths to try.
 
     Returns
@@ -161,20 +161,21 @@ def differentiate(
         flat_error, flat_width, moved = np.full(m, np.inf), np.full(m, np.inf), np.zeros(m, dtype=bool)
         tried = 0
         for number, h in enumerate(_widths(scale, max(spacing, float(np.spacing(abs(place)))))):
-            if number >= most:
+            if number >= max_widths:
                 break
-            found = _window(function, place, h, side, noise)
-            if found is None:
+            estimate = _window(function, place, h, side, noise)
+            if estimate is None:
                 continue
             # on a narrow interval, terms of a function may be constant by rounding while the rest looks smooth
             with np.errstate(invalid="ignore"):
-                agrees = ~(np.abs(found.slope - slope) > SAFETY * (found.error + error))
-            better = ~found.flat & (found.error < error) & agrees & ~(found.nothing & (h > RATIO * FIRST * scale))
-            slope[better], error[better], width[better] = found.slope[better], found.error[better], h
-            better = found.flat & (FROZEN * found.error < flat_error)
-            flat_error[better], flat_width[better] = FROZEN * found.error[better], h
+                agrees = ~(np.abs(estimate.slope - slope) > SAFETY * (estimate.error + error))
+            too_wide = estimate.nothing & (h > RATIO * FIRST * scale)
+            better = ~estimate.flat & (estimate.error < error) & agrees & ~too_wide
+            slope[better], error[better], width[better] = estimate.slope[better], estimate.error[better], h
+            better = estimate.flat & (FROZEN * estimate.error < flat_error)
+            flat_error[better], flat_width[better] = FROZEN * estimate.error[better], h
             # if a wider interval changes an entry, a narrower one without change showed only rounding, or a dead zone
-            moved |= ~found.flat
+            moved |= ~estimate.flat
             best = Estimate(
                 np.where(moved, slope, 0.0),
                 np.where(moved, error, flat_error),
@@ -207,25 +208,25 @@ def confirms(
     """
     width = float(best.width[entry])
     for part in BESIDE:
-        found = _window(function, place, part * width, best.side, noise)
-        if found is not None and np.isfinite(found.error[entry]):
+        estimate = _window(function, place, part * width, best.side, noise)
+        if estimate is not None and np.isfinite(estimate.error[entry]):
             break
     else:
         return False
-    apart = abs(given - float(found.slope[entry]))
-    if apart <= 0.6 * SAFETY * found.error[entry] or abs(found.slope[entry] - best.slope[entry]) >= 0.5 * apart:
+    apart = abs(given - float(estimate.slope[entry]))
+    if apart <= 0.6 * SAFETY * estimate.error[entry] or abs(estimate.slope[entry] - best.slope[entry]) >= 0.5 * apart:
         return False
     least = LEAST_SPACINGS * max(spacing, float(np.spacing(abs(place))))
     for k in (*range(-WIDER, 0), *range(1, CLOSER)):
         if width / FINER**k < least:
             break
-        found = _window(function, place, width / FINER**k, best.side, noise)
-        if found is None or found.flat[entry]:
+        estimate = _window(function, place, width / FINER**k, best.side, noise)
+        if estimate is None or estimate.flat[entry]:
             continue
-        if abs(found.slope[entry] - best.slope[entry]) > SAFETY * (found.error[entry] + best.error[entry]):
+        if abs(estimate.slope[entry] - best.slope[entry]) > SAFETY * (estimate.error[entry] + best.error[entry]):
             return False
         # not caused by the ends of the interval: a ripple may hide a steep slope
-        if k > RIPPLES and found.ripple[entry] > 0.0:
+        if k > RIPPLES and estimate.ripple[entry] > 0.0:
             return False
     return True
 

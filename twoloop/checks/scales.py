@@ -62,10 +62,10 @@ class Scales:
 
         n, size = len(q), np.abs(jacobian)
         entries = (size > NO_ENTRY * size.max(axis=1, initial=0.0)[:, None]).ravel()
-        known = system.made.get("sizes", NONE).reshape(-1, 2 * n + entries.size)
+        known = system.derived.get("sizes", NONE).reshape(-1, 2 * n + entries.size)
         away = (np.abs(known[:, n : 2 * n] - q) > NEAR_SHARE * known[:, :n]).any(axis=1)
         others = known[away | (known[:, 2 * n :] != entries).any(axis=1)][: MOST_PLACES - 1]
-        system.made["sizes"] = np.concatenate([self.by_coordinate(self.reach, jacobian), q, entries, others.ravel()])
+        system.derived["sizes"] = np.concatenate([self.by_coordinate(self.reach, jacobian), q, entries, others.ravel()])
 
 
 def sizes(q: Array) -> Array:
@@ -158,9 +158,9 @@ def units(system: ConstrainedSystem, t: float, q: Array, jacobian: Rows, typical
     """
     columns, ways = column_scales(jacobian, typical), np.outer([1.0, -1.0], generic_factors(len(q)))
     for _ in range(ROUNDS):  # a fixed number, so that rounding does not decide it
-        found = column_scales(_largest(system, t, q + columns * ways, jacobian), typical)
+        estimated = column_scales(_largest(system, t, q + columns * ways, jacobian), typical)
         # an entry that grows with its coordinate has half the unit at twice the displacement
-        columns = np.cbrt(columns * found * found)
+        columns = np.cbrt(columns * estimated * estimated)
     return columns
 
 

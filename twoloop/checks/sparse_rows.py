@@ -60,32 +60,32 @@ class SparseRows:
 
     def part(self, rows: tuple[int, ...], columns: tuple[int, ...]) -> Array:
         """Return some rows and columns as a full matrix."""
-        made = np.zeros((len(rows), len(columns)))
+        matrix = np.zeros((len(rows), len(columns)))
         for k, row in enumerate(rows):
             first, last = np.searchsorted(self.rows, [row, row + 1])  # entries are sorted by rows
             for column, value in zip(self.columns[first:last].tolist(), self.values[first:last], strict=True):
                 if column in columns:
-                    made[k, columns.index(column)] = value
-        return made
+                    matrix[k, columns.index(column)] = value
+        return matrix
 
     def row(self, i: int) -> Array:
         """Return one row as a full vector."""
-        made = np.zeros(self.shape[1])
+        row = np.zeros(self.shape[1])
         first, last = np.searchsorted(self.rows, [i, i + 1])
-        made[self.columns[first:last]] = self.values[first:last]
-        return made
+        row[self.columns[first:last]] = self.values[first:last]
+        return row
 
     def matrix(self) -> Array:
         """Return the full matrix."""
-        made = np.zeros(self.shape)
-        made[self.rows, self.columns] = self.values
-        return made
+        matrix = np.zeros(self.shape)
+        matrix[self.rows, self.columns] = self.values
+        return matrix
 
     def largest(self) -> Array:
         """Return the largest magnitude in each row, (m,)."""
-        found = np.zeros(self.shape[0])
-        np.maximum.at(found, self.rows, np.abs(self.values))
-        return found
+        largest = np.zeros(self.shape[0])
+        np.maximum.at(largest, self.rows, np.abs(self.values))
+        return largest
 
 
 Rows = Array | SparseRows

@@ -42,8 +42,8 @@ def orthogonalised(rows: Array, least: float) -> tuple[Array, Array, list[int]]:
     """
     from twoloop.kernels.linalg.rank import independent_rows
 
-    most, kept = min(rows.shape), np.zeros(len(rows), dtype=np.int64)
-    basis, factors = np.zeros((most + 1, rows.shape[1])), np.zeros((most + 1, most + 1))
+    max_rank, kept = min(rows.shape), np.zeros(len(rows), dtype=np.int64)
+    basis, factors = np.zeros((max_rank + 1, rows.shape[1])), np.zeros((max_rank + 1, max_rank + 1))
     n = entry_point(independent_rows)(np.ascontiguousarray(rows), least, basis, factors, kept)
     return basis[:n], factors[:n, :n], kept[:n].tolist()
 
@@ -56,8 +56,8 @@ def least_solution(rows: Array, values: Array) -> tuple[Array, Array] | None:
     from twoloop.kernels.linalg import rank as independent
 
     n_rows, n_q = rows.shape
-    most, kept, x, left = min(n_rows, n_q) + 1, np.zeros(n_rows, dtype=np.int64), np.zeros(n_q), values.copy()
-    basis, factors, shares = np.zeros((most, n_q)), np.zeros((most, most)), np.zeros((n_rows, most))
+    max_rank, kept, x, left = min(n_rows, n_q) + 1, np.zeros(n_rows, dtype=np.int64), np.zeros(n_q), values.copy()
+    basis, factors, shares = np.zeros((max_rank, n_q)), np.zeros((max_rank, max_rank)), np.zeros((n_rows, max_rank))
     gram, parts = np.zeros((n_rows, n_rows)), np.zeros((2, n_rows))
     room = basis, factors, kept, shares, gram, parts
     n = entry_point(independent.least_solution)(np.ascontiguousarray(rows), left, NO_DIRECTION, *room, x)
@@ -96,10 +96,10 @@ def in_words(jacobian: Array, redundant: list[int]) -> str:
 
     (n_rows, n_q), shown = jacobian.shape, redundant[:SHOWN]
     others = [i for i in range(n_rows) if i not in redundant]
-    most, rest = min(len(others), n_q) + 1, np.empty((len(others), n_q))
+    max_rank, rest = min(len(others), n_q) + 1, np.empty((len(others), n_q))
     lengths, shares = np.zeros(n_rows), np.zeros((len(shown), len(others)))
     order, kept = np.array([*others, *shown]), np.zeros(n_rows, dtype=np.int64)
-    room = np.zeros((most, n_q)), np.zeros((most, most)), kept
+    room = np.zeros((max_rank, n_q)), np.zeros((max_rank, max_rank)), kept
     if not entry_point(shares_of_others)(
         np.ascontiguousarray(jacobian), order, RANK_TOLERANCE, rest, *room, shares, lengths
     ):
@@ -294,9 +294,9 @@ def changed_mass(system: ConstrainedSystem, t0: float, q0: Array, t: float, q: A
 def _mass_at(system: ConstrainedSystem, t: float, q: Array) -> Array:
     """Return M, or the values of its entries if the system gives these."""
     kind = "mass_values" if "mass" in system.entries else "mass"
-    (made,) = system.arrays_of(kind)
-    getattr(system.functions, kind)(t, np.ascontiguousarray(q), system.functions.p, made)
-    return made
+    (values,) = system.arrays_of(kind)
+    getattr(system.functions, kind)(t, np.ascontiguousarray(q), system.functions.p, values)
+    return values
 
 
 def check_bandwidth(system: ConstrainedSystem, bandwidth: int, t: float, q: Array) -> None:

@@ -146,7 +146,7 @@ class Chooser:
     def choice(self, mass: Array, G: Array) -> Choice:
         """Return the choice for an M and a G; raise like `Choice.at`."""
         system, room, chosen = self.system, self._room, self._chosen
-        constant = system.constant_mass and system.made.get("no weak mass", False)
+        constant = system.constant_mass and system.derived.get("no weak mass", False)
         room[0] = 0.0
         place = self._choose(mass, G, RANK, 0.0 if constant else SINGULAR_MASS, BOUNDS, room, chosen)
         decided = place, chosen.tobytes(), float(room[0])
@@ -184,6 +184,6 @@ class Chooser:
             stays = "stays singular with constraints added" if place == STAYS_SINGULAR else "is too nearly singular"
             raise Untraceable(f"the mass of {system.name!r} {stays}")
         if n_added == 0:
-            system.made["no weak mass"] = True
+            system.derived["no weak mass"] = True
         added = tuple(places[n_rows : n_rows + n_added])
         return Choice(tuple(places[:n_kept]), added, float(self._room[0]), float(LEAST[place]))

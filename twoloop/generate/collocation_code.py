@@ -95,8 +95,8 @@ class CollocationCode:
         else:  # the digest of `own` covers the others
             outputs = self.equations.accelerations[:1]
         numbers = self.numbers
-        told = [[each.sizes, *numbers.structure(each)] for each in outputs]
-        self.structure = hashlib.sha256(repr([own.digest, told]).encode()).hexdigest()
+        description = [[each.sizes, *numbers.structure(each)] for each in outputs]
+        self.structure = hashlib.sha256(repr([own.digest, description]).encode()).hexdigest()
 
     def _iterated(self) -> list[int]:
         graph, forms = self.equations.graph, []

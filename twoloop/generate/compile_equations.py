@@ -400,7 +400,7 @@ class SharedCode:
         structure = repr(list(self._described()))
         self.digest = hashlib.sha256((structure + _stamp()).encode()).hexdigest()
         # LLVM's optimization passes do not make equations faster, and take up to a quarter of a build
-        self.functions = generated_functions("equations", _stamp(), self.digest, self._write, passes=False)
+        self.functions = generated_functions("equations", _stamp(), self.digest, self._module_text, passes=False)
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "GeneratedCode":
         """Return the code with the coefficients of one of the systems."""
@@ -424,7 +424,7 @@ class SharedCode:
         if parts is not None:
             yield from parts.described()
 
-    def _write(self) -> tuple[list[str], str]:
+    def _module_text(self) -> tuple[list[str], str]:
         from twoloop.kernels.data.common import KIT
 
         equations = self.equations

@@ -86,7 +86,7 @@ class LaneSteps:
         """Return UNIT, the unit of time of the series: chosen anew for new runs and after accepted steps."""
         select, unit = emit.builder.select, emit.load(work, lanes.UNIT)
         fresh, accepted = (is_set(emit, work, field) for field in (lanes.FRESH, lanes.ACCEPTED))
-        span = emit.subtract(common(emit, control, lanes.T1), common(emit, control, lanes.T0))
+        span = emit.subtract(broadcast_entry(emit, control, lanes.T1), broadcast_entry(emit, control, lanes.T0))
         following = emit.smaller(
             emit.multiply(emit.load(work, lanes.LENGTH), unit),
             emit.multiply(emit.constant(GROWTH), emit.load(work, lanes.H)),
@@ -123,7 +123,7 @@ class LaneSteps:
         ]
         length = emit.exponential(emit.negative(emit.larger(*logarithms)))
         emit.store(length, work, lanes.LENGTH)
-        t, t1 = emit.load(work, lanes.T), common(emit, control, lanes.T1)
+        t, t1 = emit.load(work, lanes.T), broadcast_entry(emit, control, lanes.T1)
         left, zero = emit.subtract(t1, t), emit.constant(0.0)
         h = emit.smallest_of(emit.multiply(length, unit), emit.load(work, lanes.LONGEST))
         h = builder.select(builder.compare("fcmp oge", h, left), left, h)
@@ -269,7 +269,8 @@ class LaneSteps:
 
     def tolerances(self, emit: LaneEmitter, control: Value) -> tuple[Value, list[Value]]:
         """Return rtol, and atol of each coordinate."""
-        return common(emit, control, lanes.RTOL), [common(emit, control, lanes.ATOL + j) for j in range(self.n)]
+        atol = [broadcast_entry(emit, control, lanes.ATOL + j) for j in range(self.n)]
+        return broadcast_entry(emit, control, lanes.RTOL), atol
 
     def places(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> Places:
         """Return the pointers to all parts of `work`; sets where coefficients and constants are read, too."""
@@ -287,7 +288,7 @@ def _threes(values: list[Value]) -> Iterator[tuple[Value, Value, Value]]:
     return zip(values[::3], values[1::3], values[2::3], strict=True)
 
 
-def common(emit: LaneEmitter, control: Value, place: int) -> Value:
+def broadcast_entry(emit: LaneEmitter, control: Value, place: int) -> Value:
     """Return one entry of the array `control`, broadcast to all lanes."""
     return emit.splat(emit.builder.load(emit.builder.gep(control, integer(place))))
 
@@ -384,7 +385,7 @@ class LaneStages:
                 own = _Coordinate(self, emit, at, j, i)
                 own.move(A[i], A[i] @ A, x)
             emit.builder.run("accelerate", arguments)
-        rtol, zero = common(emit, control, lanes.RTOL), emit.constant(0.0)
+        rtol, zero = broadcast_entry(emit, control, lanes.RTOL), emit.constant(0.0)
         with emit.loop(integer(0), integer(self.n), [zero, zero, zero]) as (j, (e, d, total), new):
             own = _Coordinate(self, emit, at, j, len(b))
             moved = own.move(b, b @ A, x)
@@ -517,18 +518,18 @@ class LaneCode(LaneSteps):
 
     def _structure(self) -> str:
         equations, numbers = self.equations, self.numbers
-        told: list[Any] = [] if self.explicit is None else [*self.explicit.structure]
+        description: list[Any] = [] if self.explicit is None else [*self.explicit.structure]
         parts = [*equations.accelerations, equations.closer, equations.nearest, equations.redundant]
         if self.recurrences is not None:
-            told += list(self.recurrences.structure)
+            description += list(self.recurrences.structure)
             parts.append(self.solution.kept)
         else:
             parts.append(self._rows_at)  # its coefficients must be numbered even if the code comes from the disk
         for outputs in parts:
-            told += [outputs.sizes, *numbers.structure(outputs)]
+            description += [outputs.sizes, *numbers.structure(outputs)]
         if self.recurrences is not None:
-            told += list(numbers.structure(self.solution.solved))
-        return hashlib.sha256(repr(told).encode()).hexdigest()
+            description += list(numbers.structure(self.solution.solved))
+        return hashlib.sha256(repr(description).encode()).hexdigest()
 
     # the generated functions
 
@@ -561,7 +562,7 @@ class LaneCode(LaneSteps):
         section modulo 1; it moves the places as far as GAP allows, so that they differ from step to step.
         """
         builder, at = emit.builder, self.places(emit, order, control, work)
-        h, gap = emit.load(work, lanes.H), common(emit, control, lanes.GAP)
+        h, gap = emit.load(work, lanes.H), broadcast_entry(emit, control, lanes.GAP)
         zero, one, two = (emit.constant(x) for x in (0.0, 1.0, 2.0))
         parts = emit.function("ceil", emit.divide(h, gap))
         parts = emit.larger(emit.smaller(parts, emit.constant(MOST_PARTS)), one)
@@ -582,7 +583,7 @@ class LaneCode(LaneSteps):
             defect = builder.select(holds, self.defect_of(emit, control, at, a), emit.constant(math.inf))
             new.append(emit.largest_of(builder.select(looks, defect, zero), worst))
         emit.store(new[0], work, lanes.WORST)
-        t, t1 = emit.load(work, lanes.T), common(emit, control, lanes.T1)
+        t, t1 = emit.load(work, lanes.T), broadcast_entry(emit, control, lanes.T1)
         last = builder.compare("fcmp oeq", h, emit.subtract(t1, t))
         emit.store(builder.select(last, t1, emit.add(t, h)), work, lanes.AHEAD)
 
@@ -617,15 +618,15 @@ class LaneCode(LaneSteps):
         select, work = emit.builder.select, at.work
         inputs = self._new(emit, work, at)
         written, arrays = lower(emit, outputs, inputs, self.numbers)
-        made = dict(zip(outputs.arrays, arrays, strict=True))
+        values = dict(zip(outputs.arrays, arrays, strict=True))
         act = emit.builder.both(is_set(emit, work, which), written.holds(outputs, arrays[0]))
         largest = emit.constant(0.0)
-        for value in made["moved"]:
+        for value in values["moved"]:
             largest = emit.larger(emit.function("fabs", value), largest)
-        for k, value in enumerate([*made["q"], *made.get("v", [])]):
+        for k, value in enumerate([*values["q"], *values.get("v", [])]):
             emit.store(select(act, value, inputs[1 + k]), at.new, k)
         for base, name in ((at.a, "a"), (at.lam, "lam")):
-            for k, value in enumerate(made.get(name, [])):
+            for k, value in enumerate(values.get(name, [])):
                 emit.store(select(act, value, emit.load(base, k)), base, k)
         return act, largest
 
@@ -706,8 +707,8 @@ class LaneConstraints(LaneSteps):
         entries = [G[i, j] for i, row in enumerate(columns) for j in row]
         values = {kind: list(equations.of(kind)) for kind in ("constraint", "constraint_rate")}
         self._rows = Program(self._graph, {**values, "entries": entries})
-        told = self.n, self.pattern.tolist(), *self.numbers.structure(self._rows)
-        self.structure = hashlib.sha256(repr(told).encode()).hexdigest()
+        description = self.n, self.pattern.tolist(), *self.numbers.structure(self._rows)
+        self.structure = hashlib.sha256(repr(description).encode()).hexdigest()
         self.n_numbers, self.n_quantities = self.numbers.n_varying, len(self._rows.quantities())
 
     def rows(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
@@ -746,9 +747,9 @@ class GeneratedLanes(Generic[Code]):
     @cached_property
     def functions(self) -> GeneratedFunctions:
         """Return the functions, compiled at their first use."""
-        return generated_functions(KIND, _stamp(), self.code.structure, self._write)
+        return generated_functions(KIND, _stamp(), self.code.structure, self._module_text)
 
-    def _write(self) -> tuple[list[str], str]:
+    def _module_text(self) -> tuple[list[str], str]:
         module = Module()
         for name in self.code.tasks:
             llvm_code.write(module, name, CODE.llvm_type(name), getattr(self.code, name), LaneEmitter)

@@ -93,13 +93,13 @@ class LaneSeries:
 
     def _operations(self, table: Table, quantity: int) -> list[Operation]:
         firsts, seconds = (self._forms(each, range(len(each.column))) for each in (table.first, table.second))
-        made = []
+        operations = []
         for kind, begin, end in table.groups[:, :3].tolist():
             half = (end - begin) // 2 if kind == SINE else end - begin
             for k in range(begin, begin + half):
                 results = (quantity + k, quantity + k + half) if kind == SINE else (quantity + k,)
-                made.append(Operation(kind, results, firsts[k], seconds[k]))
-        return made
+                operations.append(Operation(kind, results, firsts[k], seconds[k]))
+        return operations
 
     def _slot(self, *key: Any) -> int:
         """Return the index of a factor in a row: of a form, or of ("scaled", form), a form times its order."""
@@ -246,8 +246,8 @@ class LaneSeries:
         """
         builder = emit.builder
         wanted = [(pair, True) for pair in self.sums_ahead]
-        found = {pair for each in (*self.early, *self.late) for pair in self._factors(each)}
-        wanted += [(pair, False) for pair in found - set(self.sums_ahead)]
+        pairs = {pair for each in (*self.early, *self.late) for pair in self._factors(each)}
+        wanted += [(pair, False) for pair in pairs - set(self.sums_ahead)]
         wanted.sort(key=lambda each: each[0][::-1] if each[1] else each[0])  # neighbours in this order share a row
         sums: dict[tuple[tuple[int, int], bool], Value] = {}
         following = builder.add(k, integer(1))

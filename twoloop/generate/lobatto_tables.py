@@ -60,14 +60,14 @@ def tables() -> Tables:
         np.array([[sign ** (n + k) * comb(n, k) * comb(n + k, k) for n in range(N)] for k in range(1, N)]).T
         for sign in (-1, 1)
     ]
-    made = (
+    exact = (
         *((each + 1) / 2 for each in (x[1:], between)),
         *_integrals(coefficients, x[1:])[1:],
         *_integrals(coefficients, between),
         coefficients[1:].T,
         *(coefficients.T @ each.astype(np.longdouble) for each in powers),
     )
-    return Tables(*(each.astype(np.float64) for each in made))
+    return Tables(*(each.astype(np.float64) for each in exact))
 
 
 def _nodes() -> Extended:

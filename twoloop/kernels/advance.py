@@ -233,17 +233,17 @@ def advance(
             if min(out_t.size - first, out_steps.shape[0] - filled[1]) < LANES and first + filled[1] > 0:
                 return at.PAUSED
             rows = out_t[first:], out_state[first:], out_steps[filled[1] :]
-            made = f.attempt_many(f, w, options, memory, tolerances, control, clock, goal, state, new_state, *rows)
-            if made > 0:
+            n_taken = f.attempt_many(f, w, options, memory, tolerances, control, clock, goal, state, new_state, *rows)
+            if n_taken > 0:
                 lands = clock[at.T] == target
                 if control[at.STORE_ALL] == 1.0:
-                    filled[0] += made
+                    filled[0] += n_taken
                 elif lands:
                     out_t[first] = target
                     copy(state, out_state[first])
                     filled[0] += 1
-                filled[1] += made
-                attempts += made
+                filled[1] += n_taken
+                attempts += n_taken
                 if lands and _was_last(f, w, clock, outputs, state):
                     return at.ALL_OUTPUT_DONE
                 end = check_partition(f, w, control, clock, out_steps[filled[1] - 1, at.H], lands, state)

@@ -249,12 +249,12 @@ def _start_run(f, given, w, b, t, t1, q, v, sizes, sure):
     n = q.size
     if not (finite_vector(q) and finite_vector(v)):
         return REFUSED
-    found = _check_start(given, b, t, q, v, sizes, b.ways[: 0 if b.constants[IN_ALL_PLACES] > 0.0 else len(b.ways)])
+    flags = _check_start(given, b, t, q, v, sizes, b.ways[: 0 if b.constants[IN_ALL_PLACES] > 0.0 else len(b.ways)])
     if b.constants[IN_ALL_PLACES] > 0.0 and not _has_all_entries(b):
-        found = _check_start(given, b, t, q, v, sizes, b.ways)
-    if found & IN_ORDER == 0 or found & (DEFINITE | INDEFINITE) != int(b.constants[OF_MASS]):
+        flags = _check_start(given, b, t, q, v, sizes, b.ways)
+    if flags & IN_ORDER == 0 or flags & (DEFINITE | INDEFINITE) != int(b.constants[OF_MASS]):
         return REFUSED
-    if found & CONSISTENT == 0 and not sure:
+    if flags & CONSISTENT == 0 and not sure:
         return IN_DOUBT
     if b.expected.size > 0 and not _makes_same_choices(b):
         return REFUSED

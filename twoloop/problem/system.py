@@ -224,7 +224,7 @@ class ConstrainedSystem:
         }
         self.within_bounds: set[str] = set()  # kinds that check_callback has checked
         self.checked = False  # whether check_derivatives has passed
-        self.made: dict[Any, Any] = {}  # cache of what follows from the equations, see `remembered`
+        self.derived: dict[Any, Any] = {}  # cache of quantities that follow from the equations, see `remembered`
         self.shared: dict[Any, Any] = {}  # cache shared with systems of other parameters: checked options, and runs
 
     @property
@@ -297,7 +297,7 @@ class ConstrainedSystem:
         if self.called_in_python:
             p = np.append(self.functions.p[:1], p)  # the handle of Python functions
         system.functions = self.functions._replace(p=p, flags=self.functions.flags.copy())
-        system.within_bounds, system.checked, system.made = set(), False, {}
+        system.within_bounds, system.checked, system.derived = set(), False, {}
         system.description = self.description.with_parameters(p)
         system.joints = tuple(joint for joint in self.joints if joint.point is None and joint.equations is None)
         return system
@@ -415,23 +415,23 @@ class ConstrainedSystem:
         """Return `make()` and cache it for these parameters; not cached for Python functions, which may change."""
         if self._python is not None:
             return make()
-        if key not in self.made:
-            self.made[key] = make()
-        return self.made[key]
+        if key not in self.derived:
+            self.derived[key] = make()
+        return self.derived[key]
 
     def remembered_at(self, key: Any, state: Any, make: Callable[[], Any]) -> Any:
-        """Return `make()` and cache it until it is asked for at another state."""
+        """Return `make()` and cache it for this state."""
         if self._python is not None:
             return make()
-        cached = self.made.get(key)
+        cached = self.derived.get(key)
         if cached is None or cached[0] != state:
-            cached = self.made[key] = state, make()
+            cached = self.derived[key] = state, make()
         return cached[1]
 
     def remember_at(self, key: Any, state: Any, value: Any) -> None:
         """Put a value into the cache of `remembered_at`."""
         if self._python is None:
-            self.made[key] = state, value
+            self.derived[key] = state, value
 
     def arrays_of(self, kind: str) -> list[Array]:
         """Return zeros for a kind of callback to fill."""

@@ -379,7 +379,7 @@ def arrays_of(
     dependents = Dependents(system, () if choice is None else choice.rows)
     search = dependents.arguments if dependents.find else (nothing, nothing, 0, np.zeros(0), nothing, nothing)
     places = np.flatnonzero(memory.view(np.int64))  # bits, because clearing would not restore -0.0
-    weak = 0.0 if system.constant_mass and system.made.get("no weak mass", False) else SINGULAR_MASS
+    weak = 0.0 if system.constant_mass and system.derived.get("no weak mass", False) else SINGULAR_MASS
     of_start: tuple[float, ...]
     of_start = max(run.rtol, GAMMA_ACCURACY), run.reuse, 0.0 if run.plan.watchful else 1.0
     of_start += np.array_equal(search[0] != 0, run.work.pattern.ravel() != 0.0), RANK, weak, scale, CONTRADICTS
@@ -457,7 +457,7 @@ def cached_result(
     Return the fields of the result and a warning of its rows; a `Missed` if the run must be repeated; a `Run` at its
     start if it cannot be cached; None if `set_up` has to check the start.
     """
-    alike = system.made.get("runs", NO_RUNS)[1].get(options.key, ())
+    alike = system.derived.get("runs", NO_RUNS)[1].get(options.key, ())
     if not alike and (others := system.shared.get("runs")):
         entry = others.get((options.key, _trace_cache(system)))
         alike = (entry,) if isinstance(entry, CacheEntry) else ()
@@ -478,12 +478,12 @@ def cached_result(
             interrupts.listen()
             run = entry.run.again() if run is None else run
             integrator = CachedIntegrator(run, system, entry.code, entry.definite, options, entry.shared)
-        made = integrator.integrate(system, t0, t1, q0, v0, output, interrupts)
+        outcome = integrator.integrate(system, t0, t1, q0, v0, output, interrupts)
         rows_warning = integrator.run.rows_warning
         if len(entry.waiting) < MOST_WAITING:
             entry.waiting.append(integrator)
-        if made is not None:
-            return made if isinstance(made, Missed) else (made, rows_warning)
+        if outcome is not None:
+            return outcome if isinstance(outcome, Missed) else (outcome, rows_warning)
     return None
 
 
@@ -502,7 +502,7 @@ def set_up(
     if system.called_in_python:  # such functions may depend on variables that change
         return _new_run(system, t0, t1, q0, v0, options)[0], None
     start, call = (t0, q0.tobytes(), v0.tobytes()), options.key
-    came_from, runs, before = system.made.get("runs", NO_RUNS)
+    came_from, runs, before = system.derived.get("runs", NO_RUNS)
     alike = runs.get(call, ())
     run, entry = None, next((each for each in alike if each.start == start), None)
     if entry is not None:
@@ -520,7 +520,7 @@ def set_up(
     if new and (added := _entry_of(run, code, t1, options)) is not None:
         runs = {} if len(runs) == MOST else dict(runs)  # a copy: another thread may read the old one
         runs[call] = added, *[each for each in alike if each is not entry][: MOST_ALIKE - 1]
-    system.made["runs"] = start, runs, id(code) if entry is None else None
+    system.derived["runs"] = start, runs, id(code) if entry is None else None
     return run, added
 
 
@@ -542,8 +542,8 @@ def _entry_of(run: Run, code: GeneratedCode | None, t1: float, options: Options)
 
 
 def _trace_cache(system: ConstrainedSystem) -> TraceCache:
-    made: TraceCache = system.remembered(("family", trace_cache_of), lambda: trace_cache_of(system))
-    return made
+    cache: TraceCache = system.remembered(("family", trace_cache_of), lambda: trace_cache_of(system))
+    return cache
 
 
 def _share_setup(system: ConstrainedSystem, run: Run, code: GeneratedCode | None, t1: float, options: Options) -> None:

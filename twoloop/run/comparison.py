@@ -88,28 +88,28 @@ def _derivatives_again(run: "Run", states: Array, first: Array, status: Status, 
     some = [(float(each[0]), each[1 : 1 + n], each[1 + n :]) for each in chosen]
     exact = exact_derivatives(run.system)
     fine = exact is not None and exact.wrong(run.system, generic_states(some)) is None
-    found = unlike_itself(run.system, some, float(first[0]), first[1 : 1 + n])
-    for t, q, v in () if fine or found is not None else some:
+    difference = unlike_itself(run.system, some, float(first[0]), first[1 : 1 + n])
+    for t, q, v in () if fine or difference is not None else some:
         wrong = wrong_derivative(run.system, t, q, v)
         if wrong is not None:
-            found = t, wrong
+            difference = t, wrong
             break
-    if found is None:
+    if difference is None:
         return status, message
-    return Status.WRONG_DERIVATIVE, f"At t = {found[0]:.10g} of the run {found[1]} {message}"
+    return Status.WRONG_DERIVATIVE, f"At t = {difference[0]:.10g} of the run {difference[1]} {message}"
 
 
 def find_nondeterminism(system: ConstrainedSystem, states: Array) -> str | None:
     """Describe how a force called in Python differs when it is evaluated again at the same state [t, q, v], or None."""
-    n, made = system.n_q, []
+    n, forces = system.n_q, []
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         for t, *state in (*states, *states[::-1]):
             try:
-                made.append(system.force(t, np.array(state[:n]), np.array(state[n:])))
+                forces.append(system.force(t, np.array(state[:n]), np.array(state[n:])))
             except Exception:  # the state is outside the domain of the force
-                made.append(np.full(n, np.nan))
-    once, again = np.array(made[: len(states)]), np.array(made[len(states) :][::-1])
+                forces.append(np.full(n, np.nan))
+    once, again = np.array(forces[: len(states)]), np.array(forces[len(states) :][::-1])
     both = np.isfinite(once) & np.isfinite(again)
     off = np.abs(np.subtract(once, again, out=np.zeros_like(once), where=both))
     if not off.max() > CLEAR * np.abs(once[both]).max(initial=0.0):
@@ -150,7 +150,7 @@ def _differs(name: str, t: float, entry: int, once: float, again: float) -> str:
     return (
         f"force of {name!r} gives something else when it is called again with the same t, q and v: at "
         f"t = {t:.10g} entry {entry} is {once:.9g}, and then {again:.9g}. It must "
-        "depend on its arguments alone: steps are tried, refused, and looked at ahead"
+        "depend on its arguments alone: steps are tried, rejected and sampled in advance"
     )
 
 

@@ -302,10 +302,10 @@ class Interpolator:
             out_t, out = np.empty(rows * len(intervals)), np.empty((rows * len(intervals), 3 * n))
             entry_point(self.kernels.fill)(kit, self.work, *vectors, table.t, table.states, intervals, out_t, out)
             times, states = out_t.reshape(-1, rows), out.reshape(-1, rows, 3 * n)
-            found = np.isfinite(times[:, 0])
+            filled_in = np.isfinite(times[:, 0])
             begins = times[:, 0].tolist()
-            filled.update({begins[k]: (times[k], states[k]) for k in found.nonzero()[0].tolist()})
-            intervals = intervals[~found]
+            filled.update({begins[k]: (times[k], states[k]) for k in filled_in.nonzero()[0].tolist()})
+            intervals = intervals[~filled_in]
         return filled
 
     def interiors(self, table: Table) -> Iterator[tuple[Array, Array]]:

@@ -41,7 +41,7 @@ def warn_of_missed_changes(run: "Run") -> str:
     a, clock = run.a, run.clock
     said = (
         f"forces, constraint_rate or nonholonomic_rate change suddenly for {clock[a.SHORTEST_CHANGE]:.2g} s, and were "
-        f"looked at every {clock[a.WIDEST_SAMPLING]:.2g} s only, where steps are long: other changes as short may have "
+        f"sampled every {clock[a.WIDEST_SAMPLING]:.2g} s only, where steps are long: other changes as short may have "
         f"been missed. Give max_step, at most {clock[a.SHORTEST_CHANGE]:.2g}"
     )
     return warn_user(said)

@@ -122,7 +122,7 @@ def interrupted_record(system: ConstrainedSystem, t0: float, events: list[Any] |
     """Return the record of a run that Ctrl-C ended before the accelerations at its start were known."""
     n_q, none = system.n_q, np.zeros(0)
     columns = np.zeros((n_q, 0))
-    found = None if events is None else [none for _ in events]
+    occurrences = None if events is None else [none for _ in events]
     states = None if events is None else [np.zeros((0, n_q)) for _ in events]
     return Record(
         t=none,
@@ -134,7 +134,7 @@ def interrupted_record(system: ConstrainedSystem, t0: float, events: list[Any] |
         status=Status.INTERRUPTED,
         message=describe_interrupt(t0, columns.T) + explained(Status.INTERRUPTED),
         stats=Statistics(n_accepted=0),
-        t_events=found,
+        t_events=occurrences,
         q_events=states,
         v_events=states,
         system=system,

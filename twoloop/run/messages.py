@@ -68,13 +68,13 @@ def message_of(run: "Run", words: str, system: "ConstrainedSystem", later: Later
         return {"message": words}
     crossings, now, rank = run.crossings, (float(run.clock[run.a.T]), run.state.copy()), run.rank
 
-    def made(name: str) -> dict[str, Any]:
+    def fields_of(name: str) -> dict[str, Any]:
         if name != "message" and later is not None:
             return later(name)
         return {"message": words.replace(CROSSINGS, describe_crossings(system, crossings, now, rank))}
 
     # functions in Python may depend on variables that change: compute the message now
-    return made("message") if system.called_in_python else {"later": made}
+    return fields_of("message") if system.called_in_python else {"later": fields_of}
 
 
 def reject_turned_velocities(
@@ -292,9 +292,9 @@ def describe_not_finite(run: "Run") -> str:
     q, v = run.state[:n], run.state[n : 2 * n]
     end = t + float(run.clock[run.a.H_FAILED])
     for instant in (t, end):
-        found = not_finite(run.system, instant, q, v)
-        if found is not None:
-            return f"{found} at t = {instant:.10g}"
+        undefined = not_finite(run.system, instant, q, v)
+        if undefined is not None:
+            return f"{undefined} at t = {instant:.10g}"
     if run.plan.looks_within:
         return (
             "the callbacks are finite there, but not the Taylor series of the motion: one of their functions has "

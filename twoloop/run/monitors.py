@@ -114,7 +114,7 @@ def describe_stiffness(looks: StiffnessMonitor, kit: Any, work: Any) -> str:
         return ""
     start = initial_direction(work.Q.size)
     directions = [np.zeros_like(start), np.zeros_like(start)]
-    found = []
+    samples = []
     for sample in looks.samples:
         for direction in directions:  # starts from the state before: no coordinate may have been lost from it for good
             direction += START * start
@@ -123,8 +123,8 @@ def describe_stiffness(looks: StiffnessMonitor, kit: Any, work: Any) -> str:
         except Exception:  # raised by a callback at a displaced state, which the run did not visit: say nothing
             return ""
         h = sample.h
-        found.append((h * vibration / sample.vibration, h * decay / sample.decay, vibration, decay, h))
-    by_vibration, by_decay, vibration, decay, h = np.median(found, axis=0)
+        samples.append((h * vibration / sample.vibration, h * decay / sample.decay, vibration, decay, h))
+    by_vibration, by_decay, vibration, decay, h = np.median(samples, axis=0)
     if max(by_vibration, by_decay) < NEXT_TO:
         return ""
     what = f"vibrations of {vibration:.2g} rad/s" if by_vibration >= by_decay else f"a decay of {decay:.2g} 1/s"

@@ -58,7 +58,7 @@ class SharedSetup:
         if run.static is not None or form == AUGMENTED or banded or system.entries:
             raise ValueError("of large systems more is decided by numbers")
         of_formulas = copy.copy(system)
-        of_formulas.made = {("family", trace_cache_of): self.family, ("numbers", self.family): lambda array: array}
+        of_formulas.derived = {("family", trace_cache_of): self.family, ("numbers", self.family): lambda array: array}
         own = code_for(of_formulas, method, fixed, compiled, t, q, unchecked)
         self.plan, self.interiors = plans_for(of_formulas, method, run.rtol, run.least_atol, fixed, own, unchecked)
         self.exact = exact_derivatives(of_formulas)
@@ -68,8 +68,8 @@ class SharedSetup:
         give_bounds(system)
         if not self.family.within_bounds >= system.given.keys():
             raise ValueError("a callback may branch on its parameters")
-        made = ParametricRun(self, run.again()).run
-        if (code is None) is not (own is None) or _told(made) != _told(run):
+        repeated = ParametricRun(self, run.again()).run
+        if (code is None) is not (own is None) or _plan_values(repeated) != _plan_values(run):
             raise ValueError("its numbers are not those of the family")
 
     def region(self, with_derivatives: bool) -> CheckedRegion:
@@ -123,7 +123,7 @@ class ParametricRun:
         self._functions.p[:] = system.functions.p
         self._formulas.write(self.shared.family.products(self._functions.p))
         self.system = self.run.system = copy.copy(system)
-        self.system.functions, self.system.made = self._functions, self._remembered.copy()
+        self.system.functions, self.system.derived = self._functions, self._remembered.copy()
         self.system.within_bounds.update(self.shared.family.within_bounds)
         self.system.checked, self._mass_agrees = False, not system.constant_mass
         self.system.bandwidth = None  # the banded form is not used by these runs
@@ -156,7 +156,7 @@ class ParametricRun:
         return plan.changed(traced=tuple(each.with_numbers(array) for each in plan.traced), **changes)
 
 
-def _told(run: Run) -> list[Any]:
+def _plan_values(run: Run) -> list[Any]:
     """List everything that the plans of a run hold, numbers to the bit."""
     plans = [run.plan, *run.interiors.values()]
     return [run.kit.flags.tobytes(), *(each for plan in plans for each in _of_plan(plan))]

@@ -141,35 +141,35 @@ def project_sparsely(
         metric = _Metric(system, t, q, form, int(metric.work.notes[indices.RANK]))
     elif code != indices.DONE:
         return None
-    found = metric.project(q, v)
-    if found is None or metric.work.notes[indices.PIVOT] < CLEAR:
+    projected = metric.project(q, v)
+    if projected is None or metric.work.notes[indices.PIVOT] < CLEAR:
         return None
-    there = _Metric(system, t, found[0], form, metric.rank)
+    there = _Metric(system, t, projected[0], form, metric.rank)
     if (
-        there.ask(tasks.RENEW_PARTITION, found[0].copy(), v.copy()) != indices.DONE
+        there.ask(tasks.RENEW_PARTITION, projected[0].copy(), v.copy()) != indices.DONE
     ):  # other rows are independent on the constraints
         return None
-    rows, rate = system.sparse_rows(t, found[0]), system.rates(t, found[0])
-    if not is_at_rounding(system.constraint(t, found[0]), rows, found[0]):
+    rows, rate = system.sparse_rows(t, projected[0]), system.rates(t, projected[0])
+    if not is_at_rounding(system.constraint(t, projected[0]), rows, projected[0]):
         return None
-    if not is_at_rounding(rows @ found[1] + rate, rows, found[1], rate):
+    if not is_at_rounding(rows @ projected[1] + rate, rows, projected[1], rate):
         return None
-    moved = found[0] - q
-    if check_assembly and np.abs(moved).max() > 0.0 and not _same_from_elsewhere(metric, found[0], moved):
+    moved = projected[0] - q
+    if check_assembly and np.abs(moved).max() > 0.0 and not _same_from_elsewhere(metric, projected[0], moved):
         return None
-    return found
+    return projected
 
 
-def _same_from_elsewhere(metric: _Metric, found: Array, moved: Array) -> bool:
+def _same_from_elsewhere(metric: _Metric, position: Array, moved: Array) -> bool:
     """Return whether other guesses, as far off, end where C_q sends them."""
     far = float(np.abs(moved).max())
-    generic = np.random.default_rng(8).uniform(-1.0, 1.0, (2, len(found)))
-    rest = np.zeros(len(found))
+    generic = np.random.default_rng(8).uniform(-1.0, 1.0, (2, len(position)))
+    rest = np.zeros(len(position))
     for way in (-2.0 * moved, far * generic[0], far * generic[1]):
-        if metric.project(found, rest) is None:
+        if metric.project(position, rest) is None:
             return False
-        expected = found + metric.nearest(way)
-        again = metric.project(found + way, rest)
+        expected = position + metric.nearest(way)
+        again = metric.project(position + way, rest)
         if again is None or np.abs(again[0] - expected).max() > STRAIGHT * np.abs(way).max():
             return False
     return True
@@ -282,17 +282,17 @@ def consistent_state(
     large = None if kept else project_sparsely(system, t, guess, speeds, check_assembly)
     if large is not None:
         return _state_of_large(system, t, guess, speeds, *large)
-    found = _position(system, t, guess, free, kept, check_assembly) if system.n_c > 0 else guess
-    jacobian = system.rows(t, found)
-    change = _least_change(jacobian, free, -system.velocity_constraint(t, found, speeds))
+    position = _position(system, t, guess, free, kept, check_assembly) if system.n_c > 0 else guess
+    jacobian = system.rows(t, position)
+    change = _least_change(jacobian, free, -system.velocity_constraint(t, position, speeds))
     velocity = speeds + change
-    scales = scales_of(system, t, found, jacobian)
-    wrong = Violation.of_velocity(system, t, found, velocity, jacobian, scales) if len(jacobian) > 0 else None
+    scales = scales_of(system, t, position, jacobian)
+    wrong = Violation.of_velocity(system, t, position, velocity, jacobian, scales) if len(jacobian) > 0 else None
     if wrong is not None and wrong.excess > 1.0:
         why = f"max|C_q v + C_t| stays at {_largest(wrong.values)}"
         raise ValueError(_no_freedom(system, t, scales.scaled(jacobian), free, kept, why))
-    state = ConsistentState((found, velocity))
-    state.moved_q, state.moved_v = _move(found - guess), _move(velocity - speeds)
+    state = ConsistentState((position, velocity))
+    state.moved_q, state.moved_v = _move(position - guess), _move(velocity - speeds)
     state.dependent, state.determinant_sign, state.margin = _assembly(scales.scaled(jacobian), free)
     return state
 
@@ -314,11 +314,11 @@ class _LargeState(ConsistentState):
 
 
 def _state_of_large(
-    system: ConstrainedSystem, t: float, guess: Array, speeds: Array, found: Array, velocity: Array
+    system: ConstrainedSystem, t: float, guess: Array, speeds: Array, position: Array, velocity: Array
 ) -> ConsistentState:
-    state = _LargeState((found, velocity))
+    state = _LargeState((position, velocity))
     state.system, state.t = system, t
-    state.moved_q, state.moved_v = _move(found - guess), _move(velocity - speeds)
+    state.moved_q, state.moved_v = _move(position - guess), _move(velocity - speeds)
     return state
 
 
@@ -332,14 +332,14 @@ def _position(
     if start.excess > CONVERGED and _rank(scaled[:, free]) < _rank(scaled):
         why = f"max|C| stays at {_largest(start.values)}"
         raise ValueError(_no_freedom(system, t, scaled, free, kept, why))
-    found, excess, iterations = _gauss_newton(system, t, guess, free)
-    redundant = found is None or _rank(scales.scaled(system.jacobian(t, found))) < system.n_c
+    position, excess, iterations = _gauss_newton(system, t, guess, free)
+    redundant = position is None or _rank(scales.scaled(system.jacobian(t, position))) < system.n_c
     cut = WEAK if redundant else NEGLIGIBLE
     if redundant:  # dependent rows are so on the constraints, and beside them only nearly
-        found, excess, iterations = _gauss_newton(system, t, guess, free, cut)
-    if found is None or not excess <= 1.0:
-        diverged = found is None
-        worst = _largest(system.constraint(t, guess if diverged else found))
+        position, excess, iterations = _gauss_newton(system, t, guess, free, cut)
+    if position is None or not excess <= 1.0:
+        diverged = position is None
+        worst = _largest(system.constraint(t, guess if diverged else position))
         reached = f"the iteration diverges; at q max|C| is {worst}"
         if not diverged:
             reached = f"after {iterations} iterations max|C| is {worst}"
@@ -347,31 +347,37 @@ def _position(
             f"q cannot be projected onto the constraints of {system.name!r} at t = {t!r}: {reached}. Give a guess that "
             f"is nearer to an assembled position{_smallest(scales, jacobian, free, kept)}"
         )
-    far = float((np.abs(found - guess) / scales.columns).max())
+    far = float((np.abs(position - guess) / scales.columns).max())
     if check_assembly and (start.excess > 1.0 or far > CONSISTENT):  # next to a dead centre a small error moves far
-        other = _another_assembly(system, t, found, guess, free, scales, cut)
+        other = _another_assembly(system, t, position, guess, free, scales, cut)
         if other is not None:
-            there = system.jacobian(t, found)
+            there = system.jacobian(t, position)
             raise ValueError(
                 f"q does not say on which assembly of {system.name!r} it is at t = {t!r}: its projection moves "
-                f"{_change(guess, found, scales)}, and that of another guess as far away {other}. Give a guess that is "
-                "nearer to the assembly that is meant, or farther from a dead centre; check_assembly=False takes the "
-                f"one found{_smallest(scales, there, free, kept)}"
+                f"{_change(guess, position, scales)}, and that of another guess as far away {other}. Give a guess that "
+                "is nearer to the assembly that is meant, or farther from a dead centre; check_assembly=False takes "
+                f"the one found{_smallest(scales, there, free, kept)}"
             )
-    return found
+    return position
 
 
 def _another_assembly(
-    system: ConstrainedSystem, t: float, found: Array, guess: Array, free: NDArray[np.intp], scales: Scales, cut: float
+    system: ConstrainedSystem,
+    t: float,
+    position: Array,
+    guess: Array,
+    free: NDArray[np.intp],
+    scales: Scales,
+    cut: float,
 ) -> str | None:
     """Describe where another guess, as far from the found position as the given one, leads; None: the same assembly.
 
     Two assemblies are positions with the same values of all but the dependent coordinates. If there is only one, a
     small displacement ends where C_q sends it, to first order, with the same sign of the determinant.
     """
-    moved = (found - guess) / scales.columns
+    moved = (position - guess) / scales.columns
     far = float(np.abs(moved).max())
-    jacobian = system.jacobian(t, found)
+    jacobian = system.jacobian(t, position)
     dependent, sign, _ = _assembly(scales.scaled(jacobian), free)
     columns = list(dependent)
 
@@ -385,19 +391,19 @@ def _another_assembly(
     weakest = far * _weakest_direction(scales.scaled(jacobian), free)
     for other in (-2.0 * moved, weakest, -weakest):
         way = other * scales.columns
-        again, excess, _ = _gauss_newton(system, t, found + way, free, cut)
+        again, excess, _ = _gauss_newton(system, t, position + way, free, cut)
         if again is None or not excess <= 1.0:
             return "does not converge"
-        expected = found + way + _least_change(jacobian, free, -(jacobian @ way), cut)
+        expected = position + way + _least_change(jacobian, free, -(jacobian @ way), cut)
         if distance(again, expected) <= STRAIGHT * float(np.abs(other).max()) and sign_at(again) == sign:
             continue
-        mixed = found.copy()  # curved path or other assembly: its dependents with the first's other values
+        mixed = position.copy()  # curved path or other assembly: its dependents with the first's other values
         mixed[columns] = again[columns]
         beside, excess, _ = _gauss_newton(system, t, mixed, np.array(columns, dtype=int), cut)
         if beside is None or not excess <= 1.0:
             return "ends elsewhere, from where no way leads back to it"
-        if distance(beside, found) > SAME * far or sign_at(beside) != sign:
-            return f"ends on another one, which differs by {_change(found, beside, scales)}"
+        if distance(beside, position) > SAME * far or sign_at(beside) != sign:
+            return f"ends on another one, which differs by {_change(position, beside, scales)}"
     return None
 
 

@@ -194,15 +194,15 @@ class Record:
 
     def _known(self, what: str) -> Any:
         """Return the energy or the drawing; if there is none, raise an error that says how to get it."""
-        found = getattr(self.description, what)
-        if found is None:
+        value = getattr(self.description, what)
+        if value is None:
             raise ValueError(
                 f"this result knows no {what}: put the system into a problem, twoloop.mechanisms.Problem(..., "
                 f"system=system, {what}=...), and solve problem.system. To a result in a file, or of another solver, "
                 "give the system: twoloop.load(path, problem.system), dataclasses.replace(result, "
                 "system=problem.system)"
             )
-        return found
+        return value
 
     def __getstate__(self) -> dict[str, Any]:
         state = {each.name: getattr(self, each.name) for each in fields(self)}
@@ -223,9 +223,9 @@ class Record:
 
 def record_of(kind: type[AnyRecord], fields: dict[str, Any]) -> AnyRecord:
     """Create a record of these fields, which it takes over: the constructor of a large frozen dataclass is slow."""
-    made = _new(kind)
-    _set_fields(made, fields)
-    return made
+    instance = _new(kind)
+    _set_fields(instance, fields)
+    return instance
 
 
 _new, _set_fields = object.__new__, vars(Record)["__dict__"].__set__

@@ -99,17 +99,17 @@ class IndependentRerun:
         t1 = float(times[-1])
         run.clock[a.H_NEXT] = first_step if first_step < np.inf else FIRST_TRY * (t1 - t0)
         run.work.notes[indices.KINK_AFTER] = t1
-        found: list[Array] = []
+        states: list[Array] = []
         longest, n_total = 0.0, 0
         buffers, filled = self.buffers, self.filled
         for _ in range(0, most + len(times), len(buffers[0])):
             code = run.advance(times, buffers, filled)
             n_rows, n_steps = filled.tolist()
-            found.append(buffers[1][:n_rows, :n].copy())
+            states.append(buffers[1][:n_rows, :n].copy())
             longest, n_total = max(longest, float(buffers[2][:n_steps, a.H].max(initial=0.0))), n_total + n_steps
             if code == a.ALL_OUTPUT_DONE:
                 self.next_step = float(run.clock[a.H_NEXT])
-                return RerunPiece(np.concatenate(found), longest, n_total)
+                return RerunPiece(np.concatenate(states), longest, n_total)
             if code != a.PAUSED and not (code == a.AT_DISCONTINUITY and apply_jump(run, t1)):
                 break
         return None

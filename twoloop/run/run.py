@@ -80,7 +80,7 @@ class Run:
         n_rows = system.n_c + system.n_a
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
         # ranks are computed at every start: those of the last one are a guess, which saves a second workspace
-        self.work = self._workspace(*(system.made.get("ranks", ()) if self.static is None else ()))
+        self.work = self._workspace(*(system.derived.get("ranks", ()) if self.static is None else ()))
         self.new_state = np.zeros_like(self.state)
         self.tolerances = np.zeros(indices.ATOL + system.n_q)
         self.tolerances[indices.RTOL] = rtol
@@ -302,7 +302,7 @@ class Run:
             code = start(self.kit, self.work, self.t0, self.state)
         if self.static is not None and code not in (indices.DONE, indices.NOT_FINITE):
             if self.work.notes[indices.SMALLEST] < 0.0:  # M is not definite, nor will it be at another start
-                self.system.made["static form"] = None
+                self.system.derived["static form"] = None
             self.static = None
             self.kit = kit_of(self.system, self.t0, self.state[: self.system.n_q], self.plan)
             self.functions = self.kit.functions
@@ -310,7 +310,8 @@ class Run:
             self.work = self._workspace()
             code = start(self.kit, self.work, self.t0, self.state)
         if code == indices.RANK_DIFFERS:
-            self.system.made["ranks"] = ranks = int(self.work.notes[indices.RANK]), int(self.work.notes[indices.RANK_V])
+            ranks = int(self.work.notes[indices.RANK]), int(self.work.notes[indices.RANK_V])
+            self.system.derived["ranks"] = ranks
             self.work = self._workspace(*ranks)
             code = start(self.kit, self.work, self.t0, self.state)
         if code == indices.GAMMA_INACCURATE:  # the first step reports it, too, and then the run has a result
@@ -350,13 +351,13 @@ class Run:
                 f"the constraints of {self.system.name!r} contradict one another at t = {self.t0:g}: "
                 f"{self._in_words(rows, wrong)}, but not so their accelerations. Correct or leave out one of these rows"
             )
-        if (found := tuple(redundant)) not in self.said:
-            self.said[found] = (
+        if (redundant_rows := tuple(redundant)) not in self.said:
+            self.said[redundant_rows] = (
                 f"the constraints of {self.system.name!r} have rank {self.rank} of {n_rows}, first at t = {self.t0:g}: "
                 f"{self._in_words(rows, redundant)}. They are left out of the solution and checked at every "
                 "step; multipliers are those of least norm. See docs/constraints.md#redundant-rows"
             )
-        return np.array(redundant), self.said[found]
+        return np.array(redundant), self.said[redundant_rows]
 
     def _start_warning(self) -> str:
         """Describe a start beside a singular position, where pivots are small; those of static factors vary more."""
@@ -397,8 +398,8 @@ class Run:
         """Set the first and the largest step, s."""
         self.max_step = max_step
         self.limit_steps()
-        found = self.first_step(self.t0, t1, self.state, max_step)
-        first = min(first_step or found, t1 - self.t0)
+        proposed = self.first_step(self.t0, t1, self.state, max_step)
+        first = min(first_step or proposed, t1 - self.t0)
         self.clock[self.a.H_NEXT], self.control[self.a.FIRST_GIVEN] = first, float(first_step is not None)
         self.control[self.a.SHORTEST] = cached_run().SHORTEST_STEP * first
 

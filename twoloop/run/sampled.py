@@ -284,12 +284,12 @@ class SampledRun:
         for kind in sorted(self.system.given.keys() - self.system.scattered - FORCES):
             if not set(KINDS[kind].state) <= set(known):
                 continue
-            made = []
+            values = []
             for each in (before, value, 0.5 * before + 1.37):
                 self.p[place] = each
-                made.append(np.concatenate([np.ravel(x) for x in parts_of(self._of(kind, t, known))]))
+                values.append(np.concatenate([np.ravel(x) for x in parts_of(self._of(kind, t, known))]))
             self.p[place] = before
-            if any((each != made[0]).any() for each in made[1:]):
+            if any((each != values[0]).any() for each in values[1:]):
                 raise ValueError(
                     f"inputs must enter forces alone; that at place {place} enters {kind} of {self.system.name!r}, "
                     "which cannot change between samples: positions or momenta would jump; start anew with others"

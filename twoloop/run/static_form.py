@@ -39,19 +39,19 @@ def newton_form(
 
     Return None if the matrix is not sparse, or has no program.
     """
-    found: set[tuple[int, int]] = set()
+    entries: set[tuple[int, int]] = set()
     rng = np.random.default_rng(9)
     size, lam = max(1.0, float(np.abs(q0).max())), rng.uniform(0.5, 1.5, system.n_c)
     most = NEWTON_SPARSE * system.n_q**2
     for share in NEARBY[:2]:
         q = q0 + share * size * rng.uniform(-1.0, 1.0, system.n_q)
         try:
-            found |= _entries(system, t0, q, rng.uniform(-1.0, 1.0, system.n_q), lam, most)
+            entries |= _entries(system, t0, q, rng.uniform(-1.0, 1.0, system.n_q), lam, most)
         except Exception:  # outside the domain of the callbacks; missed entries are found during the run
             continue
-        if len(found) > most:
+        if len(entries) > most:
             return None
-    places = np.array(sorted(found), dtype=np.int64).reshape(-1, 2)
+    places = np.array(sorted(entries), dtype=np.int64).reshape(-1, 2)
     tangents = grouped_entries((places[:, 0], places[:, 1]), system.n_q)
     program = newton_program(system.n_q, system.n_c, mass, jacobian, tangents, together, stiff)
     if program is None or program[N_UPDATES] > NEWTON_SPARSE * system.n_q**3 / 3.0:
@@ -69,7 +69,7 @@ def _entries(system: ConstrainedSystem, t: float, q: Array, v: Array, lam: Array
         return np.bincount(columns, system.jacobian_values(t, q) * lam[rows], len(q)).astype(np.float64)
 
     force, of_rows = system.force(t, q, v), reaction(q)
-    found: set[tuple[int, int]] = set()
+    entries: set[tuple[int, int]] = set()
     for j in range(len(q)):
         moved, faster = q.copy(), v.copy()
         moved[j] += DISPLACED * max(1.0, abs(q[j]))
@@ -77,10 +77,10 @@ def _entries(system: ConstrainedSystem, t: float, q: Array, v: Array, lam: Array
         changed = (system.force(t, moved, v) != force) | (reaction(moved) != of_rows)
         changed |= system.force(t, q, faster) != force
         for i in np.flatnonzero(changed).tolist():
-            found |= {(i, j), (j, i)}
-        if len(found) > most:
+            entries |= {(i, j), (j, i)}
+        if len(entries) > most:
             break
-    return found
+    return entries
 
 
 SINGULAR = 1e-10  # smallest over largest eigenvalue of a body's M, below which it counts as singular
@@ -134,8 +134,8 @@ def with_newton(system: ConstrainedSystem, t0: float, q0: Array, form: StaticFor
     """Add the program of Newton's matrix; return None if there is none, or it would not pay."""
     if system.n_q < NEWTON * LARGE:
         return None
-    made = system.remembered("newton form", lambda: newton_form(system, t0, q0, *form.known))
-    return None if made is None else form._replace(newton=made[0], n_groups=made[1])
+    cached = system.remembered("newton form", lambda: newton_form(system, t0, q0, *form.known))
+    return None if cached is None else form._replace(newton=cached[0], n_groups=cached[1])
 
 
 def _made(system: ConstrainedSystem, t0: float, q0: Array) -> StaticForm | None:
@@ -149,9 +149,9 @@ def _made(system: ConstrainedSystem, t0: float, q0: Array) -> StaticForm | None:
     if "mass" in system.entries:
         mass = system.entries["mass"]
     else:
-        found = _mass_pattern(system, t0, q0)
-        mass, dense_mass = _places(found), not system.constant_mass
-        mass_pattern = found if dense_mass else mass_pattern
+        entries = _mass_pattern(system, t0, q0)
+        mass, dense_mass = _places(entries), not system.constant_mass
+        mass_pattern = entries if dense_mass else mass_pattern
     if not _is_sparse(system.n_q, len(jacobian[0])) or not _is_sparse(system.n_q, len(mass[0])):
         return None
     together = _together(system, mass)
@@ -203,7 +203,7 @@ def _stiff_rows(
     values = system.jacobian_values(t0, q0) if "jacobian" in system.entries else system.jacobian(t0, q0)[jacobian]
     for i, j, value in zip(*(each.tolist() for each in (*jacobian, values)), strict=True):
         columns.setdefault(i, []).append((j, value))
-    found = []
+    indices = []
     for i, own in columns.items():
         body = int(body_of[own[0][0]])
         if body in free and all((j, k) in there for j, _ in own for k, _ in own):
@@ -212,9 +212,9 @@ def _stiff_rows(
                 row[place[j]] += value
             along = free[body] @ row
             if np.linalg.norm(along) > ALONG * np.linalg.norm(row):
-                found.append(i)
+                indices.append(i)
                 free[body] = np.linalg.svd(along[None, :])[2][1:] @ free[body]
-    return found
+    return indices
 
 
 def _without_mass(block: Array) -> Array:
@@ -242,7 +242,7 @@ def _places(pattern: Array) -> Entries:
 
 def _mass_pattern(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
     """Return a matrix with 1 where M has an entry at a position or, if M is not constant, near it."""
-    found = np.zeros((system.n_q, system.n_q))
+    pattern = np.zeros((system.n_q, system.n_q))
     size = np.maximum(np.abs(q0), np.abs(q0).max())
     ways = np.random.default_rng(5).uniform(-1.0, 1.0, (len(NEARBY), system.n_q))
     for share, way in zip(NEARBY[:1] if system.constant_mass else NEARBY, ways, strict=False):
@@ -250,5 +250,5 @@ def _mass_pattern(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
             mass = system.mass(t0, q0 + share * size * way)
         except Exception:  # outside the domain of the callbacks; missed entries are found during the run
             continue
-        found[(mass != 0.0) | (mass.T != 0.0)] = 1.0
-    return found
+        pattern[(mass != 0.0) | (mass.T != 0.0)] = 1.0
+    return pattern

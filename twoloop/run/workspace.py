@@ -53,8 +53,8 @@ def kit_of(
 
     if flags[FORM] == AUGMENTED:  # a run may change these flags
         return make()[0]
-    made: tuple[Kit, Any] = system.remembered(("general kit", id(system.functions), flags.tobytes()), make)
-    return made[0]
+    cached: tuple[Kit, Any] = system.remembered(("general kit", id(system.functions), flags.tobytes()), make)
+    return cached[0]
 
 
 def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) -> Kit:
@@ -124,11 +124,11 @@ def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
     flags = flags.copy()
     flags[STRAIGHT] = plan.inner is not None
     functions = system.functions._replace(flags=flags)
-    made = Kit(functions, plan.inner or inner_loop, *_steps_of(plan), inner_loop, plan.own, *read)
+    kernels = Kit(functions, plan.inner or inner_loop, *_steps_of(plan), inner_loop, plan.own, *read)
     if len(kept) == MOST_KITS:
         del kept[next(iter(kept))]
-    kept[key] = made, system.functions
-    return _with_own_flags(made) if changes else made
+    kept[key] = kernels, system.functions
+    return _with_own_flags(kernels) if changes else kernels
 
 
 def _steps_of(plan: Plan) -> tuple[Any, Any, Any]:

@@ -7,7 +7,7 @@ import numba
 LEAST, BELOW = (0, 61), (0, 69)  # limits of the version, as in pyproject.toml
 
 
-def check_version(found: str) -> None:
+def check_version(installed: str) -> None:
     """Raise unless the private parts of this version of numba are known.
 
     Raises
@@ -15,11 +15,11 @@ def check_version(found: str) -> None:
     ImportError
         If it is not; says which is needed.
     """
-    if not LEAST <= tuple(int(number) for number in re.findall(r"\d+", found)[:2]) < BELOW:
+    if not LEAST <= tuple(int(number) for number in re.findall(r"\d+", installed)[:2]) < BELOW:
         least, below = (".".join(map(str, version)) for version in (LEAST, BELOW))
         raise ImportError(
             f"twoloop uses private parts of numba, which it knows of versions from {least} to below {below}; numba "
-            f"{found} is installed: pip install 'numba>={least},<{below}'"
+            f"{installed} is installed: pip install 'numba>={least},<{below}'"
         )
 
 

@@ -70,9 +70,9 @@ def has_computed_indices(function: Callable[..., Any]) -> bool:
 
 def _computed_names(tree: ast.AST) -> set[str]:
     """Return the names that may have other values than constants and loop counters."""
-    found = {node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)}
+    safe = {node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)}
     while True:
-        before = len(found)
+        before = len(safe)
         for node in ast.walk(tree):
             if isinstance(node, ast.For):
                 targets, value = [node.target], node.iter
@@ -82,11 +82,11 @@ def _computed_names(tree: ast.AST) -> set[str]:
                 targets, value = [node.target], None
             else:
                 continue
-            if value is None or not _is_safe(value, found):
+            if value is None or not _is_safe(value, safe):
                 names = (each for target in targets for each in ast.walk(target))
-                found |= {each.id for each in names if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store)}
-        if len(found) == before:
-            return found
+                safe |= {each.id for each in names if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store)}
+        if len(safe) == before:
+            return safe
 
 
 def _is_safe(node: ast.AST | None, computed: set[str]) -> bool:

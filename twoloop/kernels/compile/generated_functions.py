@@ -80,8 +80,8 @@ def generated_functions(
     passes : bool
         See `object_code`.
     """
-    if (made := _IN_MEMORY[kind].get(key)) is not None:
-        return made  # type: ignore[no-any-return]
+    if (functions := _IN_MEMORY[kind].get(key)) is not None:
+        return functions  # type: ignore[no-any-return]
     files, place = _code_files(kind, stamp), _disk_key(key)
     try:
         kept = files.load(place)
@@ -95,8 +95,8 @@ def generated_functions(
         except OSError:
             warn_once(UNWRITABLE)
     names, content = kept
-    _IN_MEMORY[kind][key] = made = GeneratedFunctions(names, content)
-    return made
+    _IN_MEMORY[kind][key] = functions = GeneratedFunctions(names, content)
+    return functions
 
 
 def are_cached(kind: str, stamp: str, key: str) -> bool:

@@ -87,7 +87,7 @@ class Reference(types.Type):
     def llvm_type(self, field: str) -> tuple[str, list[str]]:
         """Return the types of the result and of the arguments of a generated function, as LLVM writes them."""
         signature = self.functions[field]
-        return str(_plain(signature.return_type)), [str(_plain(kind)) for kind in signature.args]
+        return str(_llvm_type(signature.return_type)), [str(_llvm_type(kind)) for kind in signature.args]
 
     def table(self, values: Any) -> Any:
         """Return the int64 table of an object with arrays and functions of these names; the object has to outlive it.
@@ -133,9 +133,9 @@ def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
             c.pyapi.incref(obj)
         with other:
             c.builder.store(c.pyapi.object_getattr_string(obj, "address"), address)
-    found = c.builder.load(address)
-    pointer = c.pyapi.long_as_voidptr(found)
-    c.pyapi.decref(found)
+    address_object = c.builder.load(address)
+    pointer = c.pyapi.long_as_voidptr(address_object)
+    c.pyapi.decref(address_object)
     return NativeValue(pointer, is_error=c.pyapi.c_api_error())
 
 
@@ -187,8 +187,8 @@ def _array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) -> An
     array = ir.Constant(context.get_value_type(kind), ir.Undefined)
     for name, value in fields.items():  # in registers; numba's helper would write the fields to memory, one by one
         at = model.get_field_position(name)
-        made = ir.Constant(array.type.elements[at], None) if value is None else value
-        array = builder.insert_value(array, made, at)
+        element = ir.Constant(array.type.elements[at], None) if value is None else value
+        array = builder.insert_value(array, element, at)
     return array
 
 
@@ -206,7 +206,7 @@ def _define_call(typ: Reference, field: str, signature: Signature) -> None:
         return value
 
 
-_PLAIN = {
+_LLVM_TYPES = {
     types.float64: ir.DoubleType(),
     types.int64: ir.IntType(64),
     types.boolean: ir.IntType(1),
@@ -214,9 +214,9 @@ _PLAIN = {
 }
 
 
-def _plain(kind: Any) -> Any:
+def _llvm_type(kind: Any) -> Any:
     """Return the LLVM type of an argument of a generated function."""
-    return _PLAIN[kind.dtype].as_pointer() if isinstance(kind, types.Array) else _PLAIN[kind]
+    return _LLVM_TYPES[kind.dtype].as_pointer() if isinstance(kind, types.Array) else _LLVM_TYPES[kind]
 
 
 def _define_llvm_call(typ: Reference, field: str, signature: Signature) -> None:
@@ -224,7 +224,7 @@ def _define_llvm_call(typ: Reference, field: str, signature: Signature) -> None:
 
     @lower_builtin((typ.name, field), typ, *signature.args)
     def call(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        kind = ir.FunctionType(_plain(signature.return_type), [_plain(each) for each in signature.args])
+        kind = ir.FunctionType(_llvm_type(signature.return_type), [_llvm_type(each) for each in signature.args])
         function = _load(context, builder, args[0], place, kind.as_pointer())
         plain = [
             make_array(kind)(context, builder, value).data if isinstance(kind, types.Array) else value

@@ -93,10 +93,11 @@ def _bend(values, n, slope, least, within):
 
 
 @compiled
-def _first_discontinuity_of(values, n, along, least):
-    """Return the first sudden bend of values (less the line to their end if `along`), with its limit.
+def _first_sudden_bend(values, n, along, least):
+    """Return the index of the first sudden bend of sampled values, and the limit that it exceeds; 0 if there is none.
 
-    The search is repeated among the values before the bend found.
+    With `along` = 1 the straight line from the first to the last value is subtracted before. The search is repeated
+    among the values before a bend, until there is no earlier one.
     """
     place, sudden = _bend(values, n, along * (values[n] - values[0]) / max(n, 1), least, False)
     while place > 1:  # a smooth curve may bend as much within few values
@@ -178,7 +179,7 @@ def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, along,
     bend, column, sudden = n, -1, 0.0
     for j in range(changes.shape[1]):
         values = changes[:, j]
-        place, least = _first_discontinuity_of(values, n, along, of_forces if j < q.size else of_rates)
+        place, least = _first_sudden_bend(values, n, along, of_forces if j < q.size else of_rates)
         if 0 < place < bend:
             bend, column, sudden = place, j, least
     if column >= 0:

@@ -236,10 +236,10 @@ def _imports(text: str) -> set[str]:
 def stamp(module: str) -> str:
     """Return a digest of what the kernels of a module, such as "steps.stages", depend on: sources and callbacks."""
     known: set[str] = set()
-    found = {module}
-    while found:
-        known |= found
-        found = {name for each in found for name in _imports(_text(each)) if name not in known}
+    pending = {module}
+    while pending:
+        known |= pending
+        pending = {name for each in pending for name in _imports(_text(each)) if name not in known}
     digest = hashlib.sha256(repr((KIT.functions, GIVEN)).encode())
     for each in sorted(known):
         digest.update(_text(each).encode())

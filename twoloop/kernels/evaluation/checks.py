@@ -64,9 +64,11 @@ def _rows_from(columns, rows, counts, logs):
 
 @kernel(types.void(MATRIX, VECTOR, VECTOR, MATRIX, MATRIX, VECTOR, VECTOR))
 def column_units(matrix, typical, columns, counts, logs, rows, room):
-    """Compute units of the columns, by least squares of log|entry| + column - row; zero columns get the typical units.
+    """Estimate the units of the coordinates from a constraint Jacobian, so that lengths and angles can be compared.
 
-    The unit of the whole matrix, which is free, is the median of the typical ones. The other arrays are scratch.
+    An entry (i, j) is about unit of row i / unit of coordinate j: least squares of log|entry| + log column - log row.
+    This leaves one factor free, which makes the median unit that of `typical`. Coordinates without entries get their
+    typical units. The results are in `columns`; the other arrays are scratch.
     """
     n_used, shift = 0, 0.0
     for i in range(rows.size):
@@ -302,20 +304,20 @@ def evaluate_start(f, t, q, v, sizes, lam, room, mass, rows, ways, pattern, leas
         f.reaction_by_q(t, q, lam, f.p, scratch)
         if not finite(scratch):
             return 0
-    found = 0
+    bits = 0
     if _symmetric(mass, least[1]) and not _empty(rows):
-        found = IN_ORDER
+        bits = IN_ORDER
         if _consistent(room[force:C], room[C:rate], rows, q, v, sizes, least[0]):
-            found |= CONSISTENT
+            bits |= CONSISTENT
     if flags[CONSTANT_MASS] == 0:  # an M between the two margins gets neither flag
         if _definite(mass, EIGENVALUE_MARGIN * least[2], scratch):
-            found |= DEFINITE
+            bits |= DEFINITE
         elif not _definite(mass, least[2] / EIGENVALUE_MARGIN, scratch):
-            found |= INDEFINITE
+            bits |= INDEFINITE
     _note_entries(rows, pattern)
     near = room[end : end + n_rows * n].reshape((n_rows, n))
     _note_entries_near(f, t, q, ways, room[end + n_rows * n : end + n_rows * n + n], near, n_c, pattern)
-    return found
+    return bits
 
 
 @kernel(types.void(KIT, f8, MATRIX, i8, MATRIX))

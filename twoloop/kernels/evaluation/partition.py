@@ -80,18 +80,18 @@ def _largest_from(row, first):
 
 
 @compiled
-def full_pivoting(A, order, row_order, largest, first, last, most):
+def full_pivoting(A, order, row_order, largest, first, last, max_rank):
     """Eliminate A by Gauss with full pivoting, in place: pivots `first`, first + 1, ... from rows up to `last`.
 
-    The elimination ends with `most` pivots. `order` and `row_order` become the order of columns and rows. Returns the
-    number of pivots, the numerical rank. `largest` is scratch: the largest entry of each row, updated where a row has
-    changed.
+    The elimination ends with `max_rank` pivots. `order` and `row_order` become the order of columns and rows. Returns
+    the number of pivots, the numerical rank. `largest` is scratch: the largest entry of each row, updated where a row
+    has changed.
     """
     n_q = A.shape[1]
     k = first
     for i in range(k, last):
         largest[i] = _largest_from(A[i], k)
-    while k < min(last, n_q) and k < most:
+    while k < min(last, n_q) and k < max_rank:
         r = k
         for i in range(k + 1, last):
             if largest[i] > largest[r]:
@@ -149,10 +149,10 @@ def least_pivot(f, w, t, q):
 
 
 @compiled
-def _eliminate(w, most, most_v):
+def _eliminate(w, max_rank, max_rank_v):
     """Order rows and columns of w.Gx: first those of the constraints C, then those that the rows A add.
 
-    Returns the rank of C_q and that of C_q and A together, counted up to `most` and `most_v`.
+    Returns the rank of C_q and that of C_q and A together, counted up to `max_rank` and `max_rank_v`.
     """
     G, order, row_order = w.Gx, w.order, w.row_order
     n_c, n_rows = w.C.size, w.Rate.size
@@ -161,7 +161,7 @@ def _eliminate(w, most, most_v):
         order[j] = j
     for i in range(n_rows):
         row_order[i] = i
-    rank = full_pivoting(G, order, row_order, w.g, 0, n_c, most)
+    rank = full_pivoting(G, order, row_order, w.g, 0, n_c, max_rank)
     w.notes[PIVOT] = abs(G[rank - 1, rank - 1]) if rank > 0 else 1.0
     if n_rows == n_c:
         return rank, rank
@@ -171,7 +171,7 @@ def _eliminate(w, most, most_v):
         for j in range(G.shape[1]):
             G[last, j], G[i, j] = G[i, j], G[last, j]
         last += 1
-    return rank, full_pivoting(G, order, row_order, w.g, rank, last, most_v)
+    return rank, full_pivoting(G, order, row_order, w.g, rank, last, max_rank_v)
 
 
 @merged
@@ -255,8 +255,8 @@ def choose_partition(f, w, t, q):
     w.counters[N_FACTORIZATIONS] += 1
     w.counters[N_PARTITIONS] += 1
     first = w.notes[GENERATION] == 0.0
-    most, most_v = (w.C.size, w.Rate.size) if first else (w.rows.size, w.rows_v.size)
-    rank, rank_v = _eliminate(w, most, most_v)
+    max_rank, max_rank_v = (w.C.size, w.Rate.size) if first else (w.rows.size, w.rows_v.size)
+    rank, rank_v = _eliminate(w, max_rank, max_rank_v)
     if first and (rank != w.rows.size or rank_v != w.rows_v.size):
         w.notes[RANK], w.notes[RANK_V] = rank, rank_v
         return RANK_DIFFERS
@@ -285,8 +285,8 @@ def partition_of_midpoint(f, w, t_mid, state, new_state):
     copy_matrix(w.G, w.Gx)
     rank, rank_v = w.rows.size, w.rows_v.size
     w.counters[N_FACTORIZATIONS] += 1
-    found, found_v = _eliminate(w, rank, rank_v)
-    if found < rank or found_v < rank_v:
+    new_rank, new_rank_v = _eliminate(w, rank, rank_v)
+    if new_rank < rank or new_rank_v < rank_v:
         return SINGULAR
     same = _same_set(w.independent, w.order[rank:])
     if same and not new and _same_set(w.independent_v, w.order[rank_v:]):

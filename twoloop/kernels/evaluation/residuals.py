@@ -69,14 +69,14 @@ def motion_residuals(f, sizes, t, share, atol, runs, parameters, states_q, state
                 largest = max(largest, _relative_residual(off, share * terms + row * atol))
         size, apart = 0.0, 0.0
         for j in range(n):
-            total, most = -Q[j], abs(Q[j])
+            total, largest_term = -Q[j], abs(Q[j])
             for m in range(n):
                 term = M[j, m] * a[m]
-                total, most = total + term, max(most, abs(term))
+                total, largest_term = total + term, max(largest_term, abs(term))
             for i in range(n_c):
                 term = G[i, j] * lam[i]
-                total, most = total + term, max(most, abs(term))
-            size = max(size, most)
+                total, largest_term = total + term, max(largest_term, abs(term))
+            size = max(size, largest_term)
             apart = max(apart, abs(total)) if np.isfinite(total) else np.inf
         largest = max(largest, _relative_residual(apart, share * size))
         worst[k] = largest

@@ -131,8 +131,8 @@ def _count(settings, work, n_evaluations):
     """Count evaluations of steps, accepted or not, and one at their ends; runs that left their lanes do not count."""
     for k in range(LANES):
         if work[RUNNING * LANES + k] == 1.0:
-            made = settings[N_EVALUATIONS] + int(work[EVALUATED * LANES + k])
-            n_evaluations[int(work[RUN * LANES + k])] += made + 1
+            n_before = settings[N_EVALUATIONS] + int(work[EVALUATED * LANES + k])
+            n_evaluations[int(work[RUN * LANES + k])] += n_before + 1
 
 
 @compiled

@@ -71,7 +71,7 @@ def _scale(work, target, factor):
 
 
 @compiled
-def _invert_gram(work, pattern, n_rows, n_redundant, row, factors, shift):
+def _cholesky(work, pattern, n_rows, n_redundant, row, factors, shift):
     """Factor G G^T + shift + Z Z^T by Cholesky in each lane; the diagonal is stored inverted."""
     n_entries = pattern[n_rows] - pattern[0]
     gram = factors + n_entries + n_rows
@@ -117,7 +117,7 @@ def factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors):
             _scale(work, factors + e - pattern[0], length)
     if n_redundant > 0:
         _find_redundant(work, pattern, n_rows, n_redundant, row, factors)
-    _invert_gram(work, pattern, n_rows, n_redundant, row, factors, LEAST)
+    _cholesky(work, pattern, n_rows, n_redundant, row, factors, LEAST)
 
 
 @compiled
@@ -126,7 +126,7 @@ def _find_redundant(work, pattern, n_rows, n_redundant, row, factors):
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
     Z = gram + n_rows * n_rows
     spare = Z + n_redundant * n_rows
-    _invert_gram(work, pattern, n_rows, 0, row, factors, MORE)
+    _cholesky(work, pattern, n_rows, 0, row, factors, MORE)
     for w in range(n_redundant):
         z = Z + w * n_rows
         for i in range(n_rows):

@@ -33,10 +33,10 @@ def largest_of(x):
 @merged
 def contains(numbers, number):
     """Return whether a number is among the given ones."""
-    found = False
+    contained = False
     for each in numbers:
-        found = found or each == number
-    return found
+        contained = contained or each == number
+    return contained
 
 
 @merged

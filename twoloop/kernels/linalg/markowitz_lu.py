@@ -182,9 +182,9 @@ def _subtract(matrix, row, column, pivot, j, nothing):
         i = lists[ROWS, column, m]
         if i == row:
             continue
-        change, found = numbers[column, m] / pivot * number, counts[FOUND, i]
-        if found > 0:
-            numbers[j, found - 1] -= change
+        change, entry = numbers[column, m] / pivot * number, counts[FOUND, i]
+        if entry > 0:
+            numbers[j, entry - 1] -= change
         else:
             done = done and put_entry(matrix, i, j, -change, nothing)
     last = counts[COLUMN_SIZE, j] - 1
@@ -226,7 +226,7 @@ def order(index, matrix, nothing, zero):
             other = lists[COLUMNS, i, n]
             if counts[COLUMN_PLACE, other] > k and not _subtract(matrix, i, j, pivot, other, nothing):
                 return TOO_MANY
-    return ORDERED if _write(index, counts, lists) else TOO_MANY
+    return ORDERED if _store_program(index, counts, lists) else TOO_MANY
 
 
 @compiled
@@ -261,7 +261,7 @@ def _size_of_program(rows, counts, lists):
 
 
 @compiled
-def _write(index, counts, lists):
+def _store_program(index, counts, lists):
     """Write the program; return whether it is short enough: False if dense factors would be faster."""
     r = index[SIZE]
     rows = rows_of(index)

@@ -277,15 +277,15 @@ def _add_rows(mass, G, weak, scale, A, x, order, added):
     """Add rows to M until no eigenvalue is weak, and record them; return their number, or STAYS_SINGULAR."""
     n_added = 0
     while _count_weak(mass, weak, A) > 0:
-        found = -1
+        position = -1
         for k in range(len(G)):
             if order[k] >= 0 and _removes_weak_eigenvalue(A, G[order[k]], scale, x):
-                found = k
+                position = k
                 break
-        if found < 0:
+        if position < 0:
             return STAYS_SINGULAR
-        row = order[found]
-        added[n_added], order[found] = row, -1
+        row = order[position]
+        added[n_added], order[position] = row, -1
         n_added += 1
         for i in range(len(mass)):
             if G[row, i] != 0.0:

@@ -67,14 +67,14 @@ def column_groups(entries: Entries, n_q: int) -> Integers:
     rows_of: list[list[int]] = [[] for _ in range(n_q)]
     for i, j in zip(*(each.tolist() for each in entries), strict=True):
         rows_of[j].append(i)
-    found = np.zeros(n_q, dtype=np.int64)
+    groups = np.zeros(n_q, dtype=np.int64)
     by_row: list[set[int]] = [set() for _ in range(n_q)]  # groups of the columns with an entry in a row
     for j, own in enumerate(rows_of):
         used = set().union(*(by_row[i] for i in own))
-        found[j] = group = next(k for k in range(n_q) if k not in used)
+        groups[j] = group = next(k for k in range(n_q) if k not in used)
         for i in own:
             by_row[i].add(group)
-    return found
+    return groups
 
 
 @inlined

@@ -285,8 +285,8 @@ def program_in_order(
     keys = column_of * n + row_of  # ascending
 
     def slots(column: Integers, row: Integers) -> Integers:
-        found = n + np.searchsorted(keys, column * n + row)
-        return np.where(column == row, column, found)
+        positions = n + np.searchsorted(keys, column * n + row)
+        return np.where(column == row, column, positions)
 
     firsts, seconds = [row_of[:0]], [row_of[:0]]
     for each in below:
@@ -335,15 +335,15 @@ def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]
     below: list[set[int]] = [set() for _ in range(n)]
     for column, row in zip(low.tolist(), high.tolist(), strict=True):
         below[column].add(row)
-    made = []
+    patterns = []
     for column in range(n):
         below[column].discard(column)
         rows = sorted(below[column])
         if rows:
             below[rows[0]].update(rows[1:])
-        made.append(np.array(rows, dtype=np.int64))
+        patterns.append(np.array(rows, dtype=np.int64))
         below[column] = set()
-    return made
+    return patterns
 
 
 @inlined

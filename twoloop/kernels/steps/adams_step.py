@@ -34,10 +34,10 @@ REST = WEIGHTS * (1.0 - NODES)
 
 def _equal_steps():
     """Return |g_k - g_k+1| of equal steps by the order k: the error of velocities over h times a difference."""
-    made = np.ones(HIGHEST + 1)
+    coefficients = np.ones(HIGHEST + 1)
     for k in range(1, HIGHEST + 1):
-        made[k] = -np.sum(made[:k] / np.arange(k + 1.0, 1.0, -1.0))
-    return np.abs(made)
+        coefficients[k] = -np.sum(coefficients[:k] / np.arange(k + 1.0, 1.0, -1.0))
+    return np.abs(coefficients)
 
 
 # error constants; a step much shorter than those before has smaller ones, but not if the force jumps within it
