@@ -1,11 +1,10 @@
 """`studies.compare` where something is missing or fails: no reference, no end, no measure, a mass of less rank."""
 
-import numpy as np
 import pandas as pd
 import pytest
 
 from studies import compare
-from studies.bench import metrics, reference_motion
+from studies.bench import reference_motion
 from studies.bench.collector import Case, Run, called_from
 from studies.bench.solvers import CATALOGUE
 
@@ -101,18 +100,3 @@ def test_where_no_solver_reaches_the_end_the_report_lists_them(mechanisms):
         compared(mechanisms, "plain", "--t-end", "0.1", "--solvers", "Exudyn, GeneralizedAlpha")
     text = (mechanisms.parent / "plain" / "compare.md").read_text()
     assert "not compared" in text and "not applicable" in text
-
-
-@pytest.mark.slow
-def test_a_run_that_cannot_be_measured_is_a_row(mechanisms, monkeypatch):
-    def measure(problem, result, *others):
-        if result.method == "DOP853":
-            raise np.linalg.LinAlgError("Singular matrix")
-        return real(problem, result, *others)
-
-    real = metrics.measure
-    monkeypatch.setattr(metrics, "measure", measure)
-    _, rows = compared(mechanisms, "plain", "--t-end", "0.1", "--solvers", "DOP853 (twoloop)", "Gauss12")
-    found = dict(zip(rows["solver"], zip(rows["status"], rows["message"], strict=True), strict=True))
-    assert found["Gauss12"][0] == "REACHED_END" and found["DOP853 (twoloop)"][0] == "NOT_MEASURED"
-    assert found["DOP853 (twoloop)"][1] == "REACHED_END, but it cannot be measured: LinAlgError: Singular matrix"

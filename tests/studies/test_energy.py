@@ -16,12 +16,10 @@ from studies.bench.solvers import CVODE_C, CVODES, CYRK, DEFAULT, DIFFRAX, HEYOK
 from studies.bench.store import Output
 from studies.energy import (
     DRIFTS,
-    EVEN,
     GAUSS,
     IRREGULAR,
     IS_LOST,
     LONG,
-    MIDPOINT,
     NEWMARK,
     NO_DRIFT,
     NOT_QUICK,
@@ -102,15 +100,6 @@ def test_the_committed_rows_say_which_methods_drift(rows):
     assert pick(rows, SWITCHING, NEWMARK)["verdict"] in (DRIFTS, IS_LOST)
     paper = pick(rows, ONE, IRK, group="controlled")
     assert paper["verdict"] == DRIFTS and abs(paper["slope"]) > 10.0 * paper["slope_error"]
-
-
-@pytest.mark.slow  # the quick study
-def test_across_changes_of_partition_only_symmetry_helps(quick):
-    for solver in (GAUSS, SUN):
-        assert pick(quick, SWITCHING, solver)["verdict"] == DRIFTS
-    assert pick(quick, SWITCHING, SUN, EVEN)["verdict"] == SLOWLY
-    assert pick(quick, SWITCHING, GAUSS, EVEN)["verdict"] == NO_DRIFT
-    assert pick(quick, SWITCHING, MIDPOINT, EVEN)["verdict"] == NO_DRIFT
 
 
 FIXED = "group == 'fixed' and case == "

@@ -137,25 +137,6 @@ def test_linkages_by_the_hundred_are_assembled_as_one_is():
 
 
 @pytest.mark.slow
-def test_energies_and_ends_of_many_are_those_of_one(monkeypatch):
-    monkeypatch.setattr(ensembles, "N_WORST", 2)
-    monkeypatch.setattr(ensembles, "N_ANY", 3)
-    monkeypatch.setattr(ensembles, "BLOCK", 12)
-    row, (given, q0), t = ensembles.drawn_row(30, 1.0), ensembles.assembled(30), np.array([0.5, 1.0])
-    runs = ensembles.ensemble(
-        ensembles.four_bar().system, (0.0, 1.0), q0, np.zeros(9), parameters=given[:, :4], t_eval=t
-    )
-    for k in (0, 11):
-        problem = ensembles.linkage(*given[k, :5], int(given[k, 5]))
-        known = problem.energy(0.0, runs.q[k], runs.v[k]) / (9.81 * (given[k, :3] ** 2).sum())
-        assert np.abs(ensembles.energies(given[:, :3], runs.q, runs.v)[k] - known).max() < 1e-14
-    assert ensembles.energy_errors(given, q0, runs).max() <= row["energy_error"] < 1e-7
-    assert row["n_failed"] == 0 and row["n_assembled"] == len(given)
-    assert 0.0 < row["end_error_any"] < 1e-6 and 0.0 < row["end_error_hard"] < 1e-6
-    assert ensembles.end_error(given[0], runs.q[0, :, -1] + 1e-3, 1.0) == pytest.approx(1e-3, rel=1e-3)
-
-
-@pytest.mark.slow
 def test_the_quick_run(tmp_path):
     ensembles.STUDY.main(["--quick", "--out", str(tmp_path)])
     text = (tmp_path / "ensembles.md").read_text()

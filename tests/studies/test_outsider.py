@@ -116,14 +116,6 @@ def test_files_that_are_no_solver(tmp_path):
         outsider.start()
 
 
-@pytest.mark.slow
-def test_a_process_that_dies_while_it_loads_says_why(tmp_path):
-    path = tmp_path / "dying.py"
-    path.write_text("import os, sys\nprint('no licence', file=sys.stderr, flush=True)\nos._exit(3)\n")
-    with pytest.raises(StudyError, match="ended with status 3: no licence"):
-        Outsider(f"{path}:solve", "pendulum").start()
-
-
 def test_files_that_are_not_there(tmp_path):
     for where in ("mine.py:solve", str(tmp_path), f"{tmp_path}:solve"):
         with pytest.raises(StudyError, match=r"--solver takes FILE\.py:FUNCTION"):
