@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from references.equations.accelerations import SINGULAR, Equations, cholesky, compiled_gamma, saddle_solve
+from references.equations.accelerations import SINGULAR, Equations, cholesky, saddle_solve
 from references.equations.expressions import Expressions, functions_of
 from references.equations.rows import accelerations as least_norm
 from references.equations.straight_line import straight_line
@@ -17,7 +17,7 @@ from tests.compiled import PENDULUM
 from tests.general.systems import SPRING, massless_coordinate
 from tests.marks import slow, slow_but
 from tests.mechanisms.make_references import solution
-from tests.problems import moving_pivot, moving_pivot_state, oblique_pendulum, oblique_start, pendulum, worst
+from tests.problems import pendulum, worst
 from tests.problems import pendulum as plain_pendulum
 from twoloop import ConstrainedSystem, Status, mechanisms, solve_dae
 from twoloop.kernels.compile.callbacks import callback
@@ -37,42 +37,6 @@ from twoloop.mechanisms import (
 
 def accelerations(system, t, q, v):
     return Equations(system, t[0], np.array(q)[:, 0]).at_points(np.array(t), np.concatenate([q, v]))
-
-
-def unbalanced(system, t, q, v, a, lam):
-    """Largest residual of M a + C_q^T lam = Q."""
-    return worst(system.mass(t, q) @ a + system.jacobian(t, q).T @ lam, system.force(t, q, v))
-
-
-@pytest.mark.slow
-def test_full_mass_that_varies_and_baumgarte_terms_off_the_constraints():
-    system = oblique_pendulum()
-    q, v = (np.array(x, dtype=float) for x in oblique_start())
-    times, states = np.array([0.0, 0.7]), np.array([[*q, *v], [*(q + 0.2), *(v - 0.3)]]).T
-    gamma = compiled_gamma(system)
-    for alpha in (0.0, 3.0):
-        a, lam = Equations(system, 0.0, q).at_points(times, states, alpha)
-        for k, t in enumerate(times):
-            q, v = np.split(states[:, k].copy(), 2)
-            right = np.zeros(1)
-            gamma(t, q, v, system.functions.p, right)
-            right -= 2.0 * alpha * system.velocity_constraint(t, q, v) + alpha**2 * system.constraint(t, q)
-            assert unbalanced(system, t, q, v, a[:, k], lam[:, k]) < 1e-12
-            assert worst(system.jacobian(t, q) @ a[:, k], right) < 1e-12
-
-
-@pytest.mark.slow  # its two systems are compiled for seconds
-def test_gamma_is_the_callback_or_differences():
-    given, differenced = moving_pivot(), moving_pivot(gamma=False)
-    times = np.array([0.2, 1.9])
-    q, v = moving_pivot_state(times)
-    for k, t in enumerate(times):
-        by_differences = np.zeros(1)
-        compiled_gamma(differenced)(t, q[:, k].copy(), v[:, k].copy(), differenced.functions.p, by_differences)
-        assert worst(by_differences, given.gamma(t, q[:, k], v[:, k])) < 1e-8
-    assert compiled_gamma(given) is given.functions.gamma
-    for a, b in zip(accelerations(given, times, q, v), accelerations(differenced, times, q, v), strict=True):
-        assert worst(a, b) < 1e-8
 
 
 @pytest.mark.slow

@@ -5,9 +5,8 @@ import pytest
 
 from references.paper.four_bar_minimal import trajectory
 from references.paper.gear import HIGHEST, STARTS, _formulas, solve_gear
-from tests.problems import force_residual, moving_pivot, moving_pivot_state, violations, worst
+from tests.problems import force_residual, violations, worst
 from twoloop.mechanisms import four_bar
-from twoloop.run.record import Status
 
 PROBLEM = four_bar()
 
@@ -51,23 +50,3 @@ def test_positions_keep_the_constraints_and_velocities_nearly(order, start):
     before, after = (violations(PROBLEM.system, result)[1] for result in (coarse, fine))
     assert 1e-6 < after < before / 1.5  # asked for by nothing, an error of the formula
     assert force_residual(PROBLEM.system, fine) < 1e-8
-
-
-@pytest.mark.parametrize("order", [2, 3])
-@pytest.mark.slow
-def test_time_dependent_constraints(order):
-    system = moving_pivot(gamma=False)
-    q, v = moving_pivot_state(0.0)
-    errors = []
-    for step in (0.01, 0.005):
-        result = solve_gear(system, (0.0, 1.0), q, v, step, order, start="accurate")
-        errors.append(worst(result.q, moving_pivot_state(result.t)[0]))
-    assert errors[0] < 3e-3 and abs(np.log2(errors[0] / errors[1]) - order) < 0.3
-
-
-@pytest.mark.slow
-def test_too_large_a_step_comes_back_as_a_row():
-    result = run(10.0, 0.1, 3)
-    assert result.status is Status.SOLVER_FAILED and not result.success
-    assert "order 3 failed in the step to t = 1:" in result.message and "smaller step" in result.message
-    assert result.t[-1] == pytest.approx(0.9) and result.stats.n_accepted == result.h.size == result.t.size - 1 == 9

@@ -13,7 +13,7 @@ from references.driver import user_call
 from studies.bench import collector as bench
 from studies.bench.apart import TimeLimit
 from studies.bench.collector import CALLS, Case, NotApplicable, Run, Solver, collect
-from studies.bench.reference_motion import Quintic, ReferenceMotion, check_published, make_reference
+from studies.bench.reference_motion import Quintic, ReferenceMotion, check_published
 from studies.bench.solvers import CATALOGUE
 from studies.bench.store import KeptRows
 from tests.problems import pendulum_problem, pendulum_state, worst
@@ -290,16 +290,6 @@ def test_the_time_is_that_of_the_whole_call_or_of_what_an_adapter_marks(kept):
 def test_two_equal_runs_are_refused(kept):
     with kept, pytest.raises(ValueError, match="same group"):
         collect([Run(case(), solver(ours), 1e-6)] * 2, kept)
-
-
-@pytest.mark.slow
-def test_a_made_reference_says_how_far_it_holds():
-    made = make_reference(problem(), T_END)
-    t = np.linspace(0.0, T_END, 77)
-    q, v, _ = pendulum_state(t)
-    states = made.states(t)
-    assert worst(states[0], q) < 10.0 * made.floor < 1e-10 and worst(states[1], v) < 1e-9
-    assert "Gauss16" in made.source and "DOP853" in made.source
 
 
 def test_a_published_state_checks_the_reference():

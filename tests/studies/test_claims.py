@@ -8,7 +8,6 @@ import pandas as pd
 import pytest
 
 from studies.bench.cli import StudyError
-from studies.bench.solvers import IRK
 from studies.claims import experiments, judges
 from studies.claims import study as claims
 from studies.claims.judges import BEAMS, Claim, Judgement, Rows, Verdict, kind_of, load, read
@@ -181,14 +180,6 @@ def test_the_numbers_are_those_of_the_rows(tables):
 
 def test_without_rows_nothing_is_judged():
     assert all(judgement.verdict is NOT_RUN and judgement.why for _, judgement in judged(Rows({}, {})).values())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("every", [80, 1])
-def test_a_missing_solver_is_not_run_and_never_an_exception(tables, every):
-    solvers = sorted({str(solver) for table in tables.values() for solver in table["solver"].unique()})
-    for solver in {*solvers[::every], IRK, "DOP853, projected"}:
-        judged(Rows({name: table[table["solver"] != solver] for name, table in tables.items()}, EXPERIMENTS))
 
 
 def test_quick_rows_do_not_answer_what_is_about_long_runs(tables):

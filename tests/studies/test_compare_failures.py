@@ -55,19 +55,6 @@ def compared(path, name, *words):
     return (out / "compare.md").read_text(), pd.read_csv(out / "compare.csv", comment="#")
 
 
-@pytest.mark.slow
-def test_euler_parameters(mechanisms, capsys):
-    solvers = ["DOP853 (twoloop)", "DOP853, projected", "LSODA, index 1"]
-    text, rows = compared(mechanisms, "top", "--t-end", "0.02", "--solvers", *solvers)
-    own = rows[rows["solver"] == solvers[0]]
-    assert set(own["status"]) == {"REACHED_END"} and own["error_q"].max() < 1e-2 and own["energy"].abs().max() > 0.0
-    others = rows[rows["solver"] != solvers[0]]
-    assert set(others["status"]) == {"REACHED_END"} and others["error_q"].max() < 1e-2
-    assert "DOP853, projected" in text and "both two-loop" not in text and "|DOP853, compiled=False|" in text
-    said = capsys.readouterr().out
-    assert "making the reference of 'heavy top' to 0.02 s, at most 300 s a run" in said and "it holds to" in said
-
-
 def test_called_from_python_is_said_of_what_is():
     names = {}
     exec(MECHANISMS, names)
@@ -92,11 +79,3 @@ def test_without_a_reference_the_report_says_why(mechanisms, monkeypatch):
 def test_functions_that_raise_are_named(mechanisms):
     with pytest.raises(SystemExit, match=r"^error: no reference for 'swing': KeyError: 'x'; raised by force of system"):
         compared(mechanisms, "raising")
-
-
-@pytest.mark.slow
-def test_where_no_solver_reaches_the_end_the_report_lists_them(mechanisms):
-    with pytest.raises(SystemExit, match=r"^error: no solver reached the end; the first said: Exudyn needs a model"):
-        compared(mechanisms, "plain", "--t-end", "0.1", "--solvers", "Exudyn, GeneralizedAlpha")
-    text = (mechanisms.parent / "plain" / "compare.md").read_text()
-    assert "not compared" in text and "not applicable" in text
