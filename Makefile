@@ -77,20 +77,19 @@ reports: install ## all studies into reports/
 	$(RUN) -m studies all $(ARGS)
 
 # the inner loop is there; two processes of about equal work, neither of which imports, and so compiles, what the other
-# does: what Newton's matrices and large systems have in common, and bodies in space, are in one of them
+# does: the steps of `twoloop` are in one, the paper's steps and the callbacks of bodies and mechanisms in the other
 compile: install ## compile the kernels, and the callbacks of bodies, mechanisms and studies, on two cores
 	@echo "Compiling (once, on both cores) the kernels, and the callbacks of bodies, mechanisms and studies"
 	@$(RUN) -c "from twoloop.kernels.evaluation import inner_loop; from twoloop.kernels.control import step_size"
-	@$(RUN) -c "from twoloop.kernels.steps import diagonal_step, newton_step, taylor_step; \
-	from twoloop.kernels.evaluation import sparse_inner_loop; from twoloop.bodies import programs; \
-	from studies.bench import sharp_callbacks; $(CALLBACKS_OF_TESTS)" & \
-	$(RUN) -c "from twoloop.kernels import advance, interpolation, cached_run; \
-	from twoloop.kernels.linalg import dependent_columns, rank; from twoloop.kernels.control import stiffness; \
-	from twoloop.kernels.evaluation import checks, residuals, traced; \
-	from twoloop.kernels.lanes import advance, explicit, starts; \
-	from twoloop.kernels.steps import adams_step, crossing_step, explicit_step, lazy, lobatto_step; \
+	@$(RUN) -c "from twoloop.kernels import advance, interpolation, cached_run; \
+	from twoloop.kernels.steps import diagonal_step, newton_step; from twoloop.kernels.control import stiffness; \
+	from twoloop.kernels.evaluation import checks, residuals, sparse_inner_loop, traced; \
+	from twoloop.kernels.linalg import dependent_columns, rank; from twoloop.kernels.lanes import advance, explicit, starts; \
+	from twoloop.kernels.steps import adams_step, crossing_step, explicit_step, lazy, lobatto_step, taylor_step; \
+	$(CALLBACKS_OF_TESTS)" & \
+	$(RUN) -c "from twoloop.bodies import programs; from studies.honesty import traps; from twoloop.mechanisms import *; \
 	from twoloop.kernels.paper import bdf_step, fixed_point_step, newmark_step, paper_step; \
-	from twoloop.mechanisms import *; from studies.honesty import traps; $(CALLBACKS_OF_MORE_TESTS)" && wait $$!
+	$(CALLBACKS_OF_MORE_TESTS)" && wait $$!
 
 # kernels that slow tests alone need
 compile-all: compile
@@ -102,11 +101,11 @@ SHARED := -n 2 --dist loadfile --no-loadscope-reorder
 
 # what tests compile when they are imported is compiled before: both workers would do that
 test: CALLBACKS_OF_TESTS := import tests.compiled, tests.problems, tests.test_bounds, tests.test_callbacks, \
-	tests.test_repeated_calls, tests.test_certificate, tests.references.test_solver_setups
+	tests.test_repeated_calls, tests.test_certificate
 test: CALLBACKS_OF_MORE_TESTS := import tests.studies.test_honesty, tests.test_differential, \
-	tests.test_derivative_campaign, tests.references.test_equations, tests.references.test_ida, \
-	tests.general.test_consistent_states, tests.general.test_lane_methods, tests.kernels.test_switching, tests.test_traced_values, \
-	tests.test_other_parameters
+	tests.references.test_solver_setups, tests.references.test_equations, tests.references.test_ida, \
+	tests.test_derivative_campaign, tests.general.test_consistent_states, tests.general.test_lane_methods, \
+	tests.kernels.test_switching, tests.test_traced_values, tests.test_other_parameters
 test: compile ## the tests that a change needs, on two cores
 	$(RUN) -m pytest $(SHARED) $(ARGS)
 
