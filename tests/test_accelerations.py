@@ -134,7 +134,7 @@ def test_so_are_those_of_random_loops_of_bodies(planar, kinds):
 
 
 @pytest.mark.parametrize(
-    ("name", "span"), quick([("spatial_four_bar", 2.0), ("four_bar", 5.0), ("spatial_slider_crank", 2.0)], 2)
+    ("name", "span"), quick([("four_bar", 5.0), ("spatial_slider_crank", 2.0), ("spatial_four_bar", 2.0)], 2)
 )
 def test_where_a_pivot_vanishes_on_the_way_the_same_accelerations_are_found(name, span):
     """And on both sides of it by few operations, whatever the sign of the pivot is."""

@@ -6,7 +6,6 @@ from scipy.interpolate import CubicSpline
 
 from tests.bad_input.bodies import loop
 from tests.bodies.runs import by_hand, moved
-from tests.marks import slow
 from twoloop import solve_with_stops
 from twoloop.bodies import PlanarModel, SpatialModel
 
@@ -173,7 +172,8 @@ def arm(driven):
     return model
 
 
-@pytest.mark.parametrize(("make", "actuators"), [slow(linkage, ["A"]), (arm, ["A", "B"])])
+@pytest.mark.slow  # compiles for seconds
+@pytest.mark.parametrize(("make", "actuators"), [(linkage, ["A"]), (arm, ["A", "B"])])
 def test_actuators_make_the_motion_that_is_prescribed_elsewhere(make, actuators):
     problem, free = make(True).problem((0.0, 1.0)), make(False)
     wanted = moved(problem, t_eval=np.linspace(0.0, 1.0, 301))

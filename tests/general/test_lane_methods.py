@@ -352,7 +352,7 @@ def test_what_cannot_go_in_lanes_says_why():
     assert np.isnan(runs.q[runs.status == Status.EVENT][:, :, -1]).all()
 
 
-@pytest.mark.parametrize(("method", "by_state"), [("auto", False), slow("DOP853", False), slow("auto", True)])
+@pytest.mark.parametrize(("method", "by_state"), [slow("auto", False), slow("DOP853", False), ("auto", True)])
 def test_what_is_narrow_and_acts_in_later_runs_alone_is_seen(method, by_state):
     """Of the first run, whose factor is zero, nothing tells that there is something."""
 

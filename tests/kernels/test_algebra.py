@@ -81,6 +81,7 @@ def program(G, pattern, columns):
     return make_program(G, pattern, np.arange(r), columns, index, values), index, values
 
 
+@pytest.mark.slow  # compiles for seconds
 @settings(max_examples=15)
 @given(st.integers(1, 40), st.integers(0, 5), st.sampled_from([0.05, 0.1, 0.3, 1.0]), st.integers(0, 2**32 - 1))
 def test_factors_solve(r, n_free, share, seed):

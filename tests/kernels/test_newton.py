@@ -127,7 +127,7 @@ def bounced(stiffness, t):
 @pytest.mark.parametrize(
     ("method", "tol"),
     [
-        (RungeKutta(radau_iia(3), outer="newton", tested="positions"), 1e-10),
+        slow(RungeKutta(radau_iia(3), outer="newton", tested="positions"), 1e-10),
         ("ESDIRK4", 1e-6),
         slow("TRBDF2", 1e-9),
         slow("ESDIRK4", 1e-4),

@@ -121,6 +121,7 @@ def test_runs_are_those_of_the_dense_forms(form, case, method, tolerance, allowe
     alike(*ends, allowed)
 
 
+@pytest.mark.slow
 def test_a_force_that_comes_up_between_others_is_found_missing(form):
     """A spring that couples two distant bars as soon as they have moved: no position at the start shows it."""
     made, n = open_chain(12), 12

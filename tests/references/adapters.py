@@ -43,7 +43,7 @@ ADAPTERS: dict[str, Any] = {
 }
 # one of each way to call a solver, of those that need no long compilation: the other tests are slow.
 # DOP853 at index 1 has tests of its own, in test_index1.py
-QUICK = ("IDA, stabilised", "IDA from C, stabilised")
+QUICK = ("IDA, stabilised",)
 # callbacks in Python, too
 ANY_CALLBACK = (*(name for name, line in FOUND.items() if not (line.traces or line.compiled_callbacks)), "GSTIFF")
 

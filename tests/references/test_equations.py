@@ -60,7 +60,7 @@ def test_a_mass_that_is_constant_or_singular_alone(make):
     assert worst(a[:, 0], known[0]) < 1e-11 * size and worst(lam[:, 0], known[1]) < 1e-11 * size
 
 
-@pytest.mark.parametrize("seed", [0, slow(3)])
+@pytest.mark.parametrize("seed", [slow(0), slow(3)])
 def test_saddle_points_of_indefinite_matrices(seed):
     rng = np.random.default_rng(seed)
     M, Cq, Q, Qd = rng.normal(size=(6, 6)), rng.normal(size=(4, 6)), rng.normal(size=6), rng.normal(size=4)

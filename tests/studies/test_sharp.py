@@ -37,7 +37,7 @@ def test_their_machine_code_is_kept_on_disk():
         assert force.stats.cache_path is not None
 
 
-@pytest.mark.parametrize("name", [slow(name) if name == "in space" else name for name in MECHANISMS])
+@pytest.mark.parametrize("name", [slow(name) if name in ("in space", "four-bar") else name for name in MECHANISMS])
 def test_callbacks_and_independent_coordinates_agree(name):
     mechanism = MECHANISMS[name](FORCE)
     truth = known(mechanism)

@@ -128,6 +128,7 @@ def test_the_quick_study_has_all_cells_and_is_drawn_again_as_it_was(tmp_path):
     assert newmark["n_evaluations"][1e-9] > 5.0 * irk["n_evaluations"][1e-9]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unsaved")
 def test_one_machine_constant_is_told_from_more(tmp_path):
     found = found_of(table3, tmp_path, rows())
