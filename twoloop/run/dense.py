@@ -142,7 +142,10 @@ class Interpolator:
         self.nodes, self.room, self.rows = np.zeros(2 * half), np.zeros((2 * half, n)), np.zeros((3, 2 * n))
 
     def __reduce__(self) -> tuple[Any, ...]:  # copies, also in other processes
-        return type(self), self.made_of, {"parts": self.parts, "filled": self.filled, "judges": self.judges}
+        *arguments, plans = self.made_of
+        # generated code has addresses in this process: copies do without it
+        plans = {kind: plan.changed(own=()) if plan.own else plan for kind, plan in plans.items()}
+        return type(self), (*arguments, plans), {"parts": self.parts, "filled": self.filled, "judges": self.judges}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
