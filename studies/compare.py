@@ -25,7 +25,7 @@ from studies.bench.store import Output, Row
 from twoloop import Result
 from twoloop.mechanisms import Problem
 from twoloop.mechanisms.registry import problem_from
-from twoloop.methods.preparation import is_small
+from twoloop.methods.presets import is_small
 from twoloop.rows.leaderboard import boards
 from twoloop.rows.row_format import CALIBRATION, calibration_s, format_rows
 

@@ -12,7 +12,7 @@ from tests.problems import force_residual, pendulum_state, quick, run, swing, vi
 from twoloop import RungeKutta, Status, solve_dae
 from twoloop.methods.presets import PRESETS
 from twoloop.methods.tableaux import gauss, lobatto_iiie
-from twoloop.run.dense import Interpolator
+from twoloop.run.dense_solution import Interpolator
 
 END = 2.0
 LOOSE = ("Newmark", "BDF", "TRBDF2", "ESDIRK4", "PaperIRK", "PaperNewmark")  # steps without number at tight tolerances

@@ -17,13 +17,13 @@ from twoloop.checks.arguments import check_span, check_times, check_vector, is_v
 from twoloop.checks.consistency import ConstraintWarning
 from twoloop.kernels.layout import give_back
 from twoloop.methods.plan import Method
-from twoloop.methods.preparation import Compiled
+from twoloop.methods.presets import Compiled
 from twoloop.problem.events import check_events
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.result.storage import begin_folder, check_folder, end_folder
 from twoloop.run.cached import STEPS, Missed, Output, cached_result, fields_of, set_up
-from twoloop.run.discontinuities import MOST, closer, may_have_missed_changes
+from twoloop.run.fallbacks import MOST, closer, may_have_missed_changes
 from twoloop.run.loop import IntegrationLoop, Interrupts, interrupted_record
 from twoloop.run.options import options_of
 from twoloop.run.record import Status, record_of

@@ -21,7 +21,7 @@ from studies.bench.collector import Case, NotApplicable, Solver
 from twoloop import Result, RungeKutta, paper_irk, paper_newmark, solve_dae
 from twoloop.methods.auto import LOOSE, TIGHTEST
 from twoloop.methods.plan import Method
-from twoloop.methods.preparation import Compiled
+from twoloop.methods.presets import Compiled
 from twoloop.methods.tableaux import sun_radau_iib
 
 TOLERANCES = tuple(float(f"1e-{k}") for k in range(3, 14))  # of all solvers that have one: no gap of over a decade

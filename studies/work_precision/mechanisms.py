@@ -27,7 +27,7 @@ from studies.bench.store import KeptRows, Row
 from studies.validation.study import MAKE
 from twoloop import mechanisms, solve_dae
 from twoloop.mechanisms import Problem, Reference
-from twoloop.methods.preparation import is_small
+from twoloop.methods.presets import is_small
 
 GROUP = "every mechanism"
 DECADES = tuple(10.0**-k for k in range(3, 14))

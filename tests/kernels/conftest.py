@@ -1,7 +1,7 @@
 import pytest
 
 from twoloop.mechanisms import planar
-from twoloop.run import static_form
+from twoloop.run import workspace
 
 
 @pytest.fixture
@@ -9,7 +9,7 @@ def large(monkeypatch):
     """What sets from how many coordinates on the static form is taken: here by all."""
 
     def set_to(n):
-        monkeypatch.setattr(static_form, "LARGE", n)
+        monkeypatch.setattr(workspace, "LARGE", n)
         monkeypatch.setattr(planar, "LARGE", n)
 
     set_to(0)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-import twoloop.run.static_form as static_module
+import twoloop.run.workspace as static_module
 from studies.bench.large import PLANAR, closed_chain, grid, ladder, open_chain, tree
 from tests.kernels.random_assemblies import PlanarAssembly
 from tests.large_systems import spatial_chain

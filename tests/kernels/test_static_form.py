@@ -5,7 +5,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-import twoloop.run.static_form as static_module
+import twoloop.run.workspace as static_module
 from studies.bench.large import LEVEL, PLANAR, closed_chain, grid, ladder
 from tests.kernels.random_assemblies import PlanarAssembly, SpatialAssembly, dense_solution, drawn
 from tests.large_systems import spatial_chain, started_run
@@ -17,8 +17,7 @@ from twoloop.checks.callbacks import MOST
 from twoloop.kernels import advance
 from twoloop.kernels.data import indices
 from twoloop.kernels.linalg import symbolic_factorization as static_program
-from twoloop.run.static_form import static_form
-from twoloop.run.workspace import kit_of, workspace
+from twoloop.run.workspace import kit_of, static_form, workspace
 
 
 class Started:

@@ -11,7 +11,7 @@ from tests.processes import run_python
 from twoloop import solve_dae
 from twoloop.problem import compiled_functions
 from twoloop.symbolic import from_lagrangian
-from twoloop.symbolic.equations import Equations
+from twoloop.symbolic.expressions import Equations
 
 m, length, g = sp.symbols("m l g")
 

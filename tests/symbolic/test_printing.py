@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from twoloop.symbolic.equations import callback_source, energy_source
-from twoloop.symbolic.expressions import FUNCTIONS, Differentiation
+from twoloop.symbolic.expressions import FUNCTIONS, Differentiation, callback_source, energy_source
 
 a, b = sp.symbols("q0 q1")
 VALUES = {a: sp.Float(0.37), b: sp.Float(0.81)}

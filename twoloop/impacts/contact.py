@@ -18,7 +18,7 @@ from twoloop.kernels.data import indices
 from twoloop.methods.dop853 import DOP853
 from twoloop.problem.description import Stop
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.discontinuities import NEGLIGIBLE
+from twoloop.run.fallbacks import NEGLIGIBLE
 from twoloop.run.run import Run
 
 

@@ -13,7 +13,7 @@ from twoloop.checks.arguments import Array
 from twoloop.impacts.contact import Gap, Gaps
 from twoloop.problem.description import Stop
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.discontinuities import NEGLIGIBLE, scaled_equations
+from twoloop.run.fallbacks import NEGLIGIBLE, scaled_equations
 
 if TYPE_CHECKING:
     from twoloop.bodies.model_problem import ModelProblem

@@ -46,7 +46,7 @@ from twoloop.methods.taylor import Taylor
 from twoloop.problem.description import Stop
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
-from twoloop.run.discontinuities import corrected
+from twoloop.run.fallbacks import corrected
 from twoloop.run.options import check_method
 from twoloop.run.record import Status
 from twoloop.run.signals import SignalHandlers

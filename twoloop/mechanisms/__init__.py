@@ -18,14 +18,18 @@ if TYPE_CHECKING:
     from twoloop.mechanisms.n_four_bar import n_four_bar
     from twoloop.mechanisms.natural import bricard, closed_chain, double_pendulum, pendulum, projection_pendulum
     from twoloop.mechanisms.rolling_disc import rolling_disc
-    from twoloop.mechanisms.slider_cranks import driven_crank, driven_slider_crank, redundant_slider_crank
+    from twoloop.mechanisms.slider_cranks import (
+        driven_crank,
+        driven_slider_crank,
+        redundant_slider_crank,
+        sundials_slider_crank,
+    )
     from twoloop.mechanisms.spatial import governor, heavy_top, spatial_four_bar, spatial_slider_crank
-    from twoloop.mechanisms.sundials_slider_crank import sundials_slider_crank
 
 _MODULES = {  # of mechanisms whose modules have other names
     "ancf_beam": ("moderately_stiff_beam", "very_flexible_beam"),
     "natural": ("bricard", "closed_chain", "double_pendulum", "pendulum", "projection_pendulum"),
-    "slider_cranks": ("driven_crank", "driven_slider_crank", "redundant_slider_crank"),
+    "slider_cranks": ("driven_crank", "driven_slider_crank", "redundant_slider_crank", "sundials_slider_crank"),
     "spatial": ("governor", "heavy_top", "spatial_four_bar", "spatial_slider_crank"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}

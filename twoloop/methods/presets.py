@@ -1,18 +1,26 @@
-"""Presets: names of methods with their usual settings; and a key that equal methods share."""
+"""Presets: names of methods with their usual settings; generated code and plans of a method, cached with the system."""
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
+from twoloop.checks.arguments import shown
+from twoloop.generate.compile_equations import GeneratedCode, generated_code
+from twoloop.generate.graph import Untraceable
+from twoloop.generate.series import is_quick, series_for
+from twoloop.generate.traced_values import Check
+from twoloop.kernels.data.indices import ACCELERATIONS, APART, VELOCITIES
 from twoloop.methods.adams import Adams
 from twoloop.methods.auto import Auto
 from twoloop.methods.dop853 import DOP853
 from twoloop.methods.lobatto import Lobatto16
 from twoloop.methods.paper import BDF, Newmark, paper_irk, paper_newmark
-from twoloop.methods.plan import Method
+from twoloop.methods.plan import Method, Plan, needs_code, takes_code
 from twoloop.methods.runge_kutta import ESDIRK, RungeKutta
 from twoloop.methods.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
 from twoloop.methods.taylor import Taylor
+from twoloop.problem.system import ConstrainedSystem
 
 PRESETS: dict[str, Method] = {
     "auto": Auto(
@@ -68,3 +76,156 @@ def identity(method: Method) -> Any:
         return None
     values = [value.content if type(value) is Tableau else value for value in vars(method).values()]
     return (type(method), *values) if all(isinstance(value, (*PLAIN, tuple)) for value in values) else None
+
+
+Array = NDArray[np.float64]
+Compiled = bool | Literal["auto"]
+
+# largest number of operations of the series of a small mechanism; it does not depend on the position. Code of
+# mechanisms with 230 to 280 operations takes 0.6 s to build, two thirds of it in LLVM; with 370 to 690 it takes 0.7 to
+# 1.9 s (Bricard 1.6, governor 1.9, whose stiff motion takes a tenth longer with code)
+SMALL = 300
+
+
+def check_compiled(value: Compiled) -> Compiled:
+    """Return `value`, or raise if it is not one of the choices."""
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, str) and value == "auto":
+        return value
+    raise (ValueError if isinstance(value, str) else TypeError)(
+        f"compiled must be True, False or 'auto'; given {shown(value)} of type {type(value).__name__}"
+    )
+
+
+def code_for(
+    system: ConstrainedSystem, method: Method, fixed: bool, compiled: Compiled, t0: float, q0: Array, check: Check
+) -> GeneratedCode | None:
+    """Return the generated code for a run, or None if the run gets none.
+
+    "auto" depends only on the arguments of the call, so that the same call gives the same numbers whatever ran before.
+
+    Raises ValueError if code is requested but does not suit the method, or cannot be generated.
+    """
+    if compiled is True:
+        _refuse(method, fixed)
+        return generated_code(system, t0, q0, check)
+    if needs_code(method):
+        return _needed(system, method, compiled, t0, q0, check)
+    if not may_have_code(system, method, fixed, compiled):
+        return None
+    try:
+        return generated_code(system, t0, q0, check)
+    except ValueError:
+        return None
+
+
+def may_have_code(system: ConstrainedSystem, method: Method, fixed: bool, compiled: Compiled) -> bool:
+    """Return whether a run gets code if it can be generated."""
+    if needs_code(method):
+        return True
+    if compiled == "auto":
+        return not fixed and takes_code(method, False) and is_small(system)
+    return compiled
+
+
+def _needed(
+    system: ConstrainedSystem, method: Method, compiled: Compiled, t0: float, q0: Array, check: Check
+) -> GeneratedCode:
+    """Return the code for a method that needs it, or raise ValueError."""
+    what = f"method={method.name!r} needs code made for {system.name!r}"
+    if not compiled:
+        raise ValueError(f"{what}; given compiled=False. Leave it out, or take method='auto'")
+    try:
+        return generated_code(system, t0, q0, check)
+    except ValueError as error:
+        raise ValueError(f"{what}, which cannot be had; {error.__cause__}. Take method='auto'") from error
+
+
+def _refuse(method: Method, fixed: bool) -> None:
+    """Raise if code does not suit the method, before it is generated."""
+    if not takes_code(method, fixed):
+        implicit = " with step_size, by which it is implicit" if takes_code(method, False) else ""
+        raise ValueError(
+            "compiled=True goes with 'auto', 'Lobatto16', 'Taylor', 'DOP853', 'Adams'; "
+            f"given method {method.name}{implicit}"
+        )
+
+
+def is_small(system: ConstrainedSystem) -> bool:
+    """Return whether the callbacks of a system are compiled, can be traced, and take few operations."""
+
+    def look() -> bool:
+        try:
+            return is_quick(system) and series_for(system).n_operations <= SMALL
+        except Untraceable:
+            return False
+
+    return not system.called_in_python and bool(system.remembered("small", look))
+
+
+MOST = 16  # largest number of plans cached with a system
+
+# the plan of the steps, and by kind the plans of their parts, for the solution between their ends; runs may share these
+Plans = tuple[Plan, dict[int, Plan]]
+
+
+def plans_for(
+    system: ConstrainedSystem,
+    method: Method,
+    rtol: float,
+    atol: float,
+    fixed: bool,
+    code: GeneratedCode | None,
+    check: Check,
+) -> Plans:
+    """Return the plans of a run.
+
+    Raises ValueError if the method cannot run the system.
+    """
+    known, choice = identity(method), None if code is None else code.shared.equations.choice
+    key, methods = (known, rtol, atol, fixed, choice), system.remembered("methods", dict)
+    kept: dict[tuple[object, ...], Plans] = system.remembered("plans", dict)
+    made = None if known is None else kept.get(key)
+    if made is None:
+        # the prepared method does not depend on tolerances
+        ready = None if known is None else methods.get((known, choice))
+        if ready is None:
+            ready = method.for_system(system, code, check) if hasattr(method, "for_system") else method
+        made = _made(system, ready, rtol, atol, fixed, code)
+        settled = code is not None or _series(ready) == _series(method)
+        if known is not None and settled and all(each.trusted for each in made[0].traced):
+            while len(kept) >= MOST:  # a loop, because other threads may add plans
+                kept.pop(next(iter(kept.copy())), None)
+            kept[key] = made
+            if len(methods) < MOST:
+                methods[known, choice] = ready
+    plan, interiors = made
+    return plan.fresh(), interiors
+
+
+def _series(method: Method) -> bool:
+    """Return whether a method has a series: it may lose it for one start, if `check` finds other values."""
+    return getattr(method, "series", None) is not None
+
+
+def _made(
+    system: ConstrainedSystem, method: Method, rtol: float, atol: float, fixed: bool, code: GeneratedCode | None
+) -> Plans:
+    plan = method.plan(system.n_q, rtol, atol, fixed)
+    interiors = {} if plan.within_newton is None else {VELOCITIES: plan.within_newton}
+    if plan.parts > 1:
+        interiors[APART if plan.apart else ACCELERATIONS] = (
+            method.plan(system.n_q, rtol, atol, True) if plan.interior is None else plan.interior
+        )
+    if code is None:
+        return plan, interiors
+    return _with_code(plan, code).changed(traced=(*plan.traced, code.traced)), interiors
+
+
+def _with_code(plan: Plan, code: GeneratedCode) -> Plan:
+    from twoloop.kernels.evaluation.inner_loop import generated_inner_loop
+
+    substitute = None if plan.substitute is None else _with_code(plan.substitute, code)
+    own = code.shared.functions, *plan.own
+    return plan.changed(inner=generated_inner_loop, own=own, numbers=code.numbers, substitute=substitute)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.dense import Interpolator, ranks_at
+from twoloop.run.dense_solution import Interpolator, ranks_at
 from twoloop.run.record import Record, Status
 
 Array = NDArray[np.float64]

@@ -16,8 +16,7 @@ from twoloop.kernels.data import indices
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.result.storage import COUNTS, EVENT_FIELDS, FORMAT, METADATA_FILE, NUMBERS, OPTIONAL, REQUIRED, checksum
-from twoloop.run.dense import Interpolator, Table, ranks_at
-from twoloop.run.dense_solution import DenseSolution
+from twoloop.run.dense_solution import DenseSolution, Interpolator, Table, ranks_at
 from twoloop.run.record import Statistics, Status
 from twoloop.run.recorder import read
 

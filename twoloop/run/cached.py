@@ -30,24 +30,22 @@ from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.indices import BANDWIDTH, FORM
 from twoloop.kernels.layout import cached_run, lasting
 from twoloop.kernels.linalg.band import lapack_addresses
-from twoloop.methods.preparation import code_for, may_have_code, plans_for
-from twoloop.methods.presets import identity
+from twoloop.methods.presets import code_for, identity, may_have_code, plans_for
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.comparison import (
-    checked_region_of,
-    compare_callbacks_at,
-    find_nondeterminism,
-    python_functions,
-)
-from twoloop.run.dense import OutputInterpolation, Table, interpolator_of
-from twoloop.run.dense_solution import DenseSolution
-from twoloop.run.discontinuities import WITHIN, closer, may_have_missed_changes
+from twoloop.run.dense_solution import DenseSolution, OutputInterpolation, Table, interpolator_of
+from twoloop.run.fallbacks import WITHIN, closer, may_have_missed_changes
 from twoloop.run.loop import NO_KINDS, IntegrationLoop, Interrupts, silent
 from twoloop.run.messages import describe_arrival
 from twoloop.run.options import Options
 from twoloop.run.parametric import ParametricRun, SharedSetup
 from twoloop.run.record import BEFORE, DEFAULTS, Record, Status, interval_kinds, state_fields, statistics, step_fields
 from twoloop.run.recorder import OF_STEPS, MemoryStore, OutputRequest
+from twoloop.run.rerun import (
+    checked_region_of,
+    compare_callbacks_at,
+    find_nondeterminism,
+    python_functions,
+)
 from twoloop.run.run import CONTRADICTS, Run
 from twoloop.run.singular_positions import TURNED
 from twoloop.run.workspace import GAMMA_ACCURACY, sparse_factors_pay

@@ -1,15 +1,435 @@
-"""Dense output for users: the state of a run at any time between its start and its end."""
+"""Dense output: interpolate the stored states of a run by polynomials, projected onto the constraints."""
 
-from __future__ import annotations  # ArrayLike stays a word in help()
+from __future__ import annotations
 
+import warnings
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
-from typing import Any
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from twoloop.checks.arguments import check_real, shaped
-from twoloop.run.dense import Array, Groups, Interpolator, Table
+from twoloop.checks.consistency import ConstraintWarning
+from twoloop.checks.structure import pattern_of
+from twoloop.kernels.compile.linking import entry_point
+from twoloop.kernels.data import indices
+from twoloop.kernels.data.indices import ATOL, RTOL
+from twoloop.kernels.steps.lazy import loaded
+from twoloop.methods.plan import INNER_TOL, Plan
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.workspace import kit_of, prepare_workspace, static_form, workspace
+
+if TYPE_CHECKING:
+    from twoloop.run.run import Run
+
+Array = NDArray[np.float64]
+Groups = NDArray[np.int64]
+
+KEPT = 512  # largest number of intervals whose interior states are cached
+SOUND = 65536  # largest number of intervals that are remembered to have accurate polynomials
+OFF = 10.0  # largest accepted error of polynomials in the constraints and the equations, over the tolerances
+REPAIRED = 4  # number of steps that divide an interval whose polynomials have a larger error
+
+
+class Table(NamedTuple):
+    """States at accepted steps: times (n,), rows [q, v, a] (n, 3 n_q), and the kind of the interval after each."""
+
+    t: Array
+    states: Array
+    kinds: NDArray[np.int64]  # see kernels/data/indices.py
+
+
+def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: float) -> tuple[int, int]:
+    """Return the ranks of C_q, and of C_q and A, by which workspaces are created: the kernels rely on them."""
+    from twoloop.kernels import advance
+
+    kit = kit_of(system, t, q)
+    work = workspace(system, kit, pattern_of(system, t, q), q, rtol, 0.0)
+    state = np.concatenate([q, v, np.zeros(system.n_q + system.n_c + system.n_a)])
+    if advance.start(kit, work, t, state) != indices.RANK_DIFFERS:
+        return system.n_c, system.n_c + system.n_a
+    return int(work.notes[indices.RANK]), int(work.notes[indices.RANK_V])
+
+
+class Interpolator:
+    """Interpolator of tables of states of one system, with a workspace of its own.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+        The problem.
+    t0, row : float, ndarray (3 n_q,)
+        A state [q, v, a] of the run.
+    rtol : float
+        Relative tolerance of the run.
+    atol : ndarray (n_q,)
+        Absolute tolerances.
+    ranks : (int, int)
+        Of C_q, and of C_q and A.
+    plans : dict, optional
+        By kind, the plan that divides an interval into `plan.parts` fixed steps; other kinds are not divided.
+    """
+
+    def __init__(
+        self,
+        system: ConstrainedSystem,
+        t0: float,
+        row: Array,
+        rtol: float,
+        atol: Array,
+        ranks: tuple[int, int],
+        plans: Mapping[int, Plan] = MappingProxyType({}),
+    ):
+        from twoloop.kernels import interpolation as dense
+
+        self.kernels = dense
+        self.plans = dict(plans)
+        self.made_of = (system, t0, row.copy(), rtol, atol, ranks, self.plans)
+        self.system, self.rtol, self.ranks = system, rtol, ranks
+        self.tolerances = np.concatenate([np.zeros(ATOL), atol])
+        self.tolerances[RTOL] = rtol
+        self.parts = max((plan.parts for plan in self.plans.values()), default=REPAIRED)
+        self.parts = max(self.parts, REPAIRED)
+        self.static = static_form(system, t0, row[: system.n_q], *self.plans.values())
+        self.matrices = max((plan.matrices for plan in self.plans.values()), default=0)
+        self._prepare()
+        self.failures, self.tells = 0, True  # number of failures of the last call; whether to warn of them
+        self.filled: dict[float, tuple[Array, Array]] = {}
+        self.sound: set[float] = set()  # beginnings of intervals that neighbouring states interpolate well
+        self.judges = True
+        self._make_room()
+
+    def _prepare(self) -> None:
+        """Set up the workspace, and the kernels that are called with it."""
+        system, t0, row = self.made_of[:3]
+        q0, static = row[: system.n_q], self.static
+        for plan in self.plans.values():
+            loaded(plan.second)  # loaded now, as the solution calls it for as long as it lives
+        self.kits = {kind: kit_of(system, t0, q0, plan, static) for kind, plan in self.plans.items()}
+        self.kit = kit_of(system, t0, q0, None, static)
+        pattern = pattern_of(system, t0, q0) if static is None else np.zeros((0, 0))
+        self.work = workspace(system, self.kit, pattern, q0, self.rtol, 0.0, self.ranks, static, self.matrices)
+        self._start()
+
+    def _start(self) -> None:
+        from twoloop.kernels import advance
+
+        system, t0, row = self.made_of[:3]
+        self.work.notes[indices.GENERATION] = 1.0  # GENERATION 1: the ranks are known
+        state = np.concatenate([row, np.zeros(system.n_c + system.n_a)])
+        entry_point(advance.start)(self.kit, self.work, t0, state)
+        self.repairs: dict[bool, tuple[Plan, Any]] = {}
+
+    def begin(self, system: ConstrainedSystem, t0: float, row: Array, pattern: Array) -> None:
+        """Reset for a run from another state that uses the same kits; rows have entries as in `pattern`."""
+        self.made_of = (system, t0, row.copy(), *self.made_of[3:])
+        self.system, self.judges = system, True
+        self.filled, self.sound = {}, set()
+        prepare_workspace(self.work, system, self.kit.flags, pattern, row[: system.n_q], self.rtol, 0.0)
+        self._start()
+        self.nodes[:], self.room[:], self.rows[:] = 0.0, 0.0, 0.0
+
+    def _become_dense(self) -> None:
+        """Replace the static form, which could not decide something."""
+        self.static = None
+        self._prepare()
+
+    def _make_room(self) -> None:
+        """Allocate scratch arrays for the coefficients of two polynomials."""
+        half = 3 * max(indices.WINDOW, self.parts + 1)
+        n = self.system.n_q
+        self.nodes, self.room, self.rows = np.zeros(2 * half), np.zeros((2 * half, n)), np.zeros((3, 2 * n))
+
+    def __reduce__(self) -> tuple[Any, ...]:  # copies, also in other processes
+        *arguments, plans = self.made_of
+        # generated code has addresses in this process: copies do without it
+        plans = {kind: plan.changed(own=()) if plan.own else plan for kind, plan in plans.items()}
+        return type(self), (*arguments, plans), {"parts": self.parts, "filled": self.filled, "judges": self.judges}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._make_room()
+
+    def states(self, table: Table, times: Array) -> Array:
+        """Interpolate rows [q, v] at `times`, sorted, each within the table."""
+        if len(times) == 0 or len(table.t) == 1:
+            return np.repeat(table.states[:1, : 2 * self.system.n_q], len(times), axis=0)
+        intervals = np.searchsorted(table.t[1:-1], times, side="right")
+        (first,) = np.concatenate([[True], intervals[1:] != intervals[:-1]]).nonzero()
+        groups = _groups(table, intervals[first])
+        groups[:, indices.FIRST_TIME], groups[:-1, indices.END_TIME] = first, first[1:]
+        groups[-1, indices.END_TIME] = len(times)
+        out = np.empty((len(times), 2 * self.system.n_q))
+        failures = 0
+        others = []
+        for block in _blocks(groups):
+            self._settle(table, block)
+            divided, own, rest = self._divided(table, block)
+            failures += self._between(divided, own, times, out)
+            others.append(rest)
+        failures += self._between(table, np.concatenate(others), times, out)
+        self._count(failures, len(times))
+        return out
+
+    def within(self, table: Table, t: float) -> Callable[[float], Array]:
+        """Return a function that interpolates at one time after another, all of them in the interval of t."""
+        groups = _groups(table, np.searchsorted(table.t[1:-1], [t], side="right"))
+        groups[:, indices.END_TIME] = 1
+        self._settle(table, groups)
+        divided, own, rest = self._divided(table, groups)
+        known, group = (divided, own) if len(own) else (table, rest)
+        time, out = np.empty(1), np.empty((1, 2 * self.system.n_q))
+
+        def row(t: float) -> Array:
+            time[0] = t
+            self._count(self._between(known, group, time, out), 1)
+            return out[0].copy()
+
+        return row
+
+    def _count(self, failures: int, n_times: int) -> None:
+        self.failures = failures
+        if failures > 0 and self.tells:
+            _warn(f"at {failures} of {n_times} times the state is interpolated and off the constraints", 5)
+
+    def _between(self, table: Table, groups: Groups, times: Array, out: Array) -> int:
+        known = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups))
+        rest = (times, self.nodes, self.room, out)
+        failures = int(entry_point(self.kernels.between)(self.kit, self.work, INNER_TOL, *known, *rest))
+        if failures > 0 and self.static is not None:
+            self._become_dense()
+            failures = int(entry_point(self.kernels.between)(self.kit, self.work, INNER_TOL, *known, *rest))
+        return failures
+
+    def _settle(self, table: Table, groups: Groups) -> None:
+        """Ensure that each interval has interior states, or is known to need none."""
+        begins = table.t[groups[:, indices.FIRST_OWN]].tolist()
+        new = np.array([t not in self.sound and t not in self.filled for t in begins])
+        if not self.judges or not new.any():
+            return
+        if len(self.filled) > KEPT:
+            self.filled.clear()
+            new = np.array([t not in self.sound for t in begins])
+        if len(self.sound) > SOUND:
+            self.sound.clear()
+        groups = groups[new & (groups[:, indices.KIND] != indices.JUMP)]
+        for kind, plan in self.plans.items():
+            of_kind = groups[:, indices.KIND] == kind
+            self.filled.update(self._fill(table, plan, self.kits[kind], groups[of_kind, indices.FIRST_OWN]))
+        inner = np.array([t in self.filled for t in table.t[groups[:, indices.FIRST_OWN]].tolist()], dtype=bool)
+        divided, own, rest = self._divided(table, groups)
+        off = np.zeros(len(groups))
+        off[inner], off[~inner] = self._judged(divided, own), self._judged(table, rest)
+        self.sound.update(table.t[groups[~inner & (off <= OFF), indices.FIRST_OWN]].tolist())
+        for k in (~(off <= OFF)).nonzero()[0]:
+            self._repair(table, groups[k], float(off[k]))
+
+    def _judged(self, table: Table, groups: Groups) -> Array:
+        """Estimate the errors of the polynomials of these intervals, over the tolerances."""
+        out = np.zeros(len(groups))
+        arrays = (
+            self.tolerances,
+            table.t,
+            table.states,
+            np.ascontiguousarray(groups),
+            self.nodes,
+            self.room,
+            self.rows,
+            out,
+        )
+        entry_point(self.kernels.judge)(self.kit, self.work, INNER_TOL, *arrays)
+        return out
+
+    def _repair(self, table: Table, group: Groups, worst: float) -> None:
+        """Choose the best states for an interval: its neighbours, those of steps within it, or its ends alone."""
+        i, kind = int(group[indices.FIRST_OWN]), int(group[indices.KIND])
+        begin = float(table.t[i])
+        ends = (table.t[i : i + 2], table.states[i : i + 2])
+        for found in (self._fill(table, *self._repair_plan(kind), np.array([i])).get(begin, ends), ends):
+            own = Table(np.ascontiguousarray(found[0]), np.ascontiguousarray(found[1]), table.kinds)
+            single = group[None, :].copy()
+            single[0, [indices.FIRST_OWN, indices.LAST_OWN, indices.LOW, indices.HIGH]] = (
+                0,
+                len(own.t) - 1,
+                0,
+                len(own.t) - 1,
+            )
+            off = float(self._judged(own, single)[0])
+            if off < worst or not np.isfinite(worst):
+                worst = off
+                self.filled[begin] = own.t, own.states
+        if begin not in self.filled:
+            self.sound.add(begin)
+
+    def _repair_plan(self, kind: int) -> tuple[Plan, Any]:
+        """Return the plan and the kit of the steps that divide an interval of a kind for a repair."""
+        stiff = kind == indices.VELOCITIES
+        if stiff not in self.repairs:
+            from twoloop.methods.dop853 import DOP853
+            from twoloop.methods.runge_kutta import RungeKutta
+            from twoloop.methods.tableaux import radau_iia
+
+            method = RungeKutta(radau_iia(3), outer="newton") if stiff else DOP853()
+            atol = float(self.tolerances[ATOL:].min())
+            plan = method.plan(self.system.n_q, self.rtol, atol, True).changed(parts=REPAIRED)
+            q0 = self.made_of[2][: self.system.n_q]
+            if plan.matrices > self.matrices:
+                self.matrices = plan.matrices
+                if self.static is not None:
+                    self.static = static_form(self.system, self.made_of[1], q0, *self.plans.values(), plan)
+                self._prepare()
+            self.repairs[stiff] = plan, kit_of(self.system, self.made_of[1], q0, plan, self.static)
+        return self.repairs[stiff]
+
+    def _divided(self, table: Table, groups: Groups) -> tuple[Table, Groups, Groups]:
+        """Return a table of interior states, the groups of intervals that are in it, and the groups of the others."""
+        begins = table.t[groups[:, indices.FIRST_OWN]].tolist()
+        filled = np.array([t in self.filled for t in begins], dtype=bool)
+        pairs = [self.filled[t] for t in begins if t in self.filled]
+        own = groups[filled]
+        if not pairs:
+            return Table(table.t[:0], table.states[:0], table.kinds), own, groups
+        t, states = zip(*pairs, strict=True)
+        sizes = np.array(list(map(len, t)), dtype=np.int64)
+        own[:, indices.LAST_OWN] = own[:, indices.HIGH] = np.cumsum(sizes) - 1
+        own[:, indices.FIRST_OWN] = own[:, indices.LOW] = own[:, indices.LAST_OWN] - sizes + 1
+        return Table(np.concatenate(t), np.concatenate(states), table.kinds), own, groups[~filled]
+
+    def _fill(self, table: Table, plan: Plan, kit: Any, intervals: Groups) -> dict[float, tuple[Array, Array]]:
+        """Compute interior states of intervals, by the times at which they begin; fewer or none if steps fail."""
+        n = self.system.n_q
+        tolerances = np.zeros(ATOL + n)  # zeros: no error estimate
+        state = np.zeros(3 * n + self.system.n_c + self.system.n_a)
+        vectors = (plan.options, plan.memory.copy(), plan.memory, tolerances, state, state.copy())
+        filled = {}
+        for parts in range(plan.parts, 1, -1):
+            if len(intervals) == 0:
+                break
+            rows = parts + 1
+            out_t, out = np.empty(rows * len(intervals)), np.empty((rows * len(intervals), 3 * n))
+            entry_point(self.kernels.fill)(kit, self.work, *vectors, table.t, table.states, intervals, out_t, out)
+            times, states = out_t.reshape(-1, rows), out.reshape(-1, rows, 3 * n)
+            filled_in = np.isfinite(times[:, 0])
+            begins = times[:, 0].tolist()
+            filled.update({begins[k]: (times[k], states[k]) for k in filled_in.nonzero()[0].tolist()})
+            intervals = intervals[~filled_in]
+        return filled
+
+    def interiors(self, table: Table) -> Iterator[tuple[Array, Array]]:
+        """Yield interior states of divided intervals in blocks, (m, parts + 1) and (m, parts + 1, 3 n_q), for `keep`.
+
+        Rows end with NaN if an interval has fewer states.
+        """
+        groups = _groups(table, np.arange(len(table.t) - 1))
+        for block in _blocks(groups):
+            self._settle(table, block)
+            begins = table.t[block[:, indices.FIRST_OWN]].tolist()
+            divided = [self.filled[t] for t in begins if t in self.filled]
+            shape = (len(divided), self.parts + 1)
+            t, states = np.full(shape, np.nan), np.full((*shape, table.states.shape[1]), np.nan)
+            for row, (own_t, own) in enumerate(divided):
+                t[row, : len(own_t)], states[row, : len(own)] = own_t, own
+            yield t, states
+
+    def keep(self, t: Array, states: Array) -> None:
+        """Restore interior states that `interiors` yielded; no others can be computed."""
+        self.parts, self.judges = t.shape[1] - 1, False
+        self._make_room()
+        sizes = np.isfinite(t).sum(axis=1).tolist()
+        self.filled = {
+            float(own_t[0]): (own_t[:n], own[:n]) for own_t, own, n in zip(t, states, sizes, strict=True) if n
+        }
+
+    def complete(self, times: Array, states: Array, out: Array) -> None:
+        """Compute rows [a, lam] at rows [q, v] on the constraints, and write them to `out`."""
+        complete, times, states = entry_point(self.kernels.complete), *map(np.ascontiguousarray, (times, states))
+        failures = complete(self.kit, self.work, times, states, out)
+        if failures > 0 and self.static is not None:
+            self._become_dense()
+            failures = complete(self.kit, self.work, times, states, out)
+        self.failures = failures
+        if failures > 0 and self.tells:
+            _warn(f"at {failures} of {len(times)} times there are no accelerations and multipliers; they are NaN")
+
+
+def _blocks(groups: Groups) -> list[Groups]:
+    """Split rows of intervals into blocks of as many as have their interior states cached."""
+    return [groups[begin : begin + KEPT] for begin in range(0, len(groups), KEPT)]
+
+
+def _groups(table: Table, which: Groups) -> Groups:
+    """Return a row for each of these intervals, without the times in it."""
+    groups = np.zeros((len(which), indices.N_COLUMNS), dtype=np.int64)
+    groups[:, indices.FIRST_OWN], groups[:, indices.LAST_OWN] = which, which + 1
+    groups[:, indices.KIND] = table.kinds[which]
+    groups[:, indices.HIGH] = len(table.t) - 1
+    # rounding may have changed the states before a step across a singular position: its polynomials leave them out
+    across = np.append(False, table.kinds == indices.ACROSS)
+    (begins,) = (across[1:] & ~across[:-1]).nonzero()
+    if begins.size:
+        inner = across[which + 1]
+        groups[inner, indices.LOW] = begins[np.searchsorted(begins, which[inner], side="right") - 1]
+    (jumps,) = (table.kinds == indices.JUMP).nonzero()
+    if not jumps.size:
+        return groups
+    behind = np.searchsorted(jumps, which)
+    groups[:, indices.LOW] = np.maximum(groups[:, indices.LOW], np.append(0, jumps + 1)[behind])
+    groups[:, indices.HIGH] = np.append(jumps, len(table.t) - 1)[behind]
+    return groups
+
+
+def _warn(what: str, stacklevel: int = 4) -> None:
+    warnings.warn(f"the constraint Jacobian has lost rank: {what}", ConstraintWarning, stacklevel)
+
+
+class OutputInterpolation:
+    """Interpolation of states at output times, for runs that use the same arrays one after another.
+
+    Parameters
+    ----------
+    run : Run
+        A run at its start, or beyond.
+    """
+
+    def __init__(self, run: Run):
+        self.run, self._found = run, np.zeros((0, 0))
+        self._interpolator: Interpolator | None = None
+
+    def find(self, times: Array, t: Array, rows: Array, kinds: NDArray[np.int64], pattern: Array) -> None:
+        """Interpolate [q, v] at `times`, from rows [q, v, a, lam] at the ends of the steps and the kinds of these.
+
+        `pattern`: 1 where the rows of the constraints have entries at the start.
+        """
+        run = self.run
+        table = Table(t, rows[:, : 3 * run.system.n_q].copy(), kinds)
+        known = self._interpolator
+        if known is None:
+            known = interpolator_of(run, table.states[0])
+            known.tells = False
+        else:
+            known.begin(run.system, run.t0, table.states[0], pattern)
+        self._interpolator, self._found = known, known.states(table, times)
+
+    def completed(self, times: Array) -> Array | None:
+        """Return rows [q, v, a, lam] at these times; None if some are off the constraints, or lack accelerations."""
+        known, found = self._interpolator, self._found
+        if known is None or known.failures > 0:
+            return None
+        added = np.full((len(times), len(self.run.state) - found.shape[1]), np.nan)
+        known.complete(times, found, added)
+        if known.static is not None or known.repairs:  # it has changed: the next run needs a new one
+            self._interpolator = None
+        return np.concatenate([found, added], axis=1) if known.failures == 0 else None
+
+
+def interpolator_of(run: Run, row: Array) -> Interpolator:
+    """Create the interpolator of a run, which starts with this row [q, v, a]."""
+    ranks, atol = (len(run.work.rows), len(run.work.rows_v)), run.tolerances[indices.ATOL :]
+    interiors = {kind: plan.fresh() for kind, plan in run.interiors.items()}
+    return Interpolator(run.system, run.t0, row, run.rtol, atol, ranks, interiors)
 
 
 class DenseState:

@@ -24,9 +24,7 @@ from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.indices import LONGEST_UNSEEN
 from twoloop.problem.events import SAMPLES
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.comparison import compare_callbacks
-from twoloop.run.dense import interpolator_of
-from twoloop.run.discontinuities import warn_of_missed_changes
+from twoloop.run.dense_solution import interpolator_of
 from twoloop.run.fallbacks import (
     after_crossing,
     apply_jump,
@@ -35,6 +33,7 @@ from twoloop.run.fallbacks import (
     load,
     may_cross,
     switch_method,
+    warn_of_missed_changes,
 )
 from twoloop.run.messages import message_of, outcome, reject_turned_velocities, warn_user
 from twoloop.run.monitors import (
@@ -60,6 +59,7 @@ from twoloop.run.record import (
     step_fields,
 )
 from twoloop.run.recorder import OF_STEPS, OutputRequest, Recorder
+from twoloop.run.rerun import compare_callbacks
 from twoloop.run.run import Buffers, Run
 from twoloop.run.signals import SignalHandlers, within_a_users_function
 from twoloop.run.singular_positions import Place, turned_last

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from twoloop.checks.arguments import check_flag, check_positive, check_size, check_tolerance, shown
 from twoloop.kernels.data import indices
 from twoloop.methods.plan import Method
-from twoloop.methods.preparation import Compiled, check_compiled
-from twoloop.methods.presets import PRESETS, identity, is_preset
+from twoloop.methods.presets import PRESETS, Compiled, check_compiled, identity, is_preset
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.run import Run
 

@@ -22,7 +22,7 @@ from twoloop.generate.traced_values import CheckedRegion, refuse_wrong, unchecke
 from twoloop.kernels.data.common import Kit
 from twoloop.kernels.data.indices import AUGMENTED, BANDWIDTH, DIAGONAL_MASS, FORM
 from twoloop.methods.plan import Method, Plan
-from twoloop.methods.preparation import Compiled, code_for, plans_for
+from twoloop.methods.presets import Compiled, code_for, plans_for
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.run import Run
 from twoloop.run.workspace import is_diagonal, kit_with

@@ -25,8 +25,7 @@ from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import indices
 from twoloop.kernels.evaluation import tasks
 from twoloop.problem.system import ConstrainedSystem, check_system
-from twoloop.run.static_form import static_form
-from twoloop.run.workspace import kit_of, workspace
+from twoloop.run.workspace import kit_of, static_form, workspace
 
 Array = NDArray[np.float64]
 

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from twoloop.kernels.data.indices import WINDOW
 from twoloop.problem.events import Event, EventSearch
-from twoloop.run.dense import Interpolator, Table
-from twoloop.run.dense_solution import DenseSolution
+from twoloop.run.dense_solution import DenseSolution, Interpolator, Table
 
 MAGIC, HEAD = b"\x93NUMPY\x01\x00", 128  # bytes before the numbers of a file, in NumPy's npy format
 OF_STEPS = ("h", "rejected_error", "rejected_convergence", "partitioned", "untested")  # fields with one row per step

@@ -29,8 +29,7 @@ from twoloop.methods.plan import Plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.messages import describe_not_finite
 from twoloop.run.singular_positions import LEAST, MARGIN, WEAK, describe_singular_start, singular_threshold
-from twoloop.run.static_form import static_form, with_newton
-from twoloop.run.workspace import kit_of, kit_with, prepare_workspace, workspace
+from twoloop.run.workspace import kit_of, kit_with, prepare_workspace, static_form, with_newton, workspace
 
 Array = NDArray[np.float64]
 Buffers = tuple[Array, Array, Array]  # times, states and steps

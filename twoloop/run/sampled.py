@@ -22,7 +22,7 @@ from twoloop.methods.auto import Auto
 from twoloop.methods.plan import Method
 from twoloop.methods.taylor import Taylor
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.discontinuities import MOST, closer, may_have_missed_changes, warn_of_missed_changes
+from twoloop.run.fallbacks import MOST, closer, may_have_missed_changes, warn_of_missed_changes
 from twoloop.run.loop import IntegrationLoop, Interrupts
 from twoloop.run.messages import warn_of_singular_end, warn_user
 from twoloop.run.record import Record, Status, statistics

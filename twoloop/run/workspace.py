@@ -1,11 +1,11 @@
-"""Kits and workspaces: the callbacks of a system with flags, and the arrays that all kernels need."""
+"""Set up kits and workspaces: callbacks with flags, the static form of large systems, and arrays for all kernels."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.structure import has_definite_mass, least_inertia
+from twoloop.checks.structure import NEARBY, has_definite_mass, least_inertia, pattern_of
 from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import common
 from twoloop.kernels.data.common import Kit
@@ -21,15 +21,256 @@ from twoloop.kernels.data.indices import (
     STRAIGHT,
 )
 from twoloop.kernels.evaluation.operations import N_NODES
-from twoloop.kernels.layout import cached_run, lasting, make_work
+from twoloop.kernels.layout import Static, cached_run, lasting, make_work
 from twoloop.kernels.linalg.band import banded_pays, lapack_addresses
 from twoloop.kernels.linalg.saddle_point import sparse_pays
+from twoloop.kernels.linalg.sparse_lu import column_groups, grouped_entries, newton_program
+from twoloop.kernels.linalg.symbolic_factorization import (
+    N_OFF,
+    N_PIVOTS,
+    N_UPDATES,
+    Entries,
+    bodies_of,
+    factorization_program,
+)
 from twoloop.kernels.steps.lazy import LOADED, loaded, without_loading
 from twoloop.methods.plan import Plan
+from twoloop.problem.callbacks import LARGE
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.static_form import StaticForm
 
 Array = NDArray[np.float64]
+
+DISPLACED = 1e-3  # relative to max(1, |value|): displacement of coordinates and velocities, to see what depends on them
+NEWTON_SPARSE = 0.2  # share of the entries and operations of dense factors above which a program does not pay
+
+
+def newton_form(
+    system: ConstrainedSystem,
+    t0: float,
+    q0: Array,
+    mass: Entries,
+    jacobian: Entries,
+    together: list[tuple[int, ...]],
+    stiff: list[int],
+) -> tuple[NDArray[np.int32], int] | None:
+    """Create the program of Newton's matrix, see sparse_lu.py, and count the groups of columns that are differenced.
+
+    Return None if the matrix is not sparse, or has no program.
+    """
+    entries: set[tuple[int, int]] = set()
+    rng = np.random.default_rng(9)
+    size, lam = max(1.0, float(np.abs(q0).max())), rng.uniform(0.5, 1.5, system.n_c)
+    most = NEWTON_SPARSE * system.n_q**2
+    for share in NEARBY[:2]:
+        q = q0 + share * size * rng.uniform(-1.0, 1.0, system.n_q)
+        try:
+            entries |= _entries(system, t0, q, rng.uniform(-1.0, 1.0, system.n_q), lam, most)
+        except Exception:  # outside the domain of the callbacks; missed entries are found during the run
+            continue
+        if len(entries) > most:
+            return None
+    places = np.array(sorted(entries), dtype=np.int64).reshape(-1, 2)
+    tangents = grouped_entries((places[:, 0], places[:, 1]), system.n_q)
+    program = newton_program(system.n_q, system.n_c, mass, jacobian, tangents, together, stiff)
+    if program is None or program[N_UPDATES] > NEWTON_SPARSE * system.n_q**3 / 3.0:
+        return None
+    return program, int(column_groups(tangents, system.n_q).max(initial=-1)) + 1
+
+
+def _entries(system: ConstrainedSystem, t: float, q: Array, v: Array, lam: Array, most: float) -> set[tuple[int, int]]:
+    """Find the entries of the derivatives of Q - C_q^T lam by coordinates and of Q by velocities, and their mirrors."""
+
+    def reaction(q: Array) -> Array:
+        if "jacobian" not in system.entries:
+            return lam @ system.jacobian(t, q)
+        rows, columns = system.entries["jacobian"]
+        return np.bincount(columns, system.jacobian_values(t, q) * lam[rows], len(q)).astype(np.float64)
+
+    force, of_rows = system.force(t, q, v), reaction(q)
+    entries: set[tuple[int, int]] = set()
+    for j in range(len(q)):
+        moved, faster = q.copy(), v.copy()
+        moved[j] += DISPLACED * max(1.0, abs(q[j]))
+        faster[j] += DISPLACED * max(1.0, abs(v[j]))
+        changed = (system.force(t, moved, v) != force) | (reaction(moved) != of_rows)
+        changed |= system.force(t, q, faster) != force
+        for i in np.flatnonzero(changed).tolist():
+            entries |= {(i, j), (j, i)}
+        if len(entries) > most:
+            break
+    return entries
+
+
+SINGULAR = 1e-10  # smallest over largest eigenvalue of a body's M, below which it counts as singular
+ALONG = 1e-3  # relative to a row: smallest part along directions without mass with which the row stiffens these
+NEWTON = 1.6  # times LARGE: number of coordinates from which on Newton's matrices are sparse
+SPARSE = 0.05  # share of the entries and operations of dense factors above which a program does not pay for its indices
+
+
+class StaticForm(NamedTuple):
+    """Program of the static form of a system, and what a workspace for it needs."""
+
+    program: NDArray[np.int32]
+    static: Static
+    mass: Entries
+    pattern: Array  # pattern of a dense Jacobian, (n_c, n_q), 1 at its entries; empty with jacobian_values
+    mass_pattern: Array  # pattern of a dense M that is not constant, likewise
+    known: tuple[Any, ...]  # further arguments of `newton_form`
+    newton: NDArray[np.int32] | None = None  # program of Newton's matrix, once it is needed
+    n_groups: int = 0  # number of groups of columns, for each of which Newton's matrix takes displaced forces
+
+    def matrix_cost(self) -> float:
+        """Estimate the cost of Newton's matrix and its factors, in evaluations of accelerations."""
+        assert self.newton is not None
+        return self.n_groups + float(self.newton[N_UPDATES]) / max(1.0, float(self.program[N_UPDATES]))
+
+    def n_matrices(self, matrices: int) -> int:
+        """Return the number of floats of Newton's matrices, for a plan with `matrices` dense ones."""
+        from twoloop.kernels.steps.newton_memory import SYSTEMS
+        from twoloop.kernels.steps.newton_systems import matrices_size
+
+        if self.newton is None or matrices == 0:
+            return 0
+        n_values = self.static.n_mass_values, self.static.n_jacobian_values
+        return matrices_size(self.newton, *n_values, (matrices - SYSTEMS) // 2)
+
+
+def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -> StaticForm | None:
+    """Create the static form of a system for runs by these plans; None if it does not serve them, or would not pay."""
+    if system.n_q < LARGE or system.n_c == 0 or system.n_a > 0 or system.bandwidth is not None:
+        return None
+    known = "gamma" in system.given or system.functions.gamma_program.size > 0
+    if not known or not all(plan.projects and plan.inner is None and not plan.own for plan in plans):
+        return None
+    form: StaticForm | None = system.remembered("static form", lambda: _made(system, t0, q0))
+    if form is not None and any(plan.matrices and plan.first is None for plan in plans):
+        return with_newton(system, t0, q0, form)
+    return form
+
+
+def with_newton(system: ConstrainedSystem, t0: float, q0: Array, form: StaticForm) -> StaticForm | None:
+    """Add the program of Newton's matrix; return None if there is none, or it would not pay."""
+    if system.n_q < NEWTON * LARGE:
+        return None
+    cached = system.remembered("newton form", lambda: newton_form(system, t0, q0, *form.known))
+    return None if cached is None else form._replace(newton=cached[0], n_groups=cached[1])
+
+
+def _made(system: ConstrainedSystem, t0: float, q0: Array) -> StaticForm | None:
+    pattern, mass_pattern = np.zeros((0, system.n_q)), np.zeros((0, 0))
+    dense_mass = False
+    if "jacobian" in system.entries:
+        jacobian = system.entries["jacobian"]
+    else:
+        pattern = pattern_of(system, t0, q0)
+        jacobian = _places(pattern)
+    if "mass" in system.entries:
+        mass = system.entries["mass"]
+    else:
+        entries = _mass_pattern(system, t0, q0)
+        mass, dense_mass = _places(entries), not system.constant_mass
+        mass_pattern = entries if dense_mass else mass_pattern
+    if not _is_sparse(system.n_q, len(jacobian[0])) or not _is_sparse(system.n_q, len(mass[0])):
+        return None
+    together = _together(system, mass)
+    stiff = _stiff_rows(system, t0, q0, mass, jacobian, together)
+    program = factorization_program(system.n_q, system.n_c, mass, jacobian, together, stiff)
+    if program is None or program[N_UPDATES] > SPARSE * _dense_work(system.n_q, system.n_c):
+        return None
+    n_factors = int(program[N_PIVOTS] + program[N_OFF] + 1)
+    static = Static(n_factors, len(mass[0]), len(jacobian[0]), dense_mass, "jacobian" not in system.entries)
+    return StaticForm(program, static, mass, pattern, mass_pattern, (mass, jacobian, together, stiff))
+
+
+def _together(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]:
+    """Return the coordinates of each body: those that joints act on, and all others that are laid out alike, in space.
+
+    A joint names only one of its bodies, so that no joint may name the body at the end of a chain.
+    """
+    named = [joint.translation + joint.rotation for joint in system.joints]
+    layouts = {tuple(j - own[0] for j in own) for own in named}
+    if layouts != {tuple(range(7))} or system.n_q % 7 > 0 or any(own[0] % 7 > 0 for own in named):
+        return named
+    body_of = bodies_of(system.n_q, mass, ())
+    expected = [7 * k + (j if j < 3 else 3) for k in range(system.n_q // 7) for j in range(7)]
+    return named if body_of != expected else [tuple(range(k, k + 7)) for k in range(0, system.n_q, 7)]
+
+
+def _stiff_rows(
+    system: ConstrainedSystem, t0: float, q0: Array, mass: Entries, jacobian: Entries, together: list[tuple[int, ...]]
+) -> list[int]:
+    """Find rows of single bodies that M is singular along, with entries only where M has some: see sparse_ldl.py.
+
+    Return no more than make M definite: other such rows, as of a hinge on the ground, are treated like joints.
+    """
+    values = system.mass_values(t0, q0) if "mass" in system.entries else system.mass(t0, q0)[mass]
+    body_of = np.array(bodies_of(system.n_q, mass, together))
+    coordinates: dict[int, list[int]] = {}
+    for j, body in enumerate(body_of.tolist()):
+        coordinates.setdefault(body, []).append(j)
+    blocks: dict[int, Array] = {body: np.zeros((len(own), len(own))) for body, own in coordinates.items()}
+    place = {j: k for own in coordinates.values() for k, j in enumerate(own)}
+    there = set()
+    for i, j, value in zip(*(each.tolist() for each in (*mass, values)), strict=True):
+        blocks[int(body_of[i])][place[i], place[j]] += value
+        there.add((i, j))
+    free = {body: ways for body, block in blocks.items() if (ways := _without_mass(block)).size > 0}
+    if not free:
+        return []
+    columns: dict[int, list[tuple[int, float]]] = {}
+    values = system.jacobian_values(t0, q0) if "jacobian" in system.entries else system.jacobian(t0, q0)[jacobian]
+    for i, j, value in zip(*(each.tolist() for each in (*jacobian, values)), strict=True):
+        columns.setdefault(i, []).append((j, value))
+    indices = []
+    for i, own in columns.items():
+        body = int(body_of[own[0][0]])
+        if body in free and all((j, k) in there for j, _ in own for k, _ in own):
+            row = np.zeros(len(coordinates[body]))
+            for j, value in own:
+                row[place[j]] += value
+            along = free[body] @ row
+            if np.linalg.norm(along) > ALONG * np.linalg.norm(row):
+                indices.append(i)
+                free[body] = np.linalg.svd(along[None, :])[2][1:] @ free[body]
+    return indices
+
+
+def _without_mass(block: Array) -> Array:
+    """Return the directions along which a body's M is singular, one per row."""
+    if not np.isfinite(block).all():
+        return np.eye(len(block))
+    values, ways = np.linalg.eigh(block)
+    return np.asarray(ways.T[values <= SINGULAR * values[-1]])
+
+
+def _is_sparse(n_q: int, n_entries: int) -> bool:
+    """Return whether there are so few entries that it pays to search for an elimination order."""
+    return n_entries <= SPARSE * n_q * n_q + 24 * n_q
+
+
+def _dense_work(n_q: int, n_c: int) -> float:
+    """Estimate the multiplications of one evaluation by Schur's complement."""
+    return 0.5 * n_c * n_c * (n_q + n_c / 3.0)
+
+
+def _places(pattern: Array) -> Entries:
+    rows, columns = np.nonzero(pattern)
+    return rows.astype(np.int64), columns.astype(np.int64)
+
+
+def _mass_pattern(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
+    """Return a matrix with 1 where M has an entry at a position or, if M is not constant, near it."""
+    pattern = np.zeros((system.n_q, system.n_q))
+    size = np.maximum(np.abs(q0), np.abs(q0).max())
+    ways = np.random.default_rng(5).uniform(-1.0, 1.0, (len(NEARBY), system.n_q))
+    for share, way in zip(NEARBY[:1] if system.constant_mass else NEARBY, ways, strict=False):
+        try:
+            mass = system.mass(t0, q0 + share * size * way)
+        except Exception:  # outside the domain of the callbacks; missed entries are found during the run
+            continue
+        pattern[(mass != 0.0) | (mass.T != 0.0)] = 1.0
+    return pattern
+
 
 GAMMA_ACCURACY = 1e-11  # relative error of gamma below which differences of C_q and C_t cannot come
 MOST_KITS = 16  # largest number of kits that are cached with a system

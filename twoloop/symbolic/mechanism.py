@@ -18,8 +18,19 @@ from twoloop.problem.compiled_functions import GeneratedCode, GeneratedEnergy
 from twoloop.problem.problem import Problem
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.projection import consistent_state
-from twoloop.symbolic.equations import Equations, time_derivatives, velocity_coefficients
-from twoloop.symbolic.expressions import POSITIONS, VELOCITIES, ZERO, Reader, as_column, as_list, as_matrix, as_number
+from twoloop.symbolic.expressions import (
+    POSITIONS,
+    VELOCITIES,
+    ZERO,
+    Equations,
+    Reader,
+    as_column,
+    as_list,
+    as_matrix,
+    as_number,
+    time_derivatives,
+    velocity_coefficients,
+)
 
 
 @dataclass(frozen=True)
