@@ -14,13 +14,12 @@ from tests.marks import slow
 from tests.problems import assert_same, quick, worst
 from twoloop import mechanisms, solve_dae
 from twoloop.bodies import PlanarModel
-from twoloop.generate.choices import Choice
-from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.compile_equations import generated_code, write_accelerations, write_function
-from twoloop.generate.elimination import Elimination
-from twoloop.generate.lane_emitter import LaneEmitter
+from twoloop.generate.elimination import Choice, Elimination
+from twoloop.generate.lane_series import LaneEmitter
 from twoloop.generate.llvm_text import BIT, Module
 from twoloop.generate.null_space import LEAST
+from twoloop.generate.program import Coefficients
 from twoloop.kernels.compile.generated_functions import GeneratedFunctions, object_code
 from twoloop.kernels.lanes.layout import LANES
 from twoloop.kernels.linalg.dependent_columns import NONE, NUMBER, VARIES, choose_dependent_columns, room_size

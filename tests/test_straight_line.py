@@ -12,13 +12,12 @@ from numba import njit
 
 from tests.problems import pendulum, quick, unconstrained, worst
 from twoloop import ConstraintWarning, mechanisms
-from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.compile_equations import generated_code, write_function
 from twoloop.generate.graph import Graph
 from twoloop.generate.llvm_code import LARGEST_ANGLE
 from twoloop.generate.llvm_text import Module
-from twoloop.generate.program import Program
-from twoloop.generate.symbolic_factors import Factors
+from twoloop.generate.null_space import Factors
+from twoloop.generate.program import Coefficients, Program
 from twoloop.kernels.compile.generated_functions import GeneratedFunctions, object_code
 from twoloop.kernels.data.indices import BY_GENERAL, DONE
 from twoloop.kernels.evaluation import tasks

@@ -251,9 +251,7 @@ def test_a_global_that_is_reached_counts_and_others_do_not(tmp_path, monkeypatch
 
 @pytest.mark.slow
 def test_a_worker_that_dies_costs_its_own_run_alone(tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        sweep_module, "RENEWED_AFTER", 0
-    )  # processes grow with what they compile: each ends with a run
+    monkeypatch.setattr(sweep_module, "RENEWED_AFTER", 0)  # processes grow with what they compile: each ends with a run
     out = tmp_path / "rows.parquet"
     rows = sweep(dying, RUNS[:4], measure=plain, workers=2, out=out, **QUICK)
     assert rows["status"].tolist() == ["REACHED_END", "ERROR", "ERROR", "REACHED_END"]

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from tests.problems import called, entry
 from twoloop.checks.structure import least_solution
-from twoloop.generate.choices import BOUNDS, LEAST, RANK, SINGULAR_MASS
+from twoloop.generate.elimination import BOUNDS, LEAST, RANK, SINGULAR_MASS
 from twoloop.kernels.lanes import operations
 from twoloop.kernels.lanes.layout import FINE, LANES, N_FIELDS
 from twoloop.kernels.linalg import dense as linalg

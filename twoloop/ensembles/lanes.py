@@ -15,7 +15,7 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from twoloop.checks.arguments import Array
 from twoloop.ensembles.starts import Starts, generic_parameters, generic_system, kit_to_write, system_of
-from twoloop.generate.choices import Choice
+from twoloop.generate.elimination import Choice
 from twoloop.generate.graph import Untraceable
 from twoloop.generate.parameter_expressions import ParameterTape
 from twoloop.generate.program import Arrays, Program

@@ -17,13 +17,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.generate import lane_emitter, llvm_code, lobatto_tables
+from twoloop.generate import lane_series, llvm_code, lobatto_tables
 from twoloop.generate.compile_equations import GeneratedCode, SharedCode, call_accelerations
-from twoloop.generate.lane_emitter import LaneEmitter, column, load_lanes, over, place_of, store_lanes, two_sums
-from twoloop.generate.llvm_code import Emitter
+from twoloop.generate.lane_series import LaneEmitter, column, load_lanes, over, place_of, store_lanes, two_sums
+from twoloop.generate.llvm_code import Emitter, Lowering, lower
 from twoloop.generate.llvm_text import BIT, DOUBLE, INTEGER, NOTHING, Module, Value, constant, constants, integer
 from twoloop.generate.lobatto_tables import tables
-from twoloop.generate.lowering import Lowering, lower
 from twoloop.generate.program import Program
 from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.generated_functions import DeferredFunctions, generated_functions
@@ -649,4 +648,4 @@ def _compiled(own: SharedCode) -> Collocation:
 @cache
 def _stamp() -> str:
     """Return a digest of the source of the functions; the key of the cache covers the code that the equations share."""
-    return digest_of("", __file__, lane_emitter, lobatto_tables, at)
+    return digest_of("", __file__, lane_series, lobatto_tables, at)

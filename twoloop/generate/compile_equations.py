@@ -21,14 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.generate import llvm_code
-from twoloop.generate.choices import Choice
-from twoloop.generate.coefficients import Coefficients
-from twoloop.generate.elimination import Elimination, Solution
+from twoloop.generate.elimination import Choice, Elimination, Solution
 from twoloop.generate.graph import Graph, Untraceable
-from twoloop.generate.llvm_code import Emitter
+from twoloop.generate.llvm_code import Emitter, Lowering, Place
 from twoloop.generate.llvm_text import BIT, DOUBLE, Module, Value, integer, width_of
-from twoloop.generate.lowering import Lowering, Place
-from twoloop.generate.program import Program
+from twoloop.generate.program import Coefficients, Program
 from twoloop.generate.trace_cache import Evaluator, TraceCache, derive_cached
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.kernels.compile.dependencies import digest_of
@@ -482,8 +479,8 @@ def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check
 @cache
 def _stamp() -> str:
     """Return a digest of the modules that write the functions, and of their signatures."""
-    from twoloop.generate import coefficients, elimination, llvm_code, llvm_text, lowering, null_space, symbolic_factors
+    from twoloop.generate import elimination, llvm_code, llvm_text, null_space, program
     from twoloop.kernels.data.common import KIT
 
-    writers = (elimination, symbolic_factors, null_space, coefficients, lowering, llvm_code, llvm_text)
+    writers = (elimination, null_space, program, llvm_code, llvm_text)
     return digest_of(repr(KIT), __file__, *writers)

@@ -16,29 +16,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.generate import (
-    coefficients,
     compile_equations,
     elimination,
-    lane_emitter,
     lane_series,
     llvm_code,
     llvm_text,
-    lowering,
     null_space,
+    program,
     series,
-    symbolic_factors,
 )
-from twoloop.generate.choices import Choice
-from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.compile_equations import write_accelerations
-from twoloop.generate.elimination import Elimination, Solution
+from twoloop.generate.elimination import Choice, Elimination, Solution
 from twoloop.generate.graph import Untraceable, is_zero
-from twoloop.generate.lane_emitter import LaneEmitter
-from twoloop.generate.lane_series import LaneSeries
+from twoloop.generate.lane_series import LaneEmitter, LaneSeries
+from twoloop.generate.llvm_code import lower
 from twoloop.generate.llvm_text import Module, Value, integer
-from twoloop.generate.lowering import lower
 from twoloop.generate.parameter_expressions import ParameterTape
-from twoloop.generate.program import Program
+from twoloop.generate.program import Coefficients, Program
 from twoloop.generate.series import series_program
 from twoloop.generate.trace import Equations
 from twoloop.kernels.compile.dependencies import digest_of
@@ -723,8 +717,8 @@ class LaneConstraints(LaneSteps):
 
 
 BUILD_SECONDS = 3e-4  # s for one quantity, estimated
-ELIMINATION = (elimination, symbolic_factors, null_space, compile_equations)
-WRITERS = (series, *ELIMINATION, coefficients, lowering, lane_series, lane_emitter, llvm_code, llvm_text)
+ELIMINATION = (elimination, null_space, compile_equations)
+WRITERS = (series, *ELIMINATION, program, lane_series, llvm_code, llvm_text)
 
 Code = TypeVar("Code", LaneCode, LaneConstraints)
 KIND = "lanes"  # kind of the cached files

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from twoloop.checks.arguments import check_vector
 from twoloop.checks.consistency import Look, check_start
 from twoloop.checks.structure import has_definite_mass
-from twoloop.generate.choices import BOUNDS, LEAST, RANK, SINGULAR_MASS, Choice, Dependents
 from twoloop.generate.compile_equations import GeneratedCode
 from twoloop.generate.derived_callbacks import exact_near, with_derived_callbacks
+from twoloop.generate.elimination import BOUNDS, LEAST, RANK, SINGULAR_MASS, Choice, Dependents
 from twoloop.generate.trace_cache import TraceCache, give_bounds, take_bounds, trace_cache_of
 from twoloop.generate.traced_values import Sample, Traced, farthest, states_around
 from twoloop.kernels.compile.linking import entry_point
