@@ -16,6 +16,7 @@ unexport PYTHONDONTWRITEBYTECODE
 RUN := .venv/bin/python
 STAMP := .venv/installed
 PIP := -m pip --disable-pip-version-check --quiet
+UV := $(RUN) -m uv pip install --quiet --python $(RUN)
 CANDIDATES := $(or $(PYTHON),python3 python3.11 python3.12 python3.13 python3.14)
 NEEDS := 3.11 to 3.14
 FITS := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
@@ -46,13 +47,12 @@ $(STAMP): requirements.lock pyproject.toml
 	@$(FIND_PYTHON); \
 	echo "[1/3] Making .venv with $$("$$python" --version)"; \
 	"$$python" -m venv --clear .venv
-	@grep -E '^(llvmlite|numba|numpy|scipy)==' requirements.lock > .venv/first.txt
-	@$(RUN) $(PIP) install --no-compile -r .venv/first.txt
-	@echo "[2/3] Installing packages; beside that, on the second core, compiling the inner loop of the integrator (once)"
-	@{ $(RUN) $(PIP) install --no-compile -r requirements.lock \
-		&& $(RUN) $(PIP) install --no-compile --no-deps --no-build-isolation --editable .; } & \
-	$(RUN) -W ignore -c "from twoloop.kernels import advance" 2>/dev/null; \
-	wait $$!
+	@echo "[2/3] Installing packages"
+	@$(RUN) $(PIP) install --no-compile $$(grep '^uv==' requirements.lock) \
+		&& $(UV) -r requirements.lock && $(UV) --no-deps --no-build-isolation --editable . \
+		|| { echo "Not by uv: by pip, which takes longer" >&2 \
+		&& $(RUN) $(PIP) install --no-compile -r requirements.lock \
+		&& $(RUN) $(PIP) install --no-compile --no-deps --no-build-isolation --editable .; }
 	@touch $@
 
 peers: .venv/peers ## more solvers for work_precision, which does without them: heyoka, CyRK, diffrax, CasADi, extensisq
@@ -69,6 +69,7 @@ engines: .venv/engines ## the physics engines of the study engines, where they a
 
 table3: install ## the paper's Table 3 into reports/, about three minutes; ARGS=--full takes twenty
 	@echo "[3/3] Compiling the paper's steps and those of the default (once), then 32 cells, IDA and Exudyn"
+	@$(RUN) -c "from twoloop.kernels import advance"
 	@$(RUN) -c "from twoloop.kernels.steps import explicit_step, lobatto_step; from twoloop.kernels.control import stiffness" & \
 	$(RUN) -c "from twoloop.kernels.paper import newmark_step, paper_step; from twoloop.kernels import interpolation" && wait $$!
 	$(RUN) -m studies.table3 $(ARGS)
@@ -76,18 +77,20 @@ table3: install ## the paper's Table 3 into reports/, about three minutes; ARGS=
 reports: install ## all studies into reports/
 	$(RUN) -m studies all $(ARGS)
 
-# the inner loop is there; two processes of about equal work, neither of which imports, and so compiles, what the other
-# does: the steps of `twoloop` are in one, the paper's steps and the callbacks of bodies and mechanisms in the other
+# two processes of about equal work, neither of which imports, and so compiles, what the other does: the inner loop and
+# the steps of `twoloop` are in one; the other begins with what does without them, and goes on with the paper's steps
 compile: install ## compile the kernels, and the callbacks of bodies, mechanisms and studies, on two cores
 	@echo "Compiling (once, on both cores) the kernels, and the callbacks of bodies, mechanisms and studies"
-	@$(RUN) -c "from twoloop.kernels.evaluation import inner_loop; from twoloop.kernels.control import step_size"
-	@$(RUN) -c "from twoloop.kernels import advance, interpolation, cached_run; \
-	from twoloop.kernels.steps import diagonal_step, newton_step; from twoloop.kernels.control import stiffness; \
-	from twoloop.kernels.evaluation import checks, residuals, sparse_inner_loop, traced; \
-	from twoloop.kernels.linalg import dependent_columns, rank; from twoloop.kernels.lanes import advance, explicit, starts; \
-	from twoloop.kernels.steps import adams_step, crossing_step, explicit_step, lazy, lobatto_step, taylor_step; \
+	@$(RUN) -c "from twoloop.kernels.evaluation import inner_loop; from twoloop.kernels.control import step_size; \
+	from twoloop.kernels.steps import lazy; from twoloop.kernels import advance, interpolation; \
+	from twoloop.kernels.control import stiffness; from twoloop.kernels.steps import diagonal_step, newton_step; \
+	from twoloop.kernels.steps import adams_step, crossing_step, explicit_step, lobatto_step, taylor_step; \
+	from twoloop.kernels import cached_run; \
 	$(CALLBACKS_OF_TESTS)" & \
-	$(RUN) -c "from twoloop.bodies import programs; from studies.honesty import traps; from twoloop.mechanisms import *; \
+	$(RUN) -c "from twoloop.kernels.linalg import dependent_columns, rank; \
+	from twoloop.kernels.evaluation import checks, residuals, sparse_inner_loop, traced; \
+	from twoloop.kernels.lanes import advance, starts; from twoloop.bodies import programs; \
+	from twoloop.mechanisms import *; from studies.honesty import traps; from twoloop.kernels.lanes import explicit; \
 	from twoloop.kernels.paper import bdf_step, fixed_point_step, newmark_step, paper_step; \
 	$(CALLBACKS_OF_MORE_TESTS)" && wait $$!
 
