@@ -408,6 +408,9 @@ def test_starts_are_taken_as_they_are_given(taken):
         solve_dae(problem.system, (0.0, 1.0), *written, rtol=1e-6, atol=1e-6)
     written[0, 0] = problem.q0[0]  # in the arrays of the last call
     lists, backwards = written.tolist(), (written[0, ::-1].copy()[::-1], written[1])
+    shifted = written + np.array([[1e-13], [0.0]])  # consistent by a closer look than that of the compiled call
+    systems = problem.system, mechanisms.four_bar().system
+    assert_same(*[solve_dae(each, (0.0, 1.0), *shifted, rtol=1e-6, atol=1e-6) for each in systems])
     for q0, v0 in (written, pickle.loads(pickle.dumps(written)), table.T, lists, backwards):
         assert (solve_dae(problem.system, (0.0, 1.0), q0, v0, rtol=1e-6, atol=1e-6).q == expected).all() and taken[-1]
     for name, values in (("q0", (np.full(9, np.inf), problem.v0)), ("v0", (problem.q0, np.full(9, np.nan)))):

@@ -205,8 +205,8 @@ def solve_dae(
         run, every, spent, repeats = None, np.inf, 0.0, MOST
         in_time = time_limit is None or time_limit >= LONGEST
         if folder is event_functions is options.own_tolerance is None and in_time and not progress:
-            is_plain = times is time_limit is None and not dense_output
-            output = STEPS if is_plain else Output(times, at_ends, bool(dense_output), time_limit)
+            is_default = times is time_limit is None and not dense_output
+            output = STEPS if is_default else Output(times, at_ends, bool(dense_output), time_limit)
             outcome = cached_result(system, t0, t1, q0, v0, options, output, interrupts)
             if isinstance(outcome, tuple) and (not interrupts.asked or outcome[0]["status"] == Status.INTERRUPTED):
                 fields, rows_warning = outcome

@@ -181,7 +181,7 @@ class CachedIntegrator:
         clock = time.perf_counter if self.cpu_time < SHORT else time.process_time
         began = clock()
         try:
-            n = n_rows = self._start_and_advance(*start, False)
+            n = self._start_and_advance(*start, False)
             if n == loops.IN_DOUBT and self.look.is_surely(0, t0, q0, v0):
                 n = self._start_and_advance(*start, True)
         except Exception:  # raised by a callback: the loop handles it
@@ -189,9 +189,10 @@ class CachedIntegrator:
             return None
         self.cpu_time = clock() - began
         fields: dict[str, Any] = {"status": REACHED_END}
-        at_times = None
+        n_rows, at_times = n, None  # a row a step, unless `_finish` counts them
         others = run.rows_warning != "" and arrays.start_rows.tobytes() != self.counted
-        if n < 0 or others or due or output is not STEPS or parametric is not None:
+        all_steps = output.times is None and not output.dense
+        if n < 0 or others or due or not all_steps or parametric is not None:
             if n in (loops.IN_DOUBT, loops.REFUSED):
                 return None
             interrupts.listen()
