@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from references.exudyn.model import SOLVERS as EXUDYN_SOLVERS
 from references.driver import user_call
+from references.exudyn.model import SOLVERS as EXUDYN_SOLVERS
 from references.lines import Line, lines
 from references.minimal.solvers import FAMILY as MINIMAL_FAMILY
 from references.paper.gear import HIGHEST
