@@ -28,7 +28,7 @@ INSTANTS = 1000  # common instants of a case that names none
 WARM_UP = 1e-3  # of the time span, run once by each solver on each case before anything is timed ...
 COMPILING = 600.0  # ... with this limit in s: the first runs compile for minutes
 AROUND = 10.0  # times the limit of a run, for all that an adapter does beside the user's call: building, output
-CALLS = 9
+CALLS, SETTLING = 9, 3  # calls that are timed, and before them some that bring code and data into the caches again
 LATER = 1e-9  # of the time span, by which starts lie apart at which runs of ours are timed
 BUILDING = 10.0  # s that building or compiling takes at most: the first call of a setting, where shorter, may hold it
 REPEATS = 5
@@ -233,10 +233,10 @@ def timed(run: Run, repeat: int, warm: Warm | None = None) -> Timed:
     """A run, its status and message, and what it takes, each call the same: all studies time in this place.
 
     call_s is the CPU time of the call that a user writes: of solve_dae all of it, of another project's solver what its
-    adapter marks (`references.driver`). Where it is shorter than `case.timed`, it is the median of CALLS more, as the
-    first in a row of others' runs takes up to 1.6 times as long, and as some of ours compare the callbacks along the
-    run; call_mean_s is their mean. Those of ours begin a little later in the motion, each at a start that no call has
-    had, as `solve_dae` remembers starts. The first call of a setting in a process, by `warm` or as the first
+    adapter marks (`references.driver`). Where it is shorter than `case.timed`, it is the median of CALLS more, as some
+    of ours compare the callbacks along the run, after SETTLING others: the first ones after other work take up to five
+    times as long. call_mean_s is their mean. Those of ours begin a little later in the motion, each at a start that no
+    call has had, as `solve_dae` remembers starts. The first call of a setting in a process, by `warm` or as the first
     repetition, does not count where it may hold a build. inside_s is what the solver says of the time in its own loop.
     """
     result, status, message, spent = attempt(run, repeat)
@@ -249,8 +249,9 @@ def timed(run: Run, repeat: int, warm: Warm | None = None) -> Timed:
         return None, status, message, {"call_s": None, "call_mean_s": None, "inside_s": None, "calls": 0}
     calls = [(spent, result.stats.cpu_time)]
     if result.success and spent < run.case.timed:
-        runs = [from_new_start(run) if run.solver.family in REMEMBERING else run for _ in range(CALLS)]
-        again = [attempt(each, repeat) for each in runs]
+        new = run.solver.family in REMEMBERING
+        runs = [from_new_start(run) if new else run for _ in range(SETTLING + CALLS)]  # no solver runs between calls
+        again = [attempt(each, repeat) for each in runs][SETTLING:]
         calls = [(spent, each.stats.cpu_time) for each, _, _, spent in again if each is not None] or calls
     (call, inside), mean = np.median(calls, axis=0).tolist(), float(np.mean(calls, axis=0)[0])
     times = {"call_s": call or None, "call_mean_s": mean or None, "inside_s": inside or None, "calls": len(calls)}

@@ -12,7 +12,7 @@ import pytest
 from references.driver import user_call
 from studies.bench import collector as bench
 from studies.bench.apart import TimeLimit
-from studies.bench.collector import CALLS, Case, NotApplicable, Run, Solver, collect
+from studies.bench.collector import CALLS, SETTLING, Case, NotApplicable, Run, Solver, collect
 from studies.bench.reference_motion import Quintic, ReferenceMotion, check_published
 from studies.bench.solvers import CATALOGUE
 from studies.bench.store import KeptRows
@@ -89,7 +89,7 @@ def test_runs_of_ours_are_timed_at_starts_that_no_call_has_had(kept):
     with kept:
         collect([Run(case(timed=1e9), solver(run), 1e-6, repeats=2)], kept)
     timed = [start for whole, *start in begun if whole and start[0] > 0.0]
-    assert len(timed) == 2 * CALLS and len({tuple(start) for start in timed}) == 2 * CALLS
+    assert len(timed) == len({tuple(start) for start in timed}) == 2 * (SETTLING + CALLS)
     for t0, *state in timed:
         q, v, _ = pendulum_state(t0)
         assert 0.0 < t0 < 1e-6 and worst(state, [*q, *v]) < 1e-12
@@ -107,8 +107,8 @@ def test_the_first_call_of_a_setting_is_made_again_where_it_may_hold_a_build(kep
 
     with kept:
         rows = collect([Run(case(timed=0.25), solver(building), 1e-6, repeats=2)], kept)
-    # the build, the call that says how long one takes, and CALLS more; ...
-    assert counted == [0] * (2 + CALLS) + [1] * (1 + CALLS)
+    # the build, the call that says how long one takes, and more that are settling or timed; ...
+    assert counted == [0] * (2 + SETTLING + CALLS) + [1] * (1 + SETTLING + CALLS)
     assert (rows["call_s"] < 0.3).all() and (rows["calls"] == CALLS).all()
 
 
