@@ -11,7 +11,7 @@ ROOMS = (  # from the lowest: each imports from itself and from those before it
     *("bodies", "mechanisms", "symbolic"),
     *("result", "solve", "impacts", "ensembles", "sweeps", "testing", "rows", "audit"),
 )
-CALLS = {"__init__", "__main__", "exported", "solve"}  # flat
+CALLS = {"__init__", "__main__", "solve"}  # flat
 
 
 def _name(path: Path) -> str:

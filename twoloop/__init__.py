@@ -8,8 +8,26 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from twoloop.exported import *  # noqa: F403
-# ruff: noqa: F405, a test compares the names below with those of `exported`
+    from twoloop.checks.consistency import ConstraintWarning
+    from twoloop.ensembles.consistent_states import consistent_states
+    from twoloop.ensembles.ensemble import Runs, ensemble
+    from twoloop.ensembles.integrator import Integrator
+    from twoloop.impacts.motion import solve_with_friction, solve_with_stops
+    from twoloop.kernels.compile.callbacks import callback
+    from twoloop.methods.dop853 import DOP853
+    from twoloop.methods.paper import BDF, Newmark, paper_irk, paper_newmark
+    from twoloop.methods.runge_kutta import ESDIRK, RungeKutta
+    from twoloop.methods.taylor import Taylor
+    from twoloop.problem.description import Drawing, Joint, Stop
+    from twoloop.problem.problem import Problem
+    from twoloop.problem.system import ConstrainedSystem
+    from twoloop.result.certificate import Certificate, CertificateWarning
+    from twoloop.result.loading import load
+    from twoloop.result.result import Result, citation
+    from twoloop.run.projection import ConsistentState, consistent_state
+    from twoloop.run.record import Statistics, Status
+    from twoloop.solve import solve_dae
+    from twoloop.sweeps.sweep import sweep
 
 __version__ = "0.1.0"
 

@@ -26,8 +26,7 @@ from twoloop.run.cached import STEPS, Missed, Output, cached_result, fields_of, 
 from twoloop.run.fallbacks import MOST, closer, may_have_missed_changes
 from twoloop.run.loop import IntegrationLoop, Interrupts, interrupted_record
 from twoloop.run.options import options_of
-from twoloop.run.record import Status, record_of
-from twoloop.run.recorder import FileStore, MemoryStore, OutputRequest
+from twoloop.run.record import FileStore, MemoryStore, OutputRequest, Status, record_of
 from twoloop.run.run import Run
 from twoloop.run.signals import interrupted
 

@@ -26,7 +26,7 @@ from twoloop.generate.graph import Graph, Untraceable
 from twoloop.generate.llvm_code import Emitter, Lowering, Place
 from twoloop.generate.llvm_text import BIT, DOUBLE, Module, Value, integer, width_of
 from twoloop.generate.program import Coefficients, Program
-from twoloop.generate.trace_cache import Evaluator, TraceCache, derive_cached
+from twoloop.generate.trace import Evaluator, TraceCache, derive_cached
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.generated_functions import generated_functions

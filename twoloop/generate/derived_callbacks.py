@@ -16,8 +16,7 @@ from twoloop.checks.derivatives import TIME
 from twoloop.checks.scales import generic_factors, sizes
 from twoloop.generate.graph import MOST_OPERATIONS, Affine, Untraceable
 from twoloop.generate.program import OperationTable
-from twoloop.generate.trace import OF_ROWS, Equations
-from twoloop.generate.trace_cache import Evaluator, TraceCache, derive_cached
+from twoloop.generate.trace import OF_ROWS, Equations, Evaluator, TraceCache, derive_cached
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.problem.system import ConstrainedSystem
 

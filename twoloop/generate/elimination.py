@@ -28,8 +28,7 @@ from twoloop.generate.graph import Affine, Graph, Untraceable, is_zero
 from twoloop.generate.null_space import Block, DependentCoordinates, Factors, NotReduced, reduced_accelerations, solve
 from twoloop.generate.parameter_expressions import elementwise
 from twoloop.generate.program import Program
-from twoloop.generate.trace import Equations, only
-from twoloop.generate.trace_cache import shared_cache
+from twoloop.generate.trace import Equations, only, shared_cache
 from twoloop.generate.traced_values import Traced
 from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.evaluation.partition import MAX_VIOLATION

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from twoloop.generate.graph import MOST_OPERATIONS, Affine, Graph, Untraceable
 from twoloop.generate.parameter_expressions import array_of, elementwise
-from twoloop.generate.trace import Equations, only
-from twoloop.generate.trace_cache import Evaluator, TraceCache, derive_cached
+from twoloop.generate.trace import Equations, Evaluator, TraceCache, derive_cached, only
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.kernels.evaluation.operations import COSINE, PENDING, SINE, SUM
 from twoloop.problem.system import ConstrainedSystem

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from twoloop.generate.graph import Affine, Graph, Untraceable
 from twoloop.generate.parameter_expressions import Parameter
 from twoloop.generate.program import Algebra
-from twoloop.generate.trace_cache import Evaluator, TraceCache, derive_cached
+from twoloop.generate.trace import Evaluator, TraceCache, derive_cached
 from twoloop.generate.traced_values import unchecked
 from twoloop.kernels.evaluation.operations import (
     ARCTANGENT,

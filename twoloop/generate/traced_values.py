@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from twoloop.checks.scales import sizes
 from twoloop.generate.graph import Graph, Untraceable
 from twoloop.generate.program import OperationTable
-from twoloop.generate.trace_cache import Evaluator
+from twoloop.generate.trace import Evaluator
 from twoloop.kernels.compile.linking import entry_point
 from twoloop.problem.system import ConstrainedSystem
 

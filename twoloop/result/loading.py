@@ -17,8 +17,7 @@ from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.result.storage import COUNTS, EVENT_FIELDS, FORMAT, METADATA_FILE, NUMBERS, OPTIONAL, REQUIRED, checksum
 from twoloop.run.dense_solution import DenseSolution, Interpolator, Table, ranks_at
-from twoloop.run.record import Statistics, Status
-from twoloop.run.recorder import read
+from twoloop.run.record import Statistics, Status, read
 
 KINDS = (indices.APART, indices.VELOCITIES, indices.ACCELERATIONS, indices.ACROSS)
 INTEGER_LIMIT = 2**63  # limit of counts

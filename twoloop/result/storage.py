@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import check_path
-from twoloop.run.record import Record, Status
-from twoloop.run.recorder import OF_STEPS, FileStore
+from twoloop.run.record import OF_STEPS, FileStore, Record, Status
 
 FORMAT = "twoloop result 1"
 STATES = ("q", "v", "a", "lam")

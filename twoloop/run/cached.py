@@ -21,7 +21,7 @@ from twoloop.checks.structure import has_definite_mass
 from twoloop.generate.compile_equations import GeneratedCode
 from twoloop.generate.derived_callbacks import exact_near, with_derived_callbacks
 from twoloop.generate.elimination import BOUNDS, LEAST, RANK, SINGULAR_MASS, Choice, Dependents
-from twoloop.generate.trace_cache import TraceCache, give_bounds, take_bounds, trace_cache_of
+from twoloop.generate.trace import TraceCache, give_bounds, take_bounds, trace_cache_of
 from twoloop.generate.traced_values import Sample, Traced, farthest, states_around
 from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.control.loop_state import N_STEP_COLUMNS
@@ -38,8 +38,19 @@ from twoloop.run.loop import NO_KINDS, IntegrationLoop, Interrupts, silent
 from twoloop.run.messages import describe_arrival
 from twoloop.run.options import Options
 from twoloop.run.parametric import ParametricRun, SharedSetup
-from twoloop.run.record import BEFORE, DEFAULTS, Record, Status, interval_kinds, state_fields, statistics, step_fields
-from twoloop.run.recorder import OF_STEPS, MemoryStore, OutputRequest
+from twoloop.run.record import (
+    BEFORE,
+    DEFAULTS,
+    OF_STEPS,
+    MemoryStore,
+    OutputRequest,
+    Record,
+    Status,
+    interval_kinds,
+    state_fields,
+    statistics,
+    step_fields,
+)
 from twoloop.run.rerun import (
     checked_region_of,
     compare_callbacks_at,

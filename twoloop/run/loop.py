@@ -35,8 +35,7 @@ from twoloop.run.fallbacks import (
     switch_method,
     warn_of_missed_changes,
 )
-from twoloop.run.messages import message_of, outcome, reject_turned_velocities, warn_user
-from twoloop.run.monitors import (
+from twoloop.run.messages import (
     INTERRUPTED,
     OUT_OF_REACH,
     OUT_OF_TIME,
@@ -44,11 +43,18 @@ from twoloop.run.monitors import (
     StallDetector,
     StiffnessMonitor,
     describe_stiffness,
+    message_of,
+    outcome,
+    reject_turned_velocities,
+    warn_user,
 )
 from twoloop.run.record import (
     BEFORE,
     DEFAULTS,
+    OF_STEPS,
+    OutputRequest,
     Record,
+    Recorder,
     Statistics,
     Status,
     explained,
@@ -58,7 +64,6 @@ from twoloop.run.record import (
     statistics,
     step_fields,
 )
-from twoloop.run.recorder import OF_STEPS, OutputRequest, Recorder
 from twoloop.run.rerun import compare_callbacks
 from twoloop.run.run import Buffers, Run
 from twoloop.run.signals import SignalHandlers, within_a_users_function

@@ -16,8 +16,7 @@ from twoloop.checks.derivatives import check_derivatives
 from twoloop.checks.structure import has_definite_mass, is_definite
 from twoloop.generate.compile_equations import GeneratedCode
 from twoloop.generate.derived_callbacks import exact_derivatives, exact_near
-from twoloop.generate.trace import runs_on_symbols
-from twoloop.generate.trace_cache import ParameterArrays, give_bounds, trace_cache_of
+from twoloop.generate.trace import ParameterArrays, give_bounds, runs_on_symbols, trace_cache_of
 from twoloop.generate.traced_values import CheckedRegion, refuse_wrong, unchecked
 from twoloop.kernels.data.common import Kit
 from twoloop.kernels.data.indices import AUGMENTED, BANDWIDTH, DIAGONAL_MASS, FORM

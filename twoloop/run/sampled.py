@@ -25,8 +25,7 @@ from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.fallbacks import MOST, closer, may_have_missed_changes, warn_of_missed_changes
 from twoloop.run.loop import IntegrationLoop, Interrupts
 from twoloop.run.messages import warn_of_singular_end, warn_user
-from twoloop.run.record import Record, Status, statistics
-from twoloop.run.recorder import MemoryStore, OutputRequest
+from twoloop.run.record import MemoryStore, OutputRequest, Record, Status, statistics
 from twoloop.run.run import Run
 
 Array = NDArray[np.float64]

@@ -7,7 +7,7 @@ if TYPE_CHECKING:
     from twoloop.testing.conformance import check_simulator
     from twoloop.testing.mechanisms import problems
     from twoloop.testing.problem import KnownBody, KnownJoint, KnownProblem, Motion
-    from twoloop.testing.report import Failure, Finding, Report
+    from twoloop.testing.properties import Failure, Finding, Report
 
 _MODULES = {
     **dict.fromkeys(("KnownBody", "KnownJoint", "KnownProblem", "Motion"), "problem"),

@@ -11,6 +11,7 @@ from twoloop.testing.problem import Array, Motion
 from twoloop.testing.properties import (
     ORDER_SLACK,
     STEP_VIOLATION,
+    Finding,
     Observation,
     Settings,
     constraint_forces,
@@ -23,7 +24,6 @@ from twoloop.testing.properties import (
     refinement_changes,
     remaining_error,
 )
-from twoloop.testing.report import Finding
 from twoloop.testing.runs import Simulate, change_frame, run_simulator, to_original
 
 EXPLAINED = 0.1  # an explanation must reduce the error to this fraction

@@ -14,8 +14,7 @@ import pytest
 
 if TYPE_CHECKING:
     from twoloop.testing.problem import KnownProblem, Motion
-    from twoloop.testing.properties import Settings
-    from twoloop.testing.report import Finding
+    from twoloop.testing.properties import Finding, Settings
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -148,7 +147,7 @@ class _Property(pytest.Item):
         names = "problem", "property", "measured", "allowed", "hint"
         self.user_properties += [(name, getattr(finding, name)) for name in names]
         if not finding.passed:
-            from twoloop.testing.report import outcome_text
+            from twoloop.testing.properties import outcome_text
 
             raise PropertyFailed(f"{outcome_text(finding)}\n{finding.hint}".rstrip())
 
@@ -173,7 +172,7 @@ class _ReportWriter:
             self._rows.append((properties, report.outcome == "passed"))
 
     def pytest_sessionfinish(self) -> None:
-        from twoloop.testing.report import Finding, Report
+        from twoloop.testing.properties import Finding, Report
 
         findings = tuple(Finding(**properties, passed=passed) for properties, passed in self._rows)
         self._path.write_text(Report(findings).to_markdown(), encoding="utf-8")
