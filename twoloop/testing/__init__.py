@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 _MODULES = {
     **dict.fromkeys(("KnownBody", "KnownJoint", "KnownProblem", "Motion"), "problem"),
-    **dict.fromkeys(("Failure", "Finding", "Report"), "report"),
+    **dict.fromkeys(("Failure", "Finding", "Report"), "properties"),
     "check_simulator": "conformance",
     "problems": "mechanisms",
 }
