@@ -159,7 +159,7 @@ def test_two_assemblies_within_reach_are_refused_unless_one_says_otherwise(besid
     rough = problems[0].q0 + 0.02 * np.array([1.0, -1.0, 0.5, 1.0, 0.3, -1.0, 0.2, 0.4, 0.0])
     rest, system = np.zeros(9), problems[0].system
     assert consistent_state(system, 0.0, problems[0].q0, rest, keep=[CRANK]).margin < 0.1  # known well enough
-    words = "does not say on which assembly.*check_assembly=False takes the one" + ".*loses rank" * (beside < 1e-3)
+    words = "does not say on which assembly.*check_assembly=False. takes the one" + ".*loses rank" * (beside < 1e-3)
     with pytest.raises(ValueError, match=words):
         consistent_state(system, 0.0, rough, rest, keep=[CRANK])
     found = consistent_state(system, 0.0, rough, rest, keep=[CRANK], check_assembly=False)

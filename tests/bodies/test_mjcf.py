@@ -250,7 +250,8 @@ def test_sites_between_two_points_and_springs_whose_length_is_elsewhere(tmp_path
       <tendon><spatial stiffness="{1}" {2}><site site="s"/><site site="w"/></spatial></tendon></mujoco>"""
     (spring,) = read(text.format("", "30", 'springlength="0.3"'), tmp_path).forces
     np.testing.assert_allclose(spring.on_first.values, [0.3 - 1.0, 0.1, 0.0])
-    with pytest.raises(ValueError, match=r"needs a springlength.*springref"):
-        read(text.format('ref="30"', "30", ""), tmp_path)
+    (spring,) = read(text.format('ref="30"', "30", ""), tmp_path).forces
+    turned = about_y(-30.0) @ [0.3, 0.1, 0.0]  # where the joint is at its springref
+    np.testing.assert_allclose(spring.more.values[2], np.linalg.norm(turned - 1.0))
     with pytest.warns(IgnoredWarning, match="tendon: spatial"):
         assert not read(text.format("", "30 2", ""), tmp_path).forces

@@ -15,6 +15,10 @@ pytestmark = [
 ]
 INERTIAL = '<inertial pos="0.2 0.1 0" mass="1.5" fullinertia="0.03 0.05 0.06 0.004 0.002 0.001"/>'
 TIP = '<body name="tip" pos="0.3 0 0.1" euler="20 0 0"><joint name="last" axis="1 2 0"/><geom size="0.1 0.2"/></body>'
+ARM = f"""<worldbody><site name="w" pos="0.5 0.3 1"/><body euler="10 20 30"><joint name="a" axis="0 1 0.3" ref="20"
+    springref="35" {{}}/>{INERTIAL}<site name="s" pos="0.2 0.1 0.3" euler="20 30 40"/><body pos="0 0.1 1"><joint name="b"
+    type="slide" axis="1 0 1"/>{INERTIAL}<site name="u" pos="0.1 -0.1 0.3"/><body pos="0.3 0 0.1" euler="20 0 0">
+    <joint name="c" axis="1 2 0"/><site name="v" pos="0.1 0.4 0.3"/>{INERTIAL}</body></body></body></worldbody>"""
 CASES = {
     "several joints": f"""<worldbody><body name="hip" euler="0 30 0">
         <joint name="a" axis="1 0 0" armature="0.3" damping="0.2" ref="20"/>
@@ -46,6 +50,23 @@ CASES = {
         {INERTIAL}{TIP}</body></body></worldbody><actuator><position class="p" joint="a" kv="2"/>
         <motor joint="last" gear="-2"/><velocity joint="b" kv="5"/>
         <general joint="b" gainprm="7" biastype="affine" biasprm="1 -2 -3" ctrlrange="0 0.1"/></actuator>""",
+    "limited actuators": f"""{ARM.format('actuatorfrcrange="-1 1"')}<actuator><position joint="a" kp="50" kv="1"/>
+        <position joint="b" kp="30" dampratio="0.7" gear="2" forcerange="-0.3 0.2"/><damper joint="c" kv="5"
+        ctrlrange="0 1"/><general joint="c" gaintype="affine" gainprm="7 2 -3" biastype="affine" biasprm="1 2 3"/>
+        </actuator>""",
+    "fixed tendons": f"""<default><tendon damping="0.7"/></default>{ARM.format("")}<tendon>
+        <fixed name="t" stiffness="5" springlength="-0.1 0.3"><joint joint="a" coef="0.7"/><joint joint="b" coef="-1"/>
+        </fixed><fixed name="u" stiffness="3"><joint joint="c" coef="0.4"/><joint joint="a" coef="1"/></fixed></tendon>
+        <actuator><position tendon="t" kp="30" dampratio="0.7" forcerange="-5 5"/><motor tendon="u" gear="3"/>
+        </actuator>""",
+    "paths": f"""{ARM.format("")}<tendon><spatial name="t" stiffness="3" damping="1"><site site="w"/><site site="s"/>
+        <pulley divisor="2"/><site site="u"/><site site="v"/><site site="w"/></spatial></tendon><actuator>
+        <position tendon="t" kp="5" gear="-2"/><motor site="s" gear="1 2 3 0.1 0.2 0.3"/></actuator>""",
+    "medium": """<option density="1000" viscosity="0.3" wind="1 -2 0.5"/><worldbody><body><freejoint/>
+        <geom type="capsule" size="0.1 0.3" euler="20 30 0"/><geom type="capsule" size="0.1 0.3" euler="20 30 0"
+        pos="0.1 0.2 0.3"/></body><body pos="1 1 1"><joint/><inertial pos="0.1 0 0" mass="2" diaginertia="0.1 0.1 0.05"
+        euler="20 30 40"/><body pos="0 0 1"><geom type="cylinder" fromto="0 0 0 0.1 0.2 0.3" size="0.1"/></body>
+        </body></worldbody>""",
 }
 
 

@@ -137,23 +137,26 @@ def test_beads_on_a_helix_on_a_surface_and_in_a_slot_that_turns():
 
 
 @pytest.mark.parametrize("model", [PlanarModel((0.0, 0.0)), SpatialModel(ZERO)], ids=["plane", "space"])
-def test_wheels_coupled_by_a_polynomial(model):
+def test_wheels_coupled_by_a_polynomial_and_by_a_tendon(model):
     zero, axis = np.zeros(model.dimension), {} if model.dimension == 2 else {"axis": Z}
     for k in range(2):
         model.body(f"wheel {k}", mass=1.0, inertia=0.1 if model.dimension == 2 else (0.1, 0.1, 0.1), position=zero)
         model.revolute("ground", f"wheel {k}", at=zero, **axis, name=f"pin {k}")
-    model.coupling(["pin 0", "pin 1"], lambda x, y: y - 0.5 * x - 0.3 * x**2)
-    model.motor("pin 0", lambda t: 0.2 * np.cos(t))
+    model.coupling(["pin 0", model.tendon({"pin 1": 2.0})], lambda x, y: 0.5 * y - 0.5 * x - 0.3 * x**2)
+    laws = {"stiffness": 0.4, "damping": 0.1, "length": 0.1, "force": lambda t: 0.2 * np.cos(t), "upper": 3.0}
+    tendon = model.tendon({"pin 0": 0.5, "pin 1": -1.0}, **laws)
     problem = model.problem((0.0, 2.0), positions={"pin 0": 0.2}, rates={"pin 0": -1.0})
     end = moved(problem).q[:, -1]
 
     def acceleration(t, x, u):
-        slope = 0.5 + 0.6 * x
-        return (2.0 * np.cos(t) - slope * 0.6 * u**2) / (1.0 + slope**2)
+        slope, length = 0.5 + 0.6 * x, -0.3 * x**2
+        tension = 0.4 * (length - 0.1) + 0.1 * (0.5 - slope) * u + 0.2 * np.cos(t)
+        return (-10.0 * tension * (0.5 - slope) - slope * 0.6 * u**2) / (1.0 + slope**2)
 
     known = by_hand(acceleration, [0.2, -1.0], [2.0])[0, -1]
     found = [problem.joint_coordinate(f"pin {k}").position(end) for k in range(2)]
     np.testing.assert_allclose(found, [known, 0.5 * known + 0.3 * known**2], atol=1e-8)
+    assert tendon.position(end) == pytest.approx(-0.3 * known**2) == 3.0 - problem.stops[0].gap(0.0, end)
 
 
 def linkage(driven):

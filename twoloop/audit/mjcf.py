@@ -26,8 +26,7 @@ from twoloop.run.projection import consistent_state
 # prefixes of ignored parts that can be disabled in MuJoCo
 DISABLED_PARTS = (
     *("contacts between", "contact", "limits of", "frictionloss of", "actuator", "the command of", "sensor"),
-    *("forcerange of actuator", "ctrlrange of actuator", "stiffness and damping of joint", "equality", "tendon"),
-    *("density of the", "viscosity of the", "wind of the"),
+    *("actuatorfrcrange of", "the damping ratio of", "stiffness and damping of joint", "equality", "tendon"),
 )
 DISABLE_FLAGS = ("CONTACT", "LIMIT", "FRICTIONLOSS", "ACTUATION")
 AGREEMENT = 1e-6  # largest difference of masses and forces, relative to the largest of them
@@ -109,11 +108,14 @@ class MujocoModel:
         mujoco, engine = self.mujoco, self.engine
         for name in DISABLE_FLAGS:
             engine.opt.disableflags |= getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")
-        engine.opt.density = engine.opt.viscosity = 0.0
         if engine.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_EQUALITY | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT):
             engine.eq_active0[:] = 0
         kept = [mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD]
-        kept += [mujoco.mjtEq.mjEQ_JOINT] if any(each.kind == "coupling" for each in self.model.joints) else []
+        kept += (
+            [mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtEq.mjEQ_TENDON]
+            if any(each.kind == "coupling" for each in self.model.joints)
+            else []
+        )
         loops = np.isin(engine.eq_type, kept)
         engine.eq_active0[~loops] = 0
         scalar_joints = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -123,12 +125,13 @@ class MujocoModel:
             if higher or (int(engine.jnt_type[k]) not in scalar_joints and engine.jnt_stiffness[k]):
                 engine.jnt_stiffness[k] = engine.jnt_stiffnesspoly[k] = 0.0
                 engine.dof_damping[dofs] = engine.dof_dampingpoly[dofs] = 0.0
+        winding = mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER
         for k in range(engine.ntendon):
             first, n = engine.tendon_adr[k], engine.tendon_num[k]
-            sites = n == 2 and (engine.wrap_type[first : first + n] == mujoco.mjtWrap.mjWRAP_SITE).all()
-            lengths = engine.tendon_lengthspring[k]
-            if not sites or engine.tendon_limited[k] or lengths[0] != lengths[1]:
+            winds = np.isin(engine.wrap_type[first : first + n], winding).any()
+            if winds or engine.tendon_stiffnesspoly[k].any() or engine.tendon_dampingpoly[k].any():
                 engine.tendon_stiffness[k] = engine.tendon_damping[k] = 0.0
+                engine.tendon_stiffnesspoly[k] = engine.tendon_dampingpoly[k] = 0.0
 
     @property
     def keyframes(self) -> list[str]:

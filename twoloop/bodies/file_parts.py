@@ -56,15 +56,17 @@ class Pose:
 
 @dataclass(frozen=True)
 class Lump:
-    """A mass with its centre (3,) and its inertia about that centre (3, 3), in one frame."""
+    """A mass with centre (3,), inertia about the centre (3, 3) and principal axes (3, 3), if known, in one frame."""
 
     mass: float
     centre: Array
     J: Array
+    axes: Array | None = None
 
     def transformed(self, pose: Pose) -> Lump:
         """Return the same mass in the frame in which `pose` is given."""
-        return Lump(self.mass, pose.point(self.centre), pose.R @ self.J @ pose.R.T)
+        axes = None if self.axes is None else pose.R @ self.axes
+        return Lump(self.mass, pose.point(self.centre), pose.R @ self.J @ pose.R.T, axes)
 
 
 def combined(lumps: list[Lump]) -> Lump:
@@ -72,12 +74,36 @@ def combined(lumps: list[Lump]) -> Lump:
     mass = sum(lump.mass for lump in lumps)
     if not mass > 0.0:
         return Lump(0.0, np.zeros(3), np.zeros((3, 3)))
+    if len(lumps) == 1:
+        return lumps[0]
     centre = sum((lump.mass * lump.centre for lump in lumps), np.zeros(3)) / mass
     J = np.zeros((3, 3))
     for lump in lumps:
         d = lump.centre - centre
         J += lump.J + lump.mass * (d @ d * np.eye(3) - np.outer(d, d))
     return Lump(mass, centre, J)
+
+
+def principal_axes(J: Array, tolerance: float = 1e-15) -> Array:
+    """Return the principal axes (3, 3) of a tensor, as columns, by Jacobi's rotations of the largest product.
+
+    Products within a tolerance, relative to the largest entry, are left. Where moments are equal, axes are ambiguous,
+    and the forces of a medium depend on them: these are MuJoCo's, which begins with the axes of the body.
+    """
+    axes, pairs, least = np.eye(3), ((1, 2), (0, 2), (0, 1)), tolerance * float(np.abs(J).max())
+    for _ in range(100):
+        D = axes.T @ J @ axes
+        i, j = pairs[int(np.argmax([abs(D[pair]) for pair in pairs]))]
+        if abs(D[i, j]) <= least:
+            break
+        tau = (D[j, j] - D[i, i]) / (2.0 * D[i, j])
+        tangent = (1.0 if tau >= 0.0 else -1.0) / (abs(tau) + np.sqrt(1.0 + tau * tau))
+        c = 1.0 / np.sqrt(1.0 + tangent * tangent)
+        turn = np.eye(3)
+        turn[i, i] = turn[j, j] = c
+        turn[i, j], turn[j, i] = tangent * c, -tangent * c
+        axes = axes @ turn
+    return axes
 
 
 def root_of(path: str | os.PathLike[str], tag: str) -> Element:
@@ -99,7 +125,7 @@ EFFECTS = (
     ("the mass of", "compiler", "shellinertia", "armature of"),
     ("equality", "joints of", "mimic of"),
     ("tendon", "springdamper of", "stiffness", "damping of", "gravcomp of", "medium"),
-    ("actuator", "command", "forcerange", "ctrlrange", "deformable", "mocap of"),
+    ("actuator", "command", "damping ratio", "deformable", "mocap of"),
     ("frictionloss of", "friction of"),
     ("limits of", "safety_controller of"),
     ("contact",),
@@ -121,6 +147,11 @@ def record_ignored(path: str | os.PathLike[str], model: Any, ignored: list[str])
     model.ignored = tuple(by_effect(ignored))
     if ignored:
         warnings.warn(f"{os.fspath(path)!r}: ignored are {'; '.join(model.ignored)}", IgnoredWarning, stacklevel=3)
+
+
+def name_of(element: Element) -> str:
+    """Return an element as messages name it."""
+    return f"{element.tag} {element.get('name')!r}" if element.get("name") else element.tag
 
 
 def numbers(text: str, n: int, what: str) -> Array:
@@ -207,7 +238,7 @@ def geom_lump(given: Mapping[str, str], what: str, degrees: bool, sequence: str)
         )
     volume, moments = _VOLUMES[kind](size)
     mass = float(given["mass"]) if "mass" in given else float(given.get("density", DENSITY)) * volume
-    return Lump(mass, np.zeros(3), mass * np.diag(moments)).transformed(pose)
+    return Lump(mass, np.zeros(3), mass * np.diag(moments), np.eye(3)).transformed(pose)
 
 
 # volume, and moments of inertia about the axes per unit mass

@@ -173,7 +173,7 @@ def spring_function(name: str, given: Any) -> SpringFunction:
             f"{name} must be a function of (length, rate) or (angle, rate), such as lambda x, rate: 40.0 * x**3; "
             f"given {shown(given)}"
         )
-    return SpringFunction(name, given, _n_arguments(name, given, (2,)), 1)
+    return SpringFunction(name, given, n_arguments(name, given, (2,)), 1)
 
 
 def with_arguments(functions: Sequence[Any], n_q: int, q: Any, v: Any) -> Iterator[tuple[Any, Any, Any]]:
@@ -190,7 +190,7 @@ def with_arguments(functions: Sequence[Any], n_q: int, q: Any, v: Any) -> Iterat
 def force_function(name: str, given: Any, size: int) -> Function | Array:
     """Return a function of t or of t, q and v, or constants."""
     if callable(given):
-        return Function(name, given, _n_arguments(name, given, (1, 3)), size)
+        return Function(name, given, n_arguments(name, given, (1, 3)), size)
     if size == 1:
         return np.array([check_finite(name, given)])
     array = check_real(name, given)
@@ -212,7 +212,7 @@ def motion_function(name: str, motion: Any, rate: Any, acceleration: Any) -> Fun
         if each is not None and not callable(each):
             raise TypeError(f"rate and acceleration of {name} must be functions of t; given {each!r}")
         if each is not None:
-            _n_arguments(name, each, (1,))
+            n_arguments(name, each, (1,))
     function = Function(name, motion, 1, 1, () if rate is None else (rate, acceleration))
     if rate is None:
         try:
@@ -264,8 +264,9 @@ def is_constant(function: Function | RowFunction) -> bool:
         return False
 
 
-def _n_arguments(name: str, function: Any, allowed: tuple[int, ...]) -> int:
-    expected = " or ".join(ARGUMENTS[n] for n in allowed)
+def n_arguments(name: str, function: Any, allowed: tuple[int, ...], called: str = "") -> int:
+    """Return how many arguments a function takes, of the numbers that are allowed; `called`: how it is called."""
+    expected = called or " or ".join(ARGUMENTS[n] for n in allowed)
     try:
         parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):  # built-in functions have no signature

@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.bodies.file_parts import Lump, Pose, numbers, pose_of
+from twoloop.bodies.file_parts import Lump, Pose, numbers, pose_of, principal_axes
 from twoloop.checks.arguments import Array
 
+PRODUCTS = 1e-7  # products of inertia, relative to the largest entry, that MuJoCo neglects in the frame of a mesh
 STL_HEAD, MSH_HEAD = 84, 16  # bytes before the triangles of an STL file, and before the numbers of an MSH file
 
 
@@ -33,6 +34,7 @@ def mesh_triangles(given: Mapping[str, str], folder: Path, what: str) -> Array |
         vertices, faces = content
     else:
         return None
+    vertices = vertices.astype(np.float32).astype(float)  # as MuJoCo stores them
     if "refpos" in given or "refquat" in given:
         reference = {"pos": given.get("refpos", "0 0 0"), "quat": given.get("refquat", "1 0 0 0")}
         pose = pose_of(reference, what, True, "xyz")
@@ -64,14 +66,18 @@ def mesh_lump(triangles: Array, legacy: bool) -> Lump:
         if not repeated:
             origin = origin + volumes @ sums / (4.0 * volume)
     second = second / 20.0
-    return Lump(volume, origin, np.trace(second) * np.eye(3) - second)
+    J = np.trace(second) * np.eye(3) - second
+    axes = principal_axes(J, PRODUCTS)
+    return Lump(volume, origin, axes @ np.diag(np.diag(axes.T @ J @ axes)) @ axes.T, axes)
 
 
 def fitted(triangles: Array, legacy: bool, kind: str, by_box: bool) -> tuple[Array, Pose]:
     """Return size and pose of a geom that is fitted to a mesh, by its moments of inertia or by its bounding box."""
     lump = mesh_lump(triangles, legacy)
-    moments, axes = np.linalg.eigh(lump.J / lump.mass)
-    moments, axes = moments[::-1], axes[:, ::-1]
+    assert lump.axes is not None
+    moments = np.diag(lump.axes.T @ lump.J @ lump.axes) / lump.mass
+    order = np.argsort(-moments)
+    moments, axes = moments[order], lump.axes[:, order]
     axes = axes * np.array([1.0, 1.0, np.sign(np.linalg.det(axes))])
     pose = Pose(lump.centre, axes)
     half = np.sqrt(np.maximum(1.5 * (moments.sum() - 2.0 * moments), 0.0))

@@ -1,67 +1,40 @@
-"""Add what acts in an MJCF file to its model: springs, friction, armature, actuators, tendons; loops; the start."""
+"""Add what acts in an MJCF file to its model: springs, friction, armature, the medium; loops; the start."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from twoloop.bodies.file_parts import FileJoint, Part, Pose, body_of, numbers, pose_of, start_point, start_pose, text_of
+from twoloop.bodies.file_parts import (
+    FileJoint,
+    Part,
+    Pose,
+    body_of,
+    name_of,
+    numbers,
+    pose_of,
+    start_point,
+    start_pose,
+    text_of,
+)
+from twoloop.bodies.mjcf_actuators import TendonsAndActuators, is_single
 from twoloop.bodies.parameter_layout import HINGE_ROTOR, SLIDE_ROTOR
 from twoloop.bodies.parts import Body, Force, Numbers
 from twoloop.bodies.rotation import rotation_matrix
-from twoloop.checks.arguments import Array, check_finite, shown
+from twoloop.bodies.rotation_rates import rate_of_vector, spin_of
+from twoloop.checks.arguments import Array, shown
 
-ACTUATORS = (
-    *("general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder", "muscle", "adhesion"),
-    *("dcmotor", "plugin"),
-)
-SUPPORTED = ACTUATORS[:6]
 AGREES = 1e-6  # tolerance of the pose that a weld prescribes
 
 
-def actuator_law(tag: str, inherited: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:
-    """Merge an actuator into its defaults, which all kinds share, and return it as a general one.
-
-    Its force is gain * command + bias_0 + bias_1 * length + bias_2 * velocity, where `gainprm` and `biasprm` count as
-    far as `gaintype` and `biastype` say.
-    """
-    law = {**inherited, **own}
-    gain, bias = (_padded(law.get(key, default)) for key, default in (("gainprm", "1"), ("biasprm", "0")))
-    types = {"gaintype": "fixed", "biastype": "none", "dyntype": "none"}
-    if tag == "general":
-        types = {key: law.get(key, default) for key, default in types.items()}
-    elif tag == "motor":
-        gain, bias = np.array([1.0, 0.0, 0.0]), np.zeros(3)
-    elif tag in ("position", "intvelocity"):
-        gain[0] = float(own.get("kp", gain[0]))
-        bias = np.array([0.0, -gain[0], -float(own["kv"]) if "kv" in own else bias[2]])
-        types["biastype"] = "affine"
-        if tag == "intvelocity" or float(own.get("timeconst", 0.0)):
-            types["dyntype"] = "integrator" if tag == "intvelocity" else "filterexact"
-    elif tag == "velocity":
-        gain[0] = float(own.get("kv", -bias[2] if bias[2] else 1.0))
-        bias, types["biastype"] = np.array([0.0, 0.0, -gain[0]]), "affine"
-    elif tag == "damper":
-        gain, types["gaintype"] = np.array([0.0, 0.0, -float(own.get("kv", 1.0))]), "affine"
-    law |= types | {"gainprm": text_of(gain), "biasprm": text_of(bias)}
-    return law
-
-
-def _padded(text: str) -> Array:
-    values = np.array([float(each) for each in text.split()][:3])
-    return np.append(values, np.zeros(3 - len(values)))
-
-
-class Loads:
+class Loads(TendonsAndActuators):
     """Add to a model what acts on its bodies, by the reader of a file."""
 
     def __init__(self, reader: Any):
-        self.reader, self.model, self.ignored = reader, reader.model, reader.ignored
-        self.commands = dict(reader.commands)
-        self.inverse: Array | None = None  # of the mass matrix in the reference pose
+        super().__init__(reader)
         names = {each.get("name", "") for group in reader.root.findall("actuator") for each in group}
         if unknown := self.commands.keys() - names:
             raise ValueError(f"commands has {min(unknown)!r}, but the file has no actuator of that name")
@@ -111,28 +84,36 @@ class Loads:
         reader = self.reader
         for joint in reader.ordered:
             self._joint(joint)
-        for part, lump, factor, _ in reader.gravcomp:
+        for part, lump, factor in reader.gravcomp:
             weight = -scale * factor * lump.mass * self.model.gravity
             if weight.any():
                 self.model.force(body_of(self.model, part), start_point(part, lump.centre), weight)
+        self._medium()
         sections = {tag: [each for group in reader.root.findall(tag) for each in group] for tag in READ}
         for tag, elements in sections.items():
+            for each in elements if tag == "actuator" else ():
+                self._passive(each)
             before = len(self.model.forces)
             for number, each in enumerate(elements):
                 getattr(self, f"_{tag}")(each, number)
             if tag == "actuator":
                 self.model.actuators = tuple(self.model.forces[before:])
 
-    def _of(self, part: Part | None) -> Body:
-        return body_of(self.model, part)
-
-    def _unit(self, joint: FileJoint) -> float:
-        return float(np.pi / 180.0) if self.reader.degrees and joint.kind == "hinge" else 1.0
+    def _medium(self) -> None:
+        """Add the forces of the medium, on each body of the file by itself."""
+        medium = self.reader.medium
+        if not (medium.density or medium.viscosity) or {"stiffness", "damping"} <= self.reader.without:
+            return
+        for number, (part, lump) in enumerate(self.reader.wetted):
+            body, local = self._of(part), lump.transformed(part.pose.inverse())
+            own = replace(local, centre=body.local_point(start_point(part, lump.centre)))
+            names = [self.reader.free(None, f"{what} of the medium {number}") for what in ("drag", "twist")]
+            medium.act(self.model, body, own, names)
 
     def _joint(self, joint: FileJoint) -> None:
         """Add armature, spring, damper, friction and limits of a joint."""
         given, name = joint.attributes, joint.name
-        single = joint.joint is not None and joint.joint.kind in ("revolute", "prismatic")
+        single = is_single(joint)
         armature, friction = (float(given.get(key, 0.0)) for key in ("armature", "frictionloss"))
         if armature and single:
             self.model.rotor(joint.joint, armature, name=self.reader.free(None, f"armature of {name}"))
@@ -143,8 +124,9 @@ class Loads:
             self.ignored.append(f"frictionloss of joint {name!r} by solve_dae (solve_with_friction has it)")
         elif friction:
             self.ignored.append(f"frictionloss of joint {name!r}")
+        self.ignored += [f"springyield of joint {name!r}"] if "springyield" in given else []
         self._spring(joint, single)
-        if joint.kind != "free" and self.reader.limited(joint):
+        if joint.kind != "free" and self.reader.limited(joint.attributes):
             self._limits(joint, single)
 
     def _limits(self, joint: FileJoint, single: bool) -> None:
@@ -152,7 +134,7 @@ class Loads:
             self.ignored.append(f"limits of joint {joint.name!r}")
             return
         low, high = self._unit(joint) * numbers(joint.attributes.get("range", ""), 2, f"range of joint {joint.name!r}")
-        zero = self._unit(joint) * float(joint.attributes.get("ref", 0.0)) + joint.displacement
+        zero = self._reference(joint) + joint.displacement
         try:
             self.model.limit(joint.joint, lower=float(low - zero), upper=float(high - zero))
         except ValueError:  # e.g. a hinge in space
@@ -185,7 +167,7 @@ class Loads:
         if any(times) and not single:
             self.ignored.append(f"springdamper of joint {joint.name!r}")
         elif len(times) == 2 and min(times) > 0.0 and not self.reader.disabled & {"spring", "damper", "passive"}:
-            inertia = self._inertia(joint)
+            inertia = self._inertia([joint], [1.0])
             stiffness, damping = [repr(inertia / (times[0] * times[1]) ** 2)], [repr(2.0 * inertia / times[0])]
         if not any(float(x) for x in (*stiffness, *damping)):
             return
@@ -198,19 +180,6 @@ class Loads:
             return
         rest = self._unit(joint) * (float(given.get("springref", 0.0)) - float(given.get("ref", 0.0)))
         self._law(joint, float(stiffness[0]), float(damping[0]), rest - joint.displacement, None)
-
-    def _inertia(self, joint: FileJoint) -> float:
-        """Return the inertia that a joint feels in the reference pose while all others are free, as MuJoCo takes it."""
-        if self.inverse is None:
-            self.inverse = np.asarray(np.linalg.inv(tree_inertia(self.reader.parts, self.reader.ordered)))
-        first = sum(DEGREES[each.kind] for each in self.reader.ordered[: self.reader.ordered.index(joint)])
-        return 1.0 / float(self.inverse[first, first])
-
-    def _law(self, joint: FileJoint, k: float, c: float, rest: float, name: str | None) -> Force:
-        assert joint.joint is not None
-        if joint.joint.kind == "revolute":
-            return self.model.torsion_spring(joint.joint, stiffness=k, damping=c, angle=rest, name=name)
-        return self.model.axial_spring(joint.joint, stiffness=k, damping=c, length=rest, name=name)
 
     def _damp(self, joint: FileJoint, damping: float) -> None:
         """Add the damper of a ball or a free joint: forces against its rates."""
@@ -231,8 +200,8 @@ class Loads:
         given = self.reader.attributes(element, "main")
         if self.reader.disabled & {"constraint", "equality"} or given.get("active", "true") == "false":
             return
-        what = f"{element.tag} {element.get('name')!r}" if element.get("name") else element.tag
-        if element.tag == "joint" and self._couple(given):
+        what = name_of(element)
+        if element.tag in ("joint", "tendon") and self._couple(given, element.tag):
             return
         if element.tag not in ("connect", "weld"):
             self.ignored.append(f"equality: {what}")
@@ -274,154 +243,27 @@ class Loads:
     def _on(self, body: Body, part: Part | None, at: Array) -> Any:
         return body.point(*body.local_point(start_point(part, at)))
 
-    def _couple(self, given: dict[str, str]) -> bool:
-        """Add a joint equality: joint 1 moves as a polynomial of joint 2; return False if a model has none."""
-        ends = [self.reader.joints.get(given[key]) for key in ("joint1", "joint2") if key in given]
-        if not all(each is not None and each.joint is not None for each in ends):
-            return False
-        if any(each.joint.kind not in ("revolute", "prismatic") for each in ends):
+    def _couple(self, given: dict[str, str], kind: str) -> bool:
+        """Let a joint or tendon move as a polynomial of another one; return False if a model cannot."""
+        names = [given[key] for key in (f"{kind}1", f"{kind}2") if key in given]
+        if kind == "tendon":
+            pairs = [self.tendons.get(name, (None, 0.0)) for name in names]
+            ends, offsets = [each for each, _ in pairs], [-reference for _, reference in pairs]
+        else:
+            joints = [self.reader.joints.get(name) for name in names]
+            if not all(each is not None and is_single(each) for each in joints):
+                return False
+            ends, offsets = [each.joint for each in joints], [each.displacement for each in joints]
+        if not names or None in ends:
             return False
         text = given.get("polycoef", "0 1 0 0 0").split()
-        coefficients = numbers(" ".join([*text, *"00000"[len(text) :]]), 5, "polycoef of a joint equality")
-        return self.couple(given.get("name"), ends, coefficients)
-
-    def couple(self, name: str | None, ends: list[Any], coefficients: Array) -> bool:
-        """Let the first joint move as a polynomial of the second, both from the reference pose of the file."""
-        add_coupling = getattr(self.model, "coupling", None)
-        if add_coupling is None:
-            return False
-        row = Polynomial(tuple(coefficients.tolist()), tuple(each.displacement for each in ends))
-        own = self.reader.free(name, f"equality of {' and '.join(each.name for each in ends)}")
-        add_coupling([each.joint for each in ends], row, name=own)
+        coefficients = numbers(" ".join([*text, *"00000"[len(text) :]]), 5, f"polycoef of a {kind} equality")
+        own = self.reader.free(given.get("name"), f"equality of {' and '.join(names)}")
+        self.model.coupling(ends, Polynomial(tuple(coefficients.tolist()), tuple(offsets)), name=own)
         return True
 
-    def _tendon(self, element: Element, number: int) -> None:
-        given = self.reader.attributes(element, "main")
-        called = f"{element.tag} {element.get('name')!r}" if element.get("name") else element.tag
-        rest = given.get("springlength", "-1").split()
-        stiffness, damping = (given.get(key, "0") for key in ("stiffness", "damping"))
-        limited = given.get("limited", "auto") == "true" or (
-            given.get("limited", "auto") == "auto" and "range" in given
-        )
-        acting = [stiffness, damping, given.get("armature", "0"), given.get("frictionloss", "0")]
-        if not limited and not any(float(x) for each in acting for x in each.split()):
-            return
-        plain = element.tag == "spatial" and [each.tag for each in element] == ["site", "site"]
-        plain &= len(stiffness.split()) == 1 == len(damping.split())
-        if not plain or len(rest) != 1 or limited:
-            self.ignored.append(f"tendon: {called}")
-            return
-        for key in ("armature", "frictionloss"):
-            if float(given.get(key, 0.0)):
-                self.ignored.append(f"{key} of {called}")
-        (part_1, point_1), (part_2, point_2) = (self.reader.site(each.get("site", "")) for each in element)
-        length = None if float(rest[0]) < 0.0 else float(rest[0])
-        if length is None and float(stiffness) and (moved := _away(part_1) or _away(part_2)):
-            raise ValueError(
-                f"{called} needs a springlength: MuJoCo takes that which it has where joints are at their "
-                f"springref, and that of {moved!r} is not its ref"
-            )
-        if length is None:
-            length = float(np.linalg.norm(point_1 - point_2))
-        body_1, body_2 = self._of(part_1), self._of(part_2)
-        ends = self._on(body_1, part_1, point_1), self._on(body_2, part_2, point_2)
-        name = self.reader.free(given.get("name"), f"spring of {body_1.name} and {body_2.name}")
-        values: dict[str, Any] = {"stiffness": float(stiffness), "damping": float(damping), "length": length}
-        self.model.spring(body_1, ends[0], body_2, ends[1], name=name, **values)
 
-    def _actuator(self, element: Element, number: int) -> None:
-        """Add an actuator of a hinge or slide as a motor and a spring."""
-        name = element.get("name", f"actuator {number}")
-        called = (
-            f"actuator: {element.tag} {element.get('name')!r}" if element.get("name") else f"actuator: {element.tag}"
-        )
-        command = self.commands.get(name, 0.0)
-        if "actuation" in self.reader.disabled:
-            return
-        given = self.reader.attributes(element, "main")
-        gain, bias = (np.array([float(x) for x in given[key].split()]) for key in ("gainprm", "biasprm"))
-        if given["biastype"] == "none":
-            bias = np.zeros(3)
-        joint = self.reader.joints.get(given.get("joint", given.get("jointinparent", "")))
-        single = joint is not None and joint.joint is not None and joint.joint.kind in ("revolute", "prismatic")
-        fixed = given["gaintype"] == "fixed" or (given["gaintype"] == "affine" and not gain[1:].any())
-        if element.tag not in SUPPORTED or not single or not fixed or given["biastype"] not in ("none", "affine"):
-            self.ignored.append(called)
-            return
-        assert joint is not None and joint.joint is not None
-        if given["dyntype"] != "none":
-            self.ignored.append(f"the command of {called}, whose activation is {given['dyntype']}")
-            command = 0.0
-        gear = float(given.get("gear", "1").split()[0])
-        k, c = -gear * gear * bias[1], -gear * gear * bias[2]
-        if min(k, c) < 0.0:
-            self.ignored.append(called)
-            return
-        for key, flag in (("forcerange", "forcelimited"), ("ctrlrange", "ctrllimited")):
-            limited = given.get(flag, "auto")
-            if limited == "true" or (limited == "auto" and key in given):
-                if key == "ctrlrange" and not callable(command):
-                    low, high = numbers(given.get(key, ""), 2, f"ctrlrange of {called}")
-                    command = float(np.clip(check_finite(f"commands[{name!r}]", command), low, high))
-                else:
-                    self.ignored.append(f"{key} of {called}")
-        zero = self._unit(joint) * float(joint.attributes.get("ref", 0.0)) + joint.displacement  # qpos at the start
-        own = self.reader.free(name, f"actuator of {joint.name}")
-        servo = k > 0.0 and gain[0] == -bias[1] and not bias[0] and not callable(command)
-        if servo:  # the command is where the spring has no force
-            self._law(joint, k, c, command / gear - zero, own)
-            return
-        if k or c:
-            self._law(joint, k, c, -zero, self.reader.free(None, f"gains of {own}"))
-        self.model.motor(joint.joint, _torque(command, gear * gain[0], gear * bias[0]), name=own)
-
-
-DEGREES = {"hinge": 1, "slide": 1, "ball": 3, "free": 6}
-
-
-def tree_inertia(parts: list[Part], joints: list[FileJoint]) -> Array:
-    """Return the mass matrix of the joints of a tree in the reference pose, in the order of the joints."""
-    first = dict(zip(map(id, joints), np.cumsum([0, *(DEGREES[each.kind] for each in joints)]), strict=False))
-    n = sum(DEGREES[each.kind] for each in joints)
-    M = np.diag([float(each.attributes.get("armature", 0.0)) for each in joints for _ in range(DEGREES[each.kind])])
-    for part in parts:
-        for lump in part.lumps:
-            linear, angular = np.zeros((3, n)), np.zeros((3, n))
-            carrier: Part | None = part
-            while carrier is not None:
-                for each in carrier.freed:
-                    k = first[id(each)]
-                    axes = each.axis[None] if each.kind in ("hinge", "slide") else carrier.pose.R.T
-                    if each.kind == "free":
-                        linear[:, k : k + 3] = np.eye(3)
-                        k += 3
-                    for axis in axes:
-                        if each.kind == "slide":
-                            linear[:, k] = axis
-                        else:
-                            linear[:, k], angular[:, k] = np.cross(axis, lump.centre - each.at), axis
-                        k += 1
-                carrier = carrier.parent
-            M += lump.mass * linear.T @ linear + angular.T @ lump.J @ angular
-    return M
-
-
-READ = ("equality", "tendon", "actuator")  # sections, in order
-
-
-def _torque(command: float | Callable[[Any], Any], factor: float, constant: float) -> Any:
-    """Return the force of an actuator: a number, or a function of t."""
-    return _Commanded(command, factor, constant) if callable(command) else factor * command + constant
-
-
-class _Commanded:
-    """Evaluate the force of an actuator with a command that is a function of time."""
-
-    def __init__(self, command: Callable[[Any], Any], factor: float, constant: float):
-        self.command, self.factor, self.constant = command, factor, constant
-
-    def __call__(self, t: Any) -> Any:
-        return self.factor * self.command(t) + self.constant
+READ = ("tendon", "equality", "actuator")  # sections, in order
 
 
 class Polynomial:
@@ -444,15 +286,6 @@ class Polynomial:
         return first + self.offsets[0] - total
 
 
-def _spin(q: Any, v: Any, body: Body) -> list[Any]:
-    """Return the angular velocity of a body in space, for numbers or symbols."""
-    if not body.coordinates:
-        return [0.0, 0.0, 0.0]
-    e, u = ([x[k] for k in body.coordinates[3:]] for x in (q, v))
-    both = _cross(e[1:], u[1:])
-    return [2.0 * (e[0] * u[i + 1] - u[0] * e[i + 1] + both[i]) for i in range(3)]
-
-
 class _Slowing:
     """Evaluate the torque of a damper against the angular velocity of a body relative to another."""
 
@@ -460,7 +293,7 @@ class _Slowing:
         self.body, self.parent, self.factor = body, parent, -sign * damping
 
     def __call__(self, t: Any, q: Any, v: Any) -> Any:
-        spins = zip(_spin(q, v, self.body), _spin(q, v, self.parent), strict=True)
+        spins = zip(spin_of(q, v, self.body.number), spin_of(q, v, self.parent.number), strict=True)
         return [self.factor * (own - other) for own, other in spins]
 
 
@@ -471,22 +304,5 @@ class _Dragging:
         self.body, self.point, self.damping = body, point, damping
 
     def __call__(self, t: Any, q: Any, v: Any) -> Any:
-        from twoloop.bodies.frames import vector_of
-
-        turning = _cross(_spin(q, v, self.body), vector_of(q, self.body.number, self.point))
+        turning = rate_of_vector(q, v, self.body.number, self.point)
         return [-self.damping * (v[self.body.coordinates[k]] + turning[k]) for k in range(3)]
-
-
-def _cross(a: Any, b: Any) -> list[Any]:
-    return [a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2] for i in range(3)]
-
-
-def _away(part: Part | None) -> str:
-    """Return the name of a joint between a part and the ground whose springref differs from its ref, or ""."""
-    while part is not None:
-        for freed in part.freed:
-            spring, given = (float(freed.attributes.get(key, 0.0)) for key in ("springref", "ref"))
-            if freed.kind in ("hinge", "slide") and spring != given:
-                return freed.name
-        part = part.parent
-    return ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -20,15 +21,19 @@ from twoloop.bodies.file_parts import (
     combined,
     counterpart,
     geom_lump,
+    name_of,
     numbers,
     pose_of,
+    principal_axes,
     record_ignored,
     tensor_of,
     text_of,
 )
+from twoloop.bodies.fluid import Medium
 from twoloop.bodies.meshes import fitted, mesh_lump, mesh_triangles
+from twoloop.bodies.mjcf_actuators import ACTUATORS, actuator_law
 from twoloop.bodies.mjcf_expand import compiler_of, expanded
-from twoloop.bodies.mjcf_loads import ACTUATORS, Loads, actuator_law
+from twoloop.bodies.mjcf_loads import Loads
 from twoloop.bodies.spatial.model import SpatialModel
 from twoloop.checks.arguments import Array, check_flag
 
@@ -140,12 +145,12 @@ class _Reader:
         self.defaults: dict[str, dict[str, dict[str, str]]] = {"main": {}}
         for each in root.findall("default"):
             self._default(each, "main", self.defaults["main"])
-        gravity = np.array([0.0, 0.0, -9.81])
+        disabled_groups = ""
+        gravity, medium = np.array([0.0, 0.0, -9.81]), dict[str, str]()
         for each in root.findall("option"):
             gravity = numbers(each.get("gravity", "0 0 -9.81"), 3, "gravity") if each.get("gravity") else gravity
-            for name in ("density", "viscosity"):
-                if any(float(x) for x in each.get(name, "0").split()):
-                    self.ignored.append(f"{name} of the surrounding medium")
+            disabled_groups = each.get("actuatorgroupdisable", disabled_groups)
+            medium |= {name: each.attrib[name] for name in ("density", "viscosity", "wind") if name in each.attrib}
         flags = {
             name: value for flag in root.findall("option/flag") for name, value in flag.attrib.items()
         }  # the last one counts
@@ -155,13 +160,17 @@ class _Reader:
         self.without |= {"damping"} if "damper" in self.disabled else set()
         self.without |= {"stiffness", "damping"} if "passive" in self.disabled else set()  # one flag, before 3.4
         self.without |= {"frictionloss"} if self.disabled & {"frictionloss", "constraint"} else set()
+        numbers_of = {key: numbers(medium.get(key, "0"), 1, key)[0] for key in ("density", "viscosity")}
+        self.medium = Medium(**numbers_of, wind=tuple(numbers(medium.get("wind", "0 0 0"), 3, "wind").tolist()))
+        self.groups_without_force = disabled_groups.split()
         self.model = SpatialModel(gravity, name=root.get("model", "MuJoCo Model"))
         self.frames: dict[str, tuple[Part | None, Pose]] = {"world": (None, Pose(np.zeros(3), np.eye(3)))}
         self.sites: dict[str, tuple[Part | None, Array]] = {}
         self.joints: dict[str, FileJoint] = {}  # by their names in the file
         self.ordered: list[FileJoint] = []  # as in qpos
         self.parts: list[Part] = []
-        self.gravcomp: list[tuple[Part | None, Lump, float, str]] = []
+        self.gravcomp: list[tuple[Part, Lump, float]] = []
+        self.wetted: list[tuple[Part, Lump]] = []  # what the medium acts on
         self.meshes: dict[str, Element] = {}
         for asset in root.findall("asset"):
             for mesh in asset.findall("mesh"):
@@ -170,16 +179,16 @@ class _Reader:
         self.n_geoms, self.n_bodies, self.total = 0, 0, 0.0
         self.taken = {"ground", *(each.get("name", "") for each in root.iter("body"))}
         acting = [each for tag in ("equality", "actuator", "tendon") for group in root.findall(tag) for each in group]
-        self.referred = {
+        self.referred = [
             value for each in acting for part in each.iter() for name, value in part.attrib.items() if "joint" in name
-        }
+        ]
         self.key, self.commands, self.limits = key, commands, limits and "limit" not in self.disabled
 
     def read(self) -> None:
         """Read the whole file."""
         for each in self.root:
             if each.tag not in SEEN_ONLY | KNOWN:
-                self.ignored += [f"{each.tag}: {called(part)}" for part in each] or [each.tag]
+                self.ignored += [f"{each.tag}: {name_of(part)}" for part in each] or [each.tag]
         for each in self.root.findall("worldbody"):
             self._within(each, None, Pose(np.zeros(3), np.eye(3)), "main")
         total = float(self.compiler.get("settotalmass", -1.0))
@@ -209,7 +218,7 @@ class _Reader:
         """Return the attributes of an element with those of its default class."""
         name = element.get("class", childclass)
         if name not in self.defaults:
-            raise ValueError(f"{called(element)} is of the class {name!r}, which no default has")
+            raise ValueError(f"{name_of(element)} is of the class {name!r}, which no default has")
         if element.tag in ACTUATORS:
             return actuator_law(element.tag, self.defaults[name].get("actuator", {}), element.attrib)
         given = _merged(self.defaults[name].get(DEFAULT_OF.get(element.tag, element.tag), {}), element.attrib)
@@ -230,13 +239,13 @@ class _Reader:
             if each.tag == "body":
                 self._body(each, part, pose.then(frame), each.get("childclass", name))
             elif each.tag == "geom":
-                lump = self._geom(given, called(each), weigh)
+                lump = self._geom(given, name_of(each), weigh)
                 lumps += [] if lump is None or not weigh else [lump.transformed(frame)]
             elif each.tag == "site":
                 if "fromto" in given:
-                    ends = numbers(given["fromto"], 6, f"fromto of {called(each)}")
+                    ends = numbers(given["fromto"], 6, f"fromto of {name_of(each)}")
                     given["pos"] = text_of(0.5 * (ends[:3] + ends[3:]))
-                place = pose.then(frame).then(self.pose(given, called(each)))
+                place = pose.then(frame).then(self.pose(given, name_of(each)))
                 self.sites[each.get("name", f"site {len(self.sites)}")] = part, place.x
                 self.frames[f"site {each.get('name', len(self.sites))}"] = part, place
             elif each is inertial:
@@ -247,15 +256,24 @@ class _Reader:
                     "(mujoco.mj_saveLastXML), and remove what is deformable"
                 )
             elif each.tag not in SEEN_ONLY | {"inertial", "joint", "freejoint"}:
-                self.ignored.append(called(each))
+                self.ignored.append(name_of(each))
         if element.tag == "body":
             lump = self._bounded(combined(lumps))
             self.total += lump.mass
             gravcomp = float(element.get("gravcomp", 0.0))
             if part is not None:
+                lump = lump if lump.axes is not None else replace(lump, axes=principal_axes(lump.J))
                 part.lumps.append(lump.transformed(pose))
                 if gravcomp and lump.mass:
-                    self.gravcomp.append((part, part.lumps[-1], gravcomp, element.get("name", "body")))
+                    self.gravcomp.append((part, part.lumps[-1], gravcomp))
+                shaped = any(each.tag == "geom" and self._is_ellipsoid(each, name) for each, _, name in contents)
+                if shaped and (self.medium.density or self.medium.viscosity):
+                    self.ignored.append(f"forces of the medium on the ellipsoids of {name_of(element)}")
+                elif lump.mass:
+                    self.wetted.append((part, part.lumps[-1]))
+
+    def _is_ellipsoid(self, geom: Element, childclass: str) -> bool:
+        return self.attributes(geom, childclass).get("fluidshape") == "ellipsoid"
 
     def _contents(self, element: Element, childclass: str) -> list[tuple[Element, Pose, str]]:
         """Return the children of a body and of its frames, each with the pose of its frame and its class."""
@@ -264,7 +282,7 @@ class _Reader:
             if each.tag != "frame":
                 contents.append((each, Pose(np.zeros(3), np.eye(3)), childclass))
                 continue
-            outer = self.pose(each.attrib, called(each))
+            outer = self.pose(each.attrib, name_of(each))
             within = self._contents(each, each.get("childclass", childclass))
             contents += [(child, outer.then(inner), name) for child, inner, name in within]
         return contents
@@ -275,11 +293,11 @@ class _Reader:
         balance = self.compiler.get("balanceinertia", "false") == "true"
         if not (least or least_moment or balance):
             return lump
-        moments, axes = np.linalg.eigh(lump.J)
-        moments = np.maximum(moments, least_moment)
-        if balance and moments[0] + moments[1] < moments[2]:
+        axes = principal_axes(lump.J) if lump.axes is None else lump.axes
+        moments = np.maximum(np.diag(axes.T @ lump.J @ axes), least_moment)
+        if balance and moments.sum() < 2.0 * moments.max():
             moments = np.full(3, moments.mean())
-        return Lump(max(lump.mass, least), lump.centre, axes @ np.diag(moments) @ axes.T)
+        return Lump(max(lump.mass, least), lump.centre, axes @ np.diag(moments) @ axes.T, axes)
 
     def _body(self, element: Element, parent: Part | None, outer: Pose, childclass: str) -> None:
         self.n_bodies += 1
@@ -317,13 +335,13 @@ class _Reader:
     def _has_coordinate(self, joint: FileJoint) -> bool:
         """Return True if something acts on the coordinate of a joint, which must then be that of a joint of its own."""
         acting = any(any(float(x) for x in joint.attributes.get(key, "0").split()) for key in INERT)
-        return acting or joint.attributes.get("name") in self.referred or (self.limits and self.limited(joint))
+        acting |= self.limits and self.limited(joint.attributes)
+        return acting or joint.attributes.get("name") in self.referred
 
-    def limited(self, joint: FileJoint) -> bool:
-        """Return True if a joint has limits."""
-        limited = joint.attributes.get("limited", "auto")
-        automatic = self.compiler.get("autolimits", "true") == "true"
-        return limited == "true" or (limited == "auto" and automatic and "range" in joint.attributes)
+    def limited(self, given: Mapping[str, str], flag: str = "limited", span: str = "range") -> bool:
+        """Return True if an element has limits."""
+        limited, automatic = given.get(flag, "auto"), self.compiler.get("autolimits", "true") == "true"
+        return limited == "true" or (limited == "auto" and automatic and span in given)
 
     def _joint(self, element: Element, pose: Pose, childclass: str, body: str, number: int) -> FileJoint:
         given = {} if element.tag == "freejoint" else self.attributes(element, childclass)
@@ -373,7 +391,7 @@ class _Reader:
             at_origin = geom_lump(own | {"type": kind, "size": text_of(size)}, what, True, "xyz")
             return None if at_origin is None else at_origin.transformed(pose.then(inner))
         mass = float(given["mass"]) if "mass" in given else float(given.get("density", 1000.0)) * lump.mass
-        return Lump(mass, lump.centre, mass / lump.mass * lump.J).transformed(pose) if lump.mass else None
+        return replace(lump, mass=mass, J=mass / lump.mass * lump.J).transformed(pose) if lump.mass else None
 
     def _mesh(self, name: str, what: str) -> tuple[Array | None, bool]:
         """Return the triangles of a mesh, and whether its pyramids are added up with positive volumes."""
@@ -397,7 +415,7 @@ class _Reader:
             J = tensor_of(*numbers(given["fullinertia"], 6, f"fullinertia of {what}"))
         else:
             J = np.diag(numbers(given.get("diaginertia", ""), 3, f"diaginertia of {what}"))
-        return Lump(float(given["mass"]), np.zeros(3), J).transformed(self.pose(given, what))
+        return Lump(float(given["mass"]), np.zeros(3), J, principal_axes(J)).transformed(self.pose(given, what))
 
     def site(self, name: str) -> tuple[Part | None, Array]:
         """Return the part and the position of a site."""
@@ -418,8 +436,3 @@ def _merged(inherited: Mapping[str, str], own: Mapping[str, str]) -> dict[str, s
     sizes = own.get("size", "").split()
     sizes += inherited.get("size", "").split()[len(sizes) :]
     return {**kept, **own, **({"size": " ".join(sizes)} if sizes else {})}
-
-
-def called(element: Element) -> str:
-    """Return an element as messages name it."""
-    return f"{element.tag} {element.get('name')!r}" if element.get("name") else element.tag

@@ -1,8 +1,8 @@
-"""Couple joint coordinates by functions, and bodies by ropes."""
+"""Couple joint coordinates by functions and tendons, and bodies by ropes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -10,9 +10,12 @@ import numpy as np
 
 from twoloop.bodies.collection import add, documented
 from twoloop.bodies.frames import point_of
-from twoloop.bodies.loads import Gears, Row, function_rows
+from twoloop.bodies.functions import n_arguments
+from twoloop.bodies.loads import CoordinateGap, Gears, Row, function_rows
 from twoloop.bodies.parts import COINCIDE, Body, ModelJoint, Numbers
-from twoloop.checks.arguments import check_finite, check_positive, shown
+from twoloop.bodies.tendons import PrescribedTension, SpringTension, Tendon
+from twoloop.checks.arguments import check_finite, check_not_negative, check_positive, shown
+from twoloop.problem.description import Stop
 
 
 @documented
@@ -26,9 +29,9 @@ class Ropes(Gears):
 
         Parameters
         ----------
-        joints : sequence of ModelJoint, str or (ModelJoint or str, str)
-            Joints with coordinates; a pair with "angle" or "displacement" for cylindrical and screw joints. In space,
-            angles are limited to 0.95 of a turn to either side (`gear` has no such limit).
+        joints : sequence of ModelJoint, str, Tendon or (ModelJoint or str, str)
+            Joints with coordinates, or tendons; a pair with "angle" or "displacement" for cylindrical and screw joints.
+            In space, angles are limited to 0.95 of a turn to either side (`gear` has no such limit).
         function : callable
             function(x1, x2, ...) of the coordinates in this order, rad or m from the position given; from numpy
             functions without branches.
@@ -50,19 +53,111 @@ class Ropes(Gears):
         if not callable(function):
             raise TypeError(f"function must be a function of {len(joints)} coordinates; given {shown(function)}")
         pairs = [each if isinstance(each, tuple) and len(each) == 2 else (each, None) for each in joints]
-        coupled = [self._which(joint, which, "coupling") for joint, which in pairs]
-        coordinates = [self.joint_coordinate(*each) for each in coupled]
-        names = " and ".join(dict.fromkeys(joint.name for joint, _ in coupled))
+        measures = [joint if hasattr(joint, "bodies") else self._single(joint, which) for joint, which in pairs]
+        names = " and ".join(dict.fromkeys(each.joint for each in measures))
         name = self._new_name(f"coupling of {names}", name)
-        first = coupled[0][0]
-        ends = first.a, first.b, first.point_a, first.point_b
-        bodies = [body for joint, _ in coupled for body in (joint.a, joint.b)]
+        a, b, at_a, at_b = measures[0].ends
+        bodies = [body for each in measures for body in each.bodies]
 
         def row(q: Any) -> Any:
-            return function(*[each.position(q) for each in coordinates])
+            return function(*[each.position(q) for each in measures])
 
-        rows = function_rows(f"coupling {name!r}", [row], bodies, ends)
-        return add(self.joints, ModelJoint(name, "coupling", *ends[:2], rows, *ends[2:]))
+        rows = function_rows(f"coupling {name!r}", [row], bodies, (a, b, at_a, at_b))
+        return add(self.joints, ModelJoint(name, "coupling", a, b, rows, at_a, at_b))
+
+    def _single(self, joint: ModelJoint | str, which: str | None) -> Tendon:
+        """Return a joint coordinate as a tendon."""
+        moved, which = self._which(joint, which, "coupling")
+        coordinate = self.joint_coordinate(moved, which)
+        head = coordinate.joint, coordinate.which, coordinate.a, coordinate.b
+        return Tendon(*head, ((coordinate, 1.0),), (moved,))
+
+    def tendon(
+        self,
+        joints: Mapping[Any, float],
+        *,
+        stiffness: float = 0.0,
+        damping: float = 0.0,
+        length: float = 0.0,
+        force: Any = None,
+        lower: float | None = None,
+        upper: float | None = None,
+        name: str | None = None,
+    ) -> Tendon:
+        """Add a tendon whose length is a linear combination of joint coordinates, such as over pulleys on hinges.
+
+        Its tension acts on each joint in proportion to the coefficient of the joint. This is the fixed tendon of
+        MuJoCo. The energy of its spring is not part of the energy of the model.
+
+        Parameters
+        ----------
+        joints : mapping
+            Coefficients by joints or their names: the radius of the pulley on a hinge, m, or a factor. The key of a
+            coordinate of a cylindrical or screw joint is a pair, such as ("sleeve", "displacement").
+        stiffness, damping : float
+            N/m and N s/m; without a length in m, per rad.
+        length : float
+            Length at which the spring has no force, from the position given.
+        force : float or callable, optional
+            Tension beside that of the spring, positive where it shortens the tendon: a number, f(t) or
+            f(t, length, rate).
+        lower, upper : float, optional
+            Limits of the length from the position given, for `solve_with_stops`.
+        name : str, optional
+
+        Returns
+        -------
+        Tendon
+            Measures the length and its rate; `coupling` takes it like a joint.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is invalid.
+
+        Examples
+        --------
+        >>> from twoloop.bodies import PlanarModel
+        >>> model = PlanarModel(name="finger")
+        >>> for k in range(2):
+        ...     part = model.rod(f"part {k}", (k, 0.0), (k + 1, 0.0), mass=1.0)
+        >>> knuckle = model.revolute("ground", "part 0", at=(0.0, 0.0), name="knuckle")
+        >>> tip = model.revolute("part 0", "part 1", at=(1.0, 0.0), name="tip")
+        >>> flexor = model.tendon({"knuckle": -0.2, "tip": -0.1}, force=40.0)
+        >>> model.problem().freedom.degrees
+        2
+        """
+        if not isinstance(joints, Mapping) or not joints:
+            raise TypeError(f"joints must be a mapping from joints, or their names, to numbers; given {shown(joints)}")
+        pairs = {key if isinstance(key, tuple) and len(key) == 2 else (key, None): x for key, x in joints.items()}
+        moved = [self._which(joint, which, "tendon") for joint, which in pairs]
+        given = zip(moved, pairs.values(), strict=True)
+        factors = [check_finite(f"joints[{each.name!r}]", factor) for (each, _), factor in given]
+        name = self._new_name(f"tendon of {' and '.join(each.name for each, _ in moved)}", name)
+        parts = tuple((self.joint_coordinate(*each), x) for each, x in zip(moved, factors, strict=True))
+        kind = "angle" if all(which == "angle" for _, which in moved) else "displacement"
+        first = moved[0][0]
+        tendon = Tendon(name, kind, first.a.number, first.b.number, parts, tuple(each for each, _ in moved))
+        k, c = check_not_negative("stiffness", stiffness), check_not_negative("damping", damping)
+        rest = check_finite("length", length)
+        arity = 0 if not callable(force) else n_arguments("force", force, (1, 3), "(t) or (t, length, rate)")
+        if not arity and force is not None:
+            check_finite("force", force)
+        self.bound(tendon, lower, upper)
+        if k or c:
+            tendon.pull(self, SpringTension(k, c, rest, rest), name)
+        if force is not None:
+            tendon.pull(self, PrescribedTension(force, arity), self._new_name(f"force of {name}", None))
+        return tendon
+
+    def bound(self, tendon: Any, lower: float | None, upper: float | None) -> None:
+        """Add limits to the length of a tendon; None: no limit."""
+        if lower is not None and upper is not None and not lower < upper:
+            raise ValueError(f"lower of {tendon.joint!r} must be below upper; given {lower!r}, {upper!r}")
+        for bound, value, sign in (("lower", lower, 1.0), ("upper", upper, -1.0)):
+            if value is not None:
+                gap = CoordinateGap(tendon, check_finite(bound, value), sign)
+                add(self.stops, Stop(gap, 0.0, self._new_name(f"{bound} limit of {tendon.joint}", None)))
 
     def rope(
         self,

@@ -1,0 +1,439 @@
+"""Add tendons and actuators of an MJCF file to its model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from twoloop.bodies.file_parts import (
+    FileJoint,
+    Part,
+    body_of,
+    name_of,
+    numbers,
+    place,
+    start_point,
+    start_pose,
+    text_of,
+)
+from twoloop.bodies.frames import vector_of
+from twoloop.bodies.parts import Body, Force
+from twoloop.bodies.tendons import SitePath, SpringTension, Tendon, bounded
+from twoloop.checks.arguments import Array, check_finite
+
+ACTUATORS = (
+    *("general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder", "muscle", "adhesion"),
+    *("dcmotor", "plugin"),
+)
+SUPPORTED = ACTUATORS[:6]
+
+
+def actuator_law(tag: str, inherited: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:
+    """Merge an actuator into its defaults, which all kinds share, and return it as a general one.
+
+    Its force is gain * command + bias_0 + bias_1 * length + bias_2 * velocity, where `gainprm` and `biasprm` count as
+    far as `gaintype` and `biastype` say; a positive bias_2 is a damping ratio.
+    """
+    law = {**inherited, **own}
+    gain, bias = (_padded(law.get(key, default)) for key, default in (("gainprm", "1"), ("biasprm", "0")))
+    types = {"gaintype": "fixed", "biastype": "none", "dyntype": "none"}
+    if tag == "general":
+        types = {key: law.get(key, default) for key, default in types.items()}
+    elif tag == "motor":
+        gain, bias = np.array([1.0, 0.0, 0.0]), np.zeros(3)
+    elif tag in ("position", "intvelocity"):
+        gain[0] = float(own.get("kp", gain[0]))
+        damping = -float(own["kv"]) if "kv" in own else float(own.get("dampratio", bias[2]))
+        bias = np.array([0.0, -gain[0], damping])
+        types["biastype"] = "affine"
+        if tag == "intvelocity" or float(own.get("timeconst", 0.0)):
+            types["dyntype"] = "integrator" if tag == "intvelocity" else "filterexact"
+    elif tag == "velocity":
+        gain[0] = float(own.get("kv", -bias[2] if bias[2] else 1.0))
+        bias, types["biastype"] = np.array([0.0, 0.0, -gain[0]]), "affine"
+    elif tag == "damper":
+        gain, types["gaintype"] = np.array([0.0, 0.0, -float(own.get("kv", 1.0))]), "affine"
+    law |= types | {"gainprm": text_of(gain), "biasprm": text_of(bias)}
+    return law
+
+
+def _padded(text: str) -> Array:
+    values = np.array([float(each) for each in text.split()][:3])
+    return np.append(values, np.zeros(3 - len(values)))
+
+
+class TendonsAndActuators:
+    """Add to a model the tendons and actuators of a file, by the reader of the file."""
+
+    def __init__(self, reader: Any):
+        self.reader, self.model, self.ignored = reader, reader.model, reader.ignored
+        self.commands: dict[str, Any] = dict(reader.commands)
+        self.inertia: Array | None = None  # mass matrix of the tree in the reference pose
+        self.tendons: dict[str, tuple[Any, float]] = {}  # with their lengths in the reference pose
+        self.carriers: dict[str, list[tuple[Part | None, Array]]] = {}  # points of a path, in the reference pose
+
+    def _of(self, part: Part | None) -> Body:
+        return body_of(self.model, part)
+
+    def _unit(self, joint: FileJoint) -> float:
+        return float(np.pi / 180.0) if self.reader.degrees and joint.kind == "hinge" else 1.0
+
+    def _inertia(self, joints: list[FileJoint], factors: list[float]) -> float:
+        """Return the inertia behind a combination of joints in the reference pose while all joints are free."""
+        if self.inertia is None:
+            self.inertia = tree_inertia(self.reader.parts, self.reader.ordered)
+        w = np.zeros(len(self.inertia))
+        for joint, factor in zip(joints, factors, strict=True):
+            w[sum(DEGREES[each.kind] for each in self.reader.ordered[: self.reader.ordered.index(joint)])] = factor
+        return 1.0 / float(w @ np.linalg.solve(self.inertia, w))
+
+    def _law(self, joint: FileJoint, k: float, c: float, rest: float, name: str | None) -> Force:
+        assert joint.joint is not None
+        if joint.joint.kind == "revolute":
+            return self.model.torsion_spring(joint.joint, stiffness=k, damping=c, angle=rest, name=name)
+        return self.model.axial_spring(joint.joint, stiffness=k, damping=c, length=rest, name=name)
+
+    def _tendon(self, element: Element, number: int) -> None:
+        given = self.reader.attributes(element, "main")
+        called = name_of(element)
+        tendon: Tendon | SitePath | None
+        if element.tag == "spatial":
+            tendon, reference = self._path(element)
+        else:
+            pairs = [(self.reader.joints.get(each.get("joint", "")), float(each.get("coef", 1.0))) for each in element]
+            tendon, reference = self._combination(element.get("name"), pairs)
+        stiffness, damping = (_trimmed(given.get(key, "0")) for key in ("stiffness", "damping"))
+        limited, acting = self.reader.limited(given), bool(any(stiffness) or any(damping))
+        if tendon is None or len(stiffness) > 1 or len(damping) > 1:
+            if acting or limited or any(float(given.get(key, 0.0)) for key in ("armature", "frictionloss")):
+                self.ignored.append(f"tendon: {called}")
+            acting = limited = False
+        if tendon is None:
+            return
+        self.tendons[given.get("name", "")] = tendon, reference
+        self.ignored += [f"{key} of {called}" for key in ("armature", "frictionloss") if float(given.get(key, 0.0))]
+        self.ignored += [f"{key} of {called}" for key in ("springyield", "actuatorfrcrange") if key in given]
+        if limited and self.reader.limits:
+            low, high = numbers(given.get("range", ""), 2, f"range of {called}").tolist()
+            self.model.bound(tendon, low, high)
+        elif limited:
+            self.ignored.append(f"limits of {called}")
+        if not acting:
+            return
+        rest = [float(x) for x in given.get("springlength", "-1").split()]
+        if rest == [-1.0] or rest == [-1.0, -1.0]:
+            rest = [self._unstressed(tendon)]
+        k, c = stiffness[0], damping[0]
+        if isinstance(tendon, SitePath) and tendon.weights == (1.0,) and len(rest) == 1 and rest[0] >= 0.0:
+            (a, at_a), (b, at_b) = tendon.points
+            ends = a, a.point(*at_a), b, b.point(*at_b)
+            self.model.spring(*ends, stiffness=k, damping=c, length=rest[0], name=tendon.joint)
+            return
+        tendon.pull(self.model, SpringTension(k, c, rest[0], rest[-1]), tendon.joint)
+
+    def _combination(self, name: str | None, pairs: list[Any]) -> tuple[Tendon | None, float]:
+        """Return a fixed tendon, and its length in the reference pose; None if one of its joints has no coordinate."""
+        if not pairs or not all(joint is not None and is_single(joint) for joint, _ in pairs):
+            return None, 0.0
+        parts = tuple((self.model.joint_coordinate(joint.joint), factor) for joint, factor in pairs)
+        reference = sum(factor * self._reference(joint) for joint, factor in pairs)
+        constant = sum(factor * (self._reference(joint) + joint.displacement) for joint, factor in pairs)
+        kind = "angle" if all(each.which == "angle" for each, _ in parts) else "displacement"
+        head = self.reader.free(name, f"tendon of {pairs[0][0].name}"), kind, parts[0][0].a, parts[0][0].b
+        return Tendon(*head, parts, tuple(joint.joint for joint, _ in pairs), constant), reference
+
+    def _path(self, element: Element) -> tuple[SitePath | None, float]:
+        """Return a spatial tendon, and its length in the reference pose; None if it winds about geoms."""
+        if any(each.tag not in ("site", "pulley") for each in element):
+            return None, 0.0
+        points: list[tuple[Body, Array]] = []
+        places: list[tuple[Part | None, Array]] = []
+        weights: list[float] = []
+        weight = 1.0
+        for each in element:
+            if each.tag == "pulley":
+                weight, weights[-1:] = 1.0 / float(each.get("divisor", 1.0)), [0.0]
+                continue
+            part, at = self.reader.site(each.get("site", ""))
+            body = self._of(part)
+            points.append((body, body.local_point(start_point(part, at))))
+            places.append((part, at))
+            weights.append(weight)
+        weights = weights[:-1]
+        name = self.reader.free(element.get("name"), f"spring of {points[0][0].name} and {points[-1][0].name}")
+        self.carriers[name], reference = places, _length(weights, [at for _, at in places])
+        ends = points[0][0].number, points[-1][0].number
+        return SitePath(name, "displacement", *ends, tuple(points), tuple(weights)), reference
+
+    def _unstressed(self, tendon: Tendon | SitePath) -> float:
+        """Return the length of a tendon where its joints are at their springref."""
+        if isinstance(tendon, Tendon):
+            rests = [self._unit(each) * float(each.attributes.get("springref", 0.0)) for each in self._joints(tendon)]
+            return float(sum(factor * rest for (_, factor), rest in zip(tendon.parts, rests, strict=True)))
+        joints, parts = self.reader.ordered, self.reader.parts
+        starts = [(each.position, each.rate) for each in joints]
+        for each in joints:
+            rest = self._unit(each) * float(each.attributes.get("springref", 0.0)) - self._reference(each)
+            each.position, each.rate = rest if each.kind in ("hinge", "slide") else None, None
+        for part in parts:
+            place(part)
+        points = [start_point(*each) for each in self.carriers[tendon.joint]]
+        for each, (position, rate) in zip(joints, starts, strict=True):
+            each.position, each.rate = position, rate
+        for part in parts:
+            place(part)
+        return _length(tendon.weights, points)
+
+    def _joints(self, tendon: Tendon) -> list[FileJoint]:
+        own = {id(each.joint): each for each in self.reader.ordered}
+        return [own[id(each)] for each in tendon.joints]
+
+    def _reference(self, joint: FileJoint) -> float:
+        """Return qpos of a hinge or slide in the reference pose."""
+        return self._unit(joint) * float(joint.attributes.get("ref", 0.0))
+
+    def _passive(self, element: Element) -> None:
+        """Add armature and damping of an actuator, which act also without commands."""
+        given = self.reader.attributes(element, "main")
+        inertia, damping = float(given.get("armature", 0.0)), _trimmed(given.get("damping", "0"))
+        if not inertia and not any(damping):
+            return
+        gear, joint = float(given.get("gear", "1").split()[0]), self._joint_of(given)
+        target, called = self._target(given, gear), f"actuator: {name_of(element)}"
+        if inertia and joint is not None and is_single(joint):
+            name = self.reader.free(None, f"armature at {joint.name}")
+            self.model.rotor(joint.joint, inertia * gear * gear, name=name)
+        elif inertia:
+            self.ignored.append(f"armature of {called}")
+        if any(damping) and "damping" not in self.reader.without:
+            if target is None or len(damping) > 1:
+                self.ignored.append(f"damping of {called}")
+            else:
+                name = self.reader.free(None, f"damper of {target.joint}")
+                target.pull(self.model, SpringTension(0.0, damping[0], 0.0, 0.0), name)
+
+    def _actuator(self, element: Element, number: int) -> None:
+        """Add an actuator as a motor and a spring in a joint, a tension, or a force at a site."""
+        name = element.get("name", f"actuator {number}")
+        called = f"actuator: {name_of(element)}"
+        command = self.commands.get(name, 0.0)
+        given = self.reader.attributes(element, "main")
+        if "actuation" in self.reader.disabled or given.get("group", "0") in self.reader.groups_without_force:
+            return
+        if element.tag not in SUPPORTED:
+            self.ignored.append(called)
+            return
+        gain, bias = (np.array([float(x) for x in given[key].split()]) for key in ("gainprm", "biasprm"))
+        bias *= given["biastype"] == "affine"
+        gain[1:] *= given["gaintype"] == "affine"
+        gear = np.append([float(x) for x in given.get("gear", "1").split()], np.zeros(6))[:6]
+        target = self._target(given, float(gear[0]))
+        supported = given["gaintype"] in ("fixed", "affine") and given["biastype"] in ("none", "affine")
+        at_site = "site" in given and "refsite" not in given and not gain[1:].any() and not bias[1:].any()
+        if not supported or not (target or at_site):
+            self.ignored.append(called)
+            return
+        self.ignored += [f"{key} of {called}" for key in ("delay", "ffrange", "velrange") if key in given]
+        if given["dyntype"] != "none":
+            self.ignored.append(f"the command of {called}, whose activation is {given['dyntype']}")
+            command = 0.0
+        elif not callable(command):
+            command = check_finite(f"commands[{name!r}]", command)
+        joint = self._joint_of(given)
+        if bias[2] > 0.0 and gain[0] == -bias[1]:  # a damping ratio
+            mass = 0.0
+            if isinstance(target, Tendon) and gear[0]:
+                mass = self._inertia(self._joints(target), [factor for _, factor in target.parts])
+            else:
+                self.ignored.append(f"the damping ratio of {called}")
+            bias[2] *= -2.0 * np.sqrt(max(gain[0], 0.0) * mass)
+        if (span := self._range(given, "ctrl", joint)) and "clampctrl" not in self.reader.disabled:
+            command = Limited(command, *span) if callable(command) else float(np.clip(command, *span))
+        limits = self._range(given, "force", None)
+        if joint is not None and (own := self._limits_of_force(joint, float(gear[0]))):
+            limits = own if limits is None else (max(own[0], limits[0]), min(own[1], limits[1]))
+        own_name = self.reader.free(name, f"actuator {number} of the file")
+        law = ActuatorTension(command, tuple(gain), tuple(bias), limits)
+        if target is None:
+            self._at_site(given["site"], gear, law, own_name)
+            return
+        k, c = -gear[0] * gear[0] * bias[1:]
+        if joint is None or limits is not None or gain[1:].any() or min(k, c) < 0.0:
+            target.pull(self.model, law, own_name)
+            return
+        zero = self._reference(joint) + joint.displacement  # qpos at the start
+        servo = k > 0.0 and gain[0] == -bias[1] and not bias[0] and not callable(command)
+        if servo:  # the command is where the spring has no force
+            self._law(joint, k, c, command / gear[0] - zero, own_name)
+            return
+        if k or c:
+            self._law(joint, k, c, -zero, self.reader.free(None, f"gains of {own_name}"))
+        self.model.motor(joint.joint, _torque(command, gear[0] * gain[0], gear[0] * bias[0]), name=own_name)
+
+    def _target(self, given: dict[str, str], gear: float) -> Tendon | SitePath | None:
+        """Return the joint or tendon on which an actuator acts, as a tendon whose length and rate it feels."""
+        if "tendon" in given:
+            tendon, _ = self.tendons.get(given["tendon"], (None, 0.0))
+            if isinstance(tendon, SitePath):
+                return replace(tendon, weights=tuple(gear * x for x in tendon.weights))
+        else:
+            tendon, _ = self._combination(None, [(self._joint_of(given), 1.0)])
+        if tendon is None:
+            return None
+        parts = tuple((each, gear * x) for each, x in tendon.parts)
+        return replace(tendon, parts=parts, constant=gear * tendon.constant)
+
+    def _joint_of(self, given: dict[str, str]) -> FileJoint | None:
+        return self.reader.joints.get(given.get("joint", given.get("jointinparent", "")))
+
+    def _range(self, given: dict[str, str], what: str, joint: FileJoint | None) -> tuple[float, float] | None:
+        """Return the limits of the force or of the command (ctrl) of an actuator, or None."""
+        inherited = float(given.get("inheritrange", 0.0))
+        if what == "ctrl" and inherited and joint is not None and "range" in joint.attributes:
+            low, high = self._unit(joint) * numbers(joint.attributes["range"], 2, f"range of joint {joint.name!r}")
+            return 0.5 * (low + high - inherited * (high - low)), 0.5 * (low + high + inherited * (high - low))
+        if not self.reader.limited(given, f"{what}limited", f"{what}range"):
+            return None
+        low, high = numbers(given.get(f"{what}range", ""), 2, f"{what}range of an actuator")
+        return float(low), float(high)
+
+    def _limits_of_force(self, joint: FileJoint, gear: float) -> tuple[float, float] | None:
+        """Return the limits that a joint sets to the force of its only actuator, or None."""
+        if not gear or not self.reader.limited(joint.attributes, "actuatorfrclimited", "actuatorfrcrange"):
+            return None
+        elements = [each for group in self.reader.root.findall("actuator") for each in group]
+        if sum(self._may_act_on(joint, self.reader.attributes(each, "main")) for each in elements) > 1:  # of their sum
+            self.ignored.append(f"actuatorfrcrange of joint {joint.name!r}")
+            return None
+        ends = numbers(joint.attributes["actuatorfrcrange"], 2, f"actuatorfrcrange of joint {joint.name!r}") / gear
+        return float(ends.min()), float(ends.max())
+
+    def _may_act_on(self, joint: FileJoint, given: dict[str, str]) -> bool:
+        """Return True if an actuator acts on a joint, directly, by a tendon, or at a site somewhere."""
+        if "tendon" in given:
+            tendon, _ = self.tendons.get(given["tendon"], (None, 0.0))
+            return joint.joint in getattr(tendon, "joints", (joint.joint,))
+        return self._joint_of(given) in (joint, None)
+
+    def _at_site(self, site: str, gear: Array, law: ActuatorTension, name: str) -> None:
+        """Add an actuator whose force and torque have fixed components in the frame of a site."""
+        part, pose = self.reader.frame(f"site {site}")
+        frame, body = start_pose(part, pose), self._of(part)
+        if part is None:
+            return
+        pushes = self.model.force, self.model.torque
+        for push, given, own in zip(pushes, (gear[:3], gear[3:]), (name, f"torque of {name}"), strict=True):
+            if given.any():
+                along = SiteForce(body, tuple(body.local_direction(frame.R @ given).tolist()), law)
+                at = (body.point(*body.local_point(frame.x)),) if push == self.model.force else ()
+                push(body, *at, along, name=self.reader.free(None, own))
+
+
+DEGREES = {"hinge": 1, "slide": 1, "ball": 3, "free": 6}
+
+
+def tree_inertia(parts: list[Part], joints: list[FileJoint]) -> Array:
+    """Return the mass matrix of the joints of a tree in the reference pose, in the order of the joints."""
+    first = dict(zip(map(id, joints), np.cumsum([0, *(DEGREES[each.kind] for each in joints)]), strict=False))
+    n = sum(DEGREES[each.kind] for each in joints)
+    M = np.diag([float(each.attributes.get("armature", 0.0)) for each in joints for _ in range(DEGREES[each.kind])])
+    for part in parts:
+        for lump in part.lumps:
+            linear, angular = np.zeros((3, n)), np.zeros((3, n))
+            carrier: Part | None = part
+            while carrier is not None:
+                for each in carrier.freed:
+                    k = first[id(each)]
+                    axes = each.axis[None] if each.kind in ("hinge", "slide") else carrier.pose.R.T
+                    if each.kind == "free":
+                        linear[:, k : k + 3] = np.eye(3)
+                        k += 3
+                    for axis in axes:
+                        if each.kind == "slide":
+                            linear[:, k] = axis
+                        else:
+                            linear[:, k], angular[:, k] = np.cross(axis, lump.centre - each.at), axis
+                        k += 1
+                carrier = carrier.parent
+            M += lump.mass * linear.T @ linear + angular.T @ lump.J @ angular
+    return M
+
+
+def _torque(command: float | Callable[[Any], Any], factor: float, constant: float) -> Any:
+    """Return the force of an actuator: a number, or a function of t."""
+    return _Commanded(command, factor, constant) if callable(command) else factor * command + constant
+
+
+class _Commanded:
+    """Evaluate the force of an actuator with a command that is a function of time."""
+
+    def __init__(self, command: Callable[[Any], Any], factor: float, constant: float):
+        self.command, self.factor, self.constant = command, factor, constant
+
+    def __call__(self, t: Any) -> Any:
+        return self.factor * self.command(t) + self.constant
+
+
+class Limited:
+    """Evaluate a command that is a function of time, within its range."""
+
+    def __init__(self, command: Callable[[Any], Any], low: float, high: float):
+        self.command, self.low, self.high = command, low, high
+
+    def __call__(self, t: Any) -> Any:
+        """Return the command, for numbers or symbols."""
+        return bounded(self.command(t), self.low, self.high)
+
+
+@dataclass(frozen=True, eq=False)
+class ActuatorTension:
+    """Evaluate minus the force of an actuator, whose gain and bias are linear in its length and rate."""
+
+    command: Any
+    gain: tuple[float, ...]
+    bias: tuple[float, ...]
+    limits: tuple[float, float] | None
+
+    def __call__(self, t: Any, length: Any, rate: Any) -> Any:
+        """Return the tension, for numbers or symbols."""
+        command = self.command(t) if callable(self.command) else self.command
+        gain, bias = (c[0] + c[1] * length + c[2] * rate for c in (self.gain, self.bias))
+        force = gain * command + bias
+        return -force if self.limits is None else -bounded(force, *self.limits)
+
+
+@dataclass(frozen=True, eq=False)
+class SiteForce:
+    """Evaluate a force or torque with constant direction in the axes of a body, without length and rate."""
+
+    body: Body
+    components: tuple[float, ...]
+    law: ActuatorTension
+
+    def __call__(self, t: Any, q: Any, v: Any) -> Any:
+        """Return the force along the axes of space, for numbers or symbols."""
+        size = -self.law(t, 0.0, 0.0)
+        return [size * x for x in vector_of(q, self.body.number, self.components)]
+
+
+def is_single(joint: FileJoint) -> bool:
+    """Return True if a hinge or slide is a joint of its own in the model."""
+    return joint.joint is not None and joint.joint.kind in ("revolute", "prismatic")
+
+
+def _trimmed(text: str) -> list[float]:
+    """Return the coefficients of a polynomial, without zeros at its end but for the first."""
+    values = [float(x) for x in text.split()] or [0.0]
+    while len(values) > 1 and not values[-1]:
+        values.pop()
+    return values
+
+
+def _length(weights: Any, points: list[Array]) -> float:
+    """Return the length of a path through points of space."""
+    parts = zip(weights, points, points[1:], strict=False)
+    return sum(weight * float(np.linalg.norm(x - y)) for weight, x, y in parts)
