@@ -12,33 +12,21 @@ from tests.marks import slow
 from twoloop.bodies import IgnoredWarning, SpatialModel, from_mjcf
 
 pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
-LEG = """
-<mujoco model="leg">
-  <compiler angle="degree" eulerseq="XYZ"/>
-  <option gravity="0 0 -9.81" timestep="0.002"/>
-  <default>
-    <joint damping="0.05"/>
-    <geom contype="0" conaffinity="0" density="500"/>
-    <default class="stiff"><joint stiffness="3" springref="20"/></default>
-  </default>
+LEG = """<mujoco model="leg"><compiler angle="degree" eulerseq="XYZ"/><option gravity="0 0 -9.81" timestep="0.002"/>
+  <default><joint damping="0.05"/><geom contype="0" conaffinity="0" density="500"/>
+    <default class="stiff"><joint stiffness="3" springref="20"/></default></default>
   <worldbody>
     <light pos="0 0 3"/>
     <body name="hip" pos="0 0 1" euler="0 30 0">
       <joint name="hip" axis="0 1 0"/>
       <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.04"/>
-      <body name="plate" pos="0 0 -0.2" quat="0.5 0.5 0.5 0.5">
-        <geom type="box" size="0.05 0.02 0.03" mass="0.2"/>
-      </body>
-      <body name="shin" pos="0 0 -0.4" axisangle="0 1 0 -60">
-        <joint name="knee" axis="0 2 0" class="stiff" damping="0.1"/>
-        <inertial pos="0 0 -0.2" mass="0.8" diaginertia="0.02 0.021 0.004" zaxis="1 0 1"/>
-        <geom type="sphere" size="0.1"/>
-      </body>
+      <body name="plate" pos="0 0 -0.2" quat="1 1 1 1"><geom type="box" size="0.05 0.02 0.03" mass="0.2"/></body>
+     <body name="shin" pos="0 0 -0.4" axisangle="0 1 0 300"><joint name="knee" class="stiff" axis="0 2 0" damping=".1"/>
+        <inertial pos="0 0 -0.2" mass="0.8" diaginertia="0.02 0.021 0.004" zaxis="1 0 1"/><geom size="0.1"/></body>
     </body>
     <body name="bob" pos="1 0 0.5"><freejoint/><geom type="ellipsoid" size="0.1 0.2 0.3"/></body>
   </worldbody>
-</mujoco>
-"""
+</mujoco>"""
 
 
 def read(text, folder):
@@ -176,15 +164,10 @@ def test_files_that_are_none(tmp_path):
 
 
 def test_defaults_of_tendons_and_what_else_was_passed_over(tmp_path):
-    text = """<mujoco>
-      <default><tendon stiffness="7" damping="2"/><equality active="false"/></default>
-      <worldbody>
-        <site name="a"/>
-        <body name="bob" pos="0 0 1"><freejoint/><geom size="0.1"/><site name="b"/></body>
-      </worldbody>
+    text = """<mujoco><default><tendon stiffness="7" damping="2"/><equality active="false"/></default><worldbody>
+      <site name="a"/><body name="bob" pos="0 0 1"><freejoint/><geom size="0.1"/><site name="b"/></body></worldbody>
       <tendon><spatial frictionloss="1"><site site="a"/><site site="b"/></spatial></tendon>
-      <equality><connect body1="bob" anchor="0 0 0"/></equality>
-    </mujoco>"""
+      <equality><connect body1="bob" anchor="0 0 0"/></equality></mujoco>"""
     with pytest.warns(IgnoredWarning, match="frictionloss of spatial"):
         model = read(text, tmp_path)
     problem = model.problem()

@@ -16,8 +16,8 @@ pytestmark = [
 INERTIAL = '<inertial pos="0.2 0.1 0" mass="1.5" fullinertia="0.03 0.05 0.06 0.004 0.002 0.001"/>'
 TIP = '<body name="tip" pos="0.3 0 0.1" euler="20 0 0"><joint name="last" axis="1 2 0"/><geom size="0.1 0.2"/></body>'
 ARM = f"""<worldbody><site name="w" pos="0.5 0.3 1"/><body euler="10 20 30"><joint name="a" axis="0 1 0.3" ref="20"
-    springref="35" {{}}/>{INERTIAL}<site name="s" pos="0.2 0.1 0.3" euler="20 30 40"/><body pos="0 0.1 1"><joint name="b"
-    type="slide" axis="1 0 1"/>{INERTIAL}<site name="u" pos="0.1 -0.1 0.3"/><body pos="0.3 0 0.1" euler="20 0 0">
+    springref="35" {{}}/>{INERTIAL}<site name="s" pos="0.2 0.1 0.3" euler="20 30 40"/><body pos="0 0.1 1"><joint
+    name="b" type="slide" axis="1 0 1"/>{INERTIAL}<site name="u" pos="0.1 0.2 0.3"/><body pos="0.3 0 0.1" euler="9 0 0">
     <joint name="c" axis="1 2 0"/><site name="v" pos="0.1 0.4 0.3"/>{INERTIAL}</body></body></body></worldbody>"""
 CASES = {
     "several joints": f"""<worldbody><body name="hip" euler="0 30 0">

@@ -11,9 +11,7 @@ from twoloop.bodies import IgnoredWarning, Loop, PlanarModel, SpatialModel, from
 from twoloop.bodies.rotation import rotation_matrix
 
 ARM = """<?xml version="1.0"?>
-<robot name="arm">
-  <material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>
-  <link name="base"/>
+<robot name="arm"><material name="grey"><color rgba="0.5 0.5 0.5 1"/></material><link name="base"/>
   <link name="shoulder"><inertial><origin xyz="0.1 0 0.02" rpy="0.3 0 0"/><mass value="2"/>
     <inertia ixx="0.02" ixy="0.001" ixz="0" iyy="0.03" iyz="-0.002" izz="0.025"/></inertial>
     <collision><geometry><sphere radius="0.1"/></geometry></collision></link>
@@ -25,8 +23,7 @@ ARM = """<?xml version="1.0"?>
   <link name="slide"><inertial><mass value="0.4"/>
     <inertia ixx="0.002" ixy="0" ixz="0" iyy="0.002" iyz="0" izz="0.003"/></inertial></link>
   <joint name="mount" type="fixed"><parent link="base"/><child link="pedestal"/>
-    <origin xyz="0 0 0.5" rpy="0.2 -0.1 0.3"/></joint>
-  <link name="pedestal"/>
+    <origin xyz="0 0 0.5" rpy="0.2 -0.1 0.3"/></joint><link name="pedestal"/>
   <joint name="turn" type="continuous"><parent link="pedestal"/><child link="shoulder"/><origin xyz="0 0 0.1"/>
     <axis xyz="0 0 2"/><dynamics damping="0.3" friction="0.1"/></joint>
   <joint name="lift" type="revolute"><parent link="shoulder"/><child link="upper"/>
@@ -36,8 +33,7 @@ ARM = """<?xml version="1.0"?>
     <origin xyz="0.4 0 0" rpy="0 0.7 0"/></joint>
   <joint name="push" type="prismatic"><parent link="weight"/><child link="slide"/><origin xyz="0 0 0.1" rpy="0 0 1"/>
     <axis xyz="1 0 0"/><limit lower="-1" upper="1" effort="10" velocity="3"/></joint>
-  <transmission name="gears"/>
-</robot>"""
+  <transmission name="gears"/></robot>"""
 POSITIONS = {"turn": 0.4, "lift": -0.3, "push": 0.05}
 
 

@@ -88,6 +88,7 @@ def positions(
         reason = ""
     except ValueError as error:
         reason = re.sub(r"coordinate (\d+)", lambda of: name_and_unit(coordinates[int(of[1])])[0], str(error))
+        reason = reason.replace("; twoloop.consistent_state(..., check_assembly=False) takes the one found", "")
     if len(keep) or reason:
         q = _least_squares_positions(system, t, guess, keep)
         left = np.abs(system.constraint(t, q))
