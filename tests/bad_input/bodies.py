@@ -55,16 +55,16 @@ def drive(motion, **more):
     return lambda: planar().drive("pin", motion, **more)
 
 
-def rough(distance):
+def rough(distance, bend=0.3):
     """Two bars of 1 m that are to reach a point of the ground."""
     model = PlanarModel(name="arms")
-    one = model.body("one", mass=1.0, inertia=0.1, position=(0.45, 0.2), angle=0.3)
-    two = model.body("two", mass=1.0, inertia=0.1, position=(1.4, 0.2), angle=-0.3)
+    one = model.body("one", mass=1.0, inertia=0.1, position=(0.45, 0.2), angle=bend)
+    two = model.body("two", mass=1.0, inertia=0.1, position=(1.4, 0.2), angle=-bend)
     ground = model.ground
     model.revolute(ground, one, at=(ground.point(0.0, 0.0), one.point(-0.5, 0.0)))
     model.revolute(one, two, at=(one.point(0.5, 0.0), two.point(-0.5, 0.0)))
     model.revolute(two, ground, at=(two.point(0.5, 0.0), ground.point(distance, 0.0)), name="end")
-    return model.problem()
+    return model
 
 
 def locked():
@@ -217,7 +217,7 @@ BODIES: list[Case] = [
     of_spatial("a curve of three values", lambda: spatial().point_on_curve("ground", "bar", at=(0, 0, 0), curve=lambda x, y, z: (x, y, z))).says("must return two values for a curve, or one for a surface; it returned 3", "use spherical(...) for a point"),
     of_spatial("`curve=3`", lambda: spatial().point_on_curve("ground", "bar", at=(0, 0, 0), curve=3)).says("must be a function of x, y and z", "give lambda x, y, z: ...", TypeError),
     of_problem("a model without bodies", lambda: PlanarModel().problem(), "has no bodies", "add bodies first"),
-    of_problem("a loop that cannot close", lambda: rough(2.3)).says(r"cannot be assembled: the joint '.*' does not close", "look at the lengths around the loop"),
+    of_problem("a loop that cannot close", lambda: rough(2.3).problem()).says(r"cannot be assembled: the joint '.*' does not close: a gap of 0.3 m is left in its loop of '.*', '.*' by", "look at the lengths around the loop"),
     of_problem("a velocity that joints do not allow", locked).says("do not allow the velocities given: the rate of angle of bar is given as 2", "give velocities of fewer bodies"),
     of_problem("a velocity across a skate", sideways).says("do not allow the velocities given: the rate of y of sledge is given as 1", "give one along the blade"),
     of_problem("two drives that contradict", two_drives, "the motion is over-constrained", "leave one of them out"),
@@ -234,11 +234,11 @@ BODIES: list[Case] = [
     of_problem("the displacement of a hinge", lambda: hinged().joint_coordinate("hinge", "displacement")).says("'hinge', which is revolute, has the coordinate \"angle\"", "leave it out"),
     of_problem("the coordinate of an unknown joint", lambda: hinged().problem().joint_coordinate("hing")).says("joint must be one of 'spatial model' that has a coordinate, 'hinge'; given 'hing'", "give its name"),
     of_problem("a coordinate of a sleeve", lambda: sleeve().problem().joint_coordinate("sleeve")).says("has an angle and a displacement: say which", "give one of both"),
-    of_problem("`energy` of rows", lambda: rough(1.9).energy(0.0, np.zeros((9, 6)), np.zeros((9, 6)))).says(r"q must have shape \(6,\) or \(6, n_t\); given shape \(9, 6\)", "give states as columns: q.T"),
-    of_problem("an unknown parameter", lambda: rough(1.9).with_parameters({"mass of three": 1.0})).says("'arms' has no parameter 'mass of three'", "take a name from problem.parameters"),
-    of_problem("a mass that becomes negative", lambda: rough(1.9).with_parameters({"mass of two": -1.0})).says("mass of two must be positive", "give a positive mass"),
+    of_problem("`energy` of rows", lambda: rough(1.9).problem().energy(0.0, np.zeros((9, 6)), np.zeros((9, 6)))).says(r"q must have shape \(6,\) or \(6, n_t\); given shape \(9, 6\)", "give states as columns: q.T"),
+    of_problem("an unknown parameter", lambda: rough(1.9).problem().with_parameters({"mass of three": 1.0})).says("'arms' has no parameter 'mass of three'", "take a name from problem.parameters"),
+    of_problem("a mass that becomes negative", lambda: rough(1.9).problem().with_parameters({"mass of two": -1.0})).says("mass of two must be positive", "give a positive mass"),
     of_problem("a damping that becomes negative", lambda: (m := planar(), m.torsion_spring("pin", stiffness=1.0, name="s"))[0].problem().with_parameters({"damping of s": -1.0})).says(r"damping of s \(N m s/rad\) must not be negative; given -1.0", "give zero or more"),
     of_problem("a distance that becomes zero", lambda: (m := planar(), m.distance("bar", (1, 0), "block", (2, 0), name="d"))[0].problem().with_parameters({"length of d": 0.0})).says(r"length of d \(m\) must be positive", "take a revolute joint for points that coincide"),
-    of_problem("a length that no longer fits", lambda: rough(1.9).with_parameters({"x of end on ground": 2.5})).says("cannot be assembled", "change other lengths with it"),
+    of_problem("a length that no longer fits", lambda: rough(1.9).problem().with_parameters({"x of end on ground": 2.5})).says("cannot be assembled", "change other lengths with it"),
     of_problem("another axis of a slide with a limit or a rack", lambda: limited().with_parameters({"angle of slide on ground": 0.1})).says(r"angle of slide on ground \(rad\) cannot change", "make the model anew"),
 ]

@@ -4,11 +4,13 @@ import pickle
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from studies.bench.large import grid, in_space, ladder
+from tests.bad_input.bodies import rough
 from tests.marks import slow
 from twoloop import solve_dae
-from twoloop.bodies import PlanarModel, assembly
+from twoloop.bodies import PlanarModel, SpatialModel, assembly
 
 pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 BARS = {"crank": 1.0, "rod": 2.0, "rocker": 1.5}
@@ -39,24 +41,42 @@ def violation(problem):
     return max(np.abs(system.constraint(t, problem.q0)).max(), np.abs(rate).max())
 
 
-def test_rough_poses_are_put_together(rough=0.15):
-    problem = four_bar(rough).problem()
-    assert violation(problem) < 1e-13 and np.abs(problem.q0 - four_bar().problem().q0).max() < 2.0 * rough + 1e-12
+def test_rough_poses_are_put_together(off=0.15):
+    problem = four_bar(off).problem()
+    assert violation(problem) < 1e-13 and np.abs(problem.q0 - four_bar().problem().q0).max() < 2.0 * off + 1e-12
     assert solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0).success
 
 
-def test_poses_from_which_two_assemblies_can_be_meant_are_refused():
-    model = PlanarModel(name="arms")
-    ground = model.ground
-    for name, x in (("one", 0.5), ("two", 1.4)):
-        model.body(name, mass=1.0, inertia=0.1, position=(x, 0.0))  # straight: the elbow may go up or down
-    one, two = model.bodies
-    model.revolute(ground, one, at=(ground.point(0.0, 0.0), one.point(-0.5, 0.0)))
-    model.revolute(one, two, at=(one.point(0.5, 0.0), two.point(-0.5, 0.0)))
-    model.revolute(two, ground, at=(two.point(0.5, 0.0), ground.point(1.7, 0.0)))
-    with pytest.raises(ValueError, match="cannot be assembled") as caught:
+def test_poses_from_which_two_assemblies_can_be_meant_need_a_limit_or_a_position():
+    model = rough(1.7, bend=0.0)  # straight: the elbow may go up or down
+    elbow = model.joints[1]
+    with pytest.raises(ValueError, match="may mean two assemblies"):
         model.problem()
-    assert "coordinate " not in str(caught.value)
+    bent, angle = 2.0 * np.arccos(0.85), model.joint_coordinate(elbow)
+    assert angle.position(model.problem(positions={elbow: -bent}).q0) == pytest.approx(-bent)
+    model.limit(elbow, lower=-0.1, upper=0.4)  # nothing closes within these
+    with pytest.raises(ValueError, match=f"with the angle of '{elbow.name}' at a limit"):
+        model.problem()
+    model.limit(elbow, lower=0.2)
+    model.limits.pop(1)
+    assert angle.position(model.problem().q0) == pytest.approx(bent)
+
+
+def test_a_loop_in_space_closes_on_the_side_where_it_is_roughly():
+    """A crank, a rod on balls and a rocker."""
+    random, model = np.random.default_rng(0), SpatialModel()
+    pins = np.array([[0.0, 0.0, 0.0], [0.0, 0.5, 0.2], [1.3, 0.5, 0.9], [1.5, 0.0, 0.0]])
+    bars = [model.rod(f"bar {k}", *pins[k : k + 2], radius=0.1, mass=1.0) for k in range(3)]
+    model.revolute("ground", bars[0], at=pins[0], axis=(1.0, 0.0, 0.0))
+    model.spherical(bars[0], bars[1], at=pins[1])
+    model.spherical(bars[1], bars[2], at=pins[2])
+    model.revolute(bars[2], "ground", at=pins[3], axis=(0.0, 1.0, 0.0))
+    for bar in bars:
+        bar.position[:] += random.uniform(-0.3, 0.3, 3)
+        bar.rotation[:] = Rotation.from_rotvec(random.uniform(-0.3, 0.3, 3)).as_matrix() @ bar.rotation
+    problem = model.problem()
+    assert violation(problem) < 1e-13 and problem.freedom.degrees == 2
+    assert np.abs(problem.q0[14:17] - 0.5 * (pins[2] + pins[3])).max() < 0.2  # the rocker
 
 
 def test_bodies_that_are_kept_stay():
@@ -125,23 +145,15 @@ def test_parameters_by_name():
     np.testing.assert_array_equal(heavier.q0, problem.q0)
     longer = problem.with_parameters({"x of revolute rod-rocker on rod (m)": 1.1})
     assert violation(longer) < 1e-12 and np.abs(longer.q0 - problem.q0).max() > 0.01
-    points = longer.drawing.at(longer.q0)
-    lengths = np.linalg.norm([points[i] - points[j] for i, j in longer.drawing.bars], axis=1)
-    assert np.sort(lengths) == pytest.approx([1.0, 1.5, 2.1])
     joint = next(each for each in longer.joints if each.name == "revolute rod-rocker")
     assert joint.point == pytest.approx((1.1, 0.0))
 
 
-def test_names_units_tags_and_reactions():
+def test_names_units_and_tags():
     problem = four_bar().problem()
     assert problem.names[:3] == ("x of crank", "y of crank", "angle of crank")
     assert problem.units[:3] == ("m", "m", "rad") and problem.tags == ("closed chain", "rigid", "planar")
     assert problem.name == "four-bar" and four_bar().problem(name="other").system.name == "other"
-    result = solve_dae(problem.system, (0.0, 0.5), problem.q0, problem.v0, rtol=1e-9, atol=1e-9)
-    pins = [result.reactions(joint.name).force for joint in problem.joints[:2]]
-    weight = np.array([0.0, -9.81])
-    # on the crank act the ground and, by the second joint, the rod
-    np.testing.assert_allclose(pins[0] + pins[1] + weight[:, None], result.a[:2], atol=1e-6)
     model = four_bar()
     assert model.revolute("rod", "crank", at=(0.0, 1.0)).name == "revolute rod-crank"
     assert model.revolute("rod", "crank", at=(0.0, 1.0)).name == "revolute rod-crank 2"
@@ -174,8 +186,7 @@ def test_a_problem_travels_to_another_process():
     model.spring("crank", (0.0, 1.0), "ground", (3.0, 0.0), stiffness=2.0)
     problem = model.problem((0.0, 0.2))
     again = pickle.loads(pickle.dumps(problem))
-    one, other = (solve_dae(each.system, each.t_span, each.q0, each.v0) for each in (problem, again))
-    np.testing.assert_array_equal(one.q, other.q)
+    np.testing.assert_array_equal(problem.q0, again.q0)
     assert again.energy(0.0, again.q0, again.v0) == problem.energy(0.0, problem.q0, problem.v0)
     assert again.with_parameters({"mass of rod": 3.0}).parameters["mass of rod (kg)"] == 3.0
     model.motor("revolute crank-ground", lambda t: 1.0 + t)

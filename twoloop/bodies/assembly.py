@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -29,7 +28,6 @@ DIFFERENCE_STEP = 1e-4  # relative to the scales of the coordinates: step of the
 DRIVE_STEP = 0.05  # rad or m: continuation step towards the initial value of a drive
 NEWTON_ITERATIONS = 5  # per continuation step
 OPEN_TOLERANCE = 1e-7  # relative to the size of the model: a larger residual means that a joint does not close
-TIE = 1e-3  # relative: residuals closer than this count as equal
 
 
 @dataclass(frozen=True)
@@ -61,44 +59,6 @@ class Freedom:
     redundant: tuple[tuple[str, ...], ...]
 
 
-def positions(
-    system: ConstrainedSystem,
-    t: float,
-    guess: Array,
-    turning: NDArray[np.bool_],
-    keep: Sequence[int],
-    rows: Mapping[str, tuple[int, ...]],
-    coordinates: Sequence[str],
-) -> Array:
-    """Return positions that close all joints, as near to the guess as possible.
-
-    The system has no drives. `turning` marks the rotations, the coordinates in `keep` must not change, and `rows` has
-    the row numbers of each joint. Raises ValueError if a joint does not close (the message names it), or the poses are
-    so far off that the assembly is ambiguous.
-    """
-    if system.n_c == 0:
-        return guess
-    terms = abs(system.sparse_rows(t, guess)[: system.n_c]) @ np.where(
-        turning, np.maximum(np.abs(guess), 1.0), np.abs(guess)
-    )
-    if (np.abs(system.constraint(t, guess)) <= ROUNDING * terms).all():
-        return guess
-    try:
-        q = consistent_state(system, t, guess, np.zeros(system.n_q))[0]
-        reason = ""
-    except ValueError as error:
-        reason = re.sub(r"coordinate (\d+)", lambda of: name_and_unit(coordinates[int(of[1])])[0], str(error))
-        reason = reason.replace("; twoloop.consistent_state(..., check_assembly=False) takes the one found", "")
-    if len(keep) or reason:
-        q = _least_squares_positions(system, t, guess, keep)
-        left = np.abs(system.constraint(t, q))
-        if (left > OPEN_TOLERANCE * np.maximum(terms, terms.max())).any():
-            raise ValueError(_open_joints_message(system, left, rows))
-    if reason:
-        raise ValueError(f"the bodies of {system.name!r} cannot be assembled from the poses given: {reason}")
-    return q
-
-
 def follow_drives(system: ConstrainedSystem, t: float, start: Array, keep: Sequence[int]) -> Array:
     """Move the bodies in small steps to the initial values of the drives, staying on the same assembly branch.
 
@@ -119,45 +79,6 @@ def follow_drives(system: ConstrainedSystem, t: float, start: Array, keep: Seque
                 "another motion, or keep fewer bodies"
             )
     return q
-
-
-def _open_joints_message(system: ConstrainedSystem, left: Array, rows: Mapping[str, tuple[int, ...]]) -> str:
-    """Return the message that names the joints which do not close."""
-    misfit = {name: max((float(left[k]) for k in of if k < len(left)), default=0.0) for name, of in rows.items()}
-    # the first of equal residuals, so that the message does not depend on rounding
-    worst = next(name for name in misfit if misfit[name] >= (1.0 - TIE) * max(misfit.values()))
-    others = [name for name in misfit if name != worst and misfit[name] > 0.1 * misfit[worst]]
-    also = f" (nor do {', '.join(map(repr, others))})" if others else ""
-    return (
-        f"the bodies of {system.name!r} cannot be assembled: the joint {worst!r} does not close{also}; the "
-        f"least-squares solution leaves a residual of {misfit[worst]:.3g} in it. Check the lengths, the points of "
-        "these joints, and the other joints of their bodies"
-    )
-
-
-def _least_squares_positions(system: ConstrainedSystem, t: float, guess: Array, keep: Sequence[int]) -> Array:
-    """Return the positions near the guess that minimise the norm of the constraints."""
-    from scipy.optimize import least_squares  # takes a quarter of a second to import, and most models assemble without
-
-    free = np.setdiff1d(np.arange(system.n_q), keep)
-    q = guess.copy()
-    if len(free) == 0:
-        return q
-
-    def put(x: Array) -> Array:
-        q[free] = x
-        return q
-
-    solution = least_squares(
-        lambda x: system.constraint(t, put(x)),
-        guess[free],
-        jac=lambda x: system.jacobian(t, put(x))[:, free],
-        xtol=1e-15,
-        ftol=1e-15,
-        gtol=1e-15,
-        max_nfev=300,
-    )
-    return put(solution.x).copy()
 
 
 def velocities(

@@ -96,6 +96,7 @@ class Collection:
         self.joints: list[ModelJoint] = []
         self.forces: list[Force] = []
         self.stops: list[Stop] = []
+        self.limits: list[tuple[tuple[str, str], float, Stop]] = []  # joint and coordinate, sign, stop
         self.dry: list[DryFriction] = []
         self.taken: list[Numbers] = []  # fixed values: racks and limits were made with them
 

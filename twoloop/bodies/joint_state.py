@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space
 
 from twoloop.bodies.coordinates import TURN, JointCoordinate, velocity_apart
-from twoloop.bodies.frames import angle_of, point_of, vector_of
+from twoloop.bodies.frames import angle_of, point_of
 from twoloop.bodies.parts import ModelJoint
-from twoloop.bodies.rotation_rates import cross, euler_product, parameters_of, rotated_by, spin_of
+from twoloop.bodies.rotation_rates import cross, spin_of
+from twoloop.bodies.spanning_tree import SpanningTree
 from twoloop.checks.arguments import Array
 from twoloop.problem.system import ConstrainedSystem
 
@@ -50,7 +51,9 @@ class Request:
         return np.where(self.turning, 1.0, length), length
 
 
-def positions(system: ConstrainedSystem, t: float, start: Array, request: Request, keep: Sequence[int]) -> Array:
+def positions(
+    system: ConstrainedSystem, t: float, start: Array, request: Request, tree: SpanningTree, keep: Sequence[int]
+) -> Array:
     """Return the coordinates of the bodies at which the joints have the positions given.
 
     `start` closes all joints; the coordinates in `keep` do not change. Raises ValueError, with the name of a joint, if
@@ -77,14 +80,14 @@ def positions(system: ConstrainedSystem, t: float, start: Array, request: Reques
             last = size
         return q, max(_open(system, t, q) / max(1.0, length), _off(request, q, target, sizes))
 
-    carried = _carried(start, request)
+    carried = _carried(start, request, tree)
     closes = _open(system, t, carried) <= OFF * max(1.0, length) and not (carried != start)[list(keep)].any()
     if closes and _off(request, carried, request.values, sizes) <= OFF:
         start = carried
     chosen = [] if start is carried else _independent(system, t, start, request, columns)
     if 0 < len(chosen) < len(request.given):  # along a straight way to all values they contradict each other
         given = tuple(request.given[k] for k in chosen)
-        start = positions(system, t, start, replace(request, given=given, values=request.values[chosen]), keep)
+        start = positions(system, t, start, replace(request, given=given, values=request.values[chosen]), tree, keep)
         carried = start
     if start is carried:
         begin = request.values
@@ -112,71 +115,19 @@ def positions(system: ConstrainedSystem, t: float, start: Array, request: Reques
     return q
 
 
-TREE = ("revolute", "prismatic", "cylindrical", "screw", "fixed", "spherical", "universal")
-
-
-def _carried(q: Array, request: Request) -> Array:
-    """Return the coordinates after the joints of a spanning tree have moved, each carrying what follows it."""
-    steps = {
-        (each.joint, each.which): x - each.position(q) for each, x in zip(request.given, request.values, strict=True)
-    }
-    axes = {each.joint: each.axis for each in (*request.given, *request.others) if hasattr(each, "axis")}
-    width = 3 if len(request.joints[0].point_a.values) == 2 else 7
-    new = q.copy()
-    edges = [joint for joint in request.joints if joint.kind in TREE]
-    placed, waiting = {-1}, set(range(len(q) // width))
-    while waiting:
-        ends = next((x for x in edges if (x.a.number in placed) != (x.b.number in placed)), None)
-        if ends is None:  # a body that hangs on no joint, or on others only, stays
-            placed.add(min(waiting))
-            waiting.remove(min(waiting))
-            continue
-        turn, slide = (float(steps.get((ends.name, which), 0.0)) for which in ("angle", "displacement"))
-        if ends.kind == "screw":
-            turn, slide = turn + slide * TURN / ends.pitch, slide + turn * ends.pitch / TURN
-        a, b = ends.a.number, ends.b.number
-        axis = np.array(axes.get(ends.name, (0.0, 0.0) if width == 3 else (0.0, 0.0, 0.0)))
-        body = b if a in placed else a
-        new[width * body : width * (body + 1)] = _along_joint(q, new, ends, axis, turn, slide, body == a)
-        placed.add(body)
-        waiting.discard(body)
-    return new
-
-
-def _along_joint(
-    q: Array, new: Array, joint: ModelJoint, axis: Array, turn: float, slide: float, backwards: bool
-) -> Array:
-    """Return the coordinates of b after its joint on a, which is at `new`, has moved; or, backwards, those of a."""
-    a, b = joint.a.number, joint.b.number
-    on_a, on_b = (np.array(each.values) for each in (joint.point_a, joint.point_b))
-    apart = np.subtract(point_of(q, b, on_b), point_of(q, a, on_a))
-    if len(on_a) == 2:
-        angle_a, angle_b = (float(angle_of(q, body)) for body in (a, b))
-        s, c = np.sin(angle_a), np.cos(angle_a)
-        apart = np.array([c * apart[0] + s * apart[1], c * apart[1] - s * apart[0]]) + slide * axis
-        if backwards:
-            here = np.zeros(3 * (a + 1))
-            here[-1] = new[3 * b + 2] - angle_b + angle_a - turn
-            here[-3:-1] = np.subtract(point_of(new, b, on_b), vector_of(here, a, apart)) - vector_of(here, a, on_a)
-        else:
-            here = np.zeros(3 * (b + 1))
-            here[-1] = (angle_of(new, a) - angle_a) + angle_b + turn
-            here[-3:-1] = np.add(point_of(new, a, on_a), vector_of(new, a, apart)) - vector_of(here, b, on_b)
-        return here[-3:]
-    apart = np.array(rotated_by(parameters_of(q, a, -1.0), apart)) + slide * axis
-    half = 0.5 * (-turn if backwards else turn)
-    rotation = [np.cos(half), *(np.sin(half) * axis)]
-    if backwards:
-        here = np.zeros(7 * (a + 1))
-        relative = euler_product(euler_product(parameters_of(q, b, -1.0), parameters_of(q, a)), rotation)
-        here[-4:] = euler_product(parameters_of(new, b), relative)
-        here[-7:-4] = np.subtract(point_of(new, b, on_b), vector_of(here, a, apart)) - vector_of(here, a, on_a)
-    else:
-        here = np.zeros(7 * (b + 1))
-        relative = euler_product(rotation, euler_product(parameters_of(q, a, -1.0), parameters_of(q, b)))
-        here[-4:] = euler_product(parameters_of(new, a), relative)
-        here[-7:-4] = np.add(point_of(new, a, on_a), vector_of(new, a, apart)) - vector_of(here, b, on_b)
-    return here[-7:]
+def _carried(start: Array, request: Request, tree: SpanningTree) -> Array:
+    """Return the coordinates after the joints of the tree have moved, each carrying what follows it."""
+    number = {key: k for k, key in enumerate(tree.keys)}
+    pitches = {joint.name: joint.pitch for joint in request.joints if joint.kind == "screw"}
+    step = np.zeros(len(tree.keys))
+    for each, value in zip(request.given, request.values, strict=True):
+        by = value - float(each.position(start))
+        if each.joint in pitches and each.which == "displacement":
+            by *= TURN / pitches[each.joint]
+        which = "angle" if each.joint in pitches else each.which
+        if (each.joint, which) in number:
+            step[number[each.joint, which]] = by
+    return tree.place(tree.moved(tree.state(start), step), start)
 
 
 def _independent(system: ConstrainedSystem, t: float, q: Array, request: Request, columns: Array) -> list[int]:

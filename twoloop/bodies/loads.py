@@ -566,6 +566,7 @@ class Stops(Loads):
                 new = self._new_name(f"{bound} limit of {limited.name if name is None else name}", None)
                 gap = self._gap(limited, which, check_finite(bound, value), sign)
                 stops.append(add(self.stops, Stop(gap, restitution, new)))
+                self.limits.append(((limited.name, which), sign, stops[-1]))
         return tuple(stops)
 
     def _gap(self, joint: ModelJoint, which: str, limit: float, sign: float) -> Any:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.bodies import assembly, inverse_dynamics, joint_state
+from twoloop.bodies import assembly, inverse_dynamics, joint_state, loop_closure
 from twoloop.bodies.assembly import Freedom, note_of
 from twoloop.bodies.coordinates import KINDS, JointCoordinate, SpatialAngle
 from twoloop.bodies.drawings import drawing_of
@@ -20,6 +20,7 @@ from twoloop.bodies.functions import motion_function
 from twoloop.bodies.joint_state import Request
 from twoloop.bodies.parts import Body, DryFriction, ModelJoint, Numbers
 from twoloop.bodies.ropes import Ropes
+from twoloop.bodies.spanning_tree import SpanningTree
 from twoloop.bodies.system import check_forces, check_loads, joints_of, system_of
 from twoloop.bodies.tables import Tables
 from twoloop.checks.arguments import Array, check_finite, check_positive, check_span, check_text, shown
@@ -231,9 +232,10 @@ class Model(Ropes):
     ) -> ModelProblem:
         """Assemble the model.
 
-        Bodies whose poses do not quite fit are moved as little as possible until all joints close. Velocities given
-        with the bodies are kept; the others minimise the kinetic energy subject to the joints and drives. With `rates`,
-        the others minimise the rates in the other joints instead.
+        Where the poses of the bodies are rough, all joints are closed within their limits. Of several assemblies, the
+        one is taken whose joints are nearest to the angles and displacements that they have in these poses; poses that
+        may mean two are refused. Velocities given with the bodies are kept; the others minimise the kinetic energy
+        subject to the joints and drives. With `rates`, the others minimise the rates in the other joints instead.
 
         Parameters
         ----------
@@ -247,7 +249,7 @@ class Model(Ropes):
             Initial angles and displacements of joints from the position given, and their rates, by the joint or its
             name: rad, m, rad/s and m/s. The key of a coordinate of a cylindrical or screw joint is a pair, such as
             ("sleeve", "displacement"). Joints that are not given do not move in an open chain, and move as little as
-            possible in a loop.
+            possible in a loop. Where the poses alone do not close the loops, these positions are where they start.
 
         Returns
         -------
@@ -257,8 +259,9 @@ class Model(Ropes):
         Raises
         ------
         TypeError, ValueError
-            If the model has no bodies, a joint cannot close (the message names it), the velocities given violate the
-            constraints, or positions or rates of joints cannot be reached or do not determine the others in their loop.
+            If the model has no bodies, a joint cannot close (the message names it, its loop and the gap), the velocities
+            given violate the constraints, or positions or rates of joints cannot be reached or do not determine the
+            others in their loop.
         """
         span = check_span(t_span)
         name = self.name if name is None else check_text("name", name)
@@ -334,14 +337,26 @@ class Model(Ropes):
         still = system
         if driveless is not tables:
             still = system_of(self.dimension, driveless, joints_of(driveless), name, start_state)
-        closed = q = assembly.positions(still, t_span[0], start, self._turning(), keep, driveless.rows, coordinates)
-        if driveless is not tables:
-            q = assembly.follow_drives(system, t_span[0], q, keep)
         measured = tuple(
             self.coordinate_of(joint, which, tables.of) for joint in self.joints for which in KINDS.get(joint.kind, ())
         )
+        at = {(each.joint, each.which): each for each in measured}
+        wanted = {at[joint, which]: value for joint, which, value in placed}
+        bounds = self._bounds(at, start)
+        tree = SpanningTree(
+            joints,
+            len(self.bodies),
+            self.dimension,
+            driveless.of,
+            self._zero,
+            {j // len(self.coordinate_names) for j in keep},
+            {each.joint for each in (*bounds, *wanted)},
+        )
+        closed = q = loop_closure.positions(still, t_span[0], start, tree, driveless.rows, bounds, wanted)
+        if driveless is not tables:
+            q = assembly.follow_drives(system, t_span[0], q, keep)
         if placed:
-            q = joint_state.positions(system, t_span[0], q, self._request(placed, measured), keep)
+            q = joint_state.positions(system, t_span[0], q, self._request(placed, measured), tree, keep)
         self._check_branches(t_span[0], q)
         given, is_given = self._velocities(q)
         if moving:
@@ -416,11 +431,24 @@ class Model(Ropes):
         tables.replaced(values or {})
         return tables
 
+    def _bounds(
+        self, at: Mapping[tuple[str, str], JointCoordinate], q: Array
+    ) -> dict[JointCoordinate, tuple[float, float]]:
+        """Return the limits of the coordinates of joints."""
+        bounds: dict[JointCoordinate, tuple[float, float]] = {}
+        for key, sign, stop in self.limits:
+            coordinate = at[key]
+            low, high = bounds.get(coordinate, (-np.inf, np.inf))
+            limit = float(coordinate.position(q)) - sign * float(stop.gap(0.0, q))
+            bounds[coordinate] = (max(low, limit), high) if sign > 0.0 else (low, min(high, limit))
+        return bounds
+
     def _copy(self) -> Model:
         """Return a copy that later additions to the model do not change."""
         copied = copy.copy(self)
         copied.bodies, copied.joints, copied.forces = list(self.bodies), list(self.joints), list(self.forces)
         copied.stops, copied.dry, copied.taken = list(self.stops), list(self.dry), list(self.taken)
+        copied.limits = list(self.limits)
         return copied
 
     def _turning(self) -> NDArray[np.bool_]:
