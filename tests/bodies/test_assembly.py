@@ -41,10 +41,13 @@ def violation(problem):
     return max(np.abs(system.constraint(t, problem.q0)).max(), np.abs(rate).max())
 
 
-def test_rough_poses_are_put_together(off=0.15):
+def test_rough_poses_are_put_together_and_bodies_that_are_kept_stay(off=0.15):
     problem = four_bar(off).problem()
     assert violation(problem) < 1e-13 and np.abs(problem.q0 - four_bar().problem().q0).max() < 2.0 * off + 1e-12
-    assert solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0).success
+    problem = four_bar(0.1, keep=("crank",)).problem(keep=["crank"])
+    assert (problem.q0[:3] == [0.0, 0.5, 0.5 * np.pi]).all() and violation(problem) < 1e-13
+    again = problem.with_parameters({"x of revolute crank-rod on rod": -1.05})
+    assert (again.q0[:3] == problem.q0[:3]).all() and violation(again) < 1e-13
 
 
 def test_poses_from_which_two_assemblies_can_be_meant_need_a_limit_or_a_position():
@@ -62,8 +65,7 @@ def test_poses_from_which_two_assemblies_can_be_meant_need_a_limit_or_a_position
     assert angle.position(model.problem().q0) == pytest.approx(bent)
 
 
-def test_a_loop_in_space_closes_on_the_side_where_it_is_roughly():
-    """A crank, a rod on balls and a rocker."""
+def test_a_crank_a_rod_on_balls_and_a_rocker_close_on_the_side_where_they_are_roughly():
     random, model = np.random.default_rng(0), SpatialModel()
     pins = np.array([[0.0, 0.0, 0.0], [0.0, 0.5, 0.2], [1.3, 0.5, 0.9], [1.5, 0.0, 0.0]])
     bars = [model.rod(f"bar {k}", *pins[k : k + 2], radius=0.1, mass=1.0) for k in range(3)]
@@ -75,21 +77,14 @@ def test_a_loop_in_space_closes_on_the_side_where_it_is_roughly():
         bar.position[:] += random.uniform(-0.3, 0.3, 3)
         bar.rotation[:] = Rotation.from_rotvec(random.uniform(-0.3, 0.3, 3)).as_matrix() @ bar.rotation
     problem = model.problem()
-    assert violation(problem) < 1e-13 and problem.freedom.degrees == 2
-    assert np.abs(problem.q0[14:17] - 0.5 * (pins[2] + pins[3])).max() < 0.2  # the rocker
-
-
-def test_bodies_that_are_kept_stay():
-    problem = four_bar(0.1, keep=("crank",)).problem(keep=["crank"])
-    assert (problem.q0[:3] == [0.0, 0.5, 0.5 * np.pi]).all() and violation(problem) < 1e-13
-    again = problem.with_parameters({"x of revolute crank-rod on rod": -1.05})
-    assert (again.q0[:3] == problem.q0[:3]).all() and violation(again) < 1e-13
+    assert (
+        violation(problem) < 1e-13 and np.abs(problem.q0[14:17] - 0.5 * (pins[2] + pins[3])).max() < 0.2
+    )  # the rocker
 
 
 def test_velocities_that_are_given_stay_and_the_others_follow():
     problem = four_bar(crank={"angular_velocity": 3.0}).problem()
     assert problem.v0[2] == pytest.approx(3.0, abs=1e-13) and violation(problem) < 1e-12
-    assert (four_bar().problem().v0 == 0.0).all()
     rough = four_bar(crank={"angular_velocity": 3.0}, rod={"velocity": problem.v0[3:5] * 1.02}).problem()
     assert violation(rough) < 1e-12 and np.abs(rough.v0 - problem.v0).max() < 0.1
 
@@ -100,9 +95,6 @@ def test_a_drive_moves_the_bodies_to_where_it_begins_far_away():
     problem = model.problem((0.1, 1.0))
     assert problem.q0[2] - 0.5 * np.pi == pytest.approx(2.2, abs=1e-12) and violation(problem) < 1e-12
     assert problem.v0[2] == pytest.approx(1.0) and problem.freedom.degrees == 0
-    result = solve_dae(problem.system, (0.1, 0.1 + 2.0 * np.pi - 2.2), problem.q0, problem.v0, rtol=1e-10, atol=1e-10)
-    known = four_bar().problem(keep="crank")  # a turn from where it was given it is there again
-    np.testing.assert_allclose(result.q[[0, 1, 3, 4, 6, 7], -1], known.q0[[0, 1, 3, 4, 6, 7]], atol=1e-8)
     rocker = four_bar()
     rocker.drive("revolute rocker-ground", lambda t: 3.0 + t)  # which rocks, and does not turn
     with pytest.raises(ValueError, match="that the joints do not permit"):
@@ -155,8 +147,7 @@ def test_names_units_and_tags():
     assert problem.units[:3] == ("m", "m", "rad") and problem.tags == ("closed chain", "rigid", "planar")
     assert problem.name == "four-bar" and four_bar().problem(name="other").system.name == "other"
     model = four_bar()
-    assert model.revolute("rod", "crank", at=(0.0, 1.0)).name == "revolute rod-crank"
-    assert model.revolute("rod", "crank", at=(0.0, 1.0)).name == "revolute rod-crank 2"
+    assert [model.revolute("rod", "crank", at=(0, 1)).name[-9:] for _ in range(2)] == ["rod-crank", "d-crank 2"]
     assert model.bodies[1].coordinates == (3, 4, 5)
 
 
@@ -188,7 +179,6 @@ def test_a_problem_travels_to_another_process():
     again = pickle.loads(pickle.dumps(problem))
     np.testing.assert_array_equal(problem.q0, again.q0)
     assert again.energy(0.0, again.q0, again.v0) == problem.energy(0.0, problem.q0, problem.v0)
-    assert again.with_parameters({"mass of rod": 3.0}).parameters["mass of rod (kg)"] == 3.0
     model.motor("revolute crank-ground", lambda t: 1.0 + t)
     without = pickle.loads(pickle.dumps(model.problem()))  # the system travels, a lambda does not
     assert without.system.force(0.0, without.q0, without.v0)[2] == pytest.approx(1.0, abs=2.0)

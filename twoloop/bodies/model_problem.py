@@ -259,9 +259,9 @@ class Model(Ropes):
         Raises
         ------
         TypeError, ValueError
-            If the model has no bodies, a joint cannot close (the message names it, its loop and the gap), the velocities
-            given violate the constraints, or positions or rates of joints cannot be reached or do not determine the
-            others in their loop.
+            If the model has no bodies, a joint cannot close (the message names it, its loop and the gap), the
+            velocities given violate the constraints, or positions or rates of joints cannot be reached or do not
+            determine the others in their loop.
         """
         span = check_span(t_span)
         name = self.name if name is None else check_text("name", name)
