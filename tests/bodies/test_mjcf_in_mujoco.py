@@ -50,10 +50,10 @@ CASES = {
         {INERTIAL}{TIP}</body></body></worldbody><actuator><position class="p" joint="a" kv="2"/>
         <motor joint="last" gear="-2"/><velocity joint="b" kv="5"/>
         <general joint="b" gainprm="7" biastype="affine" biasprm="1 -2 -3" ctrlrange="0 0.1"/></actuator>""",
-    "limited actuators": f"""{ARM.format('actuatorfrcrange="-1 1"')}<actuator><position joint="a" kp="50" kv="1"/>
-        <position joint="b" kp="30" dampratio="0.7" gear="2" forcerange="-0.3 0.2"/><damper joint="c" kv="5"
-        ctrlrange="0 1"/><general joint="c" gaintype="affine" gainprm="7 2 -3" biastype="affine" biasprm="1 2 3"/>
-        </actuator>""",
+    "limited actuators": f"""<default><general gainprm="2" biasprm="0.1 -1 -0.2"/></default>
+        {ARM.format('actuatorfrcrange="-1 1"')}<actuator><position joint="a" kp="50" kv="1"/><position joint="b" kp="30"
+        dampratio="0.7" gear="2" forcerange="-0.3 0.2"/><damper joint="c" kv="5" ctrlrange="0 1"/><velocity joint="c"/>
+        <general joint="c" gaintype="affine" gainprm="7 2 -3" biastype="affine" biasprm="1 2 3"/></actuator>""",
     "fixed tendons": f"""<default><tendon damping="0.7"/></default>{ARM.format("")}<tendon>
         <fixed name="t" stiffness="5" springlength="-0.1 0.3"><joint joint="a" coef="0.7"/><joint joint="b" coef="-1"/>
         </fixed><fixed name="u" stiffness="3"><joint joint="c" coef="0.4"/><joint joint="a" coef="1"/></fixed></tendon>

@@ -39,31 +39,37 @@ def actuator_law(tag: str, inherited: Mapping[str, str], own: Mapping[str, str])
     far as `gaintype` and `biastype` say; a positive bias_2 is a damping ratio.
     """
     law = {**inherited, **own}
-    gain, bias = (_padded(law.get(key, default)) for key, default in (("gainprm", "1"), ("biasprm", "0")))
+    gain, bias = (_padded(key, inherited, own, default) for key, default in (("gainprm", "1"), ("biasprm", "0")))
     types = {"gaintype": "fixed", "biastype": "none", "dyntype": "none"}
+    first, last, constant = (float(x) for x in law.get(tag, "1 0 0").split())  # what defaults give this kind
     if tag == "general":
         types = {key: law.get(key, default) for key, default in types.items()}
+        if types["gaintype"] == "fixed":
+            law |= dict.fromkeys(("position", "intvelocity", "velocity"), text_of((gain[0], bias[2], 0.0)))
+        else:
+            law["damper"] = text_of((0.0, -gain[2], 0.0))
     elif tag == "motor":
         gain, bias = np.array([1.0, 0.0, 0.0]), np.zeros(3)
     elif tag in ("position", "intvelocity"):
-        gain[0] = float(own.get("kp", gain[0]))
-        damping = -float(own["kv"]) if "kv" in own else float(own.get("dampratio", bias[2]))
-        bias = np.array([0.0, -gain[0], damping])
-        types["biastype"] = "affine"
-        if tag == "intvelocity" or float(own.get("timeconst", 0.0)):
+        first, constant = float(own.get("kp", first)), float(own.get("timeconst", constant))
+        last = -float(own["kv"]) if "kv" in own else float(own.get("dampratio", last))
+        gain, bias, types["biastype"] = np.array([first, 0.0, 0.0]), np.array([0.0, -first, last]), "affine"
+        if tag == "intvelocity" or constant:
             types["dyntype"] = "integrator" if tag == "intvelocity" else "filterexact"
     elif tag == "velocity":
-        gain[0] = float(own.get("kv", -bias[2] if bias[2] else 1.0))
-        bias, types["biastype"] = np.array([0.0, 0.0, -gain[0]]), "affine"
+        first = float(own.get("kv", first))
+        gain, bias, types["biastype"] = np.array([first, 0.0, 0.0]), np.array([0.0, 0.0, -first]), "affine"
     elif tag == "damper":
-        gain, types["gaintype"] = np.array([0.0, 0.0, -float(own.get("kv", 1.0))]), "affine"
+        last = float(own.get("kv", last))
+        gain, types["gaintype"] = np.array([0.0, 0.0, -last]), "affine"
     law |= types | {"gainprm": text_of(gain), "biasprm": text_of(bias)}
-    return law
+    return law if tag in ("general", "motor") else law | {tag: text_of((first, last, constant))}
 
 
-def _padded(text: str) -> Array:
-    values = np.array([float(each) for each in text.split()][:3])
-    return np.append(values, np.zeros(3 - len(values)))
+def _padded(key: str, inherited: Mapping[str, str], own: Mapping[str, str], default: str) -> Array:
+    """Return three parameters, of which those that an element does not give are inherited."""
+    values, rest = ([float(x) for x in each.split()] for each in (own.get(key, ""), inherited.get(key, default)))
+    return np.array([*values, *rest[len(values) :], 0.0, 0.0, 0.0][:3])
 
 
 class TendonsAndActuators:
@@ -89,7 +95,13 @@ class TendonsAndActuators:
         w = np.zeros(len(self.inertia))
         for joint, factor in zip(joints, factors, strict=True):
             w[sum(DEGREES[each.kind] for each in self.reader.ordered[: self.reader.ordered.index(joint)])] = factor
-        return 1.0 / float(w @ np.linalg.solve(self.inertia, w))
+        try:
+            return 1.0 / float(w @ np.linalg.solve(self.inertia, w))
+        except np.linalg.LinAlgError:
+            raise ValueError(
+                f"springdamper or dampratio at joint {joints[0].name!r} needs inertia behind all joints: give the "
+                "bodies masses, or stiffness and damping in the place of it"
+            ) from None
 
     def _law(self, joint: FileJoint, k: float, c: float, rest: float, name: str | None) -> Force:
         assert joint.joint is not None

@@ -82,23 +82,26 @@ def _replicate(root: Element, element: Element, degrees: bool, sequence: str) ->
                     each.set("name", each.attrib["name"] + suffix)
             children.append(frame)
             pose = pose.then(step)
-        for section in root:
-            if section.tag not in ("worldbody", "default", "asset", "compiler", "option"):
-                section[:] = [copied for each in section for copied in _referring(each, named, suffixes)]
+        sections = [each for each in root if each.tag not in ("worldbody", "default", "asset", "compiler", "option")]
+        for section in sorted(sections, key=lambda each: each.tag != "tendon"):  # which others refer to
+            referring = [each for each in section if _refers(each, named)]
+            named |= {each.get("name", "") for each in referring if section.tag == "tendon"} - {""}
+            others = [each for each in section if each not in referring]
+            section[:] = others + [_renamed(each, named, suffix) for suffix in suffixes for each in referring]
     element[:] = children
 
 
-def _referring(element: Element, named: set[str], suffixes: list[str]) -> list[Element]:
-    """Return copies of an element that refers to replicated ones, one for each; else the element."""
-    parts = list(element.iter())
-    if not any(value in named for part in parts for key, value in part.attrib.items() if key not in ("name", "class")):
-        return [element]
-    copies = []
-    for suffix in suffixes:
-        copied = copy.deepcopy(element)
-        for part in copied.iter():
-            for key, value in part.attrib.items():
-                if (key == "name" and part is copied) or (key not in ("name", "class") and value in named):
-                    part.set(key, value + suffix)
-        copies.append(copied)
-    return copies
+def _refers(element: Element, named: set[str]) -> bool:
+    """Return True if an element refers to replicated ones."""
+    parts = element.iter()
+    return any(value in named for part in parts for key, value in part.attrib.items() if key not in ("name", "class"))
+
+
+def _renamed(element: Element, named: set[str], suffix: str) -> Element:
+    """Return a copy of an element that refers to replicated ones, with a suffix to its name and theirs."""
+    copied = copy.deepcopy(element)
+    for part in copied.iter():
+        for key, value in part.attrib.items():
+            if (key == "name" and part is copied) or (key not in ("name", "class") and value in named):
+                part.set(key, value + suffix)
+    return copied

@@ -27,6 +27,7 @@ from twoloop.bodies.rotation import rotation_matrix
 from twoloop.bodies.rotation_rates import rate_of_vector, spin_of
 from twoloop.checks.arguments import Array, shown
 
+AT_REST = 1e-12  # rad/s or m/s: slower joints of a keyframe rest, as rounding errors may contradict closed loops
 AGREES = 1e-6  # tolerance of the pose that a weld prescribes
 
 
@@ -71,7 +72,7 @@ class Loads(TendonsAndActuators):
             elif q is not None:
                 R = rotation_matrix(q[-4:] / np.linalg.norm(q[-4:]))
                 joint.position = R if joint.kind == "ball" else Pose(q[:3], R)
-            if v is not None and v.any():
+            if v is not None and np.abs(v).max() > AT_REST:
                 joint.rate = float(v[0]) if joint.kind in ("hinge", "slide") else v
         if "ctrl" in chosen.attrib:
             actuators = [each for group in self.reader.root.findall("actuator") for each in group]

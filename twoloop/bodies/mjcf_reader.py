@@ -195,8 +195,10 @@ class _Reader:
         scale = total / self.total if total > 0.0 and self.total > 0.0 else 1.0
         loads = Loads(self)
         loads.start(self.key)
+        carrying = {id(part.parent) for part in self.parts}
         for part in self.parts:
             part.lumps = [Lump(scale * each.mass, each.centre, scale * each.J) for each in part.lumps]
+            part.massless |= id(part) in carrying and not combined(part.lumps).mass and len(part.freed) == 1
             add_part(self.model, part)
         loads.read(scale)
         if self.n_geoms > 1 and not self.disabled & {"contact", "constraint"}:
