@@ -3,14 +3,15 @@
 import gc
 import signal
 import sys
+from contextlib import suppress
+from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
-from tests.problems import LINKAGES
-from twoloop import solve
-from twoloop.run import cached
+# what takes long to import is imported where it is used: the process that distributes the tests needs none of it
 
 # not collected where the packages of the studies, or of the documentation, are not installed: `make test-oldest`
 NEED_STUDIES = (
@@ -35,11 +36,21 @@ def no_figures_stay():
         sys.modules["matplotlib.pyplot"].close("all")
 
 
+def import_from_the_last(config):
+    """Let the second of two workers begin at the other end: what one has compiled to bytecode, the other one reads."""
+    worker = getattr(config, "workerinput", {}).get("workerid")
+    if worker == "gw1" and config.args_source is config.ArgsSource.TESTPATHS:
+        for path in sorted(Path(__file__).parent.rglob("test_*.py"), reverse=True):
+            with suppress(Exception, pytest.skip.Exception):  # collection says what is wrong
+                import_module(".".join(path.relative_to(config.rootpath).with_suffix("").parts))
+
+
 @pytest.hookimpl(wrapper=True)
-def pytest_collection():
+def pytest_collection(session):
     """Switch garbage collection off while modules are imported: nothing of it is garbage."""
     gc.disable()
     try:
+        import_from_the_last(session.config)
         return (yield)
     finally:
         gc.enable()
@@ -60,12 +71,12 @@ def pytest_collection_finish():
 
 @pytest.fixture(scope="session")
 def default_four_bar():
-    return LINKAGES["default"]
+    return import_module("tests.problems").LINKAGES["default"]
 
 
 @pytest.fixture(scope="session")
 def collinear_four_bar():
-    return LINKAGES["collinear"]
+    return import_module("tests.problems").LINKAGES["collinear"]
 
 
 @pytest.fixture
@@ -85,6 +96,9 @@ def interruptible():
 @pytest.fixture
 def taken(monkeypatch):
     """Record for each call whether it used the arrays of an earlier run."""
+    from twoloop import solve
+    from twoloop.run import cached
+
     integrate, set_up, ways, new = solve.cached_result, cached.set_up, [], []
 
     def watched(*given):
@@ -103,6 +117,6 @@ def by_the_loop(monkeypatch):
     """Let all runs that follow take the integration loop from their start on."""
 
     def switch():
-        monkeypatch.setattr(solve, "cached_result", lambda *given: None)
+        monkeypatch.setattr("twoloop.solve.cached_result", lambda *given: None)
 
     return switch

@@ -10,6 +10,7 @@ import pytest
 from studies.bench.sharp_forces import KIND, SIZE, A
 from studies.bench.sharp_motion import TIMES
 from tests.differential_motions import FAMILIES, RIGHT, SILENT, judged, mechanism_of, read
+from tests.problems import quick
 
 TIME_LIMIT = 20.0  # s
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
@@ -22,18 +23,19 @@ MAY_END = ("drive with a kink",)  # whose velocities jump
 MOTIONS = read()
 
 
-def calls(place):
-    """Names, tolerances and options of the runs of a family: the default, without and with code of its own, others."""
-    names = ["auto", "Taylor", *(OTHERS[(4 * place + k) % len(OTHERS)] for k in range(4))]
+def calls(place, n):
+    """Names, tolerances, options of the runs of a family: the default, without and with code of its own, n others."""
+    names = ["auto", "Taylor", *(OTHERS[(4 * place + k) % len(OTHERS)] for k in range(n))]
     made = [(name, TOLERANCES[(place + k) % len(TOLERANCES)], {}) for k, name in enumerate(names)]
     return made + [(name, tolerance, {"compiled": True}) for name, tolerance, _ in made[:2]]
 
 
 @pytest.mark.parametrize("family", [family for family in FAMILIES if family not in SHORT_CHANGES])
-def test_a_run_is_right_or_says_that_it_is_not(family):
+@pytest.mark.parametrize("n_others", quick([1, 4]))
+def test_a_run_is_right_or_says_that_it_is_not(family, n_others):
     n_drawn, known = MOTIONS[family]
     mechanism = mechanism_of(family, n_drawn)
-    for name, tolerance, options in calls(FAMILIES.index(family)):
+    for name, tolerance, options in calls(FAMILIES.index(family), n_others):
         made = judged(mechanism, known, name, tolerance, TIME_LIMIT, **options)
         told = f"{name}, {options}, at {tolerance:g} on {mechanism.name}: {made}"
         assert made["outcome"] != SILENT, told

@@ -310,6 +310,7 @@ def test_so_are_the_derivatives_right_with_each_of_its_two_remedies(run, tol, st
         assert np.linalg.norm(by_steps - smooth) < 0.02 * np.linalg.norm(smooth)
 
 
+@pytest.mark.slow
 def test_the_check_of_the_own_integrator_is_as_printed(run):
     names, text = run("own_integrator"), (ROOT / PAGES["own_integrator"]).read_text(encoding="utf-8")
     report = names["report"]

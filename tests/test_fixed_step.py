@@ -75,6 +75,7 @@ def test_one_step_over_a_span_that_is_rounded(default_four_bar):
     assert 0.2 + 0.02 - 0.2 < 0.02 and result.success and len(result.h) == 1
 
 
+@pytest.mark.slow
 def test_rounding_does_not_add_up_in_fixed_steps():
     """Energies at the ends of runs of 10^4 steps and more; without the rests they are off by 1.8e-13 J."""
     problem = four_bar(lengths=(1.0, 1.2, 0.5), ground=1.0, theta3=np.pi, branch=1)

@@ -105,7 +105,7 @@ def test_a_series_sees_what_it_cannot_foresee(name, compiled):
         assert result.widest_gap <= 0.01 * T_END * (1.0 + 1e-9)
 
 
-@pytest.mark.parametrize("method", quick(["auto", "DOP853", "RadauIIA9", "Adams", "Gauss8", "SunRadau5"], 3))
+@pytest.mark.parametrize("method", quick(["auto", "RadauIIA9", "DOP853", "Adams", "Gauss8", "SunRadau5"], 2))
 @pytest.mark.parametrize("name", ["gust of 30 ms on a pendulum at rest", "drag through zero speed"])
 def test_no_method_passes_over_a_hundredth_of_the_run(name, method):
     for tolerance in (1e-4, 1e-9):
@@ -134,8 +134,7 @@ SLOWLY += [(lambda t, q, v: -0.1 * np.sin((q + v) * (q - 8.0 * v)), True)]
 @pytest.mark.parametrize(("force", "short"), quick(SLOWLY, 2))
 def test_steps_are_longer_than_a_hundredth_where_forces_change_slowly(force, short):
     """4/15 of a step is the longest part without a stage: the equations are still evaluated in each hundredth."""
-    system = unconstrained(force, compile=True)
-    result = solve_dae(system, (0.0, 1.0), [1.0], [0.0], "DOP853", 1e-3, 1e-3)
+    result = solve_dae(unconstrained(force, compile=True), (0.0, 1.0), [1.0], [0.0], "DOP853", 1e-3, 1e-3)
     assert result.h.max() == pytest.approx(0.01 if short else 0.0375, rel=1e-9)
     assert result.widest_gap == pytest.approx(0.01, rel=1e-9)
 
@@ -185,7 +184,7 @@ def test_auto_goes_on_where_a_series_is_not_finite(name, compiled):
 # --- forces that jump within a step, and errors of velocities that last
 TOL = 1e-8
 W, PUSH, END = 3.0, 10.0, 1.0  # rad/s, m/s^2, s
-TIMES = np.linspace(0.21, 0.79, 8) ** 1.1  # s, on no grid of steps
+TIMES = np.linspace(0.21, 0.79, 5) ** 1.1  # s, on no grid of steps
 
 
 def pushed(at):
@@ -217,7 +216,7 @@ def test_a_jump_of_the_force_is_passed_within_the_tolerance(method, limit):
 def test_a_short_step_of_adams_does_not_hide_a_jump():
     """Of a step much shorter than those before it the order's formula says an error of 1/1000 of that of the jump."""
     system = unconstrained(lambda t, q, v, p: np.array([(p[1] if t > p[0] else 0.0) - W * W * q[0]]), parameters=[0, 0])
-    for at, push in np.random.default_rng(3).uniform((0.1, -1.0), (0.9, 2.0), (12, 2)):
+    for at, push in np.random.default_rng(3).uniform((0.1, -1.0), (0.9, 2.0), (6, 2)):
         result = solve_dae(system.with_parameters([at, 10.0**push]), (0.0, END), [1.0], [0.0], "Adams", TOL, TOL)
         v = -W * np.sin(W * END) + 10.0**push / W * np.sin(W * (END - at))
         assert abs(result.v[0, -1] - v) < 10.0 * TOL * (1.0 + abs(v))
@@ -233,7 +232,7 @@ def test_times_before_zero_are_like_others(at):
 
 # --- forces that act for a thousandth of the run, in time or at a place: steps end where they change suddenly
 SIZE, WIDTH = 200.0, 1e-3
-PLACES = np.random.default_rng(12).uniform(0.4, 2.4, 12)
+PLACES = np.random.default_rng(12).uniform(0.4, 2.4, 12)[::3]
 SLOW, FAST = (0.0, 0.5), (0.0, 3.0)  # starts
 
 
@@ -295,19 +294,19 @@ def test_no_gust_of_a_thousandth_of_the_run_is_passed_over(options):
 
 @pytest.mark.parametrize("method", ["auto", "TRBDF2"])
 def test_nor_is_a_force_that_is_switched_on_for_that_time(method):
-    for at in PLACES[:4]:
+    for at in PLACES[:2]:
         found = end_of(switched, (at, WIDTH), SLOW, method=method, **LOOSE)
         assert np.abs(found - at_a_time(switched, at)).max() < 1e-3
 
 
-@pytest.mark.parametrize("compile", [True, False])
+@pytest.mark.parametrize("compile", quick([False, True]))
 def test_nor_is_what_acts_at_a_place_that_is_passed_in_that_time(compile, p=(0.3, 3e-3)):
     expected = reference(magnet, FAST, p, 5e-4)
     for method in ("auto", "DOP853", "RadauIIA9", "Adams", "BDF") if compile else ("auto",):
         assert np.abs(end_of(magnet, p, FAST, compile, method=method, **LOOSE) - expected).max() < 1e-4
 
 
-@pytest.mark.parametrize("options", quick([{}, {"compiled": False}, {"method": "Taylor"}, {"method": "DOP853"}], 2))
+@pytest.mark.parametrize("options", quick([{}, {"compiled": False}, {"method": "Taylor"}, {"method": "DOP853"}]))
 def test_nor_is_a_smooth_force_at_such_a_place(options):
     """It is passed at 3/s, a width in a two-thousandth of the run or more."""
     p = 0.1, 5e-3
@@ -318,7 +317,7 @@ def test_nor_is_a_smooth_force_at_such_a_place(options):
 @pytest.mark.parametrize("method", quick(["Adams", "BDF", "SunRadau5"]))
 def test_nor_is_a_force_that_is_not_finite(method):
     """For a 300th and a thousandth of the run; it hid later changes, too."""
-    for at, share, wrong in zip(PLACES, (300, 1000) * 6, (np.nan, np.nan, np.inf, np.inf) * 3, strict=True):
+    for at, share, wrong in zip(PLACES, (300, 1000) * 2, (np.nan, np.nan, np.inf, np.inf), strict=True):
         p = at, 0.5 * T_END / share, wrong
         system = pendulum(force=lambda t, q, v, p=p: not_finite(t, q, v, p))
         result = solve_dae(system, (0.0, T_END), *start_of(SLOW), method=method, **LOOSE)
@@ -502,7 +501,7 @@ def two_pulses(t, q, v, p):
 def test_a_pulse_is_found_ahead_of_a_much_larger_one(method):
     """Beside the large one the small one was no sudden change, and steps went from before it to between both."""
     system = on_a_spring(two_pulses, 1.0, 20.0, -300.0)
-    for begin in np.linspace(1.0, 1.1, 15):
+    for begin in np.linspace(1.0, 1.1, 5):
         result = solve_dae(system.with_parameters([begin, 20.0, -300.0]), (0.0, 3.0), [0.0], [0.0], method, 1e-6, 1e-6)
         state = state_after(((20.0, 2e-3), (0.0, 4e-3), (-300.0, 2e-3), (0.0, 3.0 - begin - 8e-3)))
         assert result.success and np.abs([result.q[0, -1], result.v[0, -1]] - state).max() < 1e-3
@@ -533,7 +532,7 @@ def across(problem, end, tolerances, **options):
 
 @pytest.mark.parametrize(
     ("windows", "tolerances", "end", "compiled"),
-    [(3, (3e-9, 2e-9, 1e-8, 2e-8, 5e-8), 10.0, False), (2, (1e-7, 5e-8, 2e-7), 3.0, True)],
+    quick([(2, (1e-7, 5e-8, 2e-7), 3.0, True), (3, (3e-9, 2e-9, 1e-8, 2e-8, 5e-8), 10.0, False)]),
 )
 def test_steps_across_singular_positions(windows, tolerances, end, compiled):
     problem = n_four_bar(windows)
@@ -571,7 +570,7 @@ CASES = [(SHORT_GUST, "DOP853", 1e-10), (RUBBING, "BDF", 1e-8), (BRAKING, "Adams
 CASES += [(RUBBING, "DOP853", 1e-7), (BRAKING, "Gauss8", 1e-10), (BRAKING, "RadauIIA9", 1e-8)]
 
 
-@pytest.mark.parametrize(("case", "method", "tol"), quick(CASES, 3))
+@pytest.mark.parametrize(("case", "method", "tol"), quick(CASES, 2))
 def test_between_steps_that_forces_make_short(case, method, tol):
     system, q0 = case
     span = (system, (0.0, 2.0), q0, [0.0, 0.0])

@@ -189,6 +189,7 @@ def test_a_block_slides_down_bounces_and_rests_on_the_limit():
     np.testing.assert_allclose(-result.arcs[-1].lam[result.system.n_c, -1], 2.0 * pull, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_an_impact_releases_a_joint_that_sticks():
     M, m, v, f, g = 2.0, 1.0, 3.0, 1.0, 0.4
     model = PlanarModel(name="cart")

@@ -105,6 +105,7 @@ class AdaptiveMethod:
             assert result.success, result.message
             assert problems.worst(result.q[:, -1], truth.q[:, -1]) < far
 
+    @pytest.mark.slow
     def test_a_moving_pivot(self):
         system, times = problems.moving_pivot(compile=True), np.linspace(0.1, 10.0, 100)
         q, v = problems.moving_pivot_state(times)

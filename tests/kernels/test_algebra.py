@@ -108,6 +108,7 @@ def test_factors_solve(r, n_free, share, seed):
 
 
 @pytest.mark.parametrize("share", [0.1, 1.0])
+@pytest.mark.slow
 def test_singular_matrices_have_no_program(share):
     G, pattern, columns = sparse_rows(np.random.default_rng(2), 12, 12, share)
     G[3], pattern[3] = G[7], pattern[7]

@@ -128,7 +128,7 @@ def bounced(stiffness, t):
     ("method", "tol"),
     [
         slow(RungeKutta(radau_iia(3), outer="newton", tested="positions"), 1e-10),
-        ("ESDIRK4", 1e-6),
+        slow("ESDIRK4", 1e-6),
         slow("TRBDF2", 1e-9),
         slow("ESDIRK4", 1e-4),
     ],
@@ -203,7 +203,7 @@ def spring(**tangents):
     return ConstrainedSystem.from_python(mass=np.kron(np.eye(COPIES), np.eye(4) + 0.1), **sizes, **functions)
 
 
-@pytest.mark.parametrize(("banded", "reaction"), [slow(False, {}), (True, {"reaction_by_q": rod_by_q})])
+@pytest.mark.parametrize(("banded", "reaction"), [slow(False, {}), slow(True, {"reaction_by_q": rod_by_q})])
 def test_tangents_replace_differences(monkeypatch, banded, reaction):
     monkeypatch.setattr(workspace_module, "banded_pays", lambda *sizes: banded)
     systems = spring(), spring(force_by_q=spring_by_q, force_by_v=spring_by_v, **reaction)

@@ -134,8 +134,8 @@ def test_a_run_past_its_time_limit_is_a_row(name):
 @pytest.mark.parametrize(
     "name",
     [
-        *("heyoka", "CVODE from C, Adams", "collocation, CasADi", "IDA from C, stabilised"),
-        slow("DOP853, index 1"),
+        *("heyoka", "CVODE from C, Adams", "collocation, CasADi"),
+        *(slow("IDA from C, stabilised"), slow("DOP853, index 1")),
     ],
 )
 def test_a_run_past_its_limit_is_not_run_again_to_its_end(name):

@@ -6,22 +6,9 @@ import pytest
 
 from studies.bench.cli import Call
 from studies.bench.render import render
-from studies.bench.solvers import CATALOGUE
 from studies.bench.store import Output
 
 GOOD = {"status": "REACHED_END", "message": "", "repeat": 0}  # of a row, before medians
-
-
-def told(name):
-    """What a row says of its solver."""
-    solver = CATALOGUE[name]
-    of_solver = {"family": solver.family, "called_from": solver.called_from, "solver": name}
-    return of_solver | {"keeps_constraints": solver.keeps_constraints}
-
-
-def line(good, group, name, value, **more):
-    """A row of a group, of a solver at a value of its setting."""
-    return {**good, **told(name), "group": group, CATALOGUE[name].setting: value, **more}
 
 
 def median(solver, error, seconds, **more):

@@ -242,6 +242,7 @@ def test_orders_see_a_method_below_its_own(monkeypatch):
     assert experiments.orders() == {"methods": 2.0, "methods of their order": 1.0}
 
 
+@pytest.mark.slow
 def test_choices_repeat_where_nothing_moves_and_change_with_the_motion():
     problem = four_bar()
     run = solve_dae(problem.system, (0.0, 3.0), problem.q0, problem.v0, method=paper_irk(), rtol=1e-5, atol=1e-5)

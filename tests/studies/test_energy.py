@@ -1,4 +1,4 @@
-"""The energy study: what its rows say of drift, how they come to say it, and other solvers whose energy is followed."""
+"""The energy study: what its rows say of drift, how they come to say it, and other solvers."""
 
 import math
 from pathlib import Path
@@ -14,35 +14,6 @@ from studies.bench.collector import REPEATS, attempt
 from studies.bench.figures import STYLES
 from studies.bench.solvers import CVODE_C, CVODES, CYRK, DEFAULT, DIFFRAX, HEYOKA, IDA_C, IRK, OWN_EXPLICIT
 from studies.bench.store import Output
-from studies.energy import (
-    DRIFTS,
-    GAUSS,
-    IRREGULAR,
-    IS_LOST,
-    LONG,
-    NEWMARK,
-    NO_DRIFT,
-    NOT_QUICK,
-    ONE,
-    OTHERS,
-    QUICK,
-    RADAU,
-    REPEATED,
-    ROUNDS,
-    SLOWLY,
-    SUN,
-    SWITCHING,
-    H,
-    case_of,
-    drift,
-    instants,
-    linkage,
-    measure,
-    pick,
-    runs,
-    verdict,
-    windows,
-)
 from tests.studies import of_study
 
 REPORTS = Path(__file__).parents[2] / "reports"
@@ -60,22 +31,9 @@ def rows(loaded):
     return energy.judged(loaded)
 
 
-@pytest.fixture(scope="module")
-def found(loaded):
-    return energy.findings_of(loaded)
-
-
 @pytest.fixture
 def quick(out):
     return energy.judged(Output(Call("energy", True, out, False, "")).load_rows(curves=True)[0])
-
-
-def changed(rows, where, **values):
-    place = rows.index[rows.eval(where, engine="python")]
-    assert len(place), where
-    for column, value in values.items():
-        rows.loc[place, column] = value
-    return rows
 
 
 @pytest.mark.slow  # as that of step_size
@@ -91,83 +49,39 @@ def test_other_solvers_have_rows_near_the_true_motion(quick):
 
 
 def test_the_committed_rows_say_which_methods_drift(rows):
-    sun = pick(rows, ONE, SUN)
+    sun = energy.pick(rows, energy.ONE, energy.SUN)
     assert abs(sun["slope"]) > 100.0 * sun["slope_error"]
-    gauss = pick(rows, ONE, GAUSS)
+    gauss = energy.pick(rows, energy.ONE, energy.GAUSS)
     least = abs(sun["slope"]) / (abs(gauss["slope"]) + 3.0 * gauss["slope_error"])
-    assert gauss["verdict"] == NO_DRIFT and least > 100.0
-    assert pick(rows, ONE, RADAU)["verdict"] == DRIFTS and pick(rows, ONE, NEWMARK)["verdict"] == NO_DRIFT
-    assert pick(rows, SWITCHING, NEWMARK)["verdict"] in (DRIFTS, IS_LOST)
-    paper = pick(rows, ONE, IRK, group="controlled")
-    assert paper["verdict"] == DRIFTS and abs(paper["slope"]) > 10.0 * paper["slope_error"]
-
-
-FIXED = "group == 'fixed' and case == "
-ON_ONE = f"{FIXED}'{ONE}' and partition == 'lasting' and solver == "
-TURNING = {  # finding: rows, and their slope; the finding is there before that and not after
-    "sun drifts": (lambda f: f["sun"]["drifts"], f"{ON_ONE}'{SUN}'", 0.0),
-    "symmetry": (lambda f: f["gauss"]["calm"], f"{ON_ONE}'{GAUSS}'", 1.0),
-    "none is calm": (lambda f: f["n_calm"]["lasting"] == 0, f"{FIXED}'{SWITCHING}' and solver == '{GAUSS}'", 0.0),
-    "but the symmetric": (
-        lambda f: f["n_calm"]["even"] == f["n"]["even"],
-        f"{FIXED}'{SWITCHING}' and partition == 'symmetric'",
-        1.0,
-    ),
-    "sun is not": (
-        lambda f: f["n_calm"]["uneven"] == 0 and f["fates"][0]["fates"][2] == "drifts",
-        f"{FIXED}'{SWITCHING}' and solver == '{SUN}' and partition == 'symmetric'",
-        0.0,
-    ),
-    "the paper's drifts": (lambda f: f["paper"]["one"]["drifts"], f"solver == '{IRK}'", 0.0),
-    "variable steps": (lambda f: f["controlled"]["drift"] > 0, "group == 'controlled'", 0.0),
-}
-
-
-@pytest.mark.parametrize(("finding", "where", "slope"), TURNING.values(), ids=TURNING)
-def test_findings_turn_with_the_rows(finding, where, slope, rows, found):
-    assert finding(found)
-    assert not finding(energy.findings_of(changed(rows, where, slope_error=0.0, slope=slope)))
-
-
-def repeated(rows, seconds=None):
-    """The rows with five repetitions each, of times that scatter by half a percent."""
-    rows = rows if seconds is None else rows.assign(call_s=seconds)
-    times = [tuple(call_s * (1.0 + 1e-3 * k) for k in range(5)) for call_s in rows["call_s"]]
-    return rows.assign(times=pd.Series(times, rows.index, dtype=object), repeats=5)
-
-
-def long_found(rows):
-    return energy.findings_of(rows)["long"]
-
-
-def test_freedom_from_drift_pays_where_it_is_cheaper(rows):
-    where = f"case == '{SWITCHING}'"
-    rows = changed(rows, where, slope=1.0, slope_error=0.0, call_s=1.0, energy=1e-9)
-    even = f"{FIXED}'{SWITCHING}' and solver == '{GAUSS}' and partition == 'symmetric'"
-    pays = changed(rows.copy(), even, slope=0.0, call_s=0.1)
-    found = long_found(repeated(pays))
-    assert found["n_pays"] == len(found["at"]) == 3 and found["ratios"] == [0.1, 0.1] and not found["others_calm"]
-    assert energy.answer_of(found).startswith("Over 1e4 s a run without drift is at 3 of 3 energy errors the cheapest")
-    for cpu in (0.98, 1.02, 10.0):
-        found = long_found(repeated(changed(pays, even, call_s=cpu)))
-        assert found["n_pays"] == 0 and found["ratios"] == [cpu, cpu]
-    found = long_found(repeated(changed(pays, where, slope=1.0)))
-    assert found["ratios"] is None and all(at["no_drift"]["own"] is None for at in found["at"])
+    assert gauss["verdict"] == energy.NO_DRIFT and least > 100.0
+    assert (
+        energy.pick(rows, energy.ONE, energy.RADAU)["verdict"] == energy.DRIFTS
+        and energy.pick(rows, energy.ONE, energy.NEWMARK)["verdict"] == energy.NO_DRIFT
+    )
+    assert energy.pick(rows, energy.SWITCHING, energy.NEWMARK)["verdict"] in (energy.DRIFTS, energy.IS_LOST)
+    paper = energy.pick(rows, energy.ONE, IRK, group="controlled")
+    assert paper["verdict"] == energy.DRIFTS and abs(paper["slope"]) > 10.0 * paper["slope_error"]
 
 
 def test_runs_have_keys_and_those_that_set_the_price_are_repeated():
-    listed = list(runs(False))
-    assert len({run.key(0) for run in listed}) == len(listed) < 125 and {run.case.t_end for run in listed} == {LONG}
-    assert {run.repeats for run in listed if run.case.name == ONE} == {1}
-    assert {run.solver.name for run in listed if run.repeats == REPEATS} == set(REPEATED)
-    assert all(run.repeats == 1 for run in runs(True))
+    listed = list(energy.runs(False))
+    assert len({run.key(0) for run in listed}) == len(listed) < 125 and {run.case.t_end for run in listed} == {
+        energy.LONG
+    }
+    assert {run.repeats for run in listed if run.case.name == energy.ONE} == {1}
+    assert {run.solver.name for run in listed if run.repeats == REPEATS} == set(energy.REPEATED)
+    assert all(run.repeats == 1 for run in energy.runs(True))
 
 
 def test_a_run_that_does_not_converge_is_a_row():
-    run = next(run for run in runs(True) if run.solver.name == GAUSS and run.case.name == SWITCHING and run.value == H)
+    run = next(
+        run
+        for run in energy.runs(True)
+        if run.solver.name == energy.GAUSS and run.case.name == energy.SWITCHING and run.value == energy.H
+    )
     run = type(run)(run.case, run.solver, 0.05)
     result, status, _, _ = attempt(run, 0)
-    found = measure(run, result)
+    found = energy.measure(run, result)
     assert status == "NOT_CONVERGED" and found["slope"] is None and 0.0 < found["t_reached"] < 75.0
 
 
@@ -179,26 +93,26 @@ def row_of(**changes):
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({}, DRIFTS),
-        ({"slope": -1e-9}, DRIFTS),
-        ({"swing": 1e-4}, SLOWLY),
-        ({"slope_error": 1e-9}, IRREGULAR),
-        ({"slope_error": 1e-9, "swing": 1e-4}, NO_DRIFT),
-        ({"slope": 0.0, "slope_error": 1e-11}, NO_DRIFT),
-        ({"slope": 0.0, "slope_error": 1e-10}, IRREGULAR),  # no net slope, but 3e-6 J may hide in the scatter
-        ({"slope": 1e-13, "slope_error": 1e-15}, ROUNDS),  # 1e-9 J; one rounding a step makes 2e-9 J
-        ({"lost": True}, IS_LOST),
+        ({}, energy.DRIFTS),
+        ({"slope": -1e-9}, energy.DRIFTS),
+        ({"swing": 1e-4}, energy.SLOWLY),
+        ({"slope_error": 1e-9}, energy.IRREGULAR),
+        ({"slope_error": 1e-9, "swing": 1e-4}, energy.NO_DRIFT),
+        ({"slope": 0.0, "slope_error": 1e-11}, energy.NO_DRIFT),
+        ({"slope": 0.0, "slope_error": 1e-10}, energy.IRREGULAR),  # no net slope, but 3e-6 J may hide in the scatter
+        ({"slope": 1e-13, "slope_error": 1e-15}, energy.ROUNDS),  # 1e-9 J; one rounding a step makes 2e-9 J
+        ({"lost": True}, energy.IS_LOST),
         ({"status": "NOT_CONVERGED", "t_reached": 12.5}, "not converged at 12.5 s"),
         ({"status": "NOT_AVAILABLE", "t_reached": math.nan}, "not available"),
     ],
 )
 def test_verdict(changes, expected):
-    assert verdict(row_of(**changes)) == expected
+    assert energy.verdict(row_of(**changes)) == expected
 
 
 def test_drift_finds_a_slope_under_an_oscillation():
     t = np.arange(100.0)
-    slope, error = drift(t, 1e-3 * t + np.sin(2.4 * t))
+    slope, error = energy.drift(t, 1e-3 * t + np.sin(2.4 * t))
     assert abs(slope - 1e-3) < 3.0 * error < 0.05
 
 
@@ -207,38 +121,38 @@ def test_a_random_walk_is_seldom_called_a_drift():
     t = np.arange(100.0)
     called = 0
     for _ in range(300):
-        slope, error = drift(t, np.cumsum(generator.standard_normal(100)))
+        slope, error = energy.drift(t, np.cumsum(generator.standard_normal(100)))
         called += abs(slope) > 3.0 * error
     assert called < 0.05 * 300  # expected 1.5 %
     with pytest.raises(ValueError, match="needs 20 windows or more; given 19"):
-        drift(t[:19], t[:19])
+        energy.drift(t[:19], t[:19])
 
 
 def test_what_wanders_and_comes_back_is_not_free_of_drift():
     t = np.linspace(0.0, 1e4, 100)
-    for size, expected in ((1e-7, NO_DRIFT), (1e-4, IRREGULAR)):
-        slope, error = drift(t, size * np.sin(2.0 * np.pi * t / 1e4))
+    for size, expected in ((1e-7, energy.NO_DRIFT), (1e-4, energy.IRREGULAR)):
+        slope, error = energy.drift(t, size * np.sin(2.0 * np.pi * t / 1e4))
         row = row_of(slope=0.0, slope_error=error)
-        assert abs(slope) < 3.0 * error and verdict(row) == expected
+        assert abs(slope) < 3.0 * error and energy.verdict(row) == expected
 
 
 def test_windows_are_whole_periods():
     t = np.linspace(0.0, 100.0, 200_001)
-    seen = windows(t, 1e-3 * t + np.sin(2.0 * np.pi * t / PERIOD), PERIOD, 100.0)
+    seen = energy.windows(t, 1e-3 * t + np.sin(2.0 * np.pi * t / PERIOD), PERIOD, 100.0)
     assert seen["t"].size == 44
     np.testing.assert_allclose(seen["mean"], 1e-3 * seen["t"], atol=1e-3)
     np.testing.assert_allclose(seen["range"], 2.0, atol=1e-2)
 
 
 @pytest.mark.parametrize("h", [0.01, 0.02, 0.04, None])
-@pytest.mark.parametrize("motion", [ONE, SWITCHING])
+@pytest.mark.parametrize("motion", [energy.ONE, energy.SWITCHING])
 def test_long_runs_are_sampled_evenly_over_the_phases(h, motion):
-    case, period = case_of(motion, LONG), linkage(motion)[1].period
-    times = instants(case, h) if h else case.instants
-    assert LONG - period < times[-2] < times[-1] == LONG
+    case, period = energy.case_of(motion, energy.LONG), energy.linkage(motion)[1].period
+    times = energy.instants(case, h) if h else case.instants
+    assert energy.LONG - period < times[-2] < times[-1] == energy.LONG
     if h:
         np.testing.assert_allclose(times / h, np.round(times / h), atol=1e-6)
-        assert instants(case_of(motion, QUICK), h) is None
+        assert energy.instants(energy.case_of(motion, energy.QUICK), h) is None
     for first in (0, 3000):
         phases = np.sort(times[first : first + 200] / period % 1.0)
         assert np.diff(phases, append=phases[0] + 1.0).max() < 0.05
@@ -262,8 +176,8 @@ PACKAGES = {HEYOKA: "heyoka", CYRK: "CyRK", CVODE_C: "sksundae", CVODES: "casadi
 
 
 def test_the_other_solvers_are_among_the_runs():
-    full, quick = ({run.solver.name for run in runs(short)} for short in (False, True))
-    assert set(PACKAGES) <= full and quick == full - set(NOT_QUICK) and set(PACKAGES) <= set(STYLES)
+    full, quick = ({run.solver.name for run in energy.runs(short)} for short in (False, True))
+    assert set(PACKAGES) <= full and quick == full - set(energy.NOT_QUICK) and set(PACKAGES) <= set(STYLES)
 
 
 def start(case):
@@ -273,12 +187,12 @@ def start(case):
 def test_a_long_run_may_take_as_many_steps_as_it_needs():
     """The limit of the other studies, which have no clock in it, would end a long run."""
     pytest.importorskip("casadi")
-    case = case_of(SWITCHING, QUICK)
-    assert OTHERS[CVODES][1](case, 1e-8, 0).stats.n_accepted > 1000
+    case = energy.case_of(energy.SWITCHING, energy.QUICK)
+    assert energy.OTHERS[CVODES][1](case, 1e-8, 0).stats.n_accepted > 1000
     span = (0.0, case.t_end)
     few = solve_sundials(case.problem.system, span, *start(case), "BDF", 1e-4, 1e-4, most_steps=100)
     assert not few.success and few.t.size == 0
-    run = next(run for run in runs(False) if run.solver.name == CVODES)
-    assert measure(type(run)(case, run.solver, 1e-4, "other", 1), few)["t_reached"] == 0.0  # a row, all the same
+    run = next(run for run in energy.runs(False) if run.solver.name == CVODES)
+    assert energy.measure(type(run)(case, run.solver, 1e-4, "other", 1), few)["t_reached"] == 0.0  # a row, all the same
     with pytest.raises(ValueError, match="most_steps"):
         solve_sundials(case.problem.system, span, *start(case), most_steps=0)
