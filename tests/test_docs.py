@@ -72,7 +72,7 @@ def names(tmp_path_factory):
 CODE = [page for page in PAGES if page not in ELSEWHERE]
 
 
-@pytest.mark.parametrize("page", [slow(page) if page in ("certificate", "your_mechanism") else page for page in CODE])
+@pytest.mark.parametrize("page", [slow(page) if page == "certificate" else page for page in CODE])
 def test_the_code_of_a_page_runs(page, names, recwarn):
     assert (len(blocks(f"docs/{page}.md")) == 0) == (page in WITHOUT_CODE)
     names(page)
@@ -135,7 +135,6 @@ def test_between_steps(names):
     assert page["landed"].q[1:, -1] == pytest.approx([0.2, 0.0], abs=1e-8)
 
 
-@pytest.mark.slow
 def test_all_three_are_one_mechanism(names):
     page = names("your_mechanism")
     systems = page["plain"], page["compiled"], page["problem"].system
@@ -150,7 +149,6 @@ def test_all_three_are_one_mechanism(names):
     assert np.ptp(page["energy"]) < 1e-5
 
 
-@pytest.mark.slow
 def test_the_drawing_of_the_page_is_its_mechanism(names):
     page, drawing = names("your_mechanism"), names("your_mechanism")["drawing"]
     run = solve_dae(page["compiled"], (0.0, 2.0), page["q0"], page["v0"], rtol=1e-8, atol=1e-8)
@@ -161,7 +159,6 @@ def test_the_drawing_of_the_page_is_its_mechanism(names):
     assert "slider-crank" in (page["_folder"] / "slider_crank.html").read_text(encoding="utf-8")
 
 
-@pytest.mark.slow
 def test_what_the_page_says_of_the_others(names):
     page = names("your_mechanism")
     assert page["problem"].conserved
