@@ -117,8 +117,15 @@ def test_massless_links_and_types_from_elsewhere(tmp_path):
     """A massless link between two hinges is the cross of a universal joint."""
     path = tmp_path / "odd.urdf"
     path.write_text(ODD.format(LINK.format("rod", 0.3, 2.0, 0.4), LINK.format("bob", 0.2, 1.0, 0.3)))
-    model = read(path, types={"ball": "spherical"})
-    assert model.ignored == ("joint 'last', beyond which there is no mass",)
+    side = tmp_path / "odd.yaml"
+    side.write_text(
+        "joint_name: ['ball', 'none']  # the second is not in the file\njoint_type: ['SPHERICAL', 'UJOINT_XY']\n"
+    )
+    model = read(path, side_file=side)
+    assert model.ignored[::-1] == (
+        "joint 'last', beyond which there is no mass",
+        "type of joint 'none', which the file has not",
+    )
     hand = SpatialModel()
     hand.body("rod", mass=2.0, inertia=(0.01, 0.4, 0.5), position=(0.3, 0, 1))
     hand.body("bob", mass=1.0, inertia=(0.01, 0.3, 0.5), position=(0.2, 0, 0))
@@ -171,6 +178,27 @@ def test_a_loop_that_is_given_beside_the_file(tmp_path):
     assert space.freedom.degrees == flat.freedom.degrees == 1
     ours, theirs = result.q.reshape(3, 7, -1)[:, [0, 2], -1], known.q.reshape(3, 3, -1)[:, :2, -1]
     np.testing.assert_allclose(ours, theirs, atol=1e-8)
+
+
+def test_frames_that_a_side_file_joins(tmp_path):
+    """A load on an arm, and one welded there or hung by a ball to a frame of its own."""
+    path, side = tmp_path / "arm.urdf", tmp_path / "arm.yaml"
+    load, mount = LINK.format("load", 0.3, 1.0, 0.4), '<origin xyz="1 0 0" rpy="0.3 0.2 0.1"/>'
+    hinge = '<joint name="j" type="continuous"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/></joint>'
+    joint = '<joint name="{0}" type="{1}"><parent link="{2}"/><child link="{3}"/>' + mount + "</joint>"
+    links = '<link name="base"/><link name="tip"/>' + LINK.format("arm", 0.5, 2.0, 0.2) + load
+    text = f'<robot name="r">{links}{hinge}{{}}</robot>'
+    tip = joint.format("at", "fixed", "arm", "tip")
+    path.write_text(text.format(tip + joint.format("k", "fixed", "arm", "load")))
+    known = moved(read(path).problem((0.0, 0.5))).q[:2, -1]  # of the common centre
+    path.write_text(text.format(tip + joint.format("free", "floating", "base", "load")))
+    for kind, degrees in (("6d", 1), ("3D", 4)):
+        side.write_text(f"closed_loop: [['load', 'at']]\ntype: ['{kind}']\nname_mot: ['j']\n")
+        problem = read(path, side_file=side).problem((0.0, 0.5))
+        assert problem.freedom.degrees == degrees
+        if kind == "6d":
+            q = moved(problem).q[:, -1].reshape(2, 7)
+            np.testing.assert_allclose((2.0 * q[0, :2] + q[1, :2]) / 3.0, known, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -62,6 +62,7 @@ def actuator_law(tag: str, inherited: Mapping[str, str], own: Mapping[str, str])
     elif tag == "damper":
         last = float(own.get("kv", last))
         gain, types["gaintype"] = np.array([0.0, 0.0, -last]), "affine"
+        law["ctrllimited"] = "true"
     law |= types | {"gainprm": text_of(gain), "biasprm": text_of(bias)}
     return law if tag in ("general", "motor") else law | {tag: text_of((first, last, constant))}
 

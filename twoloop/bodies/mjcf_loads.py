@@ -76,6 +76,9 @@ class Loads(TendonsAndActuators):
                 joint.rate = float(v[0]) if joint.kind in ("hinge", "slide") else v
         if "ctrl" in chosen.attrib:
             actuators = [each for group in self.reader.root.findall("actuator") for each in group]
+            if any(each.tag in ("pid", "orientation") for each in actuators):  # these have several commands
+                self.ignored.append(f"the command of actuators in the keyframe {key!r}")
+                return
             values = numbers(chosen.attrib["ctrl"], len(actuators), f"ctrl of the keyframe {key!r}")
             for k, (each, value) in enumerate(zip(actuators, values, strict=True)):
                 self.commands.setdefault(each.get("name", f"actuator {k}"), float(value))
@@ -167,9 +170,10 @@ class Loads(TendonsAndActuators):
         times = [float(x) for x in given.get("springdamper", "0 0").split()]
         if any(times) and not single:
             self.ignored.append(f"springdamper of joint {joint.name!r}")
-        elif len(times) == 2 and min(times) > 0.0 and not self.reader.disabled & {"spring", "damper", "passive"}:
+        elif len(times) == 2 and min(times) > 0.0:
             inertia = self._inertia([joint], [1.0])
-            stiffness, damping = [repr(inertia / (times[0] * times[1]) ** 2)], [repr(2.0 * inertia / times[0])]
+            both = {"stiffness": inertia / (times[0] * times[1]) ** 2, "damping": 2.0 * inertia / times[0]}
+            stiffness, damping = ([repr(0.0 if key in self.reader.without else x)] for key, x in both.items())
         if not any(float(x) for x in (*stiffness, *damping)):
             return
         stiff, damped = any(float(x) for x in stiffness[1:]), any(float(x) for x in damping[1:])

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import permutations
 from typing import Any
 from xml.etree.ElementTree import Element
 
@@ -28,13 +31,16 @@ from twoloop.bodies.file_parts import (
     text_of,
 )
 from twoloop.bodies.mjcf_loads import Polynomial
-from twoloop.bodies.parts import Body
+from twoloop.bodies.parameter_layout import POINT
+from twoloop.bodies.parts import Body, JointRow, ModelJoint, Numbers
 from twoloop.bodies.rotation import perpendiculars
-from twoloop.bodies.spatial.model import SpatialModel
-from twoloop.checks.arguments import Array, check_choice, check_finite, check_flag, check_vector
+from twoloop.bodies.spatial.model import SpatialModel, across
+from twoloop.checks.arguments import Array, check_choice, check_finite, check_flag, check_path, check_vector
 
 KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "floating": "free", "fixed": ""}
-MORE = ("spherical", "planar")  # types beside these
+CROSSES = {f"universal_{'xyz'[i]}{'xyz'[j]}": (i, j) for i, j in permutations(range(3), 2)}  # axes of the joint's frame
+MORE = ("spherical", "planar", *CROSSES)  # types beside these
+SIDE_TYPES = {"SPHERICAL": "spherical", "FIXED": "fixed"} | {f"UJOINT_{each[-2:].upper()}": each for each in CROSSES}
 TURNING, SLIDING = ("revolute", "continuous"), ("prismatic",)
 CLOSING = ("spherical", "revolute", "universal", "cylindrical", "prismatic", "planar", "fixed")
 WITHOUT_EFFECT = {"link", "joint", "material"}  # supported elements, and colours
@@ -82,6 +88,7 @@ def from_urdf(
     loops: Sequence[Loop] = (),
     positions: Mapping[str, float] | None = None,
     types: Mapping[str, str] | None = None,
+    side_file: str | os.PathLike[str] | None = None,
     limits: bool = False,
     free_base: bool = False,
     gravity: ArrayLike = (0.0, 0.0, -9.81),
@@ -101,6 +108,10 @@ def from_urdf(
         Angles or displacements by names of joints, rad or m, that define the position of the bodies. Default: zero.
     types : mapping, optional
         Types of joints by their names, where the file has others: many exporters write a ball as a fixed joint.
+    side_file : path-like, optional
+        YAML file with loops and types of joints, as of example-parallel-robots (github.com/Gepetto): lists
+        `closed_loop` of pairs of links whose frames coincide, `type` ("3d": in their origins only; "6d"), `joint_name`
+        and `joint_type` (SPHERICAL, FIXED, UJOINT_XY, ...).
     limits : bool
         If True, limits of joints that a model supports become stops, for `solve_with_stops`.
     free_base : bool
@@ -161,11 +172,18 @@ def from_urdf(
     check_flag("free_base", free_base)
     check_flag("limits", limits)
     model = SpatialModel(gravity, name=root.get("name", "robot"))
-    reader = _Reader(root, dict(positions or {}), model, dict(types or {}), limits)
-    reader.closed = {name for loop in loops for name in (loop.a, loop.b)}
+    welds, balls, more_types = ([], [], {}) if side_file is None else _side_file(side_file)
+    names = {each.get("name") for each in root.findall("joint")}
+    of_joints = {name: each for name, each in more_types.items() if name in names}
+    reader = _Reader(root, dict(positions or {}), model, of_joints | dict(types or {}), limits)
+    reader.ignored += [f"type of joint {name!r}, which the file has not" for name in more_types if name not in names]
+    pairs = [*welds, *((loop.a, loop.b) for loop in (*loops, *balls))]
+    reader.closed = {reader.link_of(name) for pair in pairs for name in pair}
     reader.read(free_base)
-    for loop in loops:
+    for loop in (*loops, *balls):
         reader.close(loop)
+    for pair in welds:
+        reader.weld(*pair)
     record_ignored(path, reader.model, reader.ignored)
     return reader.model
 
@@ -253,7 +271,23 @@ class _Reader:
             more = {"axes" if kind == "universal" else "axis": pair}
         getattr(self.model, kind)(body_a, body_b, at=at, name=loop.name, **more)
 
+    def weld(self, a: str, b: str) -> None:
+        """Let the frames of two links coincide."""
+        ends = [(body_of(self.model, part), start_pose(part, frame)) for part, frame in map(self._frame, (a, b))]
+        (body_a, _), (body_b, _) = ends
+        on_a, on_b = (Numbers(tuple(body.local_point(frame.x).tolist())) for body, frame in ends)
+        axes_a, axes_b = ([body.local_direction(column) for column in frame.R.T] for body, frame in ends)
+        turns = [across(body_a, axes_a[i], body_b, axes_b[j]) for i, j in ((0, 1), (0, 2), (1, 2))]
+        rows = JointRow(POINT, 3, body_a, body_b, on_a, on_b), *turns
+        self.model.joints.append(ModelJoint(f"{a} on {b}", "weld", body_a, body_b, rows, on_a, on_b))
+
+    def link_of(self, name: str) -> str:
+        """Return the name of a link at the end of a loop, which may be given by the joint that carries it."""
+        carried = (self._end(each, "child") for each in self.joints if each.get("name") == name)
+        return name if name in self.links else next(carried, name)
+
     def _frame(self, name: str) -> tuple[Part | None, Pose]:
+        name = self.link_of(name)
         if name == "ground":
             return None, Pose(np.zeros(3), np.eye(3))
         if name not in self.frames:
@@ -356,11 +390,16 @@ class _Reader:
             axis = axis / np.linalg.norm(axis)
         dynamics = joint.find("dynamics")
         attributes = {} if dynamics is None else dict(dynamics.attrib)
+        turned: list[Array] = []
+        if kind in CROSSES:
+            turned = [pose.R[:, k] for k in CROSSES[kind]]
         own = f"joint {name}" if name in self.links else name  # in URDF a link and a joint may share a name
         normal = pose.R @ axis
         if kind == "planar":
             freed = [FileJoint(own, "slide", pose.x, each, attributes) for each in perpendiculars(normal)]
             freed.append(FileJoint(own, "hinge", pose.x, normal, attributes))
+        elif turned:
+            freed = [FileJoint(own, "hinge", pose.x, each, attributes) for each in turned]
         else:
             moved = "ball" if kind == "spherical" else KINDS[kind]
             freed = [FileJoint(own, moved, pose.x, normal, attributes, position=value if value else None)]
@@ -385,6 +424,36 @@ class _Reader:
         J = tensor_of(*numbers(entries, 6, f"inertia of link {name!r}"))
         (value,) = numbers(mass.get("value", ""), 1, f"mass of link {name!r}")
         part.lumps.append(Lump(float(value), np.zeros(3), J).transformed(pose.then(_origin(inertial, what))))
+
+
+def _side_file(path: str | os.PathLike[str]) -> tuple[list[tuple[str, str]], list[Loop], dict[str, str]]:
+    """Read pairs of links that are welded, balls between links, and types of joints."""
+    lists: dict[str, Any] = {}
+    for key, text in re.findall(
+        r"(?m)^(\w+):\s*(\[(?:.|\n)*?\])\s*(?=^\w|\Z)", re.sub("#.*", "", check_path(path).read_text())
+    ):
+        try:
+            lists[key] = ast.literal_eval(text)
+        except (SyntaxError, ValueError):
+            raise ValueError(
+                f"{key} of {os.fspath(path)!r} must be a list such as ['a', 'b']; given {text!r}"
+            ) from None
+    pairs, kinds = lists.get("closed_loop", []), lists.get("type", [])
+    kinds += ["6d"] * (len(pairs) - len(kinds))
+    names, types = lists.get("joint_name", []), lists.get("joint_type", [])
+    if not all(isinstance(each, (list, tuple)) and len(each) == 2 for each in pairs) or len(names) != len(types):
+        raise ValueError(
+            f"{os.fspath(path)!r} must have pairs of links in closed_loop, and a joint_type per joint_name"
+        )
+    if unknown := set(types) - SIDE_TYPES.keys():
+        raise ValueError(f"joint_type must be one of {', '.join(SIDE_TYPES)}; given {min(unknown)!r}")
+    sorts: dict[str, list[Any]] = {"3d": [], "6d": []}
+    for pair, kind in zip(pairs, kinds, strict=True):
+        sorts.setdefault(str(kind).lower(), []).append(tuple(pair))
+    if unknown := sorts.keys() - {"3d", "6d"}:
+        raise ValueError(f"type of a closed_loop must be 3d or 6d; given {min(unknown)!r}")
+    balls = [Loop("spherical", a, b, at_b=(0.0, 0.0, 0.0), name=f"{a} on {b}") for a, b in sorts["3d"]]
+    return sorts["6d"], balls, {name: SIDE_TYPES[each] for name, each in zip(names, types, strict=True)}
 
 
 def _name(element: Element) -> str:
