@@ -123,13 +123,9 @@ class TestInMuJoCo:
         assert "at 2 ms: failed: MuJoCo warns of BADQACC" in audit_mjcf(lost, error=1e-2, t_end=0.2).as_it_is
 
     CHANGES = {  # noqa: RUF012
-        "class": [
-            ("<joint axis", '<default class="soft"><joint stiffness="2" springref="30"/></default><joint axis'),
-            ('name="crank">', 'name="crank" childclass="soft">'),
-        ],
-        "turned": [
-            ("<default>", '<compiler angle="radian" eulerseq="zyx"/><default>'),
-            ('name="crank"', 'euler="0 0.2 0"'),
+        "medium": [
+            ('timestep="0.002"', 'timestep="0.002" density="900" viscosity="0.1"'),
+            end('<tendon><fixed stiffness="3"><joint joint="pivot" coef="2"/></fixed></tendon>'),
         ],
         "ref": [('name="elbow"', 'name="elbow" ref="20" springref="35" stiffness="3" damping="0.1"')],
         "gravity": [('timestep="0.002"', 'timestep="0.002" gravity="3 1 -4"')],
