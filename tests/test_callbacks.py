@@ -311,6 +311,19 @@ def test_memory_that_shows_along_the_motion_is_named_at_its_end(make):
     assert result.status is Status.WRONG_TRACE and "when it is called again" in result.message
 
 
+@callback("force")
+def throws_dice(t, q, v, p, Q):
+    Q[0] = np.random.random()  # noqa: NPY002
+
+
+@pytest.mark.slow
+def test_a_compiled_force_that_changes_is_named_at_the_end_of_each_run():
+    system = ConstrainedSystem(n_q=1, n_c=0, mass=unit_mass, force=throws_dice, name="dice")
+    for _ in range(3):
+        result = solve_dae(system, (0.0, 1.0), [0.0], [0.0], "DOP853", rtol=1e-2, atol=1e-2)
+        assert result.status is Status.WRONG_TRACE and "when it is called again" in result.message
+
+
 def test_what_is_kept_for_speed_or_to_be_looked_at_is_no_memory():
     known, log, guess = {}, [], [0.0]
 

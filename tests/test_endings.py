@@ -12,7 +12,7 @@ import pytest
 
 from tests.problems import event, pendulum, quick, run, violations, worst
 from tests.processes import run_python
-from twoloop import DOP853, Status, mechanisms, solve_dae
+from twoloop import DOP853, Integrator, Status, mechanisms, solve_dae
 from twoloop.mechanisms import four_bar
 
 HORIZONTAL = ([-1.0, 0.0], [0.0, 0.0])
@@ -258,10 +258,22 @@ class Alarm(Exception):
     pass
 
 
+def step(system):
+    integrator = Integrator(system)
+    integrator.start(0.0, *START)
+    integrator.step(0.1)
+
+
+def interpolate(system):
+    solve_dae(system, (0.0, 1.0), *START, dense_output=True).sol(np.linspace(0.0, 1.0, 300))
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="no timers that send signals")
-@pytest.mark.parametrize("after", [0.003, 0.0171, 0.0533])
-@pytest.mark.parametrize("error", [Alarm, KeyboardInterrupt])
-def test_an_exception_of_a_signal_handler_arrives_as_itself(error, after):
+@pytest.mark.parametrize(("error", "after"), [(Alarm, 0.003), (KeyboardInterrupt, 0.0171), (Alarm, 0.0533)])
+@pytest.mark.parametrize(
+    "work", [lambda system: solve_dae(system, (0.0, 10.0), *START, "RadauIIA5", 1e-6, 1e-6), step, interpolate]
+)
+def test_an_exception_of_a_signal_handler_arrives_as_itself(work, error, after):
     """Handlers run at any instruction of Python, also at those of numba between pieces of machine code."""
 
     def ring(number, frame):
@@ -272,7 +284,7 @@ def test_an_exception_of_a_signal_handler_arrives_as_itself(error, after):
         with pytest.raises(error):
             signal.setitimer(signal.ITIMER_REAL, after)
             while True:
-                solve_dae(system, (0.0, 10.0), *START, "RadauIIA5", 1e-6, 1e-6)
+                work(system)
     finally:
         signal.signal(signal.SIGALRM, before)
 

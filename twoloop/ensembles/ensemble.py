@@ -118,7 +118,7 @@ class LaneEnsemble:
     why : str
         Why no run went in lanes, or none by the first method.
     deadline : float
-        Time of `time.monotonic` after which no runs begin; compilation delays it.
+        Time of `time.monotonic` at which runs stop; compilation delays it.
     """
 
     system: ConstrainedSystem
@@ -239,7 +239,9 @@ FIRST = "the first, which checks the system"  # reason for which the first run i
 ROUNDS = 3  # of runs that are integrated one at a time within a time limit
 LARGEST_SHARE, TIMES = 0.1, 3.0  # such a run may take this part of the remaining time, or of the longest run so far
 FIRST_SHARE = 0.5  # largest part of the time limit that the first run takes
-NOT_BEGUN = "The run was not begun: time_limit had ended. Raise time_limit, loosen rtol and atol, or shorten t_span."
+NOT_ENDED = (
+    "time_limit ended before the run began or, in lanes, ended: raise it, loosen rtol and atol, or shorten t_span."
+)
 CLOSER, TIGHT = 0.1, 1e-9  # factor of the tolerances of the first run, unless these are as tight as TIGHT
 
 
@@ -293,8 +295,8 @@ def ensemble(
         None: one for each core that this process may use. Results do not depend on it.
     time_limit : float, optional
         Wall-clock time of all runs, s, without compilation. Runs that have not ended by then get the status TIME_LIMIT
-        and keep their states so far. Runs that are integrated one at a time share the time, so that a run that never
-        ends does not take that of others; a block of runs in lanes is not interrupted.
+        and, if they were integrated one at a time, keep their states so far. Such runs share the time, so that a run
+        that never ends does not take that of others.
 
     Returns
     -------
@@ -433,7 +435,7 @@ def _share_time(
                 if single(run, runs.max_step(run), limit).success:
                     longest = max(longest, time.monotonic() - began)
             elif had[run] == 0.0 and run > 0:
-                status[run], messages[run] = int(Status.TIME_LIMIT), NOT_BEGUN
+                status[run], messages[run] = int(Status.TIME_LIMIT), NOT_ENDED
                 if runs.times[0] == runs.starts.t0:
                     runs.q[run, :, 0], runs.v[run, :, 0] = runs.starts.q[run], runs.starts.v[run]
         queue = [run for run in queue if status[run] == Status.TIME_LIMIT]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -225,11 +225,11 @@ Flags = NDArray[np.bool_]
 N_SAMPLES = 100  # smallest number of evaluations of the equations in a run ...
 OF_SUDDEN = 20  # ... times this if a force may act for a short time: lanes do not sample ahead
 SMALLEST, LARGEST = 128, 4096  # number of runs of a block; coefficients of all its runs are computed at once
-LIMITED = 16  # ... and if there is a time limit, which is checked before each block
 FOR_EACH = 3  # blocks per thread, so that all threads end at about the same time
 LOOKS = N_SAMPLES * OF_SUDDEN
 SHORT = min(layout.NO_START, layout.UNLIKE) - 1  # a status besides those of layout.py
-OUT_OF_TIME = SHORT - 1  # likewise: not begun when the time limit ended
+OUT_OF_TIME = SHORT - 1  # likewise: not at its end when the time limit ended
+AGAIN = 0.01  # s: after this time, runs that began meanwhile are stopped too
 AGREES = 1e-7  # relative to the terms of an equation: residual that rounding may leave at the end of a run
 
 WHY = {  # reasons for which a run is left to `solve_dae`, by its status in layout.py
@@ -239,7 +239,7 @@ WHY = {  # reasons for which a run is left to `solve_dae`, by its status in layo
     layout.OFTEN_REFUSED: "steps are refused again and again (a sudden force, stiff motion, a singular position)",
     layout.MANY_STEPS: "it takes more than 100,000 steps in lanes (stiff, or very fast motion)",
     layout.UNLIKE: "the callbacks do not agree with the code at the end (they branch)",
-    OUT_OF_TIME: "the time limit ended before its turn in lanes",
+    OUT_OF_TIME: "the time limit ended before the run did, in lanes",
     SHORT: "forces or drives change for so short a time that lanes may miss others",
 }
 
@@ -292,22 +292,26 @@ class LaneRuns:
     ) -> tuple[Integers, Integers, Integers, Array]:
         """Integrate these runs; return status (see layout.py), steps and evaluations, and a and lam at the end.
 
-        No block of runs begins after the deadline, which is a time of `time.monotonic`.
+        Runs stop at the deadline, a time of `time.monotonic`.
         """
+        from twoloop.kernels.lanes.control import MOST_STEPS
+
         n_runs = len(which)
         status, n_steps, n_evaluations = np.zeros((3, n_runs), dtype=np.int64)
         n_evaluations += 1  # the evaluation at the start
         ends = np.full((n_runs, self.system.n_q + self.system.n_c), np.nan)
 
         def block(rows: slice) -> None:
-            if time.monotonic() > deadline:
-                status[rows] = OUT_OF_TIME
-                return
             out = out_q[rows], out_v[rows], ends[rows]
             told = status[rows], n_steps[rows], n_evaluations[rows]
             self._make(which[rows], t1, times, rtol, atol, out, told)
 
-        in_blocks(block, n_runs, threads, LIMITED if deadline < np.inf else LARGEST)
+        def stop() -> None:
+            """Let runs leave their lanes, also in the threads that integrate them, as if they had taken all steps."""
+            n_steps[status == layout.UNDECIDED] = MOST_STEPS
+
+        if not in_blocks(block, n_runs, threads, deadline, stop):
+            status[(status == layout.MANY_STEPS) | (status == layout.UNDECIDED)] = OUT_OF_TIME
         return status, n_steps, n_evaluations, ends
 
     def _make(
@@ -376,17 +380,34 @@ class LaneRuns:
         return fine
 
 
-def in_blocks(make: Callable[[slice], None], n_runs: int, threads: int, largest: int = LARGEST) -> None:
-    """Call `make` for blocks of at most `largest` runs, in so many threads."""
+def in_blocks(
+    make: Callable[[slice], None],
+    n_runs: int,
+    threads: int,
+    deadline: float = np.inf,
+    stop: Callable[[], None] = lambda: None,
+) -> bool:
+    """Call `make` for blocks of runs in threads; call `stop` at the deadline, or if this thread gets an exception.
+
+    Return whether all blocks ended before.
+    """
     n_blocks = 1 if threads == 1 else FOR_EACH * threads
-    size = int(np.clip(-(-n_runs // n_blocks), min(SMALLEST, largest), largest))
+    size = int(np.clip(-(-n_runs // n_blocks), SMALLEST, LARGEST))
     blocks = [slice(begin, min(begin + size, n_runs)) for begin in range(0, n_runs, size)]
-    if threads == 1 or len(blocks) == 1:
-        for rows in blocks:
-            make(rows)
-    else:
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(make, blocks))
+    stopped = False
+    with ThreadPoolExecutor(threads) as pool:
+        futures = [pool.submit(make, rows) for rows in blocks]
+        try:
+            while wait(futures, None if deadline == np.inf else max(AGAIN, deadline - time.monotonic())).not_done:
+                stopped = True
+                stop()
+        finally:
+            while wait(futures, 0.0).not_done:  # an exception, as by Ctrl-C
+                stop()
+                wait(futures, AGAIN)
+        for future in futures:
+            future.result()
+    return not stopped
 
 
 def aligned(vectors: int, lanes: int) -> Array:

@@ -71,6 +71,7 @@ MOVED = 10.0  # in heights LOW: displacement during a sequence of impacts that a
 WITHIN = 1e4  # in heights LOW: largest gap of a stop that such a sequence may reach
 LEAST_RATE = 1e-13  # relative to the velocities: smaller rates in such a sequence are rounding errors
 DIFFERS = 1e-6  # relative to the velocities: outcomes of laws of impact that differ by more do not agree
+TOUCH = "an impact reaches stops that touch"
 LISTED = 100  # longest sequence of impacts that are listed one by one
 LAWS = ("moreau", "sequential")
 
@@ -104,7 +105,8 @@ class Motion:
         self.t, self.q, self.v = t, q, v
         self.e = np.array([stop.restitution for stop in stops])
         self.gaps, self.friction = Gaps("gap", stops, t, q), StopFriction(stops, t, q)
-        self.law, self.depends, self.unfinished = law, [], []  # type: ignore[var-annotated]
+        self.law, self.unfinished = law, []  # type: ignore[var-annotated]
+        self.depends: list[tuple[float, list[str], str]] = []  # time, stops, what they do, where the law decides
         self.noise = EQUAL_GAPS * max(1.0, float(np.abs(q).max()))
         self.low = max(LOW * float(options["atol"].min()), ROUNDING * max(1.0, float(np.abs(q).max())))
         closed = np.flatnonzero(self.gaps.at(t, q, v).g < -100.0 * self.low)
@@ -164,11 +166,11 @@ class Motion:
         """Describe where the outcome depends on the law of impacts, or a sequence was left unfinished."""
         note = ""
         if self.depends:
-            t, stops = self.depends[0]
+            t, stops, event = self.depends[0]
             note = (
-                f" At t = {t:.6g} an impact reaches stops that touch ({', '.join(map(repr, stops))}), and the outcome "
-                "depends on the law: Moreau's law, used here, joins their impacts into one; impacts one after another, "
-                "as in Newton's cradle, give other velocities. For these, leave a small gap between the bodies or set "
+                f" At t = {t:.6g} {event} ({', '.join(map(repr, stops))}), and the outcome depends on the law: "
+                "Moreau's law, used here, joins their impacts into one; impacts one after another, as in Newton's "
+                "cradle, give other velocities. For these, leave a small gap between the bodies or set "
                 'law="sequential"; law="moreau" confirms the choice.'
             )
         if self.unfinished:
@@ -321,9 +323,9 @@ class Motion:
         if not course.ended:
             self.unfinished.append((self.t, names))
         touch = (g <= self.noise) & (u[: len(g)] <= 0.0)
-        compared = self.law is None and course.shared and not ambiguous
-        if compared and differ(impacts.follow(g, u, limit, False), course):
-            self.depends.append((self.t, [self.stops[k].name for k in reach[g <= self.noise]] or names))
+        if self.law is None and course.shared and (ambiguous or differ(impacts.follow(g, u, limit, False), course)):
+            event = "stops close at once, in an order within the tolerance" if ambiguous else TOUCH
+            self.depends.append((self.t, [self.stops[k].name for k in reach[g <= self.noise]] or names, event))
         at_once = {int(k) for k in reach[touch]}
         if len(course.steps) <= 1 and set(near.tolist()) <= at_once:
             return False  # one impact at all of these stops
@@ -586,10 +588,10 @@ def solve_with_stops(
     t_eval : array_like, optional
         Output times. None: the ends of steps, with two columns at an impact, before and after it.
     law : "moreau" or "sequential", optional
-        Law of an impact that reaches stops which touch already. "moreau": they share one impact, by Moreau's law, which
-        keeps the symmetry of a box that lands flat. "sequential": impacts follow one another, the fastest first, as in
-        Newton's cradle and as with small gaps. None: Moreau's law, with an `ImpactWarning` where the other one gives
-        other velocities.
+        Law of an impact at stops that touch already or close at once. "moreau": they share one impact, by Moreau's law,
+        which keeps the symmetry of a box that lands flat. "sequential": impacts follow one another, the fastest first,
+        as in Newton's cradle and as with small gaps. None: Moreau's law, with an `ImpactWarning` where the other one
+        gives other velocities.
     **options
         Further keyword arguments of `solve_dae`: max_step, compiled, time_limit (of each arc), ...
 

@@ -15,6 +15,7 @@ from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.field_faults import NEAR, all_states, end_of_run, field_faults
 from twoloop.run.record import Record
 from twoloop.run.rerun import FINEST, IndependentRerun, RerunPiece, explicit, implicit, tighter
+from twoloop.run.signals import SignalHandlers
 
 PIECES = 200  # the run is divided into at least this many intervals, also the bound of the step size
 LIMIT = 100.0  # tolerances: largest defect of a step, and largest error of a state, of a run that passes
@@ -104,6 +105,11 @@ class Certificate:
 
 def certify(result: Record, rtol: float | None, atol: ArrayLike | None) -> Certificate:
     """Return the certificate of a result, see `Result.certify`."""
+    with SignalHandlers() as handlers:
+        return _certify(result, rtol, atol, handlers)
+
+
+def _certify(result: Record, rtol: float | None, atol: ArrayLike | None, handlers: SignalHandlers) -> Certificate:
     if result.system is None:
         raise ValueError(
             "certify needs the system: read a file by twoloop.load(path, system), give a result of another solver "
@@ -114,7 +120,7 @@ def certify(result: Record, rtol: float | None, atol: ArrayLike | None) -> Certi
             f"certify verifies a single run of a single system; in this result {result.changes}"
             f"{': certify its parts, result.arcs' if result.arcs else ''}"
         )
-    checker = _Checker(result, result.system, *_tolerances(result, result.system.n_q, rtol, atol))
+    checker = _Checker(result, result.system, *_tolerances(result, result.system.n_q, rtol, atol), handlers)
     faults = tuple(field_faults(result, result.system, checker.rtol, checker.atol, LIMIT))
     defect, t_worst, unseen = _local(checker)
     error, t_error, t_grown = checker.errors() if defect <= LIMIT else (defect, t_worst, np.inf)
@@ -130,7 +136,7 @@ def certify(result: Record, rtol: float | None, atol: ArrayLike | None) -> Certi
     outcome = _Outcome(defect, error, t_worst, gap, unseen, faults, wrong)
     message = outcome.message(result)
     if wrong or faults:
-        warnings.warn(message, CertificateWarning, stacklevel=3)
+        warnings.warn(message, CertificateWarning, stacklevel=4)
     passed = not wrong and error <= LIMIT and not unseen and not faults
     return Certificate(defect, t_worst, gap, LIMIT, tuple(unseen), passed, message, error, faults)
 
@@ -175,7 +181,8 @@ class _Checker:
         Longest time between evaluations so far, s.
     """
 
-    def __init__(self, result: Record, system: ConstrainedSystem, rtol: float, atol: Array):
+    def __init__(self, result: Record, system: ConstrainedSystem, rtol: float, atol: Array, handlers: SignalHandlers):
+        self.handlers = handlers
         self.result, self.sol, self.system, self.rtol, self.atol = result, result.sol, system, rtol, atol
         every_t, self.every_state = all_states(result)
         self.t, first, self.place = np.unique(every_t, return_index=True, return_inverse=True)
@@ -376,6 +383,7 @@ class _Checker:
             int(self.n_steps[i:j].sum()) + int((t1 - t0) / self.longest)
         )
         rerun = remaker.to(t0, start, times, max_attempts if looser == 1.0 else MAX_ATTEMPTS)
+        self.handlers.check()
         if rerun is not None:
             self.gap = max(self.gap, rerun.longest * remaker.spacing)
         return rerun

@@ -52,10 +52,12 @@ from twoloop.run.record import (
     step_fields,
 )
 from twoloop.run.rerun import (
+    FIRST_FORCE,
     checked_region_of,
     compare_callbacks_at,
+    describe_changed_force,
     find_nondeterminism,
-    python_functions,
+    first_force,
 )
 from twoloop.run.run import CONTRADICTS, Run
 from twoloop.run.singular_positions import TURNED
@@ -301,6 +303,8 @@ class CachedIntegrator:
         `inside`: all states lie where callbacks were compared.
         """
         run, region, parameters = self.run, self.region, self.run.varied_parameters
+        if describe_changed_force(run) is not None:
+            return False
         if run.compared_until[0] >= t1 and not due:
             return True
         everywhere = due or (parameters is not None and not region.knows(parameters))
@@ -591,8 +595,7 @@ def _new_run(
     fixed, given, new = options.step_size is not None, system, not system.checked
     if new:
         take_bounds(system)
-    if functions := python_functions(system):
-        functions.restart()
+    first = first_force(system, t0, q0, v0)
     _check_start(system, t0, q0, v0, options.check_derivatives)
 
     def check(traced: Traced) -> None:
@@ -609,6 +612,8 @@ def _new_run(
         unlike = find_nondeterminism(system, states_around(t0, t1, q0, v0))
         if unlike is not None:
             raise ValueError(unlike)
+    if first is not None and not any("force" in each.kinds for each in plan.traced):
+        system.derived.setdefault(FIRST_FORCE, [first])
     run = Run(system, plan, t0, q0, v0, options.rtol, options.atol, options.step_size, interiors)
     options.set_sizes(run, t1)
     if options.max_steps is not None:

@@ -20,6 +20,7 @@ from twoloop.kernels.data.indices import ATOL, RTOL
 from twoloop.kernels.steps.lazy import loaded
 from twoloop.methods.plan import INNER_TOL, Plan
 from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.signals import signals_of
 from twoloop.run.workspace import kit_of, prepare_workspace, static_form, workspace
 
 if TYPE_CHECKING:
@@ -464,7 +465,8 @@ class DenseState:
     def _completed(self) -> Array:
         system, times = self._interpolator.system, np.atleast_1d(self.t)[self._order]
         out = np.empty((len(times), system.n_q + system.n_c + system.n_a))
-        self._interpolator.complete(times, self._rows, out)
+        with signals_of(system):
+            self._interpolator.complete(times, self._rows, out)
         return out
 
     @property
@@ -537,7 +539,8 @@ class DenseSolution:
                 f"{float(np.atleast_1d(times)[np.atleast_1d(outside)][0])!r}"
             )
         order = np.argsort(np.atleast_1d(times), kind="stable")
-        rows = self.interpolator.states(self.table, np.atleast_1d(times)[order])
+        with signals_of(self.interpolator.system):
+            rows = self.interpolator.states(self.table, np.atleast_1d(times)[order])
         return DenseState(self.interpolator, times, order, rows)
 
     def __repr__(self) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ from twoloop.run.run import Run
 
 Array = NDArray[np.float64]
 
+FIRST_FORCE = "first force"  # cache key of a compiled force at the start of a run, unless it is traced
 LATER = 4  # states of the run at which derivatives are checked again, including the last one
 
 
@@ -36,6 +38,8 @@ def compare_callbacks(
 
     Compiled callbacks are not compared again in the region where they were: see CheckedRegion.
     """
+    if changed := describe_changed_force(run):
+        return Status.WRONG_TRACE, f"{changed} {message}"
     region = checked_region_of(run, check_derivatives)
     parameters = run.varied_parameters
     everywhere = region.is_due() or run.system.called_in_python
@@ -79,8 +83,7 @@ def compare_callbacks_at(
             status, message = _derivatives_again(run, states, first, status, message)
         status, message = _traces(run, states, status, message)
         if status == before and run.system.called_in_python and run.control[run.a.FIXED_STEP] == 0.0:
-            unlike = find_changed_force(run.system)
-            unlike = unlike or find_nondeterminism(run.system, states[:: 1 + len(states) // FEW])
+            unlike = find_nondeterminism(run.system, states[:: 1 + len(states) // FEW])
             if unlike is not None:
                 status, message = Status.WRONG_TRACE, f"In the run {unlike}. {message}"
     if status == before:
@@ -130,26 +133,40 @@ def python_functions(system: ConstrainedSystem) -> PythonFunctions | None:
     return PythonFunctions.registry.get(float(system.functions.p[0])) if system.called_in_python else None
 
 
-def find_changed_force(system: ConstrainedSystem) -> str | None:
-    """Describe how a force called in Python differs from what it was in the run for the same arguments, or None.
+def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> tuple[Any, Array] | None:
+    """Return arguments and value of a compiled force at the start; a force called in Python takes its samples anew."""
+    if functions := python_functions(system):
+        functions.restart()
+        return None
+    with suppress(Exception):  # what is wrong is reported by the checks of the start, or in the run
+        return (t0, q0.copy(), v0.copy()), np.asarray(system.force(t0, q0, v0))
+    return None
+
+
+def describe_changed_force(run: Run) -> str | None:
+    """Describe how a force that is called differs from what it was in the run for the same arguments, or None.
 
     A force may change slowly, as with the clock, or once, as after 1000 calls: two calls at the end do not show that.
     """
-    functions = python_functions(system)
-    samples = [] if functions is None else functions.samples.copy()
+    system, functions = run.system, python_functions(run.system)
+    if functions is None:
+        samples, force = system.derived.get(FIRST_FORCE, []), system.force
+    else:
+        samples, force = functions.samples.copy(), functions.functions["force"]
+    if not samples or run.control[run.a.FIXED_STEP] != 0.0:
+        return None
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         for arguments, value in samples:
-            assert functions is not None
             try:
-                again = np.asarray(functions.functions["force"](float(arguments[0]), *map(np.copy, arguments[1:])))
+                again = np.asarray(force(float(arguments[0]), *map(np.copy, arguments[1:])))
             except Exception:  # the state is outside the domain of the force
                 continue
             both = np.isfinite(value) & np.isfinite(again)
             off = np.abs(np.subtract(value, again, out=np.zeros(len(value)), where=both))
             if off.max(initial=0.0) > CLEAR * np.abs(value[both]).max(initial=0.0):
                 entry = int(off.argmax())
-                return _differs(system.name, float(arguments[0]), entry, value[entry], again[entry])
+                return f"In the run {_differs(system.name, float(arguments[0]), entry, value[entry], again[entry])}."
     return None
 
 

@@ -27,6 +27,7 @@ from twoloop.run.loop import IntegrationLoop, Interrupts
 from twoloop.run.messages import warn_of_singular_end, warn_user
 from twoloop.run.record import MemoryStore, OutputRequest, Record, Status, statistics
 from twoloop.run.run import Run
+from twoloop.run.signals import signals_of
 
 Array = NDArray[np.float64]
 
@@ -158,20 +159,24 @@ class SampledRun:
             self._return()
         end, began = self.times[-1] + dt, time.process_time()
         self._failed = True  # until the end is reached, as a callback may raise
+        with signals_of(self.system):
+            self._step_to(end)
+        self.cpu += time.process_time() - began
+        self._note(end)
+        return self.state
+
+    def _step_to(self, end: float) -> None:
+        """Integrate from the last sample to the end of the next one, again if that met a short change."""
         for _ in range(MOST):
             self._go_to(end)
             if not may_have_missed_changes(self.run):
-                break
+                return
             if len(self.times) > 1:  # earlier samples may have missed something, and are not repeated
                 warn_of_missed_changes(self.run)
             self._every = closer(self.run)
             self._return()
-        else:
-            self._go_to(end)
-            warn_of_missed_changes(self.run)
-        self.cpu += time.process_time() - began
-        self._note(end)
-        return self.state
+        self._go_to(end)
+        warn_of_missed_changes(self.run)
 
     def _go_to(self, end: float) -> None:
         """Integrate from the last sample to the end of the next one."""

@@ -3,11 +3,13 @@
 import _signal  # type: ignore[import-not-found]  # `signal` makes enumerations of handlers, which takes 8 microseconds
 import signal
 import threading
+from contextlib import AbstractContextManager, nullcontext
 from types import FrameType, TracebackType
 from typing import Any
 
 from twoloop.problem.callbacks import PythonFunctions
 from twoloop.problem.events import Event
+from twoloop.problem.system import ConstrainedSystem
 
 CALLS_A_USER = (PythonFunctions.call.__code__, Event.__call__.__code__)
 COMPILERS = ("numba", "llvmlite")  # packages that an exception between two instructions leaves unusable
@@ -71,6 +73,11 @@ class SignalHandlers:
         if error is not None and error is self._raised:
             self._raised = None  # it arrives with its own traceback
         self.leave()
+
+
+def signals_of(system: ConstrainedSystem) -> AbstractContextManager[Any]:
+    """Return a context for machine code that calls functions of the system in Python, where handlers may run."""
+    return SignalHandlers() if system.called_in_python else nullcontext()
 
 
 def within_a_users_function(frame: FrameType | None) -> bool:
