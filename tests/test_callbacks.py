@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from tests.compiled import HEAVY_PENDULUM, centripetal, circle, heavy, radius, unit_mass, weight
-from tests.marks import slow
 from tests.problems import pendulum, quick
 from twoloop import ConstrainedSystem, Status, callback, solve_dae
 from twoloop.kernels.compile.callbacks import KINDS, OPTIONAL
@@ -276,18 +275,6 @@ def sampled_controller():
     return force
 
 
-def delayed():
-    before = []
-
-    def force(t, q, v):
-        while before and before[-1][0] >= t:
-            before.pop()
-        before.append((t, v[0]))
-        return -2.0 * np.interp(t - 0.2, *zip(*before, strict=True))
-
-    return force
-
-
 @pytest.mark.parametrize("method", quick(["auto", "RadauIIA9"]))
 @pytest.mark.parametrize("make", [noise, sampled_controller])
 def test_memory_is_named_at_the_start(make, method):
@@ -304,7 +291,7 @@ def timed():
     return lambda t, q, v: -2.0 * v[0] if v[0] > 1e9 else time.monotonic()
 
 
-@pytest.mark.parametrize("make", [lambda: tired(60), lambda: tired(250), timed, slow(delayed)])
+@pytest.mark.parametrize("make", [lambda: tired(60), lambda: tired(250), timed])
 def test_memory_that_shows_along_the_motion_is_named_at_its_end(make):
     """The force changes once, so that two calls at the end of the run agree, or slowly, or late."""
     result = solve_dae(pushed_by(make()), (0.0, 1.0), *BESIDE, "DOP853")

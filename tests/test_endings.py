@@ -258,21 +258,16 @@ class Alarm(Exception):
     pass
 
 
-def step(system):
-    integrator = Integrator(system)
-    integrator.start(0.0, *START)
-    integrator.step(0.1)
-
-
-def interpolate(system):
-    solve_dae(system, (0.0, 1.0), *START, dense_output=True).sol(np.linspace(0.0, 1.0, 300))
+WORK = {
+    "runs": lambda system: solve_dae(system, (0.0, 10.0), *START, "RadauIIA5", 1e-6, 1e-6),
+    "samples": lambda system: [(sampled := Integrator(system)).start(0.0, *START), sampled.step(0.1)],
+    "dense": lambda system: solve_dae(system, (0.0, 1.0), *START, dense_output=True).sol(np.linspace(0.0, 1.0, 300)),
+}
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no timers that send signals")
 @pytest.mark.parametrize(("error", "after"), [(Alarm, 0.003), (KeyboardInterrupt, 0.0171), (Alarm, 0.0533)])
-@pytest.mark.parametrize(
-    "work", [lambda system: solve_dae(system, (0.0, 10.0), *START, "RadauIIA5", 1e-6, 1e-6), step, interpolate]
-)
+@pytest.mark.parametrize("work", WORK.values(), ids=WORK)
 def test_an_exception_of_a_signal_handler_arrives_as_itself(work, error, after):
     """Handlers run at any instruction of Python, also at those of numba between pieces of machine code."""
 

@@ -120,24 +120,19 @@ def test_the_first_touch_of_a_shaking_table_is_found(size=5e-3, rate=300.0):
     assert result.impacts[0].t == pytest.approx(first, abs=1.1e-5)
 
 
-@pytest.mark.parametrize(("above", "method"), [(1e-6, "auto"), *(slow(1e-8, name) for name in ("RadauIIA5", "BDF"))])
+@pytest.mark.parametrize(
+    ("above", "method"), [(1e-6, "auto"), (-1e-8, "auto"), slow(1e-8, "RadauIIA5"), slow(1e-8, "BDF")]
+)
 def test_a_ball_that_grazes_a_ceiling_between_two_looks_hits_it(above, method):
-    """The gap is closed for 0.1 ms to 9 ms, and looked at every 0.5 ms or more rarely."""
+    """The gap is closed for 0.1 ms to 9 ms, or not at all, and looked at every 0.5 ms or more rarely."""
     height, e, end = 0.437, 0.5, 1.0
     system = unconstrained(lambda t, q, v: np.array([-GRAVITY]))
-    speed, hit = np.sqrt(2.0 * GRAVITY * (height + above)), np.sqrt(2.0 * GRAVITY * above)
+    speed, hit = np.sqrt(2.0 * GRAVITY * (height + above)), np.sqrt(2.0 * GRAVITY * max(0.0, above))
     ceiling = Stop(lambda t, q: height - q[0], e, "ceiling")
     result = solve_with_stops(system, (0.0, end), [0.0], [speed], ceiling, method, **TIGHT)
-    assert len(result.impacts) == 1
-    rest = end - (speed - hit) / GRAVITY
-    assert abs(result.v[0, -1] + e * hit + GRAVITY * rest) < 1e-4 * hit + 1e-6
-
-
-def test_a_ball_that_does_not_reach_a_ceiling_does_not_hit_it():
-    system = unconstrained(lambda t, q, v: np.array([-GRAVITY]))
-    speed = np.sqrt(2.0 * GRAVITY * (0.437 - 1e-8))
-    result = solve_with_stops(system, (0.0, 1.0), [0.0], [speed], Stop(lambda t, q: 0.437 - q[0], 0.5), **TIGHT)
-    assert result.success and not result.impacts and abs(result.v[0, -1] - speed + GRAVITY) < 1e-8
+    assert result.success and len(result.impacts) == (above > 0.0)
+    reached, rest = (e * hit, end - (speed - hit) / GRAVITY) if above > 0.0 else (-speed, end)
+    assert abs(result.v[0, -1] + reached + GRAVITY * rest) < 1e-4 * hit + 1e-6
 
 
 def test_two_stops_on_one_side_of_which_one_moves():

@@ -21,6 +21,7 @@ from twoloop.result.result import Result
 from twoloop.run.options import check_method, check_options
 from twoloop.run.record import record_of
 from twoloop.run.sampled import SampledRun, SampledState
+from twoloop.run.signals import signals_of
 from twoloop.solve import solve_dae
 
 MOST = 64  # largest number of cached systems with other parameters
@@ -154,7 +155,8 @@ class Integrator:
             self._options.get("check_derivatives", True),
         )
         asked = self._options["method"], float(rtol), atol, float(max_step), checks
-        self._sampled = SampledRun(system, *asked, t0, q, v)
+        with signals_of(system):
+            self._sampled = SampledRun(system, *asked, t0, q, v)
         if self._sampled.run.rows_warning:
             warnings.warn(self._sampled.run.rows_warning, ConstraintWarning, stacklevel=2)
         return self._sampled.state

@@ -134,7 +134,7 @@ def join_arcs(
     else:
         table = list(ArcSolution(arcs, system.n_c, system.n_a)(times[times <= last.t[-1]]))
     status, message = (Status.STAGNATED, stagnated) if stagnated else (last.status, last.message)
-    if not stagnated and len(arcs) > 1:
+    if not stagnated and (len(arcs) > 1 or impacts):
         message += f" {summary}"
     counts: dict[str, Any] = {
         name: _concatenated(arcs, name) for name in ("rejected_error", "rejected_convergence", "partitioned")

@@ -25,6 +25,7 @@ from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import indices
 from twoloop.kernels.evaluation import tasks
 from twoloop.problem.system import ConstrainedSystem, check_system
+from twoloop.run.signals import signals_of
 from twoloop.run.workspace import kit_of, static_form, workspace
 
 Array = NDArray[np.float64]
@@ -267,6 +268,13 @@ def consistent_state(
     (True, True)
     """
     check_system(system)
+    with signals_of(system):
+        return _consistent_state(system, t, q, v, keep, check_assembly)
+
+
+def _consistent_state(
+    system: ConstrainedSystem, t: float, q: ArrayLike, v: ArrayLike, keep: Any, check_assembly: bool
+) -> ConsistentState:
     check_flag("check_assembly", check_assembly)
     t = check_finite("t", t)
     guess = check_vector("q", q, system.n_q)
