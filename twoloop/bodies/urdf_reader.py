@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import permutations
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -30,11 +31,13 @@ from twoloop.bodies.file_parts import (
     tensor_of,
     text_of,
 )
+from twoloop.bodies.loads import function_rows
 from twoloop.bodies.mjcf_loads import Polynomial
 from twoloop.bodies.parameter_layout import POINT
 from twoloop.bodies.parts import Body, JointRow, ModelJoint, Numbers
-from twoloop.bodies.rotation import perpendiculars
-from twoloop.bodies.spatial.model import SpatialModel, across
+from twoloop.bodies.rotation import euler_parameters, perpendiculars
+from twoloop.bodies.rotation_rates import euler_product, parameters_of
+from twoloop.bodies.spatial.model import SpatialModel
 from twoloop.checks.arguments import Array, check_choice, check_finite, check_flag, check_path, check_vector
 
 KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "floating": "free", "fixed": ""}
@@ -276,10 +279,18 @@ class _Reader:
         ends = [(body_of(self.model, part), start_pose(part, frame)) for part, frame in map(self._frame, (a, b))]
         (body_a, _), (body_b, _) = ends
         on_a, on_b = (Numbers(tuple(body.local_point(frame.x).tolist())) for body, frame in ends)
-        axes_a, axes_b = ([body.local_direction(column) for column in frame.R.T] for body, frame in ends)
-        turns = [across(body_a, axes_a[i], body_b, axes_b[j]) for i, j in ((0, 1), (0, 2), (1, 2))]
-        rows = JointRow(POINT, 3, body_a, body_b, on_a, on_b), *turns
-        self.model.joints.append(ModelJoint(f"{a} on {b}", "weld", body_a, body_b, rows, on_a, on_b))
+        zero_a, zero_b = (euler_parameters(body.rotation.T @ frame.R) for body, frame in ends)
+        back = [zero_a[0], *-zero_a[1:]]
+
+        def turn(q: Any, k: int) -> Any:
+            """Return a component of the relative Euler parameters, which have no second zero within a turn."""
+            frame = euler_product(parameters_of(q, body_b.number), zero_b)
+            return euler_product(back, euler_product(parameters_of(q, body_a.number, -1.0), frame))[k]
+
+        name, carrying = f"{a} on {b}", (body_a, body_b, on_a, on_b)
+        turns = function_rows(name, [partial(turn, k=k) for k in (1, 2, 3)], (body_a, body_b), carrying)
+        rows = JointRow(POINT, 3, *carrying), *turns
+        self.model.joints.append(ModelJoint(name, "weld", body_a, body_b, rows, on_a, on_b))
 
     def link_of(self, name: str) -> str:
         """Return the name of a link at the end of a loop, which may be given by the joint that carries it."""
