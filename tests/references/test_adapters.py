@@ -187,9 +187,11 @@ NANS += [(name, "constraint") for name in ("DOP853, projected", "IDA, stabilised
 NANS += [(name, "gamma") for name in ("DOP853, index 1", "IDA, index1")]
 
 
-@pytest.mark.slow  # of IDA, test_ida.py has one that is not
-@pytest.mark.parametrize("every_step", [True, False])
-@pytest.mark.parametrize(("name", "kind"), NANS)
+QUICK_NAN = ("IDA, stabilised", "force")
+
+
+@pytest.mark.parametrize("every_step", [slow(True), False])
+@pytest.mark.parametrize(("name", "kind"), [pair if pair == QUICK_NAN else slow(*pair) for pair in NANS])
 def test_a_function_that_becomes_nan_is_a_row(name, kind, every_step, capfd):
     began, more = time.monotonic(), {} if every_step else {"t_eval": np.linspace(0.0, 2.0, 101)}
     result = ADAPTERS[name](late(kind, lambda: np.nan), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], **more)
