@@ -28,7 +28,7 @@ CASES = {
         <joint type="slide" axis="1 0 1" damping="3"/><joint axis="0 1 0" springdamper="0.2 1"/>{INERTIAL}
         <body pos="0 0 1"><joint type="slide" axis="0 1 1" stiffness="5" armature="1"/>{INERTIAL}{TIP}</body></body>
         </worldbody>""",
-    "balls": f"""<worldbody><body><joint type="ball" pos="0.1 0 0" armature="0.4"/>{INERTIAL}{TIP}</body>
+    "balls": f"""<worldbody><body><joint type="ball" pos="0.1 0 0" armature="0.4" stiffness="2"/>{INERTIAL}{TIP}</body>
         <body pos="0 0 2"><joint type="free" armature="0.2"/>{INERTIAL}{TIP.replace("tip", "t").replace("last", "l")}
         </body></worldbody>""",
     "frames": f"""<default><default class="x"><joint axis="1 0 0" damping="0.3"/></default></default><worldbody>

@@ -118,11 +118,11 @@ class MujocoModel:
         )
         loops = np.isin(engine.eq_type, kept)
         engine.eq_active0[~loops] = 0
-        scalar_joints = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+        free = int(mujoco.mjtJoint.mjJNT_FREE)
         for k in range(engine.njnt):
             dofs = engine.dof_jntid == k
             higher = engine.jnt_stiffnesspoly[k].any() or engine.dof_dampingpoly[dofs].any()
-            if higher or (int(engine.jnt_type[k]) not in scalar_joints and engine.jnt_stiffness[k]):
+            if higher or (int(engine.jnt_type[k]) == free and engine.jnt_stiffness[k]):
                 engine.jnt_stiffness[k] = engine.jnt_stiffnesspoly[k] = 0.0
                 engine.dof_damping[dofs] = engine.dof_dampingpoly[dofs] = 0.0
         winding = mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 from xml.etree.ElementTree import Element
 
@@ -20,13 +20,15 @@ from twoloop.bodies.file_parts import (
     start_pose,
     text_of,
 )
+from twoloop.bodies.frames import vector_of
 from twoloop.bodies.mjcf_actuators import TendonsAndActuators, is_single
 from twoloop.bodies.parameter_layout import HINGE_ROTOR, SLIDE_ROTOR
 from twoloop.bodies.parts import Body, Force, Numbers
-from twoloop.bodies.rotation import rotation_matrix
-from twoloop.bodies.rotation_rates import rate_of_vector, spin_of
+from twoloop.bodies.rotation import euler_parameters, rotation_matrix
+from twoloop.bodies.rotation_rates import euler_product, parameters_of, rate_of_vector, spin_of
 from twoloop.checks.arguments import Array, shown
 
+SMALL = 1e-9  # sine of half the angle of a ball, below which its spring is linear
 AT_REST = 1e-12  # rad/s or m/s: slower joints of a keyframe rest, as rounding errors may contradict closed loops
 AGREES = 1e-6  # tolerance of the pose that a weld prescribes
 
@@ -177,8 +179,8 @@ class Loads(TendonsAndActuators):
         if not any(float(x) for x in (*stiffness, *damping)):
             return
         stiff, damped = any(float(x) for x in stiffness[1:]), any(float(x) for x in damping[1:])
-        if not single and not any(float(x) for x in stiffness) and not damped:
-            self._damp(joint, float(damping[0]))
+        if not (single or stiff or damped) and (joint.kind == "ball" or not float(stiffness[0])):
+            self._resist(joint, float(stiffness[0]), float(damping[0]))
             return
         if not single or stiff or damped:
             self.ignored.append(f"stiffness and damping of joint {joint.name!r}")
@@ -186,14 +188,21 @@ class Loads(TendonsAndActuators):
         rest = self._unit(joint) * (float(given.get("springref", 0.0)) - float(given.get("ref", 0.0)))
         self._law(joint, float(stiffness[0]), float(damping[0]), rest - joint.displacement, None)
 
-    def _damp(self, joint: FileJoint, damping: float) -> None:
-        """Add the damper of a ball or a free joint: forces against its rates."""
+    def _resist(self, joint: FileJoint, stiffness: float, damping: float) -> None:
+        """Add spring and damper of a ball, which has no torque in the reference pose, or the damper of a free joint."""
         part = next(each for each in self.reader.parts if joint in each.freed)
         body, parent = self._of(part), self._of(part.parent)
-        turn = _Slowing(body, parent, damping, 1.0)
+        outer = np.eye(3) if part.parent is None else part.parent.pose.R
+        zero = euler_parameters(part.pose.R.T @ outer)
+        start = [euler_parameters(each.rotation) for each in (parent, body)]
+        start[0][1:] *= -1.0
+        if euler_product(zero, euler_product(*start))[0] < 0.0:  # of two signs the one within half a turn
+            zero = -zero
+        numbers_of = stiffness, damping, tuple(zero.tolist())
+        turn = _Resisting(body, parent, *numbers_of, 1.0)
         self.model.torque(body, turn, name=self.reader.free(None, f"damper of {joint.name}"))
         if parent is not self.model.ground:
-            back = _Slowing(body, parent, damping, -1.0)
+            back = _Resisting(body, parent, *numbers_of, -1.0)
             self.model.torque(parent, back, name=self.reader.free(None, f"reaction of the damper of {joint.name}"))
         if joint.kind == "free":
             assert part.start is not None
@@ -291,15 +300,28 @@ class Polynomial:
         return first + self.offsets[0] - total
 
 
-class _Slowing:
-    """Evaluate the torque of a damper against the angular velocity of a body relative to another."""
+@dataclass(frozen=True, eq=False)
+class _Resisting:
+    """Evaluate the torque of a spring and damper against the rotation of a body relative to another."""
 
-    def __init__(self, body: Body, parent: Body, damping: float, sign: float):
-        self.body, self.parent, self.factor = body, parent, -sign * damping
+    body: Body
+    parent: Body
+    stiffness: float
+    damping: float
+    zero: tuple[float, ...]  # relative Euler parameters without torque, inverse
+    sign: float
 
     def __call__(self, t: Any, q: Any, v: Any) -> Any:
-        spins = zip(spin_of(q, v, self.body.number), spin_of(q, v, self.parent.number), strict=True)
-        return [self.factor * (own - other) for own, other in spins]
+        own, other = self.body.number, self.parent.number
+        spins = zip(spin_of(q, v, own), spin_of(q, v, other), strict=True)
+        torque = [self.damping * (x - y) for x, y in spins]
+        if self.stiffness:
+            relative = euler_product(parameters_of(q, other, -1.0), parameters_of(q, own))
+            w, *e = euler_product(self.zero, relative)
+            s = np.sqrt(sum(x * x for x in e) + SMALL * SMALL)
+            turn = self.stiffness * 4.0 * np.arctan(s / (w + 1.0)) / s  # the angle over the sine of its half
+            torque = [x + y for x, y in zip(torque, vector_of(q, own, [turn * x for x in e]), strict=True)]
+        return [-self.sign * x for x in torque]
 
 
 class _Dragging:
