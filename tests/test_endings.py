@@ -306,6 +306,14 @@ def test_real_signals_while_compiled_code_python_callbacks_and_events_run():
         assert compiled.stats.n_accepted > 100
         for k, events in enumerate((None, lambda t, q, v: q[0], None, lambda t, q, v: q[0])):
             interrupted(system, [0.0, -1.0], [3.0, 0.0], after=0.1 + 0.0137 * k, events=events)
+        solution = solve_dae(system, (0.0, 1.0), [0.0, -1.0], [3.0, 0.0], dense_output=True).sol
+        for k in range(5):
+            threading.Timer(0.1 + 0.0137 * k, os.kill, (os.getpid(), signal.SIGINT)).start()
+            try:
+                while True:
+                    solution([0.001 * i for i in range(1000)])
+            except KeyboardInterrupt:
+                pass
     """)
 
 

@@ -105,7 +105,7 @@ class Certificate:
 
 def certify(result: Record, rtol: float | None, atol: ArrayLike | None) -> Certificate:
     """Return the certificate of a result, see `Result.certify`."""
-    with SignalHandlers() as handlers:
+    with SignalHandlers(ctrl_c=True) as handlers:
         return _certify(result, rtol, atol, handlers)
 
 

@@ -25,15 +25,20 @@ class SignalHandlers:
     of the process. Handlers wait there. Elsewhere they run at once, but the exception may be taken for one of a
     callback, as for a force that has no value; it is therefore raised again by `check`, between chunks of steps, and
     by `leave`.
+
+    Parameters
+    ----------
+    ctrl_c : bool
+        Whether Python's own handler of Ctrl-C is called like this, too. Runs replace it by one of theirs.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, ctrl_c: bool = False) -> None:
         self._before: dict[int, Any] = {}
         self._waiting: list[tuple[int, FrameType | None]] = []
         self._raised: BaseException | None = None
         for number in NUMBERS:
             handler = _signal.getsignal(number)
-            if callable(handler) and handler is not signal.default_int_handler:
+            if callable(handler) and (ctrl_c or handler is not signal.default_int_handler):
                 if threading.current_thread() is not threading.main_thread():
                     break  # other threads get no signals
                 self._before[number] = handler
@@ -77,7 +82,7 @@ class SignalHandlers:
 
 def signals_of(system: ConstrainedSystem) -> AbstractContextManager[Any]:
     """Return a context for machine code that calls functions of the system in Python, where handlers may run."""
-    return SignalHandlers() if system.called_in_python else nullcontext()
+    return SignalHandlers(ctrl_c=True) if system.called_in_python else nullcontext()
 
 
 def within_a_users_function(frame: FrameType | None) -> bool:
