@@ -28,8 +28,8 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     mass_of,
     order_of,
     program_in_order,
+    runs_of,
     stiffened_of,
-    targets_of,
 )
 
 MIN_PIVOT = 1e-11  # relative to the numbers of which the pivot is the difference: a smaller one is rounding
@@ -116,8 +116,8 @@ def factor(program, counts, values, sizes):
     Redundant rows, 0 in `counts`, have 0 on the diagonal and do not take part. `sizes` is scratch of real numbers.
     """
     n_q, n, off = program[N_COORDINATES], program[N_PIVOTS], program[N_OFF]
-    order, targets = order_of(program), targets_of(program)
-    begin, _ = columns_of(program)
+    order, runs = order_of(program), runs_of(program)
+    begin, row_of = columns_of(program)
     for k in range(n):
         sizes[k] = abs(values[k])
     u = 0
@@ -128,7 +128,10 @@ def factor(program, counts, values, sizes):
             for s in range(first, last):
                 values[s] = 0.0
                 values[s + off] = 0.0
-            u += (last - first) * (last - first + 1) // 2
+                r = s + 1
+                while r < last:
+                    r += runs[u]
+                    u += 2
             continue
         if not abs(values[k]) > MIN_PIVOT * sizes[k]:  # also true for NaN
             return False
@@ -136,16 +139,23 @@ def factor(program, counts, values, sizes):
         values[k] = inverse
         for s in range(first, last):
             one, other = values[s] * inverse, values[s + off] * inverse
-            target = targets[u]  # target on the diagonal
+            target = row_of[s - n]
             change = one * values[s + off]
             values[target] -= change
             sizes[target] += abs(change)
-            u += 1
-            for r in range(s + 1, last):
-                target = targets[u]
-                values[target] -= values[r] * other
-                values[target + off] -= one * values[r + off]
-                u += 1
+            r = s + 1
+            while r < last:
+                size, target = runs[u], runs[u + 1]
+                if other != 0.0:
+                    into, own = values[target : target + size], values[r : r + size]
+                    for i in range(size):
+                        into[i] -= own[i] * other
+                if one != 0.0:
+                    into, own = values[target + off : target + off + size], values[r + off : r + off + size]
+                    for i in range(size):
+                        into[i] -= one * own[i]
+                r += size
+                u += 2
             values[s] = one
     return True
 

@@ -235,10 +235,10 @@ def _minimum_degree(
 Entries = tuple[Integers, Integers]  # rows and columns
 
 # places in the program; the sections that the functions below return follow
-N_COORDINATES, N_PIVOTS, N_OFF, N_UPDATES, N_OF_MASS, N_OF_JACOBIAN, N_STIFFENED, N_HEAD = range(8)
+N_COORDINATES, N_PIVOTS, N_OFF, N_UPDATES, N_RUNS, N_OF_MASS, N_OF_JACOBIAN, N_STIFFENED, N_HEAD = range(9)
 ALWAYS_ALLOWED_UPDATES = 3_000_000  # largest number of updates (multiplications) for which a program always pays ...
 MAX_UPDATE_SHARE = 1e-3  # ... above it, a program pays up to this share of n^3 ...
-MAX_UPDATES = 30_000_000  # ... and up to this number, because of memory: four bytes for each
+MAX_UPDATES = 30_000_000  # ... and up to this number, because of the memory that making the program takes
 
 
 def factorization_program(
@@ -293,7 +293,8 @@ def program_in_order(
         i, j = _pairs(len(each))
         firsts.append(each[i])
         seconds.append(each[j])
-    targets = slots(np.concatenate(firsts), np.concatenate(seconds))
+    first_of, second_of = np.concatenate(firsts), np.concatenate(seconds)
+    runs = _runs(slots(first_of, second_of), first_of == second_of)
     source = slots(low, high)
     n_mass = len(mass[0])
     # entries of the other triangle: without U, they get a slot that is never read
@@ -302,9 +303,21 @@ def program_in_order(
     which, first, second = _products(jacobian[0], stiff_rows)
     one, other = (position[jacobian[1][each]] for each in (first, second))
     stiffened = [which, first, second, slots(np.minimum(one, other), np.maximum(one, other))]
-    head = [n_q, n, len(keys), len(targets), n_mass, len(jacobian[0]), len(which)]
-    parts = [order, begin, row_of, targets, *mass, source[:n_mass], *jacobian, source[n_mass:], *stiffened]
+    head = [n_q, n, len(keys), len(first_of), len(runs), n_mass, len(jacobian[0]), len(which)]
+    parts = [order, begin, row_of, runs, *mass, source[:n_mass], *jacobian, source[n_mass:], *stiffened]
     return np.concatenate([np.array(head), *parts]).astype(np.int32)
+
+
+def _runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
+    """Return length and first target of each run of updates off the diagonal whose targets follow one another.
+
+    The rows of a joint are neighbours in all columns, so that runs are long: the numbers of one are read and written as
+    vectors, and the program is a tenth as long as a list of all targets.
+    """
+    off = np.flatnonzero(~diagonal)
+    begins = np.flatnonzero(diagonal[off - 1] | (targets[off] != targets[off - 1] + 1))
+    lengths = np.diff(np.append(begins, len(off)))
+    return np.stack([lengths, targets[off][begins]], axis=1).ravel()
 
 
 def _products(rows: Integers, chosen: Sequence[int]) -> tuple[Integers, Integers, Integers]:
@@ -349,7 +362,7 @@ def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]
 @inlined
 def end_of_sections(program):
     """Return the place behind the sections of a program."""
-    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_UPDATES]
+    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_RUNS]
     return first + 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN]) + 4 * program[N_STIFFENED]
 
 
@@ -368,17 +381,17 @@ def columns_of(program):
 
 
 @inlined
-def targets_of(program):
-    """Return the slots that the updates change, pivot by pivot."""
+def runs_of(program):
+    """Return length and first slot of the runs of updates off the diagonal, pivot by pivot and entry by entry."""
     first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF]
-    return program[first : first + program[N_UPDATES]]
+    return program[first : first + program[N_RUNS]]
 
 
 @inlined
 def mass_of(program):
     """Return rows, columns and slots of the values of M."""
     n = program[N_OF_MASS]
-    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_UPDATES]
+    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_RUNS]
     return program[first : first + n], program[first + n : first + 2 * n], program[first + 2 * n : first + 3 * n]
 
 
@@ -386,7 +399,7 @@ def mass_of(program):
 def jacobian_of(program):
     """Return rows, columns and slots of the values of G."""
     n = program[N_OF_JACOBIAN]
-    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_UPDATES] + 3 * program[N_OF_MASS]
+    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_RUNS] + 3 * program[N_OF_MASS]
     return program[first : first + n], program[first + n : first + 2 * n], program[first + 2 * n : first + 3 * n]
 
 
@@ -394,7 +407,7 @@ def jacobian_of(program):
 def stiffened_of(program):
     """Return rows, two entries of each, and slots of the products that stiffen M."""
     n = program[N_STIFFENED]
-    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_UPDATES]
+    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_RUNS]
     first += 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN])
     middle = first + 2 * n
     slots = program[middle + n : middle + 2 * n]
