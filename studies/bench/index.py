@@ -22,6 +22,7 @@ REPORTS = {  # and their questions, in the order of the index
     "claims": "Which of the paper's claims hold?",
     "energy": "Which methods keep the energy over long times?",
     "ensembles": "What do thousands of runs cost in one call?",
+    "models": "Which model files are read, and are the models right?",
     "scale": "How do costs grow with the number of bodies?",
     "work_precision": "What does an accuracy cost, beside all other solvers?",
     "reproduction": "Do the paper's figures come out again?",
@@ -29,7 +30,7 @@ REPORTS = {  # and their questions, in the order of the index
 # claims reads the rows of the others
 STUDIES = (
     *("work_precision", "table3", "energy", "validation", "honesty", "planted_errors", "ensembles", "scale", "engines"),
-    *("reproduction", "claims"),
+    *("models", "reproduction", "claims"),
 )
 
 

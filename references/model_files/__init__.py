@@ -1,0 +1,1 @@
+"""Random model files, to test readers of them."""
