@@ -11,6 +11,7 @@ from twoloop.kernels.control.loop_state import EXPONENT, FACTOR_MIN, SAFETY
 from twoloop.kernels.control.singular_positions import (
     SHORT,
     check_partition,
+    comes_near_singular,
     ends_at_singular,
     fails_at_singular,
     near_singular,
@@ -289,6 +290,11 @@ def advance(
             if not retry_with_care(f, w, control, clock, size):
                 clock[at.H_NEXT], clock[at.PIVOT_HERE] = 0.5 * size, w.notes[PIVOT]
             continue
+        if accepted and not leaps and comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_state):
+            f.settle(f, w, options, memory, tolerances, False)
+            w.counters[N_REJECTED_ERROR] += 1
+            clock[at.FAILURE_CODE] = SINGULAR
+            return at.NEAR_SINGULAR
         driven = control[at.DRIVEN] == 1.0 and not leaps
         if driven and _before_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
             f.settle(f, w, options, memory, tolerances, False)

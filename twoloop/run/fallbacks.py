@@ -95,7 +95,11 @@ def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Arr
 LENGTHS = tuple(0.85**k for k in range(28))
 LONGER = tuple(1.4**k for k in range(1, 7))  # ... and those to try if too few nodes of that one are beyond it
 FAR = 0.2  # relative to the largest pivot: a state farther from the singular position is a base of the polynomial
-LONGEST_PAST = 1.5  # relative to the longest of the last steps: no base is older
+# factors on tolerances, and on the longest time without an evaluation, of the last attempts across
+LOOSER, WIDER = 10.0, 4.0
+# no base is older than this, relative to the longest of the last steps, or to twice the time to the position
+LONGEST_PAST, FARTHEST = 1.5, 4.0
+BEYOND = 0.5  # relative to the farthest state: one before it that is nearer lies beyond another singular position
 SMALL = 1e-300  # avoids a division by zero
 CLEAR = 0.3  # relative to the largest pivot that C_q had: above it the run's own steps continue
 
@@ -150,11 +154,15 @@ def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
 
     plan = _crossing_plan(run.system.n_q)
     earliest, fixed = max(clock[a.T_START], clock[a.LAST_CHANGE], *run.jumps), run.control[a.FIXED_STEP] > 0.0
-    base = None if fixed else _state_farther_away(run, [place for place in past if place[0] >= earliest])
+    base, run.mirrored = None, 0.0
+    if not fixed:
+        base, run.mirrored = _state_farther_away(run, [place for place in past if place[0] >= earliest])
     # a force that jumped may spoil nodes in the past, and beside the start of the run there may be too few of them
-    run.origins = [(earliest, base), (np.inf, None)]
+    run.origins = [(earliest, base, False), (np.inf, None, False)]
     if float(clock[a.T] - clock[a.T_START]) < clock[a.H_LONG] and not run.system.called_in_python:
-        run.origins.append((-np.inf, None))
+        run.origins.append((-np.inf, None, False))
+    if not fixed:
+        run.origins.append((earliest, base, True))
     run.crossings.append([base or (float(clock[a.T]), run.state.copy())])
     control = run.control.copy()
     control[: a.N_RULE] = plan.rule
@@ -162,7 +170,6 @@ def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
     control[a.MAY_SWITCH] = control[a.MAKES_MANY] = 0.0
     if control[a.FIXED_STEP] == 0.0:
         control[a.MAX_EVALUATION_GAP] = 1.0 if run.narrow else UNSEEN / (1.0 - BACK)
-        control[a.MAX_STEP] = min(run.max_step, run.tolerances[indices.GAP] / control[a.MAX_EVALUATION_GAP])
     clock[a.LIMIT_AGE] = 0.0
     _next_origin(run, plan, control)
     return plan, control
@@ -173,31 +180,47 @@ def _next_origin(run: Run, plan: Plan, control: Array) -> None:
     from twoloop.kernels.steps.crossing_step import begin
 
     a, clock = run.a, run.clock
-    begin(plan.memory, clock[a.LARGEST_PIVOT], *run.origins.pop(0))
+    earliest, base, looser = run.origins.pop(0)
+    begin(plan.memory, clock[a.LARGEST_PIVOT], earliest, base)
+    run.looser = run.tolerances
+    if looser:
+        run.looser = run.tolerances.copy()
+        run.looser[[indices.RTOL, indices.LEAST]] *= LOOSER
+        run.looser[indices.ATOL :] *= LOOSER
+        run.looser[indices.GAP] *= WIDER
+    if control[a.FIXED_STEP] == 0.0:
+        control[a.MAX_STEP] = min(run.max_step, run.looser[indices.GAP] / control[a.MAX_EVALUATION_GAP])
     longest, allowed = float(clock[a.H_LONG]), float(control[a.MAX_STEP])
-    run.lengths = lengths_across(longest, allowed)
-    run.longer = [longest * part for part in LONGER if longest * part <= allowed]
+    first = max(longest, min(run.mirrored, LONGER[-1] * longest))
+    run.lengths = lengths_across(first, allowed)
+    run.longer = [longest * part for part in LONGER if first < longest * part <= allowed]
     clock[a.H_NEXT], clock[a.H_LIMIT] = run.lengths.pop(0), np.inf
     run.crossed = float(clock[a.H_NEXT])
 
 
-def _state_farther_away(run: Run, past: list[Place]) -> Place | None:
+def _state_farther_away(run: Run, past: list[Place]) -> tuple[Place | None, float]:
     """Return the latest of these states that is well away from the singular position, else the farthest of them.
 
-    Rounding changes velocities by eps/s^2 at a distance s, as the smallest singular value measures it.
+    Rounding changes velocities by eps/s^2 at a distance s, as the smallest singular value measures it. There is none
+    (None) if the present state is farther away. Returned, too: the length of the step that leads as far beyond the
+    position as that state is before it, s, if the distance changes evenly; 0 if the motion does not approach.
     """
     a, n, t = run.a, run.system.n_q, float(run.clock[run.a.T])
     here = least_singular_value(run.system, t, run.state[:n], run.rank)
-    farthest = run.work.notes[indices.PIVOT] / max(float(run.clock[a.LARGEST_PIVOT]), SMALL)
-    scale = farthest / here if here > 0.0 else np.inf
-    found: Place | None = None
+    farthest = now = run.work.notes[indices.PIVOT] / max(float(run.clock[a.LARGEST_PIVOT]), SMALL)
+    scale = now / here if here > 0.0 else np.inf
+    base: Place | None = None
+    length, oldest = 0.0, LONGEST_PAST * float(run.clock[a.H_LONG])
     for time, state in reversed(past):
-        if farthest >= FAR or t - time > LONGEST_PAST * run.clock[a.H_LONG]:
-            break
         distance = scale * least_singular_value(run.system, time, state[:n], run.rank)
+        if (farthest >= FAR and length > 0.0) or distance < BEYOND * farthest or t - time > oldest:
+            break
         if distance > farthest:
-            farthest, found = distance, (time, state.copy())
-    return found
+            length = 2.0 * now * (t - time) / (distance - now)
+            oldest = max(oldest, FARTHEST * length)
+            if farthest < FAR:
+                farthest, base, length = distance, (time, state.copy()), length + t - time
+    return base, length
 
 
 def lengths_across(longest: float, allowed: float) -> list[float]:
@@ -267,14 +290,14 @@ def after_crossing(run: Run, plan: Plan, control: Array, code: int, accepted: in
             return plan, control, code
     if code == a.PAUSED and accepted > 0 and (run.work.notes[indices.PIVOT] < CLEAR * clock[a.LARGEST_PIVOT]):
         proposal = clock[a.H_NEXT]
-        run.origins = [(float(clock[a.T]), None)]
+        run.origins = [(float(clock[a.T]), None, False), (float(clock[a.T]), None, True)]
         _next_origin(run, plan, control)
         clock[a.H_NEXT] = run.crossed = proposal
         return plan, control, code
     if code not in (a.PAUSED, a.STEP_TOO_SMALL, a.FIXED_STEP_FAILED, a.RANK_LOST):
         return plan, control, code
     if accepted == 0:  # there is no way across: the run's own steps go on as far as they can
-        run.control[a.BRIDGE] = 0.0
+        run.control[a.BRIDGE] = a.SUSPENDED
     run.crossings[-1].append((float(run.clock[a.T]), run.state.copy()))
     run.work.notes[indices.NEAR_NOW] = 0.0
     run.plan.memory[:] = run.memory

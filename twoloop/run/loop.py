@@ -46,6 +46,7 @@ from twoloop.run.messages import (
     message_of,
     outcome,
     reject_turned_velocities,
+    warn_of_own_passages,
     warn_user,
 )
 from twoloop.run.record import (
@@ -418,7 +419,7 @@ class IntegrationLoop:
                     end = recorder.last[0]
                 status, message = compare_callbacks(run, self.sample, end, check_derivatives, status, message)
             if self.last and status >= 0:
-                message += warn_of_missed_changes(run)
+                message += warn_of_missed_changes(run) + warn_of_own_passages(run)
             if status >= 0 and run.start_warning:
                 message += warn_user(run.start_warning)
             if status in EXPLAINED_BY_STIFFNESS:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from twoloop.checks.consistency import ConstraintWarning
 from twoloop.checks.structure import dependent_rows, in_words, least_inertia, not_finite, surely_above
 from twoloop.kernels.control.loop_state import DISPLACEMENT, INNER_TOL, initial_direction
+from twoloop.kernels.control.singular_positions import EPS
 from twoloop.kernels.data import indices
 from twoloop.methods.plan import Plan
 from twoloop.run.record import Later, Status
@@ -392,6 +393,22 @@ def warn_of_singular_end(run: "Run") -> str:
             "End t_span a little before, or beyond, or loosen rtol and atol"
         )
     return warn_user(said)
+
+
+def warn_of_own_passages(run: "Run") -> str:
+    """Warn if the run's own steps went on where no step led across a singular position, and return the sentence."""
+    share = float(run.clock[run.a.PIVOT_PASSED])
+    if share == 0.0:
+        return ""
+    over = EPS / share**3 / float(run.tolerances[indices.LEAST])
+    if over <= LASTING:
+        return ""
+    return warn_user(
+        f"no step led across a singular position, and the run went on with steps within which the smallest pivot of "
+        f"the constraint Jacobian came down to {share:.1g} of its largest: rounding of accelerations there may be "
+        f"about {over:.1g} times what rtol and atol allow. Loosen rtol and atol, take another method, or change the "
+        "geometry slightly"
+    )
 
 
 def warn_user(text: str) -> str:

@@ -108,12 +108,14 @@ class Run:
         self.narrow = narrow or plan.unseen == 1.0
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and after steps across singular positions
         # step lengths that are still to be tried across such a position, and where the polynomial may begin: the
-        # earliest time of nodes, and an earlier state
+        # earliest time of nodes, an earlier state, and whether tolerances are looser
+        self.mirrored = 0.0  # length of the step that leads as far beyond the position as that state is before it, s
+        self.looser = self.tolerances  # tolerances of the steps across
         self.lengths: list[float] = []
         self.longer: list[float] = []
         self.crossed = 0.0  # length of the last attempt across, s
         self.pieces: list[float] = []  # times at which the next pieces of its polynomial end
-        self.origins: list[tuple[float, tuple[float, Array] | None]] = []
+        self.origins: list[tuple[float, tuple[float, Array] | None, bool]] = []
         self.jumps: list[float] = []  # times at which velocities changed as by an impulse
         self.compared_until = [-np.inf]  # time up to which callbacks were compared, in this run or an equal one
         self.region: CheckedRegion | None = None  # shared by cached integrators: callbacks were compared there
@@ -196,7 +198,8 @@ class Run:
             The plan, the controls and the kit of these steps. None: those of the run.
         """
         plan, control, kit = active or (self.plan, self.control, self.kit)
-        arrays = plan.options, plan.memory, self.tolerances, control, self.clock, self.state, self.new_state
+        tolerances = self.tolerances if plan is self.plan else self.looser
+        arrays = plan.options, plan.memory, tolerances, control, self.clock, self.state, self.new_state
         code: int = entry_point(self.kernels.advance)(kit, self.work, *arrays, outputs, *buffers, filled)
         return code
 
@@ -213,6 +216,7 @@ class Run:
             crossings=[],
             jumps=[],
         )
+        other.looser = other.tolerances
         if self.static is None and self.kit.flags[indices.FORM] == indices.AUGMENTED:  # a run may change these flags
             other.kit = kit_with(self.system, self.kit.flags, other.plan)
             other.functions = other.kit.functions

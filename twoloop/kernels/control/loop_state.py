@@ -22,6 +22,7 @@ from numpy.typing import NDArray
     NEEDS_DENSE,  # the sparse form cannot decide it
     NEEDS_COMPILATION,  # the step is not compiled; it is tried again once it is
 ) = range(12)
+SUSPENDED = 0.5  # value of BRIDGE after a position across which no step led
 CONTINUE = -1  # no end code: the loop continues
 
 # rule of step-size control: the factor is SAFETY error**-EXPONENT within FACTOR_MIN and FACTOR_MAX. Errors below
@@ -41,7 +42,8 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     STORE_ALL,  # 1: every accepted step is stored; 0: output times only
     SYMMETRIC,  # 1: each step has the partition of its midpoint; 0: a partition stays until it is renewed
     MAX_ATTEMPTS,  # largest number of attempts in one call, so that the caller can watch the run
-    BRIDGE,  # 1: stop with NEAR_SINGULAR where steps become short near a singular position
+    # 1: stop with NEAR_SINGULAR where steps come near a singular position; SUSPENDED: not before it is left behind
+    BRIDGE,
     SHORTEST,  # shortest step, s; a step of a few spacings of t is too short as well
     MAY_SWITCH,  # 1: stop with SWITCH_METHOD at a value that is not finite ...
     TRIAL_STEPS,  # ... and within this number of steps, if the next one is not longer than GAP
@@ -93,8 +95,9 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     SAMPLES_MOTION,  # 1 while forces are sampled ahead, at states that the motion may not reach
     # smallest pivot at output times or grid points, where steps had to end; see least_pivot in partition.py
     PIVOT_AT_OUTPUT,
+    PIVOT_PASSED,  # smallest share of the largest pivot in steps that went on where none led across; 0: there are none
     N_CLOCK,
-) = range(N_PAST, N_PAST + 28)
+) = range(N_PAST, N_PAST + 29)
 
 # power iterations for the largest rate, in stiffness.py and in run/monitors.py
 DISPLACEMENT = 1e-6  # relative to the largest coordinate or velocity: length of differences along a direction

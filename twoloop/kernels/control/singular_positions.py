@@ -1,12 +1,13 @@
 """Check the partition and the distance from a singular position between the steps of a run."""
 
 from twoloop.kernels.control import loop_state as at
-from twoloop.kernels.data.common import merged
+from twoloop.kernels.data.common import compiled, merged
 from twoloop.kernels.data.indices import (
     AUGMENTED,
     BY_GENERAL,
     DONE,
     FORM,
+    LEAST,
     N_ACCEPTED,
     NEAR_NOW,
     NEARLY_SINGULAR,
@@ -17,7 +18,7 @@ from twoloop.kernels.data.indices import (
     STRAIGHT,
 )
 from twoloop.kernels.evaluation.inner_loop import find_tangents, renew_partition
-from twoloop.kernels.evaluation.partition import least_pivot, partition_is_poor
+from twoloop.kernels.evaluation.partition import MAX_ROWS_ELIMINATED, least_pivot, partition_is_poor, smallest_pivot
 from twoloop.kernels.evaluation.sparse_inner_loop import PROJECT_STAGES
 
 SHORT = 0.5  # relative to the longest of the last steps: a shorter step may be near a singular position ...
@@ -31,6 +32,11 @@ LOST = 0.001  # ... and share of the longest of the last steps below which steps
 UNDETERMINED = 1e-6
 RARELY = 16  # accepted steps from one check of the partition to the next, if steps do not use it
 FEW = 32  # degrees of freedom; k times as many mean that a partition is checked every k + 1 steps, because T is full
+N_CHECKED = 8  # positions within an accepted step at which the pivots of C_q are computed ...
+CHECKED = 0.5  # ... if it begins below this share of the largest pivot ...
+PASSED = 0.6  # ... and share of the largest change from one to the next below which the position is within the step
+# share of the largest pivot below which nothing of a step may be, by tolerance, see crossing_step.py
+NEAR_LEAST, NEAR_MOST, SHARE_OF_NOISE, EPS = 0.02, 0.1, 0.2, 2.0**-53
 NEARER = 0.25  # relative to the smallest sine at the start of a step: a step that ends below this is halved
 
 
@@ -40,7 +46,7 @@ def near_singular(f, w, control, clock, t, q):
 
     Steps that do not use partitions may have an old one: it is renewed once the run has come near such a position.
     """
-    if control[at.BRIDGE] == 0.0:
+    if control[at.BRIDGE] != 1.0:
         return False
     old = f.flags[STRAIGHT] == 1 and w.notes[NEARLY_SINGULAR] == 1.0
     if old and renew_partition(f, w, t, q) != DONE:
@@ -82,6 +88,60 @@ def retry_with_care(f, w, control, clock, size):
         clock[at.H_NEXT] = max(size, clock[at.H_LONG])
     clock[at.H_LIMIT] = max(clock[at.H_LIMIT], clock[at.H_NEXT])
     return True
+
+
+@merged
+def near_share(tolerances):
+    """Return the share of the largest pivot below which rounding of accelerations exceeds a part of the tolerances."""
+    return min(max(NEAR_LEAST, (EPS / (SHARE_OF_NOISE * tolerances[LEAST])) ** (1.0 / 3.0)), NEAR_MOST)
+
+
+@compiled
+def _least_pivot_within(f, w, t, size, before, end, state, new_state):
+    """Return the smallest pivot within a step, on the cubic through its ends, and its largest change between two looks.
+
+    `before` and `end` are the pivots at its ends.
+    """
+    n, least, change = w.Q.size, min(before, end), 0.0
+    for k in range(1, N_CHECKED):
+        s = k / N_CHECKED
+        rest = 1.0 - s
+        for m in range(n):
+            q0, v0, q1, v1 = state[m], size * state[n + m], new_state[m], size * new_state[n + m]
+            w.y[m] = q0 + s * s * (3.0 - 2.0 * s) * (q1 - q0) + s * rest * (rest * v0 - s * v1)
+        pivot = smallest_pivot(f, w, t + s * size, w.y)
+        change = max(change, abs(pivot - before))
+        least, before = min(least, pivot), pivot
+    return least, max(change, abs(end - before))
+
+
+@compiled
+def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_state):
+    """Return whether an accepted step comes so near a singular position that another step has to lead across.
+
+    Rounding of its stages there may change the result by more than the tolerances, of which estimates see a part.
+    """
+    bridge = control[at.BRIDGE]
+    if bridge == 0.0 or w.notes[NEARLY_SINGULAR] != 1.0 or control[at.FIXED_STEP] > 0.0:
+        return False
+    if f.flags[FORM] == STATIC or w.rows_v.size > MAX_ROWS_ELIMINATED:
+        return False
+    n, largest = w.Q.size, clock[at.LARGEST_PIVOT]
+    before = smallest_pivot(f, w, t, state[:n])
+    end = smallest_pivot(f, w, t + size, new_state[:n])
+    w.notes[PIVOT] = end
+    if min(before, end) > CHECKED * largest:
+        control[at.BRIDGE] = 1.0
+        return False
+    least, change = _least_pivot_within(f, w, t, size, before, end, state, new_state)
+    if bridge == at.SUSPENDED:
+        passed = max(least / largest, EPS)
+        clock[at.PIVOT_PASSED] = passed if clock[at.PIVOT_PASSED] == 0.0 else min(clock[at.PIVOT_PASSED], passed)
+        return False
+    if least < max(near_share(tolerances) * largest, min(PASSED * change, SINGULAR_PIVOT * largest)):
+        w.notes[PIVOT] = before
+        return True
+    return False
 
 
 @merged
@@ -137,6 +197,6 @@ def check_partition(f, w, control, clock, size, lands, state):
         # the partition, which serves implicit methods well up to there, was chosen far from there
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
-        if control[at.BRIDGE] == 0.0 and w.notes[PIVOT] < UNDETERMINED * clock[at.LARGEST_PIVOT]:
+        if control[at.BRIDGE] != 1.0 and w.notes[PIVOT] < UNDETERMINED * clock[at.LARGEST_PIVOT]:
             return at.RANK_LOST  # no step has crossed the position, and rounding would determine velocities
     return at.NEAR_SINGULAR if short and near_singular(f, w, control, clock, clock[at.T], state[:n]) else at.CONTINUE

@@ -174,6 +174,25 @@ def _eliminate(w, max_rank, max_rank_v):
     return rank, full_pivoting(G, order, row_order, w.g, rank, last, max_rank_v)
 
 
+@compiled
+def smallest_pivot(f, w, t, q):
+    """Return the smallest pivot at a position, as w.notes[PIVOT] has it; the partition stays."""
+    rank = w.rows.size
+    if rank == 0:
+        return 1.0
+    G, order, row_order = w.Gx, w.order, w.row_order
+    G[:, :] = 0.0
+    constraint_rows(f, w, t, q, G)
+    scale_rows(G)
+    for j in range(order.size):
+        order[j] = j
+    for i in range(row_order.size):
+        row_order[i] = i
+    if full_pivoting(G, order, row_order, w.g, 0, w.C.size, rank) < rank:
+        return 0.0
+    return abs(G[rank - 1, rank - 1])
+
+
 @merged
 def _insert_sorted(source, target):
     for k in range(source.size):

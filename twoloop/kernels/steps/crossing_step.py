@@ -18,6 +18,7 @@ motion, and the fixed-point iteration converges as it does elsewhere.
 
 import numpy as np
 
+from twoloop.kernels.control.singular_positions import NEAR_LEAST, NEAR_MOST, near_share
 from twoloop.kernels.control.step_size import commit_nothing, store_prediction
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed, compiled, kernel, merged
 from twoloop.kernels.data.indices import (
@@ -26,7 +27,6 @@ from twoloop.kernels.data.indices import (
     DONE,
     ESTIMATE,
     GAP,
-    LEAST,
     N_OUTER,
     ORIENTATION,
     ORIENTATION_NEW,
@@ -47,9 +47,6 @@ STAGNANT, NOISE = 0.5, 0.3  # ... or NOISE of them, if a change is at least STAG
 MOST, FEW = 40, 12  # largest number of sweeps; and number of sweeps after which more nodes are left out ...
 FARTHER = 2.0  # ... up to this times the distance
 MOST_LEFT_OUT = 9  # largest number of nodes that may be left out
-# relative to the largest pivot so far: nodes below NEAR_LEAST are left out, and those at which accelerations are
-# rounded by SHARE_OF_NOISE of the tolerances, up to NEAR_MOST
-NEAR_LEAST, NEAR_MOST, SHARE_OF_NOISE, EPS = 0.02, 0.1, 0.2, 2.0**-53
 # numbers at the end of `memory`: two that `begin` stores, the time of its base, and first time, length and end of the
 # polynomial that was found (-inf: none)
 LARGEST_PIVOT, EARLIEST, BASE, BEGIN, WHOLE, END, N_STORED = range(7)
@@ -60,7 +57,8 @@ BACK = 0.4  # part of the polynomial before the state from which the step begins
 ORDER, SHARE = 12.0, 0.5  # order of the estimated error; and factor on it
 MOVED = 0.5  # weight of the correction of a stage by its projection, as an error
 ROUNDING = 1e-13  # relative: accuracy of the iteration in steps without an estimate, and of times
-NEARER = 0.5  # smallest ratio of the pivots at the end and at the start of a step
+NEARER = 0.5  # smallest ratio of the pivots at the end and at the start of a step ...
+ENDS = 4.0  # ... and 1 below so many times the pivot at which nodes are left out
 FOUND = 2.0  # error and factor returned with a polynomial that was found, so that its pieces follow
 SMALL = 1e-300  # replaces a coefficient of zero
 
@@ -198,13 +196,13 @@ def _widest_gap(c, c0, left_out):
 
 
 @merged
-def _choose_partition_at_end(f, w, t, q, pivot):
+def _choose_partition_at_end(f, w, t, q, pivot, near):
     """Choose the partition at the end of a step; return SINGULAR if the next step would begin nearer to the position.
 
-    `pivot` is the smallest pivot at the beginning.
+    `pivot` is the smallest pivot at the beginning, `near` the one below which nodes are left out.
     """
     code = renew_partition(f, w, t, q)
-    if code == DONE and w.notes[PIVOT] < NEARER * pivot:
+    if code == DONE and w.notes[PIVOT] < max(NEARER * pivot, min(ENDS * near, pivot)):
         return SINGULAR
     return code
 
@@ -335,7 +333,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     near, whole = NEAR_LEAST, h
     q_base, v_base = memory[(S + 5) * n : (S + 6) * n], memory[(S + 6) * n : (S + 7) * n]
     if estimated:
-        near = min(max(near, (EPS / (SHARE_OF_NOISE * tolerances[LEAST])) ** (1.0 / 3.0)), NEAR_MOST)
+        near = near_share(tolerances)
     if t + h <= stored[END] + ROUNDING * stored[WHOLE] + 4.0 * np.spacing(abs(t)):
         begin, whole = stored[BEGIN], stored[WHOLE]
         _evaluate(t + h - begin, whole, b, c, a, q_0, v_0, to_v, to_q, q_stage, v_stage, a_stage)
@@ -435,7 +433,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         # most rejected steps are rejected for their end, which is known well enough by now
         if sweep == 1 and estimated:
             _integrate(whole, 1.0, b, bA, a, q_0, v_0, q1, v1)
-            code = _choose_partition_at_end(f, w, t + h, q1, pivot)
+            code = _choose_partition_at_end(f, w, t + h, q1, pivot, near * largest_pivot)
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
         change_before = change
@@ -448,7 +446,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             return Attempt(DONE, error, 0.0)
     _set_base(whole, c_base, to_v, to_q, a, q_base, v_base, q_0, v_0)
     _integrate(whole, 1.0, b, bA, a, q_0, v_0, q1, v1)
-    code = _choose_partition_at_end(f, w, t + h, q1, pivot)
+    code = _choose_partition_at_end(f, w, t + h, q1, pivot, near * largest_pivot)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
     if estimated:  # the steps that are accepted are pieces of the polynomial

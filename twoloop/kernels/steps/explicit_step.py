@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from twoloop.kernels.control.step_size import commit_nothing, departure, store_prediction
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, inlined, kernel, times_gap
-from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, N_OUTER, NEARLY_SINGULAR, RTOL
+from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, LEAST, N_OUTER, NEARLY_SINGULAR, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_as_given, evaluate_state, project
 from twoloop.kernels.linalg.dense import copy
 
@@ -20,6 +20,9 @@ STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)  # FREE: stages are not pro
 # vectors in `memory`, then the slopes of the stages. Each has 2 n_q numbers, and zeros up to a multiple of BLOCK
 STAGE, FINE, COARSE, N_VECTORS = range(4)
 BLOCK = 8
+# factor on errors once a singular position was near, as errors of the phase grow from one passage to the next, but no
+# tolerance becomes smaller than LEAST_STRICT by it
+STRICT, LEAST_STRICT = 10.0, 1e-11
 
 
 def options_array(
@@ -174,6 +177,8 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
         error = _error(tolerances, h, fine, coarse, y, y1, slopes, one, other, near)
+        if near:
+            error *= min(max(tolerances[LEAST] / LEAST_STRICT, 1.0), STRICT)
         if not error <= 1.0:
             return Attempt(DONE, error, 0.0)
     store_prediction(w, q1)
