@@ -5,6 +5,7 @@ import pytest
 
 from studies.bench.closed_loops import parallelogram, parallelogram_motion
 from tests.general.mechanisms import error, mechanism
+from tests.marks import slow
 from twoloop import solve_dae
 from twoloop.kernels.steps import crossing_step
 from twoloop.methods.tableaux import gauss
@@ -29,13 +30,14 @@ def test_the_tables_are_exact_for_polynomials():
         np.testing.assert_allclose(legendre @ series, expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("n", [1, 2])
-def test_runs_find_across_at_tight_tolerances(n):
-    """Three passages in 5 s: stages beside the constraints let one run in four end at one of them."""
-    m = mechanism(f"A02, N = {n}")
-    ended = 0
+@pytest.mark.parametrize(
+    ("n", "options"), [(1, {}), (2, {}), slow(2, {"method": "DOP853"}), slow(2, {"compiled": False})]
+)
+def test_runs_find_across_at_tight_tolerances(n, options):
+    """Three passages in 5 s: rounding stopped steps, or changed velocities by a hundred tolerances in one of them."""
+    m, ended = mechanism(f"A02, N = {n}"), 0
     for tolerance in (1e-8, 1e-9, 1e-10, 1e-11):
-        result = solve_dae(m.system(), (0.0, 5.0), *m.start, rtol=tolerance, atol=tolerance)
+        result = solve_dae(m.system(), (0.0, 5.0), *m.start, rtol=tolerance, atol=tolerance, **options)
         ended += result.success
         assert not result.success or error(m, result) < 1e3 * tolerance
     assert ended >= 3

@@ -233,7 +233,7 @@ class Run:
         control[: a.N_RULE] = plan.rule
         control[a.LIMIT_START], control[a.LIMIT_FACTOR] = plan.limit_start, plan.limit_factor
         control[a.LIMIT_MEMORY], control[a.SYMMETRIC] = plan.limit_memory, plan.symmetric
-        control[a.ROUGH] = plan.rough
+        control[a.ROUGH], control[a.WATCHFUL] = plan.rough, plan.watchful
         control[a.MAY_SWITCH] = plan.substitute is not None
         control[a.MAKES_MANY] = getattr(plan.step, "many", None) is not None
         control[a.TRIAL_STEPS] = PROVISIONAL if plan.provisional else -1.0

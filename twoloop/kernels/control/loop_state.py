@@ -58,8 +58,9 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     FIRST_GIVEN,  # 1: the first step is the user's, and not a guess that may become longer
     MAX_EVALUATION_GAP,  # the longest part of a step within which nothing is evaluated, over the step
     MAKES_MANY,  # 1: the method makes many steps in a row, before each of which nothing has to be checked
+    WATCHFUL,  # 1: explicit steps, which must not come near a singular position at all, once one was near
     N_CONTROL,
-) = range(N_RULE, N_RULE + 24)
+) = range(N_RULE, N_RULE + 25)
 
 # columns of `out_steps`: the size of an accepted step, and the counters so far; JACOBIANS is 0 after an explicit step
 # of a method that switches

@@ -122,7 +122,7 @@ def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_st
     Rounding of its stages there may change the result by more than the tolerances, of which estimates see a part.
     """
     bridge = control[at.BRIDGE]
-    if bridge == 0.0 or w.notes[NEARLY_SINGULAR] != 1.0 or control[at.FIXED_STEP] > 0.0:
+    if bridge == 0.0 or control[at.WATCHFUL] == 0.0 or w.notes[NEARLY_SINGULAR] != 1.0 or control[at.FIXED_STEP] > 0.0:
         return False
     if f.flags[FORM] == STATIC or w.rows_v.size > MAX_ROWS_ELIMINATED:
         return False
