@@ -112,9 +112,9 @@ class DOP853:
     Tableau and error estimate, e5^2 / sqrt(e5^2 + 0.01 e3^2) of embedded estimates of orders 5 and 3: Hairer, Norsett
     and Wanner, Solving ODEs I (1993), II.5 and II.10; e5 and e3 are largest components here, not root mean squares.
     From where a run has come near a singular position, the square root of e5 / sqrt(e5^2 + 0.01 e3^2) takes the place
-    of this quotient, as terms of high order are not small there, and errors have to be within a tenth of tolerances from
-    1e-10 on. The numbers are those of SciPy's `DOP853`. The stability limits are those of the method's polynomial R(z): |R| <= 1 on the imaginary axis up to 5.96 i, on the
-    real one down to -6.39.
+    of this quotient, as terms of high order are not small there, and errors have to be within a tenth of tolerances
+    from 1e-10 on. The numbers are those of SciPy's `DOP853`. The stability limits are those of the method's polynomial
+    R(z): |R| <= 1 on the imaginary axis up to 5.96 i, on the real one down to -6.39.
 
     Examples
     --------
