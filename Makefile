@@ -71,7 +71,7 @@ table3: install ## the paper's Table 3 into reports/, about three minutes; ARGS=
 	@echo "[3/3] Compiling the paper's steps and those of the default (once), then 32 cells, IDA and Exudyn"
 	@$(RUN) -c "from twoloop.kernels import advance"
 	@$(RUN) -c "from twoloop.kernels.steps import explicit_step, lobatto_step; from twoloop.kernels.control import stiffness" & \
-	$(RUN) -c "from twoloop.kernels.paper import newmark_step, paper_step; from twoloop.kernels import interpolation" && wait $$!
+	$(RUN) -c "from twoloop.kernels.paper import fixed_point_step, newmark_step; from twoloop.kernels import interpolation" && wait $$!
 	$(RUN) -m studies.table3 $(ARGS)
 
 reports: install ## all studies into reports/
@@ -88,10 +88,10 @@ compile: install ## compile the kernels, and the callbacks of bodies, mechanisms
 	from twoloop.kernels import cached_run; \
 	$(CALLBACKS_OF_TESTS)" & \
 	$(RUN) -c "from twoloop.kernels.linalg import dependent_columns, rank; \
-	from twoloop.kernels.evaluation import checks, residuals, sparse_inner_loop, traced; \
+	from twoloop.kernels.evaluation import checks, sparse_inner_loop, traced; \
 	from twoloop.kernels.lanes import advance, starts; from twoloop.bodies import programs; \
-	from twoloop.mechanisms import *; from studies.honesty import traps; from twoloop.kernels.lanes import explicit; \
-	from twoloop.kernels.paper import bdf_step, fixed_point_step, newmark_step, paper_step; \
+	from twoloop.mechanisms import *; from studies.honesty import traps; \
+	from twoloop.kernels.paper import bdf_step, fixed_point_step, newmark_step; \
 	$(CALLBACKS_OF_MORE_TESTS)" && wait $$!
 
 # kernels that slow tests alone need

@@ -15,8 +15,8 @@ from twoloop.generate.series import series_program
 from twoloop.generate.traced_values import unchecked
 from twoloop.kernels.data.common import KIT, VECTOR, WORK, f8, i8
 from twoloop.kernels.data.indices import DONE
-from twoloop.kernels.evaluation.accelerations import acceleration_constraint
 from twoloop.kernels.evaluation.constraints import constraint_rows
+from twoloop.kernels.evaluation.inner_loop import acceleration_constraint
 from twoloop.run.workspace import kit_of, workspace
 
 WEIGHT = np.array([0.0, -9.81])

@@ -13,7 +13,7 @@ from references.sundials.ida import solve_ida, solve_ida_c
 from studies.bench.solvers import GIVEN
 from studies.honesty.traps import FORCE, INPUT, LINKAGE, MISTAKE, SHORT, SINGULAR, Trap
 from twoloop import Result, solve_dae
-from twoloop.kernels.control.force_discontinuities import N_SAMPLES
+from twoloop.kernels.control.discontinuities import N_SAMPLES
 from twoloop.kernels.data.indices import LONGEST_UNSEEN
 
 OWN = (GIVEN, "Taylor", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")

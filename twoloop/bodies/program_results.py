@@ -4,8 +4,7 @@ import numpy as np
 
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.data.common import inlined
-from twoloop.kernels.evaluation.operations import N_COLUMNS
-from twoloop.kernels.evaluation.program import run_table
+from twoloop.kernels.evaluation.operations import N_COLUMNS, run_table
 
 N_RESULTS, N_NODES, N_ROWS, N_TERMS, PROGRAM = range(5)  # sizes in front of a program; nodes follow its results
 

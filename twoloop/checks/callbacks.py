@@ -19,7 +19,7 @@ from numba import njit
 from twoloop.checks.arguments import Array
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.kernels.compile.dependencies import FunctionCopier, is_library, is_ours
-from twoloop.kernels.compile.private import Dispatcher
+from twoloop.kernels.compile.linking import Dispatcher
 
 if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem

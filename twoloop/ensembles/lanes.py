@@ -22,8 +22,8 @@ from twoloop.generate.program import Arrays, Program
 from twoloop.generate.series import series_for
 from twoloop.generate.time_dependence import BY_TIME, TIME, may_be_narrow, may_be_sudden
 from twoloop.generate.trace import Equations
-from twoloop.kernels.control.force_discontinuities import FLOOR, LEAST, SHARE, STEEPER
-from twoloop.kernels.control.force_discontinuities import N_SAMPLES as N_PLACES
+from twoloop.kernels.control.discontinuities import FLOOR, LEAST, SHARE, STEEPER
+from twoloop.kernels.control.discontinuities import N_SAMPLES as N_PLACES
 from twoloop.kernels.lanes import layout
 from twoloop.kernels.layout import cached_run
 from twoloop.methods import dop853
@@ -172,7 +172,7 @@ def lane_methods(name: str, stiff: bool, n: int, rtol: float, atol: float, invol
 
 def _taylor(rtol: float, atol: float) -> LaneMethod:
     def step() -> Any:
-        from twoloop.kernels.lanes.explicit import step_by_series
+        from twoloop.kernels.lanes.advance import step_by_series
 
         return step_by_series
 
@@ -182,12 +182,12 @@ def _taylor(rtol: float, atol: float) -> LaneMethod:
 
 def _dop853(n: int, rtol: float, atol: float) -> LaneMethod:
     def step() -> Any:
-        from twoloop.kernels.lanes.explicit import step_by_dop853
+        from twoloop.kernels.lanes.advance import step_by_dop853
 
         return step_by_dop853
 
     def memory(code: LaneCode) -> int:
-        from twoloop.kernels.lanes.explicit import memory_size
+        from twoloop.kernels.lanes.advance import memory_size
 
         return memory_size(len(dop853.B), n)
 
@@ -344,7 +344,7 @@ class LaneRuns:
 
         q, v : (n_runs, n, n_t), the last at the end; ends : a and lam there.
         """
-        from twoloop.kernels.evaluation.residuals import motion_residuals
+        from twoloop.kernels.lanes.starts import motion_residuals
 
         n, n_c = self.system.n_q, self.system.n_c
         room, worst = np.zeros(n * (n + 3) + n_c * (n + 3)), np.full(len(which), np.inf)

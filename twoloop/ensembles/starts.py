@@ -87,7 +87,7 @@ def kit_to_write(system: ConstrainedSystem) -> tuple[Any, NDArray[np.int64]]:
 
 def far_off(kit: tuple[Any, NDArray[np.int64]], starts: Starts) -> NDArray[np.bool_]:
     """Return for which starts C or C_q v + C_t exceeds the possible rounding error of its terms."""
-    from twoloop.kernels.evaluation.residuals import constraint_residuals
+    from twoloop.kernels.lanes.starts import constraint_residuals
 
     functions, sizes = kit
     room, worst = np.zeros(int(sizes[1] * (sizes[0] + 2))), np.zeros(len(starts.q))

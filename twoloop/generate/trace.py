@@ -42,7 +42,7 @@ from twoloop.generate.parameter_expressions import (
 from twoloop.kernels.compile.caches import BoundedCache, garbage_collection_off
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.kernels.compile.dependencies import FunctionCopier, is_library
-from twoloop.kernels.compile.private import Dispatcher
+from twoloop.kernels.compile.linking import Dispatcher
 from twoloop.problem.system import ConstrainedSystem
 
 # functions of NumPy that handle arrays of expressions like arrays of numbers

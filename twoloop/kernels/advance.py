@@ -6,7 +6,14 @@
 import numpy as np
 
 from twoloop.kernels.control import loop_state as at
-from twoloop.kernels.control.force_discontinuities import limit_to_discontinuity
+from twoloop.kernels.control.discontinuities import (
+    JUMP,
+    RAMP,
+    SMOOTH,
+    limit_to_discontinuity,
+    locate_discontinuity,
+    unexplained_velocity_change,
+)
 from twoloop.kernels.control.loop_state import EXPONENT, FACTOR_MIN, SAFETY
 from twoloop.kernels.control.singular_positions import (
     SHORT,
@@ -43,13 +50,6 @@ from twoloop.kernels.data.indices import (
     SINGULAR,
     STATIC,
     UNSUITED,
-)
-from twoloop.kernels.evaluation.drive_discontinuities import (
-    JUMP,
-    RAMP,
-    SMOOTH,
-    locate_discontinuity,
-    unexplained_velocity_change,
 )
 from twoloop.kernels.evaluation.inner_loop import (
     accelerations,

@@ -17,7 +17,7 @@ from numba import types
 
 from twoloop.kernels.compile.reference import Reference
 from twoloop.kernels.control import loop_state as at
-from twoloop.kernels.control.force_discontinuities import N_SAMPLES
+from twoloop.kernels.control.discontinuities import N_SAMPLES
 from twoloop.kernels.data import indices
 from twoloop.kernels.data.common import (
     INTEGERS,

@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.kernels.control.force_discontinuities import N_CHANGES
+from twoloop.kernels.control.discontinuities import N_CHANGES, N_PARTS
 from twoloop.kernels.data.common import WORK, Work
 from twoloop.kernels.data.indices import N_COUNTERS, N_NOTES
-from twoloop.kernels.evaluation.drive_discontinuities import N_PARTS
 from twoloop.kernels.linalg.band import N_ROUTINES
 from twoloop.kernels.linalg.markowitz_lu import MAX_ENTRIES_PER_LINE, N_COUNTS, N_LISTS, index_size, values_size
 

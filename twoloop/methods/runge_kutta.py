@@ -159,7 +159,7 @@ class RungeKutta:
         plan = Plan(step, options, memory, 1.0 / (tableau.order + 1), rough=ROUGH)
         if self.outer == "paper":
             return plan.changed(
-                step=LazyStep("paper.paper_step", "PAPER"),
+                step=LazyStep("paper.fixed_point_step", "PAPER"),
                 factor_min=0.5,
                 limit_start=1.0,
                 limit_factor=1.0,
@@ -175,17 +175,17 @@ class RungeKutta:
 
     def _newton_plan(self, plan: Plan, n_q: int) -> Plan:
         """Return the plan with Newton's method as the outer loop."""
-        from twoloop.kernels.steps import newton_memory
+        from twoloop.kernels.steps import stages
         from twoloop.kernels.steps.lazy import LazyStep
 
         tableau = self.tableau
-        extra = newton_memory.newton_options(tableau.A, tableau.b, tableau.c, self.tested == "all")
-        n_eigen = int(extra[newton_memory.N_REAL] + extra[newton_memory.N_PAIRS])
+        extra = stages.newton_options(tableau.A, tableau.b, tableau.c, self.tested == "all")
+        n_eigen = int(extra[stages.N_REAL] + extra[stages.N_PAIRS])
         made = plan.changed(
             step=LazyStep("steps.newton_step", "NEWTON"),
             options=np.concatenate([plan.options, extra]),
-            memory=np.zeros(newton_memory.memory_size(n_eigen, tableau.stages, n_q)),
-            matrices=newton_memory.n_matrices(n_eigen),
+            memory=np.zeros(stages.memory_size(n_eigen, tableau.stages, n_q)),
+            matrices=stages.n_matrices(n_eigen),
             projects=True,
             exponent=1.0 / (tableau.stages + 1),
         )
@@ -326,7 +326,7 @@ class ESDIRK:
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Return the plan of the method for a run of n_q coordinates."""
         from twoloop.kernels.steps.lazy import LazyStep
-        from twoloop.kernels.steps.newton_memory import diagonal_memory, diagonal_options, n_matrices
+        from twoloop.kernels.steps.stages import diagonal_memory, diagonal_options, n_matrices
 
         make, order = FORMULAS[self.formula]
         A, embedded = make()

@@ -113,8 +113,7 @@ class Taylor:
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Return the plan of the method for a run of n_q coordinates."""
-        from twoloop.kernels.steps import recurrences as series
-        from twoloop.kernels.steps import taylor_step as taylor
+        from twoloop.kernels.steps import taylor_step as kernels
 
         program = self.program
         if program is None:
@@ -127,12 +126,12 @@ class Taylor:
         highest = order + 1
         widths = [-(-len(table.first.column) // PADDED) * PADDED for table in (program.early, program.late)]
         plan = Plan(
-            taylor.TAYLOR,
+            kernels.TAYLOR,
             _options(program, highest, widths),
-            np.zeros(series.memory_size(highest, n_q, program.n_rows, program.n_nodes, *widths)),
+            np.zeros(kernels.memory_size(highest, n_q, program.n_rows, program.n_nodes, *widths)),
             exponent=1.0 / highest,
             safety=1.0,
-            factor_max=taylor.GROWTH,
+            factor_max=kernels.GROWTH,
             watchful=True,
             projects=True,
             looks_within=True,
@@ -140,21 +139,21 @@ class Taylor:
             traced=(program.traced,),
         )
         kept = plan.options.copy()
-        kept[series.KEEP] = 1.0
+        kept[kernels.KEEP] = 1.0
         return plan.changed(interior=plan.changed(options=kept, memory=plan.memory.copy()))
 
 
 def _options(program: SeriesProgram, highest: int, widths: list[int]) -> Array:
     """Return the options that the step reads as one array; integers are stored by their bits."""
-    from twoloop.kernels.steps import recurrences as series
+    from twoloop.kernels.steps import taylor_step as kernels
 
     tables = [[table.groups.ravel(), *table.first, *table.second] for table in (program.early, program.late)]
     arrays: list[Any] = [*tables[0], *tables[1], *program.rows, program.row_places]
     arrays += [*program.balance, program.balance_places]
     arrays = [each.view(np.float64) if each.dtype == np.int64 else each for each in arrays]
-    scalars = np.zeros(series.N_SCALARS)
-    scalars[series.ORDER], scalars[series.THETA], scalars[series.N_NODES] = highest, LARGEST_MOVE, program.n_nodes
-    scalars[series.EARLY_WIDTH], scalars[series.LATE_WIDTH] = widths
-    begin = series.N_SCALARS + series.N_ARRAYS + 1
+    scalars = np.zeros(kernels.N_SCALARS)
+    scalars[kernels.ORDER], scalars[kernels.THETA], scalars[kernels.N_NODES] = highest, LARGEST_MOVE, program.n_nodes
+    scalars[kernels.EARLY_WIDTH], scalars[kernels.LATE_WIDTH] = widths
+    begin = kernels.N_SCALARS + kernels.N_ARRAYS + 1
     ends = begin + np.cumsum([0, *(len(each) for each in arrays)])
     return np.concatenate([scalars, ends.astype(float), *arrays])

@@ -19,7 +19,7 @@ from twoloop.checks.arguments import Array, check_call, check_real, shaped, show
 from twoloop.kernels.compile.caches import digests_of, with_unique_name
 from twoloop.kernels.compile.callbacks import KINDS, compile_callback, zero_callback
 from twoloop.kernels.compile.dependencies import digest_as, digest_of
-from twoloop.kernels.compile.private import Dispatcher
+from twoloop.kernels.compile.linking import Dispatcher
 
 Integers = NDArray[np.int64]
 Entries = tuple[Integers, Integers]  # row and column indices

@@ -33,7 +33,7 @@ from twoloop.kernels.compile.caches import (
 )
 from twoloop.kernels.compile.callbacks import KINDS, compile_callback
 from twoloop.kernels.compile.dependencies import Digest, NotDigestible, frozen_values, python_function
-from twoloop.kernels.compile.private import Dispatcher
+from twoloop.kernels.compile.linking import Dispatcher
 from twoloop.problem.callbacks import ConstantMatrix
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from twoloop.checks.arguments import Array, check_flag, check_number, check_real
 from twoloop.checks.callbacks import check_callback
 from twoloop.checks.sparse_rows import Rows, SparseRows
 from twoloop.kernels.compile.callbacks import KINDS, STATE
-from twoloop.kernels.compile.private import Dispatcher
+from twoloop.kernels.compile.linking import Dispatcher
 from twoloop.kernels.data.common import PROGRAMS, Functions, Kit
 from twoloop.kernels.data.indices import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS
 from twoloop.problem.callbacks import (

@@ -126,8 +126,8 @@ class StaticForm(NamedTuple):
 
     def n_matrices(self, matrices: int) -> int:
         """Return the number of floats of Newton's matrices, for a plan with `matrices` dense ones."""
-        from twoloop.kernels.steps.newton_memory import SYSTEMS
         from twoloop.kernels.steps.newton_systems import matrices_size
+        from twoloop.kernels.steps.stages import SYSTEMS
 
         if self.newton is None or matrices == 0:
             return 0

@@ -18,7 +18,7 @@ import numpy as np
 
 from twoloop.checks.arguments import needed
 from twoloop.kernels.compile.dependencies import LIBRARIES, Digest, NotDigestible
-from twoloop.kernels.compile.private import Dispatcher
+from twoloop.kernels.compile.linking import Dispatcher
 from twoloop.problem.system import ConstrainedSystem
 
 # metadata of the Parquet file

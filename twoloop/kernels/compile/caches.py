@@ -35,7 +35,7 @@ from numba.core.serialize import dumps
 from numba.misc.appdirs import AppDirs
 
 from twoloop.kernels.compile.dependencies import Digest, NotDigestible, enclosed_by, names_reached
-from twoloop.kernels.compile.private import forget_compiled, jitable_templates
+from twoloop.kernels.compile.linking import forget_compiled, jitable_templates
 
 ADVICE = (
     "Code is loaded only from what belongs to you or root and no other user can write: take that right away (chmod "

@@ -32,7 +32,7 @@ from twoloop.kernels.compile.dependencies import (
     is_ours,
     python_function,
 )
-from twoloop.kernels.compile.private import add_signature, options_of
+from twoloop.kernels.compile.linking import add_signature, options_of
 
 BOUNDS_CHECK = {"boundscheck": True}  # option of numba
 # calls that are safe if their arguments are

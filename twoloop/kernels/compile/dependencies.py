@@ -22,7 +22,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numba.core.types import Type
 
-from twoloop.kernels.compile.private import Dispatcher, jitable_templates, options_of
+from twoloop.kernels.compile.linking import Dispatcher, jitable_templates, options_of
 
 # libraries whose functions are identified by name; the versions of numba and numpy are compared, too
 LIBRARIES = {*sys.stdlib_module_names, "numpy", "numba", "scipy"}

@@ -49,7 +49,7 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     TRIAL_STEPS,  # ... and within this number of steps, if the next one is not longer than GAP
     DRIVEN,  # 1: C_t or b may jump
     ROUGH,  # factor by which errors may exceed their estimates where a force jumps, see UNFORESEEN in advance.py
-    SPACING,  # s, between samples of the forces ahead, see force_discontinuities.py; 0: no samples
+    SPACING,  # s, between samples of the forces ahead, see discontinuities.py; 0: no samples
     APART,  # s, between samples in time alone, which are taken ahead of shorter steps as well
     # 1: samples follow the motion; 0: they stay at the state, because a callback raised along the motion
     SAMPLE_MOTION,

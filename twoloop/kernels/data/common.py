@@ -20,8 +20,7 @@ from numba.extending import typeof_impl
 from twoloop.kernels.compile.caches import compile_cached
 from twoloop.kernels.compile.callbacks import KINDS, MATRIX, VECTOR, f8
 from twoloop.kernels.compile.generated_functions import DeferredFunctions, GeneratedFunctions
-from twoloop.kernels.compile.linking import HelperCompiler, KernelCompiler, VectorizingCompiler
-from twoloop.kernels.compile.private import Dispatcher
+from twoloop.kernels.compile.linking import Dispatcher, HelperCompiler, KernelCompiler, VectorizingCompiler
 from twoloop.kernels.compile.reference import Reference
 from twoloop.kernels.data.indices import ATOL, ESTIMATE, FAULT_KIND, FAULT_TIME, GAP, GIVEN, NOT_FINITE, RTOL
 
@@ -29,8 +28,8 @@ i8 = types.int64
 INTEGERS = types.int64[::1]
 PLACES = types.int32[::1]  # indices of long programs; 32 bits, so that they fit in the cache
 
-# Programs that replace missing callbacks (evaluation/program.py), and those of the sparse elimination of large systems
-# and of their Newton matrices (linalg/symbolic_factorization.py); of size 0 if there is none
+# Programs that replace missing callbacks (evaluation/operations.py), and those of the sparse elimination of large
+# systems and of their Newton matrices (linalg/symbolic_factorization.py); of size 0 if there is none
 PROGRAMS = (
     "jacobian_program",
     "jacobian_numbers",
@@ -66,8 +65,8 @@ class Work(NamedTuple):
     mass_pattern: Any  # (n_q, n_q) 1 where M has had a nonzero entry; empty without the augmented form
     places: Any  # where the entries of each row of G begin (n_c + n_a + 1), then their columns
     Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences over a double length, and with the length tried before
-    rates: Any  # (13, n_c + n_a) C_t and b at times within a step, see drive_discontinuities.py
-    changes: Any  # (8, n_q + n_c + n_a) changes of forces, C_t and b with time, see force_discontinuities.py
+    rates: Any  # (13, n_c + n_a) C_t and b at times within a step, see discontinuities.py
+    changes: Any  # (8, n_q + n_c + n_a) changes of forces, C_t and b with time, see discontinuities.py
     Q: Any  # (n_q) force
     x: Any  # (n_q) scratch
     y: Any  # (n_q) scratch
@@ -98,7 +97,7 @@ class Work(NamedTuple):
     predicted: Any  # (r) dependent positions that the integration formula gives, before the constraints restore them
     notes: Any  # (N_NOTES) see indices.py
     nodes: Any  # results of the operations of a program
-    matrices: Any  # matrices of Newton's method, see steps/newton_memory.py and steps/newton_systems.py
+    matrices: Any  # matrices of Newton's method, see steps/stages.py and steps/newton_systems.py
     # fields of the static form, empty in others; N is n_q + n_c; fields that this form does not use are empty in it
     mass_values: Any  # entries of M, see linalg/symbolic_factorization.py
     jacobian_values: Any  # entries of G

@@ -23,7 +23,7 @@ from twoloop.kernels.data.indices import (
     KINK_BEFORE,
     NONHOLONOMIC_RATE_GIVEN,
 )
-from twoloop.kernels.evaluation.program import jacobian_by_program
+from twoloop.kernels.evaluation.operations import jacobian_by_program
 from twoloop.kernels.linalg.dense import copy, largest_of
 
 

@@ -1,4 +1,13 @@
-"""Kinds of operations of traced programs, and the layout of their tables for compiled kernels."""
+"""Operations of traced programs: their kinds, the layout of their tables, and an interpreter in compiled code.
+
+Programs compute C_q and Gamma where no callback gives them (generate/derived_callbacks.py), and forces, motions and
+rows of models that are functions (bodies/program_results.py). An exact derivative may overflow where the callback does
+not, as that of tanh does for large numbers.
+"""
+
+import math
+
+from twoloop.kernels.data.common import compiled, exact
 
 # PENDING: products whose second factors become known with the solution of an order of a series. RESULT: outputs of a
 # table
@@ -8,3 +17,102 @@ KIND, NODE, FIRST, SECOND, END, N_COLUMNS = range(6)
 # a table as a vector of integers: these sizes, its rows, the nodes of all terms, and the entry of each result. Results
 # are the last nodes
 N_NODES, N_ROWS, N_TERMS, N_RESULTS, HEAD = range(5)
+
+
+@exact
+def operation(kind, x, y):
+    """Return the result of an operation; y is the second factor of a product."""
+    if kind == PRODUCT:
+        z = x * y
+    elif kind == RECIPROCAL:
+        z = 1.0 / x
+    elif kind == SQUARE_ROOT:
+        z = math.sqrt(x)
+    elif kind == EXPONENTIAL:
+        z = math.exp(x)
+    elif kind == SINE:
+        z = math.sin(x)
+    elif kind == COSINE:
+        z = math.cos(x)
+    elif kind == LOGARITHM:
+        z = math.log(x)
+    elif kind == ARCTANGENT:
+        z = math.atan(x)
+    else:
+        z = x
+    return z
+
+
+@exact
+def affine(nodes, table, columns, numbers, coefficients, constant, begin, end):
+    """Return a constant plus the multiples of nodes in terms begin to end."""
+    total = numbers[constant]
+    for k in range(begin, end):
+        total = total + numbers[coefficients + k] * nodes[int(table[columns + k])]
+    return total
+
+
+@exact
+def run_table(table, rows, n_rows, columns, numbers, coefficients, constants, nodes, inputs, t, q, v):
+    """Compute all nodes from t, q and v, which become the nodes from `inputs` on.
+
+    The table may hold integers, or whole floats among the parameters of a model. `rows` and `columns` are places in it,
+    `coefficients` and `constants` places in `numbers`.
+    """
+    nodes[inputs] = t
+    for j in range(q.size):
+        nodes[inputs + 1 + j] = q[j]
+        nodes[inputs + 1 + q.size + j] = v[j]
+    for i in range(n_rows):
+        row = rows + N_COLUMNS * i
+        begin, middle, end = int(table[row + FIRST]), int(table[row + SECOND]), int(table[row + END])
+        x = affine(nodes, table, columns, numbers, coefficients, constants + 2 * i, begin, middle)
+        y = affine(nodes, table, columns, numbers, coefficients, constants + 2 * i + 1, middle, end)
+        nodes[int(table[row + NODE])] = operation(int(table[row + KIND]), x, y)
+
+
+@exact
+def _run(program, numbers, nodes, t, q, v):
+    """Compute all nodes of a system's program."""
+    n_rows = program[N_ROWS]
+    columns = HEAD + N_COLUMNS * n_rows
+    run_table(program, HEAD, n_rows, columns, numbers, 2 * n_rows, 0, nodes, 0, t, q, v)
+
+
+@exact
+def _results(program):
+    """Return the number of results, their first node, and the place of their entries."""
+    n = program[N_RESULTS]
+    return n, program[N_NODES] - n, HEAD + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
+
+
+@compiled
+def gamma_by_program(f, w, t, q, v):
+    """Compute the rows of Gamma that no callback gives; return whether there is a program and all are finite."""
+    program = f.gamma_program
+    if program.size == 0:
+        return False
+    _run(program, f.gamma_numbers, w.nodes, t, q, v)
+    n, first, places = _results(program)
+    for k in range(n):
+        if not math.isfinite(w.nodes[first + k]):
+            return False
+        w.Gamma[program[places + k]] = w.nodes[first + k]
+    return True
+
+
+@compiled
+def jacobian_by_program(f, w, t, q, G):
+    """Compute C_q into the first rows of G, which are zero; return whether there is a program and all is finite."""
+    program = f.jacobian_program
+    if program.size == 0:
+        return False
+    _run(program, f.jacobian_numbers, w.nodes, t, q, q)
+    n, first, places = _results(program)
+    for k in range(n):
+        if not math.isfinite(w.nodes[first + k]):
+            return False
+    for k in range(n):
+        place = program[places + k]
+        G[place // q.size, place % q.size] = w.nodes[first + k]
+    return True

@@ -58,10 +58,10 @@ from twoloop.kernels.data.indices import (
     SMALLEST,
 )
 from twoloop.kernels.evaluation import tasks
-from twoloop.kernels.evaluation.accelerations import MIN_CORRECTION
 from twoloop.kernels.evaluation.constraints import constraint_rates
+from twoloop.kernels.evaluation.inner_loop import MIN_CORRECTION
+from twoloop.kernels.evaluation.operations import gamma_by_program, jacobian_by_program
 from twoloop.kernels.evaluation.partition import CONTRACTION, MAX_ITERATIONS, MAX_VIOLATION, ROUNDING_OF_CORRECTIONS
-from twoloop.kernels.evaluation.program import gamma_by_program, jacobian_by_program
 from twoloop.kernels.linalg.dense import copy, has_new_entries, largest_of
 from twoloop.kernels.linalg.sparse_ldl import factor, load, solve, solve_refined
 from twoloop.kernels.linalg.symbolic_factorization import N_OFF, N_PIVOTS, jacobian_of, mass_of, order_of
@@ -405,7 +405,7 @@ def _move(f, w, x):
 
 @compiled
 def _to_constraints(f, w, t, q, v, theta):
-    """Project (q, v) onto the constraints as accelerations.py does; factors are those before the last correction."""
+    """Project (q, v) onto the constraints as inner_loop.py does; factors are those before the last correction."""
     before = np.inf
     theta = max(theta, MIN_CORRECTION * w.notes[ROUNDED])
     for _ in range(MAX_ITERATIONS):

@@ -9,7 +9,7 @@ from numba import types
 
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, exact, i8, kernel
 from twoloop.kernels.evaluation import operations as op
-from twoloop.kernels.evaluation.program import operation
+from twoloop.kernels.evaluation.operations import operation
 
 VALUE, BOUND = range(2)  # rows of `nodes`
 

@@ -12,7 +12,23 @@ each step.
 import numpy as np
 
 from twoloop.kernels.data.common import compiled, kernel, merged
-from twoloop.kernels.lanes.control import LEAST, N_HEAD, begin_control, choose_steps, end_steps, judge_steps, set_end
+from twoloop.kernels.lanes.control import (
+    LEAST,
+    N_HEAD,
+    add_product,
+    begin_control,
+    choose_steps,
+    copy_vectors,
+    end_steps,
+    enlarge,
+    factor_lanes,
+    judge_steps,
+    set_end,
+    solve_lanes,
+    sum_rows,
+    table,
+    vectors,
+)
 from twoloop.kernels.lanes.layout import (
     ACCEPTED,
     AHEAD,
@@ -36,26 +52,19 @@ from twoloop.kernels.lanes.layout import (
     fill_field,
     places_of,
 )
-from twoloop.kernels.lanes.operations import (
-    add_product,
-    copy_vectors,
-    enlarge,
-    factor_lanes,
-    solve_lanes,
-    sum_rows,
-    table,
-    vectors,
-)
-from twoloop.kernels.steps.newton_memory import (
+from twoloop.kernels.steps.newton_systems import DIFFERENCE, MAX_ITERATIONS, STAGNATION
+from twoloop.kernels.steps.stages import (
+    FARTHEST,
     GAMMA0,
     N_EIGEN_SCALARS,
     N_REAL,
+    OUTER_TOL,
     VELOCITIES,
     count_eigenvalues,
     eigen_place,
+    middle_node,
+    tableau_of,
 )
-from twoloop.kernels.steps.newton_systems import DIFFERENCE, MAX_ITERATIONS, STAGNATION
-from twoloop.kernels.steps.stages import FARTHEST, OUTER_TOL, middle_node, tableau_of
 from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STEPS_TO_DECAY
 
 # fields of the method's memory, in vectors: first one number for each lane, ...

@@ -14,7 +14,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import get_cython_function_address, intrinsic
 
-from twoloop.kernels.compile.private import cgutils
+from twoloop.kernels.compile.linking import cgutils
 from twoloop.kernels.data.common import compiled, inlined, merged
 from twoloop.kernels.data.indices import BANDWIDTH, DIAGONAL_MASS, DONE, MASS_NOT_DEFINITE, SINGULAR
 from twoloop.kernels.linalg.dense import lu_factor, lu_solve

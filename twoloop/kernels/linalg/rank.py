@@ -375,7 +375,7 @@ def choose_rows(given, G, least, weak, bounds, room, chosen):
     Rows of G are independent as in `select_rows` for `least`, except for exchanges. Rows are added to M if eigenvalues
     of it are below the share `weak` of the largest; 0: none is. `chosen`, of 2 + 3 n_rows numbers, begins with the
     numbers of independent and of added rows, then lists them, each list in n_rows places. `room` begins with the factor
-    of the added rows. See generate/choices.py.
+    of the added rows. See generate/elimination.py.
     """
     n_rows, n = G.shape
     most = min(n_rows, n) + 1

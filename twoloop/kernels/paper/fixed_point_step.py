@@ -1,13 +1,22 @@
-"""Implicit Runge-Kutta steps whose outer loop is a fixed point, with Richardson's error estimate around it."""
+"""Implicit Runge-Kutta steps whose outer loop is a fixed point: with Richardson's estimate, and as in the paper."""
 
 import numpy as np
 
+from twoloop.kernels.control.step_size import commit_nothing
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, kernel
 from twoloop.kernels.data.indices import DONE, ESTIMATE
 from twoloop.kernels.evaluation.inner_loop import accelerations
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.paper import iterations as at
-from twoloop.kernels.paper.iterations import block, conclude, iterate_accelerations, keep_rest, rests_of, vector
+from twoloop.kernels.paper.iterations import (
+    block,
+    conclude,
+    iterate_accelerations,
+    iterate_first_order,
+    keep_rest,
+    rests_of,
+    vector,
+)
 from twoloop.kernels.steps.stages import (
     END_ERROR_WEIGHT,
     EXTRAPOLATION,
@@ -98,3 +107,56 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
 
 
 RUNGE_KUTTA = Step(runge_kutta_step, settle_runge_kutta)
+
+
+SUDDEN = 10.0  # value of `end_error` above which it counts; the paper's procedure has no such estimate
+
+
+@kernel(ATTEMPT)
+def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """Attempt a step as in Sects. 3.1-3.3: take a step of h and two of h/2; their difference is the error."""
+    s, _, _, _, _, _ = tableau_of(options)
+    n = w.Q.size
+    q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
+    q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
+    A_stage = block(memory, s, n, at.TRIAL)
+    A_full = block(memory, s, n, at.HALF)
+    Q_stage = block(memory, s, n, at.Q_STAGE)
+    V_stage = block(memory, s, n, at.V_STAGE)
+    q_full, v_full = vector(memory, s, n, at.Q_FULL), vector(memory, s, n, at.V_FULL)
+    q_mid, v_mid, a_mid = vector(memory, s, n, at.Q_MID), vector(memory, s, n, at.V_MID), vector(memory, s, n, at.A_MID)
+    q_old, v_old = vector(memory, s, n, at.Q_OLD), vector(memory, s, n, at.V_OLD)
+    code = iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1)
+    if code != DONE:
+        return Attempt(code, np.inf, 0.0)
+    error = 0.0
+    if tolerances[ESTIMATE] == 1.0:
+        copy(q1, q_full)
+        copy(v1, v_full)
+        for j in range(s):
+            copy(A_stage[j], A_full[j])
+        g = 0.5 * h
+        code = iterate_first_order(f, w, options, t, g, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q_mid, v_mid)
+        if code == DONE:
+            code = accelerations(f, w, t + g, q_mid, v_mid, a_mid, w.lam)
+        if code != DONE:
+            return Attempt(code, np.inf, 0.0)
+        code = iterate_first_order(
+            f, w, options, t + g, g, q_mid, v_mid, a_mid, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1
+        )
+        if code != DONE:
+            return Attempt(code, np.inf, 0.0)
+        code, error = conclude(
+            f, w, options[EXTRAPOLATION], options[INNER_TOL], t + h, tolerances, q, v, q_full, v_full, q1, v1
+        )
+        if code != DONE:
+            return Attempt(code, np.inf, 0.0)
+    code = accelerations(f, w, t + h, q1, v1, a1, lam1)
+    if code == DONE and tolerances[ESTIMATE] == 1.0:
+        beside = END_ERROR_WEIGHT * end_error(tolerances, options, h, state, new_state, A_full)
+        if error <= 1.0 and beside > SUDDEN:
+            error = beside
+    return Attempt(code, error, 0.0)
+
+
+PAPER = Step(paper_step, commit_nothing)

@@ -2,7 +2,7 @@
 
 `iterate_accelerations` iterates on the stage accelerations alone (the tableau applied twice to q'' = a),
 `iterate_first_order` is the paper's loop on y_i = [v_i, q_i]. They are compiled in the steps that call them,
-fixed_point_step.py and paper_step.py. Equation numbers are the paper's.
+fixed_point_step.py. Equation numbers are the paper's.
 
 Richardson's estimate: the difference of one step and two half steps is the error, and may improve the result.
 """

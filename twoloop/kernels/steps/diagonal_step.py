@@ -41,8 +41,7 @@ from twoloop.kernels.data.indices import (
 )
 from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, find_tangents, multipliers
 from twoloop.kernels.linalg.dense import copy, ldl_factor, ldl_solve, lu_factor, lu_solve
-from twoloop.kernels.steps import newton_memory as at
-from twoloop.kernels.steps.newton_memory import PLACE, TAIL, block, pivots_of, space, square, vector
+from twoloop.kernels.steps import stages as at
 from twoloop.kernels.steps.newton_systems import (
     SAME_STEP,
     correct,
@@ -54,7 +53,18 @@ from twoloop.kernels.steps.newton_systems import (
     tangent_by_q,
     tangent_by_v,
 )
-from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TOL, STAGES
+from twoloop.kernels.steps.stages import (
+    INNER_TOL,
+    OUTER_TOL,
+    PLACE,
+    STAGES,
+    TAIL,
+    block,
+    pivots_of,
+    space,
+    square,
+    vector,
+)
 from twoloop.kernels.steps.velocity_errors import (
     STEPS_TO_DECAY,
     derivatives_agree,

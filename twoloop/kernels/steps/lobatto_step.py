@@ -56,8 +56,7 @@ from twoloop.kernels.data.indices import (
     SINGULAR,
     UNSUITED,
 )
-from twoloop.kernels.evaluation.accelerations import MIN_CORRECTION
-from twoloop.kernels.evaluation.inner_loop import check_redundant, project, renew_partition
+from twoloop.kernels.evaluation.inner_loop import MIN_CORRECTION, check_redundant, project, renew_partition
 from twoloop.kernels.linalg.dense import copy
 
 # FREE: longest step, in units of LOOK, whose nodes alone are close enough; a longer one is audited between its nodes
@@ -267,7 +266,7 @@ def _take(f, w, options, room, tolerances, driven, n, k, t, row, state):
     """Replace `row` by its projection in lane k; return whether the projection moved it by the tolerance at most.
 
     Where constraints depend on time (`driven`), velocities are compared, too: a change that the accelerations at the
-    nodes do not explain may come from a discontinuity of the drive, see drive_discontinuities.py.
+    nodes do not explain may come from a discontinuity of the drive, see discontinuities.py.
     """
     _, _, _, _, _, ends, end_a, lam, _ = _places(n, int(options[N_ITERATED]), int(options[N_ROWS]))
     if room[room_at.FINE + k] == 0.0:

@@ -18,8 +18,7 @@ from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, allowed,
 from twoloop.kernels.data.indices import DONE, ESTIMATE, FORM, GENERATION, LEAST, N_OUTER, OUTER_DIVERGED, STATIC
 from twoloop.kernels.evaluation.inner_loop import accelerations, evaluate, multipliers
 from twoloop.kernels.linalg.dense import copy
-from twoloop.kernels.steps import newton_memory as at
-from twoloop.kernels.steps.newton_memory import block, eigen_place, vector
+from twoloop.kernels.steps import stages as at
 from twoloop.kernels.steps.newton_systems import (
     MAX_ITERATIONS,
     SAME_STEP,
@@ -30,7 +29,18 @@ from twoloop.kernels.steps.newton_systems import (
     factor_systems,
     filter_error,
 )
-from twoloop.kernels.steps.stages import FARTHEST, INNER_TOL, OUTER_TOL, STAGES, interpolate, middle_node, tableau_of
+from twoloop.kernels.steps.stages import (
+    FARTHEST,
+    INNER_TOL,
+    OUTER_TOL,
+    STAGES,
+    block,
+    eigen_place,
+    interpolate,
+    middle_node,
+    tableau_of,
+    vector,
+)
 from twoloop.kernels.steps.velocity_errors import STEPS_TO_DECAY, filtered_velocity_error, motion_time, velocity_error
 
 SLOW = 0.05  # contraction above which the derivatives are renewed before the next step

@@ -64,7 +64,7 @@ from twoloop.kernels.linalg.sparse_lu import factor as factor_lu
 from twoloop.kernels.linalg.sparse_lu import load, tangents_of
 from twoloop.kernels.linalg.sparse_lu import solve as solve_lu
 from twoloop.kernels.linalg.symbolic_factorization import N_OF_MASS, N_OFF, N_PIVOTS, jacobian_of, mass_of
-from twoloop.kernels.steps.newton_memory import (
+from twoloop.kernels.steps.stages import (
     A_NEW,
     BY_Q,
     BY_V,
@@ -72,6 +72,7 @@ from twoloop.kernels.steps.newton_memory import (
     FILTER,
     GAMMA0,
     H_FACTORED,
+    INNER_TOL,
     N_EIGEN_SCALARS,
     N_REAL,
     Q_MOVED,
@@ -88,7 +89,6 @@ from twoloop.kernels.steps.newton_memory import (
     system_space,
     vector,
 )
-from twoloop.kernels.steps.stages import INNER_TOL
 
 MAX_ITERATIONS = 15
 SAME_STEP = 1e-9  # relative: steps are differences of times, so that equal steps are rounded differently at other times

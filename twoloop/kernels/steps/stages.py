@@ -1,4 +1,6 @@
-"""Common parts of all implicit Runge-Kutta steps: parameter block, prediction of stages, and error at jumps."""
+"""Common parts of implicit Runge-Kutta steps: parameters, prediction of stages, error at jumps, memory."""
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -108,3 +110,177 @@ def end_error(tolerances, options, h, state, new_state, A_stage):
         scale = allowed(tolerances, m, q[m], q1[m])
         top = max(top, h * error / scale)
     return top
+
+
+# `options` is that of stages.py, then these scalars, the weights e (s) of the estimate, and for each eigenvalue its
+# real and imaginary part, and its row of T^-1 and column of T (s real, s imaginary parts each). VELOCITIES: 1 if their
+# error is tested, too
+N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
+
+# places in `memory`
+(
+    HAS_TRIAL,
+    H_TRIAL,
+    HAS_PREVIOUS,
+    H_PREVIOUS,
+    HAS_JACOBIAN,
+    FRESH,  # 1: the derivatives are those of the present state
+    PARTITION_NUMBER,
+    H_FACTORED,
+    CONTRACTION,  # contraction of the last iteration
+    DAMPED,  # 0: no derivative by v
+    SYMMETRIC,  # 1: the matrix of diagonal_step.py was factored as a symmetric one
+    DURATION,  # s: duration of an error of velocity; 0: not known
+    CHANGED,  # 1: diagonal_step.py has renewed derivatives at the end of the step
+    N_MEMORY_SCALARS,
+) = range(14)
+PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
+A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
+# spaces in w.matrices, of n_q^2 numbers each; from SYSTEMS on a complex pair for each eigenvalue
+BY_Q, BY_V, FILTER, SYSTEMS = range(4)
+
+
+def newton_options(
+    A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], velocities: bool
+) -> NDArray[np.float64]:
+    """Return the part of `options` that follows that of stages.py; A has a basis of eigenvectors.
+
+    velocities : whether the error of velocities is tested.
+    """
+    values, T = np.linalg.eig(A)
+    inverse = np.linalg.inv(T)
+    real = [k for k in range(len(b)) if values[k].imag == 0.0]
+    pairs = [k for k in range(len(b)) if values[k].imag > 0.0]
+    gamma0 = float(values[real[0]].real) if real else float(np.abs(values).min())
+    parts: list[Any] = [[len(real), len(pairs), gamma0, float(velocities)], _estimate_weights(b, c, gamma0)]
+    for k in real + pairs:
+        row, column = inverse[k], T[:, k]
+        parts += [[values[k].real, values[k].imag], row.real, row.imag, column.real, column.imag]
+    return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
+
+
+def _estimate_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: float) -> NDArray[np.float64]:
+    """Return weights e: gamma0 f(y_n) + sum_j e_j f(Y_j) is a quadrature of order s less that of the method.
+
+    Hairer & Wanner II, (IV.8.16). With c_1 = 0 the stages already contain f(y_n): then the last stage is left out.
+    """
+    s = len(b)
+    moments = 1.0 / np.arange(1.0, s + 1.0)
+    if c[0] > 1e-10:
+        moments[0] -= gamma0
+        embedded = np.linalg.solve(np.vander(c, increasing=True).T, moments)
+    else:
+        embedded = np.zeros(s)
+        embedded[:-1] = np.linalg.solve(np.vander(c[:-1], increasing=True).T, moments[:-1])
+        embedded[0] -= gamma0
+    return np.asarray(embedded - b)
+
+
+def memory_size(n_eigenvalues: int, s: int, n_q: int) -> int:
+    """Return the length of `memory`: scalars, blocks, vectors, pivots, two complex vectors, weights."""
+    return N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + 5 + n_eigenvalues) * n_q + s
+
+
+def n_matrices(n_eigenvalues: int) -> int:
+    """Return the number of spaces of n_q^2 numbers that w.matrices needs."""
+    return SYSTEMS + 2 * n_eigenvalues
+
+
+# `options` are those of a Newton method of one stage, A = [[gamma]]; then the stages, A, c and b - b^ of this method,
+# and 1 if steps with an error estimate continue from the embedded formula
+PLACE = N_SCALARS + 2 + 5
+TAIL = PLACE + N_EIGEN_SCALARS + 1 + 2 + 4
+
+
+def diagonal_options(
+    A: ArrayLike,
+    c: ArrayLike,
+    weights: ArrayLike,
+    lower: ArrayLike,
+    inner_tol: float,
+    outer_tol: float,
+    velocities: bool,
+    embedded: bool,
+) -> NDArray[np.float64]:
+    """Return the parameter block: A (s, s) has zeros in its first row, then gamma on the diagonal; b is its last row.
+
+    `lower`: weights of the estimate for accelerations that jump. `embedded`: the embedded formula is the one of higher
+    order, from which steps continue.
+    """
+    A, c, weights, lower = (np.asarray(x, dtype=np.float64) for x in (A, c, weights, lower))
+    gamma = A[-1, -1]
+    one_stage = options_array([[gamma]], [1.0], [1.0], inner_tol, outer_tol, 0.0)
+    newton = np.array([1.0, 0.0, gamma, float(velocities), 0.0, gamma, 0.0, 1.0, 0.0, 1.0, 0.0])
+    return np.concatenate([one_stage, newton, [float(c.size)], A.ravel(), c, weights, lower, [float(embedded)]])
+
+
+def diagonal_memory(s: int, n_q: int) -> NDArray[np.float64]:
+    """Allocate `memory`: that of a Newton method of one stage, then velocities and accelerations (s, n_q).
+
+    The accelerations (n_q) of the last stage of the last accepted step follow.
+    """
+    return np.zeros(memory_size(1, 1, n_q) + (2 * s + 1) * n_q)
+
+
+@merged
+def eigen_place(s):
+    """Return the first place of the eigenvalue scalars."""
+    return N_SCALARS + 2 * s * s + 5 * s
+
+
+@merged
+def count_eigenvalues(options, s):
+    """Return the number of systems: one for each real eigenvalue and one for each pair."""
+    place = eigen_place(s)
+    return int(options[place + N_REAL] + options[place + N_PAIRS])
+
+
+@inlined
+def block(memory, s, n, which):
+    """Return a view of a stage block, (s, n)."""
+    start = N_MEMORY_SCALARS + which * s * n
+    return memory[start : start + s * n].reshape((s, n))
+
+
+@inlined
+def vector(memory, s, n, which):
+    """Return a view of a vector, (n)."""
+    start = N_MEMORY_SCALARS + (N_BLOCKS * s + which) * n
+    return memory[start : start + n]
+
+
+@inlined
+def space(w, n, which):
+    """Return the space of one matrix, (n^2)."""
+    return w.matrices[which * n * n : (which + 1) * n * n]
+
+
+@inlined
+def square(numbers, m):
+    """Return the first m^2 numbers of a space as a matrix."""
+    return numbers[: m * m].reshape((m, m))
+
+
+@inlined
+def system_space(w, n, k):
+    """Return the space of the k-th eigenvalue's system, complex (n^2)."""
+    start = (SYSTEMS + 2 * k) * n * n
+    return w.matrices[start : start + 2 * n * n].view(np.complex128)
+
+
+@inlined
+def _tail(memory, s, n, k):
+    start = N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + k) * n
+    return memory[start : start + 2 * n]
+
+
+@inlined
+def pivots_of(memory, s, n, k):
+    """Return integers (n) for the row exchanges of the filter (k = 0) or of the (k - 1)-th eigenvalue's system."""
+    return _tail(memory, s, n, k)[:n].view(np.int64)
+
+
+@inlined
+def complex_vector(memory, s, n, n_eigen, which):
+    """Return a complex scratch vector (n); `which` is 0 or 1."""
+    return _tail(memory, s, n, 1 + n_eigen + 2 * which).view(np.complex128)

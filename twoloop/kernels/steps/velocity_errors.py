@@ -15,10 +15,9 @@ from twoloop.kernels.data.common import allowed, compiled
 from twoloop.kernels.data.indices import DONE, GAP
 from twoloop.kernels.evaluation.inner_loop import evaluate
 from twoloop.kernels.linalg.dense import copy
-from twoloop.kernels.steps import newton_memory as at
-from twoloop.kernels.steps.newton_memory import block, vector
+from twoloop.kernels.steps import stages as at
 from twoloop.kernels.steps.newton_systems import DIFFERENCE
-from twoloop.kernels.steps.stages import INNER_TOL
+from twoloop.kernels.steps.stages import INNER_TOL, block, vector
 
 # factor on the duration of an error that turns back as slowly as the motion itself: it is no vibration, and errors of
 # the next steps have the same sign
