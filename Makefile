@@ -82,15 +82,15 @@ reports: install ## all studies into reports/
 compile: install ## compile the kernels, and the callbacks of bodies, mechanisms and studies, on two cores
 	@echo "Compiling (once, on both cores) the kernels, and the callbacks of bodies, mechanisms and studies"
 	@$(RUN) -c "from twoloop.kernels.evaluation import inner_loop; from twoloop.kernels.control import step_size; \
-	from twoloop.kernels.steps import lazy; from twoloop.kernels import advance, interpolation; \
+	from twoloop.kernels.steps import stages; from twoloop.kernels import advance, interpolation; \
 	from twoloop.kernels.control import stiffness; from twoloop.kernels.steps import diagonal_step, newton_step; \
 	from twoloop.kernels.steps import adams_step, crossing_step, explicit_step, lobatto_step, taylor_step; \
 	from twoloop.kernels import cached_run; \
 	$(CALLBACKS_OF_TESTS)" & \
 	$(RUN) -c "from twoloop.kernels.linalg import dependent_columns, rank; \
-	from twoloop.kernels.evaluation import checks, sparse_inner_loop, traced; \
+	from twoloop.kernels.evaluation import checks, sparse_inner_loop; \
 	from twoloop.kernels.lanes import advance, starts; from twoloop.bodies import programs; \
-	from twoloop.mechanisms import *; from studies.honesty import traps; \
+	from twoloop.mechanisms import *; from studies.honesty import traps; from twoloop.kernels.lanes import control; \
 	from twoloop.kernels.paper import bdf_step, fixed_point_step, newmark_step; \
 	$(CALLBACKS_OF_MORE_TESTS)" && wait $$!
 

@@ -108,7 +108,7 @@ class Traced:
 
         `everywhere`: states at which a call is not finite count, too: the trace must not be finite there either.
         """
-        from twoloop.kernels.evaluation import traced as kernels
+        from twoloop.kernels.evaluation import checks as kernels
 
         most = FEW if system.called_in_python else MOST
         states = states[:: 1 + max(len(states) // most, len(states) * len(self.places) // ENTRIES)]
@@ -133,7 +133,7 @@ class Traced:
         return None
 
     def _evaluate(self, system: ConstrainedSystem, states: Array) -> tuple[int, Array, Array, Array]:
-        from twoloop.kernels.evaluation import traced as kernels
+        from twoloop.kernels.evaluation import checks as kernels
 
         called, traced, bounds = np.zeros((3, len(states), len(self.places)))
         n_different = entry_point(kernels.compare)(

@@ -136,8 +136,7 @@ class RungeKutta:
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Return the plan of the method for a run of n_q coordinates."""
         from twoloop.kernels.paper import iterations
-        from twoloop.kernels.steps.lazy import LazyStep
-        from twoloop.kernels.steps.stages import options_array
+        from twoloop.kernels.steps.stages import LazyStep, options_array
 
         tableau = self.tableau
         outer_tol = self.outer_tol
@@ -176,7 +175,7 @@ class RungeKutta:
     def _newton_plan(self, plan: Plan, n_q: int) -> Plan:
         """Return the plan with Newton's method as the outer loop."""
         from twoloop.kernels.steps import stages
-        from twoloop.kernels.steps.lazy import LazyStep
+        from twoloop.kernels.steps.stages import LazyStep
 
         tableau = self.tableau
         extra = stages.newton_options(tableau.A, tableau.b, tableau.c, self.tested == "all")
@@ -325,8 +324,7 @@ class ESDIRK:
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Return the plan of the method for a run of n_q coordinates."""
-        from twoloop.kernels.steps.lazy import LazyStep
-        from twoloop.kernels.steps.stages import diagonal_memory, diagonal_options, n_matrices
+        from twoloop.kernels.steps.stages import LazyStep, diagonal_memory, diagonal_options, n_matrices
 
         make, order = FORMULAS[self.formula]
         A, embedded = make()

@@ -17,7 +17,7 @@ from twoloop.checks.structure import pattern_of
 from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import indices
 from twoloop.kernels.data.indices import ATOL, RTOL
-from twoloop.kernels.steps.lazy import loaded
+from twoloop.kernels.steps.stages import loaded
 from twoloop.methods.plan import INNER_TOL, Plan
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.signals import signals_of

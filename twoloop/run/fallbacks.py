@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import indices
 from twoloop.kernels.data.common import Kit
-from twoloop.kernels.steps.lazy import loaded
+from twoloop.kernels.steps.stages import loaded
 from twoloop.methods.plan import INNER_TOL, LARGEST_MOVE, Plan
 from twoloop.methods.tableaux import gauss
 from twoloop.problem.system import ConstrainedSystem

@@ -33,7 +33,7 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     bodies_of,
     factorization_program,
 )
-from twoloop.kernels.steps.lazy import LOADED, loaded, without_loading
+from twoloop.kernels.steps.stages import LOADED, loaded, without_loading
 from twoloop.methods.plan import Plan
 from twoloop.problem.callbacks import LARGE
 from twoloop.problem.system import ConstrainedSystem

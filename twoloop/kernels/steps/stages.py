@@ -1,11 +1,17 @@
-"""Common parts of implicit Runge-Kutta steps: parameters, prediction of stages, error at jumps, memory."""
+"""Common parts of implicit Runge-Kutta steps: parameters, prediction of stages, error at jumps, memory.
 
-from typing import Any
+Implicit steps take a third of the time of a cold first run, so they are loaded when a run needs them (`LazyStep`).
+"""
+
+from importlib import import_module
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.kernels.data.common import allowed, compiled, inlined, merged
+from twoloop.kernels.control.step_size import commit_nothing
+from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed, compiled, inlined, kernel, merged
+from twoloop.kernels.data.indices import NOT_LOADED
 
 FARTHEST = 3.0  # largest step ratio over which the old stage polynomial is extrapolated
 # weight of `end_error` beside Richardson's estimate, because it serves jumps between ends and stages
@@ -284,3 +290,34 @@ def pivots_of(memory, s, n, k):
 def complex_vector(memory, s, n, n_eigen, which):
     """Return a complex scratch vector (n); `which` is 0 or 1."""
     return _tail(memory, s, n, 1 + n_eigen + 2 * which).view(np.complex128)
+
+
+@kernel(ATTEMPT)
+def stop_to_load(f, w, options, memory, t, h, tolerances, state, new_state):
+    """Stop the run, so that its caller can load the step."""
+    return Attempt(NOT_LOADED, np.inf, 0.0)
+
+
+PLACEHOLDER = Step(stop_to_load, commit_nothing)
+
+
+class LazyStep(NamedTuple):
+    """Name of a step: its module, such as "steps.newton_step", and its name there."""
+
+    module: str
+    name: str
+
+
+LOADED: dict[LazyStep, Step] = {}
+
+
+def loaded(step: Any) -> Any:
+    """Return a step; import its module first if it is a LazyStep."""
+    if isinstance(step, LazyStep) and step not in LOADED:
+        LOADED[step] = getattr(import_module(f"twoloop.kernels.{step.module}"), step.name)
+    return without_loading(step)
+
+
+def without_loading(step: Any) -> Any:
+    """Return a step, or the placeholder if it is a LazyStep that nothing has loaded yet."""
+    return LOADED.get(step, PLACEHOLDER) if isinstance(step, LazyStep) else step
