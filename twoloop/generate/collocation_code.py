@@ -156,7 +156,7 @@ class CollocationCode:
         return self._iterate(emit, room, state, tolerances, quick, otherwise)
 
     def _careful(self, emit: LaneEmitter, kinds: list[str]) -> str:
-        """Return the name of the function that iterates with the elimination that begins with M; write it once."""
+        """Return the name of the function that iterates by eliminating M first; write it at the first call."""
         module, name = emit.builder.module, "careful_nodes"
         if not module.defines(name):
             builder = module.function(name, DOUBLE, kinds, internal=True)
@@ -178,7 +178,7 @@ class CollocationCode:
         return evaluate
 
     def _accelerations(self, emit: LaneEmitter, room: Value) -> list[Value]:
-        """Load accelerations from memory: values kept across the loop would go to the stack in each turn."""
+        """Load accelerations from memory: kept across the loop, they would be spilled to the stack each time."""
         return [load_lanes(emit, room, self.a + LANES * i) for i in range(self.n)]
 
     @contextmanager
@@ -594,7 +594,7 @@ class CollocationCode:
         return emit.apart(*sums)
 
     def _polynomial(self, emit: LaneEmitter, room: Value, other: bool) -> Value:
-        """Point to the coefficients of the polynomial of the last accepted step, or of the step being made."""
+        """Return a pointer to the polynomial of the last accepted step, or (`other`) of the step that is attempted."""
         builder, one = emit.builder, Emitter(emit.builder)
         second = builder.compare("fcmp one" if not other else "fcmp oeq", one.load(room, at.WHICH), llvm_code.ZERO)
         size = LANES * len(self.iterated)
@@ -635,7 +635,7 @@ def _compiled(own: SharedCode) -> Collocation:
         module = Module(divided=long)
         for name, emit in parts.items():
             llvm_code.write(module, name, KIT.llvm_type(name), emit, partial(LaneEmitter, lanes=LANES))
-        # otherwise the functions would read arbitrary numbers beyond the end
+        # with more coefficients than numbers, the functions would read beyond the end of the array
         assert len(code.numbers.values) == len(numbers)
         return list(parts), str(module)
 

@@ -127,7 +127,7 @@ def _trace_derivatives(system: ConstrainedSystem, cache: TraceCache) -> Traced:
     equations = cache.equations(system)
     given = [kind for kind in ("jacobian", *OF_ROWS) if kind in system.given]
     forms = {kind: equations.derived(kind) for kind in (*given, *(["constraint_rate"] if system.n_c else []))}
-    # these callbacks must agree with their traces, too, as the derivatives come from the traces
+    # these callbacks must agree with their traces, as derivatives of the traces are compared with given derivatives
     forms |= {kind: equations.of(kind) for kind in ("constraint", "nonholonomic", "nonholonomic_rate")}
     return Traced(system, equations.graph, forms)
 

@@ -42,11 +42,12 @@ NEAR = 0.01  # smallest allowed pivot, relative to the smallest pivot of a row o
 # possible values of the smallest allowed pivot, down to those nearly lost to rounding
 LEAST = 10.0 ** np.arange(-2, -9, -1)
 BOUNDS = LEAST[:-1] / NEAR
-# places among the bounds of the smallest pivot from which on rows are added to M: for up to SMALL coordinates; if M is
-# singular, as Euler parameters lose two digits in sound models; for more coordinates, as the code becomes much longer
+# indices in BOUNDS of the smallest pivot, from which on rows are added to M. POOR: up to SMALL coordinates.
+# POOR_SINGULAR: M is singular, as Euler parameters lose two digits in sound models. POOREST: more coordinates, for
+# which the code becomes much longer
 POOR, POOR_SINGULAR, POOREST, SMALL = 4, 5, 6, 24
-# size of the added rows relative to M, and the number of places by which the pivot has to become larger: else the rows
-# are nearly dependent whatever M is
+# STIFFER: size of the added rows relative to M. FEWER: number of BOUNDS by which the smallest pivot has to become
+# larger; if it does not, the rows are nearly dependent whatever M is
 STIFFER, FEWER = 16.0, 2
 # ratio of rows of G to coordinates above which it pays to express some coordinates by the others: below, the system of
 # the rows is the smaller one

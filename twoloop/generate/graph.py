@@ -27,7 +27,7 @@ from twoloop.kernels.evaluation import operations as op
 # the second argument of a logarithm or an arctangent is the divisor of its derivative
 MOST_OPERATIONS = 20_000  # largest number of operations of a program; more would take longer to trace than a run takes
 LEAST_FACTOR = 1e-100  # smallest factor taken out of a product: factors of high powers would underflow or overflow ...
-HIGH_POWER = 8  # ... so above this power none are taken out, whatever the values of parameters
+HIGH_POWER = 8  # ... so no factors are taken out of powers above this one, whatever the values of parameters
 BRANCHES = "it branches on, or converts to a number, what depends on t, q or v"
 
 # functions of numbers, which may be Parameters

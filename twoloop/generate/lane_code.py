@@ -518,7 +518,9 @@ class LaneCode(LaneSteps):
             description += list(self.recurrences.structure)
             parts.append(self.solution.kept)
         else:
-            parts.append(self._rows_at)  # its coefficients must be numbered even if the code comes from the disk
+            parts.append(
+                self._rows_at
+            )  # number its coefficients, as when code is written, even if the code comes from the disk
         for outputs in parts:
             description += [outputs.sizes, *numbers.structure(outputs)]
         if self.recurrences is not None:

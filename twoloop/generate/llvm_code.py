@@ -240,7 +240,7 @@ class Quantities:
         return loaded[quantity]
 
     def stored(self, quantity: int) -> None:
-        """Drop the value of a quantity that was stored, so that later parts load it."""
+        """Forget the value of a quantity that was stored to memory, so that later parts load it from there."""
         self._here()[quantity] = self._values.pop(quantity)
 
     def _here(self) -> dict[int, Value]:
@@ -253,7 +253,7 @@ class Quantities:
         """Return constant + the sum of coefficient * quantity."""
         key = terms, constant
         if self._emit.builder.module.divided and len(terms) == 1 and constant == 0.0:
-            ((quantity, coefficient),) = terms  # to multiply again takes no longer than to keep a multiple
+            ((quantity, coefficient),) = terms  # multiplying again takes no longer than keeping the product
             return self._emit.times(coefficient, self.value(quantity))
         if key not in self._sums:
             total: Any = None if constant == 0.0 and terms else self._emit.known(constant)

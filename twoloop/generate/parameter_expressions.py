@@ -258,7 +258,7 @@ def _product(a: float, b: float) -> float:
 
 
 def _power(base: float, exponent: float) -> float:
-    # the root of a square is no product: its sign would be lost
+    # the root of a square is not recorded as a product of powers: the sign of the base would be lost
     if type(exponent) is Parameter or not exponent.is_integer():
         return _function("power", base, exponent)
     assert isinstance(base, Parameter)

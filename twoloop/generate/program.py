@@ -24,7 +24,7 @@ from twoloop.kernels.evaluation.operations import KIND, N_COLUMNS, NODE, RESULT
 Array = NDArray[np.float64]
 T = TypeVar("T")
 
-# a program of a user's function is compared with the function
+# the program traced from a user's function is compared with calls of the function
 STATES = 5  # number of states at which they are compared ...
 BETWEEN = 0.37  # ... time between them, s: no usual period
 AGREES = 1e-10  # largest relative difference

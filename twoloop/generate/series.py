@@ -177,7 +177,7 @@ def series_program(
 
 
 def _sums_of(graph: Graph) -> dict[int, Affine]:
-    """Return the expressions of quantities that are sums, for which a series needs no recurrence."""
+    """Return the terms of quantities that are sums: the series of a sum needs no recurrence of its own."""
     sums: dict[int, Affine] = {}
     for i, operation in enumerate(graph.operations):
         if operation is not None and operation[0] == SUM:

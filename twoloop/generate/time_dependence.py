@@ -25,7 +25,12 @@ from twoloop.problem.system import ConstrainedSystem
 
 BY_TIME = ("force", "constraint_rate", "nonholonomic_rate")  # callbacks whose dependence on time matters ...
 BY_STATE = ("force", "mass", "constraint", "jacobian", "nonholonomic")  # ... and on the state
-SMOOTH = (PRODUCT, SUM, SINE, COSINE)  # polynomials and vibrations are never sudden ...
+SMOOTH = (
+    PRODUCT,
+    SUM,
+    SINE,
+    COSINE,
+)  # operations of polynomials and vibrations: their values never change suddenly ...
 HIGHEST = 8  # ... up to this degree: a high power of a cosine is a pulse
 # degree in q and v up to which steps notice a change before they meet it; likewise for roots, but not for exp ...
 HIGHEST_OF_STATE = 32

@@ -452,7 +452,7 @@ class TraceCache:
         self._classes = classes
         n_numbers = int(np.abs(self._classes).max(initial=0))
         _, first = np.unique(np.abs(self._classes), return_index=True)
-        self._first = first[self._classes[first] != 0]  # first index of each number
+        self._first = first[self._classes[first] != 0]  # index of the first parameter of each class
         self._tape = ParameterTape(np.random.default_rng(7).uniform(*GENERIC, n_numbers).tolist(), range(n_numbers))
         self.parameters = parameters.astype(object) if self._classes.any() else parameters.copy()
         for place in np.flatnonzero(self._classes).tolist():

@@ -67,7 +67,7 @@ class Traced:
         self.kinds = frozenset(graph.traced)  # kinds that were traced
         self.trusted = False
         entries = (forms[kind][place] for kind, place in self.places)
-        # omit entries that are always zero
+        # entries that are always zero need no comparison
         results = {k: form for k, form in enumerate(entries) if form.terms or form.constant}
         self.not_zero = frozenset(self.places[k][0] for k in results)  # kinds of callbacks that are not all zero
         self.program = OperationTable.of(graph, 1 + 2 * system.n_q, results)

@@ -81,7 +81,9 @@ def start(f, w, t, state):
         code = find_tangents(f, w, t, q)
     if code == DONE:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
-    if code == DONE and f.flags[GAMMA_GIVEN] == 0:  # now with the scale by which the differences of Gamma are judged
+    if (
+        code == DONE and f.flags[GAMMA_GIVEN] == 0
+    ):  # compute it again: the scale for judging the differences of Gamma is known now
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
     return code
 
@@ -315,7 +317,7 @@ def advance(
         error *= strict
         if factor == 0.0:
             factor = factor_of(control, clock, size, error)
-        elif strict > 1.0 and error > 0.0:  # the step does not know of `strict`, and may want to grow
+        elif strict > 1.0 and error > 0.0:  # the factor that the step chose is without `strict`, and may be above 1
             factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
         proposal = min(size * factor, clock[at.H_LIMIT])
         if not accepted and factor > 1.0:
@@ -349,7 +351,7 @@ def advance(
         clock[at.LIMIT_AGE] += 1.0
         if clock[at.LIMIT_AGE] > control[at.LIMIT_MEMORY]:
             clock[at.H_LIMIT] = control[at.LIMIT_START]
-            clock[at.FAILURE_CODE] = DONE  # kept until then as the reason why steps are short
+            clock[at.FAILURE_CODE] = DONE  # the code was kept so far, as the reason why steps are short
         if lands and _was_last(f, w, clock, outputs, state):
             return at.ALL_OUTPUT_DONE
         if fixed and not lands:

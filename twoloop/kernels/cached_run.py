@@ -233,7 +233,7 @@ def _check_start(given, b, t, q, v, sizes, ways):
 
 @merged
 def _has_all_entries(b):
-    """Return whether rows have an entry wherever they may have one: then they need not be checked nearby."""
+    """Return whether all entries of the rows that may be nonzero are: then no position nearby has to be checked."""
     n, same = b.rows.shape[1], True
     for k in range(b.kinds.size):
         same = same and (b.kinds[k] != 0) == (b.rows[k // n, k % n] != 0.0)
@@ -314,10 +314,10 @@ def _is_last_start(last_start, t, t1, q, v):
     return same
 
 
-# the report: numbers of states, the first included, and of steps; as numbers, whether the run is plain (nothing has to
-# be checked), velocities turned in the last step, all states lie where callbacks were compared, and all steps found
-# their defect; the largest defect, the widest gap without an evaluation, the code of `advance`, and whether the start
-# is new. Then counters
+# entries of the report: number of states (with the first) and of steps; 1 or 0 for: nothing has to be checked,
+# velocities turned in the last step, all states are in the region where callbacks were compared, every step evaluated
+# its defect; then the largest defect, the widest gap without an evaluation, the code of `advance`, 1 if the start is
+# new, and the counters
 N_STATES, N_STEPS, PLAIN, TURNED, INSIDE, CHECKED, DEFECT, WIDEST, CODE, IS_NEW, N_REPORT = range(11)
 N_HEAD = N_REPORT + N_COUNTERS
 

@@ -121,7 +121,7 @@ def give_back(work: Work) -> None:
     free = _free.pop(work.sizes, [])
     if work.notes.base.size <= LARGEST_FREE and len(free) < MOST_FREE:
         free.append(work)
-    _free[work.sizes] = free  # at the end, behind sizes whose workspaces have waited longer
+    _free[work.sizes] = free  # re-insert last: the dictionary is ordered by how long workspaces have waited
     for oldest in list(_free)[:-1]:
         if sum(map(len, list(_free.values()))) <= MOST_FREE:
             break

@@ -88,7 +88,7 @@ class Output(NamedTuple):
         return None if self.at_ends else self.times
 
     def wanted(self, run: Run) -> OutputRequest:
-        """Return the request for `IntegrationLoop`."""
+        """Return the output that `IntegrationLoop` has to record."""
         return OutputRequest(self.times, self.at_ends or run.lands, self.dense, None, MemoryStore())
 
 
@@ -141,12 +141,12 @@ class CachedIntegrator:
         # indices in the block: the beginning of the states, and of the report of a run that has only one state
         self.states_from, self.width = self.arrays.report.size, len(run.state)
         self.one_state_from = self.states_from - self.loops.N_HEAD - 1
-        self.moved = False  # whether the loop may have changed attributes of `run`, besides its arrays
+        self.moved = False  # whether `IntegrationLoop` may have changed attributes of `run` that are not arrays
         self.at_start = {name: getattr(run, name) for name in ("plan", "memory", "chunk", "kit", "functions")}
         self.form, self.cpu_time = run.kit.flags[FORM], np.inf  # CPU time of the last run, s
         self.between = OutputInterpolation(run)
         self.of_run = run.rank, run.redundant, bool(run.plan.own)
-        self.counted = self.arrays.start_rows.tobytes()  # the independent rows to which `of_run` belongs
+        self.counted = self.arrays.start_rows.tobytes()  # the independent rows for which `of_run` was computed
         self.dependent = {self.counted: (run.redundant, run.rows_warning)}
 
     @staticmethod
@@ -158,7 +158,9 @@ class CachedIntegrator:
     def gives(run: Run, output: Output, shared: SharedSetup | None) -> bool:
         """Return whether arrays that are reused from start to start can give an output."""
         if output.dense and (output.between is not None or shared is not None):
-            return False  # sol and output must have the same states within steps; a shared setup takes other parameters
+            return (
+                False  # sol and output must have the same states within steps; a shared setup will get other parameters
+            )
         return output.between is None or not (run.lands or run.kit.flags[FORM] == indices.AUGMENTED)
 
     def integrate(
@@ -278,7 +280,7 @@ class CachedIntegrator:
     def _agrees(self, t1: float, q0: Array, v0: Array) -> bool:
         """Return whether callbacks agree at a new start or with new parameters; other rows may be redundant there."""
         run = self.run
-        if run.rows_warning:  # rounding may decide which row is left out
+        if run.rows_warning:  # which of the redundant rows is left out may depend on rounding
             counted = self.arrays.start_rows.tobytes()
             if counted not in self.dependent:
                 there = run.at(run.t0, q0, v0)
@@ -313,7 +315,7 @@ class CachedIntegrator:
             sample = Sample(float(t[0]), rows[0], n)
             sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
             states = sample.states()
-            if not everywhere:  # samples may all lie in the region; later runs would then be sampled in vain
+            if not everywhere:  # if all samples lie in the region, sampling later runs would be in vain
                 states = np.concatenate([farthest(t, rows[:, :n]), states])
             if compare_callbacks_at(run, region, states, self.check_derivatives, status, "", everywhere)[0] != status:
                 return False
@@ -329,7 +331,7 @@ def fields_of(
     """Return the fields of the result of a run that the loop integrated to its end."""
     fields = vars(record) | options.metadata | {"system": system, "atol": options.atol.copy(), "compiled": compiled}
     fields["t_end"] = t_end
-    if (own := options.own_tolerance) is not None:  # Newmark tests positions by a tolerance of its own
+    if (own := options.own_tolerance) is not None:  # Newmark has a tolerance of its own for positions
         fields |= {"rtol": own, "atol": np.full(system.n_q, own), "untested": np.ones(len(record.h), dtype=bool)}
     return fields
 

@@ -23,8 +23,8 @@ from twoloop.run.workspace import kit_of, kit_with
 
 WITHIN = 2.0  # gaps between evaluations: a run that met a shorter change is repeated, as others may be shorter still
 SEEN = 1.25  # gaps between evaluations: longer changes cannot fall between two of them; of shorter ones the run warns
-CLOSER = 4.0  # evaluations within the shortest change when the run is repeated ...
-MOST_CLOSER = 8.0  # ... but at most so many times as many evaluations as before
+CLOSER = 4.0  # a repeated run evaluates so many times within the shortest change that was met ...
+MOST_CLOSER = 8.0  # ... but has at most this many times as many evaluations as before
 MOST = 2  # largest number of repetitions of a run
 
 
@@ -35,7 +35,7 @@ def may_have_missed_changes(run: Run, looks: float = WITHIN) -> bool:
 
 
 def closer(run: Run) -> float:
-    """Return the time between evaluations, s, for a repeated run to meet the changes that this one may have missed."""
+    """Return the time between evaluations, s, at which a repeated run meets changes that this run may have missed."""
     a, clock = run.a, run.clock
     return float(max(clock[a.SHORTEST_CHANGE] / CLOSER, clock[a.WIDEST_SAMPLING] / MOST_CLOSER))
 
@@ -61,7 +61,7 @@ HOLDS = 1e-8  # relative residual of the equations below which they count as sol
 
 
 def state_behind_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Array | None:
-    """Return the state [q, v] at t, right after a jump, from the one before; None: no velocities fit the constraints.
+    """Return the state [q, v] right after a jump at t, from that before it; None if no velocities fit the constraints.
 
     Solve M (v+ - v) + G^T p = 0 and G v+ + (C_t, b) = 0: v+ is nearest to v, in the metric of M, of all velocities that
     the constraints allow.
@@ -101,7 +101,7 @@ LOOSER, WIDER = 10.0, 4.0
 LONGEST_PAST, FARTHEST = 1.5, 4.0
 BEYOND = 0.5  # relative to the farthest state: one before it that is nearer lies beyond another singular position
 SMALL = 1e-300  # avoids a division by zero
-CLEAR = 0.3  # relative to the largest pivot that C_q had: above it the run's own steps continue
+CLEAR = 0.3  # relative to the largest pivot that C_q had: above it the run continues with steps of its own method
 
 
 def may_cross(run: Run, code: int) -> bool:

@@ -288,7 +288,7 @@ class IntegrationLoop:
         except Exception as error:  # raised by a callback; beyond a terminal event it does not matter
             if (
                 run.clock[a.SAMPLES_MOTION] == 1.0 and not self.interrupts.asked
-            ):  # a sampled state that the motion may never reach
+            ):  # a sample of forces ahead may be at a state that the motion never reaches
                 run.clock[a.SAMPLES_MOTION] = self.control[a.SAMPLE_MOTION] = 0.0
             else:
                 self.code, self.raised = INTERRUPTED, None if self.interrupts.asked else error
@@ -374,7 +374,7 @@ class IntegrationLoop:
         return places[-MOST_PAST:]
 
     def _correct_last(self) -> None:
-        """Replace the last stored state by that of the polynomial that leads across: rounding had changed it more."""
+        """Replace the last stored state by that of the polynomial across a singular position: it has less rounding."""
         run = self.run
         t, row = float(run.clock[run.a.T]), run.state[: 3 * run.system.n_q]
         self.recorder.correct_last(t, row)

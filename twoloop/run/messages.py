@@ -137,7 +137,9 @@ def describe_stiffness(looks: StiffnessMonitor, kit: Any, work: Any) -> str:
     directions = [np.zeros_like(start), np.zeros_like(start)]
     samples = []
     for sample in looks.samples:
-        for direction in directions:  # starts from the state before: no coordinate may have been lost from it for good
+        for direction in (
+            directions
+        ):  # continue from the direction of the previous state; START restores coordinates that are zero in it
             direction += START * start
         try:
             vibration, decay = _rates(kit, work, sample, directions)
@@ -199,7 +201,7 @@ LOST_AT_END = 1e-6  # ratio of singular values, in any units, below which the st
 _REMEDIES = (
     "loosen rtol and atol, take another method or compiled=False, end t_span before, or change the geometry slightly"
 )
-CROSSINGS = "\0"  # placeholder for the description of singular positions that were crossed
+CROSSINGS = "\0"  # placeholder in a message, replaced by the description of singular positions that were crossed
 NEXT_TO_END = 1e-3  # relative to the run: if it stops so close to its end, the message says so
 
 _REASONS = {
@@ -359,7 +361,7 @@ def _standstill(run: "Run", t1: float, pace: StallDetector) -> str:
 
 
 def _contradiction(run: "Run") -> str:
-    """Describe which row that was left out is violated, and which rows it depended on."""
+    """Describe which redundant row is violated although the other rows hold, and on which rows it had depended."""
     t, n, row = float(run.clock[run.a.T]), run.system.n_q, int(run.work.notes[indices.CONTRADICTION])
     words = in_words(run.system.rows(t, run.state[:n]), [row])
     return (

@@ -38,7 +38,7 @@ class SharedSetup:
     Parameters
     ----------
     run : Run
-        A run of one of the systems, at its start, where it stays.
+        A run of one of the systems that has taken no step; copies of it are integrated.
     code : GeneratedCode or None
         The machine code that its plan calls.
     method, fixed, compiled
@@ -111,7 +111,7 @@ class ParametricRun:
         run.functions = run.kit.functions
 
     def take(self, system: ConstrainedSystem) -> bool:
-        """Set the run to a system of the family, and return whether it was set to another one."""
+        """Give the run the parameters of a system; return whether it had those of another system."""
         if system is self.given:
             return False
         self._take(system)

@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 
 CLEAR = 1e-5  # sine of the angle between a row and the others, below which a position may be near a dead centre
 MOST_CORRECTIONS, ROUNDING = 25, 1e-14  # number of Newton iterations; rounding error relative to the largest coordinate
-STRAIGHT = 0.5  # relative to a displacement: its projection ends so close to where C_q sends it, on the same assembly
+STRAIGHT = 0.5  # relative to a displacement: on the same assembly its projection ends this close to where C_q predicts
 
 
 class _Metric:
@@ -103,7 +103,7 @@ class Dependence(NamedTuple):
 
 
 def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | None:
-    """Return which rows of a large sparse system depend on others; None if that is not to be left to sparse factors."""
+    """Return which rows of a large sparse system depend on others; None if sparse factors cannot decide it reliably."""
     form, all_rows = static_form(system, t, q), system.sparse_rows(t, q)
     if form is None or not isinstance(all_rows, SparseRows):
         return None
@@ -130,7 +130,7 @@ def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | No
 def project_sparsely(
     system: ConstrainedSystem, t: float, q: Array, v: Array, check_assembly: bool
 ) -> tuple[Array, Array] | None:
-    """Project (q, v) onto the constraints by the least change; None if that is not to be left to sparse factors."""
+    """Project (q, v) onto the constraints by the least change; None if sparse factors cannot do it reliably."""
     form = static_form(system, t, q)
     if form is None:
         return None
@@ -161,7 +161,7 @@ def project_sparsely(
 
 
 def _same_from_elsewhere(metric: _Metric, position: Array, moved: Array) -> bool:
-    """Return whether other guesses, as far off, end where C_q sends them."""
+    """Return whether other guesses, as far from the constraints, are projected to where C_q predicts."""
     far = float(np.abs(moved).max())
     generic = np.random.default_rng(8).uniform(-1.0, 1.0, (2, len(position)))
     rest = np.zeros(len(position))
@@ -342,7 +342,7 @@ def _position(
     position, excess, iterations = _gauss_newton(system, t, guess, free)
     redundant = position is None or _rank(scales.scaled(system.jacobian(t, position))) < system.n_c
     cut = WEAK if redundant else NEGLIGIBLE
-    if redundant:  # dependent rows are so on the constraints, and beside them only nearly
+    if redundant:  # rows that depend on one another on the constraints do so only nearly beside them
         position, excess, iterations = _gauss_newton(system, t, guess, free, cut)
     if position is None or not excess <= 1.0:
         diverged = position is None

@@ -118,7 +118,7 @@ Store = MemoryStore | FileStore
 
 
 def mapped(path: Path) -> NDArray[Any]:
-    """Map the array in a file into memory; what is written to it does not reach the file."""
+    """Map the array in a file into memory, copy-on-write: changes of the array do not reach the file."""
     return np.load(path, mmap_mode="c", allow_pickle=False).view(np.ndarray)  # type: ignore[no-any-return]
 
 
@@ -134,7 +134,9 @@ def read(folder: Path) -> dict[str, NDArray[Any]]:
 
 Array = NDArray[np.float64]
 
-PENDING = 1024  # number of states that wait for the search of the intervals between them, unless it is needed sooner
+PENDING = (
+    1024  # number of states that are collected before the intervals between them are searched for events, at the latest
+)
 
 
 @dataclass(frozen=True)
@@ -210,7 +212,7 @@ class Recorder:
         self.interrupted = False
         self._t, self._rows = np.array([t0]), state[None, :].copy()  # the last states, and those not yet searched
         self._kinds = np.empty(0, dtype=np.int64)
-        self._next = 0  # index of the first interval of these that was not searched
+        self._next = 0  # index of the first interval between these states that was not searched
         self._n_outputs = 0
         ends = request.events is not None and any(event.terminal < np.inf for event in request.events)
         self._waits_for = 0 if ends or request.store.finished else PENDING

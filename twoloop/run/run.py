@@ -37,7 +37,7 @@ Buffers = tuple[Array, Array, Array]  # times, states and steps
 FIRST_CHUNK = 1024  # attempts of a small compiled system between two checks in Python, which cost 0.2 ms each
 FIRST_CHUNK_IN_PYTHON = 64  # ... of a system whose callbacks are plain Python functions, which may be slow
 SMALL = 32  # number of coordinates; chunks of larger systems are shorter in proportion
-PROVISIONAL = 10  # number of steps within which a method that pays only for long steps is replaced if they are short
+PROVISIONAL = 10  # number of first steps: if they are short, a method that pays only for long steps is replaced
 NONE = np.zeros((0, 0))
 CONTRADICTS = 1e-6  # relative: largest disagreement of redundant rows with the accelerations
 
@@ -429,7 +429,9 @@ class Run:
 
     def passed_near_singular(self) -> bool:
         """Return whether steps had to end so near a singular position that rounding may have changed velocities."""
-        near = self.near if self.static is None else LEAST  # pivots of static factors vary more, and a check takes long
+        near = (
+            self.near if self.static is None else LEAST
+        )  # static factors have pivots that vary more, and a check takes long
         return bool(self.clock[self.a.PIVOT_AT_OUTPUT] < near)
 
     def attempts(self) -> int:

@@ -102,7 +102,7 @@ def _entries(system: ConstrainedSystem, t: float, q: Array, v: Array, lam: Array
 
 
 SINGULAR = 1e-10  # smallest over largest eigenvalue of a body's M, below which it counts as singular
-ALONG = 1e-3  # relative to a row: smallest part along directions without mass with which the row stiffens these
+ALONG = 1e-3  # relative to a row: a row with a larger part along a direction without mass makes M definite there
 NEWTON = 1.6  # times LARGE: number of coordinates from which on Newton's matrices are sparse
 SPARSE = 0.05  # share of the entries and operations of dense factors above which a program does not pay for its indices
 
@@ -183,7 +183,7 @@ def _made(system: ConstrainedSystem, t0: float, q0: Array) -> StaticForm | None:
 
 
 def _together(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]:
-    """Return the coordinates of each body: those that joints act on, and all others that are laid out alike, in space.
+    """Return the coordinates of each body in space: of bodies that joints act on, and of all others laid out alike.
 
     A joint names only one of its bodies, so that no joint may name the body at the end of a chain.
     """

@@ -393,7 +393,9 @@ def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispa
         watched = digests_of(function)
         dispatcher = njit(**options)(with_unique_name(function, watched))
         if watched is not None:
-            _COMPILED_DIGESTS[dispatcher] = watched  # so that a closure that encloses it does not compile it again
+            _COMPILED_DIGESTS[dispatcher] = (
+                watched  # then a closure that encloses this function does not compile it again
+            )
             with suppress(RuntimeError):  # no folder can be written
                 dispatcher._cache = _Cache(dispatcher.py_func, *watched, "")
         return dispatcher

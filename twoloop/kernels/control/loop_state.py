@@ -62,8 +62,8 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     N_CONTROL,
 ) = range(N_RULE, N_RULE + 25)
 
-# columns of `out_steps`: the size of an accepted step, and the counters so far; JACOBIANS is 0 after an explicit step
-# of a method that switches
+# columns of `out_steps`: size of an accepted step, then counters up to it; JACOBIANS is 0 after an explicit step of a
+# method that switches
 H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
 
 # `clock`, after the past
@@ -77,7 +77,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     N_FIXED,  # steps of the fixed grid so far
     FAILURE_CODE,
     H_FAILED,
-    H_LONG,  # longest of the last steps, fading
+    H_LONG,  # longest of the last steps; the weight of older steps fades
     LARGEST_PIVOT,  # largest so far of the smallest pivots of C_q
     JUMP_FROM,  # start of the interval ahead in which C_t or b jumps; infinite without one
     JUMP_TO,

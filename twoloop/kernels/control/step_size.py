@@ -121,7 +121,7 @@ def on_grid(clock, t, h, target, goal):
 
 @merged
 def off_grid(control, t, h, left, leaps):
-    """Return the size of a step under step-size control, and whether it reaches the goal, `left` seconds ahead."""
+    """Return the size of a step under step-size control, and whether it reaches the goal in `left` seconds."""
     reaches = leaps or h >= left * (1.0 - 1e-10)
     size = h
     if h > 0.5 * left and not reaches:

@@ -207,7 +207,9 @@ def _largest_rate(f, w, memory, t, state, new_state):
         damping = _along(f, w, t, state, by_v, True, Q, V, A)
         if damping * memory[H_MEAN] < NEGLIGIBLE:
             break
-    for m in range(n):  # restart coordinates that were independent at no estimate, or have no part in the direction
+    for m in range(
+        n
+    ):  # restart coordinates that are zero in the direction, as they were dependent at all estimates so far
         if by_q[m] == 0.0:
             by_q[m] = SEED
         if by_v[m] == 0.0:
@@ -267,7 +269,7 @@ def _interval(options, memory):
 
 @compiled
 def _enter(w, options, memory, phase, t):
-    """Begin another phase, whose method knows nothing of the steps before."""
+    """Begin another phase: its method starts without a history of steps."""
     memory[PHASE] = phase
     memory[STEPS] = 0.0
     memory[PAST + ERROR_BEFORE] = 0.0
@@ -320,7 +322,7 @@ def _look(f, w, options, memory, tolerances, t, state, new_state):
     # only after the short steps of its start
     anyway = cheap and cost > afforded and paid > ANYWAY * afforded * (1.0 + memory[N_TRIALS])
     due = share > SURELY or hidden or anyway or (memory[NEAR] >= options[LOOKS] and cheap)
-    if cheap and share <= 1.0:  # while no trial is affordable, NEAR keeps that one will be due
+    if cheap and share <= 1.0:  # while a trial would cost too much, NEAR stores that it is due
         memory[NEAR] = 0.0
     dear = price > GAIN * memory[PRICE]  # compared with the explicit method when it was left
     if (memory[PHASE] == EXPLICIT and due) or (memory[PHASE] == IMPLICIT and (share < BELOW or dear)):

@@ -369,7 +369,7 @@ def finite(A):
 
 @compiled
 def not_finite(notes, kind, t, q):
-    """Note which callback gave a value that is not finite, for the message; none where q itself is not finite."""
+    """Record, for the message, which callback gave a value that is not finite; none if q itself is not finite."""
     notes[FAULT_KIND] = kind if finite_vector(q) else -1.0
     notes[FAULT_TIME] = t
     return NOT_FINITE

@@ -128,7 +128,7 @@ def row_reaches(in_units, radius, negligible, room, reach):
 # flags of results. IN_ORDER: all values are finite, M is symmetric, no row is empty. CONSISTENT: the state is on the
 # rows up to rounding. DEFINITE, INDEFINITE: of an M that varies, both by a margin
 IN_ORDER, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
-NEAR_SHARE = 0.5  # relative to the sizes of the coordinates: a position this near has the same sizes
+NEAR_SHARE = 0.5  # relative to the sizes of the coordinates: a position within this distance has the same sizes
 ROUNDING_OF_ZERO = 2.0**-52  # relative to the largest coordinate: a smaller one is a rounded zero
 EIGENVALUE_MARGIN = 2.0  # factor on the eigenvalue that counts as zero: more than rounding changes it by
 
@@ -171,7 +171,7 @@ def _symmetric(mass, allowed):
 
 @exact
 def _rounding(value, row, state, sizes, least, rate, allowed):
-    """Return whether a value is at most this share of the terms in its sum; no state counts as less than its size."""
+    """Return whether a value is rounding: at most this share of the terms of its sum, each at the size of its state."""
     size = abs(rate)
     for j in range(state.size):
         size += abs(row[j]) * max(abs(state[j]), sizes[j], least)
@@ -180,7 +180,7 @@ def _rounding(value, row, state, sizes, least, rate, allowed):
 
 @exact
 def _is_near(q, sizes, place):
-    """Return whether a position is so near to one with known sizes that these are its own, too."""
+    """Return whether a position is so near to another one that the sizes known there hold for it, too."""
     near = True
     for j in range(q.size):
         near = near and abs(q[j] - place[j]) <= NEAR_SHARE * sizes[j]
@@ -189,7 +189,7 @@ def _is_near(q, sizes, place):
 
 @exact
 def _has_entries(rows, entries):
-    """Return whether exactly these entries of rows are not zero: sizes say little if one of them vanishes there."""
+    """Return whether exactly these entries of rows are nonzero; if one of them vanishes, the sizes mean little."""
     same, n = True, rows.shape[1]
     for i in range(entries.size // n):
         largest = largest_of(rows[i])

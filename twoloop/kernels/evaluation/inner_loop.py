@@ -285,7 +285,7 @@ def _other_task(f, w, task, t, q, v):
 
 @kernel(INNER)
 def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
-    """Do a task, named in tasks.py, at (t, q, v); the functions below describe each."""
+    """Do a task of tasks.py at (t, q, v); the functions below explain each task."""
     if task >= tasks.FIND_NULL_SPACE:
         return _other_task(f, w, task, t, q, v)
     if task == tasks.EVALUATE_AS_GIVEN:  # this task and PROJECT serve methods that integrate all coordinates

@@ -9,13 +9,14 @@ import math
 
 from twoloop.kernels.data.common import compiled, exact
 
-# PENDING: products whose second factors become known with the solution of an order of a series. RESULT: outputs of a
-# table
+# kinds of operations. PENDING: product in a Taylor series whose second factor is known only after the linear equations
+# of the present order are solved. RESULT: output of a table
 PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGENT, PENDING, SUM, RESULT = range(11)
-# columns of a row: the kind, the node (or entry) that it defines, and where the terms of its arguments begin and end
+# columns of a row of a table: kind; node (or entry of the results) that it defines; where the terms of its first and
+# second argument begin, and where those of the second end
 KIND, NODE, FIRST, SECOND, END, N_COLUMNS = range(6)
-# a table as a vector of integers: these sizes, its rows, the nodes of all terms, and the entry of each result. Results
-# are the last nodes
+# a table is stored as a vector of integers: these sizes, the rows, the nodes of all terms, and the entry of each
+# result; results are the last nodes
 N_NODES, N_ROWS, N_TERMS, N_RESULTS, HEAD = range(5)
 
 

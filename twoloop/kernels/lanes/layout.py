@@ -57,7 +57,7 @@ LANES = 8 if has_wide_vectors() else 4  # runs side by side; with two vectors, e
 # functions generated for a mechanism, (order, control, work), which work on the vectors of `work`
 TASKS = (
     "approach",  # move positions of NEW, at AHEAD, towards the constraints, in lanes that are FINE
-    "refine",  # move those that are LEFT_TO_MOVE, and velocities, and compute A and LAM there; FINE: converged by now
+    "refine",  # move positions that are LEFT_TO_MOVE, and velocities; compute A and LAM there; FINE: converged
     "redundant",  # check whether redundant rows hold at NEW
     "departure",  # OFF: departure of a step H from STATE by PREDICTED to NEW
     "commit",  # NEW becomes STATE where ACCEPTED
@@ -65,8 +65,9 @@ TASKS = (
 TASKS_OF_STARTS = (
     "rows",
 )  # C, C_t, entries of C_q at NEW and AHEAD, in the memory of the method; FINE: all of them are finite
-TASKS_OF_STAGES = ("accelerate",)  # A at NEW, without a projection
-# NEW, X after the BEGIN of the step, and ERROR if that is the whole step; FINE stays 1 where that succeeded
+TASKS_OF_STAGES = ("accelerate",)  # compute the accelerations A at the state NEW, without a projection
+# "stages": compute the state NEW at the time X after the beginning of the step, and ERROR if X is the whole step; FINE
+# stays 1 in lanes where that succeeded
 TASKS_OF_EXPLICIT = ("stages",)
 TASKS_OF_SERIES = (
     "series",  # coefficients about STATE at T, in units of time UNIT

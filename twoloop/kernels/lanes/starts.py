@@ -215,9 +215,9 @@ WAYS = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 def places_of_starts(n, n_rows, n_entries, n_redundant):
     """Return where parts of `work` begin, counted from the memory of the method, and its length.
 
-    C, C_t and the entries of G, as the code writes them; numbers of rows; changes of positions or velocities; positions
-    found; the way there; the direction in which rows say least; a way off; a row; what `factor_gram` makes, there and
-    at NEW.
+    The parts are: C, C_t and the entries of G, as the code writes them; numbers of rows; changes of positions or
+    velocities; positions found; the way to them; the direction that the rows determine least; a displacement; a row;
+    the results of `factor_gram` at the positions found, and at NEW.
     """
     G = 2 * n_rows
     x = G + n_entries

@@ -230,7 +230,7 @@ def has_dense_tangents(f, w):
 
 @merged
 def one_stage_of(options):
-    """Return 1 as a number unknown to the compiler, so that functions of newton_systems.py are compiled once."""
+    """Return the number of stages, 1, hidden from the compiler: it would compile newton_systems.py again for a 1."""
     return int(options[STAGES])
 
 

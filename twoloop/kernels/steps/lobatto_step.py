@@ -150,7 +150,7 @@ def _collocate(f, w, options, room, tolerances, t, h, state):
     limited = room[room_at.CURVED] < STRAIGHT and beyond >= -1.0
     room[room_at.LIMITED] = max(0.0, room[room_at.LIMITED] + (1.0 if limited else -1.0))
     factor = room[room_at.FACTOR]
-    # the step size that accuracy allows mostly changes as it did from the step before to this one
+    # the step size that accuracy allows is extrapolated: it mostly changes as it did from the step before to this one
     allowed_h = h * min(room[room_at.FACTOR_OF_ERROR], FAR)
     if error > 1e-6 and room[room_at.CURVED] >= STRAIGHT:
         trend = 1.0 if first else min(max(allowed_h / room[room_at.ALLOWED_H], LEAST_TREND), 1.0)
@@ -174,7 +174,7 @@ def _accept(room):
 
 @merged
 def _is_unsuited(w, room, tolerances):
-    """Return whether another method takes over: near a singular position, and if stiffness limits the steps."""
+    """Return whether another method has to take over: near a singular position, or if stiffness limits the steps."""
     stiff = room[room_at.LIMITED] >= LIMITED or room[room_at.UNMADE] >= REFUSALS
     near = w.notes[NEAR_NOW] == 1.0 or tolerances[LEAST] < TIGHT
     return stiff or (w.notes[NEARLY_SINGULAR] == 1.0 and near)

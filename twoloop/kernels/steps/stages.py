@@ -118,9 +118,9 @@ def end_error(tolerances, options, h, state, new_state, A_stage):
     return top
 
 
-# `options` is that of stages.py, then these scalars, the weights e (s) of the estimate, and for each eigenvalue its
-# real and imaginary part, and its row of T^-1 and column of T (s real, s imaginary parts each). VELOCITIES: 1 if their
-# error is tested, too
+# `options` of Newton's method: the parameter block above, then these scalars, the weights e (s) of the estimate, and for
+# each eigenvalue its real and imaginary part, and its row of T^-1 and column of T (s real, s imaginary parts each).
+# VELOCITIES: 1 if their error is tested, too
 N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
 
 # places in `memory`
@@ -137,7 +137,7 @@ N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
     DAMPED,  # 0: no derivative by v
     SYMMETRIC,  # 1: the matrix of diagonal_step.py was factored as a symmetric one
     DURATION,  # s: duration of an error of velocity; 0: not known
-    CHANGED,  # 1: diagonal_step.py has renewed derivatives at the end of the step
+    CHANGED,  # 1: diagonal_step.py has computed new derivatives at the end of the step
     N_MEMORY_SCALARS,
 ) = range(14)
 PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
@@ -282,7 +282,7 @@ def _tail(memory, s, n, k):
 
 @inlined
 def pivots_of(memory, s, n, k):
-    """Return integers (n) for the row exchanges of the filter (k = 0) or of the (k - 1)-th eigenvalue's system."""
+    """Return the row exchanges (n integers) of the filter (k = 0), or of the system of eigenvalue k - 1."""
     return _tail(memory, s, n, k)[:n].view(np.int64)
 
 

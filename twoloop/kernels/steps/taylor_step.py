@@ -56,8 +56,8 @@ from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.linalg.saddle_point import solve_both
 
 # places in `options`: scalars (ORDER is that of the series of q); where each array of the program begins, and where the
-# last ends; then the arrays, integers by their bits. KEEP: steps follow one another by the same series, about the first
-# state, as between the ends of a step
+# last ends; then the arrays, integers by their bits. KEEP: consecutive
+# steps evaluate one series about the first state, to interpolate within a step
 ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, N_SCALARS = range(7)
 # arrays of a table; arrays of sums as twoloop.generate.series.Sums has them
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
@@ -75,13 +75,13 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns o
     NEXT_UNIT,
     LENGTH,  # length of the step that each series allows, in its unit
     NEXT_LENGTH,
-    TRIED,  # 1: the last attempt left a series that takes over if it was accepted
+    TRIED,  # 1: the last attempt stored a series, which is used from now on if the attempt was accepted
     PASSED,  # with KEEP: time since the state of the series, s
     TARGET,  # index of the series that is computed
     # ratio of the step to LENGTH that the distance of its end from the constraints allowed before; 0: not known
     SHORTER,
     ATTEMPTS,  # number of attempts, so that each attempt checks other places
-    SUSPECTED,  # 1: a step was rejected for the defect at the time SUSPECT, which no step has passed since
+    SUSPECTED,  # 1: a step was rejected for its defect at time SUSPECT, and no accepted step has reached that time
     SUSPECT,
     N_MEMORY_SCALARS,
 ) = range(14)

@@ -19,8 +19,8 @@ from twoloop.kernels.steps import stages as at
 from twoloop.kernels.steps.newton_systems import DIFFERENCE
 from twoloop.kernels.steps.stages import INNER_TOL, block, vector
 
-# factor on the duration of an error that turns back as slowly as the motion itself: it is no vibration, and errors of
-# the next steps have the same sign
+# factor on the duration of an error that turns back as slowly as the motion itself: such an error is no vibration, and
+# the errors of the next steps have the same sign
 SLOW_FACTOR = 10.0
 LONGEST_GAPS = 10.0  # times GAP: longest duration of an error
 STEPS_TO_DECAY = 10.0  # number of steps after which an error that is fast beside the step has decayed
