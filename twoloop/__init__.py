@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from twoloop.problem.problem import Problem
     from twoloop.problem.system import ConstrainedSystem
     from twoloop.result.certificate import Certificate, CertificateWarning
-    from twoloop.result.loading import load
-    from twoloop.result.result import Result, citation
+    from twoloop.result.result import Result, citation, load
     from twoloop.run.projection import ConsistentState, consistent_state
     from twoloop.run.record import Statistics, Status
     from twoloop.solve import solve_dae
@@ -81,8 +80,7 @@ _NAMES_OF = {
     "problem.problem": ("Problem",),
     "problem.system": ("ConstrainedSystem",),
     "result.certificate": ("Certificate", "CertificateWarning"),
-    "result.loading": ("load",),
-    "result.result": ("Result", "citation"),
+    "result.result": ("Result", "citation", "load"),
     "run.projection": ("ConsistentState", "consistent_state"),
     "run.record": ("Statistics", "Status"),
     "solve": ("solve_dae",),

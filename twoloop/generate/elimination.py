@@ -121,7 +121,7 @@ class Dependents:
             self.arguments = kinds, np.array(rows, np.int64), len(rows), room, work, blocks
 
     def blocks(self, G: Array) -> Blocks:
-        """Return the blocks of the choice for a G."""
+        """Return the rows and the coordinates that they determine (`Choice.blocks`) for the numbers of a G."""
         if self.find is None:
             return ()
         n = self.find(G, *self.arguments)

@@ -373,8 +373,8 @@ class LaneStages:
         _, control, work = arguments
         x, t = emit.load(work, lanes.X), emit.load(work, lanes.T)
         for i in range(1, len(b)):
-            ahead = emit.add(t, emit.multiply(emit.constant(c[i]), x))
-            emit.store(ahead, work, lanes.AHEAD)
+            stage_time = emit.add(t, emit.multiply(emit.constant(c[i]), x))
+            emit.store(stage_time, work, lanes.AHEAD)
             with emit.loop(integer(0), integer(self.n), []) as (j, _, _):
                 own = _Coordinate(self, emit, at, j, i)
                 own.move(A[i], A[i] @ A, x)

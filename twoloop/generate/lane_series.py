@@ -332,12 +332,12 @@ class LaneSeries:
         sums = self._sums(emit, scratch, k)
         edges = _Edges(sums, first, self._row(emit, scratch, integer(1)), row_before)
         self._operate(emit, known, self.early, row, scratch, edges, order, inverse)
-        ahead = {pair: edges.ahead(pair, row) for pair in self.sums_ahead}
+        next_sums = {pair: edges.next_sum(pair, row) for pair in self.sums_ahead}
         for place, pair in enumerate(self.sums_ahead):
-            emit.store(ahead[pair], scratch, self.carried + place)
+            emit.store(next_sums[pair], scratch, self.carried + place)
         per_unit = emit.divide(emit.constant(1.0), unit)
         for result, pair in self._carried.items():
-            known.define(result, emit.multiply(per_unit, ahead[pair]))
+            known.define(result, emit.multiply(per_unit, next_sums[pair]))
         scale = emit.negative(emit.divide(order, unit))
         c = [zero] * self.n_rows
         for place, (terms, _) in self.rows:
@@ -423,8 +423,8 @@ class LaneSeries:
                 up, down = self._row(emit, scratch, j), self._row(emit, scratch, builder.sub(following, j))
                 below = self._row(emit, scratch, builder.sub(j, integer(1)))
                 loaded: dict[tuple[Value, int], Value] = {}
-                for ((x, y), ahead), total in zip(some, totals, strict=True):
-                    places = ((up, x), (down, y)) if ahead else ((down, x), (below, y))
+                for ((x, y), for_next_order), total in zip(some, totals, strict=True):
+                    places = ((up, x), (down, y)) if for_next_order else ((down, x), (below, y))
                     for base, place in places:
                         if (base, place) not in loaded:
                             loaded[base, place] = emit.load(base, place)
@@ -523,7 +523,7 @@ class _Edges(NamedTuple):
         emit, (x, y) = self.before.emit, pair
         return emit.add(self.sums[pair, False], emit.multiply(emit.load(self.first, x), self.before.load(y)))
 
-    def ahead(self, pair: tuple[int, int], row: _Row) -> Value:
+    def next_sum(self, pair: tuple[int, int], row: _Row) -> Value:
         """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k, from the row of order k."""
         emit, (x, y) = self.before.emit, pair
         total = emit.add(self.sums[pair, True], emit.multiply(row.load(x), emit.load(self.first, y)))

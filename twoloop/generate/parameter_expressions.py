@@ -121,7 +121,7 @@ class ParameterTape(Symbolic):
         return {powers: number.scale * c for powers, c in definition[1]}
 
     def on(self, parameters: Array) -> Callable[[float], Any]:
-        """Return a function that evaluates a number for other parameters, of shapes as for `products`."""
+        """Return a function that evaluates a number for other parameters, whose shapes are those of `products`."""
         product = self.products(parameters)
         return lambda number: number.scale * product(number.powers) if type(number) is Parameter else number
 

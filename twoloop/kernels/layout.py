@@ -36,9 +36,9 @@ Places = list[tuple[str, int, int, tuple[int, ...]]]  # arrays in a piece of mem
 class Layout(NamedTuple):
     """Offsets of the arrays of a workspace, in one piece of memory for numbers and one for integers.
 
-    The table of addresses and shapes is `table` + `of_numbers` times the address of the one + `of_integers` times that
-    of the other. The first `n_lasting` numbers, and integers, count at the start of a step; others are filled before
-    they are read.
+    The table of addresses and shapes is `table`, plus `of_numbers` times the address of the numbers, plus `of_integers`
+    times the address of the integers. A step reads the first `n_lasting` numbers and `n_lasting_integers` integers that
+    the step before has left; it fills all others before it reads them.
     """
 
     numbers: Places

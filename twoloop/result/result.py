@@ -1,4 +1,4 @@
-"""Define `Result`, the return value of `solve_dae`: the record of a run with its views, and what to cite for it."""
+"""Define `Result`, the return value of `solve_dae`: the record of a run with its views; read saved ones, and cite."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
+from twoloop.checks.arguments import check_path
 from twoloop.methods.presets import PRESETS
+from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.certificate import Certificate, certify
 from twoloop.result.reactions import Reaction, reaction
-from twoloop.result.storage import save
+from twoloop.result.storage import read_fields, save
 from twoloop.result.views import animate, plot, to_dataframe
 from twoloop.run.record import Record
 
@@ -327,3 +329,46 @@ def bibliography() -> dict[str, str]:
     """Return the BibTeX entries of all sources by the keys of `SOURCES`, and that of the paper."""
     text = Path(__file__).with_name("citations.bib").read_text(encoding="utf-8")
     return dict(entry.removeprefix("% ").split("\n", 1) for entry in text.strip().split("\n\n"))
+
+
+def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) -> Result:
+    """Read a result written by `Result.save`, or stored in a folder by `solve_dae(..., store=folder)`.
+
+    Parameters
+    ----------
+    path : str or path
+        The file, or the folder, whose arrays are memory-mapped.
+    system : ConstrainedSystem, optional
+        The system that was solved, required by `result.sol`, `result.reactions`, `result.energy`, `result.plot` and
+        `result.animate`. None: `result.sol` is None.
+
+    Returns
+    -------
+    Result
+        The result as saved.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    TypeError, ValueError
+        If the file was not written by `Result.save`, or the folder not by `solve_dae`; if it is damaged (the message
+        names the field); or if the system has other sizes.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from twoloop import load, solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     result.save(Path(folder) / "run.npz")
+    ...     loaded = load(Path(folder) / "run.npz")
+    >>> bool((loaded.q == result.q).all())
+    True
+    """
+    if system is not None:
+        check_system(system)
+    return Result(**read_fields(check_path(path), system))

@@ -108,7 +108,7 @@ class Interpolator:
         system, t0, row = self.made_of[:3]
         q0, static = row[: system.n_q], self.static
         for plan in self.plans.values():
-            loaded(plan.second)  # loaded now, as the solution calls it for as long as it lives
+            loaded(plan.second)  # load the step now, because the solution may call it at any later time
         self.kits = {kind: kit_of(system, t0, q0, plan, static) for kind, plan in self.plans.items()}
         self.kit = kit_of(system, t0, q0, None, static)
         pattern = pattern_of(system, t0, q0) if static is None else np.zeros((0, 0))
@@ -266,7 +266,7 @@ class Interpolator:
             self.sound.add(begin)
 
     def _repair_plan(self, kind: int) -> tuple[Plan, Any]:
-        """Return the plan and the kit of the steps that divide an interval of a kind for a repair."""
+        """Return plan and kit of the steps that divide an interval whose neighbouring states do not suit it."""
         stiff = kind == indices.VELOCITIES
         if stiff not in self.repairs:
             from twoloop.methods.dop853 import DOP853
@@ -421,7 +421,7 @@ class OutputInterpolation:
             return None
         added = np.full((len(times), len(self.run.state) - found.shape[1]), np.nan)
         known.complete(times, found, added)
-        if known.static is not None or known.repairs:  # it has changed: the next run needs a new one
+        if known.static is not None or known.repairs:  # this interpolator has changed: the next run needs a new one
             self._interpolator = None
         return np.concatenate([found, added], axis=1) if known.failures == 0 else None
 

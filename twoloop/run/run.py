@@ -99,7 +99,9 @@ class Run:
         self._set_clock(t0)
         self.control_by(plan)
         self.substituted = False  # whether another plan has replaced the first for good
-        self.near = singular_threshold(rtol)  # pivots at output times below which errors of velocities are estimated
+        self.near = singular_threshold(
+            rtol
+        )  # ratio of pivots at output times below which errors of velocities are estimated
         ran = any("force" in each.kinds for each in plan.traced)
         changes = system.remembered(("changes", ran), lambda: (may_be_sudden(system, ran), may_be_narrow(system, ran)))
         sudden, narrow = (Sudden(False, False), True) if step_size is not None else changes
@@ -292,7 +294,9 @@ class Run:
         if code == indices.RANK_DIFFERS:  # happens after a start at which rows depend on one another
             self.work.notes[indices.GENERATION] = 1.0
             code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
-        if before.notes[indices.PIVOT] > 0.0 and largest > 0.0:  # as if this form had measured all pivots so far
+        if (
+            before.notes[indices.PIVOT] > 0.0 and largest > 0.0
+        ):  # scale it as if this form had measured all pivots so far
             pivot = self.work.notes[indices.PIVOT]
             self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest / before.notes[indices.PIVOT])
 

@@ -386,7 +386,7 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
             f, w, tolerances, clock, t, t, way / N_SAMPLES, last, 1.0, q, v, A
         )
     clock[at.SAMPLES_MOTION] = 0.0
-    # known from closer samples, which have to continue there
+    # a change that samples in time have found at their end: they continue from there, and have to be as close
     known = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t
     if not known and way <= N_SAMPLES * min(control[at.APART], size / IN_A_STEP):  # as close as samples in time alone
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], way / N_SAMPLES)
@@ -430,7 +430,7 @@ def limit_to_discontinuity(f, w, tolerances, control, clock, t, size, last, stat
     known = clock[at.DISCONTINUITY] if clock[at.DISCONTINUITY] > near else np.inf
     along = clock[at.DISCONTINUITY_OF_MOTION] if clock[at.DISCONTINUITY_OF_MOTION] > near else np.inf
     at_change = known == np.inf and clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO] > -np.inf
-    # not up to the end of a run, where samples of shorter and shorter remaining spans would find the change again
+    # except at the end of a run, where samples of ever shorter remaining spans would find the change again
     if control[at.BY_TIME] == 1.0 and not (at_change and size <= (1.0 + NEARLY) * clock[at.SAMPLED_EVERY]):
         known = _sample_ahead(f, w, tolerances, control, clock, known, t, size, last, q, v, a)
         clock[at.DISCONTINUITY] = known

@@ -86,7 +86,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     PIVOT_HERE,  # sparse form: the smallest pivot at the end of the last step
     SAMPLED_TO,  # end of the samples taken in time
     SAMPLED_EVERY,  # s, spacing of the last samples in time
-    WIDEST_SAMPLING,  # s, the widest spacing so far
+    WIDEST_SAMPLING,  # s, the widest spacing of samples so far
     DISCONTINUITY,  # time of the next sudden change found by samples in time
     DISCONTINUITY_OF_MOTION,  # ... and of the next one found by samples along the motion
     COMPARED,  # time at which a short step was last compared with its neighbours

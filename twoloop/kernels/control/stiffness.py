@@ -318,8 +318,8 @@ def _look(f, w, options, memory, tolerances, t, state, new_state):
         hidden = _is_quiet(w, tolerances, state, memory[RATE])
         if not hidden:
             hidden = memory[RATE] > APART * _shown_rate(f, w, t, state, memory[RATE], Q, V, A)
-    # explicit steps near a speed at which friction reverses show its rate at few states; and the cost of a run is known
-    # only after the short steps of its start
+    # a trial begins whatever the estimated rate if the explicit steps have cost so much: near a speed at which friction
+    # reverses, few states show its rate, and the cost of a run is known only after the short steps of its start
     anyway = cheap and cost > afforded and paid > ANYWAY * afforded * (1.0 + memory[N_TRIALS])
     due = share > SURELY or hidden or anyway or (memory[NEAR] >= options[LOOKS] and cheap)
     if cheap and share <= 1.0:  # while a trial would cost too much, NEAR stores that it is due

@@ -314,7 +314,8 @@ def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
 def evaluate(f, w, t, q, v, tolerance, a):
     """Evaluate the right-hand side: dependent q and v from the independent ones, then a.
 
-    Velocities and accelerations are those of a Jacobian whose position is off by w.notes[REUSE] at most.
+    Velocities and accelerations use the Jacobian of the last Newton iterate that was factored; its position differs
+    from the final one by at most w.notes[REUSE].
     """
     return f.inner(f, w, tasks.EVALUATE, t, q, v, tolerance, a, w.lam)
 

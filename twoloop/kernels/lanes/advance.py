@@ -246,7 +246,7 @@ def step_by_series(code, settings, control, options, work, status, n_steps, with
             leave_run(work, status, k, MANY_STEPS)
     code.series(order, control, work)
     code.lengths(order, control, work)
-    for k in range(LANES):  # evaluations at places within the step
+    for k in range(LANES):  # add the evaluations at places within the step
         if work[FINE * LANES + k] == 1.0 and work[H * LANES + k] > control[GAP]:
             work[EVALUATED * LANES + k] = np.ceil(work[H * LANES + k] / control[GAP]) - 1.0
     code.check_within(order, control, work)

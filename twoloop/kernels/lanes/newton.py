@@ -211,7 +211,7 @@ def factor_systems_of_lanes(settings, own, s, work):
 
 @compiled
 def predict_stages(settings, c, work, begins):
-    """Predict stages by the polynomial of the last step, or as constant; `begins` 0: by the polynomial of this step."""
+    """Predict stages by the polynomial of the last step, or as constant; with `begins` = 0 by that of this step."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     s = c.size

@@ -34,7 +34,7 @@ GROWTH = 2.0  # largest growth of a step
 HIGHEST, INNER_TOL, OUTER_TOL, N_SCALARS = range(4)
 # places in `memory`: scalars, rows of coefficients, then vectors; see _coefficients and _blocks
 (
-    HAS_TRIAL,  # 1: the last attempt left differences at its end
+    HAS_TRIAL,  # 1: the last attempt stored the differences at its end
     ORDER,
     DEPTH,  # highest difference in the history
     AGE,  # number of accepted steps since the order changed or the error test failed

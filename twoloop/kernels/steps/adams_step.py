@@ -76,7 +76,7 @@ def _row(memory, which):
 
 @inlined
 def _table(memory, n, which):
-    """Return rows phi_i - d of one of the two tables, and d in the last row (N_TERMS + 1, n padded)."""
+    """Return one of the two tables (N_TERMS + 1, n padded): rows of differences phi_i less d, and d in the last row."""
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + int(which) * (N_TERMS + 1) * width
     return memory[start : start + (N_TERMS + 1) * width].reshape((N_TERMS + 1, width))

@@ -17,7 +17,7 @@ FARTHEST = 3.0  # largest step ratio over which the old stage polynomial is extr
 # weight of `end_error` beside Richardson's estimate, because it serves jumps between ends and stages
 END_ERROR_WEIGHT = 0.01
 
-# places in `options`: scalars, then A (s, s), A A (s, s), b (s), b A (s), c (s) and two rows (s) for `end_error`
+# places in `options`: scalars, then A (s, s), A A (s, s), b (s), b A (s), c (s) and two rows (s) for `end_error`.
 # EXTRAPOLATION: 1 / (2^order - 1), or 0 without; POWER: order - 1
 STAGES, INNER_TOL, OUTER_TOL, EXTRAPOLATION, OUTER_TEST, POWER, N_SCALARS = range(7)
 
@@ -118,9 +118,9 @@ def end_error(tolerances, options, h, state, new_state, A_stage):
     return top
 
 
-# `options` of Newton's method: the parameter block above, then these scalars, the weights e (s) of the estimate, and for
-# each eigenvalue its real and imaginary part, and its row of T^-1 and column of T (s real, s imaginary parts each).
-# VELOCITIES: 1 if their error is tested, too
+# `options` of Newton's method: the parameter block above, then these scalars, the weights e (s) of the estimate, and
+# for each eigenvalue its real and imaginary part, and its row of T^-1 and column of T (s real, s imaginary parts
+# each). VELOCITIES: 1 if their error is tested, too
 N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
 
 # places in `memory`

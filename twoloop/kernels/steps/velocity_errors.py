@@ -23,8 +23,8 @@ from twoloop.kernels.steps.stages import INNER_TOL, block, vector
 # the errors of the next steps have the same sign
 SLOW_FACTOR = 10.0
 LONGEST_GAPS = 10.0  # times GAP: longest duration of an error
-STEPS_TO_DECAY = 10.0  # number of steps after which an error that is fast beside the step has decayed
-FAST = 20.0  # in steps: an error of the velocities of a shorter duration is fast
+STEPS_TO_DECAY = 10.0  # number of steps after which a fast error has decayed
+FAST = 20.0  # duration, in steps, below which an error of the velocities counts as fast
 UNLIKE = 0.3  # relative difference of accelerations above which derivatives do not belong to a state
 
 
