@@ -172,7 +172,7 @@ def lane_methods(name: str, stiff: bool, n: int, rtol: float, atol: float, invol
 
 def _taylor(rtol: float, atol: float) -> LaneMethod:
     def step() -> Any:
-        from twoloop.kernels.lanes.advance import step_by_series
+        from twoloop.kernels.lanes.control import step_by_series
 
         return step_by_series
 
@@ -182,12 +182,12 @@ def _taylor(rtol: float, atol: float) -> LaneMethod:
 
 def _dop853(n: int, rtol: float, atol: float) -> LaneMethod:
     def step() -> Any:
-        from twoloop.kernels.lanes.advance import step_by_dop853
+        from twoloop.kernels.lanes.control import step_by_dop853
 
         return step_by_dop853
 
     def memory(code: LaneCode) -> int:
-        from twoloop.kernels.lanes.advance import memory_size
+        from twoloop.kernels.lanes.control import memory_size
 
         return memory_size(len(dop853.B), n)
 

@@ -768,5 +768,5 @@ def _stamp() -> str:
     """Return a digest of the modules that write the code, and of the kernels that call it."""
     from twoloop.kernels.data import common
 
-    kernels = ("lanes.control", "lanes.advance", "control.step_size")
+    kernels = ("lanes.control", "control.step_size")
     return digest_of("".join(map(common.stamp, kernels)), __file__, *WRITERS)

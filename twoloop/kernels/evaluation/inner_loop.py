@@ -50,6 +50,7 @@ from twoloop.kernels.evaluation.operations import gamma_by_program
 from twoloop.kernels.evaluation.partition import (
     CONTRACTION,
     MAX_ITERATIONS,
+    MIN_CORRECTION,
     ROUNDING_OF_CORRECTIONS,
     choose_oriented_partition,
     factor_dependent,
@@ -157,9 +158,6 @@ def equilibrate(f, w, a, lam):
     saddle_point.multipliers(f, w, w.Q, a, lam)
     if w.rows_v.size < lam.size:
         least_norm(w, lam)
-
-
-MIN_CORRECTION = 10.0  # in units of the rounding of positions: smaller corrections are never required
 
 
 @merged

@@ -381,6 +381,7 @@ def partition_is_poor(w):
 MAX_ITERATIONS = 25  # Newton iterations; quadratic convergence needs 2 to 5
 CONTRACTION = 0.5  # each correction must be at most this times the one before
 ROUNDING_OF_CORRECTIONS = 1e-12  # relative to the largest value: changes of this size no longer shrink
+MIN_CORRECTION = 10.0  # in units of the rounding of positions: smaller corrections are never required
 MAX_VIOLATION = 1e-7  # relative to the mechanism's size: largest violation of a redundant row
 
 

@@ -59,9 +59,14 @@ from twoloop.kernels.data.indices import (
 )
 from twoloop.kernels.evaluation import tasks
 from twoloop.kernels.evaluation.constraints import constraint_rates
-from twoloop.kernels.evaluation.inner_loop import MIN_CORRECTION
 from twoloop.kernels.evaluation.operations import gamma_by_program, jacobian_by_program
-from twoloop.kernels.evaluation.partition import CONTRACTION, MAX_ITERATIONS, MAX_VIOLATION, ROUNDING_OF_CORRECTIONS
+from twoloop.kernels.evaluation.partition import (
+    CONTRACTION,
+    MAX_ITERATIONS,
+    MAX_VIOLATION,
+    MIN_CORRECTION,
+    ROUNDING_OF_CORRECTIONS,
+)
 from twoloop.kernels.linalg.dense import copy, has_new_entries, largest_of
 from twoloop.kernels.linalg.sparse_ldl import factor, load, solve, solve_refined
 from twoloop.kernels.linalg.symbolic_factorization import N_OFF, N_PIVOTS, jacobian_of, mass_of, order_of

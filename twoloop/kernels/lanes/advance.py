@@ -1,11 +1,7 @@
-"""Integration loop of runs in lanes, and the steps of explicit methods in lanes.
+"""Integration loop of runs in lanes: each lane has its own steps, and takes the next run when its run has ended.
 
-Each lane has its own steps, and takes the next run when its run has ended.
 A run leaves its lane, and is repeated on its own, if a condition of the code does not hold, or if a step is rejected
 again and again. `CODE.step` makes the steps.
-
-Stages of DOP853 are not projected, as in `explicit_step`: only the end of a step is projected onto the constraints.
-Step-size control of a Taylor series is code generated for the mechanism, see generate/lane_code.py.
 """
 
 import numpy as np
@@ -13,45 +9,26 @@ from numba import types
 
 from twoloop.kernels.compile.callbacks import VECTOR
 from twoloop.kernels.data.common import INTEGERS, compiled, kernel
-from twoloop.kernels.lanes.control import (
-    MOST_STEPS,
-    begin_control,
-    choose_steps,
-    copy_vectors,
-    end_steps,
-    judge_steps,
-    project_lanes,
-    set_end,
-)
 from twoloop.kernels.lanes.layout import (
     ACCEPTED,
     AHEAD,
-    BEGIN,
-    CHECKS_REDUNDANT,
     CODE,
     ENDED,
     EVALUATED,
     FINE,
     FRESH,
-    GAP,
     LANES,
-    MANY_STEPS,
     N_EVALUATIONS,
-    N_NUMBERS,
     N_ROWS,
     NO_START,
     NO_VALUES,
     OFTEN_REFUSED,
     ORDER,
-    PREDICTED_V,
     REACHED,
     REFUSED,
     REQUESTED,
     RUN,
     RUNNING,
-    SLOPES,
-    START,
-    STEP,
     T0,
     T1,
     UNDECIDED,
@@ -63,6 +40,7 @@ from twoloop.kernels.lanes.layout import (
     fill_field,
     leave_run,
     places_of,
+    project_lanes,
 )
 
 TABLE, STATES = types.float64[:, ::1], types.float64[:, :, ::1]
@@ -207,53 +185,3 @@ def advance_lanes(
         if times.size > 1:
             _write_within_steps(code, settings, control, options, work, n, new, times, out_q, out_v, status, n_steps)
         _advance_time(work, control, n_steps)
-
-
-def memory_size(s: int, n: int) -> int:
-    """Return the length of the method's memory, in vectors, for s stages."""
-    return (SLOPES + s) * n
-
-
-@kernel(STEP)
-def step_by_dop853(code, settings, control, options, work, status, n_steps, within):
-    """Make a step that is not longer than the largest gap between evaluations, or compute states within a step."""
-    n = settings[N]
-    state, _, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
-    start = memory + START * n
-    if not within:
-        begin_control(options, control, work, n, state, a, start)
-        choose_steps(work, control, status, n_steps)
-        copy_vectors(work, state, memory + BEGIN * n, 2 * n)
-        copy_vectors(work, start, memory + SLOPES * n, n)
-    code.stages(settings[ORDER], control, work)
-    set_end(work, control)
-    if not within:
-        end_steps(code, settings, control, work, memory + PREDICTED_V * n)
-        judge_steps(options, work, n, a, start, status)
-
-
-@kernel(STEP)
-def step_by_series(code, settings, control, options, work, status, n_steps, within):
-    """Make a step by the series about its beginning, or compute states within one."""
-    order = settings[ORDER]
-    if within:
-        for k in range(LANES):
-            work[X * LANES + k] = work[X * LANES + k] / work[UNIT * LANES + k]
-        code.evaluate(order, control, work)
-        return
-    for k in range(LANES):  # stiff motion takes as many steps as its time scales
-        if work[RUNNING * LANES + k] == 1.0 and n_steps[int(work[RUN * LANES + k])] >= MOST_STEPS:
-            leave_run(work, status, k, MANY_STEPS)
-    code.series(order, control, work)
-    code.lengths(order, control, work)
-    for k in range(LANES):  # add the evaluations at places within the step
-        if work[FINE * LANES + k] == 1.0 and work[H * LANES + k] > control[GAP]:
-            work[EVALUATED * LANES + k] = np.ceil(work[H * LANES + k] / control[GAP]) - 1.0
-    code.check_within(order, control, work)
-    code.evaluate(order, control, work)
-    project_lanes(code, order, control, work)
-    if settings[CHECKS_REDUNDANT] == 1:
-        code.redundant(order, control, work)
-    code.departure(order, control, work)
-    code.defect(order, control, work)
-    code.judge(order, control, work)

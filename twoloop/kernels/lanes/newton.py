@@ -12,23 +12,7 @@ each step.
 import numpy as np
 
 from twoloop.kernels.data.common import compiled, kernel, merged
-from twoloop.kernels.lanes.control import (
-    LEAST,
-    N_HEAD,
-    add_product,
-    begin_control,
-    choose_steps,
-    copy_vectors,
-    end_steps,
-    enlarge,
-    factor_lanes,
-    judge_steps,
-    set_end,
-    solve_lanes,
-    sum_rows,
-    table,
-    vectors,
-)
+from twoloop.kernels.lanes.control import LEAST, N_HEAD, begin_control, choose_steps, end_steps, judge_steps, set_end
 from twoloop.kernels.lanes.layout import (
     ACCEPTED,
     AHEAD,
@@ -49,8 +33,16 @@ from twoloop.kernels.lanes.layout import (
     N,
     T,
     X,
+    add_product,
+    copy_vectors,
+    enlarge,
+    factor_lanes,
     fill_field,
     places_of,
+    solve_lanes,
+    sum_rows,
+    table,
+    vectors,
 )
 from twoloop.kernels.steps.newton_systems import DIFFERENCE, MAX_ITERATIONS, STAGNATION
 from twoloop.kernels.steps.stages import (

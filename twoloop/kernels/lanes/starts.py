@@ -15,7 +15,6 @@ from numba import types
 from twoloop.kernels.compile.callbacks import VECTOR, f8
 from twoloop.kernels.data.common import INTEGERS, KIT, compiled, kernel, merged
 from twoloop.kernels.data.indices import GAMMA_GIVEN
-from twoloop.kernels.lanes.control import copy_vectors
 from twoloop.kernels.lanes.layout import (
     AHEAD,
     CODE,
@@ -27,6 +26,7 @@ from twoloop.kernels.lanes.layout import (
     RUNNING,
     T0,
     N,
+    copy_vectors,
     fill_field,
     places_of,
 )

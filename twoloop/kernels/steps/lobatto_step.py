@@ -56,7 +56,8 @@ from twoloop.kernels.data.indices import (
     SINGULAR,
     UNSUITED,
 )
-from twoloop.kernels.evaluation.inner_loop import MIN_CORRECTION, check_redundant, project, renew_partition
+from twoloop.kernels.evaluation.inner_loop import check_redundant, project, renew_partition
+from twoloop.kernels.evaluation.partition import MIN_CORRECTION
 from twoloop.kernels.linalg.dense import copy
 
 # FREE: longest step, in units of LOOK, whose nodes alone are close enough; a longer one is audited between its nodes
