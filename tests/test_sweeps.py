@@ -10,7 +10,7 @@ import pytest
 from tests.problems import pendulum as bare_pendulum
 from twoloop import solve_dae, sweep
 from twoloop.mechanisms import Problem, four_bar
-from twoloop.sweeps import saved_rows
+from twoloop.sweeps import one_run
 from twoloop.sweeps import sweep as sweep_module
 
 pd = pytest.importorskip("pandas")  # not among the oldest versions
@@ -96,7 +96,9 @@ def test_a_dask_cluster_gives_the_same_numbers(rows):
 def test_an_interrupted_sweep_goes_on(tmp_path, monkeypatch):
     out = tmp_path / "rows.parquet"
     options = {"parallel": "threads", "workers": 1, "t_span": (0.0, 0.1), "out": out}
-    monkeypatch.setattr(saved_rows, "settings", lambda work: saved_rows.Settings("the same", {}))  # of both functions
+    monkeypatch.setattr(
+        sweep_module, "sweep_settings", lambda work: one_run.Settings("the same", {})
+    )  # of both functions
     with pytest.raises(KeyboardInterrupt):
         sweep(interrupted, ANGLES, **options)
     saved = pd.read_parquet(out)
@@ -235,7 +237,7 @@ PAIRS = {
 @pytest.mark.parametrize("name", PAIRS)
 def test_rows_of_another_function_of_the_same_name_are_refused(name, resumes, monkeypatch):
     first, second = PAIRS[name]
-    monkeypatch.setattr("twoloop.sweeps.saved_rows._in_words", lambda value: "the same words")
+    monkeypatch.setattr("twoloop.sweeps.one_run._in_words", lambda value: "the same words")
     assert resumes(first, first) and not resumes(first, second)
 
 

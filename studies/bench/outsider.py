@@ -31,8 +31,7 @@ from twoloop import Result, Statistics, Status
 from twoloop.mechanisms import Problem
 from twoloop.mechanisms.registry import problem_from
 from twoloop.rows.row_format import calibration_s
-from twoloop.testing.problem import Array, KnownProblem
-from twoloop.testing.runs import run_simulator
+from twoloop.testing.problem import Array, KnownProblem, run_simulator
 
 
 def known_problem(problem: Problem, t0: float, q0: Array, v0: Array, t_end: float) -> KnownProblem:

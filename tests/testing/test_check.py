@@ -15,7 +15,7 @@ from tests.testing.systems import system_of
 from twoloop import solve_dae
 from twoloop.testing import check_simulator
 from twoloop.testing.mechanisms import MAKERS
-from twoloop.testing.runs import change_frame, change_units
+from twoloop.testing.problem import change_frame, change_units
 
 LONG = ("andrews", "heavy_top")  # the dearest to evaluate
 LONGEST = "a misprint in the tableau"  # takes ten seconds

@@ -15,8 +15,7 @@ from scipy.linalg import lapack
 from twoloop.checks.arguments import Array
 from twoloop.checks.callbacks import UNSYMMETRIC, check_bounds, unsymmetric_mass
 from twoloop.checks.derivatives import check_derivatives
-from twoloop.checks.differences import defined
-from twoloop.checks.scales import EPS, NONE, Scales, generic_factors, scales_of, signs
+from twoloop.checks.scales import EPS, NONE, Scales, defined, generic_factors, scales_of, signs
 from twoloop.checks.sparse_rows import Rows, SparseRows, largest_in_rows
 from twoloop.checks.structure import SINGULAR_MASS, least_solution, not_finite, place_of_mass, ways
 from twoloop.kernels.compile.linking import entry_point

@@ -14,8 +14,18 @@ import numpy as np
 
 from twoloop.checks.arguments import Array
 from twoloop.checks.callbacks import unsymmetric_mass, wrong_values
-from twoloop.checks.differences import EPS, Estimate, Function, as_far_as_they_differ, confirms, defined, differentiate
-from twoloop.checks.scales import generic_factors, generic_velocities, sizes
+from twoloop.checks.scales import (
+    EPS,
+    Estimate,
+    Function,
+    as_far_as_they_differ,
+    confirms,
+    defined,
+    differentiate,
+    generic_factors,
+    generic_velocities,
+    sizes,
+)
 from twoloop.checks.sparse_rows import SparseRows, apart, is_finite
 from twoloop.checks.structure import changed_mass, check_bandwidth, wrong_kinematics
 from twoloop.kernels.data.indices import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN

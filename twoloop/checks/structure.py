@@ -12,8 +12,15 @@ from scipy.linalg import lapack, null_space, qr
 
 from twoloop.checks.arguments import Array
 from twoloop.checks.callbacks import SAME, UNSYMMETRIC, unsymmetric_mass, wrong_values
-from twoloop.checks.differences import EPS, as_far_as_they_differ, defined
-from twoloop.checks.scales import generic_factors, generic_velocities, rows_at, scales_of
+from twoloop.checks.scales import (
+    EPS,
+    as_far_as_they_differ,
+    defined,
+    generic_factors,
+    generic_velocities,
+    rows_at,
+    scales_of,
+)
 from twoloop.checks.sparse_rows import SparseRows
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.kernels.compile.linking import entry_point

@@ -30,7 +30,6 @@ from twoloop.kernels.compile.caches import n_compiled
 from twoloop.result.result import Result
 from twoloop.run.options import check_method
 from twoloop.solve import solve_dae
-from twoloop.sweeps import saved_rows
 from twoloop.sweeps.one_run import (
     STANDARD_COLUMNS,
     Row,
@@ -41,6 +40,9 @@ from twoloop.sweeps.one_run import (
     fit_columns,
     kind_of,
     one_run,
+    read_rows,
+    sweep_settings,
+    write_rows,
 )
 
 if TYPE_CHECKING:
@@ -286,8 +288,8 @@ def sweep(
     path = None if out is None else check_path(out, "out")
     rows: dict[int, Row] = {}
     if path is not None:
-        settings = saved_rows.settings(work)
-        rows = saved_rows.read(pandas, path, runs, settings)
+        settings = sweep_settings(work)
+        rows = read_rows(pandas, path, runs, settings)
 
     def table() -> Any:
         numbers = sorted(rows)
@@ -306,11 +308,11 @@ def sweep(
                 rows[number] = {**runs[number], **fit_columns(row, kinds)}
                 report(len(rows))
                 if path is not None and time.monotonic() - last_save > SAVE_INTERVAL:
-                    saved_rows.write(table(), path, settings)
+                    write_rows(table(), path, settings)
                     last_save = time.monotonic()
         finally:
             if path is not None and rows:
-                saved_rows.write(table(), path, settings)
+                write_rows(table(), path, settings)
     return table()
 
 

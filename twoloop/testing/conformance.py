@@ -10,9 +10,17 @@ import numpy as np
 from twoloop.checks.arguments import check_call, shown
 from twoloop.testing.hints import MOTION_PROPERTIES, Evidence, add_hints
 from twoloop.testing.mechanisms import N_TIMES, as_list, select_problems
-from twoloop.testing.problem import KnownProblem, Motion
+from twoloop.testing.problem import (
+    KnownProblem,
+    Motion,
+    Simulate,
+    SimulatorRun,
+    TimeLimitedSimulator,
+    change_frame,
+    change_units,
+    run_simulator,
+)
 from twoloop.testing.properties import Finding, Observation, Report, Settings, measure_properties, transformed_finding
-from twoloop.testing.runs import Simulate, SimulatorRun, TimeLimitedSimulator, change_frame, change_units, run_simulator
 
 Skipped = tuple[str, str, str]
 TIME_LIMIT = 120.0  # s

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from twoloop.testing.mistakes import find_mistake
-from twoloop.testing.problem import Array, Motion
+from twoloop.testing.problem import Array, Motion, Simulate, change_frame, run_simulator, to_original
 from twoloop.testing.properties import (
     ORDER_SLACK,
     STEP_VIOLATION,
@@ -24,7 +24,6 @@ from twoloop.testing.properties import (
     refinement_changes,
     remaining_error,
 )
-from twoloop.testing.runs import Simulate, change_frame, run_simulator, to_original
 
 EXPLAINED = 0.1  # an explanation must reduce the error to this fraction
 POINTS_PER_INTERVAL = 20  # interpolation points per interval of a known motion

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twoloop.testing.problem import Array, KnownProblem, solve_saddle_point
-from twoloop.testing.runs import Simulate, restart_at, run_simulator
+from twoloop.testing.problem import Array, KnownProblem, Simulate, restart_at, run_simulator, solve_saddle_point
 
 START_INDICES = range(0, 86, 5)  # indices of the known motion from which the simulator is started
 N_LATER = 10  # number of output times after which its acceleration is measured

@@ -6,8 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from twoloop.testing.problem import Array, KnownProblem, Motion, Quantity
-from twoloop.testing.runs import SimulatorRun, Transformed, to_original
+from twoloop.testing.problem import Array, KnownProblem, Motion, Quantity, SimulatorRun, Transformed, to_original
 
 
 @dataclass(frozen=True)

@@ -34,8 +34,9 @@ N_PARTS = 12
 BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.0, 66.0, -12.0, 1.0)
 RATE_HALVINGS = 60
 RATE_ROUNDING = 1e-11  # relative to C_t: rounding errors of the twelfth difference
-TIME_ROUNDING = 5e3  # times the slope and the rounding of t: rounding errors as well
-# times the mean slope over the step: a steeper part is a ramp for which the step is too long, if it is at most ...
+TIME_ROUNDING = 5e3  # times the slope and the rounding of t: rounding errors that come from t
+# relative to the mean slope over the step: a part steeper than this is a ramp, for which the step is too long, if its
+# length is at most ...
 STEEPNESS = 4.0
 MAX_RAMP_SHARE = 0.125  # ... this share of the step
 MIN_SPACINGS = 8.0  # shortest interval that is halved, in spacings of floating-point numbers
