@@ -6,7 +6,7 @@ import pytest
 from tests.problems import quick
 from twoloop import ConstrainedSystem, ConstraintWarning, solve_dae
 from twoloop.bodies import PlanarModel
-from twoloop.generate import lobatto_tables
+from twoloop.generate import collocation_code
 from twoloop.mechanisms import four_bar, spatial_four_bar
 
 
@@ -24,7 +24,7 @@ def end(system, t_end, q0, v0=None, **options):
 
 @pytest.mark.parametrize("degree", range(9))
 def test_the_coefficients_are_exact_for_polynomials(degree):
-    tables = lobatto_tables.tables()
+    tables = collocation_code.tables()
     nodes = np.concatenate([[0.0], tables.nodes])
     values = nodes**degree
     once, twice = degree + 1, (degree + 1) * (degree + 2)
@@ -45,7 +45,7 @@ def test_the_coefficients_are_exact_for_polynomials(degree):
 
 
 def test_at_the_end_of_the_step_integrals_are_exact_to_degree_15():
-    tables = lobatto_tables.tables()
+    tables = collocation_code.tables()
     nodes = np.concatenate([[0.0], tables.nodes])
     for degree in range(16):
         assert abs(nodes**degree @ tables.velocities[:, -1] - 1.0 / (degree + 1)) < 1e-14

@@ -13,7 +13,7 @@ import numpy as np
 from studies.bench import metrics, render, solvers, tables
 from studies.bench.store import Array
 from twoloop import ConstrainedSystem, Result, callback, mechanisms
-from twoloop.generate import lobatto_tables
+from twoloop.generate import collocation_code
 from twoloop.mechanisms import Problem
 from twoloop.methods import dop853, tableaux
 from twoloop.methods import presets as methods
@@ -214,7 +214,7 @@ def in_tableau() -> Iterator[Fault]:
         array[np.unravel_index(np.flatnonzero(array)[1], array.shape)] += 1e-6
         plant = partial(patch.object, dop853, name, array)
         yield Fault(f"a number of DOP853's {name} off by 1e-6", "tableau", plant, (EXPLICIT,))
-    off_twice = _changed(lobatto_tables, "tables", lambda all_: all_._replace(positions=all_.positions + 1e-9))
+    off_twice = _changed(collocation_code, "tables", lambda all_: all_._replace(positions=all_.positions + 1e-9))
     yield Fault("double integrals of Lobatto16 off by 1e-9", "tableau", off_twice, (LOBATTO,))
 
 

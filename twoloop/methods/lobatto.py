@@ -5,9 +5,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from twoloop.generate.collocation_code import compiled_collocation, suits
+from twoloop.generate.collocation_code import compiled_collocation, suits, tables
 from twoloop.generate.compile_equations import GeneratedCode
-from twoloop.generate.lobatto_tables import tables
 from twoloop.generate.time_dependence import may_be_narrow
 from twoloop.generate.traced_values import Check, unchecked
 from twoloop.kernels.data.collocation import ORDER
