@@ -70,8 +70,8 @@ FIRST_CHUNKS = 4  # chunks in the first call, if no states are sampled between t
 AFTER_ERROR = 16  # number of calls that skip an integrator after a callback raised in it
 LATER = (*OF_STEPS, "stats")  # fields that are computed separately from the others
 OTHERS = {name: value for name, value in DEFAULTS.items() if name not in LATER}
-SHORT = 1e-3  # s of CPU time of the last run: below it the elapsed time is measured, which takes less time to read
-REACHED_END = Status.REACHED_END  # a look-up in the enumeration takes longer
+SHORT = 1e-3  # s of CPU time of the last run; below it the elapsed time is measured, which takes less time to read
+REACHED_END = Status.REACHED_END  # a global name, because looking it up in the enumeration takes longer
 
 
 class Output(NamedTuple):

@@ -235,7 +235,7 @@ class Recorder:
             self._look(len(self._t) - WINDOW)
 
     def correct_last(self, t: float, row: Array) -> None:
-        """Replace [q, v, a] of the last state, if it is that at t, for states between steps."""
+        """Replace [q, v, a] of the last state if its time is t; they serve states between steps."""
         if self.request.between_steps and len(self._t) and self._t[-1] == t:
             self._rows[-1, : len(row)] = row
 

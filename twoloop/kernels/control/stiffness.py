@@ -128,7 +128,7 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
 def switching_options(
     limit: float, looks: int, matrix_cost: float, dearer: float, each: ArrayLike, first: ArrayLike, second: ArrayLike
 ) -> NDArray[np.float64]:
-    """Return `options`: those of the pair (see LIMIT), a rule and REUSE_OF for each method, then their own options."""
+    """Return `options`: of the pair (from LIMIT on); step-size rule and REUSE_OF of each method; their own options."""
     first = np.asarray(first)  # array of numbers, or of formulas
     scalars = [limit, float(looks), matrix_cost, dearer, float(first.size)]
     return np.concatenate([scalars, np.asarray(each, dtype=np.float64).ravel(), first, np.asarray(second)])

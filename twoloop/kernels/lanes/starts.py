@@ -101,7 +101,7 @@ def _cholesky(work, pattern, n_rows, n_redundant, row, factors, shift):
 
 @compiled
 def factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors):
-    """Compute rows of length 1 of the coordinates that may move, 1 over lengths, factors of G G^T, and Z."""
+    """Scale the rows, without fixed coordinates, to length 1; compute 1 / their lengths, factors of G G^T, and Z."""
     n_entries = pattern[n_rows] - pattern[0]
     for i in range(n_rows):
         length = factors + n_entries + i

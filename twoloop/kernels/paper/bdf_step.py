@@ -152,7 +152,7 @@ def _correct(f, w, options, t, c, prediction, rate, new_state, a_new):
     """
     n = w.Q.size
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    copy(prediction, new_state[: 2 * n])  # dependents: start values of Newton's method
+    copy(prediction, new_state[: 2 * n])  # for the dependent coordinates, start values of Newton's method
     copy(rate[n:], a1)
     before = np.inf
     for iteration in range(MAX_ITERATIONS):

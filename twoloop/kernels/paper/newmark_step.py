@@ -71,7 +71,7 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
     a_new = memory[N_MEMORY_SCALARS : N_MEMORY_SCALARS + n]
     for m in range(n):
         a1[m] = a[m]
-        q1[m] = q[m] + h * v[m] + 0.5 * h * h * a[m]  # dependents: start values of Newton's method
+        q1[m] = q[m] + h * v[m] + 0.5 * h * h * a[m]  # for the dependent coordinates, start values of Newton's method
     before = np.inf
     for _ in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1
