@@ -49,8 +49,8 @@ def test_a_step_compiles_no_other_step():
     steps = {path.stem: text for path, text in WITH_KERNELS.items() if path.parent.name in ("steps", "lanes")}
     imported = r"from twoloop\.kernels\.(?:steps|lanes)\.(\w+) import"
     found = {(name, other) for name, text in steps.items() for other in re.findall(imported, text) if other in steps}
-    # the explicit step belongs to the default method, and is compiled in any case
-    assert {pair for pair in found if pair[1] != "explicit_step"} == set()
+    # explicit steps, in lanes too, belong to the default methods; `stages` has the placeholder of steps not loaded yet
+    assert {other for _, other in found} <= {"explicit_step", "control", "stages"}
 
 
 @inlined

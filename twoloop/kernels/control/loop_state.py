@@ -100,7 +100,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     N_CLOCK,
 ) = range(N_PAST, N_PAST + 29)
 
-# power iterations for the largest rate, in stiffness.py and in run/monitors.py
+# power iterations for the largest rate, in stiffness.py and in run/messages.py
 DISPLACEMENT = 1e-6  # relative to the largest coordinate or velocity: length of differences along a direction
 INNER_TOL = 1e-8  # tolerance of the projected positions
 
