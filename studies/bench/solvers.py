@@ -142,15 +142,13 @@ def _all() -> Iterator[Solver]:
     yield paper_newmark_at(ERR_IN)
     yield paper_newmark_at(ERR_IN, 0.25)
     run = partial(_preset, DEFAULT, compiled="auto")
-    yield _solver(GIVEN, "two-loop", "compiled", "tol", run, used=_chosen, builds_each=True)
+    yield _solver(GIVEN, "two-loop", "compiled", "tol", run, used=_chosen)
     for preset in dict.fromkeys((DEFAULT, *PRESETS, *OWN)):
         run = partial(_preset, "DOP853" if preset == OWN_EXPLICIT else preset)
         if preset == TAYLOR or preset in COMPILED:
             run = partial(_traced, COMPILED.get(preset, preset), preset in COMPILED)
-        # the default compiles another method at other tolerances
-        more: dict[str, Any] = {"builds_each": True, "traces": True} if preset in COMPILED else {}
         used = _chosen if COMPILED.get(preset, preset) == DEFAULT else None
-        yield _solver(preset, "two-loop", "compiled", "tol", run, used=used, **more)
+        yield _solver(preset, "two-loop", "compiled", "tol", run, used=used, traces=preset in COMPILED)
     for line in lines():
         told = {each: getattr(line, each) for each in SAME_IN_LINES}
         run = partial(_by_line, line)
