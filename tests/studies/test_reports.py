@@ -78,9 +78,9 @@ def test_readme_has_the_numbers_of_its_other_reports():
     assert f"None of {table['sharp']['default']['n']} runs with sharp forces" in README
     short = [table[name]["default"] for name in ("gust_short", "pulse_short")]
     assert f"{sum(own['wrong'] for own in short)} of {sum(own['n'] for own in short)} runs" in README
-    singular, others = (table["singular"][who] for who in ("default", "own"))
-    assert f"right in {singular['ended'] - singular['wrong']} of {singular['n']} runs" in README
-    assert f"stopped in {others['failed']} of {others['n']}, and ended wrong in {others['wrong']}" in README
+    singular = [table["singular"][who] for who in ("default", "own", "others")]
+    told = [f"{own['ended'] - own['wrong']} of {own['n']}" for own in singular]
+    assert f"right in {told[0]} runs, `DOP853` and `compiled=False` in {told[1]}, IDA in {told[2]}." in README
     typical = {at["error"]: at["median"] for at in findings("work_precision")["typical"]}
     assert f"CyRK is faster at large errors: {number(1.0 / typical[1e-4])} times at 1e-4 (median)" in README
     assert number(typical[1e-8]) == "1.0" and f"at 1e-10 twoloop is {number(typical[1e-10])} times as fast" in README
