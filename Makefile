@@ -69,9 +69,13 @@ engines: .venv/engines ## the physics engines of the study engines, where they a
 
 table3: install ## the paper's Table 3 into reports/, about three minutes; ARGS=--full takes twenty
 	@echo "[3/3] Compiling the paper's steps and those of the default (once), then 32 cells, IDA and Exudyn"
-	@$(RUN) -c "from twoloop.kernels import advance"
-	@$(RUN) -c "from twoloop.kernels.steps import explicit_step, lobatto_step; from twoloop.kernels.control import stiffness" & \
-	$(RUN) -c "from twoloop.kernels.paper import fixed_point_step, newmark_step; from twoloop.kernels import interpolation" && wait $$!
+	@$(RUN) -c "from twoloop.kernels.evaluation import inner_loop; from twoloop.kernels import advance, cached_run; \
+	from twoloop.kernels.steps import lobatto_step, taylor_step" & \
+	$(RUN) -c "from twoloop.kernels.linalg import dependent_columns, rank; \
+	from twoloop.kernels.evaluation import checks, sparse_inner_loop; \
+	from references.paper import four_bar_minimal; from twoloop.mechanisms import four_bar, planar, quadratic; \
+	from twoloop.kernels.paper import fixed_point_step, newmark_step; from twoloop.kernels import interpolation; \
+	from twoloop.kernels.steps import explicit_step; from twoloop.kernels.control import stiffness" && wait $$!
 	$(RUN) -m studies.table3 $(ARGS)
 
 reports: install ## all studies into reports/
