@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,10 +41,13 @@ class ModelEnergy:
         Parameter vector of the model.
     dimension : int
         2 or 3.
+    potentials : tuple of callable
+        Potential energies, J, of springs that are functions of q, such as those of tendons.
     """
 
     p: Array
     dimension: int
+    potentials: tuple[Callable[[Any], Any], ...] = ()
 
     def __call__(self, t: Any, q: Array, v: Array) -> Any:
         """Evaluate the energies of one state, or of many given as columns."""
@@ -88,7 +92,7 @@ class ModelEnergy:
                     axis = np.array([np.cos(axis[0]), np.sin(axis[0])])
                 slid = (on_grid(flat, vector_of(flat, i, axis)) * between(i, on_first, j, at_j)).sum(axis=0)
                 total += 0.5 * self.p[more] * (slid - self.p[more + 2]) ** 2
-        return total
+        return total + sum(potential(flat) for potential in self.potentials)
 
     @property
     def _n(self) -> int:

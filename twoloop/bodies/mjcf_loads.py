@@ -316,12 +316,21 @@ class _Resisting:
         spins = zip(spin_of(q, v, own), spin_of(q, v, other), strict=True)
         torque = [self.damping * (x - y) for x, y in spins]
         if self.stiffness:
-            relative = euler_product(parameters_of(q, other, -1.0), parameters_of(q, own))
-            w, *e = euler_product(self.zero, relative)
-            s = np.sqrt(sum(x * x for x in e) + SMALL * SMALL)
-            turn = self.stiffness * 4.0 * np.arctan(s / (w + 1.0)) / s  # the angle over the sine of its half
+            angle, s, e = self._angle(q)
+            turn = self.stiffness * angle / s
             torque = [x + y for x, y in zip(torque, vector_of(q, own, [turn * x for x in e]), strict=True)]
         return [-self.sign * x for x in torque]
+
+    def potential(self, q: Any) -> Any:
+        """Return the potential energy of the spring, for one state or many; its reaction has none."""
+        return 0.5 * self.stiffness * self._angle(q)[0] ** 2 if self.sign > 0.0 else 0.0
+
+    def _angle(self, q: Any) -> Any:
+        """Return the angle of the rotation, the sine of its half, and this sine times the axis."""
+        relative = euler_product(parameters_of(q, self.parent.number, -1.0), parameters_of(q, self.body.number))
+        w, *e = euler_product(self.zero, relative)
+        s = np.sqrt(sum(x * x for x in e) + SMALL * SMALL)
+        return 4.0 * np.arctan(s / (w + 1.0)), s, e
 
 
 class _Dragging:

@@ -373,7 +373,7 @@ class Model(Ropes):
             q0=q,
             v0=v,
             t_span=t_span,
-            energy=ModelEnergy(tables.p.copy(), self.dimension),
+            energy=ModelEnergy(tables.p.copy(), self.dimension, tables.potentials),
             parameters=tables.values,
             note=note_of(self, tables, freedom, closed if guess is not None else start, closed, q, coordinates),
             conserved=tables.conserve and not self.dry,

@@ -87,7 +87,7 @@ class Ropes(Gears):
         """Add a tendon whose length is a linear combination of joint coordinates, such as over pulleys on hinges.
 
         Its tension acts on each joint in proportion to the coefficient of the joint. This is the fixed tendon of
-        MuJoCo. The energy of its spring is not part of the energy of the model.
+        MuJoCo.
 
         Parameters
         ----------

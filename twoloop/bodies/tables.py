@@ -114,6 +114,12 @@ class Tables:
                 return False
         return all(is_constant(motion) for motion in self.motions)
 
+    @property
+    def potentials(self) -> tuple[Any, ...]:
+        """Return the potential energies of forces that are functions and know theirs."""
+        known = (getattr(each.function, "potential", None) for each in self.functions)
+        return tuple(each for each in known if each is not None)
+
     def check(self) -> None:
         """Raise if a number has a wrong sign."""
         parts: list[Force | JointRow] = [*self.forces, *(row for joint in self.joints for row in joint.rows)]

@@ -71,7 +71,8 @@ class Tendon(JointCoordinate):
         """Let a tension act on the joints."""
         for (each, factor), joint in zip(self.parts, self.joints, strict=True):
             own = name if len(self.parts) == 1 else model._new_name(f"{name} in {each.joint}", None)
-            model.motor(joint, _Share(self, -factor, tension), coordinate=each.which, name=own)
+            leads = joint is self.joints[0] and each is self.parts[0][0]
+            model.motor(joint, _Share(self, -factor, tension, leads), coordinate=each.which, name=own)
 
 
 @dataclass(frozen=True)
@@ -121,10 +122,12 @@ class SitePath(JointCoordinate):
 
     def pull(self, model: Any, tension: Tension, name: str) -> None:
         """Let a tension act on the points."""
+        leads = True
         for weight, a, at_a, b, at_b in self.parts:
             for body, at, sign in ((a, at_a, weight), (b, at_b, -weight)):
                 if a is not b and body is not model.ground:
-                    force = _SpanForce(self, sign, tension, (a, at_a, b, at_b))
+                    force = _SpanForce(self, sign, tension, leads, (a, at_a, b, at_b))
+                    leads = False
                     model.force(body, body.point(*at), force, name=model._new_name(f"{name} on {body.name}", None))
 
 
@@ -138,14 +141,19 @@ def direction(q: Any, a: Body, at_a: Array, b: Body, at_b: Array) -> list[Any]:
 
 @dataclass(frozen=True, eq=False)
 class _Share:
-    """Evaluate a multiple of a tension."""
+    """Evaluate a multiple of a tension; the share that leads has the potential energy of the tendon."""
 
     tendon: Any
     factor: float
     tension: Tension
+    leads: bool
 
     def __call__(self, t: Any, q: Any, v: Any) -> Any:
         return self.factor * self.tension(t, self.tendon.position(q), self.tendon.rate(q, v))
+
+    def potential(self, q: Any) -> Any:
+        """Return the potential energy of the tendon, for one state or many: that of a spring, or zero."""
+        return self.tension.energy(self.tendon.position(q)) if self.leads and hasattr(self.tension, "energy") else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,10 +178,16 @@ class SpringTension:
 
     def __call__(self, t: Any, length: Any, rate: Any) -> Any:
         """Return the tension, for numbers or symbols."""
-        stretch = length - self.longest
+        return self.stiffness * self._stretch(length) + self.damping * rate
+
+    def energy(self, length: Any) -> Any:
+        """Return the potential energy."""
+        return 0.5 * self.stiffness * self._stretch(length) ** 2
+
+    def _stretch(self, length: Any) -> Any:
         if self.longest > self.shortest:
-            stretch = length - bounded(length, self.shortest, self.longest)
-        return self.stiffness * stretch + self.damping * rate
+            return length - bounded(length, self.shortest, self.longest)
+        return length - self.longest
 
 
 @dataclass(frozen=True, eq=False)
