@@ -243,15 +243,13 @@ def test_sites_between_two_points_and_springs_whose_length_is_elsewhere(tmp_path
 def test_springs_of_tendons_and_balls_count_in_the_energy(tmp_path):
     """Nothing damps: what is not kinetic, of gravity or of springs would show as a drift."""
     geom = '<geom type="box" size="0.1 0.2 0.3" pos="0.2 0 -0.3"/>'
-    model = read(
-        f"""<mujoco><default><geom density="50" contype="0" conaffinity="0"/></default><worldbody><site name="w" pos="1 0 0"/><body name="a">
-        <joint name="a" axis="0 1 0"/>{geom}<site name="s" pos="0.5 0.1 0"/><body pos="0 0 -0.6"><joint type="ball"
-        stiffness="3"/>{geom}<body pos="0 0.3 -0.3"><joint name="b" axis="1 0 0"/>{geom}<site name="t" pos="0.3 0 0"/>
-        </body></body></body></worldbody><tendon><fixed stiffness="9" springlength="-0.1 0.1"><joint joint="a" coef="2"/>
-        <joint joint="b" coef="-1"/></fixed><spatial stiffness="20" springlength="0.3"><site site="w"/><site site="s"/>
-        <pulley divisor="2"/><site site="s"/><site site="t"/></spatial></tendon></mujoco>""",
-        tmp_path,
-    )
+    text = f"""<mujoco><default><geom density="50" contype="0" conaffinity="0"/></default><worldbody><site name="w"
+        pos="1 0 0"/><body><joint name="a" axis="0 1 0"/>{geom}<site name="s" pos="0.5 0.1 0"/><body pos="0 0 -0.6">
+        <joint type="ball" stiffness="3"/>{geom}<body pos="0 0.3 -0.3"><joint name="b" axis="1 0 0"/>{geom}<site name="t"
+        pos="0.3 0 0"/></body></body></body></worldbody><tendon><fixed stiffness="9" springlength="-0.1 0.1"><joint
+        joint="a" coef="2"/><joint joint="b" coef="-1"/></fixed><spatial stiffness="20" springlength="0.3">
+        <site site="w"/><site site="s"/><pulley divisor="2"/><site site="s"/><site site="t"/></spatial></tendon></mujoco>"""
+    model = read(text, tmp_path)
     result = moved(model.problem((0.0, 1.0)))
     energy, kinetic = result.energy, 0.5 * model.bodies[0].inertia[0] * (result.v[:3] ** 2).sum(axis=0)
     assert np.ptp(energy) < 1e-6 < 0.01 < np.ptp(kinetic)

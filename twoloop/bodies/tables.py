@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -115,7 +116,7 @@ class Tables:
         return all(is_constant(motion) for motion in self.motions)
 
     @property
-    def potentials(self) -> tuple[Any, ...]:
+    def potentials(self) -> tuple[Callable[[Any], Any], ...]:
         """Return the potential energies of forces that are functions and know theirs."""
         known = (getattr(each.function, "potential", None) for each in self.functions)
         return tuple(each for each in known if each is not None)
