@@ -245,11 +245,48 @@ def test_springs_of_tendons_and_balls_count_in_the_energy(tmp_path):
     geom = '<geom type="box" size="0.1 0.2 0.3" pos="0.2 0 -0.3"/>'
     text = f"""<mujoco><default><geom density="50" contype="0" conaffinity="0"/></default><worldbody><site name="w"
         pos="1 0 0"/><body><joint name="a" axis="0 1 0"/>{geom}<site name="s" pos="0.5 0.1 0"/><body pos="0 0 -0.6">
-        <joint type="ball" stiffness="3"/>{geom}<body pos="0 0.3 -0.3"><joint name="b" axis="1 0 0"/>{geom}<site name="t"
-        pos="0.3 0 0"/></body></body></body></worldbody><tendon><fixed stiffness="9" springlength="-0.1 0.1"><joint
-        joint="a" coef="2"/><joint joint="b" coef="-1"/></fixed><spatial stiffness="20" springlength="0.3">
-        <site site="w"/><site site="s"/><pulley divisor="2"/><site site="s"/><site site="t"/></spatial></tendon></mujoco>"""
+        <joint type="ball" stiffness="3"/>{geom}<body pos="0 0.3 -0.3"><joint name="b" axis="1 0 0"/>{geom}
+        <site name="t" pos="0.3 0 0"/></body></body></body></worldbody><tendon><fixed stiffness="9"
+        springlength="-0.1 0.1"><joint joint="a" coef="2"/><joint joint="b" coef="-1"/></fixed>
+        <spatial stiffness="20" springlength="0.3"><site site="w"/><site site="s"/><pulley divisor="2"/>
+        <site site="s"/><site site="t"/></spatial></tendon></mujoco>"""
     model = read(text, tmp_path)
     result = moved(model.problem((0.0, 1.0)))
     energy, kinetic = result.energy, 0.5 * model.bodies[0].inertia[0] * (result.v[:3] ** 2).sum(axis=0)
     assert np.ptp(energy) < 1e-6 < 0.01 < np.ptp(kinetic)
+
+
+def test_an_attached_model_is_the_same_as_one_written_out(tmp_path):
+    """Its angles, defaults and settings are its own; of what acts on it, that within the part comes along."""
+    inertial = '<inertial pos="0.1 0 0" mass="2" diaginertia="0.1 0.2 0.25"/>'
+    arm = f"""<body name="{{0}}arm" pos="0 0 1" {{1}}><joint name="{{0}}hinge" axis="0 1 0" {{2}}/>{inertial}
+      <body name="{{0}}tip" pos="0.3 0 0"><joint name="{{0}}rail" type="slide" {{3}}/>{inertial}</body></body>"""
+    acting = """<actuator><motor name="{0}push" joint="{0}rail" gear="3"/></actuator>
+      <equality><joint name="{0}gear" joint1="{0}hinge" joint2="{0}rail"/></equality>"""
+    bent = 'class="bent" springref="0.5" stiffness="2"'
+    child = f"""<mujoco model="kid"><compiler angle="radian" eulerseq="ZYX" boundmass="3"/><option density="9"/>
+      <default><joint damping="0.5"/><default class="bent"><joint ref="0.3"/></default></default><worldbody>
+      {arm.format("", 'euler="0.2 0.1 0.3"', bent, "")}<body name="rest"><joint name="other"/>{inertial}</body>
+      </worldbody>{acting.format("")}<tendon><fixed stiffness="1"><joint joint="hinge"/><joint joint="other"/></fixed>
+      </tendon></mujoco>"""
+    (tmp_path / "kid").mkdir()
+    (tmp_path / "kid" / "kid.xml").write_text(child)
+    own, bent = 'damping="0.5" armature="0"', f'ref="{np.degrees(0.3)}" springref="{np.degrees(0.5)}" stiffness="2"'
+    axes = Rotation.from_euler("zyx", [0.2, 0.1, 0.3]).as_matrix()[:, :2].T.ravel()
+    turn = f'xyaxes="{" ".join(map(repr, axes.tolist()))}"'
+    written = arm.format("k/", turn, f"{own} {bent}", own).replace('mass="2"', 'mass="3"')
+    problems = []
+    for asset, part, after in (
+        ('<model file="kid/kid.xml"/>', '<attach model="kid" body="arm" prefix="k/"/>', ""),
+        ("", written, acting.format("k/")),
+    ):
+        text = f"""<mujoco><compiler angle="degree"/><default><joint armature="0.1"/></default><asset>{asset}</asset>
+          <worldbody><body name="base" pos="1 0 0"><joint name="hinge"/>{inertial}{part}</body></worldbody>
+          {after}</mujoco>"""
+        problems.append(read(text, tmp_path).problem(positions={"k/rail": 0.4}))
+    one, other = problems
+    np.testing.assert_allclose(one.q0, other.q0, atol=1e-12)
+    assert one.parameters.keys() == other.parameters.keys() and "value of k/push (N)" in one.parameters
+    assert one.parameters == pytest.approx(other.parameters, abs=1e-12)
+    with pytest.raises(ValueError, match="the attached body 'tail' is not in its model"):
+        read(text.replace(written, '<attach prefix="" body="tail"/>'), tmp_path)

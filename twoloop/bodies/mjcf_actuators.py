@@ -87,7 +87,7 @@ class TendonsAndActuators:
         return body_of(self.model, part)
 
     def _unit(self, joint: FileJoint) -> float:
-        return float(np.pi / 180.0) if self.reader.degrees and joint.kind == "hinge" else 1.0
+        return float(np.pi / 180.0) if self.reader.compiler(joint.attributes).degrees and joint.kind == "hinge" else 1.0
 
     def _inertia(self, joints: list[FileJoint], factors: list[float]) -> float:
         """Return the inertia behind a combination of joints in the reference pose while all joints are free."""

@@ -32,7 +32,7 @@ from twoloop.bodies.file_parts import (
 from twoloop.bodies.fluid import Medium
 from twoloop.bodies.meshes import fitted, mesh_lump, mesh_triangles
 from twoloop.bodies.mjcf_actuators import ACTUATORS, actuator_law
-from twoloop.bodies.mjcf_expand import compiler_of, expanded
+from twoloop.bodies.mjcf_expand import MODEL, Compiler, expanded
 from twoloop.bodies.mjcf_loads import Loads
 from twoloop.bodies.spatial.model import SpatialModel
 from twoloop.checks.arguments import Array, check_flag
@@ -57,7 +57,7 @@ def from_mjcf(
 
     The reader supports
 
-    - included files, frames, replicates, default classes and the settings of the compiler;
+    - included files, attached models, frames, replicates, default classes and the settings of the compiler;
     - bodies with inertials, or with masses of their geoms and of meshes in STL, OBJ and MSH files;
     - hinge, slide, ball and free joints, any number to a body: where a model has no joint with the same freedoms,
       massless bodies carry one joint each;
@@ -130,21 +130,12 @@ def from_mjcf(
 
 class _Reader:
     def __init__(self, path: str | os.PathLike[str], key: Any, commands: dict[str, Any], limits: bool):
-        self.root, self.ignored = expanded(path), list[str]()
+        (self.root, self.compilers), self.ignored = expanded(path), list[str]()
         root = self.root
-        compiler = self.compiler = compiler_of(root)
-        self.degrees, self.sequence = compiler.get("angle", "degree") == "degree", compiler.get("eulerseq", "xyz")
-        self.from_geoms = compiler.get("inertiafromgeom", "auto")
-        groups = compiler.get("inertiagrouprange", "0 5").split()
-        self.groups = range(int(groups[0]), int(groups[1]) + 1)
-        folder = compiler.get("meshdir", compiler.get("assetdir", ""))
-        self.folder = Path(path).parent / folder
-        self.strip = compiler.get("strippath", "false") == "true"
-        if compiler.get("coordinate", "local") != "local":
-            raise ValueError("coordinates of an MJCF file must be local; global ones were dropped by MuJoCo in 2.3.4")
+        self.total_mass = [each.get("settotalmass", "-1") for each in root.findall("compiler")]
         self.defaults: dict[str, dict[str, dict[str, str]]] = {"main": {}}
         for each in root.findall("default"):
-            self._default(each, "main", self.defaults["main"])
+            self._default(each, each.attrib["class"], self.defaults.get(each.attrib["class"], {}))
         disabled_groups = ""
         gravity, medium = np.array([0.0, 0.0, -9.81]), dict[str, str]()
         for each in root.findall("option"):
@@ -191,7 +182,7 @@ class _Reader:
                 self.ignored += [f"{each.tag}: {name_of(part)}" for part in each] or [each.tag]
         for each in self.root.findall("worldbody"):
             self._within(each, None, Pose(np.zeros(3), np.eye(3)), "main")
-        total = float(self.compiler.get("settotalmass", -1.0))
+        total = max(map(float, self.total_mass[-1:]), default=-1.0)
         scale = total / self.total if total > 0.0 and self.total > 0.0 else 1.0
         loads = Loads(self)
         loads.start(self.key)
@@ -228,13 +219,19 @@ class _Reader:
 
     def pose(self, attributes: Mapping[str, str], what: str) -> Pose:
         """Return the pose of an element in that around it."""
-        return pose_of(attributes, what, self.degrees, self.sequence)
+        compiler = self.compiler(attributes)
+        return pose_of(attributes, what, compiler.degrees, compiler.sequence)
+
+    def compiler(self, attributes: Mapping[str, str]) -> Compiler:
+        """Return the settings of the compiler for an element, by its attributes."""
+        return self.compilers[attributes.get(MODEL, "")]
 
     def _within(self, element: Element, part: Part | None, pose: Pose, childclass: str) -> None:
         """Read the children of a body, or of the world."""
         contents = self._contents(element, childclass)
-        inertial = next((each for each, _, _ in contents if each.tag == "inertial" and self.from_geoms != "true"), None)
-        weigh = element.tag == "body" and inertial is None and self.from_geoms != "false"  # mass from the geoms
+        from_geoms = self.compiler(element.attrib).from_geoms
+        inertial = next((each for each, _, _ in contents if each.tag == "inertial" and from_geoms != "true"), None)
+        weigh = element.tag == "body" and inertial is None and from_geoms != "false"  # mass from the geoms
         lumps: list[Lump] = []
         for each, frame, name in contents:
             given = self.attributes(each, name)
@@ -252,7 +249,7 @@ class _Reader:
                 self.frames[f"site {each.get('name', len(self.sites))}"] = part, place
             elif each is inertial:
                 lumps = [self._inertial(each, element.get("name", "?")).transformed(frame)]
-            elif each.tag in ("attach", "composite", "flexcomp"):
+            elif each.tag in ("composite", "flexcomp"):
                 raise ValueError(
                     f"<{each.tag}> is not read: load the file in MuJoCo and save it, where bodies are written out "
                     "(mujoco.mj_saveLastXML), and remove what is deformable"
@@ -260,7 +257,7 @@ class _Reader:
             elif each.tag not in SEEN_ONLY | {"inertial", "joint", "freejoint"}:
                 self.ignored.append(name_of(each))
         if element.tag == "body":
-            lump = self._bounded(combined(lumps))
+            lump = self._bounded(combined(lumps), self.compiler(element.attrib))
             self.total += lump.mass
             gravcomp = float(element.get("gravcomp", 0.0))
             if part is not None:
@@ -289,10 +286,9 @@ class _Reader:
             contents += [(child, outer.then(inner), name) for child, inner, name in within]
         return contents
 
-    def _bounded(self, lump: Lump) -> Lump:
+    def _bounded(self, lump: Lump, compiler: Compiler) -> Lump:
         """Return a mass with the bounds that the compiler sets."""
-        least, least_moment = (float(self.compiler.get(key, 0.0)) for key in ("boundmass", "boundinertia"))
-        balance = self.compiler.get("balanceinertia", "false") == "true"
+        least, least_moment, balance = compiler.least_mass, compiler.least_moment, compiler.balance
         if not (least or least_moment or balance):
             return lump
         axes = principal_axes(lump.J) if lump.axes is None else lump.axes
@@ -342,8 +338,8 @@ class _Reader:
 
     def limited(self, given: Mapping[str, str], flag: str = "limited", span: str = "range") -> bool:
         """Return True if an element has limits."""
-        limited, automatic = given.get(flag, "auto"), self.compiler.get("autolimits", "true") == "true"
-        return limited == "true" or (limited == "auto" and automatic and span in given)
+        limited = given.get(flag, "auto")
+        return limited == "true" or (limited == "auto" and self.compiler(given).automatic and span in given)
 
     def _joint(self, element: Element, pose: Pose, childclass: str, body: str, number: int) -> FileJoint:
         given = {} if element.tag == "freejoint" else self.attributes(element, childclass)
@@ -374,21 +370,20 @@ class _Reader:
         if float(given.get("contype", 1)) or float(given.get("conaffinity", 1)):
             self.n_geoms += 1
         weighs = weighs and float(given.get("mass", given.get("density", 1.0))) > 0.0
-        kind = given.get("type", "sphere")
-        if not weighs or int(float(given.get("group", 0))) not in self.groups or kind in UNWEIGHED:
+        kind, compiler = given.get("type", "sphere"), self.compiler(given)
+        if not weighs or int(float(given.get("group", 0))) not in compiler.groups or kind in UNWEIGHED:
             return None
         if given.get("shellinertia", "false") == "true":
             self.ignored.append(f"shellinertia of {what}")
         if kind != "mesh" and "mesh" not in given:
-            return geom_lump(given, what, self.degrees, self.sequence)
+            return geom_lump(given, what, compiler.degrees, compiler.sequence)
         triangles, legacy = self._mesh(given.get("mesh", ""), what)
         if triangles is None:
             self.ignored.append(f"the mass of {what}, which is a {kind}")
             return None
         pose, lump = self.pose(given, what), mesh_lump(triangles, legacy)
         if kind in FITTED:
-            by_box = self.compiler.get("fitaabb", "false") == "true"
-            size, inner = fitted(triangles, legacy, kind, by_box)
+            size, inner = fitted(triangles, legacy, kind, compiler.by_box)
             own = {name: given[name] for name in ("mass", "density") if name in given}
             at_origin = geom_lump(own | {"type": kind, "size": text_of(size)}, what, True, "xyz")
             return None if at_origin is None else at_origin.transformed(pose.then(inner))
@@ -400,12 +395,13 @@ class _Reader:
         if name not in self.meshes:
             return None, True
         given = self.attributes(self.meshes[name], "main")
-        if self.strip and "file" in given:
+        compiler = self.compiler(given)
+        if compiler.strip and "file" in given:
             given["file"] = Path(given["file"]).name
         if name not in self.triangles:
             kinds = ("legacy", "convex", "exact")
             readable = given.get("inertia", "legacy") in kinds
-            self.triangles[name] = mesh_triangles(given, self.folder, f"mesh {name!r}") if readable else None
+            self.triangles[name] = mesh_triangles(given, compiler.folder, f"mesh {name!r}") if readable else None
         return self.triangles[name], given.get("inertia", "legacy") == "legacy"
 
     def _inertial(self, element: Element, body: str) -> Lump:
