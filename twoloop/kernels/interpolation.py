@@ -33,7 +33,8 @@ NOISY = 10.0  # relative to the tolerance of velocities: rounding above this cou
 SINGULAR_SHARE = (
     0.01  # relative to the smallest pivots at the ends of an interval: below this a position counts as singular
 )
-SINGULAR_PIVOT = 1e-5  # a smaller pivot (rows scaled to 1) counts as singular, too
+SINGULAR_PIVOT = 1e-5  # a smaller pivot (rows scaled to 1) counts as singular, too ...
+RESIDUAL, WEAK_PIVOT = 10.0, 0.05  # ... and one below WEAK_PIVOT if velocities violate rows by fewer tolerances
 
 
 @merged
@@ -103,24 +104,29 @@ def _kind(kind, tolerances, h, states, i):
 
 
 @merged
-def _turned(tolerances, v_0, v):
-    """Return whether restored velocities differ from those of the polynomials by more than errors explain."""
-    speed = largest_of(v_0)
+def _turn(tolerances, v_0, v):
+    """Return the change of restored velocities over the tolerances; errors of polynomials explain up to UNTRUE."""
+    speed, largest = largest_of(v_0), 0.0
     for m in range(v.size):
-        if not abs(v[m] - v_0[m]) <= UNTRUE * (tolerances[ATOL + m] + tolerances[RTOL] * speed):
-            return True
-    return False
+        change = abs(v[m] - v_0[m]) / (tolerances[ATOL + m] + tolerances[RTOL] * speed)
+        if not change <= largest:  # NaN, too
+            largest = change
+    return largest
 
 
 @compiled
-def _is_singular(f, w, t, states, i, last, time, q):
-    """Return whether the rows are much closer to losing rank within an interval than at its ends."""
+def _is_singular(f, w, t, states, i, last, time, q, turn):
+    """Return whether the rows are so close to losing rank within an interval that rounding explains `turn`.
+
+    They are if they are much closer than at its ends, or the velocities of the polynomials satisfy the constraints.
+    """
     n, largest = w.Q.size, 0.0
     for r in (i, last):
         if renew_partition(f, w, t[r], states[r, :n]) == DONE:
             largest = max(largest, least_pivot(f, w, t[r], states[r, :n]))
     code = renew_partition(f, w, time, q)
-    return code != DONE or least_pivot(f, w, time, q) < max(SINGULAR_SHARE * largest, SINGULAR_PIVOT)
+    pivot = least_pivot(f, w, time, q) if code == DONE else 0.0
+    return pivot < max(SINGULAR_SHARE * largest, SINGULAR_PIVOT, min(RESIDUAL / turn, WEAK_PIVOT))
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR, VECTOR, MATRIX, TABLE, VECTOR, VECTOR, MATRIX, MATRIX))
@@ -162,14 +168,15 @@ def between(f, w, tolerance, tolerances, t, states, groups, times, z, room, out)
             code = DONE if chosen else renew_partition(f, w, t[i], states[i, :n])
             if code == DONE:
                 code = restore(f, w, times[p], q, v, tolerance)
-            chosen = code == DONE and not (reduced and partition_is_poor(w)) and not _turned(tolerances, v_0, v)
+            chosen = code == DONE and not (reduced and partition_is_poor(w)) and _turn(tolerances, v_0, v) <= UNTRUE
             if not chosen:
                 copy(q_0, q)
                 copy(v_0, v)
                 code = renew_partition(f, w, times[p], q)
                 if code == DONE:
                     code = restore(f, w, times[p], q, v, tolerance)
-                if code == DONE and _turned(tolerances, v_0, v) and _is_singular(f, w, t, states, i, last, times[p], q):
+                turn = _turn(tolerances, v_0, v) if code == DONE else 0.0
+                if not turn <= UNTRUE and _is_singular(f, w, t, states, i, last, times[p], q, turn):
                     code = SINGULAR
             if code != DONE:
                 failures += 1
@@ -226,7 +233,7 @@ def judge(f, w, tolerance, tolerances, t, states, groups, z, room, rows, out):
     compared with the constraints and the equations at positions within the interval: the error of its accelerations,
     times the time in which a polynomial of its degree can turn, is an error of velocity. If accelerations hold the
     noise of stiff modes, only the change by the last node counts. Methods of low order take steps that are short for
-    their polynomials: these are checked only between steps of unequal length.
+    their polynomials: these are checked only between steps of unequal length. Divided intervals are always checked.
     """
     n = w.Q.size
     half = z.size // 2
@@ -241,7 +248,7 @@ def judge(f, w, tolerance, tolerances, t, states, groups, z, room, rows, out):
         size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
         size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == kinds.APART else 0
         out[g] = 0.0
-        if kind < kinds.ACCELERATIONS and _even(t, lo, hi):
+        if kind < kinds.ACCELERATIONS and last == i + 1 and hi - lo > 1 and _even(t, lo, hi):
             continue
         if hi - lo > 1:
             for k in range(LOOKS):

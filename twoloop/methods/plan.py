@@ -1,6 +1,7 @@
 """Plan of a run, as a method sets it up; and rules that the methods share."""
 
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import Any, Literal, Protocol, get_args, get_origin
 
 import numpy as np
@@ -145,3 +146,20 @@ def kept_plan(method: Method, n_q: int, rtol: float, atol: float) -> Plan:
         # the method is stored, too: its id must not be reused
         _PLANS[key] = known = method, method.plan(n_q, rtol, atol, False)
     return known[1]
+
+
+def crossing_plan(n_q: int) -> Plan:
+    """Make the plan of steps across a singular position."""
+    from twoloop.kernels.steps import crossing_step as kernels
+
+    return Plan(kernels.CROSSING, _crossing_options(), np.zeros(kernels.memory_size(n_q)), exponent=1.0 / kernels.ORDER)
+
+
+@cache
+def _crossing_options() -> Array:
+    """Compute the options of steps across, once: the tableau takes longer than most of these steps."""
+    from twoloop.kernels.steps import crossing_step as kernels
+    from twoloop.methods.tableaux import gauss
+
+    tableau = gauss(kernels.S)
+    return kernels.options_array(tableau.A, tableau.b, tableau.c, INNER_TOL, LARGEST_MOVE)

@@ -18,7 +18,7 @@ from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import indices
 from twoloop.kernels.data.indices import ATOL, RTOL
 from twoloop.kernels.steps.stages import loaded
-from twoloop.methods.plan import INNER_TOL, Plan
+from twoloop.methods.plan import INNER_TOL, Plan, crossing_plan
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.signals import signals_of
 from twoloop.run.workspace import kit_of, prepare_workspace, static_form, workspace
@@ -31,7 +31,9 @@ Groups = NDArray[np.int64]
 
 KEPT = 512  # largest number of intervals whose interior states are cached
 SOUND = 65536  # largest number of intervals that are remembered to have accurate polynomials
-OFF = 10.0  # largest accepted error of polynomials in the constraints and the equations, over the tolerances
+# largest accepted error of polynomials in the constraints and the equations, over the tolerances; and near singular
+# positions, where it was measured to be a tenth of the error of velocities
+OFF, OFF_ACROSS = 10.0, 1.0
 REPAIRED = 4  # number of steps that divide an interval whose polynomials have a larger error
 
 
@@ -99,6 +101,7 @@ class Interpolator:
         self._prepare()
         self.failures, self.tells = 0, True  # number of failures of the last call; whether to warn of them
         self.filled: dict[float, tuple[Array, Array]] = {}
+        self.across: dict[float, Array] = {}  # memories of steps across singular positions, by beginnings of intervals
         self.sound: set[float] = set()  # beginnings of intervals that neighbouring states interpolate well
         self.judges = True
         self._make_room()
@@ -128,7 +131,7 @@ class Interpolator:
         """Reset for a run from another state that uses the same kits; rows have entries as in `pattern`."""
         self.made_of = (system, t0, row.copy(), *self.made_of[3:])
         self.system, self.judges = system, True
-        self.filled, self.sound = {}, set()
+        self.filled, self.across, self.sound = {}, {}, set()
         prepare_workspace(self.work, system, self.kit.flags, pattern, row[: system.n_q], self.rtol, 0.0)
         self._start()
         self.nodes[:], self.room[:], self.rows[:] = 0.0, 0.0, 0.0
@@ -148,7 +151,8 @@ class Interpolator:
         *arguments, plans = self.made_of
         # generated code has addresses in this process: copies do without it
         plans = {kind: plan.changed(own=()) if plan.own else plan for kind, plan in plans.items()}
-        return type(self), (*arguments, plans), {"parts": self.parts, "filled": self.filled, "judges": self.judges}
+        kept = {name: getattr(self, name) for name in ("parts", "filled", "across", "judges")}
+        return type(self), (*arguments, plans), kept
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -220,12 +224,18 @@ class Interpolator:
         for kind, plan in self.plans.items():
             of_kind = groups[:, indices.KIND] == kind
             self.filled.update(self._fill(table, plan, self.kits[kind], groups[of_kind, indices.FIRST_OWN]))
+        for i in groups[:, indices.FIRST_OWN].tolist():
+            if (memory := self.across.get(float(table.t[i]))) is not None:
+                self.filled[float(table.t[i])] = self._of_crossing(table, i, memory)
         inner = np.array([t in self.filled for t in table.t[groups[:, indices.FIRST_OWN]].tolist()], dtype=bool)
         divided, own, rest = self._divided(table, groups)
         off = np.zeros(len(groups))
         off[inner], off[~inner] = self._judged(divided, own), self._judged(table, rest)
-        self.sound.update(table.t[groups[~inner & (off <= OFF), indices.FIRST_OWN]].tolist())
-        for k in (~(off <= OFF)).nonzero()[0]:
+        # the steps of these kinds are too long for polynomials through their ends
+        off[~inner & np.isin(groups[:, indices.KIND], list(self.plans))] = np.inf
+        fits = off <= np.where(groups[:, indices.KIND] == indices.ACROSS, OFF_ACROSS, OFF)
+        self.sound.update(table.t[groups[~inner & fits, indices.FIRST_OWN]].tolist())
+        for k in (~fits).nonzero()[0]:
             self._repair(table, groups[k], float(off[k]))
 
     def _judged(self, table: Table, groups: Groups) -> Array:
@@ -248,22 +258,51 @@ class Interpolator:
         """Choose the best states for an interval: its neighbours, those of steps within it, or its ends alone."""
         i, kind = int(group[indices.FIRST_OWN]), int(group[indices.KIND])
         begin = float(table.t[i])
-        ends = (table.t[i : i + 2], table.states[i : i + 2])
-        for found in (self._fill(table, *self._repair_plan(kind), np.array([i])).get(begin, ends), ends):
+        steps = (
+            lambda: self._crossing(table, i),
+            lambda: self._fill(table, *self._repair_plan(kind), np.array([i])).get(begin),
+            lambda: (table.t[i : i + 2], table.states[i : i + 2]),
+        )
+        for step in steps:
+            if worst <= OFF_ACROSS or (found := step()) is None:
+                continue
             own = Table(np.ascontiguousarray(found[0]), np.ascontiguousarray(found[1]), table.kinds)
             single = group[None, :].copy()
-            single[0, [indices.FIRST_OWN, indices.LAST_OWN, indices.LOW, indices.HIGH]] = (
-                0,
-                len(own.t) - 1,
-                0,
-                len(own.t) - 1,
-            )
+            single[0, [indices.FIRST_OWN, indices.LOW]] = 0
+            single[0, [indices.LAST_OWN, indices.HIGH]] = len(own.t) - 1
             off = float(self._judged(own, single)[0])
             if off < worst or not np.isfinite(worst):
                 worst = off
                 self.filled[begin] = own.t, own.states
         if begin not in self.filled:
             self.sound.add(begin)
+
+    def _crossing(self, table: Table, i: int) -> tuple[Array, Array] | None:
+        """Compute interior states by a step across a singular position that begins and ends with the interval."""
+        from twoloop.kernels.steps import crossing_step as kernels
+
+        if self.static is not None:
+            return None
+        plan, (begin, end), n = crossing_plan(self.system.n_q), table.t[i : i + 2].tolist(), self.system.n_q
+        kernels.begin(plan.memory, 0.0, begin)
+        tolerances = self.tolerances.copy()
+        tolerances[[indices.ESTIMATE, indices.GAP]] = 1.0, np.inf
+        tolerances[indices.LEAST] = tolerances[[RTOL, *range(ATOL, ATOL + n)]].min()
+        state = np.concatenate([table.states[i], np.zeros(self.system.n_c + self.system.n_a)])
+        attempt = entry_point(kernels.crossing_step)
+        attempt(self.kit, self.work, plan.options, plan.memory, begin, end - begin, tolerances, state, state.copy())
+        found = plan.memory[-kernels.N_STORED :][kernels.END] > begin
+        return self._of_crossing(table, i, plan.memory) if found else None
+
+    def _of_crossing(self, table: Table, i: int, memory: Array) -> tuple[Array, Array]:
+        """Return states of the polynomial of a step across a singular position, which `memory` holds."""
+        from twoloop.kernels.steps.crossing_step import state_at
+
+        n, options = self.system.n_q, crossing_plan(self.system.n_q).options
+        times = np.linspace(table.t[i], table.t[i + 1], self.parts + 1)
+        states = np.array([state_at(memory, options, t) for t in times])
+        states[[0, -1], : 2 * n] = table.states[i : i + 2, : 2 * n]  # their accelerations may be rounding
+        return times, states
 
     def _repair_plan(self, kind: int) -> tuple[Plan, Any]:
         """Return plan and kit of the steps that divide an interval whose neighbouring states do not suit it."""
@@ -493,8 +532,8 @@ class DenseSolution:
     too, are too long for this. Each is divided into 2 to 6 equal steps of the method when a time within it is first
     evaluated; this costs about as much as the run. If the last of its states changes a polynomial by more than the
     tolerances, the polynomial is compared with the constraints and the equations at two places of the interval. If it
-    violates them, as beside a singular position or a force that jumps, the interval is divided into four steps of
-    `DOP853` (of a Radau method where Newton's method was at work), or only its two ends are used, whichever fits best.
+    violates them, as beside a singular position or a force that jumps, its states are those of a step across, of four
+    steps of `DOP853` (of a Radau method where Newton's method was at work), or there are none, whichever fits best.
     Evaluations for this, and for restoring, are not counted.
 
     The solution takes 8 (2 + 3 n_q) bytes of memory per step.

@@ -4,8 +4,6 @@ A run that met a short change of forces is repeated with more evaluations, at mo
 another without end, as noise does, would take evaluations without end. Then a warning says so.
 """
 
-from functools import cache
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,8 +11,7 @@ from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import indices
 from twoloop.kernels.data.common import Kit
 from twoloop.kernels.steps.stages import loaded
-from twoloop.methods.plan import INNER_TOL, LARGEST_MOVE, Plan
-from twoloop.methods.tableaux import gauss
+from twoloop.methods.plan import Plan, crossing_plan
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.messages import warn_user
 from twoloop.run.run import Run
@@ -152,7 +149,7 @@ def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
     a, clock = run.a, run.clock
     from twoloop.kernels.steps.crossing_step import BACK, UNSEEN
 
-    plan = _crossing_plan(run.system.n_q)
+    plan = crossing_plan(run.system.n_q)
     earliest, fixed = max(clock[a.T_START], clock[a.LAST_CHANGE], *run.jumps), run.control[a.FIXED_STEP] > 0.0
     base, run.mirrored = None, 0.0
     if not fixed:
@@ -227,22 +224,6 @@ def lengths_across(longest: float, allowed: float) -> list[float]:
     """Return the lengths to try for a step across, s; each above the largest one allowed would be the same attempt."""
     first = min(longest, allowed)
     return [first, *(longest * part for part in LENGTHS if longest * part < first)]
-
-
-def _crossing_plan(n_q: int) -> Plan:
-    """Make the plan of steps across a singular position."""
-    from twoloop.kernels.steps import crossing_step as kernels
-
-    return Plan(kernels.CROSSING, _crossing_options(), np.zeros(kernels.memory_size(n_q)), exponent=1.0 / kernels.ORDER)
-
-
-@cache
-def _crossing_options() -> Array:
-    """Compute the options of steps across, once: the tableau takes longer than most of these steps."""
-    from twoloop.kernels.steps import crossing_step as kernels
-
-    tableau = gauss(kernels.S)
-    return kernels.options_array(tableau.A, tableau.b, tableau.c, INNER_TOL, LARGEST_MOVE)
 
 
 def crossing_kit(kit: Kit) -> Kit:

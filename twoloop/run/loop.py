@@ -245,6 +245,8 @@ class IntegrationLoop:
             copied = 2 * n_rows < len(buffers[0])  # copies take less memory then
             if copied:
                 t, rows, steps = t.copy(), rows.copy(), steps.copy()
+            if across and n_steps and self.request.between_steps:
+                self.recorder.keep_crossing(self.plan.memory)
             self._take(t, rows, steps, self._kinds(steps, across, leaps))
             spent = time.process_time() - began
             self.cpu += spent

@@ -239,6 +239,13 @@ class Recorder:
         if self.request.between_steps and len(self._t) and self._t[-1] == t:
             self._rows[-1, : len(row)] = row
 
+    def keep_crossing(self, memory: Array) -> None:
+        """Keep the polynomial across a singular position that `memory` may hold, for the next interval."""
+        from twoloop.kernels.steps.crossing_step import END, N_STORED
+
+        if self.interpolator is not None and memory[-N_STORED:][END] > -np.inf:
+            self.interpolator.across[float(self._t[-1])] = memory.copy()
+
     def _add(self, t: Array, rows: Array, kinds: NDArray[np.int64]) -> None:
         request, store = self.request, self.request.store
         if request.times is None:
