@@ -12,6 +12,7 @@ from tests.marks import slow
 from tests.problems import worst
 from twoloop import DOP853, ConstraintWarning, Integrator, Status, solve_dae
 from twoloop.bodies import PlanarModel
+from twoloop.mechanisms import n_four_bar
 
 OTHERS = [name for name in SINGULAR if name not in {f"A02, N = {n}" for n in WINDOWS}]
 CROSSED = [
@@ -208,6 +209,18 @@ def test_an_end_beside_a_singular_position_is_right_or_the_run_says_so(method, t
         result, errors, said = turning(method, tolerance, beside_singular(beside))
         assert errors[-1] < 1e3 or said or not result.success, (beside, result)
         assert all("The run ends where the constraints" in result.message for _ in said if result.success)
+
+
+@pytest.mark.parametrize(("n", "coordinates", "tolerance", "end"), [(2, "tips", 3e-7, 20.0), (1, "bodies", 1e-6, 1.2)])
+def test_samples_within_one_step_across_a_singular_position_are_as_accurate_as_its_ends(n, coordinates, tolerance, end):
+    """The first passage is within one ordinary step: samples in it erred by 28,000 and 390 tolerances, its ends by 1."""
+    problem, times = n_four_bar(n, coordinates), np.linspace(0.6, 0.9, 151)
+    with warnings.catch_warnings(action="ignore", category=ConstraintWarning):
+        result = solve_dae(
+            problem.system, (0.0, end), problem.q0, problem.v0, rtol=tolerance, atol=tolerance, t_eval=times
+        )
+    exact = np.array([np.concatenate(problem.motion(t)) for t in times]).T
+    assert np.abs(np.concatenate([result.q, result.v]) - exact).max() < 30.0 * tolerance
 
 
 SIDES = 10.0 ** np.arange(-9.0, -2.0, 0.5)
