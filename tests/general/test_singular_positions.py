@@ -213,7 +213,7 @@ def test_an_end_beside_a_singular_position_is_right_or_the_run_says_so(method, t
 
 @pytest.mark.parametrize(("n", "coordinates", "tolerance", "end"), [(2, "tips", 3e-7, 20.0), (1, "bodies", 1e-6, 1.2)])
 def test_samples_within_one_step_across_a_singular_position_are_as_accurate_as_its_ends(n, coordinates, tolerance, end):
-    """The first passage is within one ordinary step: samples in it erred by 28,000 and 390 tolerances, its ends by 1."""
+    """The first passage is within one ordinary step: samples erred by 28,000 and 390 tolerances, its ends by 1."""
     problem, times = n_four_bar(n, coordinates), np.linspace(0.6, 0.9, 151)
     with warnings.catch_warnings(action="ignore", category=ConstraintWarning):
         result = solve_dae(
