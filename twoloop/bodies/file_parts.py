@@ -122,7 +122,7 @@ def root_of(path: str | os.PathLike[str], tag: str) -> Element:
 
 # what is ignored, in the order of its effect on the motion: by the words that its name contains
 EFFECTS = (
-    ("the mass of", "compiler", "shellinertia", "armature of"),
+    ("the mass of", "for the mass", "shellinertia", "armature of", "align of"),
     ("equality", "joints of", "mimic of"),
     ("tendon", "springdamper of", "stiffness", "damping of", "gravcomp of", "medium"),
     ("actuator", "command", "damping ratio", "deformable", "mocap of"),
@@ -236,7 +236,8 @@ def geom_lump(given: Mapping[str, str], what: str, degrees: bool, sequence: str)
         raise ValueError(
             f"size of {what} must be {needed} positive numbers for a {kind}; given {given.get('size', '')!r}"
         )
-    volume, moments = _VOLUMES[kind](size)
+    shell = given.get("shellinertia", "false") == "true" and kind in _SURFACES
+    volume, moments = (_SURFACES if shell else _VOLUMES)[kind](size)  # density is then mass per area
     mass = float(given["mass"]) if "mass" in given else float(given.get("density", DENSITY)) * volume
     return Lump(mass, np.zeros(3), mass * np.diag(moments), np.eye(3)).transformed(pose)
 
@@ -275,6 +276,38 @@ def _capsule(size: Array) -> tuple[float, Array]:
     return total, moments
 
 
+def _surface(*parts: tuple[float, tuple[float, float, float]]) -> tuple[float, Array]:
+    """Return the area of parts of a surface, given with their mean squares of x, y and z, and their moments."""
+    areas, squares = np.array([area for area, _ in parts]), np.array([means for _, means in parts])
+    mean = areas @ squares / areas.sum()
+    return float(areas.sum()), mean.sum() - mean
+
+
+def _box_surface(size: Array) -> tuple[float, Array]:
+    squares = size[:3] ** 2
+    means = (squares * np.where(np.eye(3, dtype=bool), 1.0, 1.0 / 3.0)).tolist()
+    return _surface(*((8.0 * float(size[i - 2] * size[i - 1]), tuple(means[i])) for i in range(3)))
+
+
+def _cylinder_surface(size: Array) -> tuple[float, Array]:
+    r, h = (float(x) for x in size[:2])
+    ends = 2.0 * np.pi * r * r, (0.25 * r * r, 0.25 * r * r, h * h)
+    return _surface((4.0 * np.pi * r * h, (0.5 * r * r, 0.5 * r * r, h * h / 3.0)), ends)
+
+
+def _capsule_surface(size: Array) -> tuple[float, Array]:
+    """Return those of a tube and two half spheres, whose centres are half of the radius from its ends."""
+    r, h = (float(x) for x in size[:2])
+    ends = 4.0 * np.pi * r * r, (r * r / 3.0, r * r / 3.0, r * r / 3.0 + h * h + h * r)
+    return _surface((4.0 * np.pi * r * h, (0.5 * r * r, 0.5 * r * r, h * h / 3.0)), ends)
+
+
+_SURFACES = {
+    "sphere": lambda size: _capsule_surface(np.array([size[0], 0.0])),
+    "capsule": _capsule_surface,
+    "cylinder": _cylinder_surface,
+    "box": _box_surface,
+}
 _VOLUMES = {"sphere": _sphere, "capsule": _capsule, "cylinder": _cylinder, "box": _box, "ellipsoid": _ellipsoid}
 
 

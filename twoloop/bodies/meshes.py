@@ -45,35 +45,36 @@ def mesh_triangles(given: Mapping[str, str], folder: Path, what: str) -> Array |
     return np.asarray(vertices[faces])
 
 
-def mesh_lump(triangles: Array, legacy: bool) -> Lump:
-    """Return the mass of density 1 within triangles.
+def mesh_lump(triangles: Array, inertia: str) -> Lump:
+    """Return the mass of density 1 within triangles, or on them with the inertia "shell".
 
-    `legacy`: as MuJoCo does by default, the pyramids from the centroid of the surface to the triangles are added up
+    "legacy": as MuJoCo does by default, the pyramids from the centroid of the surface to the triangles are added up
     with positive volumes, which is exact for convex meshes; mass and inertia are then those of the pyramids from the
     centre so found.
     """
     areas = 0.5 * np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
-    origin = (areas @ triangles.mean(axis=1)) / areas.sum()
+    origin, shell = (areas @ triangles.mean(axis=1)) / areas.sum(), inertia == "shell"
     for repeated in (False, True):
         corners = triangles - origin
         volumes = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
-        volumes = np.abs(volumes) if legacy else volumes
+        volumes = areas if shell else np.abs(volumes) if inertia == "legacy" else volumes
         volume, sums = float(volumes.sum()), corners.sum(axis=1)
         if not volume > 0.0:
             return Lump(0.0, np.zeros(3), np.zeros((3, 3)))
-        # integral of x x^T over a tetrahedron with a corner at the origin: volume / 20 (sum of c c^T + s s^T)
+        # integral of x x^T over a tetrahedron with a corner at the origin: volume / 20 (sum of c c^T + s s^T); over a
+        # triangle: area / 12 of the same
         second = np.einsum("i,ijk,ijl->kl", volumes, corners, corners) + np.einsum("i,ik,il->kl", volumes, sums, sums)
-        if not repeated:
+        if not (repeated or shell):
             origin = origin + volumes @ sums / (4.0 * volume)
-    second = second / 20.0
+    second = second / (12.0 if shell else 20.0)
     J = np.trace(second) * np.eye(3) - second
     axes = principal_axes(J, PRODUCTS)
     return Lump(volume, origin, axes @ np.diag(np.diag(axes.T @ J @ axes)) @ axes.T, axes)
 
 
-def fitted(triangles: Array, legacy: bool, kind: str, by_box: bool) -> tuple[Array, Pose]:
+def fitted(triangles: Array, inertia: str, kind: str, by_box: bool) -> tuple[Array, Pose]:
     """Return size and pose of a geom that is fitted to a mesh, by its moments of inertia or by its bounding box."""
-    lump = mesh_lump(triangles, legacy)
+    lump = mesh_lump(triangles, inertia)
     assert lump.axes is not None
     moments = np.diag(lump.axes.T @ lump.J @ lump.axes) / lump.mass
     order = np.argsort(-moments)

@@ -11,7 +11,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from twoloop.bodies.file_parts import Pose, numbers, pose_of, root_of, text_of
+from twoloop.bodies.file_parts import numbers, pose_of, root_of, text_of
 from twoloop.bodies.rotation import euler_parameters
 
 DEEPEST = 30  # files within files: more are taken for a cycle
@@ -45,6 +45,7 @@ class Compiler:
     least_mass: float
     least_moment: float
     balance: bool
+    align: bool  # free bodies without children with their principal axes
 
 
 def compiler_of(root: Element, folder: Path) -> Compiler:
@@ -65,6 +66,7 @@ def compiler_of(root: Element, folder: Path) -> Compiler:
         float(given.get("boundmass", 0.0)),
         float(given.get("boundinertia", 0.0)),
         given.get("balanceinertia", "false") == "true",
+        given.get("alignfree", "false") == "true",
     )
 
 
@@ -206,7 +208,7 @@ def _include(element: Element, folder: Path, depth: int) -> None:
 
 
 def _replicate(root: Element, element: Element, degrees: bool, sequence: str) -> None:
-    """Replace the replicates below an element by frames, innermost first; each is relative to the one before it."""
+    """Replace the replicates below an element by frames, innermost first; each begins where the one before it ends."""
     children: list[Element] = []
     for child in element:
         _replicate(root, child, degrees, sequence)
@@ -217,19 +219,20 @@ def _replicate(root: Element, element: Element, degrees: bool, sequence: str) ->
         if not count.isdigit() or int(count) < 1:
             raise ValueError(f"count of a <replicate> must be a positive whole number; given {count!r}")
         offset = numbers(child.get("offset", "0 0 0"), 3, "offset of a <replicate>")
-        turn = pose_of({"euler": child.get("euler", "0 0 0")}, "a <replicate>", degrees, sequence)
-        step, pose = Pose(offset, turn.R), Pose(np.zeros(3), np.eye(3))
+        turn, place = numbers(child.get("euler", "0 0 0"), 3, "euler of a <replicate>"), np.zeros(3)
         named = {each.get("name", "") for part in child for each in part.iter()} - {""}
         digits, separator = len(str(int(count) - 1)), child.get("sep", "")
         suffixes = [f"{separator}{number:0{digits}d}" for number in range(int(count))]
-        for suffix in suffixes:
-            frame = Element("frame", pos=text_of(pose.x), quat=text_of(euler_parameters(pose.R)))
+        for number, suffix in enumerate(suffixes):
+            # the angles are multiplied, as in MuJoCo; about more than one axis, this is not the turn repeated
+            R = pose_of({"euler": text_of(number * turn)}, "a <replicate>", degrees, sequence).R
+            frame = Element("frame", pos=text_of(place), quat=text_of(euler_parameters(R)))
             frame.extend(copy.deepcopy(list(child)))
             for each in frame.iter():
                 if each.get("name"):
                     each.set("name", each.attrib["name"] + suffix)
             children.append(frame)
-            pose = pose.then(step)
+            place = place + R @ offset
         sections = [each for each in root if each.tag not in ("worldbody", "default", "asset", "compiler", "option")]
         for section in sorted(sections, key=lambda each: each.tag != "tendon"):  # which others refer to
             referring = [each for each in section if _refers(each, named)]

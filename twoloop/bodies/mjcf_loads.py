@@ -90,11 +90,13 @@ class Loads(TendonsAndActuators):
         reader = self.reader
         for joint in reader.ordered:
             self._joint(joint)
-        for part, lump, factor in reader.gravcomp:
+        passive = not {"stiffness", "damping"} <= reader.without
+        for part, lump, factor in reader.gravcomp if passive else ():
             weight = -scale * factor * lump.mass * self.model.gravity
             if weight.any():
                 self.model.force(body_of(self.model, part), start_point(part, lump.centre), weight)
-        self._medium()
+        if passive:
+            self._medium()
         sections = {tag: [each for group in reader.root.findall(tag) for each in group] for tag in READ}
         for tag, elements in sections.items():
             for each in elements if tag == "actuator" else ():
@@ -108,7 +110,7 @@ class Loads(TendonsAndActuators):
     def _medium(self) -> None:
         """Add the forces of the medium, on each body of the file by itself."""
         medium = self.reader.medium
-        if not (medium.density or medium.viscosity) or {"stiffness", "damping"} <= self.reader.without:
+        if not (medium.density or medium.viscosity):
             return
         for number, (part, lump) in enumerate(self.reader.wetted):
             body, local = self._of(part), lump.transformed(part.pose.inverse())
@@ -131,6 +133,10 @@ class Loads(TendonsAndActuators):
         elif friction:
             self.ignored.append(f"frictionloss of joint {name!r}")
         self.ignored += [f"springyield of joint {name!r}"] if "springyield" in given else []
+        if given.get("actuatorgravcomp", "false") == "true" and self.reader.gravcomp:
+            limited = self.reader.limited(given, "actuatorfrclimited", "actuatorfrcrange")
+            if limited or "actuation" in self.reader.disabled or self.reader.root.find("actuator/*") is None:
+                self.ignored.append(f"actuatorgravcomp of joint {name!r}")
         self._spring(joint, single)
         if joint.kind != "free" and self.reader.limited(joint.attributes):
             self._limits(joint, single)
@@ -211,7 +217,7 @@ class Loads(TendonsAndActuators):
             self.model.force(body, body.point(*origin), slow, name=self.reader.free(None, f"drag of {joint.name}"))
 
     def _equality(self, element: Element, number: int) -> None:
-        given = self.reader.attributes(element, "main")
+        given = self.reader.attributes(element, "main", "equality")
         if self.reader.disabled & {"constraint", "equality"} or given.get("active", "true") == "false":
             return
         what = name_of(element)

@@ -39,9 +39,9 @@ from twoloop.checks.arguments import Array, check_flag
 
 SEEN_ONLY = {"asset", "visual", "statistic", "size", "custom", "camera", "light"}  # without effect on the motion
 KNOWN = {"compiler", "option", "default", "worldbody", "equality", "tendon", "actuator", "keyframe"}
-DEFAULT_OF = {"spatial": "tendon", "fixed": "tendon"} | dict.fromkeys(("connect", "weld"), "equality")
+DEFAULT_OF = {"spatial": "tendon", "fixed": "tendon"}
 TURNS = {"quat", "axisangle", "xyaxes", "zaxis", "euler"}  # alternative orientations of an element
-INERT = {"armature", "stiffness", "damping", "frictionloss", "springdamper"}  # what needs the coordinate of a joint
+INERT = ("armature", "damping", "stiffness", "frictionloss", "springdamper")  # what needs the coordinate of a joint
 FITTED = ("sphere", "capsule", "cylinder", "box", "ellipsoid")
 UNWEIGHED = ("plane", "hfield", "sdf")
 
@@ -207,14 +207,15 @@ class _Reader:
         for each in element.findall("default"):
             self._default(each, name, merged)
 
-    def attributes(self, element: Element, childclass: str) -> dict[str, str]:
-        """Return the attributes of an element with those of its default class."""
+    def attributes(self, element: Element, childclass: str, kind: str | None = None) -> dict[str, str]:
+        """Return the attributes of an element with those of its default class; `kind`: of the default, if special."""
         name = element.get("class", childclass)
         if name not in self.defaults:
             raise ValueError(f"{name_of(element)} is of the class {name!r}, which no default has")
         if element.tag in ACTUATORS:
             return actuator_law(element.tag, self.defaults[name].get("actuator", {}), element.attrib)
-        given = _merged(self.defaults[name].get(DEFAULT_OF.get(element.tag, element.tag), {}), element.attrib)
+        kind = kind or DEFAULT_OF.get(element.tag, element.tag)
+        given = _merged(self.defaults[name].get(kind, {}), element.attrib)
         return {key: value for key, value in given.items() if key not in self.without}
 
     def pose(self, attributes: Mapping[str, str], what: str) -> Pose:
@@ -230,9 +231,9 @@ class _Reader:
         """Read the children of a body, or of the world."""
         contents = self._contents(element, childclass)
         from_geoms = self.compiler(element.attrib).from_geoms
-        inertial = next((each for each, _, _ in contents if each.tag == "inertial" and from_geoms != "true"), None)
-        weigh = element.tag == "body" and inertial is None and from_geoms != "false"  # mass from the geoms
-        lumps: list[Lump] = []
+        inertial = next((each for each, _, _ in contents if each.tag == "inertial"), None)
+        weigh = element.tag == "body" and (from_geoms == "true" or (from_geoms == "auto" and inertial is None))
+        lumps, stated = list[Lump](), list[Lump]()
         for each, frame, name in contents:
             given = self.attributes(each, name)
             if each.tag == "body":
@@ -248,7 +249,7 @@ class _Reader:
                 self.sites[each.get("name", f"site {len(self.sites)}")] = part, place.x
                 self.frames[f"site {each.get('name', len(self.sites))}"] = part, place
             elif each is inertial:
-                lumps = [self._inertial(each, element.get("name", "?")).transformed(frame)]
+                stated = [self._inertial(each, element.get("name", "?")).transformed(frame)]
             elif each.tag in ("composite", "flexcomp"):
                 raise ValueError(
                     f"<{each.tag}> is not read: load the file in MuJoCo and save it, where bodies are written out "
@@ -257,7 +258,7 @@ class _Reader:
             elif each.tag not in SEEN_ONLY | {"inertial", "joint", "freejoint"}:
                 self.ignored.append(name_of(each))
         if element.tag == "body":
-            lump = self._bounded(combined(lumps), self.compiler(element.attrib))
+            lump = self._bounded(combined(lumps or stated), self.compiler(element.attrib))
             self.total += lump.mass
             gravcomp = float(element.get("gravcomp", 0.0))
             if part is not None:
@@ -309,9 +310,21 @@ class _Reader:
             if each.tag in ("joint", "freejoint"):
                 moved.append(self._joint(each, pose.then(frame), class_name, name, len(moved)))
         if moved:
+            if moved[0].kind == "free" and not any(
+                each.tag == "body" for each, _, _ in self._contents(element, childclass)
+            ):
+                self._align(moved[0], element)
             part = self._chain(name, parent, pose, moved)
         self.frames[element.get("name", name)] = part, pose
         self._within(element, part, pose, childclass)
+
+    def _align(self, joint: FileJoint, body: Element) -> None:
+        """Record a free joint that MuJoCo aligns with the principal axes of its body, where that has an effect."""
+        aligned = joint.attributes.get("align", "auto")
+        aligns = aligned == "true" or (aligned == "auto" and self.compiler(body.attrib).align)
+        acts = any(float(joint.attributes.get(key, "0").split()[0]) for key in INERT[:3])
+        if aligns and (self.key is not None or acts) and next(body.iterfind(".//body"), None) is None:
+            self.ignored.append(f"align of joint {joint.name!r}, which is along the axes of its body")
 
     def _chain(self, name: str, parent: Part | None, pose: Pose, moved: list[FileJoint]) -> Part:
         """Return the part of a body, behind massless ones that carry its first joints if no single joint has all."""
@@ -342,7 +355,7 @@ class _Reader:
         return limited == "true" or (limited == "auto" and self.compiler(given).automatic and span in given)
 
     def _joint(self, element: Element, pose: Pose, childclass: str, body: str, number: int) -> FileJoint:
-        given = {} if element.tag == "freejoint" else self.attributes(element, childclass)
+        given = dict(element.attrib) if element.tag == "freejoint" else self.attributes(element, childclass)
         name = self.free(element.get("name"), f"joint of {body}" if number == 0 else f"joint {number + 1} of {body}")
         kind = "free" if element.tag == "freejoint" else given.get("type", "hinge")
         if kind not in ("hinge", "slide", "ball", "free"):
@@ -373,36 +386,37 @@ class _Reader:
         kind, compiler = given.get("type", "sphere"), self.compiler(given)
         if not weighs or int(float(given.get("group", 0))) not in compiler.groups or kind in UNWEIGHED:
             return None
-        if given.get("shellinertia", "false") == "true":
+        if given.get("shellinertia", "false") == "true" and kind == "ellipsoid":
             self.ignored.append(f"shellinertia of {what}")
         if kind != "mesh" and "mesh" not in given:
             return geom_lump(given, what, compiler.degrees, compiler.sequence)
-        triangles, legacy = self._mesh(given.get("mesh", ""), what)
+        triangles, inertia = self._mesh(given.get("mesh", ""))
         if triangles is None:
             self.ignored.append(f"the mass of {what}, which is a {kind}")
             return None
-        pose, lump = self.pose(given, what), mesh_lump(triangles, legacy)
+        pose, lump = self.pose(given, what), mesh_lump(triangles, inertia)
         if kind in FITTED:
-            size, inner = fitted(triangles, legacy, kind, compiler.by_box)
-            own = {name: given[name] for name in ("mass", "density") if name in given}
+            size, inner = fitted(triangles, inertia, kind, compiler.by_box)
+            own = {name: given[name] for name in ("mass", "density", "shellinertia") if name in given}
+            size *= float(given.get("fitscale", 1.0))
             at_origin = geom_lump(own | {"type": kind, "size": text_of(size)}, what, True, "xyz")
             return None if at_origin is None else at_origin.transformed(pose.then(inner))
         mass = float(given["mass"]) if "mass" in given else float(given.get("density", 1000.0)) * lump.mass
         return replace(lump, mass=mass, J=mass / lump.mass * lump.J).transformed(pose) if lump.mass else None
 
-    def _mesh(self, name: str, what: str) -> tuple[Array | None, bool]:
-        """Return the triangles of a mesh, and whether its pyramids are added up with positive volumes."""
+    def _mesh(self, name: str) -> tuple[Array | None, str]:
+        """Return the triangles of a mesh, and how its mass is computed from them."""
         if name not in self.meshes:
-            return None, True
+            return None, "legacy"
         given = self.attributes(self.meshes[name], "main")
-        compiler = self.compiler(given)
+        compiler, inertia = self.compiler(given), given.get("inertia", "legacy")
         if compiler.strip and "file" in given:
             given["file"] = Path(given["file"]).name
         if name not in self.triangles:
-            kinds = ("legacy", "convex", "exact")
-            readable = given.get("inertia", "legacy") in kinds
-            self.triangles[name] = mesh_triangles(given, compiler.folder, f"mesh {name!r}") if readable else None
-        return self.triangles[name], given.get("inertia", "legacy") == "legacy"
+            self.triangles[name] = mesh_triangles(given, compiler.folder, f"mesh {name!r}")
+            if inertia == "convex" and int(given.get("maxhullvert", -1)) > 0:
+                self.ignored.append(f"maxhullvert of mesh {name!r}, for the mass of its geoms")
+        return self.triangles[name], inertia
 
     def _inertial(self, element: Element, body: str) -> Lump:
         what = f"inertial of body {body!r}"
