@@ -93,9 +93,13 @@ class TendonsAndActuators:
         """Return the inertia behind a combination of joints in the reference pose while all joints are free."""
         if self.inertia is None:
             self.inertia = tree_inertia(self.reader.parts, self.reader.ordered)
+            for element in (each for group in self.reader.root.findall("actuator") for each in group):
+                given = self.reader.attributes(element, "main")
+                if (moved := self._joint_of(given)) and is_single(moved):
+                    self.inertia[(self._place(moved),) * 2] += float(given.get("armature", 0.0)) * _gear(given) ** 2
         w = np.zeros(len(self.inertia))
         for joint, factor in zip(joints, factors, strict=True):
-            w[sum(DEGREES[each.kind] for each in self.reader.ordered[: self.reader.ordered.index(joint)])] = factor
+            w[self._place(joint)] = factor
         try:
             return 1.0 / float(w @ np.linalg.solve(self.inertia, w))
         except np.linalg.LinAlgError:
@@ -103,6 +107,10 @@ class TendonsAndActuators:
                 f"springdamper or dampratio at joint {joints[0].name!r} needs inertia behind all joints: give the "
                 "bodies masses, or stiffness and damping in the place of it"
             ) from None
+
+    def _place(self, joint: FileJoint) -> int:
+        """Return the number of the first coordinate of a joint in the order of the joints."""
+        return sum(DEGREES[each.kind] for each in self.reader.ordered[: self.reader.ordered.index(joint)])
 
     def _law(self, joint: FileJoint, k: float, c: float, rest: float, name: str | None) -> Force:
         assert joint.joint is not None
@@ -119,13 +127,11 @@ class TendonsAndActuators:
         else:
             pairs = [(self.reader.joints.get(each.get("joint", "")), float(each.get("coef", 1.0))) for each in element]
             tendon, reference = self._combination(element.get("name"), pairs)
-        stiffness, damping = (_trimmed(given.get(key, "0")) for key in ("stiffness", "damping"))
+        stiffness, damping = (trimmed(given.get(key, "0")) for key in ("stiffness", "damping"))
         limited, acting = self.reader.limited(given), bool(any(stiffness) or any(damping))
-        if tendon is None or len(stiffness) > 1 or len(damping) > 1:
+        if tendon is None:
             if acting or limited or any(float(given.get(key, 0.0)) for key in ("armature", "frictionloss")):
                 self.ignored.append(f"tendon: {called}")
-            acting = limited = False
-        if tendon is None:
             return
         self.tendons[given.get("name", "")] = tendon, reference
         self.ignored += [f"{key} of {called}" for key in ("armature", "frictionloss") if float(given.get(key, 0.0))]
@@ -140,13 +146,15 @@ class TendonsAndActuators:
         rest = [float(x) for x in given.get("springlength", "-1").split()]
         if rest == [-1.0] or rest == [-1.0, -1.0]:
             rest = [self._unstressed(tendon)]
-        k, c = stiffness[0], damping[0]
-        if isinstance(tendon, SitePath) and tendon.weights == (1.0,) and len(rest) == 1 and rest[0] >= 0.0:
+        plain = len(stiffness) == len(damping) == len(rest) == 1
+        if isinstance(tendon, SitePath) and tendon.weights == (1.0,) and plain and rest[0] >= 0.0:
             (a, at_a), (b, at_b) = tendon.points
             ends = a, a.point(*at_a), b, b.point(*at_b)
-            self.model.spring(*ends, stiffness=k, damping=c, length=rest[0], name=tendon.joint)
+            if a is not b:
+                name = tendon.joint
+                self.model.spring(*ends, stiffness=stiffness[0], damping=damping[0], length=rest[0], name=name)
             return
-        tendon.pull(self.model, SpringTension(k, c, rest[0], rest[-1]), tendon.joint)
+        tendon.pull(self.model, SpringTension(stiffness, damping, rest[0], rest[-1]), tendon.joint)
 
     def _combination(self, name: str | None, pairs: list[Any]) -> tuple[Tendon | None, float]:
         """Return a fixed tendon, and its length in the reference pose; None if one of its joints has no coordinate."""
@@ -212,22 +220,22 @@ class TendonsAndActuators:
     def _passive(self, element: Element) -> None:
         """Add armature and damping of an actuator, which act also without commands."""
         given = self.reader.attributes(element, "main")
-        inertia, damping = float(given.get("armature", 0.0)), _trimmed(given.get("damping", "0"))
+        inertia, damping = float(given.get("armature", 0.0)), trimmed(given.get("damping", "0"))
         if not inertia and not any(damping):
             return
-        gear, joint = float(given.get("gear", "1").split()[0]), self._joint_of(given)
-        target, called = self._target(given, gear), f"actuator: {name_of(element)}"
+        gear, joint = _gear(given), self._joint_of(given)
+        target, called = self._target(given, 1.0), f"actuator: {name_of(element)}"
         if inertia and joint is not None and is_single(joint):
             name = self.reader.free(None, f"armature at {joint.name}")
             self.model.rotor(joint.joint, inertia * gear * gear, name=name)
         elif inertia:
             self.ignored.append(f"armature of {called}")
         if any(damping) and "damping" not in self.reader.without:
-            if target is None or len(damping) > 1:
+            if target is None:
                 self.ignored.append(f"damping of {called}")
             else:
                 name = self.reader.free(None, f"damper of {target.joint}")
-                target.pull(self.model, SpringTension(0.0, damping[0], 0.0, 0.0), name)
+                target.pull(self.model, SpringTension((), [gear * gear * x for x in damping], 0.0, 0.0), name)
 
     def _actuator(self, element: Element, number: int) -> None:
         """Add an actuator as a motor and a spring in a joint, a tension, or a force at a site."""
@@ -438,7 +446,12 @@ def is_single(joint: FileJoint) -> bool:
     return joint.joint is not None and joint.joint.kind in ("revolute", "prismatic")
 
 
-def _trimmed(text: str) -> list[float]:
+def _gear(given: Mapping[str, str]) -> float:
+    """Return the gear of an actuator of a joint or tendon."""
+    return float(given.get("gear", "1").split()[0])
+
+
+def trimmed(text: str) -> list[float]:
     """Return the coefficients of a polynomial, without zeros at its end but for the first."""
     values = [float(x) for x in text.split()] or [0.0]
     while len(values) > 1 and not values[-1]:

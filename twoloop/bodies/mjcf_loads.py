@@ -21,11 +21,12 @@ from twoloop.bodies.file_parts import (
     text_of,
 )
 from twoloop.bodies.frames import vector_of
-from twoloop.bodies.mjcf_actuators import TendonsAndActuators, is_single
+from twoloop.bodies.mjcf_actuators import TendonsAndActuators, is_single, trimmed
 from twoloop.bodies.parameter_layout import HINGE_ROTOR, SLIDE_ROTOR
 from twoloop.bodies.parts import Body, Force, Numbers
 from twoloop.bodies.rotation import euler_parameters, rotation_matrix
 from twoloop.bodies.rotation_rates import euler_product, parameters_of, rate_of_vector, spin_of
+from twoloop.bodies.tendons import SpringTension
 from twoloop.checks.arguments import Array, shown
 
 SMALL = 1e-9  # sine of half the angle of a ball, below which its spring is linear
@@ -174,25 +175,33 @@ class Loads(TendonsAndActuators):
     def _spring(self, joint: FileJoint, single: bool) -> None:
         """Add the spring and damper of a joint; it is unstressed at springref, and the pose of the file is ref."""
         given = joint.attributes
-        stiffness, damping = (given.get(key, "0").split() for key in ("stiffness", "damping"))
+        stiffness, damping = (trimmed(given.get(key, "0")) for key in ("stiffness", "damping"))
         times = [float(x) for x in given.get("springdamper", "0 0").split()]
         if any(times) and not single:
             self.ignored.append(f"springdamper of joint {joint.name!r}")
         elif len(times) == 2 and min(times) > 0.0:
-            inertia = self._inertia([joint], [1.0])
-            both = {"stiffness": inertia / (times[0] * times[1]) ** 2, "damping": 2.0 * inertia / times[0]}
-            stiffness, damping = ([repr(0.0 if key in self.reader.without else x)] for key, x in both.items())
-        if not any(float(x) for x in (*stiffness, *damping)):
+            inertia, without = self._inertia([joint], [1.0]), self.reader.without
+            stiffness[0] = 0.0 if "stiffness" in without else inertia / (times[0] * times[1]) ** 2
+            damping[0] = 0.0 if "damping" in without else 2.0 * inertia / times[0]
+        if not any((*stiffness, *damping)):
             return
-        stiff, damped = any(float(x) for x in stiffness[1:]), any(float(x) for x in damping[1:])
-        if not (single or stiff or damped) and (joint.kind == "ball" or not float(stiffness[0])):
-            self._resist(joint, float(stiffness[0]), float(damping[0]))
-            return
-        if not single or stiff or damped:
+        linear = len(stiffness) == len(damping) == 1
+        if not single and linear and (joint.kind == "ball" or not stiffness[0]):
+            self._resist(joint, stiffness[0], damping[0])
+        elif not single:
             self.ignored.append(f"stiffness and damping of joint {joint.name!r}")
-            return
-        rest = self._unit(joint) * (float(given.get("springref", 0.0)) - float(given.get("ref", 0.0)))
-        self._law(joint, float(stiffness[0]), float(damping[0]), rest - joint.displacement, None)
+        elif linear:
+            rest = self._unit(joint) * (float(given.get("springref", 0.0)) - float(given.get("ref", 0.0)))
+            self._law(joint, stiffness[0], damping[0], rest - joint.displacement, None)
+        else:
+            tendon, _ = self._combination(None, [(joint, 1.0)])
+            rest = self._unit(joint) * float(given.get("springref", 0.0))
+            assert tendon is not None
+            tendon.pull(
+                self.model,
+                SpringTension(stiffness, damping, rest, rest),
+                self.reader.free(None, f"spring of {joint.name}"),
+            )
 
     def _resist(self, joint: FileJoint, stiffness: float, damping: float) -> None:
         """Add spring and damper of a ball, which has no torque in the reference pose, or the damper of a free joint."""

@@ -145,7 +145,7 @@ class Ropes(Gears):
             check_finite("force", force)
         self.bound(tendon, lower, upper)
         if k or c:
-            tendon.pull(self, SpringTension(k, c, rest, rest), name)
+            tendon.pull(self, SpringTension((k,), (c,), rest, rest), name)
         if force is not None:
             tendon.pull(self, PrescribedTension(force, arity), self._new_name(f"force of {name}", None))
         return tendon

@@ -5,7 +5,7 @@ A tendon of length x(q) with the tension T acts on the coordinates by -T dx/dq.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,6 +17,7 @@ from twoloop.bodies.parts import Body, ModelJoint, Numbers
 from twoloop.checks.arguments import Array
 
 Tension = Callable[[Any, Any, Any], Any]  # of t, length and rate; positive where it shortens the tendon
+AT_REST = 1e-8  # m/s or rad/s: below, |v| v is smooth; it changes by less than 1e-16
 CORNER = 1e-7  # width of rounded corners of limited forces, relative to their range: equations have no branches
 
 
@@ -169,20 +170,30 @@ class _SpanForce(_Share):
 
 @dataclass(frozen=True, eq=False)
 class SpringTension:
-    """Evaluate the tension of a spring, which is slack between two lengths, and a damper."""
+    """Evaluate the tension of a spring, which is slack between two lengths, and a damper.
 
-    stiffness: float
-    damping: float
+    The tension is k_0 s + k_1 s^2 + ... of the stretch s, and c_0 v + c_1 |v| v + c_2 v^3 + ... of the rate v.
+    """
+
+    stiffness: Sequence[float]
+    damping: Sequence[float]
     shortest: float
     longest: float
 
     def __call__(self, t: Any, length: Any, rate: Any) -> Any:
         """Return the tension, for numbers or symbols."""
-        return self.stiffness * self._stretch(length) + self.damping * rate
+        stretch, tension = self._stretch(length), 0.0
+        for k, factor in enumerate(self.stiffness):
+            tension = tension + factor * stretch ** (k + 1) if factor else tension
+        for k, factor in enumerate(self.damping):
+            size = smooth_size(rate, AT_REST) if k % 2 else 1.0
+            tension = tension + factor * rate ** (k + 1 - k % 2) * size if factor else tension
+        return tension
 
     def energy(self, length: Any) -> Any:
         """Return the potential energy."""
-        return 0.5 * self.stiffness * self._stretch(length) ** 2
+        stretch = self._stretch(length)
+        return sum(factor * stretch ** (k + 2) / (k + 2) for k, factor in enumerate(self.stiffness))
 
     def _stretch(self, length: Any) -> Any:
         if self.longest > self.shortest:
