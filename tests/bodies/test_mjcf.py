@@ -10,6 +10,7 @@ from tests.bodies.random_models import Both
 from tests.bodies.runs import moved
 from tests.marks import slow
 from twoloop.bodies import IgnoredWarning, SpatialModel, from_mjcf
+from twoloop.bodies.file_parts import geom_lump, text_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 LEG = """<mujoco model="leg"><compiler angle="degree" eulerseq="XYZ"/><option gravity="0 0 -9.81" timestep="0.002"/>
@@ -236,8 +237,19 @@ def test_sites_between_two_points_and_springs_whose_length_is_elsewhere(tmp_path
     (spring,) = read(text.format('ref="30"', "30", ""), tmp_path).forces
     turned = about_y(-30.0) @ [0.3, 0.1, 0.0]  # where the joint is at its springref
     np.testing.assert_allclose(spring.more.values[2], np.linalg.norm(turned - 1.0))
-    with pytest.warns(IgnoredWarning, match="tendon: spatial"):
-        assert not read(text.format("", "30 2", ""), tmp_path).forces
+    problem = read(text.format("", "30 2 5", 'springlength="0.3" damping="1 2"'), tmp_path).problem()
+    points, x = np.array([[0.3, 0.1, 0.0], [1.0, 1.0, 1.0]]), np.linalg.norm([0.7, 0.9, 1.0]) - 0.3
+    along, v = (points[1] - points[0]) / (x + 0.3), np.zeros(7)
+    v[3:] = 0.5 * np.array([0.0, 0.0, 2.0, 0.0])  # 2 rad/s about y
+    rate = -along @ np.cross([0.0, 2.0, 0.0], points[0] - [1.0, 0.0, 0.0])
+    tension = 30.0 * x + 2.0 * x**2 + 5.0 * x**3 + rate + 2.0 * abs(rate) * rate
+    force, gravity = (problem.system.force(0.0, problem.q0, each)[:3] for each in (v, 0.0 * v))
+    still = 30.0 * x + 2.0 * x**2 + 5.0 * x**3
+    np.testing.assert_allclose(force - gravity, (tension - still) * along, atol=1e-9)
+    np.testing.assert_allclose(gravity - problem.model.bodies[0].inertia[0] * np.array([0, 0, -9.81]), still * along)
+    unloaded = read(text.format("", "0", 'springlength="0.3"'), tmp_path).problem()
+    stored = problem.energy(0.0, problem.q0, 0.0 * v) - unloaded.energy(0.0, problem.q0, 0.0 * v)
+    assert stored == pytest.approx(15.0 * x**2 + 2.0 / 3.0 * x**3 + 1.25 * x**4, rel=1e-12)
 
 
 def test_springs_of_tendons_and_balls_count_in_the_energy(tmp_path):
@@ -290,3 +302,36 @@ def test_an_attached_model_is_the_same_as_one_written_out(tmp_path):
     assert one.parameters == pytest.approx(other.parameters, abs=1e-12)
     with pytest.raises(ValueError, match="the attached body 'tail' is not in its model"):
         read(text.replace(written, '<attach prefix="" body="tail"/>'), tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["sphere", "capsule", "cylinder", "box"])
+def test_the_inertia_of_a_shell_is_that_of_a_thin_layer(kind):
+    """Volume and moments of the solid, differentiated by the thickness of a layer around it."""
+    sizes, grows = np.array([0.3, 0.5, 0.4]), np.array([1.0, float(kind != "capsule"), 1.0])
+    given = {"type": kind, "density": "1", "quat": "1 2 3 4"}
+
+    def solid(thickness):
+        lump = geom_lump({**given, "size": text_of(sizes + thickness * grows)}, "", True, "xyz")
+        return np.r_[lump.mass, lump.J.ravel()]
+
+    shell = geom_lump({**given, "size": text_of(sizes), "shellinertia": "true"}, "", True, "xyz")
+    layer = (solid(1e-4) - solid(-1e-4)) / 2e-4
+    np.testing.assert_allclose(np.r_[shell.mass, shell.J.ravel()], layer, rtol=1e-6, atol=1e-6)
+
+
+def test_what_mujoco_makes_of_replicates_and_missing_numbers(tmp_path):
+    """The angles of replicates are multiplied; c_1 of an equality is 1; inertials stay where no geom has mass."""
+    inertial, step = '<inertial pos="0 0 1" mass="2" diaginertia="0.1 0.2 0.25"/>', np.array([1.0, 0.0, 0.1])
+    text = f"""<mujoco><compiler inertiafromgeom="true"/><default><equality active="false"/></default><worldbody>
+      <replicate count="3" offset="{text_of(step)}" euler="10 20 0"><body name="r" gravcomp="-1"><joint name="j"/>
+      <geom size="1" mass="0"/>{inertial}</body></replicate></worldbody><equality>
+      <joint joint1="j0" joint2="j1" polycoef="0.3" active="true"/><joint joint1="j2"/></equality></mujoco>"""
+    with warnings.catch_warnings(action="ignore", category=IgnoredWarning):
+        model = read(text, tmp_path)
+    turns = [Rotation.from_euler("XYZ", [10.0 * k, 20.0 * k, 0.0], degrees=True).as_matrix() for k in range(3)]
+    place = step + turns[1] @ step
+    np.testing.assert_allclose(model.bodies[2].rotation, turns[2], atol=1e-12)
+    np.testing.assert_allclose(model.bodies[2].position, place + turns[2][:, 2], atol=1e-12)
+    problem = model.problem(positions={"j1": 0.2})
+    assert problem.joint_coordinate("j0").position(problem.q0) == pytest.approx(0.5, abs=1e-12)
+    assert [body.inertia[0] for body in model.bodies] == [2.0] * 3 and len(model.joints) == 4 and not model.forces

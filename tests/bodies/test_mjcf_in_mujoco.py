@@ -22,8 +22,8 @@ ARM = f"""<worldbody><site name="w" pos="0.5 0.3 1"/><body euler="10 20 30"><joi
 CASES = {
     "several joints": f"""<worldbody><body name="hip" euler="0 30 0">
         <joint name="a" axis="1 0 0" armature="0.3" damping="0.2" ref="20"/>
-        <joint name="b" axis="0 1 1" pos="0 0 0.1" stiffness="3" springref="30"/><joint axis="1 1 1" armature="2"/>
-        {INERTIAL}{TIP}</body></worldbody>""",
+        <joint name="b" axis="0 1 1" pos="0 0 0.1" stiffness="3 2 1" damping="1 2 3" springref="30"/>
+        <joint axis="1 1 1" armature="2"/>{INERTIAL}{TIP}</body></worldbody>""",
     "slides": f"""<worldbody><body name="cart"><joint type="slide" axis="1 0 0" armature="0.7" springdamper="0.4 0.6"/>
         <joint type="slide" axis="1 0 1" damping="3"/><joint axis="0 1 0" springdamper="0.2 1"/>{INERTIAL}
         <body pos="0 0 1"><joint type="slide" axis="0 1 1" stiffness="5" armature="1"/>{INERTIAL}{TIP}</body></body>
@@ -34,7 +34,7 @@ CASES = {
     "frames": f"""<default><default class="x"><joint axis="1 0 0" damping="0.3"/></default></default><worldbody>
         <frame pos="1 0 0" euler="0 40 0" childclass="x"><body name="arm"><frame pos="0 0.1 0" euler="0 0 50">
         <joint name="in" pos="0 0 0.2"/>{INERTIAL}</frame>{TIP}</body></frame>
-        <replicate count="3" offset="0.5 0 0" euler="0 0 30" sep="-"><body name="leg" pos="0 1 0"><joint name="k"/>
+        <replicate count="3" offset="0.5 0 0" euler="20 0 30" sep="-"><body name="leg" pos="0 1 0"><joint name="k"/>
         <geom type="box" size="0.1 0.2 0.3"/></body></replicate></worldbody><actuator>
         <position joint="k" kp="40" kv="3"/></actuator>""",
     "compiler": f"""<compiler balanceinertia="true" boundmass="0.5" boundinertia="0.01" settotalmass="7"

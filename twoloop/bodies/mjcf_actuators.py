@@ -275,6 +275,10 @@ class TendonsAndActuators:
         if (span := self._range(given, "ctrl", joint)) and "clampctrl" not in self.reader.disabled:
             command = Limited(command, *span) if callable(command) else float(np.clip(command, *span))
         limits = self._range(given, "force", None)
+        if joint is None:
+            bounded_joints = [each for each in self.reader.ordered if self._has_limited_force(each)]
+            moved = [each.name for each in bounded_joints if self._may_act_on(each, given)]
+            self.ignored += [f"actuatorfrcrange of joint {each!r}" for each in moved]
         if joint is not None and (own := self._limits_of_force(joint, float(gear[0]))):
             limits = own if limits is None else (max(own[0], limits[0]), min(own[1], limits[1]))
         own_name = self.reader.free(name, f"actuator {number} of the file")
@@ -324,7 +328,7 @@ class TendonsAndActuators:
 
     def _limits_of_force(self, joint: FileJoint, gear: float) -> tuple[float, float] | None:
         """Return the limits that a joint sets to the force of its only actuator, or None."""
-        if not gear or not self.reader.limited(joint.attributes, "actuatorfrclimited", "actuatorfrcrange"):
+        if not gear or not self._has_limited_force(joint):
             return None
         elements = [each for group in self.reader.root.findall("actuator") for each in group]
         if sum(self._may_act_on(joint, self.reader.attributes(each, "main")) for each in elements) > 1:  # of their sum
@@ -332,6 +336,9 @@ class TendonsAndActuators:
             return None
         ends = numbers(joint.attributes["actuatorfrcrange"], 2, f"actuatorfrcrange of joint {joint.name!r}") / gear
         return float(ends.min()), float(ends.max())
+
+    def _has_limited_force(self, joint: FileJoint) -> bool:
+        return bool(self.reader.limited(joint.attributes, "actuatorfrclimited", "actuatorfrcrange"))
 
     def _may_act_on(self, joint: FileJoint, given: dict[str, str]) -> bool:
         """Return True if an actuator acts on a joint, directly, by a tendon, or at a site somewhere."""

@@ -92,7 +92,8 @@ class Loads(TendonsAndActuators):
         for joint in reader.ordered:
             self._joint(joint)
         passive = not {"stiffness", "damping"} <= reader.without
-        for part, lump, factor in reader.gravcomp if passive else ():
+        compensated = passive and any(factor > 0.0 for _, _, factor in reader.gravcomp)  # MuJoCo: else not at all
+        for part, lump, factor in reader.gravcomp if compensated else ():
             weight = -scale * factor * lump.mass * self.model.gravity
             if weight.any():
                 self.model.force(body_of(self.model, part), start_point(part, lump.centre), weight)
@@ -285,8 +286,8 @@ class Loads(TendonsAndActuators):
             ends, offsets = [each.joint for each in joints], [each.displacement for each in joints]
         if not names or None in ends:
             return False
-        text = given.get("polycoef", "0 1 0 0 0").split()
-        coefficients = numbers(" ".join([*text, *"00000"[len(text) :]]), 5, f"polycoef of a {kind} equality")
+        text = given.get("polycoef", "").split()
+        coefficients = numbers(" ".join([*text, *"01000"[len(text) :]]), 5, f"polycoef of a {kind} equality")
         own = self.reader.free(given.get("name"), f"equality of {' and '.join(names)}")
         self.model.coupling(ends, Polynomial(tuple(coefficients.tolist()), tuple(offsets)), name=own)
         return True

@@ -259,6 +259,8 @@ class _Reader:
                 self.ignored.append(name_of(each))
         if element.tag == "body":
             lump = self._bounded(combined(lumps or stated), self.compiler(element.attrib))
+            if lump.mass and not (lumps or stated) and numbers(element.get("pos", "0 0 0"), 3, "pos").any():
+                self.ignored.append(f"where boundmass puts the mass of {name_of(element)}")  # in MuJoCo at its pos
             self.total += lump.mass
             gravcomp = float(element.get("gravcomp", 0.0))
             if part is not None:
