@@ -60,10 +60,10 @@ class Code:
         self.equations = self.code.shared.equations
         self.there = on_arrays(self.code.shared.functions.addresses["own_there"])
         self.quick = None
-        if self.equations.quick is not None:
+        if self.equations.reduced is not None:
             module, numbers = Module(), self.code.shared.numbers
             kind = BIT, ["double*"] * 5
-            write_function(module, "quick", kind, self.equations.quick, numbers)
+            write_function(module, "quick", kind, self.equations.reduced, numbers)
             self.quick = function_of(module, "quick", *[ctypes.c_void_p] * 5)
 
     def at(self, t, q, v):
@@ -166,16 +166,16 @@ def test_they_take_fewer_operations(name, most, mass_first):
     problem = getattr(mechanisms, name)()
     equations = generated_code(problem.system, 0.0, problem.q0).shared.equations
     quick_ones, all_of_them = (
-        len(equations.graph.needed_by(outputs.arrays["a"])) for outputs in (equations.quick, equations.there)
+        len(equations.graph.needed_by(outputs.arrays["a"])) for outputs in (equations.reduced, equations.mass_first)
     )
     assert quick_ones <= most < all_of_them <= mass_first
-    assert len(equations.quick.quantities()) < 0.8 * len(equations.there.quantities())
+    assert len(equations.reduced.quantities()) < 0.8 * len(equations.mass_first.quantities())
 
 
 @pytest.mark.parametrize("name", ["pendulum", "double_pendulum", "heavy_top", "closed_chain", "rolling_disc"])
 def test_where_few_coordinates_depend_mass_first_stays(name):
     problem = getattr(mechanisms, name)()
-    assert generated_code(problem.system, 0.0, problem.q0).shared.equations.quick is None
+    assert generated_code(problem.system, 0.0, problem.q0).shared.equations.reduced is None
 
 
 @settings(max_examples=50, deadline=None)

@@ -166,7 +166,7 @@ def test_what_does_the_same_with_symbols_is_traced(case):
     system = pendulum(force=TRACED[case])
     program = series_program(system)
     states = np.column_stack([np.linspace(0.0, 1.0, 5), np.random.default_rng(1).uniform(-1.0, 1.0, (5, 4))])
-    assert program.traced.wrong(system, states) is None
+    assert program.traced.difference(system, states) is None
     one, other = run(system), run(system, "DOP853", 1e-10)
     assert one.success and worst(one.q[:, -1], other.q[:, -1]) < 1e-6
 

@@ -22,8 +22,8 @@ from twoloop.problem.events import check_events
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.result.storage import begin_folder, check_folder, end_folder
-from twoloop.run.cached import STEPS, Missed, Output, cached_result, fields_of, set_up
-from twoloop.run.fallbacks import MOST, closer, may_have_missed_changes
+from twoloop.run.cached import STEPS, MissedChanges, Output, cached_result, fields_of, set_up
+from twoloop.run.fallbacks import MOST, closer_sampling, may_have_missed_changes
 from twoloop.run.loop import IntegrationLoop, Interrupts, interrupted_record
 from twoloop.run.options import options_of
 from twoloop.run.record import FileStore, MemoryStore, OutputRequest, Status, record_of
@@ -207,12 +207,12 @@ def solve_dae(
             is_default = times is time_limit is None and not dense_output
             output = STEPS if is_default else Output(times, at_ends, bool(dense_output), time_limit)
             outcome = cached_result(system, t0, t1, q0, v0, options, output, interrupts)
-            if isinstance(outcome, tuple) and (not interrupts.asked or outcome[0]["status"] == Status.INTERRUPTED):
+            if isinstance(outcome, tuple) and (not interrupts.n_signals or outcome[0]["status"] == Status.INTERRUPTED):
                 fields, rows_warning = outcome
                 if rows_warning:
                     warnings.warn(rows_warning, ConstraintWarning, stacklevel=2)
                 return record_of(Result, fields)
-            if isinstance(outcome, Missed):
+            if isinstance(outcome, MissedChanges):
                 every, spent, repeats = outcome.every, outcome.cpu_time, MOST - 1
             elif isinstance(outcome, Run):
                 run = outcome
@@ -236,7 +236,7 @@ def solve_dae(
             give_back(run.work)
             if last or record.status < 0 or not may_have_missed_changes(run):
                 break
-            every, spent, run = closer(run), spent + record.stats.cpu_time, None
+            every, spent, run = closer_sampling(run), spent + record.stats.cpu_time, None
         if spent > 0.0:
             record = replace(record, stats=replace(record.stats, cpu_time=spent + record.stats.cpu_time))
         result = record_of(Result, fields_of(record, options, system, with_code, t1))
@@ -244,7 +244,7 @@ def solve_dae(
             end_folder(kept, result)
         return result
     except (KeyboardInterrupt, SystemError) as error:
-        if not (interrupted(error) and interrupts.answers()):
+        if not (interrupted(error) and interrupts.gives_result()):
             raise
     finally:
         interrupts.leave()

@@ -15,7 +15,7 @@ import numpy as np
 from references.equations.rows import independent_rows
 from references.lines import CannotRun
 from twoloop.generate.graph import Affine, Derivative, Graph, Untraceable, symbols
-from twoloop.generate.trace import Equations, only
+from twoloop.generate.trace import Equations, only_quantity
 from twoloop.generate.traced_values import Traced
 from twoloop.kernels.data.indices import GAMMA_GIVEN
 from twoloop.kernels.evaluation import operations
@@ -127,7 +127,7 @@ class Expressions:
         n, graph = self.system.n_q, self.traced.graph
         masses, jacobians = _nonzero(self.mass), _nonzero(self.jacobian)
         for unknown in (*self.traced.q, *self.traced.v):
-            by = Derivative(graph, {only(unknown): Affine(graph, 1.0, {})})
+            by = Derivative(graph, {only_quantity(unknown): Affine(graph, 1.0, {})})
             Q, gamma = (list(map(by.of, forms)) for forms in (self.force, self.gamma))
             for i, j in masses:
                 Q[i] = Q[i] - by.of(self.mass[i, j]) * self.solution[j]

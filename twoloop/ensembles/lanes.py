@@ -20,7 +20,7 @@ from twoloop.generate.graph import Untraceable
 from twoloop.generate.parameter_expressions import ParameterTape
 from twoloop.generate.program import Arrays, Program
 from twoloop.generate.series import series_for
-from twoloop.generate.time_dependence import BY_TIME, TIME, may_be_narrow, may_be_sudden
+from twoloop.generate.time_dependence import BY_TIME, TIME, may_be_short, may_be_steep
 from twoloop.generate.trace import Equations
 from twoloop.kernels.control.discontinuities import FLOOR, LEAST, SHARE, STEEPER
 from twoloop.kernels.control.discontinuities import N_SAMPLES as N_PLACES
@@ -142,7 +142,7 @@ def is_involved(system: ConstrainedSystem) -> bool:
 
     Return False if a force may be narrow: DOP853 then needs short steps, a series only samples within its steps.
     """
-    if may_be_narrow(system, ran_on_symbols=True):
+    if may_be_steep(system, ran_on_symbols=True):
         return False
     try:
         return series_for(system).n_operations > INVOLVED * system.n_q
@@ -263,8 +263,8 @@ class LaneRuns:
         self.system, self.starts, self.method, self.kit = system, starts, method, kit_to_write(system)
         generic, varying = generic_parameters(starts.parameters)
         of_all = generic_system(system, starts)
-        sudden = may_be_sudden(of_all, ran_on_symbols=True)
-        unseen = 1.0 if may_be_narrow(of_all, ran_on_symbols=True) else method.unseen
+        sudden = may_be_short(of_all, ran_on_symbols=True)
+        unseen = 1.0 if may_be_steep(of_all, ran_on_symbols=True) else method.unseen
         self.places = LOOKS if any(sudden) else N_SAMPLES * unseen
         self.looks = ShortLooks(system, generic, varying) if sudden.by_time else None
         choice = Choice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
@@ -332,7 +332,7 @@ class LaneRuns:
         begin = layout.places(n, n_rows, code.n_numbers)[-1]
         room = aligned(begin + method.memory(code), layout.LANES)
         kit = layout.LaneKit(self.own.functions, method.step())
-        redundant = bool(code.equations.redundant.conditions)
+        redundant = bool(code.equations.redundant_rows.conditions)
         settings = np.array([n, n_rows, method.order, redundant, code.n_numbers, method.evaluations], dtype=np.int64)
         control = np.concatenate([[starts.t0, t1, (t1 - starts.t0) / self.places, rtol], atol, code.numbers.values])
         given = np.ascontiguousarray(starts.q[which]), np.ascontiguousarray(starts.v[which])

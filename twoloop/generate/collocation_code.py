@@ -1,11 +1,12 @@
 """Generate code for collocation steps whose stages are evaluated side by side, one in each SIMD lane.
 
 Fixed-point iteration evaluates all stages of an implicit Runge-Kutta step anew in each sweep. No stage waits for
-another, so that a sweep takes little longer than one evaluation. Mostly the accelerations depend on some of the
-coordinates only: these are iterated, and the others follow from the accelerations at the end. The ends of eight steps
-are projected onto the constraints side by side, too.
+another, so that a sweep takes little longer than one evaluation. Usually the accelerations depend on some of the
+coordinates only: only these coordinates are iterated, and the others follow from the final accelerations. The ends of
+eight steps are projected onto the constraints together, one in each lane.
 
-The functions work in a memory that kernels/data/collocation.py lays out; kernels/steps/lobatto_step.py calls them.
+The functions share an array, `room`, whose layout is in kernels/data/collocation.py; kernels/steps/lobatto_step.py
+calls them.
 
 The method is Lobatto IIIA with nine nodes, the first of which is the end of the previous step; its order is 16. A
 polynomial of degree 8 through values at the nodes is expanded in Legendre polynomials, whose integrals and derivatives
@@ -25,7 +26,15 @@ from numpy.typing import NDArray
 
 from twoloop.generate import lane_series, llvm_code
 from twoloop.generate.compile_equations import GeneratedCode, SharedCode, call_accelerations
-from twoloop.generate.lane_series import LaneEmitter, column, load_lanes, over, place_of, store_lanes, two_sums
+from twoloop.generate.lane_series import (
+    LaneEmitter,
+    column,
+    load_lanes,
+    loop_over,
+    store_lanes,
+    two_sums,
+    vector_index,
+)
 from twoloop.generate.llvm_code import Emitter, Lowering, lower
 from twoloop.generate.llvm_text import BIT, DOUBLE, INTEGER, NOTHING, Module, Value, constant, constants, integer
 from twoloop.generate.program import Program
@@ -41,7 +50,7 @@ N = 9
 
 
 class Tables(NamedTuple):
-    """Tables for nodes c_0 = 0 < ... < c_8 = 1; row k multiplies the value at node k.
+    """Coefficients for nodes c_0 = 0 < ... < c_8 = 1; row k of a table multiplies the value at node k.
 
     Attributes
     ----------
@@ -50,11 +59,11 @@ class Tables(NamedTuple):
     velocities, positions : (9, 8)
         Single and double integrals from 0 to each of the nodes 1 to 8.
     values_between, velocities_between, positions_between : (9, 8)
-        Values of the polynomial, and the same integrals, at the midpoints.
+        Values of the polynomial at the midpoints, and its single and double integrals from 0 to the midpoints.
     spectrum : (9, 8)
-        Coefficients of the Legendre polynomials 1 to 8 on [0, 1], which are 1 at its end.
+        Coefficients of the polynomial in the Legendre polynomials 1 to 8 on [0, 1], which are 1 at its end.
     begin, end : (9, 8)
-        Coefficients of the powers 1 to 8 of the time from the beginning, and from the end.
+        Coefficients of the polynomial in the powers 1 to 8 of the time from the beginning, and from the end.
     """
 
     nodes: Array
@@ -71,7 +80,7 @@ class Tables(NamedTuple):
 
 @cache
 def tables() -> Tables:
-    """Return the coefficients, computed in extended precision and rounded once."""
+    """Return the tables, computed in extended precision and rounded once."""
     x = _nodes()
     between: Extended = (x[1:] + x[:-1]) / np.longdouble(2)
     values = _legendre(x)
@@ -94,7 +103,7 @@ def tables() -> Tables:
 
 
 def _nodes() -> Extended:
-    """Return -1, the zeros of P_8', and 1."""
+    """Return the nodes on [-1, 1]: -1, the zeros of P_8', and 1."""
     inner = legendre.legroots(legendre.legder([0] * (N - 1) + [1])).astype(np.longdouble)
     derivative = legendre.legder(np.array([0] * (N - 1) + [1], dtype=np.longdouble))
     for _ in range(3):
@@ -103,12 +112,12 @@ def _nodes() -> Extended:
 
 
 def _legendre(z: Extended) -> Extended:
-    """Evaluate P_0 to P_10, one row each."""
+    """Return the values of the Legendre polynomials P_0 to P_10 at z, one row for each polynomial."""
     return np.array([legendre.legval(z, np.array([0] * k + [1], dtype=np.longdouble)) for k in range(N + 2)])
 
 
 def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended, Extended]:
-    """Evaluate the Lagrange polynomials on [0, 1], and their single and double integrals from 0; a row a node."""
+    """Return values, single and double integrals from 0 of the Lagrange polynomials on [0, 1]; a row for each node."""
     values = _legendre(z)
     # the integral of P_k from -1 is (P_k+1 - P_k-1) / (2 k + 1)
     once = np.array([values[1] + 1, *((values[k + 1] - values[k - 1]) / (2 * k + 1) for k in range(1, N + 1))])
@@ -116,43 +125,47 @@ def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended,
     return coefficients.T @ values[:N], coefficients.T @ once[:N] / 2, coefficients.T @ twice / 4
 
 
-LONGEST = 5000  # largest number of operations of the equations: code of this length takes 2 s to compile
+MOST_OPERATIONS = 5000  # largest number of operations of the equations: code of this length takes 2 s to compile
 SMALLEST = 1e-300  # replaces a divisor of zero
 FAILED = -1.0  # result of an audit that cannot evaluate the accelerations (defects are never negative)
 INFINITE = float("inf")
-# number of steps that eliminate M first, after a step in which the conditions of the shorter elimination failed
+# number of steps that use `mass_first`, after a step in which the conditions of `reduced` failed
 CAREFULLY = 8.0
 FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the second step
 
 # the iteration
-# error that the iteration may leave, relative to the tolerance: total errors are then no larger than those of DOP853
+# error of the stopped iteration, relative to the tolerance: with this value, total errors are no larger than those of
+# DOP853
 KAPPA = 0.02
-# number of sweeps aimed at; one more if the prediction has degree 6, two more from 7 on, as steps are long then
+# number of sweeps that the step size aims at; one more if the prediction has degree 6, two more from degree 7 on,
+# because steps are long then
 TARGET = 6.0
 MORE = 7  # number of sweeps beyond the target after which a step is rejected
 SLOW = 0.8  # contraction of the iteration above which a step is rejected after the third sweep
 LEAST_RHO, MOST_RHO = 1e-3, 0.9
 SLOW_START, FAST_START = 0.3, 0.04  # if the contraction of the first step is outside these limits, its size is changed
-STAGNANT = 0.5  # ratio of changes from which on they are rounding, if they are below NOISE relative to the values
-# KAPPA and NOISE for steps of fixed size, and the largest number of sweeps; forces may have rounding errors, too
+# ratio of two successive changes from which on the changes are rounding, if they are below NOISE relative to the values
+STAGNANT = 0.5
+# steps of fixed size: their KAPPA and NOISE (forces may have rounding errors, too), and the largest number of sweeps
 ROUNDING_OF_FIXED, NOISE_OF_FIXED, MOST_OF_FIXED = 1e-16, 1e-9, 60.0
-LEAST_CHANGE = 1e-30  # added to the remaining error over its limit, so that its logarithm exists
+LEAST_CHANGE = 1e-30  # added to an error ratio, so that its logarithm exists
 SHARE = 0.5  # weight of the error estimate
 # allowed defect between nodes, relative to the tolerances: most of it oscillates and does not last to the end
 ALLOWED = 16.0
 
 
-def suits(own: SharedCode) -> bool:
-    """Return whether the code of a mechanism compiles within a few seconds."""
-    return own.equations.n_operations <= LONGEST
+def compiles_quickly(own: SharedCode) -> bool:
+    """Return whether the collocation code of a mechanism compiles within a few seconds."""
+    return own.equations.n_operations <= MOST_OPERATIONS
 
 
 class CollocationCode:
-    """Generator of the functions that make the collocation steps of one mechanism.
+    """Generator of the functions for the collocation steps of one mechanism.
 
     Parameters
     ----------
     own : SharedCode
+        Code of the equations, whose coefficients the functions share.
 
     Attributes
     ----------
@@ -169,14 +182,14 @@ class CollocationCode:
         self.n, self.n_rows = self.equations.system.n_q, len(self.equations.all_rows)
         self.iterated = self._iterated()
         self.others = [i for i in range(self.n) if i not in self.iterated]
-        self.has_others = len(self.equations.accelerations) > 1
+        self.has_reduced = len(self.equations.accelerations) > 1
         self.a, self.q, self.v, self.polynomials, self.spectra, self.ends, self.end_a, self.lam, self.size = at.places(
             self.n, len(self.iterated), self.n_rows
         )
 
         if self.parts is None:
-            outputs = [*self.equations.accelerations, self.equations.closer, self.equations.nearer]
-        else:  # the digest of `own` covers the others
+            outputs = [*self.equations.accelerations, self.equations.position_projection, self.equations.projection]
+        else:  # the digest of `own` covers the other programs
             outputs = self.equations.accelerations[:1]
         numbers = self.numbers
         description = [[each.sizes, *numbers.structure(each)] for each in outputs]
@@ -187,17 +200,17 @@ class CollocationCode:
         for outputs in self.equations.accelerations:
             forms += outputs.forms
             forms += [form for i in outputs.quantities() for form in graph.arguments(i)]
-        found = {i for form in forms for i in form.terms if graph.operations[i] is None}
-        return sorted({(i - 1) % self.n for i in found if i > 0})
+        inputs = {i for form in forms for i in form.terms if graph.operations[i] is None}
+        return sorted({(i - 1) % self.n for i in inputs if i > 0})
 
     # the functions
 
     def attempt(self, emit: LaneEmitter, room: Value, state: Value, tolerances: Value, numbers: Value) -> Value:
-        """Write the iteration of the stages of a step; its result tells how it ended, see data/collocation.py.
+        """Iterate the stages of a step; return a code for how the iteration ended, see data/collocation.py.
 
-        The accelerations come from the elimination with the fewest operations. If its conditions fail, which are
-        checked once, after the last sweep, another function makes this step and some of the next ones with the
-        elimination that begins with M.
+        The accelerations come from the program with the fewest operations. Its conditions are checked once, after the
+        last sweep. If they fail, another function makes this step and the next CAREFULLY steps with the elimination
+        that begins with M.
         """
         builder, one = emit.builder, Emitter(emit.builder)
         emit.numbers = emit.constants = numbers
@@ -207,8 +220,8 @@ class CollocationCode:
             return builder.call(name, DOUBLE, [room, state, tolerances, numbers])
 
         def quick(inputs: list[Value]) -> Callable[[], Value]:
-            if self.parts is not None and not self.has_others:
-                return self._called(emit, room, 0)(inputs)
+            if self.parts is not None and not self.has_reduced:
+                return self._caller(emit, room, 0)(inputs)
             outputs, written = self.equations.accelerations[0], Lowering(emit, self.numbers)
             (forms,), graph = outputs.arrays.values(), self.equations.graph
             for quantity, value in enumerate(inputs):
@@ -227,12 +240,12 @@ class CollocationCode:
             return finish
 
         def otherwise() -> Value:
-            if not self.has_others:
+            if not self.has_reduced:
                 return constant(DOUBLE, float(at.LEFT))
             one.store(constant(DOUBLE, CAREFULLY), room, at.CAREFUL)
             return careful()
 
-        if self.has_others:
+        if self.has_reduced:
             left = one.load(room, at.CAREFUL)
             with self._leaving(emit, builder.compare("fcmp ogt", left, llvm_code.ZERO)):
                 one.store(one.subtract(left, llvm_code.ONE), room, at.CAREFUL)
@@ -248,12 +261,12 @@ class CollocationCode:
             inner, (room, state, tolerances, numbers) = emit.like(builder), builder.arguments
             inner.numbers = inner.constants = numbers
             self._call(inner, "begin_nodes", self._begin, [room, state, tolerances])
-            mass_first, given_up = self._called(inner, room, -1), constant(DOUBLE, float(at.LEFT))
+            mass_first, given_up = self._caller(inner, room, -1), constant(DOUBLE, float(at.LEFT))
             builder.ret(self._iterate(inner, room, state, tolerances, mass_first, lambda: given_up))
         return name
 
-    def _called(self, emit: LaneEmitter, room: Value, way: int) -> Callable[[list[Value]], Callable[[], Value]]:
-        """Return a writer of calls of the module's function for accelerations, see `call_accelerations`."""
+    def _caller(self, emit: LaneEmitter, room: Value, way: int) -> Callable[[list[Value]], Callable[[], Value]]:
+        """Return a function `evaluate` for `_iterate` that calls `call_accelerations`."""
         filled = Emitter(emit.builder).pointer(room, self.a)
 
         def evaluate(inputs: list[Value]) -> Callable[[], Value]:
@@ -263,12 +276,12 @@ class CollocationCode:
         return evaluate
 
     def _accelerations(self, emit: LaneEmitter, room: Value) -> list[Value]:
-        """Load accelerations from memory: kept across the loop, they would be spilled to the stack each time."""
+        """Load the accelerations from memory: values kept across the loop would be spilled to the stack."""
         return [load_lanes(emit, room, self.a + LANES * i) for i in range(self.n)]
 
     @contextmanager
     def _leaving(self, emit: LaneEmitter, condition: Value) -> Iterator[None]:
-        """Open a block of code for the case that a condition holds; the block has to return."""
+        """Context of instructions that run only if a condition holds, and that must return from the function."""
         builder = emit.builder
         leave, go_on = builder.append_block(), builder.append_block()
         builder.branch(condition, leave, go_on)
@@ -286,11 +299,10 @@ class CollocationCode:
         emit.builder.run(name, arguments)
 
     def _begin(self, emit: LaneEmitter, room: Value, state: Value, tolerances: Value) -> None:
-        """Write the error weights, and predict positions and velocities at the nodes.
+        """Store the error weights, and predict positions and velocities at the nodes.
 
-        Errors are relative to the larger of two numbers: the size of the position (or velocity) at the beginning, and
-        the change that half a step adds. Steps of fixed size have no error estimate: there errors are relative to that
-        size, or absolute if it is below 1.
+        Errors are relative to the position (or velocity) at the beginning, or to its change in half a step if that is
+        larger. In steps of fixed size, which have no error estimate, rtol = atol = 1.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
         fixed = builder.compare("fcmp oeq", one.load(tolerances, ESTIMATE), llvm_code.ZERO)
@@ -329,8 +341,8 @@ class CollocationCode:
         # integrals of the powers 0 to 8 from the beginning to the nodes, a row for each power
         velocities = np.array([nodes ** (k + 1) / (k + 1) for k in range(LANES + 1)])
         positions = np.array([nodes ** (k + 2) / ((k + 1) * (k + 2)) for k in range(LANES + 1)])
-        with over(emit, self.iterated) as (k, i, _, _):
-            scaled = emit.multiply(load_lanes(emit, one.pointer(old, place_of(emit, k))), kept)
+        with loop_over(emit, self.iterated) as (k, i, _, _):
+            scaled = emit.multiply(load_lanes(emit, one.pointer(old, vector_index(emit, k))), kept)
             store_lanes(emit, scaled, room, at.SCALED)
             terms = [one.load(one.pointer(state, i), 2 * n), *(one.load(room, at.SCALED + j) for j in range(LANES))]
             self._put_stages(
@@ -338,7 +350,7 @@ class CollocationCode:
             )
 
     def _powers(self, emit: LaneEmitter, x: Value) -> Value:
-        """Compute the powers 1 to 8 of x, one in each lane."""
+        """Return the powers 1 to 8 of x, one in each lane."""
         builder, power = emit.builder, emit.splat(x)
         factors = []
         for bit in (1, 2, 4, 8):
@@ -348,7 +360,7 @@ class CollocationCode:
         return emit.multiply(emit.multiply(*factors[:2]), emit.multiply(*factors[2:]))
 
     def _several(self, emit: LaneEmitter) -> tuple[LaneEmitter, list[int]]:
-        """Return an emitter for vectors of coordinates, and where these begin; the last one may overlap."""
+        """Return an emitter for vectors of coordinates, and their first coordinates; the last vector may overlap."""
         lanes = min(LANES, 1 << (self.n.bit_length() - 1))
         return LaneEmitter(emit.builder, lanes), [*range(0, self.n - lanes, lanes), self.n - lanes]
 
@@ -361,10 +373,11 @@ class CollocationCode:
         evaluate: Callable[[list[Value]], Callable[[], Value]],
         otherwise: Callable[[], Value],
     ) -> Value:
-        """Write the sweeps over the stages until they have converged, or the step is rejected.
+        """Sweep over the stages until they have converged, or the step is rejected; return the code of `attempt`.
 
         `evaluate` stores the accelerations of the iterated coordinates at [t, q, v]; the function that it returns
-        stores the other accelerations and returns whether all of them are valid. If not, `otherwise` makes the step.
+        stores the other accelerations and returns whether all accelerations are valid. If they are not, `otherwise`
+        makes the step.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
 
@@ -423,32 +436,33 @@ class CollocationCode:
                 holds_that("ole", change, noise),
             ),
         )
-        made = either(holds_that("ole", one.multiply(rho_now, change), kappa), stagnant)
+        converged = either(holds_that("ole", one.multiply(rho_now, change), kappa), stagnant)
         slow = builder.both(builder.both(holds_that("ogt", m, 3.0), estimated), holds_that("oge", rho_now, SLOW))
         refused = either(either(slow, holds_that("oge", m, most)), holds_that("uge", change, INFINITE))
-        goes_on = builder.operation("or", either(guessed, made), refused)
+        ends = builder.operation("or", either(guessed, converged), refused)
         for phi, value in zip(carried, (m, change, rho_now), strict=True):
             phi.add_incoming(value, builder.block)
-        builder.branch(goes_on, after, loop)
+        builder.branch(ends, after, loop)
         builder.position_at_end(after)
         all_hold = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [finish()])
         with self._leaving(emit, builder.operation("xor", all_hold, Value(BIT, "true"))):
             builder.ret(otherwise())
         for value, place in ((m, at.SWEEPS), (change, at.CHANGE), (target, at.TARGETED), (rho_now, at.RHO)):
             one.store(value, room, place)
-        ended = builder.select(made, number(at.MADE), number(at.REFUSED))
+        ended = builder.select(converged, number(at.MADE), number(at.REFUSED))
         ended = builder.select(guessed, number(at.GUESSED), ended)
         with builder.if_then(builder.both(builder.compare("fcmp oeq", ended, number(at.MADE)), estimated)):
             self._call(emit, "judge_nodes", self._judge, [room, state])
         return ended
 
     def _judge(self, emit: LaneEmitter, room: Value, state: Value) -> None:
-        """Write ERROR and CURVED, and the factors of the next step size by convergence and by the error.
+        """Store ERROR and CURVED, and the factors of the next step size by convergence and by the error.
 
-        The coefficients of a in Legendre polynomials show how fast they decrease: t is the larger one of degrees 7 and
-        8, s that of degrees 5 and 6, f the largest of all from degree 3 on. The error is estimated as the larger of t
-        (t / s)^1.5 and t^2 / f. In 99 % of the steps over corners and peaks of forces, errors are at most 20 times the
-        estimate; for smooth motion they are smaller by decades, which costs few steps, as the estimate is of order 12.
+        The error estimate extrapolates the decay of the Legendre coefficients of the accelerations. Let t be the larger
+        coefficient of degrees 7 and 8, s the larger one of degrees 5 and 6, f the largest one from degree 3 on. The
+        estimate is the larger of t (t / s)^1.5 and t^2 / f. In 99 % of the steps over corners and peaks of forces,
+        errors are at most 20 times the estimate. In smooth motion errors are smaller by decades, which costs few steps,
+        because the estimate is of order 12.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
         m, change, target, rho = (one.load(room, place) for place in (at.SWEEPS, at.CHANGE, at.TARGETED, at.RHO))
@@ -462,7 +476,7 @@ class CollocationCode:
             a0 = one.load(one.pointer(state, i), 2 * n)
             values = emit.function("fabs", self._combined(emit, tables().spectrum, a0, room, i))
             pairs = emit.larger(values, builder.shuffle(values, values, [1, 0, 3, 2, 5, 4, 7, 6]))
-            store_lanes(emit, pairs, one.pointer(room, place_of(emit, i)), self.spectra)
+            store_lanes(emit, pairs, one.pointer(room, vector_index(emit, i)), self.spectra)
         several, starts = self._several(emit)
         error = curved = several.constant(0.0)
         least = several.constant(SMALLEST)
@@ -525,45 +539,47 @@ class CollocationCode:
         return builder.select(all_hold, defect, constant(DOUBLE, FAILED))
 
     def retry(self, emit: LaneEmitter, room: Value, state: Value) -> None:
-        """Let the polynomial of a rejected step predict the shorter step that replaces it."""
+        """Store the polynomial of a rejected step, so that it predicts the shorter step that replaces it."""
         one, old = Emitter(emit.builder), self._polynomial(emit, room, other=False)
-        with over(emit, self.iterated) as (k, i, _, _):
+        with loop_over(emit, self.iterated) as (k, i, _, _):
             a0 = one.load(one.pointer(state, i), 2 * self.n)
-            store_lanes(emit, self._combined(emit, tables().begin, a0, room, i), one.pointer(old, place_of(emit, k)))
+            store_lanes(
+                emit, self._combined(emit, tables().begin, a0, room, i), one.pointer(old, vector_index(emit, k))
+            )
 
     def end(self, emit: LaneEmitter, room: Value, state: Value, new_state: Value) -> None:
-        """Write [q, v, a] at the end of the step, and the polynomial that predicts the next one, with its degree.
+        """Store [q, v, a] at the end of the step, and the polynomial that predicts the next step, with its degree.
 
-        The best degree is the one that would have predicted the end of this step best, near the one that it had.
+        The degree is the one that would have predicted the end of this step best; it changes by at most 2.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
         last, h = LANES - 1, one.load(room, at.H)
         powers, new = load_lanes(emit, room, at.POWERS), self._polynomial(emit, room, other=True)
         old, zero = self._polynomial(emit, room, other=False), emit.constant(0.0)
-        with over(emit, self.iterated, [zero]) as (k, i, (worst,), carried):
-            place = one.pointer(room, place_of(emit, k))
+        with loop_over(emit, self.iterated, [zero]) as (k, i, (worst,), carried):
+            place = one.pointer(room, vector_index(emit, k))
             here = one.pointer(new_state, i)
             a0, a1 = (
                 one.load(one.pointer(state, i), 2 * n),
-                one.load(one.pointer(room, place_of(emit, i)), self.a + last),
+                one.load(one.pointer(room, vector_index(emit, i)), self.a + last),
             )
             for value, begin in ((one.load(place, self.q + last), 0), (one.load(place, self.v + last), n), (a1, 2 * n)):
                 one.store(value, here, begin)
-            sums = emit.multiply(load_lanes(emit, one.pointer(old, place_of(emit, k))), powers)
+            sums = emit.multiply(load_lanes(emit, one.pointer(old, vector_index(emit, k))), powers)
             for distance in (1, 2, 4):  # partial sums of all terms up to each degree
                 shifted = [LANES + k if k < distance else k - distance for k in range(LANES)]
                 sums = emit.add(sums, builder.shuffle(sums, zero, shifted))
             off = emit.add(sums, emit.splat(one.subtract(a0, a1)))
             weight = emit.splat(one.load(one.pointer(room, i), at.WEIGHTS))
             carried.append(emit.larger(emit.multiply(emit.function("fabs", off), weight), worst))
-            store_lanes(emit, self._combined(emit, tables().end, a0, room, i), one.pointer(new, place_of(emit, k)))
+            store_lanes(emit, self._combined(emit, tables().end, a0, room, i), one.pointer(new, vector_index(emit, k)))
         self._choose_degree(emit, room, carried[0])
         if self.others:
             ends = [constants(table[1:, last]) for table in (tables().velocities, tables().positions)]
             of_first = [constant(DOUBLE, table[0, last]) for table in (tables().velocities, tables().positions)]
-            with over(emit, self.others) as (_, i, _, _):
+            with loop_over(emit, self.others) as (_, i, _, _):
                 first, here = one.pointer(state, i), one.pointer(new_state, i)
-                a = load_lanes(emit, one.pointer(room, place_of(emit, i)), self.a)
+                a = load_lanes(emit, one.pointer(room, vector_index(emit, i)), self.a)
                 q, v, a0 = (one.load(first, m * n) for m in range(3))
                 of_v, of_q = two_sums(emit, *(emit.multiply(a, end) for end in ends))
                 of_v, of_q = (one.fused(factor, a0, each) for factor, each in zip(of_first, (of_v, of_q), strict=True))
@@ -573,7 +589,7 @@ class CollocationCode:
                 one.store(builder.extract(a, last), here, 2 * n)
 
     def _choose_degree(self, emit: LaneEmitter, room: Value, worst: Value) -> None:
-        """Write NEXT_DEGREE, by the errors of predictions of degree 1 to 8 at the end of the step."""
+        """Store NEXT_DEGREE; `worst`: the errors of predictions of degree 1 to 8 at the end of the step."""
         builder, one = emit.builder, Emitter(emit.builder)
         least = one.negative(emit.largest_lane(emit.negative(worst)))
         good = builder.compare("fcmp ole", worst, emit.splat(one.multiply(least, constant(DOUBLE, 1.2))))
@@ -586,19 +602,19 @@ class CollocationCode:
         predicts = builder.compare("fcmp one", one.load(room, at.PREDICTS), llvm_code.ZERO)
         one.store(builder.select(predicts, degree, constant(DOUBLE, FIRST_DEGREE)), room, at.NEXT_DEGREE)
 
-    def closer(self, emit: LaneEmitter, room: Value, numbers: Value) -> None:
-        """Project the positions at the ends of eight steps; write FINE (success) and MOVED (the largest change)."""
+    def project_positions(self, emit: LaneEmitter, room: Value, numbers: Value) -> None:
+        """Project the positions at the ends of eight steps; store FINE (success) and MOVED (the largest change)."""
         if self.parts is None:
-            self._project(emit, room, numbers, self.equations.closer)
+            self._project(emit, room, numbers, self.equations.position_projection)
         else:
-            self._project_in_parts(emit, room, numbers, self.parts.closer, ("moved", "q"))
+            self._project_in_parts(emit, room, numbers, self.parts.project_position, ("moved", "q"))
 
-    def nearer(self, emit: LaneEmitter, room: Value, numbers: Value) -> None:
-        """Project the positions likewise, and compute velocities, accelerations and multipliers there."""
+    def project_states(self, emit: LaneEmitter, room: Value, numbers: Value) -> None:
+        """Project the states at the ends of eight steps; compute accelerations and multipliers there."""
         if self.parts is None:
-            self._project(emit, room, numbers, self.equations.nearer)
+            self._project(emit, room, numbers, self.equations.projection)
         else:
-            self._project_in_parts(emit, room, numbers, self.parts.nearer, ("a", "moved", "q", "v", "lam"))
+            self._project_in_parts(emit, room, numbers, self.parts.project, ("a", "moved", "q", "v", "lam"))
 
     # parts of the functions
 
@@ -616,7 +632,7 @@ class CollocationCode:
     def _project_in_parts(
         self, emit: LaneEmitter, room: Value, numbers: Value, write: Callable[..., Value], names: tuple[str, ...]
     ) -> None:
-        """Project the ends by a function of compile_equations.py that fills the arrays of these names."""
+        """Project the ends by a function of compile_equations.py, `write`, that fills the arrays `names`."""
         one, moved = Emitter(emit.builder), emit.builder.room(DOUBLE, LANES * self.n)
         places = {name: one.pointer(room, place) for name, place in self._places_of_ends().items()} | {"moved": moved}
         state = load_lanes(emit, room, self.ends), places["q"], places["v"]
@@ -635,10 +651,10 @@ class CollocationCode:
         store_lanes(emit, emit.builder.select(holds, before, emit.constant(0.0)), room, at.FINE)
 
     def _integrate(self, emit: LaneEmitter, room: Value, state: Value) -> Value:
-        """Integrate the accelerations to the nodes; return the largest change of a velocity."""
+        """Integrate the accelerations up to each node; return the largest change of a velocity since the last sweep."""
         one = Emitter(emit.builder)
-        with over(emit, self.iterated, [emit.constant(0.0)]) as (k, i, (largest,), new):
-            before = load_lanes(emit, one.pointer(room, place_of(emit, k)), self.v)
+        with loop_over(emit, self.iterated, [emit.constant(0.0)]) as (k, i, (largest,), new):
+            before = load_lanes(emit, one.pointer(room, vector_index(emit, k)), self.v)
             terms = self._values(emit, one.load(one.pointer(state, i), 2 * self.n), room, i)
             sums = [self._sums(emit, table, terms) for table in (tables().velocities, tables().positions)]
             v = self._put_stages(emit, room, state, k, i, sums)
@@ -650,10 +666,10 @@ class CollocationCode:
     def _put_stages(
         self, emit: LaneEmitter, room: Value, state: Value, k: Value, i: Value, sums: Sequence[Value]
     ) -> Value:
-        """Store velocities and positions of coordinate i, the k-th iterated one; return the velocities."""
+        """Store velocities and positions of coordinate i, the k-th iterated coordinate; return the velocities."""
         one = Emitter(emit.builder)
         h = emit.splat(one.load(room, at.H))
-        place, begin = one.pointer(room, place_of(emit, k)), one.pointer(state, i)
+        place, begin = one.pointer(room, vector_index(emit, k)), one.pointer(state, i)
         q0, v0 = (emit.splat(one.load(begin, m * self.n)) for m in range(2))
         v = emit.fused(h, sums[0], v0)
         inner = emit.fused(h, sums[1], emit.multiply(constants(tables().nodes), v0))
@@ -662,24 +678,24 @@ class CollocationCode:
         return v
 
     def _values(self, emit: LaneEmitter, first: Value, room: Value, i: Value) -> list[Value]:
-        """Load the accelerations of coordinate i at all nodes; `first` is its acceleration at the beginning."""
+        """Load the accelerations of coordinate i at all nodes after `first`, its acceleration at the beginning."""
         one = Emitter(emit.builder)
-        place = one.pointer(room, place_of(emit, i))
+        place = one.pointer(room, vector_index(emit, i))
         return [first, *(one.load(place, self.a + node) for node in range(LANES))]
 
     def _combined(self, emit: LaneEmitter, table: Array, first: Value, room: Value, i: Value) -> Value:
-        """Sum the rows of a table times the accelerations of coordinate i (see `_values`)."""
+        """Return the sum of the rows of a table, weighted by the accelerations of coordinate i (see `_values`)."""
         return self._sums(emit, table, self._values(emit, first, room, i))
 
     def _sums(self, emit: LaneEmitter, table: Array, terms: Sequence[Value]) -> Value:
-        """Sum the rows of a table times numbers, in two accumulators."""
+        """Return the sum of the rows of a table, weighted by `terms`; in two accumulators, which is faster."""
         sums = [emit.multiply(emit.splat(term), constants(row)) for term, row in zip(terms[:2], table[:2], strict=True)]
         for k, (term, row) in enumerate(zip(terms[2:], table[2:], strict=True)):
             sums[(k + 1) % 2] = emit.fused(emit.splat(term), constants(row), sums[(k + 1) % 2])
-        return emit.apart(*sums)
+        return emit.add_sums(*sums)
 
     def _polynomial(self, emit: LaneEmitter, room: Value, other: bool) -> Value:
-        """Return a pointer to the polynomial of the last accepted step, or (`other`) of the step that is attempted."""
+        """Return a pointer to the polynomial of the last accepted step; with `other`, of the attempted step."""
         builder, one = emit.builder, Emitter(emit.builder)
         second = builder.compare("fcmp one" if not other else "fcmp oeq", one.load(room, at.WHICH), llvm_code.ZERO)
         size = LANES * len(self.iterated)
@@ -688,18 +704,18 @@ class CollocationCode:
 
 
 class Collocation(NamedTuple):
-    """Functions of a mechanism for collocation steps."""
+    """Compiled functions of a mechanism for collocation steps, with their coefficients."""
 
     functions: DeferredFunctions
     code: CollocationCode
-    numbers: Any  # the coefficients that the functions read, or formulas for them
+    numbers: Any  # coefficients that the functions read, or (shared between systems) expressions for them
 
 
 def compiled_collocation(of_one: GeneratedCode) -> Collocation:
-    """Return the code of a mechanism; its machine code is compiled at the first step, and kept on disk."""
+    """Return the functions of a mechanism, which are compiled at the first step and cached on disk."""
     own = of_one.shared
-    made: Collocation = own.cache.remembered(("collocation", own.equations.choice), lambda: _compiled(own))
-    return made._replace(numbers=of_one.evaluate(made.numbers))
+    shared: Collocation = own.cache.remembered(("collocation", own.equations.choice), lambda: _compiled(own))
+    return shared._replace(numbers=of_one.evaluate(shared.numbers))
 
 
 def _compiled(own: SharedCode) -> Collocation:
@@ -711,8 +727,8 @@ def _compiled(own: SharedCode) -> Collocation:
         "audit_nodes": code.audit,
         "retry_nodes": code.retry,
         "end_nodes": code.end,
-        "closer_ends": code.closer,
-        "nearer_ends": code.nearer,
+        "closer_ends": code.project_positions,
+        "nearer_ends": code.project_states,
     }
     long, numbers = own.parts is not None, code.numbers.formulas
 
@@ -720,7 +736,7 @@ def _compiled(own: SharedCode) -> Collocation:
         module = Module(divided=long)
         for name, emit in parts.items():
             llvm_code.write(module, name, KIT.llvm_type(name), emit, partial(LaneEmitter, lanes=LANES))
-        # with more coefficients than numbers, the functions would read beyond the end of the array
+        # if writing numbered further coefficients, the functions would read beyond the end of the array
         assert len(code.numbers.values) == len(numbers)
         return list(parts), str(module)
 
@@ -732,5 +748,5 @@ def _compiled(own: SharedCode) -> Collocation:
 
 @cache
 def _stamp() -> str:
-    """Return a digest of the source of the functions; the key of the cache covers the code that the equations share."""
+    """Return a digest of the modules that write the functions; those of the equations are in `SharedCode.digest`."""
     return digest_of("", __file__, lane_series, at)

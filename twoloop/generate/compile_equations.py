@@ -1,15 +1,15 @@
-"""Compile the equations of one mechanism: the functions of the inner loop that explicit methods call.
+"""Compile the equations of one mechanism: accelerations and projections, which explicit methods call.
 
 The operations of an elimination become LLVM instructions one by one, without numba, which would take seconds for a few
-hundred of them. The code is cached on disk like that of the kernels.
+hundred operations. The code is cached on disk like that of the kernels.
 
 **Accelerations** have two forms. The form with the fewest operations (null_space.py) divides by fixed pivots. If one of
-these is small, a function of the module computes the same numbers by the elimination of M. In SIMD lanes it is called
-for all lanes if one needs it; the other lanes keep their results, so that no run depends on its neighbours.
+these pivots is small, a function of the module computes the same numbers by the elimination of M. In SIMD lanes it is
+called for all lanes if one lane needs it; the other lanes keep their results, so that no run depends on its neighbours.
 
 **Long equations** are divided into functions that call one another, each written and compiled once. The time of LLVM
 grows faster than the length of a block, and the values of long equations pass through memory in any case. Accelerations
-and both projections share the factors of a position, and the solution with these factors.
+and both projections share the factors of the matrix at a position, and the solution with these factors.
 """
 
 import hashlib
@@ -38,9 +38,9 @@ ARRAY = f"{DOUBLE}*"
 def write_accelerations(
     emit: Emitter, equations: Elimination, inputs: Sequence[Value], numbers: Coefficients
 ) -> tuple[list[Value], Value]:
-    """Write the accelerations at [t, q, v]; return them, and whether they are valid.
+    """Write code for the accelerations at [t, q, v]; return their values, and whether they are valid.
 
-    The builder may be in another block afterwards. `emit` has the pointers to the coefficients.
+    The builder may be in another block afterwards. `emit` must have the pointers to the coefficients.
     """
     lowering, n = Lowering(emit, numbers), equations.system.n_q
     for quantity, value in enumerate(inputs):
@@ -58,7 +58,7 @@ def write_accelerations(
 def write_acceleration_function(
     module: Module, name: str, kind: tuple[str, list[str]], equations: Elimination, numbers: Coefficients
 ) -> None:
-    """Write a function of t, q, v and `numbers` that fills a and returns whether a is valid."""
+    """Write a function of t, q, v and the coefficients that fills an array a and returns whether a is valid."""
 
     def emit_all(emit: Emitter, t: Value, q: Value, v: Value, given: Value, filled: Value) -> Value:
         lowering, emit.numbers = Lowering(emit, numbers), given
@@ -75,7 +75,7 @@ def write_acceleration_function(
 def call_accelerations(
     emit: Emitter, equations: Elimination, way: int, inputs: Sequence[Value], numbers: Coefficients, filled: Value
 ) -> Value:
-    """Call a function that fills an array with the accelerations at [t, q, v]; return whether they are valid.
+    """Write a call of a function that fills an array with the accelerations at [t, q, v]; return whether it is valid.
 
     `way` is an index of `equations.accelerations`: 0 has the fewest operations, -1 eliminates M.
     """
@@ -89,7 +89,10 @@ def call_accelerations(
 def _accelerations(
     emit: Emitter, equations: Elimination, lowering: Lowering, state: Callable[[], list[Value]]
 ) -> tuple[list[Value], Value]:
-    """Write accelerations with a lowering; `state` returns t and pointers to q and v for a call."""
+    """Write the accelerations; return their values and whether they are valid.
+
+    `state` returns t and pointers to q and v, to be passed to the function that eliminates M.
+    """
     outputs, *alternatives = equations.accelerations
     a, holds = _run_accelerations(emit, equations, lowering, outputs)
     if not alternatives:
@@ -125,7 +128,7 @@ def _run_accelerations(
 
 
 def _acceleration_function(emit: Emitter, equations: Elimination, way: int, numbers: Coefficients) -> str:
-    """Return the name of the module's function for accelerations; it is written at the first call."""
+    """Return the name of the module's function for accelerations, which is written at the first call."""
     outputs, mass_first = equations.accelerations[way], way in (-1, len(equations.accelerations) - 1)
     module, name = emit.builder.module, f"{'mass_first' if mass_first else 'quick'}_{emit.suffix}"
     if not module.defines(name):
@@ -137,7 +140,7 @@ def _acceleration_function(emit: Emitter, equations: Elimination, way: int, numb
         for attribute, place in zip(("numbers", "constants"), places, strict=False):
             setattr(inner, attribute, place)
         if mass_first and equations.parts is not None:
-            builder.ret(equations.parts.there(inner, t, q, v, places[0], filled))
+            builder.ret(equations.parts.accelerations(inner, t, q, v, places[0], filled))
             return name
         lowering = Lowering(inner, numbers)
         lowering.define(0, t)
@@ -161,13 +164,13 @@ def _room(emit: Emitter, size: int) -> Value:
     return emit.builder.room(DOUBLE, size * width_of(emit.double))
 
 
-# numbers of operations above which equations are split, which halves the time to build: `SPLIT_PROJECTIONS` if only
-# projections are, `SPLIT_ALL` if accelerations are, too, which then take half as long again
+# Splitting halves the time to compile. Limits of the number of operations from which on equations are split:
+# SPLIT_PROJECTIONS, if `reduced` computes accelerations; else SPLIT_ALL, as split accelerations take 50 % longer.
 SPLIT_PROJECTIONS, SPLIT_ALL = 200, 500
 
 
 class SplitFunctions:
-    """Generator of equations in parts: each part is a function of the module, and other functions call them.
+    """Generator of long equations in parts: each part is a function of the module, which the others call.
 
     Parameters
     ----------
@@ -177,10 +180,10 @@ class SplitFunctions:
     Attributes
     ----------
     solution : Solution
-        Solution of the linear equations; keeps the quantities that parts share.
+        Solution of the linear equations; it lists the quantities that parts share, which are stored in memory.
     at_position, with_factors : dict
-        Programs of parts by their names: functions of t, q, v and the kept quantities, or of r, c and the kept
-        quantities.
+        Programs of parts by their names. Parts are functions of the stored quantities and of t, q, v (`at_position`) or
+        of r, c (`with_factors`).
     """
 
     def __init__(self, equations: Elimination, numbers: Coefficients):
@@ -188,31 +191,35 @@ class SplitFunctions:
         equations.parts = self
         self.n, self.n_rows = equations.system.n_q, len(equations.all_rows)
         self.redundant = len(equations.choice.rows) < self.n_rows
-        self.at_position = {"right": equations.right, "off": equations.off, "faster": equations.faster}
+        self.at_position = {
+            "right": equations.right_sides,
+            "off": equations.position_errors,
+            "faster": equations.velocity_errors,
+        }
         self.solution = Solution(equations, list(self.at_position.values()))
         self.with_factors = {"solution": self.solution.solved}
         if self.redundant:
             self.with_factors["least"] = self.solution.least
         self._parts: dict[str, Callable[..., Value]] = {"factors": self._factors}
         for name, outputs in self.at_position.items():
-            self._parts[name] = partial(self._part, outputs, self.solution.known)
+            self._parts[name] = partial(self._part, outputs, self.solution.stored)
         for name, outputs in self.with_factors.items():
             self._parts[name] = partial(self._part, outputs, {})
 
-    def described(self) -> Iterable[Any]:
-        """List everything that the functions depend on, except the values of numbers."""
+    def structure(self) -> Iterable[Any]:
+        """List everything that the functions depend on, except the values of coefficients."""
         solution, numbers = self.solution, self.numbers
         yield solution.kept.sizes, list(numbers.structure(solution.kept))
         for outputs in self.at_position.values():
-            yield outputs.sizes, list(numbers.structure(outputs, solution.known))
+            yield outputs.sizes, list(numbers.structure(outputs, solution.stored))
         for outputs in self.with_factors.values():
             yield outputs.sizes, list(numbers.structure(outputs))
 
     def write(self, module: Module, kinds: Callable[[str], tuple[str, list[str]]]) -> list[str]:
         """Write the functions that kernels call into a module and return their names; `kinds` returns their types."""
-        functions: dict[str, Callable[..., Any]] = {"own_closer": self.closer, "own_nearer": self.nearer}
-        if self.equations.quick is None:
-            functions["own_there"] = self.there
+        functions: dict[str, Callable[..., Any]] = {"own_closer": self.project_position, "own_nearer": self.project}
+        if self.equations.reduced is None:
+            functions["own_there"] = self.accelerations
         for name, emit in functions.items():
             llvm_code.write(module, name, kinds(name), emit)
         return list(functions)
@@ -220,7 +227,7 @@ class SplitFunctions:
     # functions of the module for the parts
 
     def _call(self, emit: Emitter, *calls: tuple[str, Sequence[Value]]) -> Value:
-        """Call parts, which are written at their first call; return whether their results are valid."""
+        """Write calls of parts, each of which is written at its first call; return whether all results are valid."""
         module, holds = emit.builder.module, None
         for part, arguments in calls:
             name = f"{part}_{emit.suffix}"
@@ -235,7 +242,7 @@ class SplitFunctions:
     def _lowering(
         self, emit: Emitter, graph: Graph, arguments: Sequence[Value], places: Mapping[int, Place]
     ) -> Lowering:
-        """Return a lowering for a part, whose first arguments are three inputs of a graph and the coefficients."""
+        """Return a lowering for a part; its first arguments are the three inputs of its graph and the coefficients."""
         *given, emit.numbers = arguments[:4]
         if width_of(emit.double) > 1:
             emit.constants = emit.numbers  # type: ignore[attr-defined]
@@ -244,10 +251,10 @@ class SplitFunctions:
         return lowering
 
     def _factors(self, emit: Emitter, *arguments: Value) -> Value:
-        """Compute and store the kept quantities; return whether the conditions hold."""
+        """Write the part that computes the quantities to be stored; return whether the conditions hold."""
         graph, solution, kept = self.equations.graph, self.solution, arguments[4]
         lowering = self._lowering(emit, graph, arguments, {})
-        places = {i: (kept, place) for i, place in solution.known.items()}
+        places = {i: (kept, place) for i, place in solution.stored.items()}
         for i, place in places.items():
             if graph.operations[i] is None:  # this entry is t or a coordinate
                 emit.store(lowering.value(i), *place)
@@ -255,7 +262,7 @@ class SplitFunctions:
         return lowering.holds(solution.kept, [])
 
     def _part(self, program: Program, kept: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
-        """Compute and store outputs; return whether they are valid. `kept`: indices in the fifth argument."""
+        """Write a part that fills arrays; return whether they are valid. `kept`: indices in the fifth argument."""
         places = {i: (arguments[4], place) for i, place in kept.items()}
         lowering = self._lowering(emit, program.graph, arguments, places)
         results = program.run(lowering)
@@ -266,14 +273,16 @@ class SplitFunctions:
 
     # functions for kernels, and for code in SIMD lanes
 
-    def there(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, a: Value) -> Value:
-        """Compute the accelerations at (t, q, v)."""
+    def accelerations(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, a: Value) -> Value:
+        """Write the accelerations at (t, q, v) to `a`; return whether they are valid."""
         kept, r, c, lam = self._rooms(emit)
         at = [t, q, v, numbers, kept]
         return self._call(emit, ("factors", at), ("right", [*at, r, c]), ("solution", [r, c, kept, numbers, a, lam]))
 
-    def closer(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, moved: Value, out: Value) -> Value:
-        """Correct positions towards the constraints, by one projection."""
+    def project_position(
+        self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, moved: Value, out: Value
+    ) -> Value:
+        """Move positions towards the constraints by one Newton step; return whether the results are valid."""
         kept, r, c, lam = self._rooms(emit)
         at = [t, q, v, numbers, kept]
         _clear(emit, self.n, r)
@@ -282,7 +291,7 @@ class SplitFunctions:
         _sum(emit, self.n, q, moved, out)
         return holds
 
-    def nearer(
+    def project(
         self,
         emit: Emitter,
         t: Value,
@@ -295,7 +304,10 @@ class SplitFunctions:
         new_v: Value,
         lam: Value,
     ) -> Value:
-        """Correct positions and velocities in the metric of M, and compute accelerations and multipliers."""
+        """Project positions and velocities in the metric of M, and compute accelerations and multipliers.
+
+        Return whether the results are valid.
+        """
         kept, r, c, change = self._rooms(emit)
         u, at = self._room(emit, self.n), [t, q, v, numbers, kept]
         _clear(emit, self.n, r)
@@ -320,8 +332,8 @@ class SplitFunctions:
         return holds
 
     def _rooms(self, emit: Emitter) -> list[Value]:
-        """Reserve memory for the kept quantities, r, c, and a solution."""
-        sizes = self.solution.n_kept, self.n, self.n_rows, max(self.n, self.n_rows)
+        """Allocate memory on the stack for the stored quantities, r, c, and a solution; return pointers."""
+        sizes = self.solution.n_stored, self.n, self.n_rows, max(self.n, self.n_rows)
         return [self._room(emit, size) for size in sizes]
 
     def _room(self, emit: Emitter, size: int) -> Value:
@@ -329,7 +341,7 @@ class SplitFunctions:
 
 
 def _leave_unless(emit: Emitter, holds: Value) -> None:
-    """Leave the function before it changes an argument if results are invalid; not in SIMD lanes."""
+    """Return from the generated function before it changes an argument if results are invalid; not in SIMD lanes."""
     if holds.type == BIT:
         emit.builder.leave_unless(holds)
 
@@ -351,9 +363,9 @@ Array = NDArray[np.float64]
 def write_function(
     module: Module, name: str, kind: tuple[str, list[str]], program: Program, numbers: Coefficients
 ) -> None:
-    """Write a function that reads inputs and coefficients and fills arrays.
+    """Write a function of inputs and coefficients that fills the arrays of a program.
 
-    It returns whether the conditions hold and the first array is finite, and fills the arrays only then.
+    The function returns whether the conditions hold and the first array is finite; only then it fills the arrays.
     """
 
     def emit_all(emit: Emitter, *arguments: Value) -> Value:
@@ -391,16 +403,16 @@ class SharedCode:
 
     def __init__(self, equations: Elimination, cache: TraceCache):
         self.equations, self.cache, self.numbers, self.parts = equations, cache, Coefficients(), None
-        if equations.n_operations > (SPLIT_ALL if equations.quick is None else SPLIT_PROJECTIONS):
+        if equations.n_operations > (SPLIT_ALL if equations.reduced is None else SPLIT_PROJECTIONS):
             self.parts = SplitFunctions(equations, self.numbers)
         self.outputs = self._programs()
-        structure = repr(list(self._described()))
+        structure = repr(list(self._structure()))
         self.digest = hashlib.sha256((structure + _stamp()).encode()).hexdigest()
-        # LLVM's optimization passes do not make equations faster, and take up to a quarter of a build
+        # optimization passes of LLVM do not make the code faster, and take up to a quarter of the time to compile
         self.functions = generated_functions("equations", _stamp(), self.digest, self._module_text, passes=False)
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "GeneratedCode":
-        """Return the code with the coefficients of one of the systems."""
+        """Return the code with coefficients for the parameters of one of the systems."""
         return GeneratedCode(
             self, evaluate(self.numbers.formulas), self.equations.traced.of(system, evaluate), evaluate
         )
@@ -408,18 +420,18 @@ class SharedCode:
     def _programs(self) -> dict[str, Program]:
         """Return the programs of functions that are not split."""
         equations = self.equations
-        outputs = {"own_redundant": equations.redundant}
+        outputs = {"own_redundant": equations.redundant_rows}
         if self.parts is None:
-            outputs |= {"own_closer": equations.closer, "own_nearer": equations.nearer}
+            outputs |= {"own_closer": equations.position_projection, "own_nearer": equations.projection}
         return outputs
 
-    def _described(self) -> Iterable[Any]:
+    def _structure(self) -> Iterable[Any]:
         equations, parts, numbers = self.equations, self.parts, self.numbers
         yield equations.system.n_q, equations.choice.rows, equations.choice.added
         for outputs in (*self.outputs.values(), *equations.accelerations[: None if parts is None else -1]):
             yield outputs.sizes, list(numbers.structure(outputs))
         if parts is not None:
-            yield from parts.described()
+            yield from parts.structure()
 
     def _module_text(self) -> tuple[list[str], str]:
         from twoloop.kernels.data.common import KIT
@@ -449,7 +461,7 @@ class GeneratedCode(NamedTuple):
         return self.traced.kinds
 
     def serves(self, system: ConstrainedSystem, t0: float, q0: Array) -> bool:
-        """Return whether a run of the same system from this position gets the same code."""
+        """Return whether this is the code for a run of the same system from another start."""
         try:
             return Choice.at(system, t0, q0) == self.shared.equations.choice
         except Untraceable:
@@ -457,7 +469,7 @@ class GeneratedCode(NamedTuple):
 
 
 def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = unchecked) -> GeneratedCode:
-    """Return the code for a system and a start; `check` raises if calls of callbacks differ from their traces.
+    """Return the code for a system and a start, cached; `check` raises if calls of callbacks differ from their traces.
 
     Raises
     ------
@@ -478,7 +490,7 @@ def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check
 
 @cache
 def _stamp() -> str:
-    """Return a digest of the modules that write the functions, and of their signatures."""
+    """Return a digest of the modules that generate the functions, and of the signatures of kernel functions."""
     from twoloop.generate import elimination, llvm_code, llvm_text, null_space, program
     from twoloop.kernels.data.common import KIT
 

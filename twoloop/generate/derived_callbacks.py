@@ -1,7 +1,7 @@
 """Derive C_q, C_t and Gamma exactly from traced callbacks.
 
-Programs compute the derivatives for which no callback is given. Given callbacks are compared with the exact derivatives
-instead of differences.
+Missing callbacks are replaced by programs. Given callbacks are compared with the exact derivatives instead of finite
+differences.
 """
 
 import copy
@@ -25,12 +25,12 @@ DERIVABLE = {"jacobian": "n_c", "gamma": "n_c", "nonholonomic_gamma": "n_a"}
 
 
 class DerivedPrograms:
-    """Derived programs that replace missing callbacks, shared by the systems of a trace cache.
+    """Programs that replace missing callbacks, shared by the systems of a trace cache.
 
     Parameters
     ----------
     programs : dict
-        Programs by name, each with the entries to which its results belong.
+        For each missing callback its program, and the indices of the array entries that the program computes.
     traced : Traced
         The traces from which they were derived.
     """
@@ -39,7 +39,7 @@ class DerivedPrograms:
         self.programs, self.traced, self.kinds = programs, traced, traced.kinds
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "DerivedSystem":
-        """Return one of the systems together with its programs."""
+        """Return a system with these programs in place of its missing callbacks."""
         functions: dict[str, Any] = {}
         for name, (program, places) in self.programs.items():
             vectors = program.with_numbers(evaluate).packed(places)
@@ -50,7 +50,7 @@ class DerivedPrograms:
 
 
 class DerivedSystem(NamedTuple):
-    """A system with derived programs, and the traces from which they were derived."""
+    """System with derived programs, and the traces from which the programs were derived."""
 
     system: ConstrainedSystem
     traced: Traced
@@ -62,9 +62,10 @@ class DerivedSystem(NamedTuple):
 
 
 def with_derived_callbacks(system: ConstrainedSystem, check: Check) -> tuple[ConstrainedSystem, tuple[Traced, ...]]:
-    """Return a system with programs for C_q and Gamma if callbacks for them are missing, and their traces.
+    """Return a system with programs for C_q and Gamma in place of missing callbacks, and the traces of the programs.
 
-    If all are given, or callbacks cannot be traced, return the system itself without traces: differences are used.
+    If no callback is missing, or callbacks cannot be traced, return the system itself without traces: finite
+    differences then replace missing callbacks.
     """
     absent = [kind for kind, size in DERIVABLE.items() if getattr(system, size) and kind not in system.given]
     if not absent:
@@ -90,7 +91,7 @@ def _derive_programs(system: ConstrainedSystem, absent: Sequence[str], cache: Tr
 
 
 def _results(equations: Equations, absent: Sequence[str]) -> dict[str, dict[int, Affine]]:
-    """Return the results of each program: expressions by their entries."""
+    """Return, for each missing callback, expressions by the indices of the array entries."""
     system = equations.system
     gamma: dict[int, Affine] = {}
     for kind, first in (("gamma", 0), ("nonholonomic_gamma", system.n_c)):
@@ -104,17 +105,17 @@ def _results(equations: Equations, absent: Sequence[str]) -> dict[str, dict[int,
 
 Array = NDArray[np.float64]
 
-MOST = 50_000  # largest number of entries of C_q
+MOST_ENTRIES = 50_000  # largest number of entries of C_q that are derived for a comparison
 # displacements at which derivatives are compared, relative to the sizes of coordinates, and to TIME
-NEAR = (0.0, 1e-3, 0.03)
+DISPLACEMENTS = (0.0, 1e-3, 0.03)
 
 
 def exact_derivatives(system: ConstrainedSystem, check: Check = unchecked) -> Traced | None:
-    """Return the traces with which the given derivatives of a system must agree; None if unknown.
+    """Return traces of the exact derivatives, with which the given derivatives of a system must agree.
 
-    They are unknown if there are no constraints or too many, callbacks cannot be traced, or `check` refuses the traces.
+    Return None if there are too many entries, callbacks cannot be traced, or `check` refuses the traces.
     """
-    if system.n_q * (system.n_c + system.n_a) > MOST:
+    if system.n_q * (system.n_c + system.n_a) > MOST_ENTRIES:
         return None
     try:
         traced: Traced = derive_cached(system, "derivatives", partial(_trace_derivatives, system), check)
@@ -127,13 +128,13 @@ def _trace_derivatives(system: ConstrainedSystem, cache: TraceCache) -> Traced:
     equations = cache.equations(system)
     given = [kind for kind in ("jacobian", *OF_ROWS) if kind in system.given]
     forms = {kind: equations.derived(kind) for kind in (*given, *(["constraint_rate"] if system.n_c else []))}
-    # these callbacks must agree with their traces, as derivatives of the traces are compared with given derivatives
+    # the derivatives are those of traces, so these callbacks must agree with their traces
     forms |= {kind: equations.of(kind) for kind in ("constraint", "nonholonomic", "nonholonomic_rate")}
     return Traced(system, equations.graph, forms)
 
 
 def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
-    """Return whether C_q, C_t and Gamma are the exact derivatives of the traced callbacks near a start.
+    """Return whether the given C_q, C_t and Gamma are the exact derivatives of the traced callbacks near a start.
 
     Raises
     ------
@@ -141,19 +142,19 @@ def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
         If C_t is not given and C was traced to depend on time, though not near the start.
     """
     away = generic_factors(len(q)) * sizes(q)
-    places = [(t + share * TIME, q + share * away) for share in NEAR]
+    places = [(t + share * TIME, q + share * away) for share in DISPLACEMENTS]
 
     def check(traced: Traced) -> None:
         try:
             with np.errstate(all="ignore"):
-                wrong = traced.wrong(system, generic_states([(*place, v) for place in places]))
+                difference = traced.difference(system, generic_states([(*place, v) for place in places]))
         except Exception as error:  # outside the domain of the callbacks
             raise Untraceable(str(error)) from error
-        if wrong is not None:
-            raise Untraceable(wrong)
+        if difference is not None:
+            raise Untraceable(difference)
 
     exact = exact_derivatives(system, check)
-    if exact is not None and "constraint_rate" in exact.not_zero and "constraint_rate" not in system.given:
+    if exact is not None and "constraint_rate" in exact.nonzero_kinds and "constraint_rate" not in system.given:
         raise ValueError(
             f"constraint_rate of {system.name!r} is not given, but constraint depends on t, though not near t = {t:g}: "
             "give constraint_rate, the derivative of constraint with respect to t"
@@ -162,7 +163,7 @@ def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
 
 
 def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
-    """Return rows [t, q, v] with generic velocities as fast as the states', in which every coordinate counts."""
+    """Return rows [t, q, v] with random velocities, none of them zero, that are about as large as the given ones."""
     times, positions, velocities = (np.array(each, dtype=float) for each in zip(*states, strict=True))
     generic = np.array([sizes(q) for q in positions]) * _factors(*positions.shape)
     speed = max(1.0, float(np.abs(velocities).max()) / float(np.abs(generic).max()))

@@ -1,17 +1,17 @@
-"""Eliminate the equations of one mechanism symbolically, with choices made by numbers at a position.
+"""Eliminate the equations of one mechanism symbolically; the numbers at one position decide the order of elimination.
 
 The matrix of
 
     [M  G^T] [a  ]   [Q    ]
     [G  0  ] [lam] = [Gamma]
 
-with G = [C_q; A] is eliminated without what is zero by its structure, in an order that is chosen once: a row of G after
-all its coordinates, so that the pivots are those of definite matrices, M and -G M^-1 G^T, and need no search.
+with G = [C_q; A] is eliminated without its structural zeros, in an order that is chosen once. Each row of G comes after
+all its coordinates. So the pivots are those of the definite matrices M and -G M^-1 G^T, and need no search.
 
-- A row is nearly a combination of others if its pivot is small compared with its pivot without the other rows. There
-  the code must not be used.
+- Where the pivot of a row is small compared with its pivot without the other rows, the row nearly depends on them. The
+  code then reports its results as invalid.
 - The same factors give the nearest position and velocity on the constraints, in the metric of M.
-- If M is singular, rows g of G are added to it, M + g^T g; this changes neither of these results.
+- If M is singular, rows g of G are added to it: M + g^T g. This changes neither accelerations nor projections.
 - Of redundant rows, a subset of full rank is kept.
 """
 
@@ -28,7 +28,7 @@ from twoloop.generate.graph import Affine, Graph, Untraceable, is_zero
 from twoloop.generate.null_space import Block, DependentCoordinates, Factors, NotReduced, reduced_accelerations, solve
 from twoloop.generate.parameter_expressions import elementwise
 from twoloop.generate.program import Program
-from twoloop.generate.trace import Equations, only, shared_cache
+from twoloop.generate.trace import Equations, only_quantity, shared_cache
 from twoloop.generate.traced_values import Traced
 from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.evaluation.partition import MAX_VIOLATION
@@ -39,18 +39,18 @@ Array = NDArray[np.float64]
 SINGULAR_MASS = 1e-10  # smallest over largest eigenvalue of M; below, rows of G are added to M
 RANK = 1e-9  # relative norm of a row of G after elimination of the rows before; below, the row depends on them
 NEAR = 0.01  # smallest allowed pivot, relative to the smallest pivot of a row of G at the start
-# possible values of the smallest allowed pivot, down to those nearly lost to rounding
+# possible values of the smallest allowed pivot; below the last one, rounding errors would dominate
 LEAST = 10.0 ** np.arange(-2, -9, -1)
 BOUNDS = LEAST[:-1] / NEAR
-# indices in BOUNDS of the smallest pivot, from which on rows are added to M. POOR: up to SMALL coordinates.
-# POOR_SINGULAR: M is singular, as Euler parameters lose two digits in sound models. POOREST: more coordinates, for
-# which the code becomes much longer
+# Indices in BOUNDS: from this smallest pivot on, rows are added to M. POOR: for up to SMALL coordinates.
+# POOR_SINGULAR: if M is singular, because Euler parameters lose two digits in sound models. POOREST: for more
+# coordinates, because adding rows makes their code much longer.
 POOR, POOR_SINGULAR, POOREST, SMALL = 4, 5, 6, 24
-# STIFFER: size of the added rows relative to M. FEWER: number of BOUNDS by which the smallest pivot has to become
-# larger; if it does not, the rows are nearly dependent whatever M is
-STIFFER, FEWER = 16.0, 2
-# ratio of rows of G to coordinates above which it pays to express some coordinates by the others: below, the system of
-# the rows is the smaller one
+# ADDED_SIZE: size of the added rows relative to M. MIN_GAIN: number of BOUNDS by which the smallest pivot must improve;
+# otherwise the rows are nearly dependent for any M
+ADDED_SIZE, MIN_GAIN = 16.0, 2
+# ratio of rows of G to coordinates from which it pays to express some coordinates by the others; with fewer rows, the
+# linear system of the multipliers is the smaller one
 MOSTLY_ROWS = 2.0 / 3.0
 
 Blocks = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
@@ -58,19 +58,20 @@ Blocks = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
 
 @dataclass(frozen=True)
 class Choice:
-    """Decisions that depend on numbers at a position.
+    """Decisions of the elimination that depend on the numbers of M and G at a position.
 
     Attributes
     ----------
     rows : tuple of int
         Independent rows of G.
     added, scale : tuple of int, float
-        Rows of G that make M definite when added to it, and their factor: a power of two that scales them to its size.
+        Rows of G that make M definite when added to it, and their factor: a power of two that scales them to the size
+        of M.
     least : float
-        Smallest allowed pivot of a row, over its pivot without the other rows; a power of ten.
+        Smallest allowed pivot of a row, relative to its pivot without the other rows; a power of ten.
     blocks : tuple of (rows, columns)
-        One or two of `rows`, by their indices in it, and as many coordinates that they determine, in the order of
-        elimination; empty if it does not pay, or if no coordinates are suitable.
+        Pivot blocks in the order of elimination: one or two indices in `rows`, and as many coordinates that these rows
+        determine. Empty if dependent coordinates save nothing, or if no coordinates are suitable.
     """
 
     rows: tuple[int, ...]
@@ -94,7 +95,7 @@ class Choice:
 
 
 class Dependents:
-    """Search for the coordinates that rows of G determine, at one position after another.
+    """Find the coordinates that rows of G determine; one object serves many positions of a system.
 
     Parameters
     ----------
@@ -105,7 +106,7 @@ class Dependents:
     ----------
     find : callable or None
         Function of G and `arguments` that returns the number of blocks, see kernels/linalg/dependent_columns.py. None:
-        there are none at any position.
+        no coordinates are suitable at any position.
     """
 
     find: Any = None
@@ -121,7 +122,7 @@ class Dependents:
             self.arguments = kinds, np.array(rows, np.int64), len(rows), room, work, blocks
 
     def blocks(self, G: Array) -> Blocks:
-        """Return the rows and the coordinates that they determine (`Choice.blocks`) for the numbers of a G."""
+        """Return `Choice.blocks` for the values of G at a position."""
         if self.find is None:
             return ()
         n = self.find(G, *self.arguments)
@@ -131,7 +132,7 @@ class Dependents:
 
 def _kinds(system: ConstrainedSystem) -> Any:
     """Return the kind of each entry of G: 0 for zero, 1 for a constant, 2 if it varies; None if unknown."""
-    if system.called_in_python:  # a function may keep its arguments, so it is traced as late as possible
+    if system.called_in_python:  # such a function may store its arguments, so it is traced as late as possible
         return None
 
     def make(equations: Callable[[], Equations]) -> Any:
@@ -143,13 +144,13 @@ def _kinds(system: ConstrainedSystem) -> Any:
 
     cache = shared_cache(system)
     kinds = cache.remembered("kinds of entries", partial(make, partial(cache.equations, system)))
-    if kinds is None:  # it may be traceable with the numbers of this system
+    if kinds is None:  # callbacks that branch on parameters can be traced for one system alone
         kinds = system.remembered("kinds of entries", partial(make, partial(Equations, system)))
     return kinds
 
 
 class Chooser:
-    """Search for the choice at one M and G of a system after another; it is mostly the last one."""
+    """Make the choice for values of M and G at many positions of a system; equal choices are returned as one object."""
 
     def __init__(self, system: ConstrainedSystem):
         from twoloop.kernels.linalg.rank import choose_rows, room_size
@@ -176,25 +177,27 @@ class Chooser:
     def _stiffened(self, mass: Array, G: Array, place: int) -> Choice:
         """Return the choice with all independent rows added to M, if that makes much larger pivots, else the last one.
 
-        Where bodies have little inertia about their joints, as a rod with its mass in its middle, the rows are nearly
-        dependent in the metric of M, and accelerations lose up to twice the digits of the smallest pivot. They are not
-        in that of M + s G^T G. M and s G^T G may differ by a few powers of ten: that many digits are lost instead.
+        Some bodies have little inertia about their joints, such as a rod with its mass in its middle. Then the rows are
+        nearly dependent in the metric of M, and accelerations lose up to twice the digits of the smallest pivot. In the
+        metric of M + s G^T G the rows are not nearly dependent. If M and s G^T G differ by a few powers of ten, only as
+        many digits are lost.
         """
         last = self._last
         rows = G[list(last.rows)]
-        scale = 2.0 ** np.round(np.log2(STIFFER * np.abs(mass).max() / np.abs(rows).max() ** 2))
+        scale = 2.0 ** np.round(np.log2(ADDED_SIZE * np.abs(mass).max() / np.abs(rows).max() ** 2))
         room, chosen = np.zeros_like(self._room), np.zeros_like(self._chosen)
         new = self._choose(mass + scale * rows.T @ rows, G, RANK, 0.0, BOUNDS, room, chosen)
-        if not 0 <= new <= place - FEWER or chosen[2 : 2 + chosen[0]].tolist() != list(last.rows):
+        if not 0 <= new <= place - MIN_GAIN or chosen[2 : 2 + chosen[0]].tolist() != list(last.rows):
             return last
         return replace(last, added=last.rows, scale=float(scale), least=float(LEAST[new]))
 
     def _decode(self, place: int) -> Choice:
+        """Return the choice that the kernel wrote to `self._chosen`; `place`: index in LEAST, or negative."""
         from twoloop.kernels.linalg.rank import STAYS_SINGULAR
 
         system, n_rows = self.system, self.system.n_c + self.system.n_a
-        n_kept, n_added, *places = self._chosen.tolist()
-        if n_kept == 0:
+        n_independent, n_added, *places = self._chosen.tolist()
+        if n_independent == 0:
             return Choice((), (), 1.0, 0.0)
         if place < 0:
             stays = "stays singular with constraints added" if place == STAYS_SINGULAR else "is too nearly singular"
@@ -202,13 +205,13 @@ class Chooser:
         if n_added == 0:
             system.derived["no weak mass"] = True
         added = tuple(places[n_rows : n_rows + n_added])
-        return Choice(tuple(places[:n_kept]), added, float(self._room[0]), float(LEAST[place]))
+        return Choice(tuple(places[:n_independent]), added, float(self._room[0]), float(LEAST[place]))
 
 
 MOST_ELIMINATED = 60_000  # largest number of operations with the elimination: enough for 40 bodies on hinges in space
-# largest ratio of the costs of `quick` and `there` at which both are written: small pivots need both, and the code of
-# both takes longer to build; at 0.68 (four-bar) a run gains 5 %
-WORTH = 0.75
+# `reduced` is used if its cost is less than this share of the cost of `mass_first`: both must be compiled, as small
+# pivots need `mass_first`. At a ratio of 0.68 (four-bar) a run gains 5 %.
+MAX_COST_RATIO = 0.75
 
 
 class Elimination:
@@ -226,26 +229,28 @@ class Elimination:
     ----------
     graph : Graph
         Graph of the operations; its first inputs are t, q and v.
-    there : Program
-        "a" (n_q,), the accelerations at a state, without projection.
-    quick : Program or None
-        The same by dependent coordinates, if that takes fewer operations. `there` is valid in more positions.
-    right : Program
+    mass_first : Program
+        "a" (n_q,), the accelerations at a state, by an elimination that begins with M.
+    reduced : Program or None
+        "a" by dependent coordinates, if that takes fewer operations. `mass_first` is valid at more positions.
+    right_sides : Program
         "r" (n_q,) and "c" (n_c + n_a,): Q, and the right-hand sides of the rows of G in use; without conditions.
-    closer : Program
+    position_projection : Program
         "q" (n_q,), the position after a Newton step towards the constraints, in directions that A allows, and "moved"
         (n_q,), the change.
-    nearer : Program
-        The same, and "v" (n_q,), projected with the rows at the old position, with "a" (n_q,) and "lam" (n_c + n_a,)
-        there.
-    off, faster : Program
+    projection : Program
+        The same and "v" (n_q,), the projected velocity, with "a" (n_q,) and "lam" (n_c + n_a,) for it. All rows are
+        those at the given position.
+    basic_projection : Program
+        The same, but with "lam" 0 for dependent rows.
+    position_errors, velocity_errors : Program
         "c" (n_c + n_a,), the right-hand sides of the corrections of positions and of velocities.
-    redundant : Program
+    redundant_rows : Program
         Program without arrays; its conditions are that the redundant constraints hold, too.
     parts : SplitFunctions or None
-        Writer of the elimination of M in parts, for long equations: see compile_equations.py, which sets it.
+        Generator of long equations in several functions, set by compile_equations.py.
     n_operations : int
-        Number of operations of callbacks and elimination, without solutions.
+        Number of operations of callbacks and factorization, without the solution of linear equations.
     traced : Traced
         The traced callbacks.
 
@@ -260,7 +265,7 @@ class Elimination:
     def __init__(self, system: ConstrainedSystem, choice: Choice, equations: Equations | None = None):
         self.equations = Equations(system) if equations is None else equations
         self.system, self.choice, self.graph = system, choice, self.equations.graph
-        self.nothing, self._n_alternative = Affine(self.graph, 0.0, {}), 0  # number of operations of `quick`
+        self.zero, self._n_reduced = Affine(self.graph, 0.0, {}), 0  # number of operations of `reduced`
         n, (self.q, self.v) = system.n_q, (self.equations.q, self.equations.v)
         self.mass = self._values_of("mass")
         rows = [self._values_of("jacobian"), self._values_of("nonholonomic")]
@@ -269,22 +274,22 @@ class Elimination:
         self.rows, self.rates = self.all_rows[counting], np.concatenate(rates)[counting]
         self.factors = Factors(self._matrix(), n + len(self.rows), n)
         self.conditions = [(pivot, alone.times(choice.least)) for pivot, alone in self.factors.conditions]
-        self.conditions += [(pivot, self.nothing) for pivot in self.factors.positive if pivot.terms]
-        self.redundant = self._redundant(np.concatenate(rates))
-        self._bound()
+        self.conditions += [(pivot, self.zero) for pivot in self.factors.positive if pivot.terms]
+        self.redundant_rows = self._redundant_rows(np.concatenate(rates))
+        self._check_length()
         for kind in ("gamma", "nonholonomic_gamma", "force"):
             self.equations.of(kind)
         self.n_operations = len(self.graph.operations)
         self.traced = Traced(system, self.graph)
 
-    def _bound(self) -> None:
-        if len(self.graph.operations) - self._n_alternative > MOST_ELIMINATED:
+    def _check_length(self) -> None:
+        if len(self.graph.operations) - self._n_reduced > MOST_ELIMINATED:
             raise Untraceable(f"its equations are more than {MOST_ELIMINATED} operations")
 
     def _values_of(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
         return elementwise(Affine.value, [self.equations.of(kind, v)])
 
-    def _redundant(self, rates: Any) -> Program:
+    def _redundant_rows(self, rates: Any) -> Program:
         redundant = [k for k in range(self.system.n_c) if k not in self.choice.rows]
         off = self._values_of("constraint")
         unit, conditions = Affine(self.graph, 1.0, {}), []
@@ -292,12 +297,13 @@ class Elimination:
         for k in redundant:
             row, rate = self.all_rows[k], rates[k]
             faster = sum((entry * u for entry, u in zip(row, self.v, strict=True)), rate)
-            allowed = sum((entry * entry for entry in row), self.nothing).times(MAX_VIOLATION**2)
+            allowed = sum((entry * entry for entry in row), self.zero).times(MAX_VIOLATION**2)
             for what, scale in ((off[k], size), (faster, speed)):
                 conditions.append((allowed * scale, what * what))
         return Program(self.graph, {"": []}, conditions)
 
     def _matrix(self) -> dict[tuple[int, int], Affine]:
+        """Return the nonzero entries of [M G^T; G 0] with the independent rows of G, and with rows added to M."""
         n = self.system.n_q
         matrix = {(i, j): self.mass[i, j] for i in range(n) for j in range(n) if not is_zero(self.mass[i, j])}
         for i, j in matrix:
@@ -326,41 +332,41 @@ class Elimination:
         ]
 
     @cached_property
-    def there(self) -> Program:
-        """Return the program `there` (see the class)."""
+    def mass_first(self) -> Program:
+        """Return the program `mass_first` (see the class)."""
         solution = self._accelerations(self.v)
-        self._bound()
+        self._check_length()
         return Program(self.graph, {"a": solution[: self.system.n_q]}, self.conditions)
 
     @cached_property
-    def quick(self) -> Program | None:
-        """Return the program `quick` (see the class)."""
+    def reduced(self) -> Program | None:
+        """Return the program `reduced` (see the class)."""
         blocks = self.choice.blocks
         if not blocks:
             return None
-        most, before = int(WORTH * self.there.cost()), len(self.graph.operations)
+        most, before = int(MAX_COST_RATIO * self.mass_first.cost()), len(self.graph.operations)
         force, gamma = self._right_sides(self.v)
         try:
-            of = DependentCoordinates(self.rows.tolist(), [gamma[k] for k in self.choice.rows], blocks, most)
-            a, conditions = reduced_accelerations(self.mass, force, of)
-            quick = Program(self.graph, {"a": a}, [*of.conditions, *conditions])
+            dependent = DependentCoordinates(self.rows.tolist(), [gamma[k] for k in self.choice.rows], blocks, most)
+            a, conditions = reduced_accelerations(self.mass, force, dependent)
+            reduced = Program(self.graph, {"a": a}, [*dependent.conditions, *conditions])
         except NotReduced:
-            quick = None
-        self._n_alternative += len(self.graph.operations) - before
-        return quick if quick is not None and quick.cost() < most else None
+            reduced = None
+        self._n_reduced += len(self.graph.operations) - before
+        return reduced if reduced is not None and reduced.cost() < most else None
 
     @property
     def accelerations(self) -> list[Program]:
-        """Return the programs for accelerations, see `compile_equations.write_accelerations`."""
-        return [self.there] if self.quick is None else [self.quick, self.there]
+        """Return the programs for accelerations, `mass_first` last."""
+        return [self.mass_first] if self.reduced is None else [self.reduced, self.mass_first]
 
     @cached_property
-    def right(self) -> Program:
-        """Return the program `right` (see the class)."""
+    def right_sides(self) -> Program:
+        """Return the program `right_sides` (see the class)."""
         force, gamma = self._right_sides(self.v)
         used = {*self.choice.rows, *self.choice.added}
         return Program(
-            self.graph, {"r": force, "c": [each if k in used else self.nothing for k, each in enumerate(gamma)]}
+            self.graph, {"r": force, "c": [each if k in used else self.zero for k, each in enumerate(gamma)]}
         )
 
     def _accelerations(self, v: Sequence[Affine]) -> list[Affine]:
@@ -372,72 +378,73 @@ class Elimination:
         return self.factors.solve([*right, *(gamma[k] for k in self.choice.rows)])
 
     def _on_all_rows(self, independent: Sequence[Affine]) -> list[Affine]:
-        """Return values for all rows from those of the independent rows; 0 for the others."""
-        numbers = [self.nothing] * len(self.all_rows)
+        """Return the values of the independent rows as a list for all rows, with 0 for dependent ones."""
+        numbers = [self.zero] * len(self.all_rows)
         for k, number in zip(self.choice.rows, independent, strict=True):
             numbers[k] = number
         return numbers
 
     @cached_property
-    def off(self) -> Program:
-        """Return the program `off` (see the class)."""
-        off = [*(-each for each in self._values_of("constraint")), *[self.nothing] * self.system.n_a]
+    def position_errors(self) -> Program:
+        """Return the program `position_errors` (see the class)."""
+        off = [*(-each for each in self._values_of("constraint")), *[self.zero] * self.system.n_a]
         return Program(self.graph, {"c": self._on_all_rows([off[k] for k in self.choice.rows])})
 
     @cached_property
-    def faster(self) -> Program:
-        """Return the program `faster` (see the class)."""
-        faster = []
+    def velocity_errors(self) -> Program:
+        """Return the program `velocity_errors` (see the class)."""
+        errors = []
         for row, rate in zip(self.rows, self.rates, strict=True):
             total = rate
             for entry, u in zip(row, self.v, strict=True):
                 total = total + entry * u
-            faster.append(-total)
-        return Program(self.graph, {"c": self._on_all_rows(faster)})
+            errors.append(-total)
+        return Program(self.graph, {"c": self._on_all_rows(errors)})
 
     @cached_property
-    def closer(self) -> Program:
-        """Return the program `closer` (see the class)."""
-        moved = self._correction(self.off)
+    def position_projection(self) -> Program:
+        """Return the program `position_projection` (see the class)."""
+        moved = self._correction(self.position_errors)
         position = {"moved": moved, "q": [x + change for x, change in zip(self.q, moved, strict=True)]}
         return Program(self.graph, position, self.conditions)
 
     @cached_property
-    def nearer(self) -> Program:
-        """Return the program `nearer` (see the class)."""
-        arrays = self.nearest.arrays
+    def projection(self) -> Program:
+        """Return the program `projection` (see the class)."""
+        arrays = self.basic_projection.arrays
         independent = [arrays["lam"][k] for k in self.choice.rows]
-        lam = of_least_norm(self.graph, independent, self.all_rows, self.choice.rows, self.factors.solve)
-        self._bound()
+        lam = multipliers_of_least_norm(self.graph, independent, self.all_rows, self.choice.rows, self.factors.solve)
+        self._check_length()
         return Program(self.graph, {**arrays, "lam": lam}, self.conditions)
 
     @cached_property
-    def nearest(self) -> Program:
-        """Return the program `nearer`, but with "lam" 0 for dependent rows."""
-        n, position = self.system.n_q, self.closer.arrays
-        v = [(u + change).value() for u, change in zip(self.v, self._correction(self.faster), strict=True)]
+    def basic_projection(self) -> Program:
+        """Return the program `basic_projection` (see the class)."""
+        n, position = self.system.n_q, self.position_projection.arrays
+        v = [(u + change).value() for u, change in zip(self.v, self._correction(self.velocity_errors), strict=True)]
         solution = self._accelerations(v)
-        self._bound()
+        self._check_length()
         return Program(
             self.graph, {"a": solution[:n], **position, "v": v, "lam": self._on_all_rows(solution[n:])}, self.conditions
         )
 
     def _correction(self, c: Program) -> list[Affine]:
+        """Return the smallest change x in the metric of M with G x = c."""
         n = self.system.n_q
-        return self.factors.solve([*([self.nothing] * n), *(c.arrays["c"][k] for k in self.choice.rows)])[:n]
+        return self.factors.solve([*([self.zero] * n), *(c.arrays["c"][k] for k in self.choice.rows)])[:n]
 
 
-def of_least_norm(
+def multipliers_of_least_norm(
     graph: Graph,
     independent: Sequence[Affine],
     all_rows: Any,
     rows: Sequence[int],
     solve: Callable[[Sequence[Affine]], list[Affine]],
 ) -> list[Affine]:
-    """Return multipliers of all rows, of least norm, from those of the independent rows.
+    """Return the multipliers of all rows that have least norm, given multipliers of the independent rows.
 
-    A dependent row is a combination of independent ones, with the coefficients Z. The null space of G^T is spanned by
-    e_i - sum_k Z_ik e_k; without its part in that space, lam has least norm.
+    Dependent row i is the combination sum_k Z_ik g_k of independent rows g_k. The null space of G^T is spanned by
+    e_i - sum_k Z_ik e_k. The component of lam in this space is removed.
     """
     nothing = Affine(graph, 0.0, {})
     lam = [nothing] * len(all_rows)
@@ -459,26 +466,26 @@ def of_least_norm(
 
 
 class Solution:
-    """Solution of M a + G^T lam = r with G a = c, by factors of a position that are stored in memory.
+    """Solution of M a + G^T lam = r with G a = c, by factors of the matrix at a position that are stored in memory.
 
     Parameters
     ----------
     equations : Elimination
     more : sequence of Program
-        Programs of the equations; quantities that they share with the factors are stored, too.
+        Programs of the equations; quantities that these programs share with the factors are stored, too.
 
     Attributes
     ----------
-    known : dict
+    stored : dict
         Index in memory of each stored quantity.
     kept : Program
         Program that computes the stored quantities.
     graph : Graph
         Graph of the solution; its inputs are r (n_q,), c (n_c + n_a,) and the factors, which come first in memory.
     solved : Program
-        Program for "a" (n_q,) and "lam" (n_c + n_a,); 0 for dependent rows.
+        Program for "a" (n_q,) and "lam" (n_c + n_a,), which is 0 for dependent rows.
     least : Program
-        Program for "lam" (n_c,) of least norm, if c is the "lam" of `solved`.
+        Program that turns the "lam" of `solved`, given as c, into "lam" (n_c,) of least norm.
     """
 
     def __init__(self, equations: Elimination, more: Sequence[Program] = ()):
@@ -490,15 +497,15 @@ class Solution:
         forms += [form for block in factors.blocks for _, row in block.below for form in row]
         factors_kept = sorted({i for form in forms for i in form.terms})
         shared = _shared(equations.graph, factors_kept, more)
-        self.known = {i: k for k, i in enumerate([*factors_kept, *shared])}
-        kept = [equations.graph.quantity(i) for i in self.known]
+        self.stored = {i: k for k, i in enumerate([*factors_kept, *shared])}
+        kept = [equations.graph.quantity(i) for i in self.stored]
         self.kept = Program(equations.graph, {"kept": kept}, equations.conditions)
         self.graph = Graph()
         self._r, self._c = self.graph.inputs(self._n, False), self.graph.inputs(n_rows, False)
-        places = [only(form) for form in self.graph.inputs(len(factors_kept), False)]
+        places = [only_quantity(form) for form in self.graph.inputs(len(factors_kept), False)]
 
         def here(form: Affine) -> Affine:
-            return Affine(self.graph, form.constant, {places[self.known[i]]: x for i, x in form.terms.items()})
+            return Affine(self.graph, form.constant, {places[self.stored[i]]: x for i, x in form.terms.items()})
 
         self._blocks = [
             Block(
@@ -513,9 +520,9 @@ class Solution:
         self.solved = self._solved()
 
     @property
-    def n_kept(self) -> int:
+    def n_stored(self) -> int:
         """Return the number of stored quantities."""
-        return len(self.known)
+        return len(self.stored)
 
     def _solve(self, right: Sequence[Affine]) -> list[Affine]:
         return solve(self._blocks, right)
@@ -537,12 +544,13 @@ class Solution:
         """Return the program `least` (see the class)."""
         rows = [self._rows.get(k, []) for k in range(len(self._c))]
         return Program(
-            self.graph, {"lam": of_least_norm(self.graph, self._independent(), rows, self._choice.rows, self._solve)}
+            self.graph,
+            {"lam": multipliers_of_least_norm(self.graph, self._independent(), rows, self._choice.rows, self._solve)},
         )
 
 
 def _shared(graph: Graph, kept: Sequence[int], more: Sequence[Program]) -> list[int]:
-    """Return the quantities that programs share with the stored ones."""
+    """Return the quantities, other than `kept`, that are computed for `kept` and that the programs use, too."""
     computed = set(graph.needed_by(map(graph.quantity, kept)))
     used = {i for outputs in more for form in outputs.forms for i in form.terms}
     for outputs in more:

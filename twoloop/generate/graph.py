@@ -1,4 +1,4 @@
-"""Graph of the operations of compiled callbacks, whose values are expressions; derivatives extend it.
+"""Record the operations of callbacks in a graph, and differentiate the recorded expressions.
 
 A value is an affine expression c + sum_i c_i x_i of quantities x_i: the time, coordinates, velocities, and the results
 of products and functions of such expressions. An operation that occurs twice is recorded once.
@@ -24,17 +24,17 @@ from twoloop.generate.parameter_expressions import (
 )
 from twoloop.kernels.evaluation import operations as op
 
-# the second argument of a logarithm or an arctangent is the divisor of its derivative
 MOST_OPERATIONS = 20_000  # largest number of operations of a program; more would take longer to trace than a run takes
-LEAST_FACTOR = 1e-100  # smallest factor taken out of a product: factors of high powers would underflow or overflow ...
-HIGH_POWER = 8  # ... so no factors are taken out of powers above this one, whatever the values of parameters
+# Constant factors are taken out of products. Two limits keep them from underflow and overflow: the smallest factor that
+# is taken out, and the exponent above which powers keep their factors, whatever the values of parameters are.
+LEAST_FACTOR, HIGH_POWER = 1e-100, 8
 BRANCHES = "it branches on, or converts to a number, what depends on t, q or v"
 
-# functions of numbers, which may be Parameters
+# functions of `math` that also accept Parameters
 SIN, COS, EXP, LOG, ATAN, ROOT = map(function_of_number, ("sin", "cos", "exp", "log", "atan", "sqrt"))
 
-_equal = float.__eq__  # compares Parameters, too, which refuse ==
-_size = float.__abs__  # absolute value as a plain number, also of a Parameter
+_equal = float.__eq__  # Parameters refuse ==, but not this function
+_size = float.__abs__  # absolute value as a plain float, also for a Parameter
 
 CONVERTS = "it converts what depends on t, q or v to a number, as functions of math do within methods (numpy's do not)"
 
@@ -45,7 +45,8 @@ class Graph(Symbolic):
     Attributes
     ----------
     operations : list
-        For each quantity its kind and one or two arguments; None for an input.
+        For each quantity its kind and one or two arguments; None for an input. The second argument of a logarithm or
+        an arctangent is the divisor of its derivative.
     sizes : list of int
         Number of inputs added by each call of `inputs`.
     traced : dict
@@ -59,12 +60,12 @@ class Graph(Symbolic):
         self.inputs_of: list[int] = []  # bit masks of the inputs on which a quantity depends
         self.traced: dict[str, Any] = {}
         self._recorded: dict[tuple[int, int, int], int] = {}
-        self._order: dict[int, int] = {}  # order of first use of factors, which does not depend on values
-        self._numbers: dict[Any, int] = {}  # numbers of expressions by key, because keys take long to compare
+        self._order: dict[int, int] = {}  # rank of each factor by its first use: the same for all parameter values
+        self._numbers: dict[Any, int] = {}  # an integer for each key of an expression: keys take long to compare
         self._quantities: dict[int, Affine] = {}
 
     def copy(self) -> "Graph":
-        """Return a graph with the same quantities that can be extended on its own; its `traced` is empty."""
+        """Copy the graph, so that the copy can be extended independently; `traced` is not copied."""
         graph = Graph()
         graph.sizes, graph.late, graph.inputs_of = self.sizes.copy(), self.late.copy(), self.inputs_of.copy()
         graph._recorded, graph._order, graph._numbers = self._recorded.copy(), self._order.copy(), self._numbers.copy()
@@ -77,7 +78,7 @@ class Graph(Symbolic):
         return graph
 
     def inputs(self, n: int, late: bool) -> list["Affine"]:
-        """Add n inputs and return them; `late`: they are neither time nor coordinates."""
+        """Add n inputs and return them; `late` is false for time and coordinates only."""
         first = len(self.operations)
         self.sizes.append(n)
         self.operations += [None] * n
@@ -93,7 +94,7 @@ class Graph(Symbolic):
         return expression
 
     def number(self, form: "Affine") -> int:
-        """Return a number shared by expressions that are equal but for rounding of their coefficients."""
+        """Return an identifier; expressions that are equal up to rounding of their coefficients share it."""
         if form.cached_number is None:
             form.cached_number = self._numbers.setdefault(form.key, len(self._numbers))
         return form.cached_number
@@ -113,7 +114,7 @@ class Graph(Symbolic):
         return self.quantity(quantity)
 
     def needed_by(self, forms: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
-        """Return the quantities that expressions need, but inputs and available ones, in an order of computation."""
+        """List the quantities to compute for some expressions, arguments first, without inputs and available ones."""
         needed: set[int] = set()
         stack = [i for form in forms for i in form.terms]
         while stack:
@@ -125,24 +126,24 @@ class Graph(Symbolic):
         return sorted(needed)
 
     def kind(self, i: int) -> int:
-        """Return the kind of the operation of a quantity that is no input."""
+        """Return the kind of the operation that computes a quantity; inputs have none."""
         operation = self.operations[i]
         assert operation is not None
         return operation[0]
 
     def arguments(self, i: int) -> list["Affine"]:
-        """Return the arguments of the operation of a quantity; none for an input."""
+        """Return the arguments of the operation that computes a quantity; an empty list for an input."""
         return [form for form in (self.operations[i] or ())[1:] if isinstance(form, Affine)]
 
     def in_order_of_use(self, forms: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
-        """Return the quantities that expressions need, each just before its first use."""
+        """List the quantities as in `needed_by`, but each just before its first use."""
         order: list[int] = []
         needed: set[int] = set()
         stack = [i for form in forms for i in form.terms][::-1]
         while stack:
             i = stack.pop()
             operation = None if i < 0 else self.operations[i]
-            if i < 0:  # all its arguments are in the list
+            if i < 0:  # ~i was pushed below its arguments, which are in the list by now
                 order.append(~i)
             elif i not in needed and operation is not None and i not in available:
                 needed.add(i)
@@ -151,7 +152,7 @@ class Graph(Symbolic):
         return order
 
     def product(self, a: "Affine", b: "Affine") -> "Affine":
-        """Return a b; factors are taken out, so that multiples of a product are one quantity."""
+        """Return a b; constant factors are taken out first, so that multiples of a product share one quantity."""
         if not a.terms:
             return b.times(a.constant)
         if not b.terms:
@@ -170,24 +171,24 @@ class Graph(Symbolic):
         return self.operation(op.PRODUCT, a, b)
 
     def square(self, form: "Affine", high: bool) -> "Affine":
-        """Return a square; `high`: it is part of a high power, so that no factors are taken out."""
+        """Return a square; `high`: it is part of a high power, from which no factors may be taken out."""
         return self._product(form, form) if high and form.terms else self.product(form, form)
 
 
 def rounded(value: float) -> Any:
-    """Round a number to 41 bits (12 digits); return the expression of a Parameter, whose values may differ."""
+    """Round a number to 41 bits (12 digits). For a Parameter, return its expression instead, as its value varies."""
     if type(value) is Parameter:
         return rounded(value.scale), value.powers
     value = float(value)
-    split = 4097.0 * value
+    split = 4097.0 * value  # 2**12 + 1: Dekker's splitting
     return split - (split - value)
 
 
 class Affine:
     """Affine expression of quantities, with the arithmetic of a number.
 
-    It has no value that could be compared. While a callback runs on it, operations that would distinguish it from a
-    number are refused.
+    An expression has no value that could be compared. While a callback runs on expressions, operations that would
+    distinguish them from numbers are refused.
     """
 
     __slots__ = ("cached_key", "cached_number", "constant", "graph", "terms")
@@ -198,21 +199,21 @@ class Affine:
         self.cached_number: int | None = None  # see Graph.number
 
     def on(self, graph: Graph) -> "Affine":
-        """Return the same expression in a graph that has the same quantities."""
+        """Return the same expression for a copy of its graph."""
         copy = Affine(graph, self.constant, self.terms)
         copy.cached_key = self.cached_key
         return copy
 
     @property
     def key(self) -> tuple[Any, ...]:
-        """Return a key shared by expressions that are equal but for rounding of their coefficients."""
+        """Return a key; expressions that are equal up to rounding of their coefficients share it."""
         if self.cached_key is None:
             self.cached_key = rounded(self.constant), *[(i, rounded(self.terms[i])) for i in sorted(self.terms)]
         return self.cached_key
 
     @property
     def late(self) -> bool:
-        """Return whether it depends on other inputs than time and coordinates."""
+        """Return whether the expression depends on inputs other than time and coordinates."""
         return any(self.graph.late[i] for i in self.terms)
 
     def times(self, factor: float) -> "Affine":
@@ -224,7 +225,7 @@ class Affine:
         return Affine(self.graph, self.constant * factor, {i: c * factor for i, c in self.terms.items()})
 
     def normalised(self) -> tuple[float, "Affine"]:
-        """Return a factor and the expression divided by it, whose first coefficient is 1."""
+        """Return the first coefficient, and the expression divided by it."""
         first = min(self.terms)
         factor = self.terms[first]
         if type(factor) is float and factor == 1.0:
@@ -252,7 +253,7 @@ class Affine:
         for i, c in other.terms.items():
             total = terms[i] + c if i in terms else c
             if _size(total) <= CANCELLED * _size(c):
-                terms.pop(i, None)  # also if a coefficient underflowed and is absent
+                terms.pop(i, None)  # the term may be absent: c may have underflowed to zero
             else:
                 terms[i] = total
         if _equal(other.constant, 0.0):
@@ -336,17 +337,17 @@ class Affine:
         return self._function(op.EXPONENTIAL, EXP)
 
     def sine(self) -> "Affine":
-        """Return sin x; the cosine is recorded, too, as the derivative of each is the other."""
+        """Return sin x; cos x is recorded, too, because the derivative needs it."""
         self._function(op.COSINE, COS)
         return self._function(op.SINE, SIN)
 
     def cosine(self) -> "Affine":
-        """Return cos x."""
+        """Return cos x; sin x is recorded, too, because the derivative needs it."""
         self._function(op.SINE, SIN)
         return self._function(op.COSINE, COS)
 
     def value(self) -> "Affine":
-        """Return the same value as a multiple of one quantity, or as a number."""
+        """Return the same value as a number or a multiple of one quantity; a longer sum becomes a quantity."""
         if len(self.terms) + (not _equal(self.constant, 0.0)) < 2:
             return self
         scale, form = self.normalised()
@@ -389,13 +390,13 @@ class Affine:
         return self
 
     def item(self) -> "Affine":
-        """Return the expression itself, like the method of a NumPy number."""
+        """Return the expression itself, as `item` of a NumPy number does."""
         return self
 
     real = property(item)
 
     @property  # type: ignore[misc]
-    def __class__(self) -> Any:  # isinstance reads it
+    def __class__(self) -> Any:  # isinstance reads this property
         if self.graph.running:
             self.graph.refuse("it asks for the type of what depends on t, q or v")
         return Affine
@@ -428,12 +429,12 @@ FUNCTIONS: dict[str, Callable[[Affine], Any]] = {
     "cosh": lambda x: (x.exponential() + (-x).exponential()) * 0.5,
     "tanh": lambda x: 1.0 - 2.0 / ((2.0 * x).exponential() + 1.0),
 }
-for _name, _function in FUNCTIONS.items():  # NumPy calls them by these names on arrays of expressions
+for _name, _function in FUNCTIONS.items():  # NumPy calls methods of these names on arrays of expressions
     setattr(Affine, _name, _function)
 
 
 def symbols(forms: Iterable[Affine]) -> Any:
-    """Return expressions as an array for callbacks."""
+    """Return an array of expressions, to be passed to callbacks."""
     forms = list(forms)
     array = np.empty(len(forms), dtype=object)
     array[:] = forms
@@ -441,12 +442,12 @@ def symbols(forms: Iterable[Affine]) -> Any:
 
 
 def is_zero(form: Affine) -> bool:
-    """Return whether an expression is zero by its structure."""
+    """Return whether an expression has no terms and the constant 0."""
     return not form.terms and form.constant == 0.0
 
 
 class Derivative:
-    """Derivatives of expressions along a direction of the inputs; they are expressions of the same graph."""
+    """Derivatives of expressions along a direction in the space of inputs, as expressions of the same graph."""
 
     def __init__(self, graph: Graph, direction: dict[int, Affine]):
         self.graph = graph

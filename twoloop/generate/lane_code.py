@@ -1,8 +1,8 @@
-"""Machine code of one mechanism for many runs at once: every number is a vector, with one run in each of its lanes.
+"""Generate code of one mechanism for many runs at once: every number is a vector, with one run in each of its lanes.
 
-The operations are those of `series`, `elimination` and `compile_equations`. Coefficients are read as vectors, so that
-each run may have its own parameters. The step-size control of Taylor series is generated, too. The layout of the memory
-is in kernels/lanes/layout.py. The code is cached on disk, by the structure of the equations.
+The operations come from `series`, `elimination` and `compile_equations`. Coefficients are read as vectors, so that each
+run may have its own parameters. The step-size control of Taylor series is generated, too. The layout of the memory is
+in kernels/lanes/layout.py. The code is cached on disk; its key is the structure of the equations.
 """
 
 import hashlib
@@ -30,7 +30,7 @@ from twoloop.generate.elimination import Choice, Elimination, Solution
 from twoloop.generate.graph import Untraceable, is_zero
 from twoloop.generate.lane_series import LaneEmitter, LaneSeries
 from twoloop.generate.llvm_code import lower
-from twoloop.generate.llvm_text import Module, Value, integer
+from twoloop.generate.llvm_text import INTEGER, Module, Value, integer
 from twoloop.generate.parameter_expressions import ParameterTape
 from twoloop.generate.program import Coefficients, Program
 from twoloop.generate.series import series_program
@@ -44,13 +44,14 @@ from twoloop.problem.system import ConstrainedSystem
 
 # constants of a step by series, as in kernels/steps/taylor_step.py
 ALLOWED = 0.3  # violation of the constraints that a step aims at before its projection, relative to the tolerances
-MOST_SHORTENED, SHORTENED, GROWTH = 0.1, 0.9, 5.0  # factors of step sizes: the smallest, a safety factor, the largest
-MOST_REFUSED = 10  # largest number of rejections in a row
+MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # factors of step sizes: the smallest, a safety factor, the largest
+MAX_REJECTIONS = 10  # largest number of rejections in a row
 FIRST_UNIT = 0.01  # first guess of the unit of time, relative to the length of the run
-# a projection has converged when a correction is below: absolute (unit of q), and relative to the largest position
-LARGEST_MOVE, OF_POSITIONS = 1e-14, 1e-14
+# a projection has converged when a correction is below an absolute limit (unit of q), or this share of the largest
+# position
+ABSOLUTE_CORRECTION, RELATIVE_CORRECTION = 1e-14, 1e-14
 CONTRACTION = 0.5  # largest ratio of a correction to the one before; above, the projection does not converge
-AT_ONCE = 3  # coordinates whose Horner schemes run side by side: each carries three numbers, and there are 16 registers
+IN_PARALLEL = 3  # coordinates in one loop of Horner schemes: each carries three numbers, and there are 16 registers
 
 
 class Places(NamedTuple):
@@ -69,7 +70,7 @@ class Places(NamedTuple):
 
 
 class LaneSteps:
-    """Writer of the step-size control for a mechanism of n coordinates and n_rows multipliers."""
+    """Generator of the step-size control for a mechanism of n coordinates and n_rows multipliers."""
 
     n_numbers: int  # number of coefficients that depend on parameters
 
@@ -77,13 +78,13 @@ class LaneSteps:
         self.n, self.n_rows = n, n_rows
 
     def unit(self, emit: LaneEmitter, control: Value, work: Value) -> Value:
-        """Return UNIT, the unit of time of the series: chosen anew for new runs and after accepted steps."""
+        """Store and return UNIT, the unit of time of the series; new runs and accepted steps get a new one."""
         select, unit = emit.builder.select, emit.load(work, lanes.UNIT)
         fresh, accepted = (is_set(emit, work, field) for field in (lanes.FRESH, lanes.ACCEPTED))
         span = emit.subtract(broadcast_entry(emit, control, lanes.T1), broadcast_entry(emit, control, lanes.T0))
         following = emit.smaller(
             emit.multiply(emit.load(work, lanes.LENGTH), unit),
-            emit.multiply(emit.constant(GROWTH), emit.load(work, lanes.H)),
+            emit.multiply(emit.constant(MAX_FACTOR), emit.load(work, lanes.H)),
         )
         first = emit.multiply(emit.constant(FIRST_UNIT), span)
         unit = select(fresh, first, select(accepted, following, unit))
@@ -93,7 +94,7 @@ class LaneSteps:
         return unit
 
     def lengths(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Choose step sizes by the last two terms of positions and velocities, relative to the tolerances."""
+        """Store step sizes, chosen by the last two terms of positions and velocities relative to the tolerances."""
         builder, n, at = emit.builder, self.n, self.places(emit, order, control, work)
         unit, (rtol, atol) = emit.load(work, lanes.UNIT), self.tolerances(emit, control)
         one, found = emit.constant(1.0), []
@@ -132,7 +133,7 @@ class LaneSteps:
             store_mask(emit, work, field, goes)
 
     def evaluate(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Evaluate the series at X units of time: NEW (positions, velocities), accelerations, predicted positions."""
+        """Evaluate the series at X units of time; store NEW (positions, velocities), accelerations, predictions."""
         at = self.places(emit, order, control, work)
         for j, q in enumerate(self.positions(emit, at, emit.load(work, lanes.X))):
             emit.store(q, at.predicted, j)
@@ -145,14 +146,14 @@ class LaneSteps:
         per_unit = emit.divide(emit.constant(1.0), unit)
         twice = emit.multiply(emit.constant(2.0), emit.multiply(per_unit, per_unit))
         last = emit.pointer(at.series, builder.mul(order, integer(n)))
-        for begin in range(0, n, AT_ONCE):
-            some = range(begin, min(begin + AT_ONCE, n))
+        for begin in range(0, n, IN_PARALLEL):
+            some = range(begin, min(begin + IN_PARALLEL, n))
             initial = [each for j in some for each in (emit.load(last, j), zero, zero)]
             with emit.loop(integer(0), order, initial) as (m, carried, new):
                 power = builder.sub(builder.sub(order, integer(1)), m)
                 row = emit.pointer(at.series, builder.mul(power, integer(n)))
                 for j, (q, v, a) in zip(some, _threes(carried), strict=True):
-                    # first, so that each number takes the register of its predecessor
+                    # from a to q: in this order each new number takes the register of the old one
                     a = emit.add(emit.multiply(a, x), v)
                     v = emit.add(emit.multiply(v, x), q)
                     new += [emit.add(emit.multiply(q, x), emit.load(row, j)), v, a]
@@ -164,16 +165,19 @@ class LaneSteps:
         return positions
 
     def defect(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write the defect of a step at its end."""
+        """Store DEFECT, the defect of a step at its end (see `defect_of`)."""
         at = self.places(emit, order, control, work)
         a = [emit.load(at.a, j) for j in range(self.n)]
         emit.store(self.defect_of(emit, control, at, a), work, lanes.DEFECT)
 
     def defect_of(self, emit: LaneEmitter, control: Value, at: Places, a: list[Value]) -> Value:
-        """Return the defect of the series' accelerations at NEW, relative to the tolerances (control/step_size.py)."""
+        """Return the defect of the accelerations of the series at NEW, relative to the tolerances.
+
+        `a`: the accelerations from the equations of motion. See control/step_size.py.
+        """
         n, (rtol, atol) = self.n, self.tolerances(emit, control)
         steps, h = emit.number(at.order), emit.load(at.work, lanes.H)
-        # infinite if h is 0: then positions set no limit
+        # per_share is infinite if h is 0: then positions set no limit
         share, per_share = emit.divide(h, steps), emit.divide(steps, h)
         largest = worst = emit.constant(0.0)
         for each in a:
@@ -190,7 +194,7 @@ class LaneSteps:
         return emit.multiply(share, worst)
 
     def departure(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write OFF, the error of the prediction of a step relative to its limit, see control/step_size.py."""
+        """Store OFF, the error of the predicted positions relative to its limit, see control/step_size.py."""
         n, at, (rtol, atol) = self.n, self.places(emit, order, control, work), self.tolerances(emit, control)
         h = emit.load(work, lanes.H)
 
@@ -202,8 +206,8 @@ class LaneSteps:
 
         motion = off = emit.constant(0.0)
         for j in range(n):
-            way = emit.larger(emit.multiply(h, size(at.state, n + j)), apart(at.new, at.state, j))
-            motion = emit.larger(way, motion)
+            distance = emit.larger(emit.multiply(h, size(at.state, n + j)), apart(at.new, at.state, j))
+            motion = emit.larger(distance, motion)
         turned, least = self.turned(emit, at), emit.multiply(emit.constant(SHARE_THROUGH_ZERO), motion)
         motion = emit.multiply(emit.constant(SHARE_OF_MOTION), motion)
         for j in range(n):
@@ -217,11 +221,11 @@ class LaneSteps:
         emit.store(off, work, lanes.OFF)
 
     def turned(self, emit: LaneEmitter, at: Places) -> Value | None:
-        """Return the lanes in which a step from STATE to NEW may have passed a singular position; None: unchecked."""
+        """Return a mask of the lanes that may have passed a singular position from STATE to NEW; None: unchecked."""
         return None
 
     def judge(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Accept steps or shorten them by their error; a lane fails after too many rejections or a NaN."""
+        """Accept steps, or reject and shorten them; a lane fails after too many rejections or a NaN."""
         builder, one = emit.builder, emit.constant(1.0)
         select, per_order = builder.select, emit.divide(one, emit.number(order))
         off, *defects = (emit.load(work, field) for field in (lanes.OFF, lanes.WORST, lanes.DEFECT))
@@ -229,14 +233,14 @@ class LaneSteps:
         for value in (off, *defects):
             size = emit.function("fabs", value)
             fine = builder.both(fine, builder.compare("fcmp olt", size, emit.constant(math.inf)))
-        defect, shortest = emit.larger(*defects), emit.constant(MOST_SHORTENED)
+        defect, shortest = emit.larger(*defects), emit.constant(MIN_FACTOR)
 
         def root(x: Value) -> Value:
             return emit.exponential(emit.multiply(emit.logarithm(x), per_order))
 
         nearer = root(emit.divide(emit.constant(ALLOWED), off))
         factor = select(builder.compare("fcmp ogt", off, one), nearer, one)
-        truer = emit.multiply(emit.constant(SHORTENED), root(emit.divide(one, defect)))
+        truer = emit.multiply(emit.constant(SAFETY), root(emit.divide(one, defect)))
         truer = emit.smaller(factor, emit.larger(shortest, truer))
         factor = select(builder.compare("fcmp ogt", defect, one), truer, factor)
         factor = select(fine, factor, shortest)
@@ -245,29 +249,28 @@ class LaneSteps:
         store_mask(emit, work, lanes.ACCEPTED, accepted)
         times = emit.load(work, lanes.REFUSED)
         times = select(builder.both(running, refused), emit.add(times, one), times)
-        # a value is not finite: fail, because shorter steps could pass over the place where the equations have no
-        # values
+        # fail if a value is not finite: shorter steps could pass over the point where the equations are undefined
         times = select(fine, times, emit.constant(math.inf))
         emit.store(times, work, lanes.REFUSED)
-        grown = emit.multiply(emit.load(work, lanes.H), select(refused, factor, emit.constant(GROWTH)))
+        grown = emit.multiply(emit.load(work, lanes.H), select(refused, factor, emit.constant(MAX_FACTOR)))
         emit.store(select(running, grown, emit.load(work, lanes.LONGEST)), work, lanes.LONGEST)
-        few = builder.compare("fcmp ole", times, emit.constant(float(MOST_REFUSED)))
+        few = builder.compare("fcmp ole", times, emit.constant(float(MAX_REJECTIONS)))
         store_mask(emit, work, lanes.RUNNING, builder.both(running, few))
 
     def commit(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Make the end of an accepted step the state."""
+        """Copy the end of an accepted step to the state."""
         at = self.places(emit, order, control, work)
         accepted = is_set(emit, work, lanes.ACCEPTED)
         for k in range(2 * self.n):
             emit.store(emit.builder.select(accepted, emit.load(at.new, k), emit.load(at.state, k)), at.state, k)
 
     def tolerances(self, emit: LaneEmitter, control: Value) -> tuple[Value, list[Value]]:
-        """Return rtol, and atol of each coordinate."""
+        """Return rtol, and a list with atol of each coordinate."""
         atol = [broadcast_entry(emit, control, lanes.ATOL + j) for j in range(self.n)]
         return broadcast_entry(emit, control, lanes.RTOL), atol
 
     def places(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> Places:
-        """Return the pointers to all parts of `work`; sets where coefficients and constants are read, too."""
+        """Return the pointers to all parts of `work`; set the pointers to coefficients in `emit`, too."""
         *fixed, series = lanes.places(self.n, self.n_rows, self.n_numbers)
         emit.numbers = emit.pointer(work, fixed.pop())
         emit.constants = emit.builder.gep(control, integer(lanes.ATOL + self.n))
@@ -306,13 +309,12 @@ Rows = list[dict[int, Value]]  # the nonzero entries of each row, by column
 
 
 def turned(emit: LaneEmitter, before: Rows, after: Rows) -> Value:
-    """Return the lanes in which a step may have passed a singular position: det G1 G0^T is not positive.
+    """Return a mask of the lanes in which a step may have passed a singular position: det G1 G0^T is not positive.
 
-    G0 and G1 are the rows of the constraints at both ends of the step. By Cauchy and Binet the determinant is the inner
-    product of their maximal minors. It is close to the square of these while a step turns little. A step straight
-    through a position at which the rows become dependent leads to another assembly: all minors pass through zero and
-    change their signs. No partition of the coordinates is needed. Lanes in which the determinant needs a search for
-    pivots count as well.
+    G0 and G1 are the rows of the constraints at both ends of the step. By the Cauchy-Binet formula the determinant is
+    the inner product of the vectors of their maximal minors, which is positive if the two vectors are similar. A step
+    straight through a position at which the rows become dependent leads to another assembly: all minors pass through
+    zero and change their signs. Lanes in which the determinant would need a search for pivots are set in the mask, too.
     """
     matrix: list[dict[int, Value]] = [{} for _ in before]
     for i, row in enumerate(after):
@@ -345,18 +347,18 @@ def turned(emit: LaneEmitter, before: Rows, after: Rows) -> Value:
 
 Array = NDArray[np.float64]
 
-NOTHING = 1e-13  # sums of products of weights below this are zero but for rounding
+WEIGHT_ROUNDING = 1e-13  # sums of products of weights below this are rounding errors of zero
 
 
-# A, b and c of an explicit method whose first stage is the state itself, and the weights of two estimates of its error
+# A, b and c of an explicit method whose first stage is the state itself, and the weights of two error estimates
 Tableau = tuple[Array, Array, Array, Array, Array]
 
 
 class LaneStages:
-    """Writer of the stages of an explicit Runge-Kutta method, and of its error estimates, for n coordinates.
+    """Generator of the stages of an explicit Runge-Kutta method, and of its error estimates, for n coordinates.
 
-    Velocities of stages are weighted sums of accelerations. So positions are such sums, too, with the weights A A, and
-    each acceleration is read once for both. Weights are literals in the code; terms of weight zero are left out.
+    Velocities of stages are weighted sums of accelerations, with weights A. Positions are such sums, too, with weights
+    A A, so that each acceleration is read once for both. Weights are literals in the code; zero terms are left out.
     """
 
     def __init__(self, tableau: Tableau, n: int):
@@ -368,7 +370,7 @@ class LaneStages:
         return [np.asarray(each).tobytes() for each in self.tableau]
 
     def write(self, emit: LaneEmitter, arguments: tuple[Value, Value, Value], at: Places) -> None:
-        """Write NEW, the state X after the beginning of the step, and ERROR, which is valid if X is the whole step."""
+        """Store NEW, the state at time X after the beginning of the step, and ERROR, valid if X is the step size."""
         A, b, c, fine, coarse = self.tableau
         _, control, work = arguments
         x, t = emit.load(work, lanes.X), emit.load(work, lanes.T)
@@ -406,7 +408,7 @@ class LaneStages:
 
 
 class _Coordinate:
-    """One coordinate within the loop over the coordinates, with its accelerations at the stages so far."""
+    """Coordinate j in the loop over the coordinates, with its accelerations at the stages so far."""
 
     def __init__(self, stages: LaneStages, emit: LaneEmitter, at: Places, j: Value, count: int):
         n, self.emit, self.new, self.n = stages.n, emit, emit.pointer(at.new, j), stages.n
@@ -422,7 +424,7 @@ class _Coordinate:
         """Return the weighted sum of the accelerations."""
         total: Value | None = None
         for k, weight in enumerate(weights.tolist()):
-            if abs(weight) > NOTHING:
+            if abs(weight) > WEIGHT_ROUNDING:
                 if k not in self._loaded:
                     self._loaded[k] = self.emit.load(*self._slopes[k])
                 term = self.emit.multiply(self.emit.constant(weight), self._loaded[k])
@@ -430,13 +432,13 @@ class _Coordinate:
         return self.emit.constant(0.0) if total is None else total
 
     def share(self, atol: Value, rtol: Value, one: Value, other: Value) -> Value:
-        """Return 1 / (allowed error of a number that changed from `one` to `other`)."""
+        """Return the reciprocal of the allowed error of a number that changed from `one` to `other`."""
         emit = self.emit
         size = emit.larger(emit.function("fabs", one), emit.function("fabs", other))
         return emit.divide(emit.constant(1.0), emit.add(atol, emit.multiply(rtol, size)))
 
     def move(self, weights: Array, twice: Array, x: Value) -> tuple[Value, Value]:
-        """Write NEW: the velocity with the weights of the accelerations, the position with the weights `twice`."""
+        """Store and return position and velocity of NEW: `weights` are for velocities, `twice` for positions."""
         emit, (q, v) = self.emit, self.before
         drift = emit.multiply(emit.constant(float(weights.sum())), v)
         q = emit.add(q, emit.multiply(x, emit.add(drift, emit.multiply(x, self.sum(twice)))))
@@ -447,12 +449,12 @@ class _Coordinate:
 
 
 GOLDEN = 0.6180339887498949
-MOST_PARTS = 1000.0  # largest number of parts of a step, between whose ends the equations are evaluated
-LARGEST = 1500  # largest number of operations of a series: as many take some seconds to compile
+MOST_PARTS = 1000.0  # largest number of parts into which a step is divided to check the defect
+MOST_OPERATIONS = 1500  # largest number of operations of a series: as many take some seconds to compile
 
 
 class LaneCode(LaneSteps):
-    """Generator of the code of one mechanism, step-size control included; some coefficients depend on parameters.
+    """Generator of the code of one mechanism for SIMD lanes, including the step-size control.
 
     Parameters
     ----------
@@ -460,7 +462,7 @@ class LaneCode(LaneSteps):
     choice : Choice
     parameters : array of Parameter
     series : bool
-        Whether to generate code for its Taylor series, too.
+        Whether to generate code for the Taylor series, too.
     tableau : Tableau, optional
         Tableau of an explicit method for whose stages code is generated.
 
@@ -483,15 +485,20 @@ class LaneCode(LaneSteps):
         self.explicit = None if tableau is None else LaneStages(tableau, self.n)
         if series:
             program = series_program(system, Equations(system, parameters), {*choice.rows, *choice.added})
-            if program.n_operations > LARGEST:
-                raise Untraceable(f"its series takes more than {LARGEST} operations")
+            if program.n_operations > MOST_OPERATIONS:
+                raise Untraceable(f"its series takes more than {MOST_OPERATIONS} operations")
             self.recurrences = LaneSeries(program, self.solution, self.numbers, self.n, self.n_rows)
         rows = self.equations.rows
         self._entries = [(k, j) for k, row in enumerate(rows) for j in range(self.n) if not is_zero(row[j])]
         self._rows_at = Program(equations.graph, {"G": [rows[k, j] for k, j in self._entries]})
         self.structure = self._structure()
         self.n_numbers = self.numbers.n_varying
-        parts = [*equations.accelerations, equations.closer, equations.nearest, equations.redundant]
+        parts = [
+            *equations.accelerations,
+            equations.position_projection,
+            equations.basic_projection,
+            equations.redundant_rows,
+        ]
         parts += [self.solution.kept] if series else []
         counts = [len(each.quantities()) for each in parts]
         counts += [len(self.solution.solved.quantities())] if series else []
@@ -499,7 +506,7 @@ class LaneCode(LaneSteps):
 
     @property
     def tasks(self) -> tuple[str, ...]:
-        """Return the names of the functions that there is code for."""
+        """Return the names of the functions to generate."""
         if self.recurrences is not None:
             return *lanes.TASKS, *lanes.TASKS_OF_SERIES
         explicit = () if self.explicit is None else lanes.TASKS_OF_EXPLICIT
@@ -513,14 +520,17 @@ class LaneCode(LaneSteps):
     def _structure(self) -> str:
         equations, numbers = self.equations, self.numbers
         description: list[Any] = [] if self.explicit is None else [*self.explicit.structure]
-        parts = [*equations.accelerations, equations.closer, equations.nearest, equations.redundant]
+        parts = [
+            *equations.accelerations,
+            equations.position_projection,
+            equations.basic_projection,
+            equations.redundant_rows,
+        ]
         if self.recurrences is not None:
             description += list(self.recurrences.structure)
             parts.append(self.solution.kept)
         else:
-            parts.append(
-                self._rows_at
-            )  # number its coefficients, as when code is written, even if the code comes from the disk
+            parts.append(self._rows_at)  # its coefficients must be numbered even if the code comes from the disk
         for outputs in parts:
             description += [outputs.sizes, *numbers.structure(outputs)]
         if self.recurrences is not None:
@@ -530,7 +540,7 @@ class LaneCode(LaneSteps):
     # the generated functions
 
     def series(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Compute coefficients of q up to an order, in units of time, about the state of each lane."""
+        """Compute the Taylor coefficients of q about the state of each lane, with UNIT as the unit of time."""
         builder, n, at = emit.builder, self.n, self.places(emit, order, control, work)
         unit, out, scratch = self.unit(emit, control, work), at.series, at.scratch
         inputs = [emit.load(work, lanes.T), *(emit.load(at.state, i) for i in range(2 * n))]
@@ -552,10 +562,10 @@ class LaneCode(LaneSteps):
         store_mask(emit, work, lanes.FINE, holds)
 
     def check_within(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write WORST, the largest defect at places within the step that are at most GAP apart (and from its ends).
+        """Store WORST, the largest defect at times within the step, whose distances are at most GAP.
 
-        AHEAD is the time of each place in turn, and finally of the end of the step. SHIFT is a multiple of the golden
-        section modulo 1; it moves the places as far as GAP allows, so that they differ from step to step.
+        AHEAD is set to each of the times in turn, and finally to the end of the step. SHIFT is a multiple of the golden
+        section modulo 1; it moves the times as far as GAP allows, so that they differ from step to step.
         """
         builder, at = emit.builder, self.places(emit, order, control, work)
         h, gap = emit.load(work, lanes.H), broadcast_entry(emit, control, lanes.GAP)
@@ -569,15 +579,16 @@ class LaneCode(LaneSteps):
         moved = emit.multiply(
             emit.subtract(emit.multiply(two, shift), one), emit.larger(emit.subtract(gap, part), zero)
         )
-        with emit.loop(integer(1), emit.largest_whole(parts), [zero]) as (place, (worst,), new):
+        most = builder.convert("fptosi", emit.largest_lane(parts), INTEGER)
+        with emit.loop(integer(1), most, [zero]) as (place, (worst,), new):
             number = emit.number(place)
-            looks = builder.compare("fcmp olt", number, parts)
-            x = builder.select(looks, emit.add(emit.multiply(number, part), moved), zero)
+            is_inside = builder.compare("fcmp olt", number, parts)
+            x = builder.select(is_inside, emit.add(emit.multiply(number, part), moved), zero)
             emit.store(emit.add(emit.load(work, lanes.T), x), work, lanes.AHEAD)
             self.positions(emit, at, emit.divide(x, emit.load(work, lanes.UNIT)))
-            holds, a = self._there(emit, work, at)
+            holds, a = self._accelerations(emit, work, at)
             defect = builder.select(holds, self.defect_of(emit, control, at, a), emit.constant(math.inf))
-            new.append(emit.largest_of(builder.select(looks, defect, zero), worst))
+            new.append(emit.largest_of(builder.select(is_inside, defect, zero), worst))
         emit.store(new[0], work, lanes.WORST)
         t, t1 = emit.load(work, lanes.T), broadcast_entry(emit, control, lanes.T1)
         last = builder.compare("fcmp oeq", h, emit.subtract(t1, t))
@@ -585,32 +596,37 @@ class LaneCode(LaneSteps):
 
     def approach(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Project the positions of the lanes in which FINE is set: the first correction."""
-        act, _ = self._project(emit, self.equations.closer, lanes.FINE, self.places(emit, order, control, work))
+        act, _ = self._project(
+            emit, self.equations.position_projection, lanes.FINE, self.places(emit, order, control, work)
+        )
         for field in (lanes.FINE, lanes.LEFT_TO_MOVE):
             store_mask(emit, work, field, act)
         emit.store(emit.constant(math.inf), work, lanes.MOVED_BEFORE)
 
     def refine(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Correct positions and velocities until only rounding is left; compute accelerations and multipliers."""
+        """Project positions and velocities once more in the lanes that need it, with accelerations and multipliers."""
         builder, at = emit.builder, self.places(emit, order, control, work)
         fine, left = (is_set(emit, work, field) for field in (lanes.FINE, lanes.LEFT_TO_MOVE))
-        act, moved = self._project(emit, self.equations.nearest, lanes.LEFT_TO_MOVE, at)
+        act, moved = self._project(emit, self.equations.basic_projection, lanes.LEFT_TO_MOVE, at)
         largest = emit.constant(0.0)
         for j in range(self.n):
             largest = emit.larger(emit.function("fabs", emit.load(at.new, j)), largest)
-        least = emit.multiply(emit.constant(OF_POSITIONS), largest)
-        least = emit.larger(least, emit.constant(LARGEST_MOVE))
-        there = builder.both(act, builder.compare("fcmp ole", moved, least))
+        least = emit.multiply(emit.constant(RELATIVE_CORRECTION), largest)
+        least = emit.larger(least, emit.constant(ABSOLUTE_CORRECTION))
+        converged = builder.both(act, builder.compare("fcmp ole", moved, least))
         before = emit.multiply(emit.constant(CONTRACTION), emit.load(work, lanes.MOVED_BEFORE))
         goes_on = builder.both(act, builder.compare("fcmp ole", moved, before))
         goes_on = builder.both(goes_on, builder.compare("fcmp ogt", moved, least))
         emit.store(emit.larger(moved, least), work, lanes.MOVED_BEFORE)
         store_mask(emit, work, lanes.LEFT_TO_MOVE, goes_on)
-        waited = builder.operation("xor", fine, builder.both(fine, left))
-        store_mask(emit, work, lanes.FINE, builder.operation("or", waited, there))
+        unchanged = builder.operation("xor", fine, builder.both(fine, left))
+        store_mask(emit, work, lanes.FINE, builder.operation("or", unchanged, converged))
 
     def _project(self, emit: LaneEmitter, outputs: Program, which: int, at: Places) -> tuple[Value, Value]:
-        """Correct NEW in the lanes of a field; return the lanes that could be corrected, and the largest change."""
+        """Correct NEW in the lanes in which the field `which` is set.
+
+        Return a mask of the lanes whose correction is valid, and the largest change of a position.
+        """
         select, work = emit.builder.select, at.work
         inputs = self._new(emit, work, at)
         written, arrays = lower(emit, outputs, inputs, self.numbers)
@@ -627,19 +643,19 @@ class LaneCode(LaneSteps):
         return act, largest
 
     def accelerate(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Compute the accelerations at NEW and AHEAD."""
+        """Compute the accelerations at the state NEW and the time AHEAD; clear FINE where they are invalid."""
         at = self.places(emit, order, control, work)
-        holds, a = self._there(emit, work, at)
+        holds, a = self._accelerations(emit, work, at)
         for k, value in enumerate(a):
             emit.store(value, at.a, k)
         keep_fine(emit, work, holds)
 
-    def _there(self, emit: LaneEmitter, work: Value, at: Places) -> tuple[Value, list[Value]]:
+    def _accelerations(self, emit: LaneEmitter, work: Value, at: Places) -> tuple[Value, list[Value]]:
         a, holds = write_accelerations(emit, self.equations, self._new(emit, work, at), self.numbers)
         return holds, a
 
     def turned(self, emit: LaneEmitter, at: Places) -> Value | None:
-        """Return the lanes in which det G1 G0^T is not positive, see `turned`; None for series: defects show it."""
+        """Return the mask of the function `turned`; None for series, whose defects show a passed singular position."""
         if self.recurrences is not None or len(self.equations.rows) == 0:
             return None
         return turned(emit, *(self._rows(emit, at, time, base) for time, base in self._ends(at)))
@@ -657,13 +673,13 @@ class LaneCode(LaneSteps):
         return rows
 
     def stages(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Compute NEW and ERROR by the stages of a step."""
+        """Compute NEW and ERROR by the stages of an explicit step."""
         assert self.explicit is not None
         self.explicit.write(emit, (order, control, work), self.places(emit, order, control, work))
 
     def redundant(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Clear FINE in the lanes in which a redundant row is violated."""
-        at, outputs = self.places(emit, order, control, work), self.equations.redundant
+        at, outputs = self.places(emit, order, control, work), self.equations.redundant_rows
         written, (none,) = lower(emit, outputs, self._new(emit, work, at), self.numbers)
         keep_fine(emit, work, written.holds(outputs, none))
 
@@ -672,7 +688,7 @@ class LaneCode(LaneSteps):
 
 
 class LaneConstraints(LaneSteps):
-    """Generator of the code for C, C_t and the entries of C_q, whose coefficients depend on parameters.
+    """Generator of the code for C, C_t and the entries of C_q in SIMD lanes.
 
     Parameters
     ----------
@@ -683,7 +699,8 @@ class LaneConstraints(LaneSteps):
     Attributes
     ----------
     pattern : ndarray of int
-        For each row, the index in `pattern` at which its columns begin, and the final end; then these columns.
+        Sparsity pattern of C_q: for each row the index in `pattern` at which its columns begin, then the length of
+        `pattern`, then the columns of all rows.
 
     Raises
     ------
@@ -708,7 +725,7 @@ class LaneConstraints(LaneSteps):
         self.n_numbers, self.n_quantities = self.numbers.n_varying, len(self._rows.quantities())
 
     def rows(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Compute C, C_t and the entries of C_q at NEW and AHEAD; store them in the memory of the series."""
+        """Compute C, C_t and the entries of C_q at the state NEW and the time AHEAD; store them at `Places.series`."""
         at = self.places(emit, order, control, work)
         inputs = [emit.load(work, lanes.AHEAD), *(emit.load(at.new, i) for i in range(2 * self.n))]
         written, arrays = lower(emit, self._rows, inputs, self.numbers)
@@ -718,7 +735,7 @@ class LaneConstraints(LaneSteps):
         keep_fine(emit, work, written.holds(self._rows, values))
 
 
-BUILD_SECONDS = 3e-4  # s for one quantity, estimated
+BUILD_SECONDS = 3e-4  # estimated time to compile one quantity, s
 ELIMINATION = (elimination, null_space, compile_equations)
 WRITERS = (series, *ELIMINATION, program, lane_series, llvm_code, llvm_text)
 
@@ -727,12 +744,12 @@ KIND = "lanes"  # kind of the cached files
 
 
 class GeneratedLanes(Generic[Code]):
-    """Compiled code of a mechanism for lanes, and the coefficients that it reads for any parameters.
+    """Compiled code of a mechanism for SIMD lanes; it evaluates its coefficients for any parameters.
 
     Parameters
     ----------
     record : ParameterTape
-        Record of the parameters that `code` was generated for.
+        Tape of the parameters with which `code` was traced.
     code : LaneCode or LaneConstraints
     """
 
@@ -753,13 +770,13 @@ class GeneratedLanes(Generic[Code]):
 
     @property
     def seconds_to_build(self) -> float:
-        """Estimate the time to compile the code, s; 0 if it is compiled or on the disk."""
+        """Estimate the time to compile the code, s; 0 if the code is in memory or on the disk."""
         if are_cached(KIND, _stamp(), self.code.structure):
             return 0.0
         return BUILD_SECONDS * self.code.n_quantities
 
     def numbers(self, parameters: Array) -> Array:
-        """Return the coefficients that the code reads, for parameters (n_runs, n_p)."""
+        """Evaluate the coefficients that the code reads, for parameters (n_runs, n_p)."""
         return self.code.numbers.for_parameters(self.record, parameters)
 
 

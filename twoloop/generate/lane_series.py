@@ -1,9 +1,10 @@
-"""Emitter for SIMD lanes, where every number is a vector, and recurrences of a Taylor series as code for lanes.
+"""Emit code for SIMD lanes, where every number is a vector, and for the recurrences of a Taylor series in lanes.
 
-The recurrences compute the coefficients of one order from the lower ones. Factors of products are stored in rows, one
-row for each order; a factor that several products share is stored once.
+The recurrences compute the coefficients of one order from those of lower orders. Factors of products are stored in
+rows, one row for each order; a factor that several products share is stored once.
 
-Collocation steps have one stage in each lane instead; `load_lanes` and `store_lanes` count places in numbers.
+Usually each lane has its own run. In collocation steps each lane has a stage of one run; for these, `load_lanes` and
+`store_lanes` take indices that count numbers instead of vectors.
 """
 
 from collections.abc import Iterator, Sequence
@@ -28,15 +29,15 @@ from twoloop.kernels.evaluation.operations import (
 )
 from twoloop.kernels.lanes.layout import LANES
 
-# log2 on [1, 2] and 2^x on [-1/2, 1/2], fitted by least squares at Chebyshev points: good to 2e-06 and 1e-07, for the
-# lengths of steps
+# log2 on [1, 2] and 2^x on [-1/2, 1/2], fitted by least squares at Chebyshev points. Their errors, 2e-06 and 1e-07,
+# suffice for step sizes.
 LOG2 = (-3.03460285, 6.089895763, -5.301709109, 3.249466561, -1.247962495, 0.2700374574, -0.02512320329)
 EXP2 = (1.000000075, 0.6931472067, 0.2402210736, 0.05550327214, 0.009676037098, 0.001340043216)
-LARGEST_POWER, SMALLEST = 1000.0, 1e-300
+LARGEST_POWER, SMALLEST = 1000.0, 1e-300  # limits of the arguments of 2^x and log2, against overflow
 
 
 class LaneEmitter(Emitter):
-    """Emitter of operations on vectors with one number for each lane; places in memory are counted in such vectors."""
+    """Emitter of operations on vectors with one number for each lane; array indices count vectors."""
 
     constants: Value  # pointer to the numbers that all lanes share
 
@@ -50,20 +51,20 @@ class LaneEmitter(Emitter):
         return LaneEmitter(builder, self.lanes)
 
     def splat(self, value: Value) -> Value:
-        """Emit a vector with one number in all lanes."""
+        """Return a vector with one number in all lanes."""
         if self.lanes == 1:
             return value
         vector = self.builder.insert(undefined(vector_of(value.type, self.lanes)), value, 0)
         return self.builder.first_everywhere(vector)
 
     def far(self, value: float) -> Value:
-        """Emit a vector with one number in all lanes that is loaded where it is used."""
+        """Return a vector with one number in all lanes that is loaded where it is used, see `Builder.far`."""
         return self.splat(super().far(value))
 
-    def known(self, number: float) -> Value:
-        """Return a literal, or load a coefficient: one for all lanes, or one for each."""
+    def coefficient(self, number: float) -> Value:
+        """Return a literal, or load a coefficient: one value for each lane if it varies, else one for all lanes."""
         if not isinstance(number, Coefficient) or number.varies:
-            return super().known(number)
+            return super().coefficient(number)
         place = self.builder.gep(self.constants, integer(number.place))
         return self.splat(self.builder.load(place, constant=True))
 
@@ -81,37 +82,33 @@ class LaneEmitter(Emitter):
         return base
 
     def load(self, base: Value, place: int = 0, constant: bool = False) -> Value:
-        """Load the vector at a place."""
+        """Load the vector at an index."""
         pointer = self.builder.convert("bitcast", self.pointer(base, place), f"{self.double}*")
         return self.builder.load(pointer, constant=constant)
 
     def store(self, value: Value, base: Value, place: int = 0) -> None:
-        """Store a vector at a place."""
+        """Store a vector at an index."""
         self.builder.store(value, self.builder.convert("bitcast", self.pointer(base, place), f"{self.double}*"))
 
     def function(self, name: str, x: Value) -> Value:
         """Apply an LLVM intrinsic to all lanes at once, or a function of libm lane by lane."""
         if name in INTRINSICS:
             return super().function(name, x)
-        made, one = undefined(self.double), Emitter(self.builder)
+        result, one = undefined(self.double), Emitter(self.builder)
         for lane in range(self.lanes):
-            made = self.builder.insert(made, one.function(name, self.builder.extract(x, lane)), lane)
-        return made
+            result = self.builder.insert(result, one.function(name, self.builder.extract(x, lane)), lane)
+        return result
 
     def largest_lane(self, x: Value) -> Value:
-        """Return the largest number of all lanes; LLVM's own reduction is sequential because of NaN."""
+        """Return the largest number of all lanes; the reduction of LLVM would be sequential, to treat NaN exactly."""
         width = self.lanes
         while width > 2:
             width //= 2
             x = self.larger(*(self.builder.shuffle(x, x, range(k, k + width)) for k in (0, width)))
         return x if width == 1 else self.larger(*(self.builder.extract(x, k) for k in (0, 1)))
 
-    def largest_whole(self, x: Value) -> Value:
-        """Return the largest of whole numbers in all lanes, as an integer."""
-        return self.builder.convert("fptosi", self.largest_lane(x), INTEGER)
-
     def logarithm(self, x: Value) -> Value:
-        """Return log2 x to within 1e-4 for numbers that are not negative; below SMALLEST, the value at SMALLEST."""
+        """Return log2 x for x >= 0 with an error below 1e-4; below SMALLEST, return the value at SMALLEST."""
         builder = self.builder
         bits = builder.convert("bitcast", self.larger(x, self.constant(SMALLEST)), self.whole_number)
         exponent = builder.sub(builder.operation("lshr", bits, self.whole(52)), self.whole(1023))
@@ -122,7 +119,7 @@ class LaneEmitter(Emitter):
         )
 
     def exponential(self, x: Value) -> Value:
-        """Return 2^x to a relative error of 1e-4."""
+        """Return 2^x with a relative error below 1e-4."""
         builder = self.builder
         x = self.larger(self.smaller(x, self.constant(LARGEST_POWER)), self.constant(-LARGEST_POWER))
         whole = self.function("rint", x)
@@ -134,31 +131,31 @@ class LaneEmitter(Emitter):
         )
 
     def smallest_of(self, a: Value, b: Value) -> Value:
-        """Return the smaller of two numbers; the first if one of them is NaN, so that a NaN in the first is kept."""
+        """Return the smaller of two numbers, or the first one if either is NaN: so a NaN in the first is kept."""
         return self.builder.select(self.builder.compare("fcmp ult", a, b), a, b)
 
     def largest_of(self, a: Value, b: Value) -> Value:
-        """Return the larger of two numbers; the first if one of them is NaN, so that a NaN in the first is kept."""
+        """Return the larger of two numbers, or the first one if either is NaN: so a NaN in the first is kept."""
         return self.builder.select(self.builder.compare("fcmp ugt", a, b), a, b)
 
 
-def place_of(emit: LaneEmitter, k: Value) -> Value:
-    """Return the index of vector k in memory, in numbers."""
+def vector_index(emit: LaneEmitter, k: Value) -> Value:
+    """Return the index at which vector k begins, counted in numbers."""
     return emit.builder.mul(k, integer(STAGES))
 
 
 def load_lanes(emit: LaneEmitter, base: Value, place: int = 0) -> Value:
-    """Load a vector at an index that counts numbers."""
+    """Load a vector of stages at an index that counts numbers."""
     return Emitter(emit.builder).load_vector(base, place, STAGES)
 
 
 def store_lanes(emit: LaneEmitter, value: Value, base: Value, place: int = 0) -> None:
-    """Store a vector at an index that counts numbers."""
+    """Store a vector of stages at an index that counts numbers."""
     Emitter(emit.builder).store_vector(value, base, place)
 
 
 def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
-    """Return the sum of the lanes of each of two vectors, computed side by side."""
+    """Return the sum over the lanes of each of two vectors; both sums take the instructions of one."""
     builder, half = emit.builder, STAGES // 2
     lower, upper = ([*range(k, k + half), *range(STAGES + k, STAGES + k + half)] for k in (0, half))
     total = emit.add(builder.shuffle(a, b, lower), builder.shuffle(a, b, upper))
@@ -168,7 +165,7 @@ def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
 
 
 def column(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value:
-    """Return a vector of one lane of each of some vectors."""
+    """Return a vector with the elements that some vectors have in one lane."""
     builder, places = emit.builder, [lane, STAGES + lane]
     if len(vectors) == 1:
         return builder.extract(vectors[0], lane)
@@ -180,10 +177,10 @@ def column(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value:
 
 
 @contextmanager
-def over(
+def loop_over(
     emit: LaneEmitter, coordinates: Sequence[int], carried: Sequence[Value] = ()
 ) -> Iterator[tuple[Value, Value, list[Any], list[Any]]]:
-    """Loop over some coordinates: yield the count, the coordinate, and the carried values of `Emitter.loop`."""
+    """Write a loop over some coordinates: yield the count, the coordinate, and the lists of `Emitter.loop`."""
     builder = emit.builder
     table = None if list(coordinates) == list(range(len(coordinates))) else builder.module.table(coordinates)
     with emit.loop(integer(0), integer(len(coordinates)), carried) as (k, values, new):
@@ -192,12 +189,12 @@ def over(
 
 
 ZEROS = -1  # index of a row of zeros, before the row of order 0
-# number of sums in one loop: of more, the running totals do not fit into 32 (or 16) registers
-AT_ONCE = 12 if LANES == 8 else 6
+# number of sums that one loop computes: the totals of more sums would not fit into 32 (or 16) registers
+SUMS_IN_LOOP = 12 if LANES == 8 else 6
 
 
 class Operation(NamedTuple):
-    """Operation of a series' program; sine and cosine are one operation with two results."""
+    """Operation in the program of a series; sine and cosine are one operation with two results."""
 
     kind: int
     results: tuple[int, ...]
@@ -208,8 +205,9 @@ class Operation(NamedTuple):
 class LaneSeries:
     """Generator of the code for the recurrences of a program.
 
-    `scratch` holds, as lane vectors: the kept factors of the linear equations; r; the reciprocal divisors of inverse
-    functions; sums that are carried to the next order; a row of zeros; and one row of factors for each order from 0 on.
+    `scratch` holds, as lane vectors: the factors of the linear equations; their right-hand side r; the reciprocal
+    divisors of inverse functions; sums that are carried to the next order; a row of zeros; and one row of factors for
+    each order from 0 on.
     """
 
     def __init__(self, program: SeriesProgram, solution: Solution, numbers: Coefficients, n: int, n_rows: int):
@@ -228,7 +226,7 @@ class LaneSeries:
             self._factors(operation)
             if operation.kind in (SQUARE_ROOT, LOGARITHM, ARCTANGENT):
                 self._divisors[operation.results[0]] = len(self._divisors)
-        self.r = solution.n_kept
+        self.r = solution.n_stored
         self.divisors = self.r + n
         self.carried = self.divisors + len(self._divisors)
         self.width = len(self.slots)
@@ -268,11 +266,11 @@ class LaneSeries:
         return operations
 
     def _slot(self, *key: Any) -> int:
-        """Return the index of a factor in a row: of a form, or of ("scaled", form), a form times its order."""
+        """Return the index of a factor in a row; the factor is a form, or ("scaled", form): a form times the order."""
         return self.slots.setdefault(key, len(self.slots))
 
     def _shared_sums(self) -> dict[int, tuple[int, int]]:
-        """Map results of products to pairs of factors of sines: products of a cosine, or sine, and its angle's rate.
+        """Map products (cos x) x' and (sin x) x' to the factors that the recurrences of sin x and cos x sum up.
 
         (cos x) x' is the derivative of sin x. So the part of the product's coefficient that is known before an order is
         solved is the sum for the sine of the next order, divided by the unit of time.
@@ -289,7 +287,7 @@ class LaneSeries:
         return {result: pair for result, pair in known.items() if pair is not None}
 
     def _factors(self, operation: Operation) -> list[tuple[int, int]]:
-        """Return the indices of the factors X and Y of the product that is summed up for each result."""
+        """Return, for each result, the indices of the factors X and Y whose products the recurrence sums up."""
         kind, results, first, second = operation
         if results[0] in self._carried:
             return []
@@ -306,7 +304,7 @@ class LaneSeries:
         return [(x, own[1]), (x, own[0])] if kind == SINE else [(x, own[0])]
 
     def begin(self, emit: LaneEmitter, inputs: Sequence[Value], scratch: Value) -> None:
-        """Write order 0 at t, q and v; the kept factors are in `scratch` already."""
+        """Emit order 0 at t, q and v; the factors of the linear equations are in `scratch` already."""
         for place in (*range(self.r, self.divisors), *range(self.carried, self.table)):
             emit.store(emit.constant(0.0), scratch, place)
         row = _Row(self, emit, emit.pointer(scratch, self.table))
@@ -343,7 +341,7 @@ class LaneSeries:
         for place, (terms, _) in self.rows:
             c[place] = emit.multiply(scale, known.sum(terms))
         r = [emit.load(scratch, self.r + i) for i in range(n)]
-        kept = [emit.load(scratch, i) for i in range(self.solution.n_kept)]
+        kept = [emit.load(scratch, i) for i in range(self.solution.n_stored)]
         solution = self.solution
         _, (a, lam) = lower(emit, solution.solved, [*r, *c, *kept], self.numbers)
         per_v, per_q = emit.multiply(unit, inverse), emit.divide(unit, emit.number(following))
@@ -369,7 +367,7 @@ class LaneSeries:
     def _begin(
         self, emit: LaneEmitter, known: Quantities, operations: list[Operation], row: "_Row", scratch: Value
     ) -> None:
-        """Write order 0, the values of the functions; factors of pending products are stored when they are known."""
+        """Emit order 0 of some operations; factors of pending products are stored as far as they are known."""
         one, zero = emit.constant(1.0), emit.constant(0.0)
         for operation in operations:
             kind, results, first, second = operation
@@ -407,8 +405,8 @@ class LaneSeries:
     def _sums(self, emit: LaneEmitter, scratch: Value, k: Value) -> dict[tuple[tuple[int, int], bool], Value]:
         """Sum X[j] Y[k - j] over 1 < j < k for pairs of factors; for the pairs in `sums_ahead`, sum X[j] Y[k + 1 - j].
 
-        The terms at the edges are added when they are known (see `_Edges`). So one loop computes several sums, does not
-        wait for the previous order, and loads each row once.
+        `_Edges` adds the first and last terms when they are known. So one loop computes several sums, does not wait for
+        the previous order, and loads each row once.
         """
         builder = emit.builder
         wanted = [(pair, True) for pair in self.sums_ahead]
@@ -417,8 +415,8 @@ class LaneSeries:
         wanted.sort(key=lambda each: each[0][::-1] if each[1] else each[0])  # neighbours in this order share a row
         sums: dict[tuple[tuple[int, int], bool], Value] = {}
         following = builder.add(k, integer(1))
-        for begin in range(0, len(wanted), AT_ONCE):
-            some = wanted[begin : begin + AT_ONCE]
+        for begin in range(0, len(wanted), SUMS_IN_LOOP):
+            some = wanted[begin : begin + SUMS_IN_LOOP]
             with emit.loop(integer(2), k, [emit.constant(0.0)] * len(some)) as (j, totals, new):
                 up, down = self._row(emit, scratch, j), self._row(emit, scratch, builder.sub(following, j))
                 below = self._row(emit, scratch, builder.sub(j, integer(1)))
@@ -443,7 +441,7 @@ class LaneSeries:
         order: Value,
         inverse: Value,
     ) -> None:
-        """Write the operations for an order above 0; for pending products, the part that is already known."""
+        """Emit the operations for an order above 0; for pending products, the part that is known already."""
         pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
         sums = {}
         for pair in pairs:
@@ -492,14 +490,14 @@ class LaneSeries:
 
 
 class _Row:
-    """Row of the factors of one order; a factor that was stored here is not loaded again."""
+    """Row of the factors of one order; values that were stored are kept, so that they are not loaded again."""
 
     def __init__(self, code: LaneSeries, emit: LaneEmitter, base: Value):
         self.code, self.emit, self.base = code, emit, base
         self._stored: dict[int, Value] = {}
 
     def store(self, key: Any, value: Value, when: str = "") -> None:
-        """Store a factor at its index; "if used": only if it has one."""
+        """Store a factor at its index; with `when` = "if used", factors without an index are skipped."""
         place = self.code.slots.get(tuple(key)) if when else self.code.slots[tuple(key)]
         if place is not None and place not in self._stored:
             self._stored[place] = value
@@ -511,7 +509,7 @@ class _Row:
 
 
 class _Edges(NamedTuple):
-    """Terms that the sums of order k still lack; `first` is the row of order 1, or zeros if k is 1."""
+    """First and last terms of the sums of order k; `first` is the row of order 1, or zeros if k is 1."""
 
     sums: dict[tuple[tuple[int, int], bool], Value]
     first: Value

@@ -1,10 +1,10 @@
-"""Emitter of arithmetic as LLVM code, and the lowering of programs to it; coefficients are read from memory.
+"""Write programs as LLVM code (`Lowering`), and single operations (`Emitter`).
 
 Numba takes milliseconds for a line of source, and LLVM well below a millisecond for an operation. So a long list of
-operations goes to LLVM directly, as functions that kernels call at their addresses. Sine and cosine are written without
-a call, so that those of several angles are computed side by side.
+operations goes to LLVM directly, as functions that kernels call at their addresses. Sine and cosine are written inline,
+so that the processor computes those of several angles in parallel.
 
-One code serves all mechanisms of the same structure: only the numbers that it reads differ.
+Coefficients are read from memory: the code serves all mechanisms of the same structure.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -48,8 +48,7 @@ INTRINSICS = {name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqr
 class Emitter:
     """Emitter that appends operations to an LLVM function.
 
-    Operands are doubles or vectors of them. Places in memory are counted in doubles. `numbers` points to the
-    coefficients that the code reads.
+    Operands are doubles. Array indices count doubles. `numbers` points to the coefficients that the code reads.
     """
 
     double, whole_number, bit = DOUBLE, INTEGER, BIT
@@ -68,15 +67,15 @@ class Emitter:
         return constant(self.double, value)
 
     def far(self, value: float) -> Value:
-        """Return a number that is loaded from memory where it is used."""
+        """Return a number that is loaded from memory where it is used, see `Builder.far`."""
         return self.builder.far(value)
 
     def whole(self, value: int) -> Value:
         """Return a literal integer of the same width as the numbers."""
         return constant(self.whole_number, value)
 
-    def known(self, number: float) -> Value:
-        """Return a literal number, or load a coefficient; memory of coefficients never changes."""
+    def coefficient(self, number: float) -> Value:
+        """Return a literal number, or load a Coefficient from memory, which never changes."""
         if not isinstance(number, Coefficient):
             return self.constant(number)
         return self.load(self.numbers, number.place, constant=True)
@@ -85,8 +84,8 @@ class Emitter:
         """Return a + b."""
         return self.builder.operation(f"fadd {FLAGS}", a, b)
 
-    def apart(self, a: Value, b: Value) -> Value:
-        """Add two sums without reassociation: LLVM would chain their terms, to spare an operation."""
+    def add_sums(self, a: Value, b: Value) -> Value:
+        """Add two sums without reassociation: LLVM would otherwise chain their terms, which is slower."""
         return self.builder.operation("fadd", a, b)
 
     def subtract(self, a: Value, b: Value) -> Value:
@@ -106,7 +105,7 @@ class Emitter:
         return self.builder.call(f"llvm.fma.{self.suffix}", a.type, [a, b, c])
 
     def polynomial(self, coefficients: Sequence[float], x: Value) -> Value:
-        """Evaluate a polynomial, its constant first; pairs of terms are independent, so that they run side by side."""
+        """Evaluate a polynomial, with pairs of terms that are independent; the constant comes first."""
         square, terms = self.builder.operation("fmul", x, x), [self.far(each) for each in coefficients]
         pairs = [self.fused(second, x, first) for first, second in zip(terms[::2], terms[1::2], strict=False)]
         pairs += terms[2 * len(pairs) :]
@@ -131,14 +130,14 @@ class Emitter:
         """Multiply by a literal, or by a coefficient loaded from memory."""
         if factor in (1.0, -1.0):
             return a if factor == 1.0 else self.negative(a)
-        return self.multiply(self.known(factor), a)
+        return self.multiply(self.coefficient(factor), a)
 
     def number(self, whole: Value) -> Value:
         """Convert an integer to a double."""
         return self.builder.convert("sitofp", whole, DOUBLE)
 
     def function(self, name: str, x: Value) -> Value:
-        """Call a function of libm, or the LLVM intrinsic if there is one."""
+        """Return f(x), by the LLVM intrinsic of this name if there is one, else by libm."""
         intrinsic = INTRINSICS.get(name)
         return self.builder.call(f"{intrinsic}.{self.suffix}" if intrinsic else name, x.type, [x])
 
@@ -157,20 +156,20 @@ class Emitter:
         self.builder.store(value, self.pointer(base, place))
 
     def load_vector(self, base: Value, place: int, width: int) -> Value:
-        """Load a vector; base + place is aligned to its size.
+        """Load a vector; base + place must be aligned to the size of the vector.
 
-        This is slow just after the numbers were stored one by one: the processor waits until they are in its cache.
+        This is slow just after the elements were stored one by one: the processor waits until they are in its cache.
         """
         pointer = self.builder.convert("bitcast", self.pointer(base, place), f"{vector_of(DOUBLE, width)}*")
         return self.builder.load(pointer, 8 * width)
 
     def store_vector(self, value: Value, base: Value, place: int) -> None:
-        """Store a vector; base + place is aligned to its size."""
+        """Store a vector; base + place must be aligned to the size of the vector."""
         pointer = self.builder.convert("bitcast", self.pointer(base, place), f"{value.type}*")
         self.builder.store(value, pointer, 8 * width_of(value.type))
 
     def vector(self, values: Sequence[Value]) -> Value:
-        """Return a vector of numbers."""
+        """Combine numbers to a vector."""
         vector = undefined(vector_of(DOUBLE, len(values)))
         for place, value in enumerate(values):
             vector = self.builder.insert(vector, value, place)
@@ -178,10 +177,10 @@ class Emitter:
 
     @contextmanager
     def loop(self, first: Value, end: Value, initial: Sequence[Value]) -> Iterator[tuple[Value, list[Any], list[Any]]]:
-        """Write a loop over integers from `first` to below `end`.
+        """Write a loop over integers from `first` to `end` - 1.
 
-        It yields the integer, the values carried from the turn before, which begin with `initial`, and a list for their
-        new values. After the loop that list has the last values.
+        The context yields the integer, the values carried from the previous iteration (`initial` in the first one), and
+        a list to which their new values are appended. After the loop that list has the final values.
         """
         builder = self.builder
         goes = builder.compare("icmp slt", first, end)
@@ -207,16 +206,16 @@ class Emitter:
 
 
 class Quantities:
-    """Values of numbered quantities, and linear combinations of them; each is loaded, or summed, once.
+    """Values of numbered quantities, and linear combinations of quantities; each is loaded, or summed, once.
 
-    Each part of a divided function loads quantities again: a number that waits for its use would be stored and loaded
-    by the compiler, too. So the memory from which they are loaded must not change.
+    Each part of a divided function loads quantities again: otherwise the compiler would spill them to the stack. So the
+    memory from which they are loaded must not change.
 
     Parameters
     ----------
     emit : Emitter
     load : callable
-        Emits the value of a quantity that is not defined.
+        Function that writes the load of a quantity whose value was not defined.
     """
 
     def __init__(self, emit: Emitter, load: Callable[[int], Value]):
@@ -231,7 +230,7 @@ class Quantities:
         self._values[quantity] = value
 
     def value(self, quantity: int) -> Value:
-        """Return the value of a quantity: defined, or else loaded."""
+        """Return the value of a quantity; load it if it was not defined."""
         if quantity in self._values:
             return self._values[quantity]
         loaded = self._here()
@@ -240,7 +239,7 @@ class Quantities:
         return loaded[quantity]
 
     def stored(self, quantity: int) -> None:
-        """Forget the value of a quantity that was stored to memory, so that later parts load it from there."""
+        """Forget the value of a quantity that was stored in memory, so that later parts load it."""
         self._here()[quantity] = self._values.pop(quantity)
 
     def _here(self) -> dict[int, Value]:
@@ -253,13 +252,13 @@ class Quantities:
         """Return constant + the sum of coefficient * quantity."""
         key = terms, constant
         if self._emit.builder.module.divided and len(terms) == 1 and constant == 0.0:
-            ((quantity, coefficient),) = terms  # multiplying again takes no longer than keeping the product
+            ((quantity, coefficient),) = terms  # to multiply again costs no more than to spill the product
             return self._emit.times(coefficient, self.value(quantity))
         if key not in self._sums:
-            total: Any = None if constant == 0.0 and terms else self._emit.known(constant)
+            total: Any = None if constant == 0.0 and terms else self._emit.coefficient(constant)
             half = len(terms) // 2 if len(terms) >= LONG else 0
-            if half:  # two independent chains of additions run side by side
-                self._sums[key] = self._emit.apart(self.sum(terms[:half], constant), self.sum(terms[half:]))
+            if half:  # the processor computes two independent chains of additions in parallel
+                self._sums[key] = self._emit.add_sums(self.sum(terms[:half], constant), self.sum(terms[half:]))
                 return self._sums[key]
             for quantity, coefficient in terms:
                 value = self.value(quantity)
@@ -280,14 +279,14 @@ def write(
     emit: Callable[..., Any],
     emitter: Callable[..., Emitter] = Emitter,
 ) -> None:
-    """Write a function into a module: `emit` writes its body, `kind` has the types of its result and arguments."""
+    """Add a function to a module: `emit` writes its body, `kind` has the types of its result and arguments."""
     builder = module.function(name, *kind)
     builder.ret(emit(emitter(builder), *builder.arguments))
 
 
-# sine and cosine on [-pi/4, pi/4]: coefficients of x^3, x^5, ... and of x^4, x^6, ... by S. Moshier's Cephes library,
-# sin.c; an angle is reduced by multiples of pi/2, which is the sum of two numbers
-LARGEST_ANGLE = 1e6  # largest angle, rad: beyond, the two numbers of pi/2 are not exact enough
+# sine and cosine on [-pi/4, pi/4]: coefficients of x^3, x^5, ... and of x^4, x^6, ... from S. Moshier's Cephes library,
+# sin.c; angles are reduced by multiples of pi/2, which is stored as the sum of two numbers
+LARGEST_ANGLE = 1e6  # largest angle, rad; for larger ones the sum of two numbers is not accurate enough
 HALF_PI = (1.5707963267948966, 6.123233995736766e-17)
 SINES = (
     -1.66666666666666307295e-1,
@@ -308,7 +307,7 @@ COSINES = (
 
 
 def sine_and_cosine(emit: Emitter, x: Value) -> tuple[Value, Value]:
-    """Emit sine and cosine, correct to rounding for angles up to LARGEST_ANGLE."""
+    """Return sine and cosine of x, correct to rounding for angles up to LARGEST_ANGLE."""
     builder, whole = emit.builder, emit.whole
     turns = emit.function("rint", builder.operation("fmul", x, emit.far(1.0 / HALF_PI[0])))
     rest = x
@@ -336,20 +335,20 @@ NOWHERE: Mapping[int, Place] = {}
 
 
 class Lowering(Algebra[Value]):
-    """Algebra of LLVM code: values are written into a function, as numbers or as SIMD lanes.
+    """Algebra whose values are those of an LLVM function that is being written: numbers or SIMD lanes.
 
     Parameters
     ----------
     emit : Emitter
     numbers : Coefficients
     places : dict, optional
-        Memory locations of quantities that were computed before.
+        Memory locations of quantities that are stored already.
     """
 
     def __init__(self, emit: Emitter, numbers: Coefficients, places: Mapping[int, Place] = NOWHERE):
         super().__init__()
         self.emit, self.numbers, self._places = emit, numbers, dict(places)
-        self.angles: list[Value] = []  # arguments of sines and cosines, whose size is limited
+        self.angles: list[Value] = []  # arguments of sines and cosines: `holds` checks that they are not too large
         self.functions = {kind: partial(emit.function, name) for kind, name in FUNCTIONS.items()}
         self.functions[RECIPROCAL] = lambda x: emit.divide(emit.constant(1.0), x)
         self._quantities = Quantities(emit, lambda quantity: emit.load(*self._places[quantity]))
@@ -361,7 +360,7 @@ class Lowering(Algebra[Value]):
         self._quantities.define(quantity, value)
 
     def take(self, graph: Graph, given: Sequence[Value]) -> None:
-        """Define the inputs of a graph, given as numbers or as arrays, which are loaded first."""
+        """Define the inputs of a graph: each argument is a number, or an array from which inputs are loaded."""
         first = 0
         for argument, size in zip(given, graph.sizes, strict=True):
             if argument.type == self.emit.double:
@@ -386,7 +385,7 @@ class Lowering(Algebra[Value]):
         return self.emit.multiply(a, b)
 
     def operation(self, kind: int, first: Affine, second: Affine | None) -> Value:
-        """Return the result of an operation; sine and cosine of an angle are computed together."""
+        """Return the result of an operation; the sine of an angle is computed together with the cosine."""
         if kind not in (SINE, COSINE):
             return super().operation(kind, first, second)
         angle = self.affine(first)
@@ -396,7 +395,7 @@ class Lowering(Algebra[Value]):
         return self._pairs[first.key][kind == COSINE]
 
     def run(self, graph: Graph, quantities: Iterable[int], places: Mapping[int, Place] = NOWHERE) -> None:
-        """Compute quantities in the given order; those in `places` are stored at once."""
+        """Compute quantities in the given order; store each quantity that has a location in `places`."""
         if not places:
             return super().run(graph, quantities)
         for i in quantities:
@@ -408,10 +407,10 @@ class Lowering(Algebra[Value]):
         return None
 
     def outputs(self, program: Program) -> list[list[Value]]:
-        """Compute the arrays of a program and the quantities of its conditions.
+        """Compute the arrays of a program and the quantities of its conditions; return the arrays.
 
-        In a divided function each number is computed just before it is used, as few numbers stay in registers from one
-        part to the next, and LLVM reorders operations only within a part.
+        In a divided function each number is computed just before it is used: few numbers stay in registers from one
+        part to the next, and LLVM reorders instructions only within a part.
         """
         graph = program.graph
         if not self.emit.builder.module.divided:
@@ -422,7 +421,7 @@ class Lowering(Algebra[Value]):
         return arrays
 
     def forms(self, graph: Graph, forms: Sequence[Affine]) -> list[Value]:
-        """Compute expressions; quantities that were computed before are not computed again."""
+        """Compute expressions and return their values; quantities that were computed before are used again."""
         quantities = graph.in_order_of_use(forms, self._computed)
         self.run(graph, quantities)
         self._computed.update(quantities)

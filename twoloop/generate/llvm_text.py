@@ -1,7 +1,8 @@
-"""Writer of LLVM modules as text: functions, blocks and operations.
+"""Write LLVM modules as text: functions, blocks and instructions.
 
-llvmlite writes them from objects, which takes ten times as long: more than LLVM takes to compile them. A type is its
-text. Pointers are written with the type that they point to, which all versions of LLVM read.
+llvmlite builds modules from objects, which takes ten times as long as writing text, and longer than LLVM takes to
+compile them. Types are represented by their text. Pointers have the type that they point to, which all versions of LLVM
+read.
 """
 
 import struct
@@ -9,8 +10,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 DOUBLE, INTEGER, WORD, BIT, NOTHING = "double", "i64", "i32", "i1", "void"
-LINE = 8  # doubles in a cache line
-# largest number of lines of a block of a divided function; longer ones take more than twice as long to compile
+LINE = 8  # number of doubles in a cache line
+# largest number of lines of a block of a divided function; longer blocks take more than twice as long to compile
 LONGEST = 400
 
 
@@ -23,7 +24,7 @@ class Value:
         self.type, self.text = kind, text
 
     def __str__(self) -> str:
-        """Return the text of an argument."""
+        """Return the type and the text, as an argument of a call is written."""
         return f"{self.type} {self.text}"
 
 
@@ -41,13 +42,13 @@ class Phi(Value):
         self.incoming.append((value, block))
 
     def line(self) -> str:
-        """Return the definition of the node."""
+        """Return the text of the instruction."""
         ways = ", ".join(f"[{value.text}, %{block.name}]" for value, block in self.incoming)
         return f"{self.text} = phi {self.type} {ways}"
 
 
 class Block:
-    """Basic block: a sequence of operations."""
+    """Basic block: a sequence of instructions."""
 
     def __init__(self, name: str):
         self.name = name
@@ -60,7 +61,7 @@ class Block:
 
 
 def vector_of(kind: str, width: int) -> str:
-    """Return the type of a vector; for width 1 that of a number."""
+    """Return the type of a vector, or of a number if the width is 1."""
     return kind if width == 1 else f"<{width} x {kind}>"
 
 
@@ -123,14 +124,14 @@ class Module:
         return any(function.name == name for function in self._functions)
 
     def table(self, places: Sequence[int]) -> Value:
-        """Add constant integers and return a pointer to them."""
+        """Add an array of constant integers, and return a pointer to it."""
         kind, name = f"[{len(places)} x {WORD}]", f"@table{len(self._tables)}"
         entries = ", ".join([f"{WORD} {place}" for place in places])
         self._tables.append(f"{name} = internal constant {kind} [{entries}]")
         return Value(f"{WORD}*", f"getelementptr inbounds ({kind}, {kind}* {name}, {INTEGER} 0, {INTEGER} 0)")
 
     def far_number(self, number: float) -> int:
-        """Add a number to those of `Builder.far` and return its index."""
+        """Add a number that `Builder.far` loads, and return its index."""
         self._numbers.append(number)
         return len(self._numbers) - 1
 
@@ -156,7 +157,7 @@ class Module:
 
 
 class Builder:
-    """Builder of a function: appends operations to its blocks."""
+    """Builder of a function: appends instructions to its blocks."""
 
     def __init__(self, module: Module, name: str, result: str, arguments: Sequence[str], internal: bool = False):
         self.module, self.name, self.result, self.internal = module, name, result, internal
@@ -173,17 +174,17 @@ class Builder:
         arguments = ", ".join(map(str, self.arguments))
         body = "\n".join(block.text() for block in self._blocks)
         linkage = "internal " if self.internal else ""
-        # spilled vectors would lie across two cache lines without this alignment, and take twice as long
+        # without this alignment spilled vectors lie across two cache lines, and take twice as long to load and store
         attributes = "noinline alignstack(64)" if f"<{LINE} x" in body else "noinline"
         return f"define {linkage}{self.result} @{self.name}({arguments}) {attributes} {{\n{body}\n}}"
 
     def append_block(self) -> Block:
-        """Return a new block; its place in the text is where `position_at_end` is called with it."""
+        """Return a new block; `position_at_end` adds it to the text of the function."""
         self._n_blocks += 1
         return Block(f"b{self._n_blocks - 1}")
 
     def position_at_end(self, block: Block) -> None:
-        """Make a block the present one, to which operations are appended."""
+        """Append a block to the function, and make it the block to which instructions are appended."""
         self.block = block
         self._blocks.append(block)
 
@@ -199,7 +200,7 @@ class Builder:
         return value
 
     def _divide(self) -> None:
-        """Continue in another block; its address is taken, so that LLVM does not merge it."""
+        """Continue in another block; its address is stored, so that LLVM does not merge it with this one."""
         block = self.append_block()
         self.go_to(block)
         self.module.kept_apart.append(f"i8* blockaddress(@{self.name}, %{block.name})")
@@ -249,11 +250,11 @@ class Builder:
         return self._value(kind, f"call {flags} {kind} @{name}({', '.join(map(str, arguments))})")
 
     def run(self, name: str, arguments: Sequence[Value]) -> None:
-        """Call a function of the module that returns nothing."""
+        """Call a function of the module that returns no value."""
         self._line(f"call {NOTHING} @{name}({', '.join(map(str, arguments))})")
 
     def room(self, kind: str, size: int) -> Value:
-        """Allocate memory on the stack, in the first block: within a loop it would grow."""
+        """Allocate memory on the stack; in the first block, as the stack would grow with each turn of a loop."""
         pointer = Value(f"{kind}*", f"%room{self._n_rooms}")
         self._blocks[0].lines.insert(
             self._n_rooms, f"{pointer.text} = alloca {kind}, {integer(max(size, 1))}, align 64"
@@ -262,7 +263,7 @@ class Builder:
         return pointer
 
     def far(self, number: float) -> Value:
-        """Load a number where it is used; a literal would occupy a register, or the stack, before."""
+        """Load a number where it is used; LLVM would keep a literal in a register, or on the stack, for a long time."""
         if self._far is None:
             self._far = Value(f"{DOUBLE}*", "%far")
             self._blocks[0].lines.insert(0, f"%far = load {DOUBLE}*, {DOUBLE}** @far")
@@ -325,7 +326,7 @@ class Builder:
 
     @contextmanager
     def if_then(self, condition: Value) -> Iterator[None]:
-        """Surround operations that run only if a condition holds."""
+        """Context of instructions that run only if a condition holds."""
         then, after = self.append_block(), self.append_block()
         self.branch(condition, then, after)
         self.position_at_end(then)

@@ -1,10 +1,11 @@
 """Factor symmetric matrices of expressions, and eliminate dependent coordinates by the rows G a = gamma.
 
 With G = [G_d G_i], a_d = g + B a_i for B = -G_d^-1 G_i and g = G_d^-1 gamma. The remaining system is small: (T^T M T)
-a_i = T^T (Q - M g) with T = [B; 1]. It takes about half the operations of an elimination that begins with M, and M may
-be singular in directions that the constraints exclude.
+a_i = T^T (Q - M g) with T = [B; 1]. This takes about half the operations of an elimination that begins with M, and M
+may be singular in directions that the constraints exclude.
 
-Pivots are fixed. If one becomes small during a run, the conditions fail, and other code has to compute a.
+Pivots are chosen once. If one becomes small during a run, the conditions of the code fail, and a is computed by the
+elimination that begins with M.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,7 +15,7 @@ from twoloop.generate.graph import Affine, is_zero
 
 
 class Block(NamedTuple):
-    """Block of one or two rows that are eliminated together, which takes one division."""
+    """Block of one or two rows that are eliminated together, with one division."""
 
     places: tuple[int, ...]
     inverse: list[list[Affine]]  # inverse of the pivots
@@ -22,16 +23,16 @@ class Block(NamedTuple):
 
 
 class Factors:
-    """Factors L D L^T of a symmetric matrix of expressions, in an order that suits a definite matrix of this pattern.
+    """Factors L D L^T of a symmetric matrix [M G^T; G 0] of expressions, without a search for pivots.
 
     Attributes
     ----------
     blocks : list of Block
         Blocks in the order of elimination.
     conditions : list of (Affine, Affine)
-        For each row from `n` on its pivot, and its pivot without the other rows from `n` on.
+        For each row of G (`n` and later) its pivot, and its pivot without the other rows of G.
     positive : list of Affine
-        Pivots that are positive if the matrix of the first `n` rows is definite.
+        Pivots that are positive if M, the first `n` rows, is definite.
     """
 
     def __init__(self, matrix: dict[tuple[int, int], Affine], size: int, n: int):
@@ -61,7 +62,7 @@ class Factors:
             self.blocks.append(Block(places, inverse, below))
 
     def _inverse(self, pivots: list[list[Affine]], alone: list[Any]) -> list[list[Affine]]:
-        """Return the inverse of one or two pivots, and record their conditions."""
+        """Return the inverse of a block of pivots, and record its conditions; `alone`: pivots without other rows."""
         diagonal = [None if each is None else each.value() for each in alone]
         a = pivots[0][0]
         if diagonal[0] is None:
@@ -80,7 +81,7 @@ class Factors:
         return [[(c * inverse).value(), (-b * inverse).value()], [(-b * inverse).value(), (a * inverse).value()]]
 
     def solve(self, right: Sequence[Affine]) -> list[Affine]:
-        """Solve for a right-hand side."""
+        """Return the solution for a right-hand side."""
         return solve(self.blocks, right)
 
 
@@ -92,7 +93,7 @@ def _dot(a: Sequence[Affine], b: Sequence[Affine]) -> Affine:
 
 
 def solve(blocks: Sequence[Block], right: Sequence[Affine]) -> list[Affine]:
-    """Solve for a right-hand side; multiples of one quantity are added before the multiplication."""
+    """Return the solution for a right-hand side, given the blocks of `Factors`; products share common factors."""
     solution = list(right)
     pending: list[list[tuple[Affine, Affine]]] = [[] for _ in right]
     for places, _, below in blocks:
@@ -109,7 +110,7 @@ def solve(blocks: Sequence[Block], right: Sequence[Affine]) -> list[Affine]:
 
 
 def _gathered(products: Sequence[tuple[Affine, Affine]]) -> Any:
-    """Sum products, with one product for all multiples of a factor."""
+    """Return the sum of products a b; those whose a is a multiple of the same expression become one product."""
     total: Any = 0.0
     groups: dict[Any, tuple[Affine, Affine]] = {}
     for factor_a, factor_b in products:
@@ -126,9 +127,10 @@ def _gathered(products: Sequence[tuple[Affine, Affine]]) -> Any:
 
 
 def _pairs(rows: list[dict[int, Affine]], n: int) -> list[tuple[int, int]]:
-    """Return pairs of a coordinate and a row of G whose entry is a number, in no other row, and whose mass is a number.
+    """Return pairs of a coordinate and a row of G that can be eliminated first, without a condition or a division.
 
-    The rank of G is that of the other rows plus the number of pairs, which take no condition and no division.
+    The coordinate occurs in no other row, and its mass and its entry of G are constants. The rank of G is the rank of
+    the remaining rows plus the number of pairs.
     """
     pairs: dict[int, int] = {}  # coordinates by rows of G
     for i, row in enumerate(rows[:n]):
@@ -138,9 +140,10 @@ def _pairs(rows: list[dict[int, Affine]], n: int) -> list[tuple[int, int]]:
 
 
 def _order(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, ...]]:
-    """Order rows by least degree, each row from n on after its neighbours below n, in pairs where neighbours agree.
+    """Order rows by minimum degree, in pairs where two rows have the same neighbours.
 
-    Among equals, rows that wait for the fewest divisions come first, so that independent operations run side by side.
+    A row of G (n and later) comes after its coordinates. Among rows of equal degree, those that wait for the fewest
+    divisions come first, so that independent operations can overlap.
     """
     neighbours = [set(row) - {i} for i, row in enumerate(rows)]
     waits = [{j for j in neighbours[i] if j < n} if i >= n else set() for i in range(len(rows))]
@@ -165,7 +168,7 @@ def _order(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int, int
 
 
 def _eliminate(neighbours: list[set[int]], places: Sequence[int]) -> set[int]:
-    """Eliminate rows, connect their neighbours with one another, and return these."""
+    """Eliminate rows from the graph: connect their neighbours with one another, and return the neighbours."""
     around = set().union(*(neighbours[i] for i in places)) - set(places)
     for j in around:
         neighbours[j] = (neighbours[j] | around) - {*places, j}
@@ -175,14 +178,14 @@ def _eliminate(neighbours: list[set[int]], places: Sequence[int]) -> set[int]:
 Blocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # rows and columns of the pivots, one or two each
 Terms = dict[int, Affine]  # nonzero entries of a row, by their columns
 
-# least square of: a pivot over the entries that it divides, or over its column; the sine between two columns. The
-# accelerations lose up to three times as many digits. At a start the limits are stricter, see
-# linalg/dependent_columns.py.
+# smallest allowed square of three ratios: a pivot over the entries that it divides, a pivot over its column, and the
+# sine of the angle between two columns. Accelerations lose up to three times the digits of the ratio. At a start the
+# limits are stricter, see linalg/dependent_columns.py.
 LEAST = 0.03**2
 
 
 class NotReduced(Exception):
-    """Exception: a pivot is zero by its structure, or the elimination takes too many operations."""
+    """Raised if a pivot is structurally zero, or if the elimination takes too many operations."""
 
 
 class DependentCoordinates:
@@ -207,12 +210,12 @@ class DependentCoordinates:
     g : list of Affine
         The vector g; 0 for independent coordinates.
     conditions : list of (Affine, Affine)
-        Pairs of which the first is larger than the second if pivots are not too small.
+        Pairs of which the first is larger than the second unless a pivot is too small.
 
     Raises
     ------
     NotReduced
-        If a pivot is zero by its structure, or if it takes more operations.
+        If a pivot is structurally zero, or if the elimination takes more than `most` operations.
     """
 
     def __init__(self, rows: Sequence[Sequence[Affine]], gamma: Sequence[Affine], blocks: Blocks, most: int):
@@ -236,7 +239,7 @@ class DependentCoordinates:
                 self._substitute(j, self._rows[i])
 
     def _eliminate(self, places: tuple[int, ...], columns: tuple[int, ...]) -> None:
-        """Solve rows for columns, and eliminate these from the remaining rows."""
+        """Solve rows (`places`) for coordinates (`columns`), and eliminate the coordinates from the other rows."""
         self.check()
         block = [[self._rows[i].get(j, self._zero) for j in columns] for i in places]
         pivot, inverse = self._inverse(block)
@@ -285,12 +288,10 @@ class DependentCoordinates:
     def _add_conditions(
         self, block: list[list[Affine]], columns: tuple[int, ...], pivot: Affine, solved: list[Terms]
     ) -> None:
-        """Require that no pivot is too small for the entries that it divides, and that rows are not nearly dependent.
+        """Add the conditions that a pivot is not small compared with the entries that it divides, and with its column.
 
-        A pivot that is too small means that the columns of a block are nearly parallel, or that one pivot is small in
-        its column, where its row may be small, too.
-
-        The sign of a pivot does not matter: on either side of zero the accelerations are the same function.
+        For a block of two, the second condition means that the columns of the block are not nearly parallel. A pivot
+        may change its sign: the formula for the accelerations stays the same.
         """
         entries = [entry for row in solved for j, entry in row.items() if j < self._n]
         total = _add_products(self._zero, [(entry, entry) for entry in entries])
@@ -305,7 +306,7 @@ class DependentCoordinates:
             self.conditions.append((pivot * pivot, (a * b).times(LEAST)))
 
     def _substitute(self, j: int, row: Terms) -> None:
-        """Express a dependent coordinate by independent ones; later dependent ones have been expressed already."""
+        """Compute T and g of a dependent coordinate j, after those of the coordinates that were eliminated later."""
         self.check()
         right, entries = row.get(self._n, self._zero), dict[int, Affine]()
         for k, entry in row.items():
@@ -319,7 +320,7 @@ class DependentCoordinates:
 def reduced_accelerations(
     mass: Any, force: Sequence[Affine], coordinates: DependentCoordinates
 ) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-    """Return the accelerations, and the conditions that all independent motions have inertia."""
+    """Return the accelerations, and the conditions under which T^T M T is not nearly singular."""
     n, T, g, independent = len(mass), coordinates.T, coordinates.g, coordinates.independent
     zero = Affine(mass[0, 0].graph, 0.0, {})
     rows = [[(mass[i, j], j) for j in range(n) if not is_zero(mass[i, j])] for i in range(n)]
@@ -337,12 +338,12 @@ def reduced_accelerations(
     right = [_add_products(zero, ((T[i][x], forces[i]) for i in range(n) if x in T[i])).value() for x in independent]
     factors = Factors(matrix, len(independent), len(independent))
     solution = dict(zip(independent, factors.solve(right), strict=True))
-    found = [g[i] + _add_products(zero, ((entry, solution[x]) for x, entry in T[i].items())) for i in range(n)]
-    return found, list(_definite(matrix, factors))
+    accelerations = [g[i] + _add_products(zero, ((entry, solution[x]) for x, entry in T[i].items())) for i in range(n)]
+    return accelerations, list(_definite(matrix, factors))
 
 
 def _definite(matrix: dict[tuple[int, int], Affine], factors: Factors) -> Iterator[tuple[Affine, Affine]]:
-    """Yield the conditions on pivots of the reduced mass matrix, each relative to its value without earlier ones."""
+    """Yield the conditions on the pivots of the reduced mass matrix, relative to its diagonal entries."""
     pivots = iter(factors.positive)
     for places, _, _ in factors.blocks:
         alone: Affine | None = None

@@ -1,8 +1,8 @@
-"""Programs: outputs of a graph, one walk over their operations in any algebra, and the coefficients that they read.
+"""Execute programs (selected outputs of a graph) in any algebra, and number the coefficients that they read.
 
-- `Program.run` executes a program, or writes it. The algebra says what values are: arrays (`Arrays`), LLVM code
-  (`llvm_code.Lowering`), degrees of growth (`time_dependence.Degrees`).
-- `OperationTable` lists the operations for compiled kernels, which walk over its rows.
+- `Program.run` executes a program, or writes code for it. The algebra defines what values are: arrays (`Arrays`), LLVM
+  code (`llvm_code.Lowering`), degrees of growth (`time_dependence.Degrees`).
+- `OperationTable` lists the operations for compiled kernels, which interpret its rows.
 - Derivatives extend the graph (`graph.Derivative`). Expressions of parameters alone are coefficients
   (`parameter_expressions`), which are computed before a program runs.
 """
@@ -24,17 +24,17 @@ from twoloop.kernels.evaluation.operations import KIND, N_COLUMNS, NODE, RESULT
 Array = NDArray[np.float64]
 T = TypeVar("T")
 
-# the program traced from a user's function is compared with calls of the function
-STATES = 5  # number of states at which they are compared ...
-BETWEEN = 0.37  # ... time between them, s: no usual period
-AGREES = 1e-10  # largest relative difference
+# A program traced from a user's function is compared with calls of the function: at this number of states, ...
+STATES = 5
+BETWEEN = 0.37  # ... whose times differ by this, s, which is no usual period of a force; ...
+AGREES = 1e-10  # ... this is the largest relative difference
 
-# cost in multiplications; each further term of a sum counts 1, functions count 0
+# cost of operations in multiplications; functions count 0
 COSTS = {op.PRODUCT: 1, op.RECIPROCAL: 4}
 
 
 class Algebra(Generic[T]):
-    """Algebra: values of the quantities of a graph in one kind of arithmetic.
+    """Arithmetic in which a program runs: values of the quantities, and operations on values.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Algebra(Generic[T]):
         raise NotImplementedError
 
     def operation(self, kind: int, first: Affine, second: Affine | None) -> T:
-        """Return the result of an operation; only products have second arguments that matter."""
+        """Return the result of an operation; operations other than products ignore their second argument."""
         argument = self.affine(first)
         if kind == op.PRODUCT:
             assert second is not None
@@ -70,21 +70,24 @@ class Algebra(Generic[T]):
         self.values[quantity] = value
 
     def run(self, graph: Graph, quantities: Iterable[int]) -> None:
-        """Compute quantities in the given order: the walk that all algebras share."""
+        """Compute quantities in the given order."""
         for i in quantities:
             operation = graph.operations[i]
             assert operation is not None
             self.define(i, self.operation(*operation))
 
     def outputs(self, program: "Program") -> list[list[T]]:
-        """Compute the arrays of a program and the quantities of its conditions; inputs must be defined."""
+        """Compute and return the arrays of a program, after its inputs were defined.
+
+        The quantities of its conditions are computed, too.
+        """
         self.run(program.graph, program.quantities())
         return [[self.affine(form) for form in forms] for forms in program.arrays.values()]
 
 
 @dataclass(frozen=True)
 class Program:
-    """Program: outputs to be computed from the inputs of a graph, arrays and conditions that must hold.
+    """Arrays to be computed from the inputs of a graph, and conditions under which they are valid.
 
     Attributes
     ----------
@@ -92,7 +95,7 @@ class Program:
     arrays : dict
         Affine expressions, for each array by its name.
     conditions : list of (Affine, Affine)
-        The first must be larger than the second.
+        Pairs of which the first must be larger than the second.
     """
 
     graph: Graph
@@ -106,11 +109,11 @@ class Program:
         return algebra.outputs(self)
 
     def quantities(self, available: Container[int] = ()) -> list[int]:
-        """Return the quantities that the outputs need, but inputs and available ones, in an order of computation."""
+        """List the quantities that the outputs need, see `Graph.needed_by`."""
         return self.graph.needed_by(self.forms, available)
 
     def cost(self) -> int:
-        """Estimate the cost of the program in multiplications and additions, without functions."""
+        """Count the multiplications and additions of the program; a reciprocal counts as four, functions as none."""
         forms, total = self.forms, 0
         for i in self.quantities():
             kind, *_ = self.graph.operations[i]  # type: ignore[misc]
@@ -131,7 +134,7 @@ class Program:
 
 
 class Arrays(Algebra[Any]):
-    """Algebra of NumPy arrays, one number for each run.
+    """Algebra of NumPy arrays, which hold one number for each run.
 
     Parameters
     ----------
@@ -174,7 +177,7 @@ class Arrays(Algebra[Any]):
 
 
 class OperationTable(NamedTuple):
-    """Table of the operations of a program for compiled kernels, see kernels/evaluation/operations.py.
+    """Operations of a program as arrays, for the kernels in kernels/evaluation/operations.py.
 
     `rows` has a row for each operation, `columns` and `coefficients` the terms of all affine expressions, and
     `constants` their constants, two for each row.
@@ -188,7 +191,7 @@ class OperationTable(NamedTuple):
 
     @classmethod
     def of(cls, graph: Graph, n_inputs: int, results: Mapping[int, Affine]) -> "OperationTable":
-        """List the operations that results, by their indices, need; the first quantities of the graph are inputs."""
+        """List the operations for `results`, expressions by their indices; the first quantities are the inputs."""
         needed = graph.needed_by(results.values())
         node = {i: i for i in range(n_inputs)} | {i: n_inputs + k for k, i in enumerate(needed)}
         operations: list[Any] = [(*graph.operations[i], node[i]) for i in needed]  # type: ignore[misc]
@@ -212,7 +215,7 @@ class OperationTable(NamedTuple):
         )
 
     def flat(self) -> list[float]:
-        """Return all numbers as the parameters of a model hold them: results are the first nodes."""
+        """Return the table as a list of numbers, to be stored in the parameters of a model: results come first."""
         rows = self.rows.copy()
         is_result = rows[:, KIND] == RESULT
         n_results = int(is_result.sum())
@@ -222,7 +225,7 @@ class OperationTable(NamedTuple):
         return [float(x) for part in parts for x in part]
 
     def packed(self, places: Sequence[int]) -> tuple[Any, Any]:
-        """Return the integers and the numbers of a program of a system; `places`: the entries of its results."""
+        """Return the table as one array of integers and one of floats; results are stored at the indices `places`."""
         rows, n = self.rows.copy(), len(places)
         rows[rows[:, KIND] == RESULT, NODE] += self.n_nodes
         head = [self.n_nodes + n, len(rows), len(self.columns), n]
@@ -230,20 +233,20 @@ class OperationTable(NamedTuple):
         return integers.astype(np.int64), np.concatenate([self.constants.ravel(), self.coefficients])
 
     def with_numbers(self, numbers_for: Callable[[Any], Array]) -> "OperationTable":
-        """Return the table with other numbers."""
+        """Return the table with each array of coefficients replaced by `numbers_for` of it."""
         return self._replace(constants=numbers_for(self.constants), coefficients=numbers_for(self.coefficients))
 
 
 Terms = tuple[tuple[int, float], ...]  # quantities and their coefficients
 
-IN_THE_CODE = (0.0, 1.0, -1.0)  # coefficients that are literals in the code, as they need no multiplication
-ROUNDING = 8.0 * 2.0**-52  # relative: coefficients that differ by less from one of IN_THE_CODE are replaced by it
+LITERALS = (0.0, 1.0, -1.0)  # coefficients that are literals in the code, as they need no multiplication
+ROUNDING = 8.0 * 2.0**-52  # relative: coefficients that differ by less from one of LITERALS are replaced by it
 
 
 class Coefficient(float):
-    """Coefficient that is read from an index of a memory; equal to no other, whatever their values.
+    """Coefficient that the code reads from an array; it equals only itself, even if values are equal.
 
-    Coefficients that vary with parameters may have a memory of their own.
+    Coefficients that vary with parameters may be in an array of their own.
     """
 
     __slots__ = ("place", "varies")
@@ -251,7 +254,7 @@ class Coefficient(float):
     varies: bool
 
     def __new__(cls, value: float, place: int, varies: bool = False) -> "Coefficient":
-        """Create the coefficient stored at an index of the array of numbers."""
+        """Create the coefficient that is stored at the index `place`."""
         coefficient = super().__new__(cls, value)
         coefficient.place, coefficient.varies = place, varies
         return coefficient
@@ -267,10 +270,10 @@ class Coefficient(float):
 
 
 class Coefficients:
-    """Numbering of the coefficients of expressions: assigns indices in the order of their first use.
+    """Assign array indices to the coefficients of expressions, in the order of their first use.
 
-    Equal expressions share their places. `apart`: coefficients that vary with parameters have a memory of their own, as
-    each SIMD lane has other values.
+    Equal expressions share their indices. `apart`: coefficients that vary with parameters get an array of their own,
+    because their values differ between SIMD lanes.
     """
 
     def __init__(self, apart: bool = False) -> None:
@@ -283,12 +286,12 @@ class Coefficients:
 
     @property
     def values(self) -> NDArray[np.float64]:
-        """Return the numbers that the code reads."""
+        """Return the values of the coefficients that the code reads."""
         return np.array(self._values, dtype=np.float64)
 
     @property
     def formulas(self) -> Any:
-        """Return these numbers as expressions in the parameters; the array object changes only if numbers are added."""
+        """Return `values` as expressions in the parameters; the same array object until a coefficient is added."""
         if len(self._formulas) != len(self._values):
             self._formulas = array_of(self._values)
         return self._formulas
@@ -309,7 +312,10 @@ class Coefficients:
         return numbers
 
     def structure(self, program: Program, given: Mapping[int, int] = MappingProxyType({})) -> Iterable[Any]:
-        """List what code for a program depends on, but for values of numbers; `given`: indices of given quantities."""
+        """List everything that the code for a program depends on, except the values of coefficients.
+
+        `given` maps quantities that are read from memory to their indices.
+        """
         graph, forms = program.graph, program.forms
         needed = graph.needed_by(forms, given)
         name: dict[int, Any] = {i: f"input {i}" for i, each in enumerate(graph.operations) if each is None}
@@ -331,24 +337,24 @@ class Coefficients:
         return len(self._varying)
 
     def for_parameters(self, record: ParameterTape, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the varying coefficients for parameters (n_runs, n_p), one row for each run."""
+        """Evaluate the coefficients that vary, for parameters (n_runs, n_p): one row for each run."""
         return record.evaluate(list(self._varying.values()), parameters)
 
     def _number(self, value: float) -> float:
-        if type(value) is Parameter:  # a parameter's present value is no literal
+        if type(value) is Parameter:  # no literal, even if its present value is 0 or 1
             if self._apart:
                 expression = value.scale, value.powers
                 self._varying.setdefault(expression, value)
                 return Coefficient(value, list(self._varying).index(expression), varies=True)
-        elif (exact := in_the_code(value)) is not None:
+        elif (exact := literal(value)) is not None:
             return exact
         self._values.append(value)
         return Coefficient(value, len(self._values) - 1)
 
 
-def in_the_code(value: float) -> float | None:
-    """Return the literal for a number, or None if it must be a coefficient."""
+def literal(value: float) -> float | None:
+    """Return 0, 1 or -1 if a number equals it up to rounding; None if the number must be read as a coefficient."""
     if type(value) is Parameter or not math.isfinite(value):
         return None
     near = float(round(value))
-    return near if near in IN_THE_CODE and abs(value - near) <= ROUNDING * abs(near) else None
+    return near if near in LITERALS and abs(value - near) <= ROUNDING * abs(near) else None

@@ -1,8 +1,8 @@
-"""Program for the Taylor series of a mechanism's motion.
+"""Write the program for the Taylor series of a mechanism's motion.
 
-Each order needs G = [C_q; A] and its rates, M and Q, see taylor_step.py. The quantities of G and M are early: they
-depend on time and coordinates. Those of Q may be late: they depend on velocities, too. G v and G^T lam + M a are
-written with few products: terms that share a factor are one product.
+Each order needs G = [C_q; A] and its rates, M and Q, see taylor_step.py. Operations on time and coordinates only, as
+those of G and M, are called early; the others, which depend on velocities, are called late. G v and G^T lam + M a are
+written with few products: terms that share a factor become one product.
 """
 
 from collections.abc import Container, Sequence
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from twoloop.generate.graph import MOST_OPERATIONS, Affine, Graph, Untraceable
 from twoloop.generate.parameter_expressions import array_of, elementwise
-from twoloop.generate.trace import Equations, Evaluator, TraceCache, derive_cached, only
+from twoloop.generate.trace import Equations, Evaluator, TraceCache, derive_cached, only_quantity
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.kernels.evaluation.operations import COSINE, PENDING, SINE, SUM
 from twoloop.problem.system import ConstrainedSystem
@@ -23,13 +23,14 @@ from twoloop.problem.system import ConstrainedSystem
 Integers = NDArray[np.int64]
 Array = NDArray[np.float64]
 
-MOST_ENTRIES = 200_000  # largest number of entries of M and C_q for which a series is traced without a request
+# largest number of entries of M and C_q for which a series is traced, unless the user asks for it
+MOST_ENTRIES = 200_000
 
 READ = ("mass", "force", "jacobian", "nonholonomic", "constraint_rate", "nonholonomic_rate")
 
 
 class Sums(NamedTuple):
-    """Affine expressions as arrays: the first term of each expression, then the further terms, row by row."""
+    """Affine expressions as arrays: one array for the first terms of all expressions, others for further terms."""
 
     column: Integers  # quantity of the first term
     coefficient: Array
@@ -46,9 +47,9 @@ class Table:
     Attributes
     ----------
     groups : ndarray (n, 7)
-        Kind, first and end of operations that do not depend on one another, and of the further terms of their first and
-        second arguments. A group of sines includes the cosines of the same angles. The last group has the products that
-        wait for the solution of an order.
+        One row for each group of independent operations of a kind: the kind, and first and end index of the operations,
+        of the further terms of their first arguments, and of those of their second arguments. A group of sines includes
+        the cosines of the same angles. The last group has the products that need the solution of the linear system.
     first, second : Sums
         Arguments of the operations.
     """
@@ -72,7 +73,7 @@ class SeriesProgram:
     rows, row_places : Sums, ndarray
         G v + G_t without multiples of v: the rows that are not zero, and their indices.
     balance, balance_places : Sums, ndarray
-        Q - G^T lam - M a without multiples of lam and a, likewise.
+        Q - G^T lam - M a without multiples of lam and a: the entries that are not zero, and their indices.
     traced : Traced or None
         The traced callbacks.
     """
@@ -89,11 +90,11 @@ class SeriesProgram:
 
     @property
     def n_operations(self) -> int:
-        """Return the number of operations, with the products of G v and G^T lam + M a."""
+        """Return the number of operations, including the products of G v and G^T lam + M a."""
         return len(self.early.first.column) + len(self.late.first.column)
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "SeriesProgram":
-        """Return the program with the coefficients of one system."""
+        """Return the program with coefficients for the parameters of one system."""
 
         def sums(given: Sums) -> Sums:
             coefficient, constant = evaluate(given.coefficient), evaluate(given.constant)
@@ -118,7 +119,7 @@ class SeriesProgram:
 
 
 def is_quick(system: ConstrainedSystem) -> bool:
-    """Return whether a series is traced within about a second: matrices are traced as full ones."""
+    """Return whether a series is traced within about a second; matrices are traced as full matrices."""
     return system.n_q * (system.n_q + system.n_c + system.n_a) <= MOST_ENTRIES
 
 
@@ -141,9 +142,9 @@ def series_for(system: ConstrainedSystem, check: Check = unchecked) -> SeriesPro
 def series_program(
     system: ConstrainedSystem, equations: Equations | None = None, independent: Container[int] | None = None
 ) -> SeriesProgram:
-    """Trace the callbacks of a system and write its program.
+    """Trace the callbacks of a system and return its program.
 
-    `independent`: the rows of G that have multipliers; None: all. The program leaves the others out.
+    `independent`: the rows of G that the program contains; None: all rows.
 
     Raises
     ------
@@ -171,13 +172,13 @@ def series_program(
         factors += [-each for each in mass[i]]
         total = _sum_of_products(graph, factors, [*multipliers, *a], force[i], reaction_products, of_rates=False)
         balance.append(total)
-    inputs = [*range(1 + 2 * n), *map(only, a), *map(only, lam)]
+    inputs = [*range(1 + 2 * n), *map(only_quantity, a), *map(only_quantity, lam)]
     program = _assemble(graph, sums, inputs, n, n_rows, rows, balance, row_products, reaction_products)
     return replace(program, traced=Traced(system, graph))
 
 
 def _sums_of(graph: Graph) -> dict[int, Affine]:
-    """Return the terms of quantities that are sums: the series of a sum needs no recurrence of its own."""
+    """Return the expression of each quantity that is a sum, to be substituted: sums need no recurrence of their own."""
     sums: dict[int, Affine] = {}
     for i, operation in enumerate(graph.operations):
         if operation is not None and operation[0] == SUM:
@@ -206,8 +207,8 @@ def _sum_of_products(
 ) -> Affine:
     """Return rest + sum_i factors[i] multipliers[i] with few products, which are added to `products`.
 
-    Terms are collected by factors, or by the quantities in these, whichever gives fewer products. If both give the same
-    number, rates are collected by quantities: a cosine times the rate of its angle is the derivative of the sine.
+    Terms are collected by factors, or by the quantities in the factors, whichever gives fewer products. If both give
+    the same number, rates are collected by quantities: (cos x) x' is the derivative of sin x.
     """
     total = rest
     by_factor: dict[Any, tuple[Affine, Affine]] = {}
@@ -268,7 +269,10 @@ def _assemble(
     tables = [
         [
             *_grouped(operations),
-            (PENDING, sorted([(only(form), *factors) for form, *factors in products.values()], key=_term_counts)),
+            (
+                PENDING,
+                sorted([(only_quantity(form), *factors) for form, *factors in products.values()], key=_term_counts),
+            ),
         ]
         for operations, products in ((early, row_products), (late, reaction_products))
     ]
@@ -289,7 +293,7 @@ def _assemble(
 
 
 def _used(graph: Graph, forms: list[Affine]) -> list[tuple[int, Any]]:
-    """Return the operations that expressions need; a sine brings the cosine of its angle, and vice versa."""
+    """Return the operations that expressions need; if the sine of an angle is needed, so is the cosine."""
     needed = set(graph.needed_by(forms))
     pairs = (SINE, COSINE)
     angles = {each[1].key for i in needed if (each := graph.operations[i]) is not None and each[0] in pairs}
@@ -301,7 +305,7 @@ def _used(graph: Graph, forms: list[Affine]) -> list[tuple[int, Any]]:
 
 
 def _nonzero(forms: list[Affine], place: dict[int, int]) -> tuple[Sums, Integers]:
-    """Return the expressions that are not zero, and their indices."""
+    """Return the nonzero expressions and their indices."""
     kept = [k for k, form in enumerate(forms) if form.terms or form.constant]
     sums = _sums([forms[k] for k in kept], place)
     places = np.array(kept, dtype=np.int64)
@@ -309,12 +313,12 @@ def _nonzero(forms: list[Affine], place: dict[int, int]) -> tuple[Sums, Integers
 
 
 def _without(form: Affine, inputs: Container[int]) -> Affine:
-    """Return an expression without its multiples of some quantities."""
+    """Return an expression without its terms in some quantities."""
     return Affine(form.graph, form.constant, {i: c for i, c in form.terms.items() if i not in inputs})
 
 
 def _grouped(operations: list[Any]) -> list[tuple[int, list[Any]]]:
-    """Group operations by level and kind: a group depends only on the groups before it."""
+    """Group operations by kind, so that a group depends only on the groups before it; return kinds and groups."""
     nodes = {node for node, *_ in operations}
     level: dict[int, int] = {}
     groups: dict[tuple[int, int], list[Any]] = {}

@@ -1,4 +1,4 @@
-"""Decide from traces whether callbacks may change suddenly, or much over a short distance."""
+"""Decide from traces whether forces or drives may be short, or vary much over a short distance."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -25,24 +25,20 @@ from twoloop.problem.system import ConstrainedSystem
 
 BY_TIME = ("force", "constraint_rate", "nonholonomic_rate")  # callbacks whose dependence on time matters ...
 BY_STATE = ("force", "mass", "constraint", "jacobian", "nonholonomic")  # ... and on the state
-SMOOTH = (
-    PRODUCT,
-    SUM,
-    SINE,
-    COSINE,
-)  # operations of polynomials and vibrations: their values never change suddenly ...
-HIGHEST = 8  # ... up to this degree: a high power of a cosine is a pulse
-# degree in q and v up to which steps notice a change before they meet it; likewise for roots, but not for exp ...
-HIGHEST_OF_STATE = 32
-HIGHEST_INVERSE = 4  # ... and for quotients up to this degree ...
-SLOWEST = -2.0  # ... if they decay no faster than this power: 1 / (1 + (x / w)**2), but not its square
-FASTEST = 4.0  # radians of a vibration per unit of a coordinate or speed, up to which long steps resolve it
+SMOOTH = (PRODUCT, SUM, SINE, COSINE)  # operations of polynomials and vibrations: these have no short pulses ...
+MAX_DEGREE = 8  # ... up to this degree: a high power of a cosine is a pulse
+# Functions of the state are also free of short pulses if they are: polynomials in q and v, or roots, up to this degree;
+# ...
+MAX_DEGREE_OF_STATE = 32
+MAX_DEGREE_OF_DIVISOR = 4  # ... quotients up to this degree of the divisor ...
+SLOWEST_DECAY = -2.0  # ... that decay no faster than this power: 1 / (1 + (x / w)**2), but not its square
+MAX_RATE = 4.0  # largest rate of a vibration's angle, rad per unit of a coordinate or speed, that long steps resolve
 # largest number of coordinates: tracing more takes up to seconds; sampling forces in a run takes a tenth of that
-LARGEST = 300
+MAX_COORDINATES = 300
 TIME = 1  # bit mask of t, the first input of a graph
 
 
-class Sudden(NamedTuple):
+class ShortForces(NamedTuple):
     """Whether forces or drives may act for a short time: at some times, or at some positions or speeds."""
 
     by_time: bool
@@ -50,38 +46,39 @@ class Sudden(NamedTuple):
 
 
 class Dependence(NamedTuple):
-    """Dependence on time and state of the callbacks that several systems share."""
+    """Result of the analysis of callbacks that several systems share."""
 
-    sudden: Sudden
-    narrow: bool  # see `may_be_narrow`
+    short: ShortForces
+    steep: bool  # see `may_be_steep`
     kinds: frozenset[str]  # kinds of callbacks that were traced
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Dependence":
-        """Return the dependence of one of these systems: it does not depend on parameters."""
+        """Return the result for one of these systems: it is the same for all parameters."""
         return self
 
 
-def may_be_sudden(system: ConstrainedSystem, ran_on_symbols: bool) -> Sudden:
-    """Return whether forces, C_t or b may act for a short time; callbacks that cannot be traced may.
+def may_be_short(system: ConstrainedSystem, ran_on_symbols: bool) -> ShortForces:
+    """Return whether forces, C_t or b may act for a short time; this is assumed of callbacks that cannot be traced.
 
-    Functions called in Python are traced only if the force was before: they may keep their arguments.
+    Functions called in Python may store their arguments. They are traced only if the force was traced before
+    (`ran_on_symbols`).
     """
-    if system.n_q > LARGEST:
-        return Sudden(True, False)
+    if system.n_q > MAX_COORDINATES:
+        return ShortForces(True, False)
     dependence = _dependence(system, ran_on_symbols)
-    return Sudden(True, True) if dependence is None else dependence.sudden
+    return ShortForces(True, True) if dependence is None else dependence.short
 
 
-def may_be_narrow(system: ConstrainedSystem, ran_on_symbols: bool) -> bool:
-    """Return whether forces may change over a distance shorter than a step, though not suddenly.
+def may_be_steep(system: ConstrainedSystem, ran_on_symbols: bool) -> bool:
+    """Return whether forces may be short, or may vary much over a distance shorter than a step.
 
-    Quotients and roots of the state may: a step notices 1 / (1 + (x / w)**2) before it meets it, but long steps may
-    step over its peak. The stages of a long step may sample a fast vibration at like phases.
+    Quotients and roots of the state may vary so: a long step may pass over the peak of 1 / (1 + (x / w)**2), although
+    its flanks are noticed. The stages of a long step may sample a fast vibration at nearly the same phase.
     """
-    if any(may_be_sudden(system, ran_on_symbols)):
+    if any(may_be_short(system, ran_on_symbols)):
         return True
     dependence = _dependence(system, ran_on_symbols)
-    return dependence is None or dependence.narrow
+    return dependence is None or dependence.steep
 
 
 def _dependence(system: ConstrainedSystem, ran_on_symbols: bool) -> Dependence | None:
@@ -104,15 +101,15 @@ def _analyse(system: ConstrainedSystem) -> Any:
 
         graph = equations.graph
         by_state = needed(BY_STATE)
-        sudden = Sudden(_by_time(graph, needed(BY_TIME)), _by_state(graph, by_state, system.n_q))
-        narrow = _is_narrow(graph, sorted({*by_state, *needed(BY_TIME)}))
-        return Dependence(sudden, narrow, frozenset(graph.traced))
+        short = ShortForces(_is_short_in_time(graph, needed(BY_TIME)), _is_short_in_state(graph, by_state, system.n_q))
+        steep = _is_steep(graph, sorted({*by_state, *needed(BY_TIME)}))
+        return Dependence(short, steep, frozenset(graph.traced))
 
     return make
 
 
 class Degrees(Algebra[float]):
-    """Algebra of degrees: the degree of each quantity in some inputs; other inputs are constants."""
+    """Algebra whose values are degrees: of each quantity, as if it were a polynomial in some of the inputs."""
 
     functions: Mapping[int, Callable[[float], float]] = MappingProxyType(
         {
@@ -126,11 +123,11 @@ class Degrees(Algebra[float]):
         self.values = dict.fromkeys(inputs, 1.0)
 
     def affine(self, expression: Affine) -> float:
-        """Return the largest degree of the terms of a sum."""
+        """Return the degree of a sum, the largest degree of its terms."""
         return max((self.values.get(i, 0.0) for i in expression.terms), default=0.0)
 
     def product(self, a: float, b: float) -> float:
-        """Return the degree of a product, the sum of those of its factors."""
+        """Return the degree of a product, the sum of the degrees of its factors."""
         return a + b
 
 
@@ -143,7 +140,7 @@ class Vibrations(Degrees):
 
 
 class Growth(Degrees):
-    """Algebra of growth: powers by which quantities grow far away; negative for reciprocals, zero for vibrations."""
+    """Algebra of growth: power of x with which a quantity grows for large x; negative for reciprocals."""
 
     functions = MappingProxyType(
         {
@@ -155,26 +152,26 @@ class Growth(Degrees):
 
 
 class Divisors(Degrees):
-    """Algebra of divisors: their highest degree in each quantity; an arctangent counts, as its slope is a quotient."""
+    """Algebra of divisors: total degree of all divisors in a quantity; an arctangent counts, as its slope is one."""
 
     def __init__(self, degrees: Degrees):
         super().__init__()
         self._degrees = degrees
 
     def operation(self, kind: int, first: Affine, second: Affine | None) -> float:
-        """Return the highest degree of the divisors of an operation's result."""
+        """Return the degree of the divisors in the result of an operation."""
         degree = super().operation(kind, first, second)
         return degree + self._degrees.affine(first) if kind in (RECIPROCAL, ARCTANGENT) else degree
 
 
 class Rates(Degrees):
-    """Algebra of rates: how many times faster than a coordinate or a speed each quantity changes at most.
+    """Algebra of rates: upper bound of the derivative of each quantity with respect to a coordinate or speed.
 
     The rate of a coordinate times a parameter is infinite, as the parameter may have any value.
     """
 
     def affine(self, expression: Affine) -> float:
-        """Return the largest rate of the terms."""
+        """Return the largest rate of the terms of a sum."""
         return max(
             (
                 math.inf if type(c) is Parameter else abs(c) * self.values.get(i, 1.0)
@@ -184,14 +181,14 @@ class Rates(Degrees):
         )
 
 
-def _by_time(graph: Graph, needed: list[int]) -> bool:
+def _is_short_in_time(graph: Graph, needed: list[int]) -> bool:
     depending = [i for i in needed if graph.inputs_of[i] & TIME]
     degrees = Degrees([0])  # degrees in time, or in vibrations with time
     degrees.run(graph, depending)
-    return any(graph.kind(i) not in SMOOTH or degrees.values[i] > HIGHEST for i in depending)
+    return any(graph.kind(i) not in SMOOTH or degrees.values[i] > MAX_DEGREE for i in depending)
 
 
-def _by_state(graph: Graph, needed: list[int], n_q: int) -> bool:
+def _is_short_in_state(graph: Graph, needed: list[int], n_q: int) -> bool:
     depending = [i for i in needed if graph.inputs_of[i] & ~TIME]
     inputs = range(1, 2 * n_q + 1)
     degrees, vibrations, growth = Degrees(inputs), Vibrations(), Growth(inputs)
@@ -200,19 +197,19 @@ def _by_state(graph: Graph, needed: list[int], n_q: int) -> bool:
         algebra.run(graph, depending)
     return any(
         graph.kind(i) == EXPONENTIAL
-        or degrees.values[i] > HIGHEST_OF_STATE
-        or divisors.values[i] > HIGHEST_INVERSE
-        or growth.values[i] < SLOWEST
-        or vibrations.values[i] > HIGHEST
+        or degrees.values[i] > MAX_DEGREE_OF_STATE
+        or divisors.values[i] > MAX_DEGREE_OF_DIVISOR
+        or growth.values[i] < SLOWEST_DECAY
+        or vibrations.values[i] > MAX_DEGREE
         for i in depending
     )
 
 
-def _is_narrow(graph: Graph, needed: list[int]) -> bool:
-    """Return whether a quantity is a quotient or a root, a vibration in time, or a fast vibration in the state."""
+def _is_steep(graph: Graph, needed: list[int]) -> bool:
+    """Return whether a quantity is a quotient, a root, a vibration in time, or a fast vibration in the state."""
     if any(graph.kind(i) not in SMOOTH for i in needed):
         return True
     rates = Rates()
     rates.run(graph, needed)
     vibrations = [i for i in needed if graph.kind(i) in (SINE, COSINE)]
-    return any(rates.values[i] > FASTEST or graph.inputs_of[i] & TIME for i in vibrations)
+    return any(rates.values[i] > MAX_RATE or graph.inputs_of[i] & TIME for i in vibrations)

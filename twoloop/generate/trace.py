@@ -1,17 +1,17 @@
-"""Trace callbacks: run them in Python on symbols, with functions of expressions for those of `math` and `numpy`.
+"""Trace callbacks: run them in Python on symbols; functions of `math` and `numpy` are replaced by symbolic ones.
 
-A callback must do with symbols exactly what it does with numbers. So a function that may treat them differently is
-refused by name when it is given symbols, even if the callback catches the refusal. Changes that remain undetected, as
-of a global, are found by comparing numbers (`traced_values.py`).
+A callback must do with symbols exactly what it does with numbers. So a function that may treat symbols differently is
+refused by name when it is called with one, even if the callback catches the exception. Differences that tracing cannot
+detect, such as a changed global variable, are found by comparing numbers (`traced_values.py`).
 
 `Equations` holds every callback of one system as an array of expressions; exact derivatives replace callbacks that are
 not given. Series, eliminations, references and derived callbacks read them there.
 
 `TraceCache` keeps traces for all systems that share their callbacks: coefficients are expressions in the parameters.
 
-- Parameters that are whole numbers keep their values, as they may be counts, indices or switches, and zeros and ones
-  save operations. Parameters of equal magnitude stay equal. So the systems of one cache differ only in other numbers.
-- A callback that branches on its parameters, or rounds them, has no such expressions. It is traced for each system.
+- Whole numbers keep their values: they may be counts, indices or switches, and zeros and ones save operations.
+  Parameters of equal magnitude stay equal. So the systems of one cache differ only in the values of other parameters.
+- A callback that branches on its parameters, or rounds them, is traced for each system.
 """
 
 import copy
@@ -46,7 +46,7 @@ from twoloop.kernels.compile.linking import Dispatcher
 from twoloop.problem.system import ConstrainedSystem
 
 # functions of NumPy that handle arrays of expressions like arrays of numbers
-AS_WITH_NUMBERS = {
+NUMPY_FUNCTIONS = {
     *("add", "append", "atleast_1d", "atleast_2d", "block", "column_stack", "concatenate", "copy", "cross", "diag"),
     *("diagonal", "divide", "dot", "einsum", "expand_dims", "flip", "hstack", "inner", "kron", "matmul", "mean"),
     *("multiply", "ndim", "negative", "outer", "positive", "prod", "ravel", "repeat", "reshape", "roll", "shape"),
@@ -63,7 +63,7 @@ def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
     Raises
     ------
     Untraceable
-        If it does not run on symbols, or treats them differently from numbers.
+        If the callback does not run on symbols, or treats them differently from numbers.
     """
     graph, value = t.graph, None
     with graph.watched():
@@ -73,9 +73,9 @@ def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
             raise Untraceable(f"{graph.refused or refusal}{place_of(refusal)}") from None
         except Exception as error:  # a callback may raise anything on symbols
             if not graph.refused:
-                said = str(error).partition("\n")[0].replace("twoloop.generate.graph.", "").replace("Affine", "symbol")
-                said = f"it does not run on symbols in the place of t, q and v: {type(error).__name__}: {said}"
-                raise Untraceable(f"{said}{place_of(error)}") from error
+                text = str(error).partition("\n")[0].replace("twoloop.generate.graph.", "").replace("Affine", "symbol")
+                text = f"it does not run on symbols in the place of t, q and v: {type(error).__name__}: {text}"
+                raise Untraceable(f"{text}{place_of(error)}") from error
     return value
 
 
@@ -133,7 +133,7 @@ def _type(value: Any, *more: Any) -> Any:
 
 
 def _symbol_in(value: Any) -> Affine | None:
-    """Return a symbol in a number, an array, or a list of these; None if there is none."""
+    """Return the value if it is a symbol, or the first symbol in an array or a list; None if there is none."""
     if type(value) is Affine:
         return value
     if isinstance(value, np.ndarray):
@@ -144,7 +144,7 @@ def _symbol_in(value: Any) -> Affine | None:
 
 
 def _has_parameters(value: Any) -> bool:
-    """Return whether a number, an array or a list of these holds a Parameter."""
+    """Return whether a value is a Parameter, or an array or a list that holds one."""
     if isinstance(value, np.ndarray):
         value = value.ravel().tolist() if value.dtype == object else ()
     return any(map(_has_parameters, value)) if isinstance(value, list | tuple) else type(value) is Parameter
@@ -157,7 +157,7 @@ def _refuse(value: Any, does: str) -> None:
 
 
 def _of_numbers(function_of_numbers: Any, name: str) -> Callable[..., Any]:
-    """Wrap a function that may not work with expressions: it refuses them."""
+    """Wrap a function that may treat expressions differently from numbers: the wrapper refuses expressions."""
 
     @functools.wraps(function_of_numbers)
     def function(*arguments: Any, **options: Any) -> Any:
@@ -168,7 +168,7 @@ def _of_numbers(function_of_numbers: Any, name: str) -> Callable[..., Any]:
 
 
 def _either(of_numbers: Any, of_symbols: Callable[..., Any]) -> Callable[..., Any]:
-    """Combine a function of numbers with the same function of expressions."""
+    """Return a function that calls `of_symbols` if an argument holds symbols, else `of_numbers`."""
 
     def function(*arguments: Any) -> Any:
         if _symbol_in(arguments) is None:
@@ -186,7 +186,7 @@ def _is_real(dtype: Any) -> bool:
 
 
 def _constructor(constructor: Any) -> Callable[..., Any]:
-    """Wrap `zeros`, `ones` or `empty`: their arrays of real numbers can hold expressions."""
+    """Wrap `zeros`, `ones` or `empty` so that arrays of real numbers can hold expressions."""
 
     def function(shape: Any, dtype: Any = None, **options: Any) -> Any:
         if not _is_real(dtype):
@@ -197,7 +197,7 @@ def _constructor(constructor: Any) -> Callable[..., Any]:
 
 
 def _conversion(conversion: Any) -> Callable[..., Any]:
-    """Wrap `array`, `asarray` or `ascontiguousarray`."""
+    """Wrap `array`, `asarray` or `ascontiguousarray` so that arrays of real numbers can hold expressions."""
 
     def function(value: Any, dtype: Any = None, **options: Any) -> Any:
         if _symbol_in(value) is None and not _has_parameters(value):
@@ -231,7 +231,7 @@ def _norm(x: Any, *more: Any, **options: Any) -> Any:
 
 
 class _Mathematics:
-    """Substitute for `math`, `numpy` or a part of it: its functions take expressions, too, and its arrays hold them."""
+    """Substitute for `math`, `numpy` or a submodule, whose functions and arrays also accept expressions."""
 
     def __init__(self, module: types.ModuleType):
         self._module = module
@@ -254,7 +254,7 @@ class _Mathematics:
             return _full
         if original is np.linalg.norm:
             return _norm
-        if self._module is np and name in AS_WITH_NUMBERS:
+        if self._module is np and name in NUMPY_FUNCTIONS:
             return original
         return _of_numbers(original, f"{self._module.__name__}.{name}")
 
@@ -291,18 +291,18 @@ class Equations:
         (self.t,) = self.graph.inputs(1, False)
         self.q, self.v = self.graph.inputs(system.n_q, False), self.graph.inputs(system.n_q, True)
         self._forms: dict[str, Any] = {}
-        self._copied: dict[str, Any] = {}  # results traced in the graph of which this one is a copy
+        self._copied: dict[str, Any] = {}  # results that were traced in the original of this graph
 
     def trace_all(self) -> "Equations":
-        """Trace all callbacks that can be traced, so that copies share them."""
+        """Trace all callbacks that can be traced, so that copies share the results; return self."""
         for kind in CALLBACKS:
             if not self._is_derived(kind):
-                with suppress(Untraceable):  # raised again when the callback is needed
+                with suppress(Untraceable):  # `of` raises it again if the callback is needed
                     self.of(kind)
         return self
 
     def copy(self) -> "Equations":
-        """Return equations with their own graph, which contains all that was traced here."""
+        """Return a copy with its own graph, which contains everything that was traced so far."""
         equations = copy.copy(self)
         equations.graph = self.graph.copy()
         equations.t, equations.q, equations.v = (
@@ -313,14 +313,14 @@ class Equations:
         return equations
 
     def of(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
-        """Return the array of a kind of callback as expressions; zeros or derivatives if it is not given.
+        """Return the result of a callback as an array of expressions; zeros or derivatives if it is not given.
 
         `v`: expressions that replace the velocities.
 
         Raises
         ------
         Untraceable
-            If a callback does not run on symbols; the message names it and the reason.
+            If a callback does not run on symbols; the message names the callback and the reason.
         """
         if v is not None and "v" in KINDS[kind].state:
             return self._make(kind, v)
@@ -329,7 +329,7 @@ class Equations:
         return self._forms[kind].copy()
 
     def derived(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
-        """Derive C_q, C_t or a right-hand side by differentiation, even if there is a callback for it."""
+        """Derive C_q, C_t or gamma by differentiation, even if there is a callback for it; return expressions."""
         if kind == "jacobian":
             return self._jacobian()
         return self._rate() if kind == "constraint_rate" else self._gamma(*OF_ROWS[kind], self.v if v is None else v)
@@ -371,19 +371,22 @@ class Equations:
         constraint, unit = self.of("constraint"), Affine(self.graph, 1.0, {})
         jacobian = np.empty((self.system.n_c, self.system.n_q), dtype=object)
         for j, coordinate in enumerate(self.q):
-            by = Derivative(self.graph, {only(coordinate): unit})
+            by = Derivative(self.graph, {only_quantity(coordinate): unit})
             jacobian[:, j] = [by.of(form) for form in constraint]
         return jacobian
 
     def _rate(self) -> Any:
         """Derive C_t from C."""
-        constraint, by_t = self.of("constraint"), Derivative(self.graph, {only(self.t): Affine(self.graph, 1.0, {})})
+        constraint, by_t = (
+            self.of("constraint"),
+            Derivative(self.graph, {only_quantity(self.t): Affine(self.graph, 1.0, {})}),
+        )
         return symbols(by_t.of(form) for form in constraint)
 
     def _gamma(self, rows: str, rates: str, v: Sequence[Affine]) -> Any:
         """Return -(dG/dt v + dG_t/dt) at constant v, the right-hand side of G a = gamma."""
-        moving = {only(coordinate): u for coordinate, u in zip(self.q, v, strict=True)}
-        along = Derivative(self.graph, {only(self.t): Affine(self.graph, 1.0, {}), **moving})
+        moving = {only_quantity(coordinate): u for coordinate, u in zip(self.q, v, strict=True)}
+        along = Derivative(self.graph, {only_quantity(self.t): Affine(self.graph, 1.0, {}), **moving})
         gamma = self.of(rates)
         for i, row in enumerate(self.of(rows)):
             total = along.of(gamma[i])
@@ -394,7 +397,7 @@ class Equations:
 
 
 def runs_on_symbols(system: ConstrainedSystem, kind: str, parameters: Any) -> bool:
-    """Return whether a compiled callback does not branch on its arguments, nor on parameters that vary."""
+    """Return whether a compiled callback can be traced: it branches neither on its arguments nor on Parameters."""
     equations = Equations(system, parameters)
     state = {"q": equations.q, "v": equations.v, "lam": equations.graph.inputs(system.n_c, True)}
     arrays = [symbols(state[name]) for name in KINDS[kind].state]
@@ -409,17 +412,17 @@ def runs_on_symbols(system: ConstrainedSystem, kind: str, parameters: Any) -> bo
     return True
 
 
-def only(form: Affine) -> int:
-    """Return the quantity of an expression that consists of one."""
+def only_quantity(form: Affine) -> int:
+    """Return the index of the quantity in an expression with a single term."""
     (place,) = form.terms
     return place
 
 
 Array = NDArray[np.float64]
-Gathered = tuple[Array, NDArray[np.int64], list[Powers]]
+ScaledProducts = tuple[Array, NDArray[np.int64], list[Powers]]  # entry i is scales[i] * products[indices[i]]
 Evaluator = Callable[[Any], Array]  # computes the numbers of an array of expressions for one system
 
-# range of the parameters with which callbacks are traced: of like size, so that no term hides another
+# callbacks are traced with random parameters in this range: of similar size, so that rounding hides no term
 GENERIC = 0.5, 1.5
 # parameters smaller than this, or larger than its inverse, keep their values: their powers would over- or underflow
 EXTREME = 1e-30
@@ -435,17 +438,17 @@ class TraceCache:
     parameters : ndarray (n_p,)
         Parameters of one of the systems.
     classes : ndarray of int (n_p,)
-        Class of each parameter: parameters of equal magnitude share a number from 1 on, negative for negative ones; 0:
-        it keeps its value.
+        Class of each parameter: parameters of equal magnitude share a number from 1 on, with a minus sign for negative
+        parameters. 0: the parameter keeps its value.
 
     Attributes
     ----------
     parameters : ndarray of float and Parameter (n_p,)
         Parameters with which callbacks are traced.
     traced : set of str
-        Kinds of callbacks that were traced: they write the same entries in all systems.
+        Kinds of callbacks that were traced: these callbacks write the same entries in all systems.
     within_bounds : set of str
-        Kinds among these whose bounds `check_bounds` has checked in one of the systems.
+        Those of them that `check_bounds` has checked in one of the systems.
     """
 
     def __init__(self, parameters: Array, classes: NDArray[np.int64]):
@@ -461,20 +464,20 @@ class TraceCache:
             self.parameters[place] = parameter if which > 0 else -parameter
         self.traced: set[str] = set()
         self.within_bounds: set[str] = set()
-        self._made: dict[Any, Any] = {}
-        # by id; the arrays are stored as well, so that ids are not reused
-        self._arrays: dict[int, tuple[Any, Gathered]] = {}
+        self._results: dict[Any, Any] = {}
+        # by id of an array; the array is stored as well, so that its id is not reused
+        self._arrays: dict[int, tuple[Any, ScaledProducts]] = {}
         self._tracing = RLock()  # one lock, as all traces record on one tape
 
     def equations(self, system: ConstrainedSystem) -> Equations:
-        """Return the traced callbacks; their graph can be extended."""
-        if system.called_in_python:  # a function may keep its arguments, so it is traced as late as possible
+        """Return the traced callbacks, with a graph of their own that may be extended."""
+        if system.called_in_python:  # such a function may store its arguments, so it is traced as late as possible
             return Equations(system, self.parameters)
         traced: Equations = self.remembered("equations", lambda: Equations(system, self.parameters).trace_all())
         return traced.copy()
 
     def numbers(self, parameters: Array) -> Array:
-        """Return the magnitudes of a system's parameters, one for each class."""
+        """Return the magnitude that the parameters of each class have in a system."""
         return np.abs(parameters[self._first])
 
     def products(self, parameters: Array) -> Callable[[Powers], Any]:
@@ -488,7 +491,7 @@ class TraceCache:
         def evaluate(array: Any) -> Array:
             if array.dtype != object:
                 return array
-            scales, places, products = self._gathered(array)
+            scales, places, products = self._scaled_products(array)
             with np.errstate(all="ignore"):
                 values: Array = scales * np.array(list(map(product, products)))[places]
             if not np.isfinite(values).all():  # an expression may divide by a sum of parameters that is zero
@@ -497,7 +500,7 @@ class TraceCache:
 
         return evaluate
 
-    def _gathered(self, array: Any) -> Gathered:
+    def _scaled_products(self, array: Any) -> ScaledProducts:
         """Return the scales of an array's entries, the indices of their products, and the products."""
         entry = self._arrays.get(id(array))
         if entry is None:
@@ -512,19 +515,19 @@ class TraceCache:
         return entry[1]
 
     def remembered(self, what: Any, make: Callable[[], Any]) -> Any:
-        """Return the result of `make` of the first call for this key."""
-        if what not in self._made:
+        """Return the cached result for the key `what`; `make` computes it at the first call."""
+        if what not in self._results:
             with self._tracing:
-                if what not in self._made:
-                    with garbage_collection_off():  # all of it stays in memory
-                        self._made[what] = make()
-        return self._made[what]
+                if what not in self._results:
+                    with garbage_collection_off():  # there is no garbage: everything stays in the cache
+                        self._results[what] = make()
+        return self._results[what]
 
 
 def derive_cached(
     system: ConstrainedSystem, what: Any, make: Callable[[TraceCache], Any], check: Callable[[Any], None]
 ) -> Any:
-    """Return what `make` derives from shared traces, for one system: the result of its method `of`.
+    """Return the object that `make` derives from shared traces, converted for one system by its method `of`.
 
     The system gets a trace of its own if callbacks cannot be traced with variable parameters, or if `check` refuses the
     result, as a callback may treat variable parameters differently from numbers.
@@ -549,7 +552,7 @@ def derive_cached(
 
 
 def _derived_for(system: ConstrainedSystem, cache: TraceCache, what: Any, make: Callable[[TraceCache], Any]) -> Any:
-    """Return the result for a system, or the exception that says why there is none."""
+    """Return the derived object for a system, or the exception that says why there is none."""
     try:
         shared = cache.remembered(what, partial(make, cache))
         return shared.of(system, system.remembered(("numbers", cache), partial(cache.evaluator, system.parameters)))
@@ -559,26 +562,26 @@ def _derived_for(system: ConstrainedSystem, cache: TraceCache, what: Any, make: 
         return Untraceable(f"what it makes of its parameters cannot be written down: {error}")
 
 
-def take_bounds(system: ConstrainedSystem) -> None:
-    """Copy the results of `check_bounds` for systems that share the traces, as their callbacks do the same."""
+def load_checked_bounds(system: ConstrainedSystem) -> None:
+    """Take over the results of `check_bounds` from systems with the same traces, whose callbacks do the same."""
     if not system.called_in_python:
         system.within_bounds |= shared_cache(system).within_bounds
 
 
-def give_bounds(system: ConstrainedSystem) -> None:
-    """Share the results of `check_bounds` for a system with those that have the same traces."""
+def share_checked_bounds(system: ConstrainedSystem) -> None:
+    """Share a system's results of `check_bounds` with the systems that have the same traces."""
     if not system.called_in_python:
         cache = shared_cache(system)
         cache.within_bounds |= cache.traced & system.within_bounds
 
 
 def shared_cache(system: ConstrainedSystem) -> TraceCache:
-    """Return the cached traces that a system of compiled callbacks shares with others."""
+    """Return the trace cache that a system of compiled callbacks shares with others, remembered by the system."""
     return system.remembered(("family", trace_cache_of), partial(trace_cache_of, system))  # type: ignore[no-any-return]
 
 
 def trace_cache_of(system: ConstrainedSystem) -> TraceCache:
-    """Look up the traces that a system of compiled callbacks shares with others."""
+    """Look up, or create, the trace cache that a system of compiled callbacks shares with others."""
     parameters = system.parameters
     classes = _classes(parameters)
     fixed = parameters[classes == 0] + 0.0  # without a sign of zero
@@ -590,12 +593,12 @@ def trace_cache_of(system: ConstrainedSystem) -> TraceCache:
 
 
 def _own_cache(system: ConstrainedSystem) -> TraceCache:
-    """Return traces for one system alone, with its parameters as plain numbers."""
+    """Return a trace cache for one system alone, with its parameters as plain numbers."""
     return TraceCache(system.parameters, np.zeros(system.parameters.size, dtype=np.int64))
 
 
 def _classes(parameters: Array) -> NDArray[np.int64]:
-    """Number the magnitudes of parameters in order of appearance, with the signs; 0: it keeps its value."""
+    """Return the class of each parameter, see `TraceCache`; classes are numbered in order of appearance."""
     size = np.abs(parameters)
     varies = (size > EXTREME) & (size < 1.0 / EXTREME) & (size != np.floor(size))
     _, first, which = np.unique(size[varies], return_index=True, return_inverse=True)
@@ -609,16 +612,16 @@ def _classes(parameters: Array) -> NDArray[np.int64]:
 class ParameterArrays:
     """Arrays of numbers for arrays of expressions in parameters; `write` evaluates all of them at once.
 
-    The same array of expressions always gets the same array of numbers. An array of plain numbers stays itself.
+    The same array of expressions always gets the same array of numbers. An array of plain numbers is used as it is.
     """
 
     def __init__(self) -> None:
-        # by id; the arrays are stored as well, so that ids are not reused
+        # by id of an array; the array is stored as well, so that its id is not reused
         self._arrays: dict[int, tuple[Any, Array]] = {}
         self._places: list[tuple[Array, NDArray[np.int64], slice]] = []
         self._products: dict[Powers, int] = {}
         self._scales: list[float] = []
-        self._which: list[int] = []
+        self._product_of: list[int] = []
         self._gathered: tuple[list[Powers], Array, NDArray[np.int64]] | None = None
 
     def array(self, expressions: Any) -> Array:
@@ -634,19 +637,19 @@ class ParameterArrays:
         where = [k for k, entry in enumerate(entries) if type(entry) is Parameter]
         for k in where:
             self._scales.append(entries[k].scale)
-            self._which.append(self._products.setdefault(entries[k].powers, len(self._products)))
+            self._product_of.append(self._products.setdefault(entries[k].powers, len(self._products)))
             entries[k] = 0.0
         numbers = np.array(entries, dtype=np.float64)
         self._places.append((numbers, np.array(where, dtype=np.int64), slice(begin, len(self._scales))))
-        self._gathered = list(self._products), np.array(self._scales), np.array(self._which, dtype=np.int64)
+        self._gathered = list(self._products), np.array(self._scales), np.array(self._product_of, dtype=np.int64)
         return numbers.reshape(expressions.shape)
 
     def write(self, product: Callable[[Powers], Any]) -> None:
         """Write the numbers for the parameters of `product`, see TraceCache.products."""
         if self._gathered is None:
             return
-        products, scales, which = self._gathered
+        products, scales, product_of = self._gathered
         with np.errstate(all="ignore"):
-            values = scales * np.array(list(map(product, products)), dtype=np.float64)[which]
+            values = scales * np.array(list(map(product, products)), dtype=np.float64)[product_of]
         for numbers, where, part in self._places:
             numbers[where] = values[part]

@@ -1,8 +1,8 @@
-"""Compare traced callbacks in numbers with what they return when they are called.
+"""Compare the values of traces with the values that calls of the callbacks return.
 
 A trace is wrong if the callback branches undetected, keeps something from call to call, or reads data that change and
-are not its arguments (a global that numba froze when it compiled it). Before a run, both are compared at states near
-the start and at times spread over the run; later at states of the run itself.
+are not its arguments (a global variable that numba froze when it compiled the callback). Before a run, values are
+compared at states near the start and at times spread over the run; later at states of the run itself.
 """
 
 import copy
@@ -28,23 +28,22 @@ KINDS = (
     *("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma"),
     *("nonholonomic", "nonholonomic_rate", "nonholonomic_gamma"),
 )
-AROUND = 8  # number of random states near the start at which traces are compared, beside the start
-TIMES = np.linspace(0.0, 1.0, AROUND)  # their times, as shares of the run
-AWAY = 0.3  # their distance from the start, as a share of the size of coordinates
-EACH, MOST = 32, 64  # largest number of states of a chunk of a run, and of a whole run ...
-FEW = 9  # ... and of a run whose callbacks are called in Python
-ENTRIES = 20_000  # entries of callbacks compared in a run, about: large systems are compared at fewer states
+N_NEARBY = 8  # number of random states near the start at which traces are compared, besides the start
+TIMES = np.linspace(0.0, 1.0, N_NEARBY)  # times of these states, as shares of the run
+DISTANCE = 0.3  # distance of these states from the start, relative to the size of coordinates
+# largest number of states that are compared: of a chunk of a run, of a run, of a run with callbacks called in Python
+MAX_OF_CHUNK, MAX_STATES, MAX_IN_PYTHON = 32, 64, 9
+MAX_ENTRIES = 20_000  # approximate limit of the entries compared in a run: large systems are compared at fewer states
 LOST = 16.0 * np.finfo(float).eps  # relative to the largest term of a kind: a smaller difference is rounding
 # relative to the largest term: a smaller difference counts only if it is the same at neighbouring states, ...
 CLEAR = 1e-6
-NEXT = 1e-7  # ... which differ by this relative change
-NEIGHBOURS = 12
-MARGIN = 0.01  # margin of a CheckedRegion, as a share of its sides; small beside the distance between states of a run
-AT_REST = 1e-9  # margin relative to the longest side (time excluded): for coordinates at rest
+PERTURBATION, N_NEIGHBOURS = 1e-7, 12  # ... which are this many states, perturbed by this relative change
+MARGIN = 0.01  # margin of a CheckedRegion relative to its sides; small compared with the steps of a run
+MARGIN_AT_REST = 1e-9  # margin relative to the longest side (without time), for coordinates at rest
 
 
 class Traced:
-    """Traced callbacks as an operation table, to be compared with calls of the callbacks.
+    """Operation table of traced callbacks, to be compared with calls of the callbacks.
 
     Parameters
     ----------
@@ -52,7 +51,7 @@ class Traced:
     graph : Graph
         The graph of the trace, whose first inputs are t, q and v.
     forms : mapping or None
-        Results of the callbacks as traced, by kind. None: the traces of the callbacks that the system has.
+        Traced results by kind of callback. None: the traces in `graph` of the callbacks that the system has.
     """
 
     def __init__(self, system: ConstrainedSystem, graph: Graph, forms: Mapping[str, Any] | None = None):
@@ -60,58 +59,59 @@ class Traced:
             forms = {kind: results for kind, results in graph.traced.items() if kind in system.given}
         kinds = [kind for kind in KINDS if kind in forms and forms[kind].size]
         self.places = [(kind, place) for kind in kinds for place in np.ndindex(forms[kind].shape)]
-        self.n_of = np.array([forms[kind].size for kind in kinds], dtype=np.int64)
-        self.which = np.array([kind in kinds for kind in KINDS], dtype=np.int64)
+        self.n_entries = np.array([forms[kind].size for kind in kinds], dtype=np.int64)
+        self.is_compared = np.array([kind in kinds for kind in KINDS], dtype=np.int64)
         self.sizes = np.array([system.n_q, system.n_c, system.n_a], dtype=np.int64)
         self.name = system.name
-        self.kinds = frozenset(graph.traced)  # kinds that were traced
+        self.kinds = frozenset(graph.traced)  # all kinds of callbacks that were traced, compared or not
         self.trusted = False
         entries = (forms[kind][place] for kind, place in self.places)
         # entries that are always zero need no comparison
         results = {k: form for k, form in enumerate(entries) if form.terms or form.constant}
-        self.not_zero = frozenset(self.places[k][0] for k in results)  # kinds of callbacks that are not all zero
+        self.nonzero_kinds = frozenset(self.places[k][0] for k in results)
         self.program = OperationTable.of(graph, 1 + 2 * system.n_q, results)
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Traced":
-        """Return the traces of another system of the same cache, with the numbers of its parameters."""
+        """Return the traces for another system of the same cache, with coefficients for its parameters."""
         traced = self.with_numbers(evaluate)
         traced.name = system.name
         return traced
 
     def with_numbers(self, numbers_for: Callable[[Any], Array]) -> "Traced":
-        """Return a copy with other numbers in the operation table; it is not trusted yet."""
+        """Return a copy, not trusted yet, whose operation table has other coefficients."""
         traced = copy.copy(self)
         traced.program = self.program.with_numbers(numbers_for)
         traced.trusted = False
         return traced
 
     def refuse(self, system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:
-        """Compare calls and traces at states near the start of a run, see `refuse_wrong`."""
+        """Compare calls and traces at states near the start of a run; raise Untraceable if they differ."""
         refuse_wrong([self], system, t0, t1, q, v)
 
-    def check_around(self, system: ConstrainedSystem, around: Array) -> None:
+    def check_near_start(self, system: ConstrainedSystem, nearby: Array) -> None:
         """Compare calls and traces at states whose first row is the start; raise Untraceable if they differ."""
-        wrong = None
-        for states in (around, *around[:, None, :]):  # all at once; one by one if a call raises
+        difference = None
+        for states in (nearby, *nearby[:, None, :]):  # all at once; one by one if a call raises
             try:
-                wrong = wrong or self.wrong(system, states, everywhere=False)
+                difference = difference or self.difference(system, states, everywhere=False)
             except Exception:  # the state is outside the domain of the callbacks
                 continue
-            if states is around:
+            if states is nearby:
                 break
-        if wrong is not None:
-            raise Untraceable(wrong)
+        if difference is not None:
+            raise Untraceable(difference)
         self.trusted = not system.called_in_python  # compiled callbacks never change
 
-    def wrong(self, system: ConstrainedSystem, states: Array, everywhere: bool = True) -> str | None:
+    def difference(self, system: ConstrainedSystem, states: Array, everywhere: bool = True) -> str | None:
         """Describe the first difference between calls and traces at states [t, q, v]; None if there is none.
 
-        `everywhere`: states at which a call is not finite count, too: the trace must not be finite there either.
+        `everywhere`: where a call returns a value that is not finite, the trace must not be finite either. Otherwise
+        such values are not compared.
         """
         from twoloop.kernels.evaluation import checks as kernels
 
-        most = FEW if system.called_in_python else MOST
-        states = states[:: 1 + max(len(states) // most, len(states) * len(self.places) // ENTRIES)]
+        most = MAX_IN_PYTHON if system.called_in_python else MAX_STATES
+        states = states[:: 1 + max(len(states) // most, len(states) * len(self.places) // MAX_ENTRIES)]
         n_different, called, traced, bounds = self._evaluate(system, states)
         if n_different == 0:
             return None
@@ -126,9 +126,9 @@ class Traced:
             same |= ~finite
         largest = np.where(np.isfinite(bounds), bounds, 0.0).max(axis=0)
         # the largest term of the kind of each entry
-        size = np.repeat(np.maximum.reduceat(largest, np.cumsum(self.n_of) - self.n_of), self.n_of)
+        size = np.repeat(np.maximum.reduceat(largest, np.cumsum(self.n_entries) - self.n_entries), self.n_entries)
         for k, entry in np.argwhere(~same & ~(off <= LOST * size)):
-            if not off[k, entry] <= CLEAR * size[entry] or self._stays(system, states[k], int(entry)):
+            if not off[k, entry] <= CLEAR * size[entry] or self._is_systematic(system, states[k], int(entry)):
                 return self._message(states[k], int(entry), called[k, entry], traced[k, entry])
         return None
 
@@ -139,7 +139,7 @@ class Traced:
         n_different = entry_point(kernels.compare)(
             system.kit,
             self.sizes,
-            self.which,
+            self.is_compared,
             np.ascontiguousarray(states),
             *self.program[:-1],
             np.zeros((2, self.program.n_nodes)),
@@ -149,10 +149,10 @@ class Traced:
         )
         return n_different, called, traced, bounds
 
-    def _stays(self, system: ConstrainedSystem, state: Array, entry: int) -> bool:
-        """Return whether a difference is about the same at neighbouring states; rounding errors are not."""
-        parts = np.random.default_rng(5).uniform(-1.0, 1.0, (NEIGHBOURS, len(state)))
-        _, called, traced, _ = self._evaluate(system, state * (1.0 + NEXT * parts))
+    def _is_systematic(self, system: ConstrainedSystem, state: Array, entry: int) -> bool:
+        """Return whether a difference is about the same at neighbouring states, as rounding errors would not be."""
+        parts = np.random.default_rng(5).uniform(-1.0, 1.0, (N_NEIGHBOURS, len(state)))
+        _, called, traced, _ = self._evaluate(system, state * (1.0 + PERTURBATION * parts))
         off = (called - traced)[:, entry]
         return bool(np.abs(off).min() > 0.5 * np.abs(off).max() and np.abs(off.sum()) == np.abs(off).sum())
 
@@ -168,25 +168,25 @@ class Traced:
 
 
 class Sample:
-    """A sample of the states [t, q, v] of a run, from its start to its present time."""
+    """Sample of the states [t, q, v] of a run, from its start to its present time."""
 
     def __init__(self, t: float, state: Array, n: int) -> None:
         self._n, self._parts = n, list[Array]()
         self.add(state[:0], state[None, :][:0], t, state)
 
     def add(self, t: Array, rows: Array, end: float, state: Array) -> None:
-        """Add states of a chunk of the run, whose rows begin with [q, v], and its last state."""
-        stride = 1 + len(t) // EACH
+        """Add a selection of the states of a chunk (times `t`, rows that begin with [q, v]), and its last state."""
+        stride = 1 + len(t) // MAX_OF_CHUNK
         some = t[::stride]
         part = np.empty((len(some) + 1, 1 + self._n))
         part[0, 0], part[0, 1:] = end, state[: self._n]
         part[:0:-1, 0], part[:0:-1, 1:] = some, rows[::stride, : self._n]
         self._parts.insert(0, part)
-        if len(self._parts) > MOST:
+        if len(self._parts) > MAX_STATES:
             self._parts = self._parts[::2]
 
     def end(self, t: float, state: Array) -> None:
-        """Drop states after a time, and add the state at that time."""
+        """Drop the states after the time at which a run ended, and add the state at that time."""
         states = self.states()
         self._parts = [states[states[:, 0] <= t]]
         self.add(states[:0, 0], states[:0], t, state)
@@ -209,38 +209,38 @@ def refuse_wrong(traced: Sequence[Traced], system: ConstrainedSystem, t0: float,
         return
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
-        around = states_around(t0, t1, q, v)
+        nearby = states_near_start(t0, t1, q, v)
         for each in new:
-            each.check_around(system, around)
+            each.check_near_start(system, nearby)
 
 
 Check = Callable[[Traced], None]
 
 
 def unchecked(traced: Traced) -> None:
-    """Accept traces without a comparison, as no run uses their results."""
+    """Accept traces without a comparison: for callers whose results enter no run."""
 
 
-def states_around(t0: float, t1: float, q: Array, v: Array) -> Array:
+def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:
     """Return the start [t, q, v], and random states near it at times spread over the run."""
     size = sizes(q)
     speed = np.maximum(size, np.abs(v))
     n, parts = len(q), _parts(len(q))
-    states = np.empty((1 + AROUND, 1 + 2 * n))
+    states = np.empty((1 + N_NEARBY, 1 + 2 * n))
     states[0, 0], states[0, 1 : 1 + n], states[0, 1 + n :] = t0, q, v
     states[1:, 0] = t0 + (t1 - t0) * TIMES
-    states[1:, 1 : 1 + n] = q + AWAY * size * parts[0]
+    states[1:, 1 : 1 + n] = q + DISTANCE * size * parts[0]
     states[1:, 1 + n :] = speed * parts[1]
     return states
 
 
 @cache
 def _parts(n_q: int) -> Array:
-    """Return fixed random numbers between -1 and 1, (2, AROUND, n_q)."""
-    return np.random.default_rng(6).uniform(-1.0, 1.0, (2, AROUND, n_q))
+    """Return fixed random numbers between -1 and 1, (2, N_NEARBY, n_q)."""
+    return np.random.default_rng(6).uniform(-1.0, 1.0, (2, N_NEARBY, n_q))
 
 
-def farthest(t: Array, rows: Array) -> Array:
+def extreme_states(t: Array, rows: Array) -> Array:
     """Return the states [t, q, v] of a run at which a component is smallest or largest; `rows` are [q, v]."""
     states = np.column_stack([t, rows])
     return states[np.unique([states.argmin(axis=0), states.argmax(axis=0)])]
@@ -251,50 +251,50 @@ class CheckedRegion:
 
     Attributes
     ----------
-    known : ndarray (2, 1 + 2 n_q) or (2, 0)
-        Least and largest components of the states that need no new comparison.
+    bounds : ndarray (2, 1 + 2 n_q) or (2, 0)
+        Smallest and largest components of the states that need no new comparison: the box with its margin.
     """
 
     def __init__(self) -> None:
         self._runs = 0
-        self._parameters: tuple[Array, Array] | None = None  # least and largest parameters of runs of many systems
-        self._box = np.zeros((2, 0))  # least and largest value of each component
-        self.known = self._box
+        self._parameters: tuple[Array, Array] | None = None  # smallest and largest parameters, by component
+        self._box = np.zeros((2, 0))  # smallest and largest value of each component of the states
+        self.bounds = self._box
 
     def is_due(self) -> bool:
-        """Return whether the next run must compare at all its states; it is for the runs 1, 2, 4, 8, ..."""
+        """Return whether the next run must compare at all its states: this holds for the runs 1, 2, 4, 8, ..."""
         return (self._runs + 1) & self._runs == 0
 
     def count(self) -> None:
         """Count one more run."""
         self._runs += 1
 
-    def without_known(self, states: Array) -> Array:
-        """Return the states outside the region, with its margin."""
+    def states_outside(self, states: Array) -> Array:
+        """Return the states outside the region and its margin."""
         if not self._box.size:
             return states
-        least, largest = self.known
+        least, largest = self.bounds
         new = (states < least) | (states > largest)
         return states[new.any(axis=1)] if new.any() else states[:0]
 
-    def knows(self, parameters: Array) -> bool:
-        """Return whether parameters lie in the region, with its margin."""
+    def contains_parameters(self, parameters: Array) -> bool:
+        """Return whether parameters lie in the region or its margin."""
         if self._parameters is None:
             return False
         least, largest = self._parameters
-        beside = MARGIN * (largest - least)
-        return bool((least - beside <= parameters).all() and (parameters <= largest + beside).all())
+        margin = MARGIN * (largest - least)
+        return bool((least - margin <= parameters).all() and (parameters <= largest + margin).all())
 
     def add_parameters(self, parameters: Array) -> None:
-        """Extend the region by the parameters of a run without differences."""
+        """Extend the region by the parameters of a run in which calls and traces agreed."""
         least, largest = self._parameters or (parameters, parameters)
         self._parameters = np.minimum(least, parameters), np.maximum(largest, parameters)
 
     def add(self, states: Array) -> None:
-        """Extend the region by states of a run without differences."""
+        """Extend the region by states at which calls and traces agreed."""
         if len(states) == 0:
             return
         checked = np.concatenate([states, self._box]) if self._box.size else states
         least, largest = self._box = np.array([checked.min(axis=0), checked.max(axis=0)])
-        beside = MARGIN * (largest - least) + AT_REST * float((largest - least)[1:].max())
-        self.known = np.array([least - beside, largest + beside])
+        margin = MARGIN * (largest - least) + MARGIN_AT_REST * float((largest - least)[1:].max())
+        self.bounds = np.array([least - margin, largest + margin])

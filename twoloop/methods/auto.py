@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass, replace
 
-from twoloop.generate.collocation_code import suits
+from twoloop.generate.collocation_code import compiles_quickly
 from twoloop.generate.compile_equations import GeneratedCode
 from twoloop.generate.graph import Untraceable
 from twoloop.generate.series import is_quick, series_for
-from twoloop.generate.time_dependence import may_be_narrow
+from twoloop.generate.time_dependence import may_be_steep
 from twoloop.generate.traced_values import Check, unchecked
 from twoloop.methods.lobatto import Lobatto16
 from twoloop.methods.plan import Method, Plan, kept_plan, least_tolerance
@@ -166,7 +166,7 @@ class Auto:
         sparse = len(system.entries) == 2 and system.n_a == 0
         chosen = replace(self, n_rows=system.n_c + system.n_a, series=None, lanes=None, sparse=sparse)
         if code is not None:
-            lanes = self.lanes if suits(code.shared) else None
+            lanes = self.lanes if compiles_quickly(code.shared) else None
             lanes = None if lanes is None else lanes.for_system(system, code)
             chosen = replace(chosen, lanes=lanes, dearer=_dearer(system))
         plain = code is None and (system.called_in_python or not is_quick(system))
@@ -176,7 +176,7 @@ class Auto:
             series = self.series.for_system(system, code, check)
         except ValueError:
             return chosen
-        return replace(chosen, series=series, narrow=may_be_narrow(system, ran_on_symbols=True))
+        return replace(chosen, series=series, narrow=may_be_steep(system, ran_on_symbols=True))
 
     def _series_pays(self, n_q: int, tolerance: float) -> bool:
         """Return whether a step of the series costs less than the steps that it replaces."""

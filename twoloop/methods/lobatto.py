@@ -5,9 +5,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from twoloop.generate.collocation_code import compiled_collocation, suits, tables
+from twoloop.generate.collocation_code import compiled_collocation, compiles_quickly, tables
 from twoloop.generate.compile_equations import GeneratedCode
-from twoloop.generate.time_dependence import may_be_narrow
+from twoloop.generate.time_dependence import may_be_steep
 from twoloop.generate.traced_values import Check, unchecked
 from twoloop.kernels.data.collocation import ORDER
 from twoloop.methods.dop853 import DOP853
@@ -66,12 +66,12 @@ class Lobatto16:
         ValueError
             If there is no code for it, or it is too long.
         """
-        if code is None or not suits(code.shared):
+        if code is None or not compiles_quickly(code.shared):
             raise ValueError(
                 f"method='Lobatto16' needs code made for {system.name!r}, whose equations are too long. "
                 "Take method='auto'"
             )
-        return replace(self, code=code, narrow=may_be_narrow(system, ran_on_symbols=True))
+        return replace(self, code=code, narrow=may_be_steep(system, ran_on_symbols=True))
 
     def takes_code(self, fixed: bool) -> bool:
         """Return whether its steps may call generated code."""

@@ -382,7 +382,7 @@ class _Checker:
         max_attempts = MAX_ATTEMPTS + MAX_ATTEMPTS_PER_STEP * (
             int(self.n_steps[i:j].sum()) + int((t1 - t0) / self.longest)
         )
-        rerun = remaker.to(t0, start, times, max_attempts if looser == 1.0 else MAX_ATTEMPTS)
+        rerun = remaker.integrate(t0, start, times, max_attempts if looser == 1.0 else MAX_ATTEMPTS)
         self.handlers.check()
         if rerun is not None:
             self.gap = max(self.gap, rerun.longest * remaker.spacing)

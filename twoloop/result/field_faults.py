@@ -114,7 +114,7 @@ def _accelerations(result: Record, system: ConstrainedSystem, rtol: float, atol:
     first = np.concatenate([states[0], np.zeros(n)])
     ranks = ranks_at(system, float(t[0]), states[0, :n], states[0, n:], rtol)
     interpolator = Interpolator(system, float(t[0]), first, rtol, atol, ranks)
-    interpolator.tells = False
+    interpolator.warns = False
 
     def evaluated(times: Array, rows: Array) -> Array:
         out = np.full(stored.shape, np.nan)

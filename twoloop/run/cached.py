@@ -1,8 +1,8 @@
-"""Cached integrators: a call with the options of an earlier one reuses its plan, code, arrays and checks.
+"""Cache integrators: a call with the same options as an earlier one reuses its plan, code, arrays and checks.
 
 `CachedIntegrator` calls `start_and_advance` of kernels/cached_run.py, which checks the start and makes a first chunk of
-steps. If that reaches the end and nothing unusual happens, the fields of the result are deferred. Otherwise
-`IntegrationLoop` continues the run.
+steps. If the chunk reaches the end and nothing unusual happens, the fields of the result are computed when they are
+read. Otherwise `IntegrationLoop` continues the run.
 """
 
 import time
@@ -21,8 +21,8 @@ from twoloop.checks.structure import has_definite_mass
 from twoloop.generate.compile_equations import GeneratedCode
 from twoloop.generate.derived_callbacks import exact_near, with_derived_callbacks
 from twoloop.generate.elimination import BOUNDS, LEAST, RANK, SINGULAR_MASS, Choice, Dependents
-from twoloop.generate.trace import TraceCache, give_bounds, take_bounds, trace_cache_of
-from twoloop.generate.traced_values import Sample, Traced, farthest, states_around
+from twoloop.generate.trace import TraceCache, load_checked_bounds, share_checked_bounds, trace_cache_of
+from twoloop.generate.traced_values import Sample, Traced, extreme_states, states_near_start
 from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.control.loop_state import N_STEP_COLUMNS
 from twoloop.kernels.data import indices
@@ -33,7 +33,7 @@ from twoloop.kernels.linalg.band import lapack_addresses
 from twoloop.methods.presets import code_for, identity, may_have_code, plans_for
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.dense_solution import DenseSolution, OutputInterpolation, Table, interpolator_of
-from twoloop.run.fallbacks import WITHIN, closer, may_have_missed_changes
+from twoloop.run.fallbacks import WITHIN, closer_sampling, may_have_missed_changes
 from twoloop.run.loop import NO_KINDS, IntegrationLoop, Interrupts, silent
 from twoloop.run.messages import describe_arrival
 from twoloop.run.options import Options
@@ -65,17 +65,17 @@ from twoloop.run.workspace import GAMMA_ACCURACY, sparse_factors_pay
 
 Array = NDArray[np.float64]
 
-MOST_WAITING = 4  # largest number of idle integrators of equal options, one per thread
-FIRST_CHUNKS = 4  # chunks in the first call, if no states are sampled between them: Ctrl-C is answered within 0.1 s
+MAX_IDLE = 4  # largest number of idle integrators with equal options; each thread takes one
+FIRST_CHUNKS = 4  # length of the first call in chunks, if no states are sampled: Ctrl-C is answered within 0.1 s
 AFTER_ERROR = 16  # number of calls that skip an integrator after a callback raised in it
-LATER = (*OF_STEPS, "stats")  # fields that are computed separately from the others
-OTHERS = {name: value for name, value in DEFAULTS.items() if name not in LATER}
-SHORT = 1e-3  # s of CPU time of the last run; below it the elapsed time is measured, which takes less time to read
+STEP_FIELDS = (*OF_STEPS, "stats")  # fields that are computed separately from the others
+OTHER_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
+SHORT_RUN = 1e-3  # CPU time of a run, s, below which elapsed time is measured instead: that clock is faster to read
 REACHED_END = Status.REACHED_END  # a global name, because looking it up in the enumeration takes longer
 
 
 class Output(NamedTuple):
-    """Requested states: at all steps, or at times, which may be the ends of the run alone; and if `sol` is wanted."""
+    """Requested output: states at all steps (`times` is None), at times, or at the ends alone; `dense`: also `sol`."""
 
     times: Array | None
     at_ends: bool
@@ -84,11 +84,11 @@ class Output(NamedTuple):
 
     @property
     def between(self) -> Array | None:
-        """Output times between steps, or None."""
+        """Output times at which states must be interpolated, or None."""
         return None if self.at_ends else self.times
 
-    def wanted(self, run: Run) -> OutputRequest:
-        """Return the output that `IntegrationLoop` has to record."""
+    def request(self, run: Run) -> OutputRequest:
+        """Return the request for the output that `IntegrationLoop` has to record."""
         return OutputRequest(self.times, self.at_ends or run.lands, self.dense, None, MemoryStore())
 
 
@@ -96,7 +96,7 @@ STEPS = Output(None, False, False, None)
 
 
 @dataclass(frozen=True)
-class Missed:
+class MissedChanges:
     """Request to repeat a run that may have missed short changes, with evaluations at most `every` seconds apart."""
 
     every: float
@@ -104,21 +104,21 @@ class Missed:
 
 
 class CachedIntegrator:
-    """Integrator that reuses one plan and the same arrays for start after start.
+    """Integrator that reuses one plan and the same arrays for many starts, one after another.
 
     Parameters
     ----------
     run : Run
-        A run at its start; the integrator takes it over.
+        A run at its start, which belongs to the integrator from now on.
     system : ConstrainedSystem
-        System of the call: `run.system` may be another, with derived callbacks.
+        System of the call; `run.system` may be a copy of it with derived callbacks.
     code : GeneratedCode or None
-        The machine code that its plan calls.
+        The machine code that the plan of the run calls.
     definite : bool
-        Whether M has an inverse at its start.
+        Whether M has an inverse at the start.
     options : Options
     shared : SharedSetup or None
-        Setup shared by systems of other parameters, for which the integrator then serves, too.
+        Setup for systems with other parameters, if the integrator is to serve these, too.
     """
 
     def __init__(
@@ -134,11 +134,11 @@ class CachedIntegrator:
         self.run, self.options, self.check_derivatives = run, options, (checks := options.check_derivatives)
         self.region = run.region = checked_region_of(run, checks) if shared is None else shared.region(checks)
         run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, (room := first_chunk(run))
-        looked = system if self.parametric is None else self.parametric.system
-        self.look, self.loops, self.skips = Look(looked), cached_run(), 0
-        self.arrays, self.given = arrays_of(run, self.look, code, definite, options, room), looked.kit
+        checked = system if self.parametric is None else self.parametric.system
+        self.look, self.loops, self.skips = Look(checked), cached_run(), 0
+        self.arrays, self.given = arrays_of(run, self.look, code, definite, options, room), checked.kit
         self._start_and_advance = entry_point(self.loops.start_and_advance)
-        # indices in the block: the beginning of the states, and of the report of a run that has only one state
+        # indices in `arrays.block`: the beginning of the states, and of the report of a run with a single state
         self.states_from, self.width = self.arrays.report.size, len(run.state)
         self.one_state_from = self.states_from - self.loops.N_HEAD - 1
         self.moved = False  # whether `IntegrationLoop` may have changed attributes of `run` that are not arrays
@@ -146,21 +146,20 @@ class CachedIntegrator:
         self.form, self.cpu_time = run.kit.flags[FORM], np.inf  # CPU time of the last run, s
         self.between = OutputInterpolation(run)
         self.of_run = run.rank, run.redundant, bool(run.plan.own)
-        self.counted = self.arrays.start_rows.tobytes()  # the independent rows for which `of_run` was computed
-        self.dependent = {self.counted: (run.redundant, run.rows_warning)}
+        self.independent = self.arrays.start_rows.tobytes()  # the independent rows for which `of_run` was computed
+        self.redundancy = {self.independent: (run.redundant, run.rows_warning)}
 
     @staticmethod
-    def suits(run: Run) -> bool:
+    def can_start(run: Run) -> bool:
         """Return whether the compiled loop can start this run: in the dense form, at a start without warnings."""
         return run.static is None and not run.start_warning and not run.system.called_in_python
 
     @staticmethod
-    def gives(run: Run, output: Output, shared: SharedSetup | None) -> bool:
-        """Return whether arrays that are reused from start to start can give an output."""
+    def can_provide(run: Run, output: Output, shared: SharedSetup | None) -> bool:
+        """Return whether an integrator that reuses its arrays can provide an output."""
+        # sol and output must have the same states within steps; a shared setup will get other parameters
         if output.dense and (output.between is not None or shared is not None):
-            return (
-                False  # sol and output must have the same states within steps; a shared setup will get other parameters
-            )
+            return False
         return output.between is None or not (run.lands or run.kit.flags[FORM] == indices.AUGMENTED)
 
     def integrate(
@@ -172,11 +171,11 @@ class CachedIntegrator:
         v0: Array,
         output: Output,
         interrupts: Interrupts,
-    ) -> dict[str, Any] | Missed | None:
+    ) -> dict[str, Any] | MissedChanges | None:
         """Integrate a system from a start, and return the fields of the result.
 
-        Return None if the start must be checked more closely, or if a callback raised: `set_up` then describes what is
-        wrong. If nothing unusual happened, the fields are deferred: computed on access, from a copy of the arrays.
+        Return None if the start must be checked more closely, or if a callback raised: `set_up` then describes the
+        problem. If nothing unusual happened, the fields are computed when they are read, from a copy of the arrays.
         """
         run, region, arrays, loops, parametric = self.run, self.region, self.arrays, self.loops, self.parametric
         due = region.is_due()
@@ -184,30 +183,30 @@ class CachedIntegrator:
             self.skips -= 1
             return None
         if parametric is not None:
-            if parametric.take(system):
+            if parametric.use(system):
                 self.look.system, arrays.last_start[loops.N_EQUAL] = parametric.system, loops.NEVER
         elif self.check_derivatives and not system.checked:
             return None
         if self.moved:
             self._return_to_start()
         run.t0 = t0
-        kit, work, sizes, box = run.kit.address, run.work.address, self.look.sizes(), region.known
+        kit, work, sizes, box = run.kit.address, run.work.address, self.look.sizes(), region.bounds
         start = kit, self.given.address, work, arrays.address, t0, t1, q0, v0, sizes, box
-        clock = time.perf_counter if self.cpu_time < SHORT else time.process_time
+        clock = time.perf_counter if self.cpu_time < SHORT_RUN else time.process_time
         began = clock()
         try:
             n = self._start_and_advance(*start, False)
             if n == loops.IN_DOUBT and self.look.is_surely(0, t0, q0, v0):
                 n = self._start_and_advance(*start, True)
-        except Exception:  # raised by a callback: the loop handles it
+        except Exception:  # raised by a callback: `IntegrationLoop` will handle it
             self.skips, arrays.last_start[loops.N_EQUAL] = AFTER_ERROR, loops.NEVER
             return None
         self.cpu_time = clock() - began
         fields: dict[str, Any] = {"status": REACHED_END}
-        n_rows, at_times = n, None  # a row a step, unless `_finish` counts them
-        others = run.rows_warning != "" and arrays.start_rows.tobytes() != self.counted
+        n_rows, at_times = n, None  # one row for each step, unless `_finish` counts them
+        other_rows = run.rows_warning != "" and arrays.start_rows.tobytes() != self.independent
         all_steps = output.times is None and not output.dense
-        if n < 0 or others or due or not all_steps or parametric is not None:
+        if n < 0 or other_rows or due or not all_steps or parametric is not None:
             if n in (loops.IN_DOUBT, loops.REFUSED):
                 return None
             interrupts.listen()
@@ -232,11 +231,11 @@ class CachedIntegrator:
         interrupts: Interrupts,
         due: bool,
         fields: dict[str, Any],
-    ) -> dict[str, Any] | Missed | tuple[tuple[Array, Array] | None] | None:
-        """Check the first chunk of a run, and integrate to the end if that is not its last chunk.
+    ) -> dict[str, Any] | MissedChanges | tuple[tuple[Array, Array] | None] | None:
+        """Check the first chunk of a run, and integrate to the end if the run has further chunks.
 
-        Return all fields of a run in which something happened, or else what the deferred fields need: a tuple of the
-        output times and the rows there, or of None for all steps. `fields` gets `sol`.
+        Return all fields of an unusual run. Of other runs return a tuple for the deferred fields, whose only element
+        is (output times, rows), or None for all steps; `sol` is added to `fields`. Return None like `integrate`.
         """
         run, arrays, loops = self.run, self.arrays, self.loops
         n_rows, n_steps = arrays.filled.tolist()
@@ -245,17 +244,17 @@ class CachedIntegrator:
         t, rows, steps = arrays.t[: 1 + n_rows], arrays.states[: 1 + n_rows], arrays.steps[:n_steps]
         if report[loops.IS_NEW]:
             run.compared_until[0] = -np.inf
-            if not self._agrees(t1, q0, v0):
+            if not self._check_new_start(t1, q0, v0):
                 arrays.last_start[loops.N_EQUAL] = loops.NEVER
                 return None
         if report[loops.CODE] != run.a.ALL_OUTPUT_DONE or not report[loops.PLAIN]:
             self.moved = True
-            arguments = output.wanted(run), silent, output.time_limit, interrupts, False
+            arguments = output.request(run), silent, output.time_limit, interrupts, False
             loop = IntegrationLoop(run, t1, *arguments, start=rows[0], system=system)
             loop.resume(int(report[loops.CODE]), t[1:], rows[1:], steps, self.cpu_time)
             record = loop.to_end(self.check_derivatives)
             if record.status >= 0 and may_have_missed_changes(run):
-                return Missed(closer(run), record.stats.cpu_time)
+                return MissedChanges(closer_sampling(run), record.stats.cpu_time)
             return fields_of(record, self.options, system, self.of_run[-1], t1)
         at_times = None
         kinds = interval_kinds(run, steps) if output.dense or output.between is not None else NO_KINDS
@@ -263,7 +262,7 @@ class CachedIntegrator:
             began = time.process_time()
             self.between.find(output.between, t, rows, kinds, self.look.pattern)
             self.cpu_time += time.process_time() - began
-        if not self._compared(t, rows, t1, bool(report[loops.INSIDE]), due):
+        if not self._compare_callbacks(t, rows, t1, bool(report[loops.INSIDE]), due):
             arrays.last_start[loops.N_EQUAL] = loops.NEVER
             return None
         if output.dense:
@@ -277,18 +276,18 @@ class CachedIntegrator:
             at_times = output.times.copy(), states
         return (at_times,)
 
-    def _agrees(self, t1: float, q0: Array, v0: Array) -> bool:
-        """Return whether callbacks agree at a new start or with new parameters; other rows may be redundant there."""
+    def _check_new_start(self, t1: float, q0: Array, v0: Array) -> bool:
+        """Update the redundant rows at a new start, and return whether callbacks with new parameters are consistent."""
         run = self.run
-        if run.rows_warning:  # which of the redundant rows is left out may depend on rounding
-            counted = self.arrays.start_rows.tobytes()
-            if counted not in self.dependent:
-                there = run.at(run.t0, q0, v0)
-                if there is None:
+        if run.rows_warning:  # rounding may decide which of several dependent rows is left out
+            independent = self.arrays.start_rows.tobytes()
+            if independent not in self.redundancy:
+                new_run = run.from_start(run.t0, q0, v0)
+                if new_run is None:
                     return False
-                self.dependent[counted] = there.redundant, there.rows_warning
-            run.redundant, run.rows_warning = self.dependent[counted]
-            self.of_run, self.counted = (run.rank, run.redundant, self.of_run[-1]), counted
+                self.redundancy[independent] = new_run.redundant, new_run.rows_warning
+            run.redundant, run.rows_warning = self.redundancy[independent]
+            self.of_run, self.independent = (run.rank, run.redundant, self.of_run[-1]), independent
         mass, derivatives = self.look.mass, self.check_derivatives
         return self.parametric is None or self.parametric.agrees(run.t0, q0, v0, t1, mass, derivatives)
 
@@ -296,27 +295,27 @@ class CachedIntegrator:
         """Restore the attributes of the run, besides arrays, that the loop may have changed."""
         run, self.moved = self.run, False
         if run.plan is self.at_start["plan"] and not run.substituted and run.kit.flags[FORM] == self.form:
-            self.at_start |= {"kit": run.kit, "functions": run.functions}  # keep a step that the kit may have loaded
+            self.at_start |= {"kit": run.kit, "functions": run.functions}  # the kit may have loaded a step meanwhile
         vars(run).update(self.at_start, crossings=[], jumps=[], lengths=[], substituted=False)
 
-    def _compared(self, t: Array, rows: Array, t1: float, inside: bool, due: bool) -> bool:
-        """Compare callbacks at states outside the compared region, or everywhere; return whether they were right.
+    def _compare_callbacks(self, t: Array, rows: Array, t1: float, inside: bool, due: bool) -> bool:
+        """Compare callbacks with their traces at states outside the checked region; return whether they agree.
 
-        `inside`: all states lie where callbacks were compared.
+        `inside`: all states lie in the region. `due`: compare at all states.
         """
         run, region, parameters = self.run, self.region, self.run.varied_parameters
         if describe_changed_force(run) is not None:
             return False
         if run.compared_until[0] >= t1 and not due:
             return True
-        everywhere = due or (parameters is not None and not region.knows(parameters))
+        everywhere = due or (parameters is not None and not region.contains_parameters(parameters))
         if everywhere or not inside:
             n, status = 2 * run.system.n_q, Status.REACHED_END
             sample = Sample(float(t[0]), rows[0], n)
             sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
             states = sample.states()
-            if not everywhere:  # if all samples lie in the region, sampling later runs would be in vain
-                states = np.concatenate([farthest(t, rows[:, :n]), states])
+            if not everywhere:  # the region must reach the extreme states, or equal runs would be compared again
+                states = np.concatenate([extreme_states(t, rows[:, :n]), states])
             if compare_callbacks_at(run, region, states, self.check_derivatives, status, "", everywhere)[0] != status:
                 return False
             if parameters is not None:
@@ -346,12 +345,12 @@ def _field(
     options: Options,
     name: str,
 ) -> dict[str, Any]:
-    """Return a deferred field of a result, with those computed together; `data` is the report of the run."""
+    """Compute a deferred field of a result; return it with others by name. `data` is the report of the run."""
     if name == "message":
         return {name: describe_arrival(t1, options.step_size is not None)}
     loops, n_states, n_steps = cached_run(), int(data[0]), int(data[1])
     begin, end = (places := loops.N_HEAD + n_states), places + n_steps * N_STEP_COLUMNS
-    if name in LATER:
+    if name in STEP_FIELDS:
         counts = data[loops.N_REPORT : loops.N_HEAD].astype(np.int64)
         by_step = step_fields(data[begin:end].reshape(n_steps, N_STEP_COLUMNS), BEFORE.copy())
         return by_step | {"stats": statistics(counts, cpu_time)} | options.metadata
@@ -360,10 +359,10 @@ def _field(
     fields = {"rank": rank, "redundant": redundant.copy(), "defect": defect, "compiled": own}
     fields |= {"widest_gap": float(data[loops.WIDEST]), "system": system, "atol": options.atol.copy(), "t_end": t1}
     t, rows = (data[loops.N_HEAD : begin], data[end:].reshape(n_states, -1)) if at_times is None else at_times
-    return OTHERS | state_fields(system.n_q, t, rows) | fields | options.metadata
+    return OTHER_DEFAULTS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
-NEARER = 0.1  # relative to the smallest pivot at the start of the first run: a start below it is checked anew
+NEARER = 0.1  # starts whose smallest pivot is below this share of the first run's smallest pivot are checked anew
 
 
 def first_chunk(run: Run) -> int:
@@ -376,8 +375,8 @@ def arrays_of(
 ) -> SimpleNamespace:
     """Create the arrays that `start_and_advance` of kernels/cached_run.py reads and writes, for at most `room` steps.
 
-    The run is at its start; its clock, control and tolerances become parts of one array. `look` is of its system, or of
-    the system that it stands for; `code` is the machine code that its plan calls; `definite`: whether M has an inverse.
+    `run` is at its start; its clock, control and tolerances become parts of one array. `look` belongs to the system of
+    the call. The other arguments are those of `CachedIntegrator`.
     """
     from twoloop.kernels.evaluation import checks as first_look
     from twoloop.kernels.linalg import rank as pivots
@@ -394,7 +393,7 @@ def arrays_of(
     blocks = [] if choice is None else [(i[0], i[-1], j[0], j[-1]) for i, j in choice.blocks]
     dependents = Dependents(system, () if choice is None else choice.rows)
     search = dependents.arguments if dependents.find else (nothing, nothing, 0, np.zeros(0), nothing, nothing)
-    places = np.flatnonzero(memory.view(np.int64))  # bits, because clearing would not restore -0.0
+    places = np.flatnonzero(memory.view(np.int64))  # by bits, as -0.0 must be restored, too
     weak = 0.0 if system.constant_mass and system.derived.get("no weak mass", False) else SINGULAR_MASS
     of_start: tuple[float, ...]
     of_start = max(run.rtol, GAMMA_ACCURACY), run.reuse, 0.0 if run.plan.watchful else 1.0
@@ -429,7 +428,7 @@ def arrays_of(
 
 
 def _expected(choice: Choice | None) -> tuple[NDArray[np.int64], float]:
-    """Return a choice of pivots as the array that kernels read, and its scale."""
+    """Return a choice of pivots as the array that kernels read, and the scale of the added rows."""
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
     place = int(np.searchsorted(-LEAST, -choice.least))
@@ -437,12 +436,13 @@ def _expected(choice: Choice | None) -> tuple[NDArray[np.int64], float]:
     return np.array(numbers, dtype=np.int64), choice.scale
 
 
-MOST, LARGEST = 16, 150_000  # sets of options in a system's cache; numbers in the workspace of a cached run
-MOST_ALIKE = 3  # entries of equal options: other starts may need other code
+# limits of the cache: sets of options for each system, numbers in the workspace of a run, and entries with equal
+# options (another start may need other code)
+MAX_OPTIONS, MAX_WORKSPACE, MAX_ENTRIES = 16, 150_000, 3
 
 
 class CacheEntry(NamedTuple):
-    """Cached run at its start, and its integrators, for calls with the same options, from this or another start."""
+    """Run at its start and idle integrators, for calls with the same options from this or other starts."""
 
     run: Run
     start: tuple[float, bytes, bytes]
@@ -450,7 +450,7 @@ class CacheEntry(NamedTuple):
     code: GeneratedCode | None
     definite: bool  # whether M was definite at the start
     moves: bool  # whether a run from another start differs only by that start
-    waiting: list[CachedIntegrator] | None  # idle ones, one per thread; None: the compiled loop cannot start this run
+    idle: list[CachedIntegrator] | None  # None: the compiled loop cannot start this run
     shared: SharedSetup | None = None  # setup shared with systems of other parameters
 
 
@@ -467,75 +467,75 @@ def cached_result(
     options: Options,
     output: Output,
     interrupts: Interrupts,
-) -> tuple[dict[str, Any], str] | Missed | Run | None:
-    """Integrate by the cached integrator of the system and its options, which the first call creates.
+) -> tuple[dict[str, Any], str] | MissedChanges | Run | None:
+    """Integrate by the cached integrator for a system and options, which the first call creates.
 
-    Return the fields of the result and a warning of its rows; a `Missed` if the run must be repeated; a `Run` at its
-    start if it cannot be cached; None if `set_up` has to check the start.
+    Return the fields of the result and a warning of redundant rows; or a request to repeat the run; or a `Run` at its
+    start, if it cannot be cached; or None, if `set_up` has to check the start.
     """
-    alike = system.derived.get("runs", NO_RUNS)[1].get(options.key, ())
-    if not alike and (others := system.shared.get("runs")):
-        entry = others.get((options.key, _trace_cache(system)))
-        alike = (entry,) if isinstance(entry, CacheEntry) else ()
+    entries = system.derived.get("runs", NO_RUNS)[1].get(options.key, ())
+    if not entries and (shared := system.shared.get("runs")):
+        entry = shared.get((options.key, _trace_cache(system)))
+        entries = (entry,) if isinstance(entry, CacheEntry) else ()
     run = None
-    if not alike and not system.called_in_python:
+    if not entries and not system.called_in_python:
         interrupts.listen()
         q0, v0 = check_vector("q0", q0, system.n_q), check_vector("v0", v0, system.n_q)
         run, entry = set_up(system, t0, t1, q0, v0, options)
-        if entry is None or entry.waiting is None or not CachedIntegrator.gives(run, output, None):
+        if entry is None or entry.idle is None or not CachedIntegrator.can_provide(run, output, None):
             return run
-        alike = (entry,)
-    for entry in alike:
-        if entry.waiting is None or not (output is STEPS or CachedIntegrator.gives(entry.run, output, entry.shared)):
+        entries = (entry,)
+    for entry in entries:
+        if entry.idle is None or not (output is STEPS or CachedIntegrator.can_provide(entry.run, output, entry.shared)):
             continue
         try:
-            integrator = entry.waiting.pop()
+            integrator = entry.idle.pop()
         except IndexError:
             interrupts.listen()
-            run = entry.run.again() if run is None else run
+            run = entry.run.copy() if run is None else run
             integrator = CachedIntegrator(run, system, entry.code, entry.definite, options, entry.shared)
         outcome = integrator.integrate(system, t0, t1, q0, v0, output, interrupts)
         rows_warning = integrator.run.rows_warning
-        if len(entry.waiting) < MOST_WAITING:
-            entry.waiting.append(integrator)
+        if len(entry.idle) < MAX_IDLE:
+            entry.idle.append(integrator)
         if outcome is not None:
-            return outcome if isinstance(outcome, Missed) else (outcome, rows_warning)
+            return outcome if isinstance(outcome, MissedChanges) else (outcome, rows_warning)
     return None
 
 
 def set_up(
     system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
 ) -> tuple[Run, CacheEntry | None]:
-    """Create a run at its start, or copy a cached one, from the same start or another; return it and its new entry.
+    """Create a run at its start, or copy a cached run; return it, and the cache entry that was added for it, if any.
 
     Runs are cached if the method is twoloop's own, callbacks are compiled, and traces are trusted.
 
     Raises
     ------
     TypeError, ValueError
-        If the start is refused, the method cannot run the system, or requested code cannot be had.
+        If the start is refused, the method cannot run the system, or requested code cannot be generated.
     """
     if system.called_in_python:  # such functions may depend on variables that change
         return _new_run(system, t0, t1, q0, v0, options)[0], None
     start, call = (t0, q0.tobytes(), v0.tobytes()), options.key
     came_from, runs, before = system.derived.get("runs", NO_RUNS)
-    alike = runs.get(call, ())
-    run, entry = None, next((each for each in alike if each.start == start), None)
+    entries = runs.get(call, ())
+    run, entry = None, next((each for each in entries if each.start == start), None)
     if entry is not None:
-        run, code = entry.run.again(), entry.code
+        run, code = entry.run.copy(), entry.code
         if entry.t1 != t1:
             options.set_sizes(run, t1)
-    for each in alike:
+    for each in entries:
         if run is None and each.moves:
             run, entry, code = _moved(each, system, t0, t1, q0, v0, options), each, each.code
     if run is None:
         (run, code), entry = _new_run(system, t0, t1, q0, v0, options), None
         if run.system is system:
             _share_setup(system, run, code, t1, options)
-    new, added = not alike or before == id(code) if entry is None else came_from == start != entry.start, None
+    new, added = not entries or before == id(code) if entry is None else came_from == start != entry.start, None
     if new and (added := _entry_of(run, code, t1, options)) is not None:
-        runs = {} if len(runs) == MOST else dict(runs)  # a copy: another thread may read the old one
-        runs[call] = added, *[each for each in alike if each is not entry][: MOST_ALIKE - 1]
+        runs = {} if len(runs) == MAX_OPTIONS else dict(runs)  # a copy, because another thread may read the dict
+        runs[call] = added, *[each for each in entries if each is not entry][: MAX_ENTRIES - 1]
     system.derived["runs"] = start, runs, id(code) if entry is None else None
     return run, added
 
@@ -544,7 +544,7 @@ def _entry_of(run: Run, code: GeneratedCode | None, t1: float, options: Options)
     """Return the cache entry of a run at its start, or None if the run cannot be cached."""
     system, n = run.system, run.system.n_q
     trusted = identity(options.method) is not None and all(traced.trusted for traced in run.traced)
-    if not trusted or run.work.notes.base.size > LARGEST:
+    if not trusted or run.work.notes.base.size > MAX_WORKSPACE:
         return None
     t0, q0, v0 = run.t0, run.state[:n], run.state[n : 2 * n]
     settled = code is not None or not may_have_code(
@@ -553,8 +553,8 @@ def _entry_of(run: Run, code: GeneratedCode | None, t1: float, options: Options)
     definite = has_definite_mass(system, t0, q0)
     moves = run.static is None and settled and (definite or not sparse_factors_pay(system, run.kit.flags))
     start = t0, q0.tobytes(), v0.tobytes()
-    waiting: list[CachedIntegrator] | None = [] if moves and CachedIntegrator.suits(run) else None
-    return CacheEntry(run.again(), start, t1, code, definite, moves, waiting)
+    idle: list[CachedIntegrator] | None = [] if moves and CachedIntegrator.can_start(run) else None
+    return CacheEntry(run.copy(), start, t1, code, definite, moves, idle)
 
 
 def _trace_cache(system: ConstrainedSystem) -> TraceCache:
@@ -563,29 +563,29 @@ def _trace_cache(system: ConstrainedSystem) -> TraceCache:
 
 
 def _share_setup(system: ConstrainedSystem, run: Run, code: GeneratedCode | None, t1: float, options: Options) -> None:
-    """Cache the setup of a run for systems of other parameters, from the second of these on."""
-    call, seen, known = (options.key, _trace_cache(system)), system.functions, system.shared.get("runs", {})
-    if call not in known:
-        system.shared["runs"] = (known if len(known) < MOST else {}) | {call: seen}
-    elif type(known[call]) is type(seen) and known[call] is not seen:
+    """Cache the setup of a run for systems with other parameters, once a second such system is integrated."""
+    call, functions, cached = (options.key, _trace_cache(system)), system.functions, system.shared.get("runs", {})
+    if call not in cached:
+        system.shared["runs"] = (cached if len(cached) < MAX_OPTIONS else {}) | {call: functions}
+    elif type(cached[call]) is type(functions) and cached[call] is not functions:
         entry = _entry_of(run, code, t1, options)
-        if entry is not None and entry.waiting is not None:
+        if entry is not None and entry.idle is not None:
             fixed = options.step_size is not None
             with suppress(ValueError):
                 shared = SharedSetup(entry.run, code, options.method, fixed, options.compiled)
-                known[call] = entry._replace(shared=shared)
+                cached[call] = entry._replace(shared=shared)
                 return
-        known[call] = None
+        cached[call] = None
 
 
 def _moved(
     entry: CacheEntry, system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
 ) -> Run | None:
-    """Return a run from another start; None if that needs another form of the equations, or other code."""
+    """Return a copy of a cached run for another start; None if that start needs other code or another form."""
     _check_start(system, t0, q0, v0, options.check_derivatives)
     if entry.code is not None and not entry.code.serves(system, t0, q0):
         return None
-    run = entry.run.at(t0, q0, v0) if has_definite_mass(system, t0, q0) == entry.definite else None
+    run = entry.run.from_start(t0, q0, v0) if has_definite_mass(system, t0, q0) == entry.definite else None
     if run is not None:
         options.set_sizes(run, t1)
     return run
@@ -596,7 +596,7 @@ def _new_run(
 ) -> tuple[Run, GeneratedCode | None]:
     fixed, given, new = options.step_size is not None, system, not system.checked
     if new:
-        take_bounds(system)
+        load_checked_bounds(system)
     first = first_force(system, t0, q0, v0)
     _check_start(system, t0, q0, v0, options.check_derivatives)
 
@@ -609,9 +609,9 @@ def _new_run(
     if derived:
         plan = plan.changed(traced=(*plan.traced, *derived))
     if new:
-        give_bounds(given)
+        share_checked_bounds(given)
     if system.called_in_python and not fixed:
-        unlike = find_nondeterminism(system, states_around(t0, t1, q0, v0))
+        unlike = find_nondeterminism(system, states_near_start(t0, t1, q0, v0))
         if unlike is not None:
             raise ValueError(unlike)
     if first is not None and not any("force" in each.kinds for each in plan.traced):
@@ -624,7 +624,7 @@ def _new_run(
 
 
 def _check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, derivatives: bool) -> None:
-    """Check a start, unless it is the one that was checked last."""
+    """Check a start, unless the last check was of the same start."""
 
     def check() -> None:
         check_start(system, t0, q0, v0, derivatives=derivatives, exact=lambda: exact_near(system, t0, q0, v0))

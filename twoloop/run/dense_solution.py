@@ -29,16 +29,16 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Groups = NDArray[np.int64]
 
-KEPT = 512  # largest number of intervals whose interior states are cached
-SOUND = 65536  # largest number of intervals that are remembered to have accurate polynomials
+MAX_DIVIDED = 512  # largest number of intervals whose interior states are cached
+MAX_ACCURATE = 65536  # largest number of intervals that are remembered to have accurate polynomials
 # largest accepted error of polynomials in the constraints and the equations, over the tolerances; and near singular
 # positions, where it was measured to be a tenth of the error of velocities
-OFF, OFF_ACROSS = 10.0, 1.0
-REPAIRED = 4  # number of steps that divide an interval whose polynomials have a larger error
+MAX_ERROR, MAX_ERROR_ACROSS = 10.0, 1.0
+N_REPAIR = 4  # number of steps that divide an interval whose polynomials have a larger error
 
 
 class Table(NamedTuple):
-    """States at accepted steps: times (n,), rows [q, v, a] (n, 3 n_q), and the kind of the interval after each."""
+    """States at accepted steps: times (n,), rows [q, v, a] (n, 3 n_q), and the kinds of the n - 1 intervals."""
 
     t: Array
     states: Array
@@ -46,7 +46,7 @@ class Table(NamedTuple):
 
 
 def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: float) -> tuple[int, int]:
-    """Return the ranks of C_q, and of C_q and A, by which workspaces are created: the kernels rely on them."""
+    """Return the ranks of C_q, and of C_q and A, which the kernels need to create workspaces."""
     from twoloop.kernels import advance
 
     kit = kit_of(system, t, q)
@@ -58,7 +58,7 @@ def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: floa
 
 
 class Interpolator:
-    """Interpolator of tables of states of one system, with a workspace of its own.
+    """Interpolator of the states of a run (see `Table`), with a workspace of its own.
 
     Parameters
     ----------
@@ -71,9 +71,9 @@ class Interpolator:
     atol : ndarray (n_q,)
         Absolute tolerances.
     ranks : (int, int)
-        Of C_q, and of C_q and A.
+        Ranks of C_q, and of C_q and A.
     plans : dict, optional
-        By kind, the plan that divides an interval into `plan.parts` fixed steps; other kinds are not divided.
+        For each kind of interval the plan that divides it into `plan.parts` fixed steps; other kinds are not divided.
     """
 
     def __init__(
@@ -90,28 +90,28 @@ class Interpolator:
 
         self.kernels = dense
         self.plans = dict(plans)
-        self.made_of = (system, t0, row.copy(), rtol, atol, ranks, self.plans)
+        self.arguments = (system, t0, row.copy(), rtol, atol, ranks, self.plans)
         self.system, self.rtol, self.ranks = system, rtol, ranks
         self.tolerances = np.concatenate([np.zeros(ATOL), atol])
         self.tolerances[RTOL] = rtol
-        self.parts = max((plan.parts for plan in self.plans.values()), default=REPAIRED)
-        self.parts = max(self.parts, REPAIRED)
+        self.parts = max((plan.parts for plan in self.plans.values()), default=N_REPAIR)
+        self.parts = max(self.parts, N_REPAIR)
         self.static = static_form(system, t0, row[: system.n_q], *self.plans.values())
         self.matrices = max((plan.matrices for plan in self.plans.values()), default=0)
         self._prepare()
-        self.failures, self.tells = 0, True  # number of failures of the last call; whether to warn of them
-        self.filled: dict[float, tuple[Array, Array]] = {}
+        self.failures, self.warns = 0, True  # number of failures of the last call; whether to warn of them
+        self.filled: dict[float, tuple[Array, Array]] = {}  # interior states, by the times at which intervals begin
         self.across: dict[float, Array] = {}  # memories of steps across singular positions, by beginnings of intervals
-        self.sound: set[float] = set()  # beginnings of intervals that neighbouring states interpolate well
-        self.judges = True
+        self.accurate: set[float] = set()  # beginnings of intervals that neighbouring states interpolate well
+        self.judges = True  # whether interior states may be computed; false if they were read from a file
         self._make_room()
 
     def _prepare(self) -> None:
-        """Set up the workspace, and the kernels that are called with it."""
-        system, t0, row = self.made_of[:3]
+        """Set up the workspace and the kits, for the current form of linear algebra."""
+        system, t0, row = self.arguments[:3]
         q0, static = row[: system.n_q], self.static
         for plan in self.plans.values():
-            loaded(plan.second)  # load the step now, because the solution may call it at any later time
+            loaded(plan.second)  # load the step now: `result.sol` may need it at any time
         self.kits = {kind: kit_of(system, t0, q0, plan, static) for kind, plan in self.plans.items()}
         self.kit = kit_of(system, t0, q0, None, static)
         pattern = pattern_of(system, t0, q0) if static is None else np.zeros((0, 0))
@@ -121,23 +121,23 @@ class Interpolator:
     def _start(self) -> None:
         from twoloop.kernels import advance
 
-        system, t0, row = self.made_of[:3]
+        system, t0, row = self.arguments[:3]
         self.work.notes[indices.GENERATION] = 1.0  # GENERATION 1: the ranks are known
         state = np.concatenate([row, np.zeros(system.n_c + system.n_a)])
         entry_point(advance.start)(self.kit, self.work, t0, state)
         self.repairs: dict[bool, tuple[Plan, Any]] = {}
 
     def begin(self, system: ConstrainedSystem, t0: float, row: Array, pattern: Array) -> None:
-        """Reset for a run from another state that uses the same kits; rows have entries as in `pattern`."""
-        self.made_of = (system, t0, row.copy(), *self.made_of[3:])
+        """Reset for a run from another state with the same kits; `pattern`: 1 at the entries of the constraint rows."""
+        self.arguments = (system, t0, row.copy(), *self.arguments[3:])
         self.system, self.judges = system, True
-        self.filled, self.across, self.sound = {}, {}, set()
+        self.filled, self.across, self.accurate = {}, {}, set()
         prepare_workspace(self.work, system, self.kit.flags, pattern, row[: system.n_q], self.rtol, 0.0)
         self._start()
         self.nodes[:], self.room[:], self.rows[:] = 0.0, 0.0, 0.0
 
     def _become_dense(self) -> None:
-        """Replace the static form, which could not decide something."""
+        """Replace the static form of linear algebra, which failed, by the dense form."""
         self.static = None
         self._prepare()
 
@@ -147,9 +147,9 @@ class Interpolator:
         n = self.system.n_q
         self.nodes, self.room, self.rows = np.zeros(2 * half), np.zeros((2 * half, n)), np.zeros((3, 2 * n))
 
-    def __reduce__(self) -> tuple[Any, ...]:  # copies, also in other processes
-        *arguments, plans = self.made_of
-        # generated code has addresses in this process: copies do without it
+    def __reduce__(self) -> tuple[Any, ...]:  # for copies and pickles
+        *arguments, plans = self.arguments
+        # generated code has addresses that are valid in this process only: copies do without it
         plans = {kind: plan.changed(own=()) if plan.own else plan for kind, plan in plans.items()}
         kept = {name: getattr(self, name) for name in ("parts", "filled", "across", "judges")}
         return type(self), (*arguments, plans), kept
@@ -159,7 +159,7 @@ class Interpolator:
         self._make_room()
 
     def states(self, table: Table, times: Array) -> Array:
-        """Interpolate rows [q, v] at `times`, sorted, each within the table."""
+        """Interpolate rows [q, v] at sorted `times` within the table."""
         if len(times) == 0 or len(table.t) == 1:
             return np.repeat(table.states[:1, : 2 * self.system.n_q], len(times), axis=0)
         intervals = np.searchsorted(table.t[1:-1], times, side="right")
@@ -171,55 +171,56 @@ class Interpolator:
         failures = 0
         others = []
         for block in _blocks(groups):
-            self._settle(table, block)
+            self._divide_where_needed(table, block)
             divided, own, rest = self._divided(table, block)
-            failures += self._between(divided, own, times, out)
+            failures += self._interpolate(divided, own, times, out)
             others.append(rest)
-        failures += self._between(table, np.concatenate(others), times, out)
+        failures += self._interpolate(table, np.concatenate(others), times, out)
         self._count(failures, len(times))
         return out
 
     def within(self, table: Table, t: float) -> Callable[[float], Array]:
-        """Return a function that interpolates at one time after another, all of them in the interval of t."""
+        """Return a function that interpolates [q, v] at single times in the interval that contains t."""
         groups = _groups(table, np.searchsorted(table.t[1:-1], [t], side="right"))
         groups[:, indices.END_TIME] = 1
-        self._settle(table, groups)
+        self._divide_where_needed(table, groups)
         divided, own, rest = self._divided(table, groups)
-        known, group = (divided, own) if len(own) else (table, rest)
+        source, group = (divided, own) if len(own) else (table, rest)
         time, out = np.empty(1), np.empty((1, 2 * self.system.n_q))
 
         def row(t: float) -> Array:
             time[0] = t
-            self._count(self._between(known, group, time, out), 1)
+            self._count(self._interpolate(source, group, time, out), 1)
             return out[0].copy()
 
         return row
 
     def _count(self, failures: int, n_times: int) -> None:
         self.failures = failures
-        if failures > 0 and self.tells:
+        if failures > 0 and self.warns:
             _warn(f"at {failures} of {n_times} times the state is interpolated and off the constraints", 5)
 
-    def _between(self, table: Table, groups: Groups, times: Array, out: Array) -> int:
-        known = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups))
+    def _interpolate(self, table: Table, groups: Groups, times: Array, out: Array) -> int:
+        """Write rows [q, v] at the times of the groups to `out`; return the number of failures."""
+        states = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups))
         rest = (times, self.nodes, self.room, out)
-        failures = int(entry_point(self.kernels.between)(self.kit, self.work, INNER_TOL, *known, *rest))
+        failures = int(entry_point(self.kernels.between)(self.kit, self.work, INNER_TOL, *states, *rest))
         if failures > 0 and self.static is not None:
             self._become_dense()
-            failures = int(entry_point(self.kernels.between)(self.kit, self.work, INNER_TOL, *known, *rest))
+            failures = int(entry_point(self.kernels.between)(self.kit, self.work, INNER_TOL, *states, *rest))
         return failures
 
-    def _settle(self, table: Table, groups: Groups) -> None:
-        """Ensure that each interval has interior states, or is known to need none."""
+    def _divide_where_needed(self, table: Table, groups: Groups) -> None:
+        """Compute interior states of each interval that is new, unless its polynomials are accurate without them."""
         begins = table.t[groups[:, indices.FIRST_OWN]].tolist()
-        new = np.array([t not in self.sound and t not in self.filled for t in begins])
+        new = np.array([t not in self.accurate and t not in self.filled for t in begins])
         if not self.judges or not new.any():
             return
-        if len(self.filled) > KEPT:
+        if len(self.filled) > MAX_DIVIDED:
             self.filled.clear()
-            new = np.array([t not in self.sound for t in begins])
-        if len(self.sound) > SOUND:
-            self.sound.clear()
+            new = np.array([t not in self.accurate for t in begins])
+        if len(self.accurate) > MAX_ACCURATE:
+            self.accurate.clear()
         groups = groups[new & (groups[:, indices.KIND] != indices.JUMP)]
         for kind, plan in self.plans.items():
             of_kind = groups[:, indices.KIND] == kind
@@ -230,52 +231,42 @@ class Interpolator:
         inner = np.array([t in self.filled for t in table.t[groups[:, indices.FIRST_OWN]].tolist()], dtype=bool)
         divided, own, rest = self._divided(table, groups)
         off = np.zeros(len(groups))
-        off[inner], off[~inner] = self._judged(divided, own), self._judged(table, rest)
+        off[inner], off[~inner] = self._errors(divided, own), self._errors(table, rest)
         # the steps of these kinds are too long for polynomials through their ends
         off[~inner & np.isin(groups[:, indices.KIND], list(self.plans))] = np.inf
-        fits = off <= np.where(groups[:, indices.KIND] == indices.ACROSS, OFF_ACROSS, OFF)
-        self.sound.update(table.t[groups[~inner & fits, indices.FIRST_OWN]].tolist())
+        fits = off <= np.where(groups[:, indices.KIND] == indices.ACROSS, MAX_ERROR_ACROSS, MAX_ERROR)
+        self.accurate.update(table.t[groups[~inner & fits, indices.FIRST_OWN]].tolist())
         for k in (~fits).nonzero()[0]:
             self._repair(table, groups[k], float(off[k]))
 
-    def _judged(self, table: Table, groups: Groups) -> Array:
-        """Estimate the errors of the polynomials of these intervals, over the tolerances."""
-        out = np.zeros(len(groups))
-        arrays = (
-            self.tolerances,
-            table.t,
-            table.states,
-            np.ascontiguousarray(groups),
-            self.nodes,
-            self.room,
-            self.rows,
-            out,
-        )
+    def _errors(self, table: Table, groups: Groups) -> Array:
+        """Estimate the errors of the polynomials of intervals, over the tolerances."""
+        out, groups = np.zeros(len(groups)), np.ascontiguousarray(groups)
+        arrays = self.tolerances, table.t, table.states, groups, self.nodes, self.room, self.rows, out
         entry_point(self.kernels.judge)(self.kit, self.work, INNER_TOL, *arrays)
         return out
 
     def _repair(self, table: Table, group: Groups, worst: float) -> None:
-        """Choose the best states for an interval: its neighbours, those of steps within it, or its ends alone."""
+        """Choose the most accurate states for an interval: neighbouring states, states of steps in it, or its ends."""
         i, kind = int(group[indices.FIRST_OWN]), int(group[indices.KIND])
         begin = float(table.t[i])
-        steps = (
+        candidates = (
             lambda: self._crossing(table, i),
             lambda: self._fill(table, *self._repair_plan(kind), np.array([i])).get(begin),
             lambda: (table.t[i : i + 2], table.states[i : i + 2]),
         )
-        for step in steps:
-            if worst <= OFF_ACROSS or (found := step()) is None:
+        for candidate in candidates:
+            if worst <= MAX_ERROR_ACROSS or (interior := candidate()) is None:
                 continue
-            own = Table(np.ascontiguousarray(found[0]), np.ascontiguousarray(found[1]), table.kinds)
-            single = group[None, :].copy()
-            single[0, [indices.FIRST_OWN, indices.LOW]] = 0
-            single[0, [indices.LAST_OWN, indices.HIGH]] = len(own.t) - 1
-            off = float(self._judged(own, single)[0])
+            own = Table(np.ascontiguousarray(interior[0]), np.ascontiguousarray(interior[1]), table.kinds)
+            single, last = group[None, :].copy(), len(own.t) - 1
+            single[0, [indices.FIRST_OWN, indices.LAST_OWN, indices.LOW, indices.HIGH]] = 0, last, 0, last
+            off = float(self._errors(own, single)[0])
             if off < worst or not np.isfinite(worst):
                 worst = off
                 self.filled[begin] = own.t, own.states
         if begin not in self.filled:
-            self.sound.add(begin)
+            self.accurate.add(begin)
 
     def _crossing(self, table: Table, i: int) -> tuple[Array, Array] | None:
         """Compute interior states by a step across a singular position that begins and ends with the interval."""
@@ -305,7 +296,7 @@ class Interpolator:
         return times, states
 
     def _repair_plan(self, kind: int) -> tuple[Plan, Any]:
-        """Return plan and kit of the steps that divide an interval whose neighbouring states do not suit it."""
+        """Return plan and kit of the steps that divide an interval whose polynomials are not accurate."""
         stiff = kind == indices.VELOCITIES
         if stiff not in self.repairs:
             from twoloop.methods.dop853 import DOP853
@@ -314,18 +305,18 @@ class Interpolator:
 
             method = RungeKutta(radau_iia(3), outer="newton") if stiff else DOP853()
             atol = float(self.tolerances[ATOL:].min())
-            plan = method.plan(self.system.n_q, self.rtol, atol, True).changed(parts=REPAIRED)
-            q0 = self.made_of[2][: self.system.n_q]
+            plan = method.plan(self.system.n_q, self.rtol, atol, True).changed(parts=N_REPAIR)
+            q0 = self.arguments[2][: self.system.n_q]
             if plan.matrices > self.matrices:
                 self.matrices = plan.matrices
                 if self.static is not None:
-                    self.static = static_form(self.system, self.made_of[1], q0, *self.plans.values(), plan)
+                    self.static = static_form(self.system, self.arguments[1], q0, *self.plans.values(), plan)
                 self._prepare()
-            self.repairs[stiff] = plan, kit_of(self.system, self.made_of[1], q0, plan, self.static)
+            self.repairs[stiff] = plan, kit_of(self.system, self.arguments[1], q0, plan, self.static)
         return self.repairs[stiff]
 
     def _divided(self, table: Table, groups: Groups) -> tuple[Table, Groups, Groups]:
-        """Return a table of interior states, the groups of intervals that are in it, and the groups of the others."""
+        """Return a table of interior states, the groups of the intervals with such states, and the other groups."""
         begins = table.t[groups[:, indices.FIRST_OWN]].tolist()
         filled = np.array([t in self.filled for t in begins], dtype=bool)
         pairs = [self.filled[t] for t in begins if t in self.filled]
@@ -339,7 +330,7 @@ class Interpolator:
         return Table(np.concatenate(t), np.concatenate(states), table.kinds), own, groups[~filled]
 
     def _fill(self, table: Table, plan: Plan, kit: Any, intervals: Groups) -> dict[float, tuple[Array, Array]]:
-        """Compute interior states of intervals, by the times at which they begin; fewer or none if steps fail."""
+        """Compute interior states; return them by the beginnings of intervals. Take fewer parts if steps fail."""
         n = self.system.n_q
         tolerances = np.zeros(ATOL + n)  # zeros: no error estimate
         state = np.zeros(3 * n + self.system.n_c + self.system.n_a)
@@ -359,13 +350,14 @@ class Interpolator:
         return filled
 
     def interiors(self, table: Table) -> Iterator[tuple[Array, Array]]:
-        """Yield interior states of divided intervals in blocks, (m, parts + 1) and (m, parts + 1, 3 n_q), for `keep`.
+        """Yield interior states of divided intervals in blocks, to be stored in a file and given to `keep`.
 
-        Rows end with NaN if an interval has fewer states.
+        A block has times (m, parts + 1) and rows (m, parts + 1, 3 n_q); the last ones are NaN if an interval has fewer
+        states.
         """
         groups = _groups(table, np.arange(len(table.t) - 1))
         for block in _blocks(groups):
-            self._settle(table, block)
+            self._divide_where_needed(table, block)
             begins = table.t[block[:, indices.FIRST_OWN]].tolist()
             divided = [self.filled[t] for t in begins if t in self.filled]
             shape = (len(divided), self.parts + 1)
@@ -375,7 +367,7 @@ class Interpolator:
             yield t, states
 
     def keep(self, t: Array, states: Array) -> None:
-        """Restore interior states that `interiors` yielded; no others can be computed."""
+        """Restore interior states that `interiors` yielded; no other interior states are computed from now on."""
         self.parts, self.judges = t.shape[1] - 1, False
         self._make_room()
         sizes = np.isfinite(t).sum(axis=1).tolist()
@@ -384,29 +376,29 @@ class Interpolator:
         }
 
     def complete(self, times: Array, states: Array, out: Array) -> None:
-        """Compute rows [a, lam] at rows [q, v] on the constraints, and write them to `out`."""
+        """Compute [a, lam] for given rows [q, v] on the constraints, and write them to `out`."""
         complete, times, states = entry_point(self.kernels.complete), *map(np.ascontiguousarray, (times, states))
         failures = complete(self.kit, self.work, times, states, out)
         if failures > 0 and self.static is not None:
             self._become_dense()
             failures = complete(self.kit, self.work, times, states, out)
         self.failures = failures
-        if failures > 0 and self.tells:
+        if failures > 0 and self.warns:
             _warn(f"at {failures} of {len(times)} times there are no accelerations and multipliers; they are NaN")
 
 
 def _blocks(groups: Groups) -> list[Groups]:
-    """Split rows of intervals into blocks of as many as have their interior states cached."""
-    return [groups[begin : begin + KEPT] for begin in range(0, len(groups), KEPT)]
+    """Split groups into blocks whose interior states fit into the cache."""
+    return [groups[begin : begin + MAX_DIVIDED] for begin in range(0, len(groups), MAX_DIVIDED)]
 
 
 def _groups(table: Table, which: Groups) -> Groups:
-    """Return a row for each of these intervals, without the times in it."""
+    """Return the groups that kernels read: a row for each interval in `which`, without the output times in it."""
     groups = np.zeros((len(which), indices.N_COLUMNS), dtype=np.int64)
     groups[:, indices.FIRST_OWN], groups[:, indices.LAST_OWN] = which, which + 1
     groups[:, indices.KIND] = table.kinds[which]
     groups[:, indices.HIGH] = len(table.t) - 1
-    # rounding may have changed the states before a step across a singular position: its polynomials leave them out
+    # the polynomials of steps across a singular position leave out the states before, which may have rounding errors
     across = np.append(False, table.kinds == indices.ACROSS)
     (begins,) = (across[1:] & ~across[:-1]).nonzero()
     if begins.size:
@@ -431,61 +423,61 @@ class OutputInterpolation:
     Parameters
     ----------
     run : Run
-        A run at its start, or beyond.
+        The run that holds the arrays.
     """
 
     def __init__(self, run: Run):
-        self.run, self._found = run, np.zeros((0, 0))
+        self.run, self._rows = run, np.zeros((0, 0))
         self._interpolator: Interpolator | None = None
 
     def find(self, times: Array, t: Array, rows: Array, kinds: NDArray[np.int64], pattern: Array) -> None:
-        """Interpolate [q, v] at `times`, from rows [q, v, a, lam] at the ends of the steps and the kinds of these.
+        """Interpolate and store [q, v] at `times`, from rows [q, v, a, lam] at the ends of steps and interval kinds.
 
         `pattern`: 1 where the rows of the constraints have entries at the start.
         """
         run = self.run
         table = Table(t, rows[:, : 3 * run.system.n_q].copy(), kinds)
-        known = self._interpolator
-        if known is None:
-            known = interpolator_of(run, table.states[0])
-            known.tells = False
+        interpolator = self._interpolator
+        if interpolator is None:
+            interpolator = interpolator_of(run, table.states[0])
+            interpolator.warns = False
         else:
-            known.begin(run.system, run.t0, table.states[0], pattern)
-        self._interpolator, self._found = known, known.states(table, times)
+            interpolator.begin(run.system, run.t0, table.states[0], pattern)
+        self._interpolator, self._rows = interpolator, interpolator.states(table, times)
 
     def completed(self, times: Array) -> Array | None:
-        """Return rows [q, v, a, lam] at these times; None if some are off the constraints, or lack accelerations."""
-        known, found = self._interpolator, self._found
-        if known is None or known.failures > 0:
+        """Return rows [q, v, a, lam] at the times of `find`; None if projection or accelerations fail at a time."""
+        interpolator, rows = self._interpolator, self._rows
+        if interpolator is None or interpolator.failures > 0:
             return None
-        added = np.full((len(times), len(self.run.state) - found.shape[1]), np.nan)
-        known.complete(times, found, added)
-        if known.static is not None or known.repairs:  # this interpolator has changed: the next run needs a new one
+        added = np.full((len(times), len(self.run.state) - rows.shape[1]), np.nan)
+        interpolator.complete(times, rows, added)
+        if interpolator.static is not None or interpolator.repairs:  # it has changed: the next run needs a new one
             self._interpolator = None
-        return np.concatenate([found, added], axis=1) if known.failures == 0 else None
+        return np.concatenate([rows, added], axis=1) if interpolator.failures == 0 else None
 
 
 def interpolator_of(run: Run, row: Array) -> Interpolator:
-    """Create the interpolator of a run, which starts with this row [q, v, a]."""
+    """Create the interpolator of a run; `row` is [q, v, a] at its start."""
     ranks, atol = (len(run.work.rows), len(run.work.rows_v)), run.tolerances[indices.ATOL :]
     interiors = {kind: plan.fresh() for kind, plan in run.interiors.items()}
     return Interpolator(run.system, run.t0, row, run.rtol, atol, ranks, interiors)
 
 
 class DenseState:
-    """Hold the state of a run at any times.
+    """State of a run at one or more times, as `result.sol(t)` returns it.
 
     Attributes
     ----------
     t : float or ndarray (n,)
         Times, s.
     q, v : ndarray (n_q,) or (n_q, n)
-        Coordinates and velocities, on the constraints to rounding, except close to a singular position, where rounding
-        would make the velocities: a warning says so.
+        Coordinates and velocities, on the constraints to rounding. Exception: close to a singular position, where
+        rounding would dominate the velocities, they are not projected, and a warning says so.
     a : ndarray (n_q,) or (n_q, n)
         Accelerations at these times, evaluated when they are first read.
     lam : ndarray (n_c + n_a,) or (n_c + n_a, n)
-        Multipliers at these times, likewise.
+        Multipliers at these times, evaluated when they are first read.
     """
 
     def __init__(self, interpolator: Interpolator, t: Array, order: Groups, rows: Array):
@@ -524,17 +516,17 @@ class DenseSolution:
 
     Between accepted steps q and v are Hermite polynomials; the inner loop then restores the dependent coordinates, so
     that the constraints hold to rounding. At an accepted step the state is the stored one. The polynomials go through
-    q, v and a of four neighbouring states (order 12). Where Newton's method was at work in the outer loop, they go
-    through q and v (order 8), because a has the noise of vibrations that are stepped over. For `BDF` and `Newmark`, v
-    has a polynomial of its own, through v and a (order 8).
+    q, v and a of four neighbouring states (order 12). Where Newton's method solved the outer loop, they go through q
+    and v (order 8), because a has the noise of vibrations that are stepped over. For `BDF` and `Newmark`, v has a
+    polynomial of its own, through v and a (order 8).
 
     The steps of `RungeKutta` of order 6 and more (by Newton's method of order 7 and more) and of `Taylor`, in `auto`
     too, are too long for this. Each is divided into 2 to 6 equal steps of the method when a time within it is first
     evaluated; this costs about as much as the run. If the last of its states changes a polynomial by more than the
-    tolerances, the polynomial is compared with the constraints and the equations at two places of the interval. If it
-    violates them, as beside a singular position or a force that jumps, its states are those of a step across, of four
-    steps of `DOP853` (of a Radau method where Newton's method was at work), or there are none, whichever fits best.
-    Evaluations for this, and for restoring, are not counted.
+    tolerances, the polynomial is compared with the constraints and the equations at two places of the interval. Beside
+    a singular position, or a force that jumps, a polynomial may violate them. Then the interval gets the interior
+    states of a step across the position, or of four steps of `DOP853` (or a Radau method, where Newton's method was
+    used), or none, whichever fits best. The evaluations for all this are not counted.
 
     The solution takes 8 (2 + 3 n_q) bytes of memory per step.
 

@@ -1,7 +1,7 @@
 """Continue a run where its own steps cannot: with another method, across a singular position, or over a jump.
 
-A run that met a short change of forces is repeated with more evaluations, at most MOST times: changes that follow one
-another without end, as noise does, would take evaluations without end. Then a warning says so.
+A run that met a short change of forces is repeated with more evaluations, at most MOST times: noise, whose changes
+have no shortest duration, would need ever more. After the last repetition a warning is given.
 """
 
 import numpy as np
@@ -18,50 +18,52 @@ from twoloop.run.run import Run
 from twoloop.run.singular_positions import Place, least_singular_value
 from twoloop.run.workspace import kit_of, kit_with
 
-WITHIN = 2.0  # gaps between evaluations: a run that met a shorter change is repeated, as others may be shorter still
-SEEN = 1.25  # gaps between evaluations: longer changes cannot fall between two of them; of shorter ones the run warns
-CLOSER = 4.0  # a repeated run evaluates so many times within the shortest change that was met ...
-MOST_CLOSER = 8.0  # ... but has at most this many times as many evaluations as before
+# durations of changes, relative to the longest time between two evaluations: a run that met a change shorter than
+# WITHIN is repeated, as other changes may be shorter still; a warning is given for changes shorter than SEEN, which may
+# fall between two evaluations
+WITHIN, SEEN = 2.0, 1.25
+PER_CHANGE = 4.0  # number of evaluations of a repeated run within the shortest change that was met ...
+MAX_REFINEMENT = 8.0  # ... but it has at most this many times as many evaluations as before
 MOST = 2  # largest number of repetitions of a run
 
 
-def may_have_missed_changes(run: Run, looks: float = WITHIN) -> bool:
-    """Return whether something changed for so short a time that another such change may have been missed."""
+def may_have_missed_changes(run: Run, limit: float = WITHIN) -> bool:
+    """Return whether forces or drives changed for so short a time that another such change may have been missed."""
     a, clock = run.a, run.clock
-    return bool(clock[a.SHORTEST_CHANGE] < looks * clock[a.WIDEST_SAMPLING])
+    return bool(clock[a.SHORTEST_CHANGE] < limit * clock[a.WIDEST_SAMPLING])
 
 
-def closer(run: Run) -> float:
-    """Return the time between evaluations, s, at which a repeated run meets changes that this run may have missed."""
+def closer_sampling(run: Run) -> float:
+    """Return the time between evaluations, s, for a repetition that meets changes that this run may have missed."""
     a, clock = run.a, run.clock
-    return float(max(clock[a.SHORTEST_CHANGE] / CLOSER, clock[a.WIDEST_SAMPLING] / MOST_CLOSER))
+    return float(max(clock[a.SHORTEST_CHANGE] / PER_CHANGE, clock[a.WIDEST_SAMPLING] / MAX_REFINEMENT))
 
 
 def warn_of_missed_changes(run: Run) -> str:
-    """Warn that a run, which is not repeated, may have missed short changes, and return the sentence."""
+    """Warn if a run that is not repeated may have missed short changes; return the sentence, or an empty one."""
     if not may_have_missed_changes(run, SEEN):
         return ""
     a, clock = run.a, run.clock
-    said = (
+    text = (
         f"forces, constraint_rate or nonholonomic_rate change suddenly for {clock[a.SHORTEST_CHANGE]:.2g} s, and were "
         f"sampled every {clock[a.WIDEST_SAMPLING]:.2g} s only, where steps are long: other changes as short may have "
         f"been missed. Give max_step, at most {clock[a.SHORTEST_CHANGE]:.2g}"
     )
-    return warn_user(said)
+    return warn_user(text)
 
 
 Array = NDArray[np.float64]
 
-CORRECTIONS = 3  # Newton corrections of positions, which are off by less than the tolerances
-NEGLIGIBLE = 1e-12  # relative to the largest: smaller singular values and eigenvalues count as zero (redundant rows)
+CORRECTIONS = 3  # number of Newton corrections of positions whose error is below the tolerances
+NEGLIGIBLE = 1e-12  # singular values below this share of the largest count as zero (redundant rows)
 HOLDS = 1e-8  # relative residual of the equations below which they count as solved
 
 
 def state_behind_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Array | None:
-    """Return the state [q, v] right after a jump at t, from that before it; None if no velocities fit the constraints.
+    """Return the state [q, v] right after a jump of C_t or b at t; None if no velocities satisfy the constraints.
 
-    Solve M (v+ - v) + G^T p = 0 and G v+ + (C_t, b) = 0: v+ is nearest to v, in the metric of M, of all velocities that
-    the constraints allow.
+    Solve M (v+ - v) + G^T p = 0 and G v+ + (C_t, b) = 0. Of all velocities that the constraints allow, v+ is nearest to
+    v in the metric of M.
     """
     q = corrected(system, t, q)
     equations, lengths, size = scaled_equations(system, t, q)
@@ -80,7 +82,7 @@ def corrected(system: ConstrainedSystem, t: float, q: Array) -> Array:
 
 
 def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, float]:
-    """Return the matrix [M G^T; G 0], the rows G scaled to the size of M, with their lengths and this size."""
+    """Return the matrix [M G^T; G 0] with rows G scaled to the size of M, the lengths of the rows, and this size."""
     mass, rows = system.mass(t, q), system.rows(t, q)
     lengths, size = np.linalg.norm(rows, axis=1), float(np.abs(mass).max())
     lengths[lengths == 0.0] = 1.0
@@ -88,21 +90,22 @@ def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Arr
     return np.block([[mass, scaled.T], [scaled, np.zeros((len(rows), len(rows)))]]), lengths, size
 
 
-# lengths to try for a step across a singular position, on which no stage should fall, over the longest last step
+# step lengths to try across a singular position (no stage should fall on it), relative to the longest of the last steps
 LENGTHS = tuple(0.85**k for k in range(28))
-LONGER = tuple(1.4**k for k in range(1, 7))  # ... and those to try if too few nodes of that one are beyond it
-FAR = 0.2  # relative to the largest pivot: a state farther from the singular position is a base of the polynomial
-# factors on tolerances, and on the longest time without an evaluation, of the last attempts across
-LOOSER, WIDER = 10.0, 4.0
-# no base is older than this, relative to the longest of the last steps, or to twice the time to the position
+LONGER = tuple(1.4**k for k in range(1, 7))  # ... and longer ones, if too few nodes of a step are beyond the position
+# Distances from a singular position are measured by the smallest pivot of C_q, relative to its largest one so far.
+FAR = 0.2  # distance from which on a state may be the base of the polynomial
+LOOSER, WIDER = 10.0, 4.0  # factors on tolerances and on the longest time without an evaluation in the last attempts
+# largest age of a base, relative to the longest of the last steps, and to twice the time to the position
 LONGEST_PAST, FARTHEST = 1.5, 4.0
-BEYOND = 0.5  # relative to the farthest state: one before it that is nearer lies beyond another singular position
+# an earlier state whose distance is below this share of the base's lies beyond another singular position
+BEYOND = 0.5
 SMALL = 1e-300  # avoids a division by zero
-CLEAR = 0.3  # relative to the largest pivot that C_q had: above it the run continues with steps of its own method
+CLEAR = 0.3  # distance from which on the run continues with steps of its own method
 
 
 def may_cross(run: Run, code: int) -> bool:
-    """Return whether steps across a singular position follow, also if the method asks for a switch near one."""
+    """Return whether steps across a singular position follow, given the code with which `advance` returned."""
     a, notes = run.a, run.work.notes
     if code == a.SWITCH_METHOD:
         from twoloop.kernels.steps.lobatto_step import TIGHT
@@ -113,10 +116,10 @@ def may_cross(run: Run, code: int) -> bool:
 
 
 def switch_method(run: Run) -> None:
-    """Switch to the substitute plan, because the run's method is not suited, or its values are not finite."""
+    """Switch to the substitute plan, because the method of the run is unsuitable or its values are not finite."""
     substitute = run.plan.substitute
     assert substitute is not None
-    run.plan, run.memory = substitute.fresh(), substitute.memory  # no run writes to this memory
+    run.plan, run.memory = substitute.fresh(), substitute.memory  # `run.memory` is only read
     _renew_kit(run)
     run.substituted = True
     run.control_by(run.plan)
@@ -144,7 +147,7 @@ def _renew_kit(run: Run) -> None:
 def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
     """Return the plan and the controls for steps across a singular position, see kernels/steps/crossing_step.py.
 
-    `past`: states of the last accepted steps, oldest first; there may be none.
+    `past`: states of the last accepted steps, oldest first; may be empty.
     """
     a, clock = run.a, run.clock
     from twoloop.kernels.steps.crossing_step import BACK, UNSEEN
@@ -154,7 +157,7 @@ def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
     base, run.mirrored = None, 0.0
     if not fixed:
         base, run.mirrored = _state_farther_away(run, [place for place in past if place[0] >= earliest])
-    # a force that jumped may spoil nodes in the past, and beside the start of the run there may be too few of them
+    # nodes in the past are wrong if a force jumped meanwhile, and too few near the start of the run: try other origins
     run.origins = [(earliest, base, False), (np.inf, None, False)]
     if float(clock[a.T] - clock[a.T_START]) < clock[a.H_LONG] and not run.system.called_in_python:
         run.origins.append((-np.inf, None, False))
@@ -166,7 +169,7 @@ def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
     control[a.SYMMETRIC], control[a.BRIDGE], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
     control[a.MAY_SWITCH] = control[a.MAKES_MANY] = 0.0
     if control[a.FIXED_STEP] == 0.0:
-        control[a.MAX_EVALUATION_GAP] = 1.0 if run.narrow else UNSEEN / (1.0 - BACK)
+        control[a.MAX_EVALUATION_GAP] = 1.0 if run.may_be_steep else UNSEEN / (1.0 - BACK)
     clock[a.LIMIT_AGE] = 0.0
     _next_origin(run, plan, control)
     return plan, control
@@ -196,11 +199,11 @@ def _next_origin(run: Run, plan: Plan, control: Array) -> None:
 
 
 def _state_farther_away(run: Run, past: list[Place]) -> tuple[Place | None, float]:
-    """Return the latest of these states that is well away from the singular position, else the farthest of them.
+    """Return the base of the polynomial: the latest state in `past` that is far from the singular position.
 
-    Rounding changes velocities by eps/s^2 at a distance s, as the smallest singular value measures it. There is none
-    (None) if the present state is farther away. Returned, too: the length of the step that leads as far beyond the
-    position as that state is before it, s, if the distance changes evenly; 0 if the motion does not approach.
+    If none is far, return the farthest one; None if the present state is farther. (Rounding changes velocities by
+    eps/s^2 at a distance s, measured by the smallest singular value.) Also return a step length, s: if the distance
+    changes linearly, the step ends as far beyond the position as the base is before it; 0 without an approach.
     """
     a, n, t = run.a, run.system.n_q, float(run.clock[run.a.T])
     here = least_singular_value(run.system, t, run.state[:n], run.rank)
@@ -221,28 +224,31 @@ def _state_farther_away(run: Run, past: list[Place]) -> tuple[Place | None, floa
 
 
 def lengths_across(longest: float, allowed: float) -> list[float]:
-    """Return the lengths to try for a step across, s; each above the largest one allowed would be the same attempt."""
+    """Return the step lengths to try across a singular position, s: shares of `longest`, cut to the allowed length."""
     first = min(longest, allowed)
     return [first, *(longest * part for part in LENGTHS if longest * part < first)]
 
 
 def crossing_kit(kit: Kit) -> Kit:
-    """Return the kit of steps across, which is cached with that of the run's own steps."""
+    """Return the kit of steps across a singular position, which is cached in the kit of the run's own steps."""
     from twoloop.kernels.steps.crossing_step import CROSSING
 
-    known = vars(kit)
-    if "crossing" not in known:
-        known["crossing"] = Kit(kit.functions, kit.general, CROSSING)
-    return known["crossing"]  # type: ignore[no-any-return]
+    attributes = vars(kit)
+    if "crossing" not in attributes:
+        attributes["crossing"] = Kit(kit.functions, kit.general, CROSSING)
+    return attributes["crossing"]  # type: ignore[no-any-return]
 
 
 def after_crossing(run: Run, plan: Plan, control: Array, code: int, accepted: int) -> tuple[Plan, Array, int]:
-    """Choose what follows an attempt to step across: a piece of its polynomial, another length, or the run's steps."""
+    """Return plan, controls and code for what follows an attempt to step across a singular position.
+
+    This is the next piece of the polynomial that was found, an attempt with another length, or the run's own method.
+    """
     from twoloop.kernels.steps import crossing_step as kernels
 
     a, clock = run.a, run.clock
-    end = float(plan.memory[-kernels.N_STORED :][kernels.END])  # of a polynomial that was found
-    # a piece may end a rounding before or after its time
+    end = float(plan.memory[-kernels.N_STORED :][kernels.END])  # end of the polynomial, if one was found
+    # the end of a piece may have a rounding error
     now = float(clock[a.T] + kernels.ROUNDING * run.crossed + 4.0 * np.spacing(abs(clock[a.T])))
     if code in (a.PAUSED, a.RANK_LOST) and end > now:
         if not run.pieces:
@@ -256,7 +262,7 @@ def after_crossing(run: Run, plan: Plan, control: Array, code: int, accepted: in
             clock[a.H_NEXT], clock[a.H_LIMIT] = run.pieces[0] - clock[a.T], np.inf
             return plan, control, a.PAUSED
     run.pieces, plan.memory[-kernels.N_STORED :][kernels.END] = [], -np.inf
-    if accepted > 0:  # the longest of the last steps is that of the whole polynomial
+    if accepted > 0:  # the whole polynomial counts as one step
         clock[a.H_LONG] = max(clock[a.H_LONG], run.crossed)
         clock[a.H_NEXT] = max(clock[a.H_NEXT], run.crossed)
     if code == a.PAUSED and accepted == 0:
@@ -277,7 +283,7 @@ def after_crossing(run: Run, plan: Plan, control: Array, code: int, accepted: in
         return plan, control, code
     if code not in (a.PAUSED, a.STEP_TOO_SMALL, a.FIXED_STEP_FAILED, a.RANK_LOST):
         return plan, control, code
-    if accepted == 0:  # there is no way across: the run's own steps go on as far as they can
+    if accepted == 0:  # all attempts failed: the run's own steps continue as far as they can
         run.control[a.BRIDGE] = a.SUSPENDED
     run.crossings[-1].append((float(run.clock[a.T]), run.state.copy()))
     run.work.notes[indices.NEAR_NOW] = 0.0
@@ -287,7 +293,7 @@ def after_crossing(run: Run, plan: Plan, control: Array, code: int, accepted: in
 
 
 def apply_jump(run: Run, t1: float) -> bool:
-    """Prepare the step over a jump of C_t or b, after which the method restarts; return whether there is one."""
+    """Apply a jump of C_t or b to the velocities, and restart the method; return whether that is possible."""
     a, clock, n = run.a, run.clock, run.system.n_q
     end = float(clock[a.JUMP_TO])
     state = state_behind_jump(run.system, end, run.state[:n], run.state[n : 2 * n])

@@ -1,9 +1,9 @@
 """Integrate chunk by chunk: call the compiled `advance`, handle the code that it returns, and record the run.
 
-Ctrl-C ends the run, which returns what it has, wherever the signal arrives. An exception between two arbitrary
-instructions of Python could leave arrays half written, and machine code cannot pass it on between its calls of Python.
-Therefore the signal raises `KeyboardInterrupt` only within functions of the user, which may take long and whose callers
-expect exceptions. Elsewhere it is stored until the loop checks for it.
+Ctrl-C ends the run at any point, with the result so far. An exception between two arbitrary instructions of Python
+could leave arrays half written, and machine code cannot propagate exceptions between its calls of Python. So the signal
+raises `KeyboardInterrupt` only within functions of the user, which may take long and whose callers expect exceptions.
+Elsewhere it is stored until the loop checks for it.
 """
 
 import _signal  # type: ignore[import-not-found]  # `signal` makes enumerations of handlers, which takes 8 microseconds
@@ -72,21 +72,21 @@ from twoloop.run.singular_positions import Place, turned_last
 
 Array = NDArray[np.float64]
 
-IMPATIENCE = 3  # signals after which the next one raises at once, even if the result is lost
+PATIENCE = 3  # number of signals after which the next one raises at once, even if the result is lost
 
 
 class Interrupts:
-    """Handler of Ctrl-C that replaces Python's own between `listen` and `leave`; a user's handler stays.
+    """Handler of Ctrl-C that replaces Python's own between `listen` and `leave`, but never a handler of the user.
 
-    Before `listen`, Ctrl-C raises as usual: this takes less time, and all that is half written then is thrown away.
+    Before `listen`, Ctrl-C raises as usual: installing a handler takes time, and nothing is lost at that stage.
 
     Attributes
     ----------
-    asked : int
+    n_signals : int
         Number of signals so far.
     """
 
-    asked, _stands_in = 0, False
+    n_signals, _installed = 0, False
     handlers: SignalHandlers | None = None
 
     def listen(self) -> "Interrupts":
@@ -95,31 +95,31 @@ class Interrupts:
             self.handlers = SignalHandlers()
         if _signal.getsignal(signal.SIGINT) is signal.default_int_handler:
             with suppress(ValueError):  # raised in threads other than the main one, which get no signals
-                _signal.signal(signal.SIGINT, self._heard)
-                self._stands_in = True
+                _signal.signal(signal.SIGINT, self._on_signal)
+                self._installed = True
         return self
 
-    def answers(self) -> bool:
-        """Return whether a raised Ctrl-C ends in a result: not the fourth one, nor one that a user's handler raised."""
-        self.listen()  # if the handler is Python's own
-        return self._stands_in and self.asked <= IMPATIENCE
+    def gives_result(self) -> bool:
+        """Return whether a run that Ctrl-C ended returns a result: the fourth signal and handlers of the user raise."""
+        self.listen()  # replaces the handler only if it is Python's own
+        return self._installed and self.n_signals <= PATIENCE
 
     def leave(self) -> None:
-        """Restore all handlers, and raise what one of the user's raised."""
-        if self._stands_in:
+        """Restore all handlers; raise the exception of a user's handler again, if there was one."""
+        if self._installed:
             _signal.signal(signal.SIGINT, signal.default_int_handler)
         if self.handlers is not None:
             self.handlers.leave()
 
-    def _heard(self, number: int, frame: FrameType | None) -> None:
-        self.asked += 1
-        if self.asked > IMPATIENCE or within_a_users_function(frame):
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self.n_signals += 1
+        if self.n_signals > PATIENCE or within_a_users_function(frame):
             raise KeyboardInterrupt
 
 
 def describe_interrupt(t: float, table: Array) -> str:
     """Describe a run that Ctrl-C ended at t; `table` has its rows [q, v, a, lam]."""
-    gaps = int(np.isnan(table[:, -1:]).sum())  # if one entry of [a, lam] is missing, all are
+    gaps = int(np.isnan(table[:, -1:]).sum())  # [a, lam] of a row is either complete or NaN
     unknown = f" Accelerations and multipliers are NaN at {gaps} of its times." if gaps else ""
     return f"Interrupted from the keyboard at t = {t:.10g}. The result holds what was computed before.{unknown}"
 
@@ -150,11 +150,11 @@ def interrupted_record(system: ConstrainedSystem, t0: float, events: list[Any] |
 
 BUFFER_ROWS = 1024  # largest number of states in the buffers of a chunk ...
 BUFFER_STEPS = 4096  # ... and of steps
-CHUNK_TO_EVENT = 16  # attempts per chunk if an event may end the run: steps computed beyond it are in vain
-CHUNK_TIME = 0.05  # s of CPU; chunks that take longer do not grow, so that Ctrl-C is heard
+CHUNK_TO_EVENT = 16  # attempts per chunk if an event may end the run: steps beyond the event are wasted
+CHUNK_TIME = 0.05  # CPU time, s; chunks that take longer do not grow, so that the loop notices Ctrl-C
 # statuses whose message may say that stability limited the steps
 EXPLAINED_BY_STIFFNESS = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
-MOST_PAST = 16  # largest number of accepted steps that a step across a singular position may begin from
+MOST_PAST = 16  # largest number of accepted states that are candidates for the base of a step across a singularity
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
 MOST_SPARE, LARGEST_SPARE = 16, 250_000  # largest number of buffers kept for later runs, and of numbers in each
 _spare: dict[tuple[int, int, int], Buffers] = {}  # buffers for the next run, by their sizes
@@ -171,16 +171,16 @@ class IntegrationLoop:
         End of the run, s.
     request : OutputRequest
     report : callable
-        Takes the time reached, after each chunk.
+        Called with the time reached after each chunk.
     time_limit : float or None
-        s.
+        Limit of elapsed time, s.
     interrupts : Interrupts
     last : bool
-        Whether the run is not repeated if it may have missed something.
+        Whether this is the last attempt: it is not repeated, but warns, if it may have missed short changes.
     start : ndarray, optional
-        The row [q, v, a, lam] at the start of a run that has left it.
+        The row [q, v, a, lam] at the start, if the run has made steps already.
     system : ConstrainedSystem, optional
-        System of the result, if the arrays of the run's system will belong to another.
+        System of the result, if the run's system is a copy whose arrays will be used for other parameters.
     """
 
     def __init__(
@@ -208,14 +208,14 @@ class IntegrationLoop:
         to_event = request.events is not None and any(event.terminal < np.inf for event in request.events)
         if to_event:
             self.largest_chunk = run.chunk = CHUNK_TO_EVENT
-        # the run is checked after so many attempts, however long the chunks are that CHUNK_TIME allows
-        self.between_looks = self.next_look = run.chunk
-        self.plan, self.control, self.kit = run.plan, run.control, run.kit  # may differ from the run's own
+        # numbers of attempts after which progress is checked, whatever chunks CHUNK_TIME allows
+        self.check_interval = self.next_check = run.chunk
+        self.plan, self.control, self.kit = run.plan, run.control, run.kit  # replaced in steps across a singularity
         self.counts = BEFORE.copy()
         self.latest: list[tuple[Array, Array]] = []  # times and rows of the last two chunks
         self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # steps that were not stored yet, after an empty array
         if self.request.store.finished:
-            self._tell()
+            self._store_step_fields()
         self.filled = np.zeros(2, dtype=np.int64)
         ends_before = to_event or time_limit is not None  # t1 may then be an arbitrary late time
         self.stall = StallDetector(run.t0, np.inf if ends_before else OUT_OF_REACH)
@@ -223,31 +223,31 @@ class IntegrationLoop:
         self.sample = Sample(run.t0, self.start, 2 * run.system.n_q)
         self.cpu = 0.0
         self.raised: Exception | None = None
-        self.code = INTERRUPTED if interrupts.asked else run.a.PAUSED
+        self.code = INTERRUPTED if interrupts.n_signals else run.a.PAUSED
 
     def resume(self, code: int, t: Array, rows: Array, steps: Array, cpu_time: float) -> None:
-        """Record a copy of the first chunk (times, rows and steps of `advance`), and handle the code that ended it."""
+        """Record a copy of the first chunk (times, rows and steps of `advance`), and handle its code."""
         self.code, self.cpu = code, cpu_time
-        self._take(t.copy(), rows.copy(), steps.copy(), self._kinds(steps, False, False))
+        self._store_chunk(t.copy(), rows.copy(), steps.copy(), self._kinds(steps, False, False))
         self._handle(steps, False, cpu_time)
 
     def to_end(self, check_derivatives: bool) -> Record:
-        """Integrate chunk by chunk to the end, compare derivatives once more there, and return the run's record."""
+        """Integrate to the end, check callbacks at states of the run, and return its record."""
         run, recorder = self.run, self.recorder
         a, clock = run.a, run.clock
         buffers, copied = self._buffers(), True
         while self.code == a.PAUSED:
-            across, leaps = self.plan is not run.plan, clock[a.APPLIES_JUMP] == 1.0
+            across, over_jump = self.plan is not run.plan, clock[a.APPLIES_JUMP] == 1.0
             began = time.process_time()
             self._advance(buffers)
             n_rows, n_steps = self.filled.tolist()
             t, rows, steps = buffers[0][:n_rows], buffers[1][:n_rows], buffers[2][:n_steps]
-            copied = 2 * n_rows < len(buffers[0])  # copies take less memory then
+            copied = 2 * n_rows < len(buffers[0])  # a copy of a half-empty buffer saves memory
             if copied:
                 t, rows, steps = t.copy(), rows.copy(), steps.copy()
             if across and n_steps and self.request.between_steps:
                 self.recorder.keep_crossing(self.plan.memory)
-            self._take(t, rows, steps, self._kinds(steps, across, leaps))
+            self._store_chunk(t, rows, steps, self._kinds(steps, across, over_jump))
             spent = time.process_time() - began
             self.cpu += spent
             if recorder.ended is not None:
@@ -268,63 +268,64 @@ class IntegrationLoop:
         return self._record(check_derivatives)
 
     def _handle(self, steps: Array, across: bool, spent: float) -> None:
-        """Handle the code that `advance` returned; afterwards it is PAUSED if the loop continues, else why it stops."""
+        """Handle the code that `advance` returned, and set it to PAUSED if the loop is to continue."""
         if self.code == self.run.a.ALL_OUTPUT_DONE:
             if self.stiffness.samples:
                 self.stiffness.add_steps(steps[:, self.run.a.H])
             self.report(self.t1)
             return
-        self._look(steps, across, spent)
-        self._go_on(across, len(steps))
+        self._check_progress(steps, across, spent)
+        self._choose_method(across, len(steps))
         self.report(self.run.clock[self.run.a.T])
 
     def _advance(self, buffers: Buffers) -> None:
         """Advance by one chunk of steps in compiled code."""
         run, a = self.run, self.run.a
-        run.control[a.MAX_ATTEMPTS] = min(run.chunk, max(0, self.next_look - run.attempts()))
-        self.filled[:] = 0  # Ctrl-C may arrive before the chunk begins
+        run.control[a.MAX_ATTEMPTS] = min(run.chunk, max(0, self.next_check - run.attempts()))
+        self.filled[:] = 0  # Ctrl-C may arrive before `advance` sets it
         try:
             self.code = run.advance(self.outputs, buffers, self.filled, (self.plan, self.control, self.kit))
         except KeyboardInterrupt:
             self.code = INTERRUPTED
-        except Exception as error:  # raised by a callback; beyond a terminal event it does not matter
-            if (
-                run.clock[a.SAMPLES_MOTION] == 1.0 and not self.interrupts.asked
-            ):  # a sample of forces ahead may be at a state that the motion never reaches
+        except (
+            Exception
+        ) as error:  # raised by a callback; `to_end` raises it again unless an event ended the run before
+            # a sample of forces ahead may be at a state that the motion never reaches: continue without samples
+            if run.clock[a.SAMPLES_MOTION] == 1.0 and not self.interrupts.n_signals:
                 run.clock[a.SAMPLES_MOTION] = self.control[a.SAMPLE_MOTION] = 0.0
             else:
-                self.code, self.raised = INTERRUPTED, None if self.interrupts.asked else error
+                self.code, self.raised = INTERRUPTED, None if self.interrupts.n_signals else error
                 if not run.system.called_in_python:
                     error.add_note(_where(run.system.name, float(run.clock[a.T]), error))
         if self.interrupts.handlers is not None:
             self.interrupts.handlers.check()
 
-    def _take(self, t: Array, rows: Array, steps: Array, kinds: NDArray[np.int64]) -> None:
+    def _store_chunk(self, t: Array, rows: Array, steps: Array, kinds: NDArray[np.int64]) -> None:
         """Store the states and the steps of a chunk."""
         run = self.run
         self.sample.add(t, rows, float(run.clock[run.a.T]), run.state)
         self.step_parts.append(steps)
         if self.request.store.finished:
-            self._tell()
+            self._store_step_fields()
         self.recorder.add(t, rows, kinds)
         if len(t):
             self.latest = [*self.latest[-1:], (t, rows)]
 
-    def _tell(self) -> None:
+    def _store_step_fields(self) -> None:
         """Store the fields that have one row per step."""
         steps, self.step_parts = np.concatenate(self.step_parts), self.step_parts[:1]
         for name, values in step_fields(steps, self.counts).items():
             self.request.store.add(name, values)
 
-    def _look(self, steps: Array, across: bool, spent: float) -> None:
+    def _check_progress(self, steps: Array, across: bool, spent: float) -> None:
         """Check whether the run makes progress, and choose the length of the next chunk."""
         run, a = self.run, self.run.a
         h = steps[:, a.H]
         self.stiffness.add_steps(h)
         self.stall.add_steps(h)
-        if self.code == a.PAUSED and run.attempts() >= self.next_look:
-            self.between_looks = min(2 * self.between_looks, self.largest_chunk)
-            self.next_look = run.attempts() + self.between_looks
+        if self.code == a.PAUSED and run.attempts() >= self.next_check:
+            self.check_interval = min(2 * self.check_interval, self.largest_chunk)
+            self.next_check = run.attempts() + self.check_interval
             if not across:
                 self.stiffness.sample_state(float(run.clock[a.T]), run.state, run.system.n_q)
             if self.stall.stagnates(run.clock[a.T], self.t1) and run.control[a.MAX_STEPS] == np.inf:
@@ -333,11 +334,11 @@ class IntegrationLoop:
             run.chunk = min(2 * run.chunk, self.largest_chunk)
         if self.code in (a.PAUSED, a.NEEDS_COMPILATION) and time.monotonic() > self.deadline:
             self.code = OUT_OF_TIME
-        if self.code in (a.PAUSED, a.NEEDS_COMPILATION) and (self.interrupts.asked or self.recorder.interrupted):
+        if self.code in (a.PAUSED, a.NEEDS_COMPILATION) and (self.interrupts.n_signals or self.recorder.interrupted):
             self.code = INTERRUPTED
 
-    def _go_on(self, across: bool, n_steps: int) -> None:
-        """Choose the method of the next steps, if it is not that of the last ones."""
+    def _choose_method(self, across: bool, n_steps: int) -> None:
+        """Change the method of the next steps if the code asks for it."""
         run, a = self.run, self.run.a
         if self.code == a.NEEDS_DENSE or run.is_lost_without_dense(self.code):
             run.change_form()
@@ -359,9 +360,9 @@ class IntegrationLoop:
         elif self.code == a.AT_DISCONTINUITY and not across and apply_jump(run, self.t1):
             self.code = a.PAUSED
         elif self.plan is not run.plan and self.code != a.ALL_OUTPUT_DONE:
-            found_before = bool(run.pieces)
+            had_pieces = bool(run.pieces)
             self.plan, self.control, self.code = after_crossing(run, self.plan, self.control, self.code, n_steps)
-            if run.pieces and not found_before:
+            if run.pieces and not had_pieces:
                 self._correct_last()
             if self.plan is run.plan:
                 self.kit = run.kit
@@ -376,7 +377,7 @@ class IntegrationLoop:
         return places[-MOST_PAST:]
 
     def _correct_last(self) -> None:
-        """Replace the last stored state by that of the polynomial across a singular position: it has less rounding."""
+        """Replace the last stored state by the more accurate one of the polynomial across a singular position."""
         run = self.run
         t, row = float(run.clock[run.a.T]), run.state[: 3 * run.system.n_q]
         self.recorder.correct_last(t, row)
@@ -384,7 +385,7 @@ class IntegrationLoop:
             self.latest[-1][1][-1, : len(row)] = row
 
     def _stalls(self, across: bool) -> bool:
-        """Return whether a method that has a substitute makes no step, though no singular position is near."""
+        """Return whether a method with a substitute makes no step, although no singular position is near."""
         run, a = self.run, self.run.a
         stalls = self.code == a.STEP_TOO_SMALL and run.control[a.MAY_SWITCH] == 1.0
         return stalls and not across and run.work.notes[indices.NEARLY_SINGULAR] != 1.0
@@ -393,7 +394,7 @@ class IntegrationLoop:
         run, recorder, code = self.run, self.recorder, self.code
         t, table = recorder.output()
         stats, store = statistics(run.work.counters, self.cpu), self.request.store
-        self._tell()
+        self._store_step_fields()
         reached = float(run.clock[run.a.T])
         if recorder.ended is not None or recorder.broken_off is not None:
             for name in OF_STEPS:
@@ -412,7 +413,7 @@ class IntegrationLoop:
                 status, message = outcome(run, code, self.t1, self.stall)
             if status >= 0:
                 end = reached if recorder.ended is None else recorder.ended[1]
-                places = self._last_step(t, table), self._landed(t, table)
+                places = self._suspicious_last_step(t, table), self._suspicious_outputs(t, table)
                 status, message = reject_turned_velocities(run, *places, end, status, message)
             if code != INTERRUPTED:
                 end = reached
@@ -428,7 +429,7 @@ class IntegrationLoop:
                 message += describe_stiffness(self.stiffness, run.kit, run.work)
         except KeyboardInterrupt:
             code = INTERRUPTED
-        if self.interrupts.asked or recorder.interrupted or (code == INTERRUPTED and recorder.ended is None):
+        if self.interrupts.n_signals or recorder.interrupted or (code == INTERRUPTED and recorder.ended is None):
             status, message = Status.INTERRUPTED, describe_interrupt(reached, table)
         t_events, q_events, v_events = recorder.events()
         fields = of_run(run, t, table) | {name: store.array(name) for name in OF_STEPS}
@@ -437,7 +438,7 @@ class IntegrationLoop:
         fields |= {"t_events": t_events, "q_events": q_events, "v_events": v_events}
         return record_of(Record, DEFAULTS | fields)
 
-    def _last_step(self, t: Array, table: Array) -> list[Place]:
+    def _suspicious_last_step(self, t: Array, table: Array) -> list[Place]:
         """Return the beginning of the last step if velocities turned in it, as they do near a singular position."""
         run = self.run
         if self.request.times is not None or self.recorder.ended is not None:
@@ -446,8 +447,8 @@ class IntegrationLoop:
             return []
         return [(float(t[-2]), table[-2])] if turned_last(t, table, run.system.n_q) else []
 
-    def _landed(self, t: Array, table: Array) -> list[Place]:
-        """Return the states on which steps had to end, if one of them is near a singular position."""
+    def _suspicious_outputs(self, t: Array, table: Array) -> list[Place]:
+        """Return the states at which steps had to end, if one of them is near a singular position."""
         run, request = self.run, self.request
         grid = run.control[run.a.FIXED_STEP] > 0.0 and request.times is None
         if not run.passed_near_singular() or not (grid or (request.times is not None and request.lands)):
@@ -468,15 +469,15 @@ class IntegrationLoop:
         run, n = self.run, self.run.system.n_q
         interpolator = interpolator_of(run, self.start[: 3 * n]) if self.request.between_steps else None
         apart = LONGEST_UNSEEN * (self.t1 - run.t0) / SAMPLES
-        every = float(run.tolerances[indices.LOOK]) if run.sudden.by_state else apart
+        every = float(run.tolerances[indices.LOOK]) if run.short_forces.by_state else apart
         return Recorder(self.request, interpolator, n, run.t0, self.start, every)
 
-    def _kinds(self, steps: Array, across: bool, leaps: bool) -> NDArray[np.int64]:
+    def _kinds(self, steps: Array, across: bool, over_jump: bool) -> NDArray[np.int64]:
         """Return the kind of interval of each accepted step, for the dense solution."""
         run = self.run
         if not self.request.between_steps:
             return NO_KINDS
-        if leaps:
+        if over_jump:
             return np.full(len(steps), indices.JUMP)
         if across:
             return np.full(len(steps), indices.ACROSS)
@@ -484,10 +485,10 @@ class IntegrationLoop:
 
 
 def silent(t: float) -> None:
-    """Report no progress."""
+    """Ignore the time reached: `report` of a loop without a progress bar."""
 
 
 def _where(name: str, t: float, error: Exception) -> str:
-    """Describe what the error of a compiled callback does not contain: the system, and the time."""
+    """Return the note that is added to an exception of a compiled callback: the system and the time."""
     beyond = ": it asks an array for more than it has, as beyond the end of a table" * isinstance(error, IndexError)
     return f"raised by a compiled callback of system {name!r} in a step from t = {t:.10g}{beyond}"

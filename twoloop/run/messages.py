@@ -1,9 +1,8 @@
 """Monitor a run, and describe its end: status, message and advice.
 
-One monitor detects a run that stalls, another one says whether stability, not accuracy, limited the steps. The second
-estimates the largest rate of the motion at a few states after the run, by power iteration with dF/dq and dF/dv, F being
-the accelerations. The rate times the step is compared with the stability limit of the method, for vibrations and for
-decay.
+`StallDetector` detects a run that makes no progress. `StiffnessMonitor` decides whether stability, not accuracy,
+limited the steps. After the run it estimates the largest rate of vibrations and of decay at a few states, by power
+iteration with dF/dq and dF/dv (F: accelerations). Rate times step is compared with the stability limit of the method.
 """
 
 import sys
@@ -38,10 +37,10 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # codes of this module, besides those that advance() returns
-STAGNATION_STEPS = 20_000  # accepted steps over which the mean step is measured; it is small if it is below ...
-STAGNATION_PACE = 1e-3  # ... this share of the longest step of the run, and the run stalls if it is small and ...
-STAGNATION_LEFT = 1e7  # ... the rest of the run would take more than this number of steps
-OUT_OF_REACH = 1e11  # number of remaining steps at which a run ends whatever its longest step was: they would take days
+STAGNATION_STEPS = 20_000  # number of accepted steps over which the mean step is measured
+# A run stalls if its mean step is below the share STAGNATION_PACE of its longest step, and the rest of the run would
+# take more than STAGNATION_LEFT steps. It also stalls if the rest would take more than OUT_OF_REACH steps, hence days.
+STAGNATION_PACE, STAGNATION_LEFT, OUT_OF_REACH = 1e-3, 1e7, 1e11
 
 
 class StallDetector:
@@ -52,7 +51,7 @@ class StallDetector:
     t0 : float
         Start of the run, s.
     most : float
-        Number of steps that the rest may take if they are as long as the last ones.
+        Largest number of remaining steps, at the mean length of the last ones.
     """
 
     def __init__(self, t0: float, most: float = OUT_OF_REACH):
@@ -79,17 +78,18 @@ class StallDetector:
         return self.mean < STAGNATION_PACE * self.longest
 
 
-MOST = 8  # most states that are kept; they are spread about evenly over the run
-LAST_STEPS = 8  # number of last steps whose median is the step at a state
-ITERATIONS = 6  # power iterations at each state
+MAX_SAMPLES = 8  # largest number of sampled states, spread about evenly over the run
+LAST_STEPS = 8  # the step at a state is the median of this number of steps before it
+ITERATIONS = 6  # number of power iterations at each state
 START = 0.1  # share of a vector with all coordinates that is added to the direction before each estimate
 ALIGNED = 0.9  # absolute cosine above which the image counts as parallel to the direction
-MANY = 200  # accepted steps below which nothing is said about stiffness
-NEXT_TO = 0.45  # share of the limit of stability that half of the states must reach; smooth motion stays below 0.4
+MIN_STEPS = 200  # number of accepted steps below which stiffness is not mentioned
+# share of the stability limit that half of the sampled states must reach; smooth motion stays below 0.4
+STABILITY_SHARE = 0.45
 
 
 class StiffnessSample(NamedTuple):
-    """Sampled state of a run, the step h there, and limits of h times a rate of vibration or decay for stability."""
+    """State of a run with the step h there, and the stability limits of h times the rate of vibration and of decay."""
 
     t: float
     q: Array
@@ -101,7 +101,7 @@ class StiffnessSample(NamedTuple):
 
 
 class StiffnessMonitor:
-    """Monitor that samples states of a run, to find out at its end whether stability limited its steps."""
+    """Monitor that samples states of a run, so that `describe_stiffness` can decide whether stability limited steps."""
 
     def __init__(self, plan: Plan):
         self.plan, self.every, self.n_seen, self.n_steps = plan, 1, 0, 0
@@ -115,7 +115,7 @@ class StiffnessMonitor:
         self.last = last if last.size == LAST_STEPS else np.concatenate([self.last, last])[-LAST_STEPS:]
 
     def sample_state(self, t: float, state: Array, n_q: int) -> None:
-        """Keep the state after the last steps; of many states, keep only every second, fourth, ..."""
+        """Store the state after the last steps; in a long run only every second state, then every fourth, and so on."""
         if self.plan.stable_to is None or self.last.size < LAST_STEPS:
             return
         self.n_seen += 1
@@ -124,31 +124,29 @@ class StiffnessMonitor:
         q, v, a = state[: 3 * n_q].reshape(3, n_q).copy()
         limits = self.plan.stable_to(self.plan.memory)
         self.samples.append(StiffnessSample(t, q, v, a, float(np.median(self.last)), *limits))
-        if len(self.samples) > MOST:
+        if len(self.samples) > MAX_SAMPLES:
             self.samples = self.samples[1::2]
             self.every *= 2
 
 
-def describe_stiffness(looks: StiffnessMonitor, kit: Any, work: Any) -> str:
-    """Return a sentence if stability limited the steps, else nothing. Overwrites the workspace."""
-    if not looks.samples or looks.n_steps < MANY:
+def describe_stiffness(monitor: StiffnessMonitor, kit: Any, work: Any) -> str:
+    """Return a sentence if stability limited the steps, else an empty string. Overwrites the workspace."""
+    if not monitor.samples or monitor.n_steps < MIN_STEPS:
         return ""
     start = initial_direction(work.Q.size)
     directions = [np.zeros_like(start), np.zeros_like(start)]
     samples = []
-    for sample in looks.samples:
-        for direction in (
-            directions
-        ):  # continue from the direction of the previous state; START restores coordinates that are zero in it
+    for sample in monitor.samples:
+        for direction in directions:  # continue from the previous state; START restores coordinates that became zero
             direction += START * start
         try:
             vibration, decay = _rates(kit, work, sample, directions)
-        except Exception:  # raised by a callback at a displaced state, which the run did not visit: say nothing
+        except Exception:  # raised by a callback at a displaced state, which the run did not visit
             return ""
         h = sample.h
         samples.append((h * vibration / sample.vibration, h * decay / sample.decay, vibration, decay, h))
     by_vibration, by_decay, vibration, decay, h = np.median(samples, axis=0)
-    if max(by_vibration, by_decay) < NEXT_TO:
+    if max(by_vibration, by_decay) < STABILITY_SHARE:
         return ""
     what = f"vibrations of {vibration:.2g} rad/s" if by_vibration >= by_decay else f"a decay of {decay:.2g} 1/s"
     return (
@@ -158,7 +156,7 @@ def describe_stiffness(looks: StiffnessMonitor, kit: Any, work: Any) -> str:
 
 
 def _rates(kit: Any, work: Any, sample: StiffnessSample, directions: list[Array]) -> tuple[float, float]:
-    """Return the angular frequency of the fastest vibration and the fastest decay, 1/s, as far as they dominate."""
+    """Return the angular frequency of the fastest vibration and the rate of the fastest decay, 1/s; 0 if unknown."""
     from twoloop.kernels.evaluation import tasks
 
     if kit.inner(kit, work, tasks.RENEW_PARTITION, sample.t, sample.q, sample.v, 0.0, work.x, work.lam) != indices.DONE:
@@ -172,7 +170,7 @@ def _rates(kit: Any, work: Any, sample: StiffnessSample, directions: list[Array]
 def _largest(
     kit: Any, work: Any, sample: StiffnessSample, direction: Array, places: NDArray[np.int64], by_v: bool
 ) -> tuple[float, bool]:
-    """Return the largest growth of a direction under dF/dq or dF/dv by power iteration, and whether it is reversed."""
+    """Return the largest eigenvalue of dF/dq or dF/dv in size, by power iteration, and whether it is negative."""
     from twoloop.kernels.evaluation import tasks
 
     size = DISPLACEMENT * max(1.0, float(np.abs(sample.v if by_v else sample.q).max()))
@@ -194,15 +192,15 @@ def _largest(
     return factor, opposed
 
 
-NEARLY_SINGULAR = 1e-3  # smallest over largest singular value of C_q, below which a message says so
-LASTING = 100.0  # times the tolerances: larger errors of velocities along the way make a run untrustworthy
-LOST_AT_END = 1e-6  # ratio of singular values, in any units, below which the state at the end counts as not determined
-# what may help where no step leads across a singular position: rounding is larger there than tight tolerances
+NEARLY_SINGULAR = 1e-3  # smallest over largest singular value of C_q, below which a message mentions it
+LASTING = 100.0  # times the tolerances: larger errors of velocities within the run make its result untrustworthy
+LOST_AT_END = 1e-6  # ratio of singular values below which velocities at the end count as not determined
+# advice if no step leads across a singular position; loose tolerances help, as rounding errors are large there
 _REMEDIES = (
     "loosen rtol and atol, take another method or compiled=False, end t_span before, or change the geometry slightly"
 )
 CROSSINGS = "\0"  # placeholder in a message, replaced by the description of singular positions that were crossed
-NEXT_TO_END = 1e-3  # relative to the run: if it stops so close to its end, the message says so
+NEXT_TO_END = 1e-3  # if a run stops closer to its end than this share of its length, the message mentions it
 
 _REASONS = {
     indices.DONE: "the error estimate stayed above the tolerances",
@@ -215,19 +213,16 @@ _REASONS = {
 
 
 def _describe_passages(run: "Run") -> str:
-    """Describe jumps and singular positions in a run that succeeded."""
-    if not run.jumps and not run.crossings:
-        return ""
-    said = ""
-    if run.jumps:
-        said = f" At t = {_times(run.jumps)} C_t or b jumps: velocities changed there as by an impulse."
-    return said + (CROSSINGS if run.crossings else "")
+    """Describe jumps and singular positions in a run that succeeded; return an empty string if there were none."""
+    text = f" At t = {_times(run.jumps)} C_t or b jumps: velocities changed there as by an impulse." * bool(run.jumps)
+    return text + (CROSSINGS if run.crossings else "")
 
 
 def message_of(run: "Run", words: str, system: "ConstrainedSystem", later: Later | None = None) -> dict[str, Any]:
-    """Return the message, or a `later` that computes it: measuring crossings takes longer than many runs.
+    """Return the field `message`, or the field `later` with a function that computes it when it is read.
 
-    `system`: must not change later, as the arrays of the run may; `later`: computes other fields.
+    Measuring crossings takes longer than many runs. `system` must not change, although the arrays of the run may.
+    `later` computes other deferred fields.
     """
     if CROSSINGS not in words:
         return {"message": words}
@@ -238,16 +233,16 @@ def message_of(run: "Run", words: str, system: "ConstrainedSystem", later: Later
             return later(name)
         return {"message": words.replace(CROSSINGS, describe_crossings(system, crossings, now, rank))}
 
-    # functions in Python may depend on variables that change: compute the message now
+    # functions called in Python may depend on variables that change: compute the message now
     return fields_of("message") if system.called_in_python else {"later": fields_of}
 
 
 def reject_turned_velocities(
     run: "Run", last_step: list[Place], landed: list[Place], end: float, status: Status, message: str
 ) -> tuple[Status, str]:
-    """Return status and message, changed if velocities turned at a crossed singular position, or in the last step.
+    """Return status and message, changed if velocities turned unaccountably near a singular position.
 
-    `landed`: states before the end on which steps had to end.
+    `last_step`: the beginning of the last step, if velocities turned in it. `landed`: states at which steps had to end.
     """
     now, crossings = (float(run.clock[run.a.T]), run.state), [each for each in run.crossings if each[0][0] < end]
     turned = describe_rounding(run, [*(place for each in crossings for place in each), *landed], end)
@@ -260,7 +255,7 @@ def reject_turned_velocities(
 
 
 def describe_rounding(run: "Run", places: list[Place], end: float) -> str:
-    """Describe where steps continued from velocities that rounding had changed; return nothing otherwise."""
+    """Describe where steps continued from velocities that rounding had changed; return "" if they did nowhere."""
     system, n = run.system, run.system.n_q
     for t, state in sorted({place[0]: place for place in places}.values(), key=itemgetter(0)):
         q, v = state[:n], state[n : 2 * n]
@@ -281,7 +276,7 @@ def describe_arrival(t: float, fixed: bool) -> str:
     return f"Reached the end, t = {t:g}{', with a constant step: no error was estimated' if fixed else ''}."
 
 
-def outcome(run: "Run", code: int, t1: float, pace: StallDetector) -> tuple[Status, str]:
+def outcome(run: "Run", code: int, t1: float, stall: StallDetector) -> tuple[Status, str]:
     """Return status and message of a run, from the code with which it ended."""
     a, t = run.a, float(run.clock[run.a.T])
     if code == a.ALL_OUTPUT_DONE:
@@ -303,7 +298,7 @@ def outcome(run: "Run", code: int, t1: float, pace: StallDetector) -> tuple[Stat
             f"{stopped} by time_limit. Raise time_limit, loosen rtol and atol, or shorten t_span.",
         )
     if code == STAGNATED:
-        return Status.STAGNATED, f"{stopped}: {_standstill(run, t1, pace)}"
+        return Status.STAGNATED, f"{stopped}: {_describe_stall(run, t1, stall)}"
     if code == a.AT_DISCONTINUITY:
         return (
             Status.RATE_JUMPS,
@@ -344,24 +339,24 @@ def outcome(run: "Run", code: int, t1: float, pace: StallDetector) -> tuple[Stat
     )
 
 
-def _standstill(run: "Run", t1: float, pace: StallDetector) -> str:
-    """Describe how short the steps are, how many more the run would take, and what may be the reason."""
-    left = (t1 - float(run.clock[run.a.T])) / pace.mean
+def _describe_stall(run: "Run", t1: float, stall: StallDetector) -> str:
+    """Describe how short the steps are, how many more the run would take, and the likely reason."""
+    left = (t1 - float(run.clock[run.a.T])) / stall.mean
     before, advice = "", "Shorten t_span, or look at the units of velocities, masses and forces. "
-    if pace.slows:
-        before = f", after steps of up to {pace.longest:.2g} s"
+    if stall.slows:
+        before = f", after steps of up to {stall.longest:.2g} s"
         advice = "Look for a singular position or a stiff force near this time, or take another method. "
         advice = _near_singular(run, t1) or advice
     elif run.control[run.a.FIXED_STEP] > 0.0:
         advice = "Take a larger step_size, or shorten t_span. "
     return (
-        f"the last {STAGNATION_STEPS} steps were {pace.mean:.2g} s long on average{before}, and the rest needs "
+        f"the last {STAGNATION_STEPS} steps were {stall.mean:.2g} s long on average{before}, and the rest needs "
         f"{left:.1g} of them. {advice}With max_steps the run goes on up to that number of steps."
     )
 
 
 def _contradiction(run: "Run") -> str:
-    """Describe which redundant row is violated although the other rows hold, and on which rows it had depended."""
+    """Describe a redundant row that is violated although the other rows hold, and the rows on which it depended."""
     t, n, row = float(run.clock[run.a.T]), run.system.n_q, int(run.work.notes[indices.CONTRADICTION])
     words = in_words(run.system.rows(t, run.state[:n]), [row])
     return (
@@ -372,7 +367,7 @@ def _contradiction(run: "Run") -> str:
 
 
 def warn_of_singular_end(run: "Run") -> str:
-    """Warn if the run ends with constraints that have lost rank, or nearly so, and return the sentence."""
+    """Warn if the constraints have lost rank, or nearly so, at the end; return the sentence, or an empty string."""
     if not run.passed_near_singular():
         return ""
     system, n, t = run.system, run.system.n_q, float(run.clock[run.a.T])
@@ -381,7 +376,7 @@ def warn_of_singular_end(run: "Run") -> str:
         return ""
     ratios = [ratio(system, t, q, run.rank) for ratio in (singular_ratio, ratio_in_any_units)]
     if max(ratios) <= LOST_AT_END:
-        said = (
+        text = (
             f"the run ends where the constraints lose rank ({_measured(run, t, q)}): they do not determine velocities "
             "and accelerations there. End t_span a little before, or beyond"
         )
@@ -389,16 +384,16 @@ def warn_of_singular_end(run: "Run") -> str:
         over = _over_allowed(run, t, q, v)
         if over <= indices.UNTRUE:
             return ""
-        said = (
+        text = (
             f"the run ends where the constraints nearly lose rank ({_measured(run, t, q)}): rounding of positions "
             f"changes velocities there {_times_allowed(over)}, and accelerations by more. "
             "End t_span a little before, or beyond, or loosen rtol and atol"
         )
-    return warn_user(said)
+    return warn_user(text)
 
 
 def warn_of_own_passages(run: "Run") -> str:
-    """Warn if the run's own steps went on where no step led across a singular position, and return the sentence."""
+    """Warn if the run's own steps passed a singular position that no special step could cross; return the sentence."""
     share = float(run.clock[run.a.PIVOT_PASSED])
     if share == 0.0:
         return ""
@@ -414,7 +409,7 @@ def warn_of_own_passages(run: "Run") -> str:
 
 
 def warn_user(text: str) -> str:
-    """Warn where twoloop was called, and return the warning as a sentence of the message."""
+    """Warn with the line of the user's code that called twoloop; return the warning as a sentence of the message."""
     frame, level = sys._getframe(1), 2
     while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("twoloop."):
         frame, level = frame.f_back, level + 1
@@ -438,7 +433,7 @@ def _measured(run: "Run", t: float, q: Array) -> str:
 
 
 def _end_is_near(run: "Run", t1: float) -> str:
-    """Return a sentence if the run stopped just before its end, else nothing."""
+    """Return a sentence if the run stopped just before its end, else an empty string."""
     left = t1 - float(run.clock[run.a.T])
     if left > NEXT_TO_END * (t1 - run.t0):
         return ""
@@ -446,7 +441,7 @@ def _end_is_near(run: "Run", t1: float) -> str:
 
 
 def _near_singular(run: "Run", t1: float) -> str:
-    """Return a sentence if the constraint Jacobian is close to losing rank at the last state, else nothing."""
+    """Return a sentence if C_q is close to losing rank at the last state, else an empty string."""
     ratio = singular_ratio(run.system, float(run.clock[run.a.T]), run.state[: run.system.n_q], run.rank)
     if ratio > NEARLY_SINGULAR:
         return ""
@@ -457,14 +452,14 @@ def _near_singular(run: "Run", t1: float) -> str:
 
 
 def _near_massless(run: "Run") -> str:
-    """Return a sentence if some motion has next to no inertia at the last state, else nothing."""
+    """Return a sentence if some motion has almost no inertia at the last state, else an empty string."""
     t, q = float(run.clock[run.a.T]), run.state[: run.system.n_q]
     ratio, words = least_inertia(run.system, t, q)
     return f"There {words}. " if ratio < NEARLY_SINGULAR else ""
 
 
 def describe_not_finite(run: "Run") -> str:
-    """Describe which callback returned a value that is not finite, and when, as far as it is known."""
+    """Describe which callback returned a value that is not finite, and at which time, if that is known."""
     kind, at = int(run.work.notes[indices.FAULT_KIND]), float(run.work.notes[indices.FAULT_TIME])
     if kind >= 0:
         name = run.functions._fields[kind]

@@ -1,4 +1,4 @@
-"""Validation of the options of a call; calls with equal options share one key, by which integrators are cached."""
+"""Validate the options of a call; calls with equal options share one key, by which integrators are cached."""
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -19,7 +19,7 @@ SMALLEST_TOLERANCE = 1e-15  # relative or absolute tolerance: if both are smalle
 
 @lru_cache(maxsize=1024)
 def _key(*_: Any) -> object:
-    """Return one object for equal options: a dictionary finds it faster than a long tuple."""
+    """Return an object that stands for a tuple of options: it is a faster key of a dictionary than the tuple."""
     return object()
 
 
@@ -46,18 +46,18 @@ class Options:
 
     @cached_property
     def own_tolerance(self) -> float | None:
-        """Tolerance of positions of a method that tests the errors of positions by itself, else None."""
+        """Tolerance of a method with an error test of its own (Newmark), else None."""
         return getattr(self.method, "error_tol", None)
 
     @cached_property
     def metadata(self) -> dict[str, Any]:
-        """Fields of a result that options give; `untested` is None if all steps are tested, else it is the run's."""
+        """Fields of a result that follow from the options; with `untested` None if all steps have an error test."""
         tested = getattr(self.method, "tested", "all")
         return {"method": self.method.name, "rtol": self.rtol} | ({} if tested == "positions" else {"untested": None})
 
     def set_sizes(self, run: Run, t1: float) -> None:
-        """Set the first and the largest step of a run to t1, unless steps are constant; no jump of C_t is known yet."""
-        run.work.notes[indices.KINK_AFTER] = t1
+        """Set the first and the largest step of a run to t1, unless steps are constant."""
+        run.work.notes[indices.KINK_AFTER] = t1  # no jump of C_t before t1 is known yet
         if self.step_size is None:
             run.set_sizes(self.first_step, self.max_step, t1)
 
@@ -83,7 +83,7 @@ def options_of(
     """Validate the options of a call, unless they are the objects of the last call, which were validated then."""
     last, options = system.shared.get("options", NO_OPTIONS)
     m, r, a, first, longest, most, size, dense, shows, limit, checks, code = last
-    # a loop or a tuple for these comparisons would take a tenth of a short repeated call
+    # written out, because a loop or a tuple would take a tenth of the time of a short repeated call
     same = m is method and r is rtol and a is atol and first is first_step and longest is max_step and most is max_steps
     same = same and size is step_size and dense is dense_output and shows is progress and limit is time_limit
     if same and checks is check_derivatives and code is compiled:
@@ -91,7 +91,7 @@ def options_of(
     last = method, rtol, atol, first_step, max_step, max_steps, step_size, dense_output, progress, time_limit
     last = *last, check_derivatives, compiled
     options = check_options(system, *last)
-    if type(atol) is float and is_preset(method):  # other types may be changed by the caller
+    if type(atol) is float and is_preset(method):  # the caller may change objects of other types
         system.shared["options"] = last, options
     return options
 
@@ -144,7 +144,7 @@ def check_options(
 
 
 def check_method(method: str | Method) -> Method:
-    """Return the method of a name, or the method object itself; raise for anything else."""
+    """Return a method, given its name or the method object itself; raise for anything else."""
     names = ", ".join(PRESETS)
     if isinstance(method, str):
         if method not in PRESETS:

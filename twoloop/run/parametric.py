@@ -1,8 +1,8 @@
-"""Runs of systems that differ only in their parameters, which one prepared run takes as inputs.
+"""Prepare one run for many systems that differ only in their parameters.
 
-All numbers that depend on parameters are in separate arrays: `p`, and results of formulas in `p`. Decisions that depend
-on numbers are made again. For every vector of parameters the callbacks are compared with one another and with their
-traces, as at the first run of a system; along a run, where no states or parameters were compared before.
+All numbers that depend on parameters are in separate arrays: `p`, and values of expressions in `p`. Decisions that
+depend on numbers are made again. For every vector of parameters the callbacks are compared with their traces at the
+start. They are compared along the run, too, where states or parameters are outside the checked region.
 """
 
 import copy
@@ -16,7 +16,7 @@ from twoloop.checks.derivatives import check_derivatives
 from twoloop.checks.structure import has_definite_mass, is_definite
 from twoloop.generate.compile_equations import GeneratedCode
 from twoloop.generate.derived_callbacks import exact_derivatives, exact_near
-from twoloop.generate.trace import ParameterArrays, give_bounds, runs_on_symbols, trace_cache_of
+from twoloop.generate.trace import ParameterArrays, runs_on_symbols, share_checked_bounds, trace_cache_of
 from twoloop.generate.traced_values import CheckedRegion, refuse_wrong, unchecked
 from twoloop.kernels.data.common import Kit
 from twoloop.kernels.data.indices import AUGMENTED, BANDWIDTH, DIAGONAL_MASS, FORM
@@ -29,7 +29,7 @@ from twoloop.run.workspace import is_diagonal, kit_with
 Array = NDArray[np.float64]
 
 NUMBERS = ("options", "numbers", "own_numbers")  # fields of a plan that may depend on parameters
-PARTS = ("interior", "substitute", "within_newton")  # fields of a plan that are plans themselves
+SUBPLANS = ("interior", "substitute", "within_newton")  # fields of a plan that are plans themselves
 
 
 class SharedSetup:
@@ -38,7 +38,7 @@ class SharedSetup:
     Parameters
     ----------
     run : Run
-        A run of one of the systems that has taken no step; copies of it are integrated.
+        A run of one of the systems at its start; copies of it are integrated.
     code : GeneratedCode or None
         The machine code that its plan calls.
     method, fixed, compiled
@@ -47,7 +47,7 @@ class SharedSetup:
     Raises
     ------
     ValueError
-        If something that depends on the parameters is not known as a formula.
+        If a number depends on the parameters, but is not known as an expression in them.
     """
 
     def __init__(self, run: Run, code: GeneratedCode | None, method: Method, fixed: bool, compiled: Compiled):
@@ -56,41 +56,41 @@ class SharedSetup:
         form, banded = run.kit.flags[FORM], run.kit.flags[BANDWIDTH] >= 0
         if run.static is not None or form == AUGMENTED or banded or system.entries:
             raise ValueError("of large systems more is decided by numbers")
-        of_formulas = copy.copy(system)
-        of_formulas.derived = {("family", trace_cache_of): self.family, ("numbers", self.family): lambda array: array}
-        own = code_for(of_formulas, method, fixed, compiled, t, q, unchecked)
-        self.plan, self.interiors = plans_for(of_formulas, method, run.rtol, run.least_atol, fixed, own, unchecked)
-        self.exact = exact_derivatives(of_formulas)
+        symbolic = copy.copy(system)  # its numbers are expressions in the parameters
+        symbolic.derived = {("family", trace_cache_of): self.family, ("numbers", self.family): lambda array: array}
+        own = code_for(symbolic, method, fixed, compiled, t, q, unchecked)
+        self.plan, self.interiors = plans_for(symbolic, method, run.rtol, run.least_atol, fixed, own, unchecked)
+        self.exact = exact_derivatives(symbolic)
         self.definite = has_definite_mass(system, t, q)
         new = system.given.keys() - self.family.traced
         self.family.traced |= {kind for kind in new if runs_on_symbols(system, kind, self.family.parameters)}
-        give_bounds(system)
+        share_checked_bounds(system)
         if not self.family.within_bounds >= system.given.keys():
             raise ValueError("a callback may branch on its parameters")
-        repeated = ParametricRun(self, run.again()).run
-        if (code is None) is not (own is None) or _plan_values(repeated) != _plan_values(run):
+        evaluated = ParametricRun(self, run.copy()).run
+        if (code is None) is not (own is None) or _plan_values(evaluated) != _plan_values(run):
             raise ValueError("its numbers are not those of the family")
 
     def region(self, with_derivatives: bool) -> CheckedRegion:
-        """Return the region in which callbacks were compared."""
+        """Return the region in which callbacks were compared, in runs with or without checks of derivatives."""
         return self._regions.setdefault(with_derivatives, CheckedRegion())
 
 
 class ParametricRun:
-    """Prepared run for the parameters of one system after another, in the same arrays.
+    """Run whose arrays can be filled with the parameters of one system after another.
 
     Parameters
     ----------
     shared : SharedSetup
     run : Run
-        A copy of the run of `shared`, at its start. It gets these arrays.
+        A copy of the run of `shared`, at its start.
 
     Attributes
     ----------
     given : ConstrainedSystem
         The system whose parameters the arrays hold.
     system : ConstrainedSystem
-        A copy of it with these arrays, and with the cache that belongs to them.
+        A copy of `given` with the arrays of this run, and with their cache.
     """
 
     def __init__(self, shared: SharedSetup, run: Run):
@@ -106,18 +106,18 @@ class ParametricRun:
             ("kit", id(self._functions)): Kit(self._functions),
             "kits": {},
         }
-        self._take(run.system)
+        self._fill(run.system)
         run.kit = kit_with(self.system, run.kit.flags, run.plan)
         run.functions = run.kit.functions
 
-    def take(self, system: ConstrainedSystem) -> bool:
-        """Give the run the parameters of a system; return whether it had those of another system."""
+    def use(self, system: ConstrainedSystem) -> bool:
+        """Fill the arrays with the parameters of a system; return whether they held those of another system."""
         if system is self.given:
             return False
-        self._take(system)
+        self._fill(system)
         return True
 
-    def _take(self, system: ConstrainedSystem) -> None:
+    def _fill(self, system: ConstrainedSystem) -> None:
         self.given = system
         self._functions.p[:] = system.functions.p
         self._formulas.write(self.shared.family.products(self._functions.p))
@@ -130,33 +130,30 @@ class ParametricRun:
             traced.trusted = False
 
     def agrees(self, t0: float, q: Array, v: Array, t1: float, mass: Array, with_derivatives: bool) -> bool:
-        """Check callbacks at the start of a run to t1 and about it, and whether M has the same structure as before.
-
-        `mass`: M at the start.
-        """
+        """Return whether callbacks are consistent near the start, and M (`mass`) has the structure of the first run."""
         run, system = self.run, self.system
         if not self._mass_agrees:
             system.remember_at("definite mass", None, is_definite(mass))
-            known = self.shared.definite, bool(run.kit.flags[DIAGONAL_MASS])
-            self._mass_agrees = known == (has_definite_mass(system, t0, q), is_diagonal(mass))
+            structure = self.shared.definite, bool(run.kit.flags[DIAGONAL_MASS])
+            self._mass_agrees = structure == (has_definite_mass(system, t0, q), is_diagonal(mass))
         try:
             if with_derivatives:
                 check_derivatives(system, t0, q, lambda: exact_near(system, t0, q, v))
             refuse_wrong(run.traced, system, t0, t1, q, v)
-        except Exception:  # a callback may raise, too; the general way of the call describes it
+        except Exception:  # also raised by callbacks; `set_up` will describe the error
             return False
         return self._mass_agrees
 
     def _numbered(self, plan: Plan) -> Plan:
-        """Return a plan whose formulas are replaced by the arrays of their values."""
-        array, known = self._formulas.array, vars(plan)
-        changes: dict[str, Any] = {name: array(known[name]) for name in NUMBERS if known[name] is not None}
-        changes |= {name: self._numbered(known[name]) for name in PARTS if known[name] is not None}
+        """Return the plan with arrays of numbers, which this run fills, in place of arrays of expressions."""
+        array, plan_fields = self._formulas.array, vars(plan)
+        changes: dict[str, Any] = {name: array(plan_fields[name]) for name in NUMBERS if plan_fields[name] is not None}
+        changes |= {name: self._numbered(plan_fields[name]) for name in SUBPLANS if plan_fields[name] is not None}
         return plan.changed(traced=tuple(each.with_numbers(array) for each in plan.traced), **changes)
 
 
 def _plan_values(run: Run) -> list[Any]:
-    """List everything that the plans of a run hold, numbers to the bit."""
+    """List all values of the plans of a run, with arrays as bytes, to compare plans exactly."""
     plans = [run.plan, *run.interiors.values()]
     return [run.kit.flags.tobytes(), *(each for plan in plans for each in _of_plan(plan))]
 
@@ -167,5 +164,5 @@ def _of_plan(plan: Plan) -> Iterator[Any]:
             yield from _of_plan(value)
         elif name == "traced":
             yield [part.tobytes() for each in value for part in each.program[:-1]]
-        elif name != "stable_to":  # stable_to is a function without a name
+        elif name != "stable_to":  # a lambda, which equals only itself
             yield value.tobytes() if isinstance(value, np.ndarray) else value

@@ -1,11 +1,10 @@
-"""consistent_state: project a guess onto the constraints, and report how far it moved and on which assembly it is.
+"""Project a guess onto the constraints (`consistent_state`); report how far it moved and on which assembly it is.
 
-Large systems are projected by sparse factors, without dense matrices. Dense matrices are used in three cases:
-dependent rows are only nearly dependent beside the constraints; the position is near a dead centre; the guess may lead
-to another assembly.
+Large systems are projected by sparse factors. Dense matrices are used in three cases: rows that depend on others on the
+constraints, but only nearly so beside them; a position near a dead centre; a guess that may lead to another assembly.
 """
 
-from __future__ import annotations  # ArrayLike stays a word in help()
+from __future__ import annotations  # so that help() shows the name ArrayLike
 
 import math
 from collections.abc import Callable, Sequence
@@ -31,12 +30,14 @@ from twoloop.run.workspace import kit_of, static_form, workspace
 Array = NDArray[np.float64]
 
 CLEAR = 1e-5  # sine of the angle between a row and the others, below which a position may be near a dead centre
-MOST_CORRECTIONS, ROUNDING = 25, 1e-14  # number of Newton iterations; rounding error relative to the largest coordinate
-STRAIGHT = 0.5  # relative to a displacement: on the same assembly its projection ends this close to where C_q predicts
+MAX_CORRECTIONS, ROUNDING = 25, 1e-14  # number of Newton iterations; rounding error relative to the largest coordinate
+# On the same assembly, a displaced position is projected to the point that C_q predicts, within this share of the
+# displacement.
+LINEAR = 0.5
 
 
 class _Metric:
-    """Static form with the unit matrix in place of M: its corrections are the smallest changes of all coordinates."""
+    """Sparse projection in the Euclidean metric: the static form with the unit matrix in place of M."""
 
     def __init__(self, system: ConstrainedSystem, t: float, q: Array, form: Any, rank: int | None = None):
         self.system, self.t, self.rank = system, t, rank
@@ -48,48 +49,47 @@ class _Metric:
         diagonal = np.where(rows == columns, 1.0, 0.0)
         self.work.mass_values[:] = diagonal / np.bincount(rows, diagonal, system.n_q)[rows]
 
-    def ask(self, task: int, q: Array, v: Array, a: Array | None = None, lam: Array | None = None) -> int:
-        """Call a task of the inner loop and return its code; q and v are changed."""
+    def run_task(self, task: int, q: Array, v: Array, a: Array | None = None, lam: Array | None = None) -> int:
+        """Run a task of the inner loop, which changes q and v, and return its code."""
         a, lam = self.work.x if a is None else a, self.work.lam if lam is None else lam
         return int(entry_point(self.kit.inner)(self.kit, self.work, task, self.t, q, v, 0.0, a, lam))
 
-    def nearest(self, way: Array) -> Array:
-        """Return the part of a displacement that the constraints allow, by the current factors."""
-        rows = self.system.sparse_rows(self.t, self.at)
-        change = np.zeros(len(way))
-        zero, residual = np.zeros(len(way)), np.ascontiguousarray(rows @ way)
-        self.ask(tasks.SOLVE, zero, residual, change)
-        return way - change
+    def allowed_part(self, displacement: Array) -> Array:
+        """Return the part of a displacement that is tangential to the constraints, by the current factors."""
+        rows = self.system.sparse_rows(self.t, self.position)
+        change = np.zeros(len(displacement))
+        zero, residual = np.zeros(len(displacement)), np.ascontiguousarray(rows @ displacement)
+        self.run_task(tasks.SOLVE, zero, residual, change)
+        return displacement - change
 
     def onto_constraints(self, q: Array) -> Array | None:
         """Project q onto the independent rows; return None if that fails or violates the other rows.
 
-        Rows that are dependent on the constraints are only nearly so beside them, where a choice of rows would fail.
+        The independent rows are not chosen anew: beside the constraints the other rows are only nearly dependent.
         """
         zero, change = np.zeros(len(q)), np.zeros(len(q))
-        for _ in range(MOST_CORRECTIONS):
-            if self.ask(tasks.FIND_NULL_SPACE, q, zero) != indices.DONE:
+        for _ in range(MAX_CORRECTIONS):
+            if self.run_task(tasks.FIND_NULL_SPACE, q, zero) != indices.DONE:
                 return None
-            self.ask(tasks.SOLVE, zero, self.system.constraint(self.t, q), change)
+            self.run_task(tasks.SOLVE, zero, self.system.constraint(self.t, q), change)
             q = q - change
             if not np.abs(change).max() > ROUNDING * np.abs(q).max():  # also true for NaN
                 break
-        held = self.system.constraint(self.t, q)
-        return q if is_at_rounding(held, self.system.sparse_rows(self.t, q), q) else None
+        residual = self.system.constraint(self.t, q)
+        return q if is_at_rounding(residual, self.system.sparse_rows(self.t, q), q) else None
 
     def project(self, q: Array, v: Array) -> tuple[Array, Array] | None:
         """Project q and v onto the constraints; return None if that fails."""
-        q, on_the_way = q.copy(), v.copy()
-        if (
-            self.ask(tasks.RENEW_PARTITION, q, v) != indices.DONE
-            or self.ask(tasks.RESTORE, q, on_the_way) != indices.DONE
-        ):
+        q, discarded = q.copy(), v.copy()
+        if self.run_task(tasks.RENEW_PARTITION, q, v) != indices.DONE:
             return None
-        v = v.copy()  # the least change of velocities is that at the final positions
-        for task in (tasks.RESTORE, tasks.RESTORE, tasks.FIND_NULL_SPACE):  # RESTORE twice: to rounding
-            if self.ask(task, q, v) != indices.DONE:
+        if self.run_task(tasks.RESTORE, q, discarded) != indices.DONE:
+            return None
+        v = v.copy()  # project velocities at the final positions only
+        for task in (tasks.RESTORE, tasks.RESTORE, tasks.FIND_NULL_SPACE):  # the second RESTORE reaches rounding
+            if self.run_task(task, q, v) != indices.DONE:
                 return None
-        self.at = q
+        self.position = q
         return q, v
 
 
@@ -98,20 +98,20 @@ class Dependence(NamedTuple):
 
     rank: int
     shares: dict[int, Array]  # coefficients (n_c,) of each dependent row in terms of the other rows
-    allowed: Array  # a displacement that C_q allows, at most 1 in the units of the coordinates, (n_q,)
-    onto_constraints: Callable[[Array], Array | None]  # projects a position near it, by the rows independent here
+    allowed: Array  # displacement that C_q allows, whose largest entry is 1 in the units of the coordinates, (n_q,)
+    onto_constraints: Callable[[Array], Array | None]  # projects a nearby position onto the independent rows
 
 
 def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | None:
-    """Return which rows of a large sparse system depend on others; None if sparse factors cannot decide it reliably."""
+    """Find the rows of a large sparse system that depend on others; None if sparse factors cannot decide reliably."""
     form, all_rows = static_form(system, t, q), system.sparse_rows(t, q)
     if form is None or not isinstance(all_rows, SparseRows):
         return None
     metric, still = _Metric(system, t, q, form), np.zeros_like(q)
-    code = metric.ask(tasks.RENEW_PARTITION, q.copy(), still)
+    code = metric.run_task(tasks.RENEW_PARTITION, q.copy(), still)
     if code == indices.RANK_DIFFERS:
         metric = _Metric(system, t, q, form, int(metric.work.notes[indices.RANK]))
-        code = metric.ask(tasks.RENEW_PARTITION, q.copy(), still)
+        code = metric.run_task(tasks.RENEW_PARTITION, q.copy(), still)
     if code != indices.DONE or metric.work.notes[indices.PIVOT] < CLEAR:
         return None
     counted, room = set(metric.work.rows_v.tolist()), np.zeros_like(q)
@@ -119,10 +119,10 @@ def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | No
     for row in range(system.n_c):
         if row not in counted:
             shares[row] = np.zeros(system.n_c)
-            metric.ask(tasks.SOLVE, all_rows.row(row), np.zeros(system.n_c), room, shares[row])
-    metric.at = q
+            metric.run_task(tasks.SOLVE, all_rows.row(row), np.zeros(system.n_c), room, shares[row])
+    metric.position = q
     columns = units(system, t, q, all_rows, typical_sizes(q))
-    allowed = metric.nearest(columns * np.random.default_rng(3).uniform(0.5, 1.0, len(q)))
+    allowed = metric.allowed_part(columns * np.random.default_rng(3).uniform(0.5, 1.0, len(q)))
     most = float((np.abs(allowed) / columns).max())
     return Dependence(len(counted), shares, allowed / most if most > 0.0 else allowed, metric.onto_constraints)
 
@@ -136,7 +136,7 @@ def project_sparsely(
         return None
     with np.errstate(all="ignore"):
         metric = _Metric(system, t, q, form)
-    code = metric.ask(tasks.RENEW_PARTITION, q.copy(), v.copy())
+    code = metric.run_task(tasks.RENEW_PARTITION, q.copy(), v.copy())
     if code == indices.RANK_DIFFERS:
         metric = _Metric(system, t, q, form, int(metric.work.notes[indices.RANK]))
     elif code != indices.DONE:
@@ -144,10 +144,9 @@ def project_sparsely(
     projected = metric.project(q, v)
     if projected is None or metric.work.notes[indices.PIVOT] < CLEAR:
         return None
+    # the rows that were chosen beside the constraints must be independent on them, too
     there = _Metric(system, t, projected[0], form, metric.rank)
-    if (
-        there.ask(tasks.RENEW_PARTITION, projected[0].copy(), v.copy()) != indices.DONE
-    ):  # other rows are independent on the constraints
+    if there.run_task(tasks.RENEW_PARTITION, projected[0].copy(), v.copy()) != indices.DONE:
         return None
     rows, rate = system.sparse_rows(t, projected[0]), system.rates(t, projected[0])
     if not is_at_rounding(system.constraint(t, projected[0]), rows, projected[0]):
@@ -161,31 +160,32 @@ def project_sparsely(
 
 
 def _same_from_elsewhere(metric: _Metric, position: Array, moved: Array) -> bool:
-    """Return whether other guesses, as far from the constraints, are projected to where C_q predicts."""
+    """Return whether displaced guesses, as far away as the given one, are projected to the points that C_q predicts."""
     far = float(np.abs(moved).max())
     generic = np.random.default_rng(8).uniform(-1.0, 1.0, (2, len(position)))
     rest = np.zeros(len(position))
-    for way in (-2.0 * moved, far * generic[0], far * generic[1]):
+    for displacement in (-2.0 * moved, far * generic[0], far * generic[1]):
         if metric.project(position, rest) is None:
             return False
-        expected = position + metric.nearest(way)
-        again = metric.project(position + way, rest)
-        if again is None or np.abs(again[0] - expected).max() > STRAIGHT * np.abs(way).max():
+        expected = position + metric.allowed_part(displacement)
+        again = metric.project(position + displacement, rest)
+        if again is None or np.abs(again[0] - expected).max() > LINEAR * np.abs(displacement).max():
             return False
     return True
 
 
 MAX_ITERATIONS = 50
-CONVERGED = 1e-2  # relative to the violation that a start may have: below it the iteration has converged
-SINGULAR = 1e-10  # relative to the largest: singular values of scaled columns above it count as independent
-NEGLIGIBLE, WEAK = 1e-13, 1e-2  # relative: smaller singular values of normalized rows are zero; WEAK: of redundant rows
+CONVERGED = 1e-2  # violation at which the iteration stops, relative to the violation that a start may have
+# relative to the largest singular value: smaller ones are zero in the rank, and in least-squares solutions (WEAK: if
+# rows are redundant)
+SINGULAR, NEGLIGIBLE, WEAK = 1e-10, 1e-13, 1e-2
 DEAD_CENTRE = 0.01  # smallest over largest singular value, below which a position is called near a dead centre
-SAME = 0.1  # relative to the change that the projection makes: positions nearer to each other count as one
-LOST = 1e8  # largest change of a position over its scale: farther away rounding hides where the mechanism is
+SAME = 0.1  # distance below which two positions count as one, relative to the change that the projection makes
+LOST = 1e8  # largest change of a position over its scale: beyond, rounding is larger than the mechanism
 
 
 class Move(NamedTuple):
-    """Largest change that the projection made, and its coordinate."""
+    """Largest change that the projection made, and the coordinate that it changed."""
 
     change: float
     coordinate: int
@@ -197,14 +197,14 @@ class ConsistentState(tuple[Array, Array]):
     Attributes
     ----------
     moved_q, moved_v : Move
-        Largest change of a position and of a velocity, and of which coordinate: (change, coordinate).
+        Largest change of a position and of a velocity: (change, coordinate).
     dependent : tuple of int (rank,)
-        The columns of C_q that determine the rest best, in ascending order; none of those kept.
+        Dependent coordinates: the best conditioned columns of C_q, in ascending order, without coordinates in `keep`.
     determinant_sign : int
-        Sign of the determinant of these columns of C_q, 0 where their rank is not full. Two positions with the same
-        values of the other coordinates and opposite signs are on different assemblies, with a dead centre between.
+        Sign of the determinant of these columns of C_q; 0 if C_q has not full rank. Two positions with the same values
+        of the other coordinates and opposite signs are on different assemblies, with a dead centre between them.
     margin : float
-        Smallest over largest singular value of these columns, rows and columns scaled to like size: 0 at a dead centre.
+        Smallest over largest singular value of these columns, after scaling of rows and columns: 0 at a dead centre.
 
     Examples
     --------
@@ -241,22 +241,22 @@ def consistent_state(
     q, v : array_like (n_q,)
         Guess. Its distance from the constraints should be small compared with the mechanism.
     keep : sequence of int, optional
-        Coordinates that stay as given, position and velocity: a crank and its speed, say. None: all may move.
+        Coordinates whose position and velocity are not changed, such as a crank's. None: all may change.
     check_assembly : bool
-        Whether three other guesses, as far off as this one, must lead to the same assembly. False: the position that
-        the projection finds is taken.
+        Whether three other guesses, as far from the constraints as this one, must lead to the same assembly. False:
+        accept the position that the projection finds.
 
     Returns
     -------
     q, v : ndarray (n_q,)
-        With C(t, q) = 0 and C_q v + C_t = 0 to rounding, as a tuple that also says how far it moved (`moved_q`,
-        `moved_v`) and on which assembly it is (`determinant_sign`, `margin`); see `ConsistentState`.
+        State with C(t, q) = 0 and C_q v + C_t = 0 to rounding. The tuple has attributes for how far the guess moved
+        (`moved_q`, `moved_v`) and for the assembly (`determinant_sign`, `margin`); see `ConsistentState`.
 
     Raises
     ------
     TypeError, ValueError
-        If a shape is wrong, a value is not finite, `keep` leaves too little freedom, no consistent position is found
-        near the guess, or other guesses as far off would lead to another one: near a dead centre, as a rule.
+        If a shape is wrong, a value is not finite, `keep` leaves too little freedom, or no consistent position is found
+        near the guess. Also if other guesses, as far away, lead to another assembly, usually near a dead centre.
 
     Examples
     --------
@@ -342,7 +342,7 @@ def _position(
     position, excess, iterations = _gauss_newton(system, t, guess, free)
     redundant = position is None or _rank(scales.scaled(system.jacobian(t, position))) < system.n_c
     cut = WEAK if redundant else NEGLIGIBLE
-    if redundant:  # rows that depend on one another on the constraints do so only nearly beside them
+    if redundant:  # beside the constraints, redundant rows are only nearly dependent: project again with WEAK
         position, excess, iterations = _gauss_newton(system, t, guess, free, cut)
     if position is None or not excess <= 1.0:
         diverged = position is None
@@ -379,8 +379,8 @@ def _another_assembly(
 ) -> str | None:
     """Describe where another guess, as far from the found position as the given one, leads; None: the same assembly.
 
-    Two assemblies are positions with the same values of all but the dependent coordinates. If there is only one, a
-    small displacement ends where C_q sends it, to first order, with the same sign of the determinant.
+    Different assemblies have the same values of all but the dependent coordinates. If there is only one, displaced
+    guesses are projected to the points that C_q predicts to first order, with the same sign of the determinant.
     """
     moved = (position - guess) / scales.columns
     far = float(np.abs(moved).max())
@@ -402,9 +402,10 @@ def _another_assembly(
         if again is None or not excess <= 1.0:
             return "does not converge"
         expected = position + way + _least_change(jacobian, free, -(jacobian @ way), cut)
-        if distance(again, expected) <= STRAIGHT * float(np.abs(other).max()) and sign_at(again) == sign:
+        if distance(again, expected) <= LINEAR * float(np.abs(other).max()) and sign_at(again) == sign:
             continue
-        mixed = position.copy()  # curved path or other assembly: its dependents with the first's other values
+        # curvature or another assembly: project a guess with the new dependent and the old independent coordinates
+        mixed = position.copy()
         mixed[columns] = again[columns]
         beside, excess, _ = _gauss_newton(system, t, mixed, np.array(columns, dtype=int), cut)
         if beside is None or not excess <= 1.0:
@@ -415,7 +416,7 @@ def _another_assembly(
 
 
 def _change(one: Array, other: Array, scales: Scales) -> str:
-    """Describe which coordinate changes most, with as many digits as show the change."""
+    """Describe which coordinate changes most, with enough digits to show the change."""
     j = int(np.abs((other - one) / scales.columns).argmax())
     size, change = max(abs(float(one[j])), abs(float(other[j]))), abs(float(other[j] - one[j]))
     digits = min(17, 3 + max(0, math.ceil(math.log10(size / change)))) if change > 0.0 else 3
@@ -425,7 +426,7 @@ def _change(one: Array, other: Array, scales: Scales) -> str:
 def _gauss_newton(
     system: ConstrainedSystem, t: float, q: Array, free: NDArray[np.intp], cut: float = NEGLIGIBLE
 ) -> tuple[Array | None, float, int]:
-    """Return the position (None: diverged), its violation over the accepted one, and the number of iterations."""
+    """Return the position (None: diverged), its violation over the accepted violation, and the number of iterations."""
     best, nearest, guess = np.inf, q, q
     for iteration in range(1, MAX_ITERATIONS + 1):
         try:
@@ -444,11 +445,7 @@ def _gauss_newton(
         q = q + step
         if not (np.abs(q - guess) <= LOST * scales.columns).all():  # also true for NaN
             return None, np.inf, iteration
-    return (
-        (nearest if best <= 1.0 else q),
-        best,
-        MAX_ITERATIONS,
-    )  # up to 1 is accepted: rounding may keep it above CONVERGED
+    return nearest if best <= 1.0 else q, best, MAX_ITERATIONS  # rounding may keep the violation above CONVERGED
 
 
 def _least_change(jacobian: Array, free: NDArray[np.intp], values: Array, cut: float = NEGLIGIBLE) -> Array:
@@ -466,7 +463,7 @@ def _rank(scaled: Array) -> int:
 
 
 def _assembly(scaled: Array, free: NDArray[np.intp]) -> tuple[tuple[int, ...], int, float]:
-    """Return the dependent columns, the sign of their determinant, and how far they are from losing rank."""
+    """Return `dependent`, `determinant_sign` and `margin` of a ConsistentState, from the scaled C_q."""
     rank = _rank(scaled[:, free])
     if rank == 0:
         return (), 0, 0.0
@@ -480,7 +477,7 @@ def _assembly(scaled: Array, free: NDArray[np.intp]) -> tuple[tuple[int, ...], i
 
 
 def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
-    """Return the direction in which the constraints hold the free coordinates least; its largest entry is 1."""
+    """Return the right singular vector of the smallest singular value that is not zero; its largest entry is 1."""
     values, rows = np.linalg.svd(scaled[:, free], full_matrices=False)[1:]
     held = values > SINGULAR * values.max()
     direction = np.zeros(scaled.shape[1])
@@ -489,7 +486,7 @@ def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
 
 
 def _smallest(scales: Scales, jacobian: Array, free: NDArray[np.intp], kept: list[int]) -> str:
-    """Describe that C_q nearly loses rank, in its own and in scaled units, and how far; return nothing elsewhere."""
+    """Describe how nearly C_q loses rank, both as given and scaled; return "" if it does not."""
     if jacobian[:, free].size == 0:
         return ""
     values = [np.linalg.svd(each[:, free], compute_uv=False) for each in (jacobian, scales.scaled(jacobian))]

@@ -1,6 +1,7 @@
-"""Record of a run: its trajectory, how it ended and what it cost. `Result` adds views to it.
+"""Record a run: its trajectory, status and cost (`Record`, to which `Result` adds views).
 
-A recorder collects accepted steps, all or those at output times, and events; in memory or in files.
+A `Recorder` collects events, and the states of accepted steps or at output times; a store holds them in memory or in
+files.
 """
 
 import pickle
@@ -27,17 +28,17 @@ from twoloop.run.dense_solution import DenseSolution, Interpolator, Table
 if TYPE_CHECKING:
     from twoloop.run.run import Run
 
-MAGIC, HEAD = b"\x93NUMPY\x01\x00", 128  # bytes before the numbers of a file, in NumPy's npy format
+MAGIC, HEAD = b"\x93NUMPY\x01\x00", 128  # first bytes of a file in NumPy's npy format, and length of its header
 OF_STEPS = ("h", "rejected_error", "rejected_convergence", "partitioned", "untested")  # fields with one row per step
 
 
 class MemoryStore:
-    """Store of arrays by name in memory, each as a list of parts that follow one another.
+    """Store of named arrays in memory; each is a list of parts until it is read.
 
     Attributes
     ----------
     finished : bool
-        Whether added rows must be in their final form, as later changes would not reach all of them.
+        Whether added rows must be in their final form, because they cannot be changed later.
     """
 
     finished = False
@@ -95,7 +96,7 @@ class FileStore:
             self._close(file, name, dtype, (min(n, before), *width))
 
     def array(self, name: str) -> NDArray[Any]:
-        """Return all rows, memory-mapped; what is written to them does not reach the file."""
+        """Return all rows as a memory map; writing to it does not change the file."""
         return mapped(self._path(name))
 
     def _path(self, name: str) -> Path:
@@ -106,7 +107,7 @@ class FileStore:
         return int(dtype.itemsize * np.prod(width, dtype=np.int64))
 
     def _close(self, file: Any, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
-        """Write the header last: a process that dies before leaves the array as it was."""
+        """Write the header, after the rows: if the process dies before, the file still has the previous array."""
         head = repr({"descr": dtype.str, "fortran_order": False, "shape": shape}).ljust(HEAD - len(MAGIC) - 3) + "\n"
         file.flush()
         file.seek(0)
@@ -118,12 +119,12 @@ Store = MemoryStore | FileStore
 
 
 def mapped(path: Path) -> NDArray[Any]:
-    """Map the array in a file into memory, copy-on-write: changes of the array do not reach the file."""
+    """Map the array in a file into memory, copy-on-write: changes of the array do not change the file."""
     return np.load(path, mmap_mode="c", allow_pickle=False).view(np.ndarray)  # type: ignore[no-any-return]
 
 
 def read(folder: Path) -> dict[str, NDArray[Any]]:
-    """Read the arrays in a folder, cut to the rows that all arrays of a group have: a process may have died."""
+    """Read the arrays in a folder. If a process died, arrays that belong together are cut to equal numbers of rows."""
     arrays = {path.stem: mapped(path) for path in sorted(folder.glob("*.npy"))}
     for group in (("t", "states"), OF_STEPS, ("sol_t", "sol_states")):
         there = [name for name in group if name in arrays]
@@ -134,9 +135,7 @@ def read(folder: Path) -> dict[str, NDArray[Any]]:
 
 Array = NDArray[np.float64]
 
-PENDING = (
-    1024  # number of states that are collected before the intervals between them are searched for events, at the latest
-)
+PENDING = 1024  # number of states after which the intervals between them are interpolated and searched for events
 
 
 @dataclass(frozen=True)
@@ -190,16 +189,15 @@ class _Between(NamedTuple):
 class Recorder:
     """Recorder of the states of accepted steps, chunk by chunk.
 
-    An interval is searched when all states are known that its polynomials go through, so that the output does not
-    depend on the chunks. As many states before it are kept as the polynomials need, and all if they are requested.
-    Events are searched at least every `every` seconds.
+    An interval is searched for events when all states that its polynomials go through are known, so that the output
+    does not depend on the chunks. Event functions are evaluated at least every `every` seconds.
 
     Attributes
     ----------
     search : EventSearch or None
         The events so far.
     n_steps, last_step : int, float
-        After a terminal event: the number of steps up to it, and the part of the last one before it, s.
+        After a terminal event: the number of steps up to it, and the length of the last step up to the event, s.
     interrupted : bool
         Whether Ctrl-C interrupted the search for events, or the interpolation between the steps.
     """
@@ -210,7 +208,8 @@ class Recorder:
         self.request, self.interpolator, self._n_q, self._width = request, interpolator, n_q, len(state)
         self.n_steps, self.last_step = 0, 0.0
         self.interrupted = False
-        self._t, self._rows = np.array([t0]), state[None, :].copy()  # the last states, and those not yet searched
+        # states of the intervals that were not searched yet, and the states before that their polynomials need
+        self._t, self._rows = np.array([t0]), state[None, :].copy()
         self._kinds = np.empty(0, dtype=np.int64)
         self._next = 0  # index of the first interval between these states that was not searched
         self._n_outputs = 0
@@ -232,10 +231,10 @@ class Recorder:
         self._t, self._rows = np.concatenate([self._t, t]), np.concatenate([self._rows, rows])
         self._kinds = np.concatenate([self._kinds, kinds])
         if len(self._t) > self._waits_for:
-            self._look(len(self._t) - WINDOW)
+            self._search(len(self._t) - WINDOW)
 
     def correct_last(self, t: float, row: Array) -> None:
-        """Replace [q, v, a] of the last state if its time is t; they serve states between steps."""
+        """Replace [q, v, a] of the last state, if its time is t, for the interpolation between steps."""
         if self.request.between_steps and len(self._t) and self._t[-1] == t:
             self._rows[-1, : len(row)] = row
 
@@ -250,7 +249,7 @@ class Recorder:
         request, store = self.request, self.request.store
         if request.times is None:
             self._store(t, rows)
-        elif request.lands:  # the ends of the run may not be among the times
+        elif request.lands:  # steps also end at the ends of the run, which may not be output times
             landed = np.append(request.times, np.inf)[np.searchsorted(request.times, t)] == t
             self._store(t[landed], rows[landed])
         if request.dense:
@@ -259,13 +258,13 @@ class Recorder:
             store.add("sol_kinds", kinds)
 
     def _store(self, t: Array, rows: Array) -> None:
-        """Store rows [q, v, a, lam], or [q, v] if the rest is computed at the end."""
+        """Store rows [q, v, a, lam], or [q, v] if [a, lam] will be computed at the end."""
         self.request.store.add("t", t)
         self.request.store.add("states", self._completed(t, rows) if self.request.store.finished else rows)
 
     def finish(self) -> None:
-        """Search the remaining intervals: no more states follow."""
-        self._look(len(self._t) - 1)
+        """Search the remaining intervals at the end of the run."""
+        self._search(len(self._t) - 1)
 
     @property
     def last(self) -> tuple[float, Array] | None:
@@ -283,8 +282,8 @@ class Recorder:
         """Event that ended the run, and its time."""
         return None if self.search is None else self.search.ended
 
-    def _look(self, end: int) -> None:
-        """Search and interpolate the intervals before `end`."""
+    def _search(self, end: int) -> None:
+        """Search the intervals before `end` for events, and interpolate the states at output times in them."""
         interpolator = self.interpolator
         if interpolator is None or self.ended is not None or self.interrupted:
             return
@@ -331,7 +330,7 @@ class Recorder:
         return t, self._completed(t, store.array("states"))
 
     def _completed(self, times: Array, rows: Array) -> Array:
-        """Complete rows [q, v] to rows [q, v, a, lam]."""
+        """Return rows [q, v, a, lam] for rows [q, v]."""
         if self.interpolator is None or rows.shape[1] == self._width:
             return rows
         added = np.full((len(times), self._width - rows.shape[1]), np.nan)
@@ -339,7 +338,7 @@ class Recorder:
             self.interpolator.complete(times, rows, added)
         except KeyboardInterrupt:
             self.interrupted = True
-            added[np.isnan(added).any(axis=1)] = np.nan  # also of a row that was half written
+            added[np.isnan(added).any(axis=1)] = np.nan  # a row may be half written
         return np.concatenate([rows, added], axis=1)
 
     def solution(self) -> DenseSolution | None:
@@ -361,7 +360,7 @@ class Recorder:
 
 
 AnyRecord = TypeVar("AnyRecord", bound="Record")
-Later = Callable[[str], dict[str, Any]]  # takes the name of a field, and returns it with others by their names
+Later = Callable[[str], dict[str, Any]]  # computes a deferred field by its name; returns it, and others, by name
 
 
 class Status(IntEnum):
@@ -415,13 +414,13 @@ MEANINGS: dict[Status, str] = {
 
 
 def explained(status: Status) -> str:
-    """Return the sentence that names the page about a failure, for the end of its message; empty after success."""
+    """Return the sentence about docs/when_it_fails.md for the message of a failure; an empty string after success."""
     return "" if status >= 0 else f" See docs/when_it_fails.md#{status.name.lower()}."
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """Counts and CPU time of a run; None where a foreign solver does not tell.
+    """Counts and CPU time of a run; None for a count that an external solver does not report.
 
     Attributes
     ----------
@@ -442,10 +441,10 @@ class Statistics:
     n_jacobians : int or None
         Evaluations of the derivatives of the right-hand side for Newton's method in the outer loop.
     cpu_time : float
-        Process time of the integration, s: of the steps, of storing what they give, of events, and of q and v at output
-        times between them. Compilation, checks of the input, the workspace, the first accelerations, and a and lam at
-        output times between steps are not included. If a run was repeated, the time includes all attempts, while the
-        counts are those of the last one. For repeated calls that take less than a millisecond, it is the elapsed time.
+        Process time of the integration, s. It includes the steps, storing their results, events, and the interpolation
+        of q and v at output times. Compilation, checks of the input, the workspace, the first accelerations, and a and
+        lam at interpolated times are not included. If a run was repeated, the time includes all attempts, while the
+        counts are those of the last attempt. For repeated calls of less than a millisecond, it is the elapsed time.
 
     Examples
     --------
@@ -471,7 +470,7 @@ class Statistics:
 
 @dataclass(frozen=True)
 class Record:
-    """Trajectory, status and cost of a run: the fields of `Result`, which explains them."""
+    """Trajectory, status and cost of a run; the docstring of `Result` explains the fields."""
 
     t: Array
     q: Array
@@ -511,12 +510,12 @@ class Record:
 
     @property
     def description(self) -> Description:
-        """Names, energy and drawing, as far as the `Problem` of the system gave them."""
+        """Names, energy and drawing, if the system belongs to a `Problem` that has them."""
         return Description() if self.system is None else self.system.description
 
     @property
     def coordinates(self) -> tuple[str, ...]:
-        """Names of the coordinates with their units; q0, q1, ... where the problem has none."""
+        """Names of the coordinates with their units; q0, q1, ... if the problem has no names."""
         return self.description.coordinates or tuple(f"q{k}" for k in range(len(self.q)))
 
     @property
@@ -546,7 +545,7 @@ class Record:
         state = {each.name: getattr(self, each.name) for each in fields(self)}
         try:
             pickle.dumps(self.system)
-        except TypeError:  # functions without a name of their own cannot be pickled
+        except TypeError:  # lambdas and local functions cannot be pickled
             state["system"] = None
         if self.arcs:
             state |= {"arcs": (), "sol": None}
@@ -560,7 +559,7 @@ class Record:
 
 
 def record_of(kind: type[AnyRecord], fields: dict[str, Any]) -> AnyRecord:
-    """Create a record of these fields, which it takes over: the constructor of a large frozen dataclass is slow."""
+    """Create a record whose attributes are the dict `fields`; the constructor of a large frozen dataclass is slow."""
     instance = _new(kind)
     _set_fields(instance, fields)
     return instance
@@ -570,10 +569,7 @@ _new, _set_fields = object.__new__, vars(Record)["__dict__"].__set__
 
 
 class _Deferred:
-    """Descriptor that defers a field until it is first read: if a record lacks it, its `later` computes it.
-
-    `later` is kept beside the fields in `vars(record)`.
-    """
+    """Descriptor of a field that is computed when it is first read, by the function `later` in `vars(record)`."""
 
     def __init__(self, name: str):
         self.name = name
@@ -587,7 +583,7 @@ class _Deferred:
 
 
 DEFAULTS = {each.name: each.default for each in fields(Record) if each.default is not MISSING}
-for _field in fields(Record):  # after the decorator, which would take a descriptor for a default
+for _field in fields(Record):  # after the decorator, which would treat a descriptor as a default
     setattr(Record, _field.name, _Deferred(_field.name))
 
 
@@ -595,11 +591,11 @@ Integers = NDArray[np.int64]
 
 COUNTED = [each.name for each in fields(Statistics) if each.name != "cpu_time"]
 COUNTERS = itemgetter(*(getattr(indices, name.upper()) for name in COUNTED))
-BEFORE = np.array([0, 0, 1])  # rejections and partitions before all steps: the first partition is not a renewal
+BEFORE = np.array([0, 0, 1])  # counts of rejections and partitions at the start: the first partition is no renewal
 
 
 def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
-    """Return the fields of a record with one row per step; `counts`, those before the steps, become those after."""
+    """Return the fields of a record with one row per step; `counts` are updated from before to after the steps."""
     n = len(steps)
     h, changes, untested = np.empty(n), np.empty((3, n), dtype=np.int64), np.empty(n, dtype=np.bool_)
     entry_point(cached_run().split_steps)(steps, counts, h, changes, untested)
@@ -612,7 +608,7 @@ def statistics(counted: Integers, cpu: float) -> Statistics:
 
 
 def of_run(run: "Run", t: Array, table: Array) -> dict[str, Any]:
-    """Return the fields of the trajectory, from rows [q, v, a, lam], and those of the run as a whole."""
+    """Return the fields of the trajectory, from rows [q, v, a, lam], and the fields of the run as a whole."""
     return {
         **state_fields(run.system.n_q, t, table),
         "rank": run.rank,
@@ -623,19 +619,13 @@ def of_run(run: "Run", t: Array, table: Array) -> dict[str, Any]:
 
 
 def state_fields(n: int, t: Array, table: Array) -> dict[str, Array]:
-    """Return the fields of a trajectory of n coordinates, from its rows."""
+    """Return the fields of a trajectory of n coordinates, from rows [q, v, a, lam]."""
     columns = table.T
-    return {
-        "t": t,
-        "q": columns[:n],
-        "v": columns[n : 2 * n],
-        "a": columns[2 * n : 3 * n],
-        "lam": columns[3 * n :],
-    }
+    return {"t": t, "q": columns[:n], "v": columns[n : 2 * n], "a": columns[2 * n : 3 * n], "lam": columns[3 * n :]}
 
 
 def interval_kinds(run: "Run", steps: Array) -> Integers:
-    """Return the kind of interval of each step that the plan of the run made, for the dense solution."""
+    """Return the kind of interval of each step, for the dense solution, if the run's own plan made the steps."""
     if run.plan.apart:
         return np.full(len(steps), indices.APART)
     explicit = indices.ACROSS if run.substituted else indices.ACCELERATIONS

@@ -1,4 +1,4 @@
-"""Check a finished run: compare its callbacks at states on the way, and rerun pieces with another method."""
+"""Check a finished run: compare its callbacks at states of the run, and rerun pieces of it with another method."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from twoloop.checks.derivatives import wrong_derivative
 from twoloop.checks.structure import unlike_itself
 from twoloop.generate.derived_callbacks import exact_derivatives, generic_states
-from twoloop.generate.traced_values import CLEAR, FEW, CheckedRegion, Sample
+from twoloop.generate.traced_values import CLEAR, MAX_IN_PYTHON, CheckedRegion, Sample
 from twoloop.kernels.data import indices
 from twoloop.methods import dop853
 from twoloop.methods.dop853 import DOP853
@@ -28,22 +28,22 @@ from twoloop.run.run import Run
 Array = NDArray[np.float64]
 
 FIRST_FORCE = "first force"  # cache key of a compiled force at the start of a run, unless it is traced
-LATER = 4  # states of the run at which derivatives are checked again, including the last one
+N_DERIVATIVES = 4  # number of states of the run at which derivatives are checked again, including the last one
 
 
 def compare_callbacks(
     run: Run, sample: Sample, end: float, check_derivatives: bool, status: Status, message: str
 ) -> tuple[Status, str]:
-    """Return the status and the message, changed if callbacks are wrong at states of the run.
+    """Return the status and the message of a run, changed if callbacks are wrong at its states.
 
-    Compiled callbacks are not compared again in the region where they were: see CheckedRegion.
+    In the region where compiled callbacks were compared before (`CheckedRegion`), they are not compared again.
     """
     if changed := describe_changed_force(run):
         return Status.WRONG_TRACE, f"{changed} {message}"
     region = checked_region_of(run, check_derivatives)
     parameters = run.varied_parameters
     everywhere = region.is_due() or run.system.called_in_python
-    everywhere = everywhere or (parameters is not None and not region.knows(parameters))
+    everywhere = everywhere or (parameters is not None and not region.contains_parameters(parameters))
     region.count()
     if not everywhere and end <= run.compared_until[0]:
         return status, message
@@ -57,10 +57,10 @@ def compare_callbacks(
 
 
 def checked_region_of(run: Run, check_derivatives: bool) -> CheckedRegion:
-    """Return the region in which callbacks were compared, in runs of this system and kind."""
+    """Return the region in which callbacks were compared, in runs of the same system with the same checks."""
     if run.region is not None:
         return run.region
-    what = (check_derivatives, *map(id, run.traced))  # the system keeps these objects, so that their ids stay unique
+    what = (check_derivatives, *map(id, run.traced))  # the system keeps the traces, so that their ids stay unique
     return run.system.remembered(("territory", what), CheckedRegion)  # type: ignore[no-any-return]
 
 
@@ -73,17 +73,20 @@ def compare_callbacks_at(
     message: str,
     everywhere: bool = False,
 ) -> tuple[Status, str]:
-    """Compare callbacks at states [t, q, v] of the run, the last first, outside the checked region or everywhere."""
+    """Compare callbacks at states [t, q, v] of the run, latest first; return status and message like the caller.
+
+    `everywhere`: also at states in the checked region.
+    """
     first = states[-1]
     if not everywhere:
-        states = region.without_known(states)
+        states = region.states_outside(states)
     before = status
     if len(states) > 0:
         if check_derivatives:
-            status, message = _derivatives_again(run, states, first, status, message)
-        status, message = _traces(run, states, status, message)
+            status, message = _check_derivatives(run, states, first, status, message)
+        status, message = _check_traces(run, states, status, message)
         if status == before and run.system.called_in_python and run.control[run.a.FIXED_STEP] == 0.0:
-            unlike = find_nondeterminism(run.system, states[:: 1 + len(states) // FEW])
+            unlike = find_nondeterminism(run.system, states[:: 1 + len(states) // MAX_IN_PYTHON])
             if unlike is not None:
                 status, message = Status.WRONG_TRACE, f"In the run {unlike}. {message}"
     if status == before:
@@ -91,13 +94,13 @@ def compare_callbacks_at(
     return status, message
 
 
-def _derivatives_again(run: Run, states: Array, first: Array, status: Status, message: str) -> tuple[Status, str]:
+def _check_derivatives(run: Run, states: Array, first: Array, status: Status, message: str) -> tuple[Status, str]:
     """Return the status and the message, changed if a derivative or a constant mass is wrong at states of the run."""
     n = run.system.n_q
-    chosen = states[:: 1 + (len(states) - 1) // LATER][::-1]
+    chosen = states[:: 1 + (len(states) - 1) // N_DERIVATIVES][::-1]
     some = [(float(each[0]), each[1 : 1 + n], each[1 + n :]) for each in chosen]
     exact = exact_derivatives(run.system)
-    fine = exact is not None and exact.wrong(run.system, generic_states(some)) is None
+    fine = exact is not None and exact.difference(run.system, generic_states(some)) is None
     difference = unlike_itself(run.system, some, float(first[0]), first[1 : 1 + n])
     for t, q, v in () if fine or difference is not None else some:
         wrong = wrong_derivative(run.system, t, q, v)
@@ -110,7 +113,10 @@ def _derivatives_again(run: Run, states: Array, first: Array, status: Status, me
 
 
 def find_nondeterminism(system: ConstrainedSystem, states: Array) -> str | None:
-    """Describe how a force called in Python differs when it is evaluated again at the same state [t, q, v], or None."""
+    """Describe how a force called in Python changes when it is evaluated twice at the same state; None if it does not.
+
+    `states` are rows [t, q, v].
+    """
     n, forces = system.n_q, []
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
@@ -134,19 +140,19 @@ def python_functions(system: ConstrainedSystem) -> PythonFunctions | None:
 
 
 def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> tuple[Any, Array] | None:
-    """Return arguments and value of a compiled force at the start; a force called in Python takes its samples anew."""
+    """Return arguments and value of a compiled force at the start. A force called in Python discards its samples."""
     if functions := python_functions(system):
         functions.restart()
         return None
-    with suppress(Exception):  # what is wrong is reported by the checks of the start, or in the run
+    with suppress(Exception):  # the checks of the start, or the run, will report the error
         return (t0, q0.copy(), v0.copy()), np.asarray(system.force(t0, q0, v0))
     return None
 
 
 def describe_changed_force(run: Run) -> str | None:
-    """Describe how a force that is called differs from what it was in the run for the same arguments, or None.
+    """Describe how a force differs from its value earlier in the run for the same arguments; None if it does not.
 
-    A force may change slowly, as with the clock, or once, as after 1000 calls: two calls at the end do not show that.
+    A force may change slowly (with the clock) or once (after 1000 calls): two calls at the end do not show that.
     """
     system, functions = run.system, python_functions(run.system)
     if functions is None:
@@ -178,40 +184,40 @@ def _differs(name: str, t: float, entry: int, once: float, again: float) -> str:
     )
 
 
-def _traces(run: Run, states: Any, status: Status, message: str) -> tuple[Status, str]:
+def _check_traces(run: Run, states: Any, status: Status, message: str) -> tuple[Status, str]:
     """Return the status and the message, changed if a callback differs from its recorded trace."""
     for traced in run.traced:
-        wrong = traced.wrong(run.system, states)
-        if wrong is not None:
-            return Status.WRONG_TRACE, f"In the run {wrong}. {message}"
+        difference = traced.difference(run.system, states)
+        if difference is not None:
+            return Status.WRONG_TRACE, f"In the run {difference}. {message}"
     return status, message
 
 
-CHUNK = 256  # attempts at steps in one call of `advance`
-FIRST_TRY = 0.1  # relative to a piece: its first step, if no step of a piece before is known
-SHARE = 0.1  # relative to the tolerances of the run: those of the pieces ...
+CHUNK = 256  # number of attempted steps in one call of `advance`
+FIRST_TRY = 0.1  # first step of a piece, relative to its length, unless the previous piece proposes one
+SHARE = 0.1  # tolerances of the pieces, relative to those of the run ...
 FINEST = 1e-13  # ... but not below this, because of rounding
 MOST_NUMBERS = 100_000  # size of the buffer of states
 
 
 def tighter(tolerance: ArrayLike) -> Array:
-    """Return the tolerances of the pieces for those of the run."""
+    """Return the tolerances of the pieces, given those of the run."""
     return np.minimum(tolerance, np.maximum(SHARE * np.asarray(tolerance), FINEST))
 
 
 def explicit() -> tuple[Method, Array]:
-    """Return the method for motion that is not stiff, and its nodes."""
+    """Return the method for pieces that are not stiff, and its nodes."""
     return DOP853(), dop853.C
 
 
 def implicit(velocities: bool) -> tuple[Method, Array]:
-    """Return the method for stiff motion, and its nodes; `velocities`: whether errors of velocities are tested, too."""
+    """Return the method for stiff pieces, and its nodes; `velocities`: whether errors of velocities are tested, too."""
     tableau = radau_iia(7)
     return RungeKutta(tableau, outer="newton", tested="all" if velocities else "positions"), tableau.c
 
 
 class RerunPiece(NamedTuple):
-    """Result of a piece: states [q, v] at the times asked for, the longest step, s, and the number of steps."""
+    """Result of a piece: states [q, v] at the requested times, the longest step, s, and the number of steps."""
 
     states: Array
     longest: float
@@ -219,7 +225,7 @@ class RerunPiece(NamedTuple):
 
 
 class IndependentRerun:
-    """Independent rerun of pieces of a run, each from a given state, in the same arrays.
+    """Integrator that reruns pieces of a run with another method, each from a given state.
 
     Parameters
     ----------
@@ -252,13 +258,13 @@ class IndependentRerun:
         a, control = self.run.a, self.run.control
         control[a.MAX_STEP], control[a.BRIDGE], control[a.STORE_ALL] = max_step, 0.0, 0.0
         control[a.MAX_ATTEMPTS] = CHUNK
-        self.run.work.notes[indices.GAMMA_REQUIRED] = np.inf  # the run has checked the accuracy of its differences
+        self.run.work.notes[indices.GAMMA_REQUIRED] = np.inf  # the run checked the accuracy of gamma by differences
         n_rows = max(2, min(CHUNK, MOST_NUMBERS // len(self.run.state)))
         rows = (np.empty(n_rows), np.empty((n_rows, len(self.run.state))))
         self.buffers, self.filled = (*rows, np.empty((CHUNK, a.N_STEP_COLUMNS))), np.zeros(2, dtype=np.int64)
         self.next_step = np.inf
 
-    def to(self, t0: float, state: Array, times: Array, most: int) -> RerunPiece | None:
+    def integrate(self, t0: float, state: Array, times: Array, most: int) -> RerunPiece | None:
         """Integrate from a state [q, v] at t0 and land on `times`; return None if that takes over `most` attempts."""
         run, a, n = self.run, self.run.a, len(state)
         first_step, self.next_step = self.next_step, np.inf

@@ -1,4 +1,4 @@
-"""Arrays of one run at its start, and what the kernels store in them."""
+"""Set up a run: its plan, kit, workspace and state, and the accelerations at its start."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -17,7 +17,7 @@ from twoloop.checks.structure import (
     mass_and_rows,
     pattern_of,
 )
-from twoloop.generate.time_dependence import Sudden, may_be_narrow, may_be_sudden
+from twoloop.generate.time_dependence import ShortForces, may_be_short, may_be_steep
 from twoloop.generate.traced_values import CheckedRegion
 from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import indices
@@ -37,13 +37,13 @@ Buffers = tuple[Array, Array, Array]  # times, states and steps
 FIRST_CHUNK = 1024  # attempts of a small compiled system between two checks in Python, which cost 0.2 ms each
 FIRST_CHUNK_IN_PYTHON = 64  # ... of a system whose callbacks are plain Python functions, which may be slow
 SMALL = 32  # number of coordinates; chunks of larger systems are shorter in proportion
-PROVISIONAL = 10  # number of first steps: if they are short, a method that pays only for long steps is replaced
-NONE = np.zeros((0, 0))
-CONTRADICTS = 1e-6  # relative: largest disagreement of redundant rows with the accelerations
+TRIAL_STEPS = 10  # number of first steps after which a method that needs long steps is replaced if they are short
+NO_PATTERN = np.zeros((0, 0))
+CONTRADICTS = 1e-6  # largest relative disagreement of redundant rows with the accelerations
 
 
 class Run:
-    """Arrays of a run, set up at its start; `IntegrationLoop` integrates it to its end.
+    """Run at its start: plan, kit, workspace, state and controls. `IntegrationLoop` integrates it to its end.
 
     Raises
     ------
@@ -78,7 +78,7 @@ class Run:
         self.functions = self.kit.functions
         n_rows = system.n_c + system.n_a
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
-        # ranks are computed at every start: those of the last one are a guess, which saves a second workspace
+        # ranks are computed at every start; the ranks of the last start are a guess, which may save a second workspace
         self.work = self._workspace(*(system.derived.get("ranks", ()) if self.static is None else ()))
         self.new_state = np.zeros_like(self.state)
         self.tolerances = np.zeros(indices.ATOL + system.n_q)
@@ -98,46 +98,44 @@ class Run:
         self.clock = np.zeros(loop_state.N_CLOCK)
         self._set_clock(t0)
         self.control_by(plan)
-        self.substituted = False  # whether another plan has replaced the first for good
-        self.near = singular_threshold(
-            rtol
-        )  # ratio of pivots at output times below which errors of velocities are estimated
+        self.substituted = False  # whether the substitute plan has replaced the first one
+        self.near = singular_threshold(rtol)  # ratio of pivots below which errors of velocities are estimated
         ran = any("force" in each.kinds for each in plan.traced)
-        changes = system.remembered(("changes", ran), lambda: (may_be_sudden(system, ran), may_be_narrow(system, ran)))
-        sudden, narrow = (Sudden(False, False), True) if step_size is not None else changes
-        self.sudden: Sudden = sudden
-        self.control[[loop_state.BY_TIME, loop_state.BY_STATE]] = self.sudden
-        self.narrow = narrow or plan.unseen == 1.0
+        changes = system.remembered(("changes", ran), lambda: (may_be_short(system, ran), may_be_steep(system, ran)))
+        short_forces, steep = (ShortForces(False, False), True) if step_size is not None else changes
+        self.short_forces: ShortForces = short_forces
+        self.control[[loop_state.BY_TIME, loop_state.BY_STATE]] = self.short_forces
+        self.may_be_steep = steep or plan.unseen == 1.0
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and after steps across singular positions
-        # step lengths that are still to be tried across such a position, and where the polynomial may begin: the
-        # earliest time of nodes, an earlier state, and whether tolerances are looser
-        self.mirrored = 0.0  # length of the step that leads as far beyond the position as that state is before it, s
-        self.looser = self.tolerances  # tolerances of the steps across
-        self.lengths: list[float] = []
-        self.longer: list[float] = []
-        self.crossed = 0.0  # length of the last attempt across, s
-        self.pieces: list[float] = []  # times at which the next pieces of its polynomial end
+        # steps across a singular position, see fallbacks.py
+        self.mirrored = 0.0  # length of a step that ends as far beyond the position as its base is before it, s
+        self.looser = self.tolerances  # tolerances of these steps
+        self.lengths: list[float] = []  # lengths that are still to be tried
+        self.longer: list[float] = []  # longer ones, for steps with too few nodes beyond the position
+        self.crossed = 0.0  # length of the last attempt, s
+        self.pieces: list[float] = []  # times at which the next pieces of the polynomial end
+        # origins of the polynomial still to be tried: earliest time of nodes, base, whether tolerances are looser
         self.origins: list[tuple[float, tuple[float, Array] | None, bool]] = []
         self.jumps: list[float] = []  # times at which velocities changed as by an impulse
-        self.compared_until = [-np.inf]  # time up to which callbacks were compared, in this run or an equal one
-        self.region: CheckedRegion | None = None  # shared by cached integrators: callbacks were compared there
-        self.varied_parameters: Array | None = None  # parameters of a run that is used for several systems
+        self.compared_until = [-np.inf]  # time up to which callbacks were compared; copies of the run share the list
+        self.region: CheckedRegion | None = None  # where callbacks were compared; cached integrators share it
+        self.varied_parameters: Array | None = None  # parameters, if the run is used for several systems
         self._begin()
         self.rank = len(self.work.rows_v)
-        self.said: dict[tuple[int, ...], str] = {}  # descriptions of redundant rows, made when first needed
+        self.descriptions: dict[tuple[int, ...], str] = {}  # warnings by redundant rows, written when first needed
         self.redundant, self.rows_warning = self.redundant_rows()
         self.start_warning = self._start_warning()
 
-    def again(self) -> "Run":
-        """Copy this run at its start; it must not have taken a step."""
+    def copy(self) -> "Run":
+        """Copy this run, which must be at its start."""
         other = self._copy()
         other.work = copy_of(self.work)
         return other
 
-    def at(self, t0: float, q0: Array, v0: Array) -> "Run | None":
-        """Copy this run for another start with equal ranks of C_q; None if these differ, or it cannot begin there.
+    def from_start(self, t0: float, q0: Array, v0: Array) -> "Run | None":
+        """Copy this run for another start; return None if the ranks of C_q differ there, or accelerations fail.
 
-        Runs in the static form cannot be copied like this.
+        The run must not be in the static form.
         """
         other = self._copy()
         other.t0, other.compared_until = t0, [-np.inf]
@@ -152,7 +150,7 @@ class Run:
         return other
 
     def restart(self, t: float, q: Array, v: Array) -> int:
-        """Begin at a state, with a method that remembers no steps; return the code of the accelerations there."""
+        """Set the run to a state, without past steps; return the code of the accelerations there."""
         n, state = self.system.n_q, self.state
         state[:n], state[n : 2 * n], state[2 * n :] = q, v, 0.0
         self.plan.memory[:] = self.memory
@@ -166,17 +164,8 @@ class Run:
         clock[:] = 0.0
         clock[a.T] = clock[a.T_START] = t
         clock[[a.JUMP_FROM, a.JUMP_TO, a.PIVOT_AT_OUTPUT, a.SHORTEST_CHANGE]] = np.inf
-        clock[
-            [
-                a.ROUGH_TO,
-                a.SAMPLED_TO,
-                a.MOTION_SAMPLED_TO,
-                a.DISCONTINUITY,
-                a.DISCONTINUITY_OF_MOTION,
-                a.COMPARED,
-                a.LAST_CHANGE,
-            ]
-        ] = -np.inf
+        sampled = a.ROUGH_TO, a.SAMPLED_TO, a.MOTION_SAMPLED_TO, a.COMPARED
+        clock[[*sampled, a.DISCONTINUITY, a.DISCONTINUITY_OF_MOTION, a.LAST_CHANGE]] = -np.inf
         clock[a.H_LIMIT] = self.plan.limit_start
 
     def advance(
@@ -186,18 +175,18 @@ class Run:
         filled: NDArray[np.int64],
         active: tuple[Plan, Array, Kit] | None = None,
     ) -> int:
-        """Take steps in compiled code, to the last output time or until something has to be handled; return its code.
+        """Take steps in compiled code until the last output time, or until Python must act; return the code why.
 
         Parameters
         ----------
         outputs : ndarray
-            Times on which steps have to end.
+            Times at which steps must end.
         buffers : tuple of ndarray
-            Times, states and steps; these get rows.
+            Times, states and steps, to which rows are written.
         filled : ndarray (2,)
-            Gets the number of states, and of steps.
+            Receives the number of states, and of steps.
         active : (Plan, ndarray, Kit), optional
-            The plan, the controls and the kit of these steps. None: those of the run.
+            Plan, controls and kit of these steps. None: those of the run.
         """
         plan, control, kit = active or (self.plan, self.control, self.kit)
         tolerances = self.tolerances if plan is self.plan else self.looser
@@ -230,7 +219,7 @@ class Run:
         return self.plan.lands or self.control[self.a.FIXED_STEP] > 0.0
 
     def control_by(self, plan: Plan) -> None:
-        """Set the step-size control of a plan."""
+        """Set the control array for the step-size control of a plan."""
         a, control = self.a, self.control
         control[: a.N_RULE] = plan.rule
         control[a.LIMIT_START], control[a.LIMIT_FACTOR] = plan.limit_start, plan.limit_factor
@@ -238,13 +227,13 @@ class Run:
         control[a.ROUGH], control[a.WATCHFUL] = plan.rough, plan.watchful
         control[a.MAY_SWITCH] = plan.substitute is not None
         control[a.MAKES_MANY] = getattr(plan.step, "many", None) is not None
-        control[a.TRIAL_STEPS] = PROVISIONAL if plan.provisional else -1.0
+        control[a.TRIAL_STEPS] = TRIAL_STEPS if plan.provisional else -1.0
         self.clock[a.H_LIMIT] = plan.limit_start
 
     def _workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
         """Create the workspace for ranks of C_q and of all rows; None: full rank."""
         q0 = self.state[: self.system.n_q]
-        pattern = self._pattern(q0) if self.static is None else NONE
+        pattern = self._pattern(q0) if self.static is None else NO_PATTERN
         ranks = rank, rank_v
         work = workspace(self.system, self.kit, pattern, q0, self.rtol, self.reuse, ranks, self.static, self.matrices)
         work.notes[indices.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
@@ -256,7 +245,7 @@ class Run:
         return system.remembered_at("pattern", (t0, q.tobytes()), lambda: pattern_of(system, t0, q))  # type: ignore[no-any-return]
 
     def is_lost_without_dense(self, code: int) -> bool:
-        """Return whether the static form found no step, however short, though other forms may find one."""
+        """Return whether no step succeeded in the static form, although it may succeed in another form."""
         reasons = (indices.INNER_DIVERGED, indices.SINGULAR, indices.MASS_NOT_DEFINITE)
         return (
             self.static is not None
@@ -265,9 +254,10 @@ class Run:
         )
 
     def change_form(self) -> None:
-        """Change the form of the linear algebra, at the current state.
+        """Change the form of the linear algebra at the current state.
 
-        Add Newton's matrices to the static form if they are due, else use the forms of saddle_point.py.
+        Newton's matrices are added to the static form if they are missing; otherwise the dense forms of saddle_point.py
+        replace it.
         """
         n = self.system.n_q
         before, largest = self.work, float(self.clock[self.a.LARGEST_PIVOT])
@@ -291,16 +281,15 @@ class Run:
             clock[a.FAILURE_CODE] = indices.DONE
         state = self.state.copy()
         code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
-        if code == indices.RANK_DIFFERS:  # happens after a start at which rows depend on one another
+        if code == indices.RANK_DIFFERS:  # the rank may be higher than at a start with dependent rows
             self.work.notes[indices.GENERATION] = 1.0
             code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
-        if (
-            before.notes[indices.PIVOT] > 0.0 and largest > 0.0
-        ):  # scale it as if this form had measured all pivots so far
+        if before.notes[indices.PIVOT] > 0.0 and largest > 0.0:  # convert the largest pivot to the scale of this form
             pivot = self.work.notes[indices.PIVOT]
             self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest / before.notes[indices.PIVOT])
 
     def _begin(self) -> None:
+        """Compute the accelerations at the start; change the workspace and the form if they fail."""
         start = entry_point(self.kernels.start)
         code = start(self.kit, self.work, self.t0, self.state)
         if self.static is not None and code == indices.RANK_DIFFERS:
@@ -321,7 +310,7 @@ class Run:
             self.system.derived["ranks"] = ranks
             self.work = self._workspace(*ranks)
             code = start(self.kit, self.work, self.t0, self.state)
-        if code == indices.GAMMA_INACCURATE:  # the first step reports it, too, and then the run has a result
+        if code == indices.GAMMA_INACCURATE:  # let the first step report it: then the run has a result
             required = self.work.notes[indices.GAMMA_REQUIRED]
             self.work.notes[indices.GAMMA_REQUIRED] = np.inf
             code = start(self.kit, self.work, self.t0, self.state)
@@ -345,7 +334,7 @@ class Run:
         )
 
     def redundant_rows(self, rows: Rows | None = None) -> tuple[NDArray[np.int64], str]:
-        """Return the rows of C_q and A at the start that depend on others, and describe them; `rows`: if known."""
+        """Return the rows of [C_q; A] (`rows`, if known) that depend on others at the start, and a warning of them."""
         n_rows = self.system.n_c + self.system.n_a
         if self.rank == n_rows:
             return np.zeros(0, dtype=np.int64), ""
@@ -358,23 +347,23 @@ class Run:
                 f"the constraints of {self.system.name!r} contradict one another at t = {self.t0:g}: "
                 f"{self._in_words(rows, wrong)}, but not so their accelerations. Correct or leave out one of these rows"
             )
-        if (redundant_rows := tuple(redundant)) not in self.said:
-            self.said[redundant_rows] = (
+        if (redundant_rows := tuple(redundant)) not in self.descriptions:
+            self.descriptions[redundant_rows] = (
                 f"the constraints of {self.system.name!r} have rank {self.rank} of {n_rows}, first at t = {self.t0:g}: "
                 f"{self._in_words(rows, redundant)}. They are left out of the solution and checked at every "
                 "step; multipliers are those of least norm. See docs/constraints.md#redundant-rows"
             )
-        return np.array(redundant), self.said[redundant_rows]
+        return np.array(redundant), self.descriptions[redundant_rows]
 
     def _start_warning(self) -> str:
-        """Describe a start beside a singular position, where pivots are small; those of static factors vary more."""
+        """Return the warning for a start beside a singular position, or an empty string."""
         if self.work.notes[indices.PIVOT] > (MARGIN * WEAK if self.static is None else LEAST):
             return ""
         atol, q = self.tolerances[indices.ATOL :], self.state[: self.system.n_q]
         return describe_singular_start(self.system, self.t0, q, self.rank, self.rtol, atol)
 
     def contradicting(self, rows: Rows) -> NDArray[np.int64]:
-        """Return the rows of C_q and A at the start that depend on others and disagree with the accelerations."""
+        """Return the rows of [C_q; A] that the accelerations at the start violate."""
         n = self.system.n_q
         a, gamma = self.state[2 * n : 3 * n], self.work.Gamma
         off = np.abs(rows @ a - gamma)
@@ -390,7 +379,7 @@ class Run:
         return mass_and_rows(system, self.t0, q)[1]
 
     def _in_words(self, all_rows: Rows, rows: list[int]) -> str:
-        """Describe which rows depend on which others; factors of the static form give coefficients of the first."""
+        """Describe on which other rows some rows depend."""
         if not isinstance(all_rows, SparseRows):
             return in_words(all_rows, rows)
         q, counted = self.state[: self.system.n_q], self.work.rows_v.tolist()
@@ -411,11 +400,11 @@ class Run:
         self.control[self.a.SHORTEST] = cached_run().SHORTEST_STEP * first
 
     def limit_steps(self) -> None:
-        """Limit the steps: none may pass over a hundredth of the run without an evaluation.
+        """Limit the steps, so that no hundredth of the run passes without an evaluation.
 
-        If a force may be short, one stage that meets it may not show it: then no step is longer than that.
+        If forces may be steep, steps are no longer than a hundredth: a single stage that meets one may not reveal it.
         """
-        unseen = 1.0 if self.narrow else self.plan.unseen
+        unseen = 1.0 if self.may_be_steep else self.plan.unseen
         longest = np.inf if self.plan.looks_within else self.tolerances[indices.GAP] / unseen
         self.control[self.a.MAX_STEP], self.control[self.a.MAX_EVALUATION_GAP] = min(self.max_step, longest), unseen
 
@@ -433,12 +422,10 @@ class Run:
 
     def passed_near_singular(self) -> bool:
         """Return whether steps had to end so near a singular position that rounding may have changed velocities."""
-        near = (
-            self.near if self.static is None else LEAST
-        )  # static factors have pivots that vary more, and a check takes long
+        near = self.near if self.static is None else LEAST  # pivots of static factors vary more, and checks take long
         return bool(self.clock[self.a.PIVOT_AT_OUTPUT] < near)
 
     def attempts(self) -> int:
-        """Return the number of steps that were tried so far."""
+        """Return the number of attempted steps so far."""
         c = self.work.counters
         return int(c[indices.N_ACCEPTED] + c[indices.N_REJECTED_ERROR] + c[indices.N_REJECTED_CONVERGENCE])

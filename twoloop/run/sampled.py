@@ -1,4 +1,4 @@
-"""Run that stops at every sample of a controller, where parameters may change; no checks are made along the way."""
+"""Integrate from one sample of a controller to the next, where parameters may change; callbacks are checked once."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from twoloop.methods.auto import Auto
 from twoloop.methods.plan import Method
 from twoloop.methods.taylor import Taylor
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.fallbacks import MOST, closer, may_have_missed_changes, warn_of_missed_changes
+from twoloop.run.fallbacks import MOST, closer_sampling, may_have_missed_changes, warn_of_missed_changes
 from twoloop.run.loop import IntegrationLoop, Interrupts
 from twoloop.run.messages import warn_of_singular_end, warn_user
 from twoloop.run.record import MemoryStore, OutputRequest, Record, Status, statistics
@@ -37,7 +37,7 @@ CHANGED = "the parameters changed at samples"
 
 
 class SampledState(NamedTuple):
-    """State at the end of a sample: t, s, and q, v, a (n_q,), lam (n_c + n_a,); read-only.
+    """State at the end of a sample: time t (s), q, v, a (n_q,) and lam (n_c + n_a,); the arrays are read-only.
 
     Examples
     --------
@@ -64,7 +64,7 @@ class SampledRun:
     Parameters
     ----------
     system : ConstrainedSystem
-        Of its own: its parameters are written to.
+        A copy for this object, which writes to its parameters.
     method : Method
     rtol, atol : float, ndarray (n_q,)
     max_step : float
@@ -75,7 +75,7 @@ class SampledRun:
     Raises
     ------
     TypeError, ValueError
-        If the start is refused, or the method is a Taylor series, whose code holds for given parameters only.
+        If the start is refused, or the method is a Taylor series, whose code is valid for given parameters only.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class SampledRun:
         def check(traced: Traced) -> None:
             traced.refuse(system, t0, t0 + 1.0, q0, v0)
 
-        self._derived, _ = with_derived_callbacks(system, check)  # its derivatives show what inputs must not enter
+        self._derived, _ = with_derived_callbacks(system, check)
         self._plan = method.plan(system.n_q, rtol, float(atol.min()), False)
         self.system, self.method, self.max_step, self.t0 = system, method, max_step, t0
         self._tolerances = rtol, atol
@@ -109,13 +109,13 @@ class SampledRun:
         if self.run.start_warning:
             warn_user(self.run.start_warning)
         self.p = system.functions.p[system.called_in_python :]
-        self._free: set[int] = set()  # indices of parameters that were checked to enter forces alone
+        self._force_parameters: set[int] = set()  # indices of parameters that were checked to enter forces only
         self._changed = self._failed = False
         self._outputs, self._filled = np.zeros(1), np.zeros(2, dtype=np.int64)
         self._buffers = np.empty(1), np.empty((1, len(self.run.state))), np.empty((STEPS, self.run.a.N_STEP_COLUMNS))
         self.rows, self.times, self.steps = list[Array](), list[float](), list[Array]()
         self.cpu, self._every = 0.0, np.inf  # time between evaluations, s; finite once a sample has met a short change
-        self._note(t0)
+        self._store_sample(t0)
 
     def _run_from(self, t: float, q: Array, v: Array) -> Run:
         run = Run(self._derived, self._plan.fresh(), t, q, v, *self._tolerances, None)
@@ -130,7 +130,7 @@ class SampledRun:
         return self.times[-1]
 
     def set(self, inputs: Any) -> None:
-        """Set other parameters: a mapping from their indices to numbers, or all of them."""
+        """Set parameters: `inputs` is a mapping from indices to numbers, or has all parameters."""
         if not self.p.size:
             raise ValueError(f"inputs are parameters, of which {self.system.name!r} has none: make it with parameters=")
         if isinstance(inputs, Mapping):
@@ -154,36 +154,36 @@ class SampledRun:
             self._write(place, float(values[place]))
 
     def step(self, dt: float) -> SampledState:
-        """Integrate by dt, and keep the state there; after a failure, continue from the last sample."""
+        """Integrate by dt, store and return the state there; after a failure, continue from the last sample."""
         if self._failed:
-            self._return()
+            self._return_to_sample()
         end, began = self.times[-1] + dt, time.process_time()
         self._failed = True  # until the end is reached, as a callback may raise
         with signals_of(self.system):
             self._step_to(end)
         self.cpu += time.process_time() - began
-        self._note(end)
+        self._store_sample(end)
         return self.state
 
     def _step_to(self, end: float) -> None:
-        """Integrate from the last sample to the end of the next one, again if that met a short change."""
+        """Integrate from the last sample to `end`; repeat this with more evaluations after a short change of forces."""
         for _ in range(MOST):
-            self._go_to(end)
+            self._integrate_to(end)
             if not may_have_missed_changes(self.run):
                 return
-            if len(self.times) > 1:  # earlier samples may have missed something, and are not repeated
+            if len(self.times) > 1:  # earlier samples, which are not repeated, may have missed a change
                 warn_of_missed_changes(self.run)
-            self._every = closer(self.run)
-            self._return()
-        self._go_to(end)
+            self._every = closer_sampling(self.run)
+            self._return_to_sample()
+        self._integrate_to(end)
         warn_of_missed_changes(self.run)
 
-    def _go_to(self, end: float) -> None:
-        """Integrate from the last sample to the end of the next one."""
+    def _integrate_to(self, end: float) -> None:
+        """Integrate from the last sample to `end`."""
         run, a, clock = self.run, self.run.a, self.run.clock
         t = self.times[-1]
         if self._changed or self.system.called_in_python:  # global variables of Python functions may change
-            self._begin_anew(t)
+            self._restart(t)
         run.first_step(self.t0, end, run.state, run.max_step)
         run.control[a.APART] = min(self._every, run.control[a.APART])
         self._outputs[0], clock[a.NEXT_OUTPUT], clock[a.T_START], clock[a.N_FIXED] = end, 0.0, t, 0.0
@@ -201,7 +201,7 @@ class SampledRun:
         row, n = self.rows[-1], self.run.system.n_q
         return SampledState(self.times[-1], row[:n], row[n : 2 * n], row[2 * n : 3 * n], row[3 * n :])
 
-    def _note(self, t: float) -> None:
+    def _store_sample(self, t: float) -> None:
         row = self.run.state.copy()
         row.setflags(write=False)
         self.rows.append(row)
@@ -228,8 +228,8 @@ class SampledRun:
             changes=CHANGED,
         )
 
-    def _begin_anew(self, t: float) -> None:
-        """Compute the accelerations with the new parameters, and let the method forget the motion before."""
+    def _restart(self, t: float) -> None:
+        """Compute the accelerations with the new parameters, and restart the method without its past steps."""
         run, a = self.run, self.run.a
         code = entry_point(run.kernels.start)(run.kit, run.work, t, run.state)
         first = 0
@@ -246,8 +246,8 @@ class SampledRun:
             )
         self._changed = False
 
-    def _return(self) -> None:
-        """Go back to the last sample: the run is where it failed, with the arrays that it left there."""
+    def _return_to_sample(self) -> None:
+        """Replace the run, which has gone beyond or failed, by a new one from the last sample."""
         before, n = self.run, self.system.n_q
         try:
             self.run = self._run_from(self.t, self.rows[-1][:n], self.rows[-1][n : 2 * n])
@@ -275,13 +275,13 @@ class SampledRun:
             raise RuntimeError(f"step of {self.system.name!r}: {record.message}")
 
     def _write(self, place: int, value: float) -> None:
-        if place not in self._free:
-            self._check_free(place, value)
+        if place not in self._force_parameters:
+            self._check_enters_forces_only(place, value)
         self.p[place] = value
         self._changed = True
 
-    def _check_free(self, place: int, value: float) -> None:
-        """Refuse an input that enters more than forces: with it the state would jump."""
+    def _check_enters_forces_only(self, place: int, value: float) -> None:
+        """Refuse a parameter that enters other callbacks than forces: positions or momenta would jump with it."""
         before, n = float(self.p[place]), self.system.n_q
         t, row = self.times[-1], self.rows[-1]
         known = {"q": row[:n], "v": row[n : 2 * n]}
@@ -298,7 +298,7 @@ class SampledRun:
                     f"inputs must enter forces alone; that at place {place} enters {kind} of {self.system.name!r}, "
                     "which cannot change between samples: positions or momenta would jump; start anew with others"
                 )
-        self._free.add(place)
+        self._force_parameters.add(place)
 
     def _of(self, kind: str, t: float, known: dict[str, Array]) -> Any:
         return self.system.evaluate(kind, t, *(known[name] for name in KINDS[kind].state))

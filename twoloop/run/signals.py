@@ -1,4 +1,4 @@
-"""Let exceptions of a user's signal handlers arrive as themselves, though signals come during machine code."""
+"""Propagate the exceptions of a user's signal handlers unchanged, although signals arrive during machine code."""
 
 import _signal  # type: ignore[import-not-found]  # `signal` makes enumerations of handlers, which takes 8 microseconds
 import signal
@@ -12,24 +12,23 @@ from twoloop.problem.events import Event
 from twoloop.problem.system import ConstrainedSystem
 
 CALLS_A_USER = (PythonFunctions.call.__code__, Event.__call__.__code__)
-COMPILERS = ("numba", "llvmlite")  # packages that an exception between two instructions leaves unusable
+COMPILERS = ("numba", "llvmlite")  # packages that an exception between two of their instructions would break
 NAMES = ("SIGALRM", "SIGINT", "SIGTERM", "SIGUSR1", "SIGUSR2", "SIGVTALRM", "SIGPROF", "SIGHUP")  # not all on Windows
 NUMBERS = [int(getattr(signal, name)) for name in NAMES if hasattr(signal, name)]
 
 
 class SignalHandlers:
-    """Call the user's signal handlers where machine code can pass on their exceptions, and raise these again.
+    """Call the user's signal handlers at safe points of a run, and raise their exceptions again.
 
-    Python runs handlers at its next instruction, which may be one of numba's: between two pieces of machine code, which
-    do not check for exceptions, so that `SystemError` follows; or while numba compiles, which then fails for the rest
-    of the process. Handlers wait there. Elsewhere they run at once, but the exception may be taken for one of a
-    callback, as for a force that has no value; it is therefore raised again by `check`, between chunks of steps, and
-    by `leave`.
+    Python runs a handler at its next instruction, which may belong to numba. Between two pieces of machine code an
+    exception becomes a `SystemError`; during compilation it breaks numba for the rest of the process. So handlers that
+    arrive in a compiler wait. Elsewhere they run at once; as their exception may be mistaken for one of a callback, it
+    is raised again by `check`, between chunks of steps, and by `leave`.
 
     Parameters
     ----------
     ctrl_c : bool
-        Whether Python's own handler of Ctrl-C is called like this, too. Runs replace it by one of theirs.
+        Whether to treat Python's own handler of Ctrl-C in the same way. Integrations replace that handler instead.
     """
 
     def __init__(self, ctrl_c: bool = False) -> None:
@@ -58,14 +57,14 @@ class SignalHandlers:
             raise
 
     def check(self) -> None:
-        """Call handlers that wait; raise what a handler raised."""
+        """Call the waiting handlers; raise the exception of a handler, if there was one."""
         while self._waiting and self._raised is None:
             self._call(*self._waiting.pop(0))
-        if self._raised is not None:  # it stays, because handlers of Ctrl-C may catch it
+        if self._raised is not None:  # not cleared, because the caller may catch a KeyboardInterrupt
             raise self._raised from None
 
     def leave(self) -> None:
-        """Restore the handlers, unless the user has set others meanwhile, and check; once for each object."""
+        """Restore the handlers, unless the user has set others meanwhile; then `check`. Call it once."""
         for number, handler in self._before.items():
             if _signal.getsignal(number) == self._receive:
                 _signal.signal(number, handler)
@@ -76,7 +75,7 @@ class SignalHandlers:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         if error is not None and error is self._raised:
-            self._raised = None  # it arrives with its own traceback
+            self._raised = None  # it propagates already
         self.leave()
 
 
@@ -86,7 +85,7 @@ def signals_of(system: ConstrainedSystem) -> AbstractContextManager[Any]:
 
 
 def within_a_users_function(frame: FrameType | None) -> bool:
-    """Return whether a frame belongs to a call of a user's function by machine code or by the search for events."""
+    """Return whether a frame is in a user's function that machine code or the search for events called."""
     while frame is not None:
         if frame.f_code in CALLS_A_USER:
             return True
@@ -95,7 +94,7 @@ def within_a_users_function(frame: FrameType | None) -> bool:
 
 
 def within_a_compiler(frame: FrameType | None) -> bool:
-    """Return whether a frame belongs to a compiler, but not to a user's function called from there."""
+    """Return whether a frame is in a compiler, and not in a user's function that was called from there."""
     while frame is not None and frame.f_code not in CALLS_A_USER:
         if frame.f_globals.get("__name__", "").partition(".")[0] in COMPILERS:
             return True
@@ -104,7 +103,7 @@ def within_a_compiler(frame: FrameType | None) -> bool:
 
 
 def interrupted(error: BaseException) -> bool:
-    """Return whether Ctrl-C caused an error that machine code turned into `SystemError`."""
+    """Return whether the cause of an error, such as a `SystemError` of machine code, is a KeyboardInterrupt."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, KeyboardInterrupt):
         cause = cause.__cause__

@@ -1,8 +1,8 @@
-"""Description of singular positions: where steps crossed them, and what rounding and tolerances leave open near them.
+"""Describe singular positions: where steps crossed them, and how uncertain the motion is near them.
 
-Near such a position the constraints hold q only to rounding over the smallest singular value s, along the direction d
-that they hold least. Over this distance the constraints change, and with them the velocities, which are divided by s
-again.
+Let s be the smallest singular value of the constraint Jacobian, and d its direction. The constraints determine q along
+d only to eps / s, for a rounding error eps. This uncertainty changes the Jacobian, so that velocities along d have
+errors of about eps / s^2.
 """
 
 from collections.abc import Callable, Iterator
@@ -20,19 +20,24 @@ Place = tuple[float, Array]  # time and state [q, v, ...]
 Ratio = Callable[[ConstrainedSystem, float, Array, int], float]
 
 LOST = 1e-2  # smallest over largest singular value, below which messages say that constraints lose rank
-SAMPLES = 33  # positions between two states at which the ratio is evaluated
-SHOWN = 3  # number of places that a message names
+SAMPLES = 33  # number of positions between two states at which the ratio of singular values is evaluated
+SHOWN = 3  # largest number of singular positions that a message names
 DIFFERENCE = 1e-6  # relative length of the displacement for differences (gamma, and derivatives of the rows)
-SHORT = 0.1  # relative to the length of a row if it turned as others do: shorter rows are short by their position
-TURNED = 3.0  # times the change that accelerations explain: velocities that changed by more turned in between ...
-APPARENT = 10.0  # ... which counts if it exceeds the tolerances so many times
+# a row shorter than this share of its expected length (in proportion to its derivative) is short by its position only
+SHORT = 0.1
+# velocities turned if they changed by more than TURNED times the change that accelerations explain, and by more than
+# APPARENT times the tolerances
+TURNED, APPARENT = 3.0, 10.0
 
 
 def describe_crossings(system: ConstrainedSystem, crossings: list[list[Place]], now: Place, rank: int) -> str:
-    """Describe where steps went across, from the states before and, if the run came so far, after each place."""
-    found = {ends[0][0]: _least_ratio(system, ends[0], [*ends, now][1], rank) for ends in crossings[:SHOWN]}
-    lost = {t: ratio for t, ratio in found.items() if ratio < LOST}
-    others = {t: ratio for t, ratio in found.items() if ratio >= LOST}
+    """Describe where steps crossed singular positions.
+
+    `crossings`: for each one the states before and after it; the latter may be missing if the run ended there.
+    """
+    ratios = {ends[0][0]: _least_ratio(system, ends[0], [*ends, now][1], rank) for ends in crossings[:SHOWN]}
+    lost = {t: ratio for t, ratio in ratios.items() if ratio < LOST}
+    others = {t: ratio for t, ratio in ratios.items() if ratio >= LOST}
     words = ""
     if lost:
         words += (
@@ -43,7 +48,7 @@ def describe_crossings(system: ConstrainedSystem, crossings: list[list[Place]], 
         words += (
             f" Near t = {_times(others)} steps by collocation took the place of shorter ones ({_measured(others)})."
         )
-    more = len(crossings) - len(found)
+    more = len(crossings) - len(ratios)
     return words + (f" There were {more} more such places." if more > 0 else "")
 
 
@@ -62,11 +67,11 @@ def least_singular_value(system: ConstrainedSystem, t: float, q: Array, rank: in
 def _least_ratio(
     system: ConstrainedSystem, before: Place, behind: Place, rank: int, ratio: Ratio = singular_ratio
 ) -> float:
-    """Return the least ratio of singular values on the way between two states."""
+    """Return the smallest ratio of singular values along a cubic interpolation between two states."""
     n, (t0, first), (t1, last) = system.n_q, before, behind
     if t1 == t0:
         return ratio(system, t0, first[:n], rank)
-    from scipy.interpolate import CubicHermiteSpline  # imports for a tenth of a second, and few runs need it
+    from scipy.interpolate import CubicHermiteSpline  # imported here, as that takes 0.1 s and few runs need it
 
     way = CubicHermiteSpline([t0, t1], [first[:n], last[:n]], [first[n : 2 * n], last[n : 2 * n]])
     return min(ratio(system, float(t), way(t), rank) for t in np.linspace(t0, t1, SAMPLES))
@@ -75,9 +80,9 @@ def _least_ratio(
 def describe_turn(
     system: ConstrainedSystem, crossings: list[list[Place]], now: Place, rank: int, rtol: float, atol: Array
 ) -> str:
-    """Describe where velocities turned by more than accelerations explain; return nothing if they did so nowhere.
+    """Describe where velocities changed by more than accelerations explain; return "" if they did so nowhere.
 
-    At such a place other branches of the motion are within the tolerance, and steps may have come onto one of them.
+    There other branches of the motion are within the tolerances, and the steps may have switched to another branch.
     """
     n = system.n_q
     for (t0, first), (t1, last), across in _passages(crossings, now):
@@ -87,7 +92,7 @@ def describe_turn(
         if not (turn > np.maximum(APPARENT * (atol + rtol * speeds), TURNED * (t1 - t0) * least)).any():
             continue
         near = min(LOST, np.sqrt(rtol + float(atol.max()) / size)) if size > 0.0 else LOST
-        # if no step led across, the run's own steps may have followed any branch: evaluate the last state only
+        # if no step led across, the run's own steps may have left the branch: evaluate the ratio at the last state only
         here, there = (t0, first), (t1, last)
         ratio = _least_ratio(system, here if across else there, there, rank, ratio_in_any_units)
         if ratio >= near:
@@ -106,8 +111,8 @@ def describe_turn(
 
 
 def turned_last(times: Array, rows: Array, n: int) -> bool:
-    """Return whether velocities of the last two states [q, v, a] differ by more than their accelerations give."""
-    most = np.maximum.reduce  # the method max of arrays makes three calls, which short repeated runs would notice
+    """Return whether velocities of the last two states [q, v, a] differ by more than their accelerations explain."""
+    most = np.maximum.reduce  # array.max() makes three calls, which would slow down short repeated runs
     if times.size < 2:
         return False
     turn = most(np.abs(rows[-1, n : 2 * n] - rows[-2, n : 2 * n]))
@@ -116,7 +121,7 @@ def turned_last(times: Array, rows: Array, n: int) -> bool:
 
 
 def _passages(crossings: list[list[Place]], now: Place) -> Iterator[tuple[Place, Place, bool]]:
-    """Yield the states before and after each passage, and whether steps led across; one may take several crossings."""
+    """Yield states before and after each passage, and whether steps led across; crossings may share a passage."""
     before: Place | None = None
     for first, *behind in crossings:
         before = first if before is None else before
@@ -144,20 +149,20 @@ def _known_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array,
     rates = [system.velocity_constraint(t + dt, q + dt * v, v) / lengths for dt in (-short, short)]
     gamma = (left.T @ (rates[0] - rates[1]))[kept] / (2.0 * short * values[kept])
     equations = np.block([[mass, right[kept].T], [right[kept], np.zeros((int(kept.sum()),) * 2)]])
-    found = np.linalg.lstsq(equations, np.append(units * system.force(t, q, v), gamma), rcond=None)[0]
-    return float(np.abs(units * found[: len(q)]).max())
+    solution = np.linalg.lstsq(equations, np.append(units * system.force(t, q, v), gamma), rcond=None)[0]
+    return float(np.abs(units * solution[: len(q)]).max())
 
 
 def ratio_in_any_units(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
-    """Return the ratio of `singular_ratio`, but independent of the units of coordinates and rows."""
+    """Return a ratio like `singular_ratio` that does not depend on the units of coordinates and rows."""
     values = np.linalg.svd(_in_any_units(system, t, q)[1], compute_uv=False)[:rank]
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
 
 
 def _in_any_units(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
-    """Return mass and rows in coordinates in which each has a mass of one, lengths of these rows, and units.
+    """Return M and the rows, scaled to unit masses and unit lengths of rows, the lengths, and the units of coordinates.
 
-    The rows are divided by their lengths, or by their lengths some way off if they are short at this position only.
+    Rows that are short at this position only are scaled by their lengths some distance away.
     """
     mass, rows = system.mass(t, q), system.rows(t, q)
     inertia = np.abs(np.diagonal(mass))
@@ -174,23 +179,23 @@ def _in_any_units(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array,
     return mass * units * units[:, None], rows * units / lengths[:, None], lengths, units
 
 
-def _times(found: dict[float, float]) -> str:
-    return ", ".join(f"{t:.4g}" for t in found)
+def _times(ratios: dict[float, float]) -> str:
+    return ", ".join(f"{t:.4g}" for t in ratios)
 
 
-def _measured(found: dict[float, float]) -> str:
-    return (
-        f"the smallest singular value of the constraint Jacobian comes down to {min(found.values()):.1g} of the largest"
-    )
+def _measured(ratios: dict[float, float]) -> str:
+    least = min(ratios.values())
+    return f"the smallest singular value of the constraint Jacobian comes down to {least:.1g} of the largest"
 
 
 ROUNDING = 0.5 * float(np.finfo(np.float64).eps)
-WEAK = 1e-2  # relative to the largest singular value: directions below it are examined
-LEAST, MARGIN = 1e-5, 30.0  # ratio of pivots below which they are always checked; factor from singular values to pivots
+WEAK = 1e-2  # relative to the largest singular value: rounding errors are estimated for smaller ones
+# ratio of pivots below which errors are always estimated, and factor from ratios of singular values to those of pivots
+LEAST, MARGIN = 1e-5, 30.0
 
 
 def singular_threshold(rtol: float) -> float:
-    """Return the ratio of pivots below which rounding may turn velocities by more than rtol allows."""
+    """Return the ratio of pivots below which rounding may change velocities by more than rtol allows."""
     return min(WEAK, max(LEAST, MARGIN * float(np.sqrt(ROUNDING / (UNTRUE * max(rtol, ROUNDING))))))
 
 
@@ -219,14 +224,14 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
 
 
 def describe_singular_start(system: ConstrainedSystem, t: float, q: Array, rank: int, rtol: float, atol: Array) -> str:
-    """Describe a start that the tolerances do not distinguish from a singular position; return nothing elsewhere."""
+    """Describe a start that the tolerances do not distinguish from a singular position; return "" at other starts."""
     if rank == 0 or surely_above(WEAK, system.rows(t, q), rank):
         return ""
     ratio = singular_ratio(system, t, q, rank)
     if max(ratio, ratio_in_any_units(system, t, q, rank)) > WEAK:
         return ""
     allowed = atol + rtol * np.abs(q).max()
-    if not (np.abs(_way_to_singular(system, t, q, rank)) <= allowed).all():
+    if not (np.abs(_displacement_to_singular(system, t, q, rank)) <= allowed).all():
         return ""
     return (
         f"the run begins where the constraints nearly lose rank (the smallest singular value of the constraint "
@@ -236,10 +241,11 @@ def describe_singular_start(system: ConstrainedSystem, t: float, q: Array, rank:
     )
 
 
-def _way_to_singular(system: ConstrainedSystem, t: float, q: Array, rank: int) -> Array:
-    """Estimate the way to the nearest singular position, (n_q,), to first order; not finite if there is no such way.
+def _displacement_to_singular(system: ConstrainedSystem, t: float, q: Array, rank: int) -> Array:
+    """Estimate the displacement to the nearest singular position, (n_q,), to first order; not finite if unknown.
 
-    It is the one, among those that the other constraints allow, along which the smallest singular value changes most.
+    Among the directions that the other constraints allow, it has the one in which the smallest singular value changes
+    most.
     """
     left, values, right = np.linalg.svd(system.rows(t, q))
     u, w, held = left[:, rank - 1], right[rank - 1], right[: rank - 1]

@@ -40,7 +40,8 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-DISPLACED = 1e-3  # relative to max(1, |value|): displacement of coordinates and velocities, to see what depends on them
+# displacement of coordinates and velocities, relative to max(1, |value|), that reveals which forces depend on them
+DISPLACED = 1e-3
 NEWTON_SPARSE = 0.2  # share of the entries and operations of dense factors above which a program does not pay
 
 
@@ -53,7 +54,9 @@ def newton_form(
     together: list[tuple[int, ...]],
     stiff: list[int],
 ) -> tuple[NDArray[np.int32], int] | None:
-    """Create the program of Newton's matrix, see sparse_lu.py, and count the groups of columns that are differenced.
+    """Create the program of Newton's matrix, see sparse_lu.py; return it and the number of groups of columns.
+
+    The columns of a group are computed from one difference of forces.
 
     Return None if the matrix is not sparse, or has no program.
     """
@@ -78,7 +81,7 @@ def newton_form(
 
 
 def _entries(system: ConstrainedSystem, t: float, q: Array, v: Array, lam: Array, most: float) -> set[tuple[int, int]]:
-    """Find the entries of the derivatives of Q - C_q^T lam by coordinates and of Q by velocities, and their mirrors."""
+    """Find the nonzero entries of d(Q - C_q^T lam)/dq and dQ/dv, and make the pattern symmetric."""
 
     def reaction(q: Array) -> Array:
         if "jacobian" not in system.entries:
@@ -102,22 +105,22 @@ def _entries(system: ConstrainedSystem, t: float, q: Array, v: Array, lam: Array
 
 
 SINGULAR = 1e-10  # smallest over largest eigenvalue of a body's M, below which it counts as singular
-ALONG = 1e-3  # relative to a row: a row with a larger part along a direction without mass makes M definite there
-NEWTON = 1.6  # times LARGE: number of coordinates from which on Newton's matrices are sparse
-SPARSE = 0.05  # share of the entries and operations of dense factors above which a program does not pay for its indices
+ALONG = 1e-3  # a row whose part along a direction without mass is a larger share of its length makes M definite there
+NEWTON = 1.6  # number of coordinates, in units of LARGE, from which on Newton's matrices are sparse
+SPARSE = 0.05  # share of the entries and operations of dense factors above which the static form does not pay
 
 
 class StaticForm(NamedTuple):
-    """Program of the static form of a system, and what a workspace for it needs."""
+    """Static form of a large system: the program of its sparse factorization, and the data that a workspace needs."""
 
     program: NDArray[np.int32]
     static: Static
     mass: Entries
-    pattern: Array  # pattern of a dense Jacobian, (n_c, n_q), 1 at its entries; empty with jacobian_values
-    mass_pattern: Array  # pattern of a dense M that is not constant, likewise
-    known: tuple[Any, ...]  # further arguments of `newton_form`
+    pattern: Array  # (n_c, n_q), 1 at the entries of a Jacobian that is computed as a dense array; else empty
+    mass_pattern: Array  # (n_q, n_q), 1 at the entries of a variable M that is computed as a dense array; else empty
+    newton_arguments: tuple[Any, ...]  # last arguments of `newton_form`
     newton: NDArray[np.int32] | None = None  # program of Newton's matrix, once it is needed
-    n_groups: int = 0  # number of groups of columns, for each of which Newton's matrix takes displaced forces
+    n_groups: int = 0  # number of groups of columns of Newton's matrix, which is the number of displaced forces
 
     def matrix_cost(self) -> float:
         """Estimate the cost of Newton's matrix and its factors, in evaluations of accelerations."""
@@ -136,27 +139,27 @@ class StaticForm(NamedTuple):
 
 
 def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -> StaticForm | None:
-    """Create the static form of a system for runs by these plans; None if it does not serve them, or would not pay."""
+    """Return the static form of a system for runs by some plans; None if a plan cannot use it, or it does not pay."""
     if system.n_q < LARGE or system.n_c == 0 or system.n_a > 0 or system.bandwidth is not None:
         return None
-    known = "gamma" in system.given or system.functions.gamma_program.size > 0
-    if not known or not all(plan.projects and plan.inner is None and not plan.own for plan in plans):
+    has_gamma = "gamma" in system.given or system.functions.gamma_program.size > 0
+    if not has_gamma or not all(plan.projects and plan.inner is None and not plan.own for plan in plans):
         return None
-    form: StaticForm | None = system.remembered("static form", lambda: _made(system, t0, q0))
+    form: StaticForm | None = system.remembered("static form", lambda: _create_static_form(system, t0, q0))
     if form is not None and any(plan.matrices and plan.first is None for plan in plans):
         return with_newton(system, t0, q0, form)
     return form
 
 
 def with_newton(system: ConstrainedSystem, t0: float, q0: Array, form: StaticForm) -> StaticForm | None:
-    """Add the program of Newton's matrix; return None if there is none, or it would not pay."""
+    """Return the static form with the program of Newton's matrix; None if there is none, or it does not pay."""
     if system.n_q < NEWTON * LARGE:
         return None
-    cached = system.remembered("newton form", lambda: newton_form(system, t0, q0, *form.known))
+    cached = system.remembered("newton form", lambda: newton_form(system, t0, q0, *form.newton_arguments))
     return None if cached is None else form._replace(newton=cached[0], n_groups=cached[1])
 
 
-def _made(system: ConstrainedSystem, t0: float, q0: Array) -> StaticForm | None:
+def _create_static_form(system: ConstrainedSystem, t0: float, q0: Array) -> StaticForm | None:
     pattern, mass_pattern = np.zeros((0, system.n_q)), np.zeros((0, 0))
     dense_mass = False
     if "jacobian" in system.entries:
@@ -172,7 +175,7 @@ def _made(system: ConstrainedSystem, t0: float, q0: Array) -> StaticForm | None:
         mass_pattern = entries if dense_mass else mass_pattern
     if not _is_sparse(system.n_q, len(jacobian[0])) or not _is_sparse(system.n_q, len(mass[0])):
         return None
-    together = _together(system, mass)
+    together = _coordinates_of_bodies(system, mass)
     stiff = _stiff_rows(system, t0, q0, mass, jacobian, together)
     program = factorization_program(system.n_q, system.n_c, mass, jacobian, together, stiff)
     if program is None or program[N_UPDATES] > SPARSE * _dense_work(system.n_q, system.n_c):
@@ -182,10 +185,10 @@ def _made(system: ConstrainedSystem, t0: float, q0: Array) -> StaticForm | None:
     return StaticForm(program, static, mass, pattern, mass_pattern, (mass, jacobian, together, stiff))
 
 
-def _together(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]:
-    """Return the coordinates of each body in space: of bodies that joints act on, and of all others laid out alike.
+def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]:
+    """Return the coordinates of each body in space: of bodies named by joints, and of others with the same layout.
 
-    A joint names only one of its bodies, so that no joint may name the body at the end of a chain.
+    A joint names only one of its two bodies, so the body at the end of a chain may be named by none.
     """
     named = [joint.translation + joint.rotation for joint in system.joints]
     layouts = {tuple(j - own[0] for j in own) for own in named}
@@ -199,9 +202,10 @@ def _together(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]
 def _stiff_rows(
     system: ConstrainedSystem, t0: float, q0: Array, mass: Entries, jacobian: Entries, together: list[tuple[int, ...]]
 ) -> list[int]:
-    """Find rows of single bodies that M is singular along, with entries only where M has some: see sparse_ldl.py.
+    """Find constraint rows of single bodies, such as the norm of Euler parameters, that make a singular M definite.
 
-    Return no more than make M definite: other such rows, as of a hinge on the ground, are treated like joints.
+    Their products may have entries only where M has some, see sparse_ldl.py. No more rows than necessary are returned:
+    further ones, such as those of a hinge on the ground, are treated like joints.
     """
     values = system.mass_values(t0, q0) if "mass" in system.entries else system.mass(t0, q0)[mass]
     body_of = np.array(bodies_of(system.n_q, mass, together))
@@ -236,7 +240,7 @@ def _stiff_rows(
 
 
 def _without_mass(block: Array) -> Array:
-    """Return the directions along which a body's M is singular, one per row."""
+    """Return the directions along which a body has no mass, one for each row."""
     if not np.isfinite(block).all():
         return np.eye(len(block))
     values, ways = np.linalg.eigh(block)
@@ -244,7 +248,7 @@ def _without_mass(block: Array) -> Array:
 
 
 def _is_sparse(n_q: int, n_entries: int) -> bool:
-    """Return whether there are so few entries that it pays to search for an elimination order."""
+    """Return whether a matrix has so few entries that it pays to search for an elimination order."""
     return n_entries <= SPARSE * n_q * n_q + 24 * n_q
 
 
@@ -259,7 +263,7 @@ def _places(pattern: Array) -> Entries:
 
 
 def _mass_pattern(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
-    """Return a matrix with 1 where M has an entry at a position or, if M is not constant, near it."""
+    """Return a matrix with 1 at the nonzero entries that M has at a position or, if M is variable, near it."""
     pattern = np.zeros((system.n_q, system.n_q))
     size = np.maximum(np.abs(q0), np.abs(q0).max())
     ways = np.random.default_rng(5).uniform(-1.0, 1.0, (len(NEARBY), system.n_q))
@@ -272,14 +276,14 @@ def _mass_pattern(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
     return pattern
 
 
-GAMMA_ACCURACY = 1e-11  # relative error of gamma below which differences of C_q and C_t cannot come
+GAMMA_ACCURACY = 1e-11  # smallest relative error of gamma that differences of C_q and C_t can reach
 MOST_KITS = 16  # largest number of kits that are cached with a system
 
 
 def kit_of(
     system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = None, static: StaticForm | None = None
 ) -> Kit:
-    """Make the kit of a system: callbacks, flags that choose the linear algebra, and the steps of a plan."""
+    """Return the kit of a system: callbacks, flags that choose the linear algebra, and the steps of a plan."""
     from twoloop.kernels.evaluation.inner_loop import inner_loop
 
     if static is not None:
@@ -299,7 +303,7 @@ def kit_of(
 
 
 def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) -> Kit:
-    """Make the kit of a system in the static form."""
+    """Return the kit of a system in the static form."""
     from twoloop.kernels.evaluation.sparse_inner_loop import sparse_inner_loop
 
     flags = system.functions.flags.copy()
@@ -313,7 +317,7 @@ def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) 
 
 
 def _flags_at(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
-    """Return the flags at a position, which must not be written to."""
+    """Return the flags at a position; the array is cached, so it must not be changed."""
     definite = has_definite_mass(system, t0, q0)
     key = ("flags", system.functions.flags.tobytes(), definite)
     flags, sparse = system.remembered(key, lambda: _flags(system, t0, q0, definite))
@@ -341,7 +345,7 @@ def _flags(system: ConstrainedSystem, t0: float, q0: Array, definite: bool) -> t
 
 
 def sparse_factors_pay(system: ConstrainedSystem, flags: Array) -> bool:
-    """Return whether sparse factors would pay; they need an M with an inverse, or inertia in all that moves."""
+    """Return whether sparse factors would be faster than dense ones; M must be definite on allowed velocities."""
     return sparse_pays(system.n_q, system.n_c + system.n_a, bool(flags[DIAGONAL_MASS]))
 
 
@@ -351,34 +355,34 @@ def is_diagonal(mass: Array) -> bool:
 
 
 def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
-    """Return the kit of these flags and of a plan, which the system caches for the next run."""
+    """Return the kit for some flags and a plan; the system caches it for the next run."""
     from twoloop.kernels.evaluation.inner_loop import inner_loop
 
     read = (plan.numbers, plan.own_numbers)
-    kept: dict[Any, tuple[Kit, Any]] = system.remembered("kits", dict)
-    # the cached objects keep those alive whose ids are in the key
+    kits: dict[Any, tuple[Kit, Any]] = system.remembered("kits", dict)
+    # ids in the key stay unique, as the cached objects keep alive the objects that have them
     called = (plan.inner, plan.step, plan.first, plan.second)
     key = (id(system.functions), flags.tobytes(), *called, len(LOADED), *map(id, (*plan.own, *read)))
     changes = flags[FORM] == AUGMENTED  # a run may change these flags
-    if key in kept:
-        return _with_own_flags(kept[key][0]) if changes else kept[key][0]
+    if key in kits:
+        return _with_own_flags(kits[key][0]) if changes else kits[key][0]
     flags = flags.copy()
     flags[STRAIGHT] = plan.inner is not None
     functions = system.functions._replace(flags=flags)
     kernels = Kit(functions, plan.inner or inner_loop, *_steps_of(plan), inner_loop, plan.own, *read)
-    if len(kept) == MOST_KITS:
-        del kept[next(iter(kept))]
-    kept[key] = kernels, system.functions
+    if len(kits) == MOST_KITS:
+        del kits[next(iter(kits))]
+    kits[key] = kernels, system.functions
     return _with_own_flags(kernels) if changes else kernels
 
 
 def _steps_of(plan: Plan) -> tuple[Any, Any, Any]:
-    """Return the step that is called, and the two between which it chooses; the second is loaded only when needed."""
+    """Return the step of a plan, and the two steps between which it chooses; the second is loaded when needed."""
     return loaded(plan.step), loaded(plan.first), without_loading(plan.second)
 
 
 def _with_own_flags(kit: Kit) -> Kit:
-    """Copy a kit for one run: this takes a tenth of the time of a new kit."""
+    """Copy a kit, with flags that one run may change; this takes a tenth of the time of a new kit."""
     other, flags, table = object.__new__(Kit), kit.flags.copy(), kit.table.copy()
     table[common.KIT.places["flags"]] = flags.ctypes.data
     functions = kit.functions._replace(flags=flags)
@@ -397,9 +401,9 @@ def workspace(
     static: StaticForm | None = None,
     matrices: int = 0,
 ) -> common.Work:
-    """Create a workspace for ranks of C_q and of all rows (None: full); `pattern` is that of all rows.
+    """Create a workspace for ranks of C_q and of all rows (None: full).
 
-    `matrices`: number of dense matrices, as in a plan.
+    `pattern`: 1 at the entries of all rows. `matrices`: number of dense matrices that the plan needs.
     """
     flags = kit.flags
     reduced, augmented = flags[DENSE_FORM] == NULL_SPACE, flags[FORM] == AUGMENTED
@@ -421,7 +425,7 @@ def prepare_workspace(
     reuse: float,
     static: StaticForm | None = None,
 ) -> common.Work:
-    """Prepare a workspace for a run, whatever the run before has left in it."""
+    """Reset a workspace, which may have been used by another run, for a new run; return it."""
     given = map(np.ascontiguousarray, (pattern, q0))
     entry_point(cached_run().prepare_workspace)(work, *lasting(work), *given, max(rtol, GAMMA_ACCURACY), reuse)
     if static is not None:
@@ -433,7 +437,7 @@ def prepare_workspace(
 
 
 def _fill(work: common.Work, system: ConstrainedSystem, form: StaticForm, q0: Array) -> None:
-    """Fill in the constant parts of a workspace of the static form."""
+    """Set the constant parts of a workspace in the static form."""
     work.pattern[:], work.mass_pattern[:] = form.pattern, form.mass_pattern
     work.dependent[:] = work.independent[:] = np.arange(system.n_q)
     work.counts[:] = 1.0
