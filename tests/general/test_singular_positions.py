@@ -155,6 +155,13 @@ def test_no_run_that_begins_beside_a_singular_position_succeeds_on_another_branc
             assert not (result.success and turned) or "lose rank" in result.message, result
 
 
+@pytest.mark.filterwarnings("ignore:the constraints of:twoloop.ConstraintWarning")
+def test_a_start_in_a_singular_position_is_named():
+    problem, v0 = parallelogram(0.0, 0.0), np.array([0.0, 0.65, 1.3, 0.0, 1.3, 0.0, 0.0, 0.65, 1.3])
+    result = solve_dae(problem.system, (0.0, 1.0), problem.q0, v0)
+    assert result.status == Status.ROWS_CONTRADICT and "a singular position" in result.message, result.message
+
+
 NEAR_START = "the run begins where the constraints nearly lose rank"
 
 

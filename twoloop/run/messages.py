@@ -200,7 +200,9 @@ _REMEDIES = (
     "loosen rtol and atol, take another method or compiled=False, end t_span before, or change the geometry slightly"
 )
 CROSSINGS = "\0"  # placeholder in a message, replaced by the description of singular positions that were crossed
-NEXT_TO_END = 1e-3  # if a run stops closer to its end than this share of its length, the message mentions it
+AFTER, NEGLIGIBLE_SLOPE = 1e-3, 1e-9  # s after a start at which its rank is compared; relative singular value of zero
+# if a run stops closer to its end than this share of its length, or than a step, the message mentions it
+NEXT_TO_END = 1e-3
 
 _REASONS = {
     indices.DONE: "the error estimate stayed above the tolerances",
@@ -359,6 +361,12 @@ def _contradiction(run: "Run") -> str:
     """Describe a redundant row that is violated although the other rows hold, and the rows on which it depended."""
     t, n, row = float(run.clock[run.a.T]), run.system.n_q, int(run.work.notes[indices.CONTRADICTION])
     words = in_words(run.system.rows(t, run.state[:n]), [row])
+    beside = run.state[:n] + AFTER * run.state[n : 2 * n]
+    if t == run.t0 and np.linalg.matrix_rank(run.system.rows(t, beside), NEGLIGIBLE_SLOPE) > run.rank:
+        return (
+            f"Stopped at its start, t = {t:.10g}, a singular position: the constraints have lost rank there ({words}), "
+            "but not beside it. Start a little before that position, or beyond."
+        )
     return (
         f"Stopped at t = {t:.10g}: constraint row {row} depended on others at the start, was left out, and does "
         f"not hold along the motion that these allow ({words} at the last state). Either it contradicts them, or "
@@ -433,9 +441,9 @@ def _measured(run: "Run", t: float, q: Array) -> str:
 
 
 def _end_is_near(run: "Run", t1: float) -> str:
-    """Return a sentence if the run stopped just before its end, else an empty string."""
+    """Return a sentence if the run stopped just before its end, beyond which steps across need nodes; else nothing."""
     left = t1 - float(run.clock[run.a.T])
-    if left > NEXT_TO_END * (t1 - run.t0):
+    if left > max(NEXT_TO_END * (t1 - run.t0), float(run.clock[run.a.H_LONG])):
         return ""
     return f" The end of t_span is {left:.1g} s ahead: end a little before that position, or beyond."
 
