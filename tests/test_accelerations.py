@@ -53,12 +53,12 @@ def on_arrays(address):
 
 
 class Code:
-    """`own_there` of a system, and a function of the few operations alone."""
+    """`own_accelerate` of a system, and a function of the few operations alone."""
 
     def __init__(self, system, q0):
         self.code, self.n = generated_code(system, 0.0, q0), system.n_q
         self.equations = self.code.shared.equations
-        self.there = on_arrays(self.code.shared.functions.addresses["own_there"])
+        self.there = on_arrays(self.code.shared.functions.addresses["own_accelerate"])
         self.quick = None
         if self.equations.reduced is not None:
             module, numbers = Module(), self.code.shared.numbers

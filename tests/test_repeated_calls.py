@@ -16,7 +16,7 @@ import twoloop
 from tests.compiled import PENDULUM
 from tests.problems import assert_same, pendulum, quick, some_of
 from twoloop import ConstrainedSystem, ConstraintWarning, Integrator, callback, mechanisms, solve_dae
-from twoloop.checks.consistency import Look, check_start
+from twoloop.checks.consistency import StartEvaluation, check_start
 from twoloop.generate.derived_callbacks import exact_derivatives, generic_states
 from twoloop.kernels.layout import _free
 from twoloop.methods.tableaux import gauss, radau_iia
@@ -288,11 +288,11 @@ def test_a_call_from_another_start_or_with_other_parameters_takes_few_calls_of_f
 def test_coordinates_that_are_zero_but_for_rounding_need_no_closer_look(make):
     """Another processor leaves 1e-50 in place of 0, and rows of such coordinates above the rounding of their terms."""
     problem, generic = make(), np.random.default_rng(6)
-    look = Look(problem.system)
+    evaluation = StartEvaluation(problem.system)
     off = generic.standard_normal(problem.system.n_q)
     for size, seen in ((0.0, True), (1e-50, True), (1e-35, True), (1e-12, False)):
-        found = look.at(0.0, problem.q0 + size * off, problem.v0)
-        assert bool(found & look.flags.CONSISTENT) is seen
+        found = evaluation.evaluate(0.0, problem.q0 + size * off, problem.v0)
+        assert bool(found & evaluation.flags.CONSISTENT) is seen
 
 
 # --- what is kept between calls changes nothing, and lets nothing wrong pass

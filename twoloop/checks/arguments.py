@@ -16,10 +16,10 @@ Array = NDArray[np.float64]
 
 FLOAT, ARRAY = np.dtype(np.float64), np.ndarray
 NUMBERS = (float, int)  # bool is excluded
-FAR = 1e300  # s: times below this are finite for certain
-SURELY_APART = 1e-14  # relative to the ends of a span: a longer span is long enough for certain
+FAR = 1e300  # s: times below this are certainly finite
+SURELY_APART = 1e-14  # relative to the ends of a span: a longer span is certainly long enough
 NEAR = 8.0  # in spacings of floating-point numbers: times that differ by less cannot be distinguished
-# names for messages, by NumPy's kind
+# contents of arrays, for messages, by NumPy's kind
 HOLDS = {"U": "text", "S": "text", "M": "dates", "m": "time differences", "c": "complex numbers"}
 SHOWN = 120  # largest number of characters of a given value in a message
 
@@ -126,7 +126,7 @@ def check_real(name: str, value: ArrayLike) -> Array:
     if array.dtype.kind == "O" and not all(isinstance(each, (int, float)) for each in array.flat):
         raise TypeError(f"{expected}; given {shown(value)}")
     try:
-        with np.errstate(over="ignore"):  # infinite results are reported by the callers that need finite numbers
+        with np.errstate(over="ignore"):  # callers that need finite numbers check for infinity
             return np.array(array, dtype=np.float64)
     except OverflowError as error:
         raise ValueError(f"{name} must hold numbers that fit into a float; given one beyond 1.8e308") from error
@@ -152,7 +152,7 @@ def check_vector(name: str, value: ArrayLike, n: int) -> Array:
     array = check_real(name, value)
     if array.shape != (n,):
         raise ValueError(f"{name} must have shape ({n},); given {shaped(array)}")
-    # a sum of finite numbers may be infinite
+    # test the sum first, which is faster; a sum of finite numbers may be infinite
     if not math.isfinite(sum(array.tolist())) and not np.isfinite(array).all():
         raise wrong_entries(name, "finite", array, ~np.isfinite(array))
     return array
@@ -189,7 +189,7 @@ def check_span(t_span: tuple[float, float]) -> tuple[float, float]:
     """Return the start and the end of `t_span`, or raise if they are wrong."""
     t0, t1 = t_span if type(t_span) is tuple and len(t_span) == 2 else (0.0, 0.0)
     if type(t0) in NUMBERS and type(t1) in NUMBERS and -FAR < t0 < t1 < FAR:
-        if t1 - t0 > SURELY_APART * (abs(t0) + abs(t1)):  # a cheaper test than the spacing
+        if t1 - t0 > SURELY_APART * (abs(t0) + abs(t1)):  # faster than computing the spacing
             return float(t0), float(t1)
         t0, t1 = float(t0), float(t1)
     else:
@@ -287,7 +287,7 @@ def _are_apart(times: Array, spacing: float) -> bool:
 
 
 def _check_each(times: Array, t0: float, t1: float, spacing: float) -> None:
-    """Raise the error that describes the wrong output time; one is known to be wrong."""
+    """Raise the error that describes the first wrong output time; the caller knows that there is one."""
     if not np.isfinite(times).all():
         raise wrong_entries("t_eval", "finite", times, ~np.isfinite(times))
     if times.min() < t0 or times.max() > t1:
@@ -317,7 +317,7 @@ def needed(module: str, package: str, what: str) -> Any:
     Raises
     ------
     ImportError
-        If it is not installed; the message says what needs it and how to install it.
+        If the package is not installed; the message says what needs it and how to install it.
     """
     try:
         return import_module(module)

@@ -1,8 +1,8 @@
 """Checks of single callbacks: indices within the bounds of arrays, values of entries, a symmetric mass matrix.
 
 An index out of bounds in machine code would read or write other memory. So each callback first runs once in Python,
-with its compiled helpers, where an index that is too large raises `IndexError`. Code that runs only compiled is
-compiled a second time with numba's own check. Branches that are not taken in this call are not checked.
+with its compiled helpers, where an index that is too large raises `IndexError`. Helpers that cannot run in Python are
+compiled again with numba's own check. Branches that this call does not take are not checked.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from numba import njit
 
 from twoloop.checks.arguments import Array
 from twoloop.kernels.compile.callbacks import KINDS
-from twoloop.kernels.compile.dependencies import FunctionCopier, is_library, is_ours
+from twoloop.kernels.compile.dependencies import FunctionCopier, is_library, is_twoloop
 from twoloop.kernels.compile.linking import Dispatcher
 
 if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
 
 
-OWN = {
+OWN_MODULES = {
     *("twoloop.checks.callbacks", "twoloop.generate.graph", "twoloop.generate.trace"),
     *("twoloop.generate.parameter_expressions", "twoloop.bodies.system"),
 }
-# parameters appended to those that a callback has, to find out whether `parameters` is the array that is too short
-MANY = 4096
+# number of parameters appended to those of a callback: if this prevents the error, `parameters` was too short
+N_APPENDED = 4096
 
 
 def check_bounds(system: ConstrainedSystem, t: float, q: Array, v: Array) -> None:
@@ -47,7 +47,7 @@ def check_bounds(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Non
         return
     state = {"q": q, "v": v, "lam": np.ones(system.n_c)}
     for kind, entry in KINDS.items():
-        if kind in system.entries and system.n_q * (system.n_q if kind == "mass" else system.n_c) > MOST:
+        if kind in system.entries and system.n_q * (system.n_q if kind == "mass" else system.n_c) > MAX_ENTRIES:
             continue
         check_callback(system, kind, t, [state[name] for name in entry.state])
 
@@ -56,7 +56,7 @@ def check_callback(system: ConstrainedSystem, kind: str, t: float, state: list[A
     """Run one callback with bounds checked, as `check_bounds` does for all of them."""
     if system.called_in_python or kind in system.within_bounds:
         return
-    if kind not in system.given and kind != "jacobian":  # a substitute of twoloop, which calls no function of the user
+    if kind not in system.given and kind != "jacobian":  # a substitute of twoloop, which calls no user function
         system.within_bounds.add(kind)
         return
     function, p, out = getattr(system.functions, kind), system.parameters, system.arrays_of(kind)
@@ -68,7 +68,7 @@ def check_callback(system: ConstrainedSystem, kind: str, t: float, state: list[A
             f"{kind} of {system.name!r} must not change the arrays that it is given: it changes {names}. Copy first"
         )
     if error is not None:
-        longer = np.concatenate([p, np.ones(MANY)])
+        longer = np.concatenate([p, np.ones(N_APPENDED)])
         too_short = _index_error(function, t, state, longer, out) is None
         filled = ", ".join(f"{name} has shape {x.shape}" for (name, _), x in zip(KINDS[kind].outputs, out, strict=True))
         sizes = [f"{name} has {array.size} entries" for name, array in zip(KINDS[kind].state, state, strict=True)]
@@ -89,12 +89,12 @@ def _index_error(
         try:
             with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore")
-                is_own = wrap is _in_python and is_ours(function.__module__ or "")
+                is_own = wrap is _in_python and is_twoloop(function.__module__ or "")
                 copy = _own_in_python(function) if is_own else FunctionCopier(wrap).value(function)
                 copy(t, *given, *(np.zeros(array.shape) for array in out))
         except IndexError as error:
             return error
-        except Exception:  # it may run only compiled; its own errors are raised when it is called
+        except Exception:  # the callback may run only compiled; its own errors are raised when it is called
             continue
         if changed is not None:
             changed += [
@@ -110,7 +110,7 @@ def _in_python(function: types.FunctionType, _: Any) -> Any:
 
 @lru_cache(256)
 def _own_in_python(function: Dispatcher) -> Any:
-    """Copy a callback of twoloop once for all systems: unlike a user's globals, what it names does not change."""
+    """Copy a callback of twoloop once for all systems: the globals that it names never change."""
     return FunctionCopier(_in_python).value(function)
 
 
@@ -123,7 +123,7 @@ def place_of(error: BaseException) -> str:
     trace, frames = error.__traceback__, []
     while trace is not None:
         module = trace.tb_frame.f_globals.get("__name__") or ""
-        if module not in OWN and not is_library(module):
+        if module not in OWN_MODULES and not is_library(module):
             frames.append((trace.tb_frame.f_code.co_filename, trace.tb_lineno))
         trace = trace.tb_next
     if not frames:
@@ -133,18 +133,18 @@ def place_of(error: BaseException) -> str:
     return f", in `{source}` ({file}, line {line})" if source else ""
 
 
-SAME = 1e-11  # relative to the largest entry: values that two callbacks must share
-MOST = 4_000_000  # largest number of entries of a dense matrix that is made for a comparison
-UNSYMMETRIC = 1e-10  # relative to the largest entry of M: larger differences from the transpose are no rounding
+SAME = 1e-11  # relative to the largest entry: larger differences between two callbacks count
+MAX_ENTRIES = 4_000_000  # largest number of entries of a dense matrix that is allocated for a comparison
+UNSYMMETRIC = 1e-10  # relative to the largest entry of M: larger differences from the transpose are not rounding
 
 
 def wrong_values(system: ConstrainedSystem, t: float, q: Array) -> str | None:
     """Describe where `mass_values` or `jacobian_values` differ from the dense callbacks beside them, or return None.
 
-    Matrices of more than `MOST` entries are not made: no run of such a system uses them.
+    Matrices of more than `MAX_ENTRIES` entries are not allocated: no run of such a system uses them.
     """
     for kind, (rows, columns) in system.entries.items():
-        if kind in system.scattered or system.n_q * (system.n_q if kind == "mass" else system.n_c) > MOST:
+        if kind in system.scattered or system.n_q * (system.n_q if kind == "mass" else system.n_c) > MAX_ENTRIES:
             continue
         dense, values = system.evaluate(kind, t, q), system.evaluate(f"{kind}_values", t, q)
         level = SAME * max(float(dense.max(initial=0.0)), -float(dense.min(initial=0.0)))
@@ -186,7 +186,7 @@ def _largest_of_matrix(mass: Array) -> tuple[int, int, float, float]:
 
 
 def _largest_of_values(system: ConstrainedSystem, t: float, q: Array) -> tuple[int, int, float, float]:
-    """Return the same from the values of the entries."""
+    """Return the result of `_largest_of_matrix`, computed from the values of the entries."""
     (rows, columns), values = system.entries["mass"], system.mass_values(t, q)
     where, other = rows * system.n_q + columns, columns * system.n_q + rows
     places = np.unique(where)  # entries in both triangles

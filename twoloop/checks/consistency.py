@@ -17,7 +17,7 @@ from twoloop.checks.callbacks import UNSYMMETRIC, check_bounds, unsymmetric_mass
 from twoloop.checks.derivatives import check_derivatives
 from twoloop.checks.scales import EPS, NONE, Scales, defined, generic_factors, scales_of, signs
 from twoloop.checks.sparse_rows import Rows, SparseRows, largest_in_rows
-from twoloop.checks.structure import SINGULAR_MASS, least_solution, not_finite, place_of_mass, ways
+from twoloop.checks.structure import SINGULAR_MASS, least_solution, not_finite, place_of_mass, shifts
 from twoloop.kernels.compile.linking import entry_point
 
 if TYPE_CHECKING:
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 
 
 CONSISTENT = 1e-8  # correction that an initial state may need, relative to the size of the mechanism
-SURELY = 0.1  # share of the accepted correction: below it a state is certainly consistent
-# relative: coordinates whose corrections exceed their limits equally to within this are tied; the first is named
+SURE_SHARE = 0.1  # share of the accepted correction: below it a state is certainly consistent
+# relative: coordinates whose corrections exceed their limits by equal ratios are tied; the message names the first one
 TIED = 1e-6
 NEIGHBOURS = 4  # number of neighbouring positions at which constraints are evaluated to measure their rounding
 # largest rounding error of a constraint, relative to the largest coordinate times the largest entry of the row
 MOST_NOISE = 1e-11
-# relative to the largest singular value of M in units of the inertia: smaller ones are rounding of zero
+# relative to the largest singular value of M in units of the inertia: smaller ones count as zero
 NO_INERTIA = 1e-12
 ROUNDING = 64.0  # allowed rounding error of the state, in spacings of floating-point numbers
 
@@ -50,7 +50,7 @@ def surely_consistent(
     """Return whether `Violation` would certainly accept a state, without singular values.
 
     The corrections are the same, but the limits are stricter: a share of the accepted correction, no allowance for
-    rounding, and a lower bound for the accelerations M^-1 Q.
+    rounding, and a lower bound instead of the accelerations M^-1 Q.
     """
     scales = scales_of(system, t, q, rows)
     fastest = np.where(rows != 0.0, np.abs(v) / scales.columns, 0.0).max(axis=1)
@@ -77,15 +77,15 @@ def _surely_small(rows: Array, values: Array, scales: Scales, per_row: Array) ->
     if solution is None:
         return False
     x, left = solution
-    allowed = SURELY * CONSISTENT * scales.by_coordinate(per_row, rows)
+    allowed = SURE_SHARE * CONSISTENT * scales.by_coordinate(per_row, rows)
     small = np.abs(scales.columns * x) <= allowed
-    return bool(small.all() and (np.abs(left) <= SURELY * CONSISTENT * per_row).all())
+    return bool(small.all() and (np.abs(left) <= SURE_SHARE * CONSISTENT * per_row).all())
 
 
 def is_at_rounding(values: Array, rows: Rows, state: Array, rate: Array | float = 0.0) -> bool:
     """Return whether values are no larger than the rounding of their terms; such values are accepted without scales.
 
-    Scales of rows given by entries would take full matrices. There each entry counts as large as the largest of its
+    Rows given by entries avoid scales, which need full matrices. Each of their entries counts as the largest of its
     row, which covers rounding of the entries, too.
     """
     if isinstance(rows, SparseRows):
@@ -97,7 +97,7 @@ def is_at_rounding(values: Array, rows: Rows, state: Array, rate: Array | float 
 def _noise(q: Array, change: Callable[[Array], Array], rows: Array, largest: float) -> Array:
     """Estimate how much rounding of a position q changes constraints, by their values at neighbours of q, (n_rows,).
 
-    `largest`: the largest coordinate or velocity that the rows are multiplied by.
+    `largest`: the largest coordinate, or velocity, by which the rows are multiplied.
     """
     noise = np.zeros(len(rows))
     for k in range(NEIGHBOURS):
@@ -109,8 +109,8 @@ def _noise(q: Array, change: Callable[[Array], Array], rows: Array, largest: flo
 def _without_constraints(system: ConstrainedSystem, t: float, q: Array, v: Array, columns: Array) -> Array:
     """Return the accelerations M^-1 Q without constraints; zero in directions without inertia, as of Euler parameters.
 
-    The constraints exclude these directions. Rounding may leave such an M an inverse of 1e16, so small singular values
-    are cut off, in units in which the largest inertia of each coordinate, here or a unit away, is 1.
+    The constraints exclude these directions. Because of rounding such an M may have an inverse of 1e16. So small
+    singular values count as zero, in units in which the largest inertia of each coordinate, here or nearby, is 1.
     """
     mass, inertia = system.mass(t, q), np.zeros(len(q))
     for each in (mass, defined(lambda: system.mass(t, q + columns * generic_factors(len(q))))):
@@ -161,8 +161,10 @@ class Violation:
         """Measure the violation of C(t, q) = 0 at a position."""
         values, size = system.constraint(t, q), np.abs(q)
 
-        def change(beside: Array) -> Array:  # C may be a difference of large terms that its derivatives do not show
-            return system.constraint(t, beside) - values - jacobian @ (beside - q)
+        def change(
+            neighbour: Array,
+        ) -> Array:  # shows whether C is a difference of large terms
+            return system.constraint(t, neighbour) - values - jacobian @ (neighbour - q)
 
         noise = _noise(q, change, jacobian, float(size.max(initial=0.0)))
         terms = np.maximum(np.abs(jacobian) @ size, noise / EPS)
@@ -180,8 +182,8 @@ class Violation:
         speeds = np.maximum(np.maximum(fastest, np.abs(rate) / scales.rows), falling)
         equation, values = "C_q v + C_t" if system.n_a == 0 else "(C_q v + C_t, A v + b)", jacobian @ v + rate
 
-        def change(beside: Array) -> Array:  # the rows change with the position
-            return system.rows(t, beside) @ v + system.rates(t, beside) - values
+        def change(neighbour: Array) -> Array:  # how much the rows change with the position
+            return system.rows(t, neighbour) @ v + system.rates(t, neighbour) - values
 
         noise = _noise(q, change, jacobian, float(np.abs(v).max(initial=0.0)))
         terms = np.maximum(np.abs(jacobian) @ np.abs(v) + np.abs(rate), noise / EPS)
@@ -220,7 +222,7 @@ class Violation:
         )
 
 
-LEAST = np.array([ROUNDING * EPS, UNSYMMETRIC, SINGULAR_MASS])  # limits in the order in which the kernel reads them
+ROUNDINGS = np.array([ROUNDING * EPS, UNSYMMETRIC, SINGULAR_MASS])  # limits in the order in which the kernel reads them
 
 
 class ConstraintWarning(UserWarning):
@@ -262,7 +264,7 @@ def check_start(
     """
     check_bounds(system, t0, q0, v0)
     system.check_returned(t0, q0, v0)
-    if _in_order(system, t0, q0, v0):
+    if _passes_all_checks(system, t0, q0, v0):
         if derivatives:
             check_derivatives(system, t0, q0, exact)
         return
@@ -294,7 +296,7 @@ def check_start(
         Violation.of_velocity(system, t0, q0, v0, full, scales).refuse("v0")
 
 
-class Look:
+class StartEvaluation:
     """First evaluation of compiled callbacks at one start after another: its arrays, and the result of the last one.
 
     Attributes
@@ -306,28 +308,28 @@ class Look:
     """
 
     def __init__(self, system: ConstrainedSystem):
-        from twoloop.kernels.evaluation import checks as first_look
+        from twoloop.kernels.evaluation import checks as start_checks
         from twoloop.kernels.evaluation.checks import evaluate_start, room_size
 
-        self.flags, self._look = first_look, entry_point(evaluate_start)
+        self.flags, self._evaluate = start_checks, entry_point(evaluate_start)
         n, n_rows, size = system.n_q, system.n_c + system.n_a, room_size(system.n_q, system.n_c, system.n_a)
-        self.system, looked = system, np.zeros(size + n * n + 2 * n_rows * n)
-        self._room, mass, rows, pattern = np.split(looked, np.cumsum([size, n * n, n_rows * n]))
+        self.system, values = system, np.zeros(size + n * n + 2 * n_rows * n)
+        self._room, mass, rows, pattern = np.split(values, np.cumsum([size, n * n, n_rows * n]))
         self.mass, self.rows, self.pattern = mass.reshape(n, n), rows.reshape(n_rows, n), pattern.reshape(n_rows, n)
         self.arrays = {
-            **{"looked": looked, "lam": _ones(system.n_c), "room": self._room, "mass": self.mass, "rows": self.rows},
-            **{"ways": ways(n)[1:], "pattern": self.pattern, "least": LEAST},
+            **{"start_values": values, "lam": _ones(system.n_c), "room": self._room, "mass": self.mass},
+            **{"rows": self.rows, "shifts": shifts(n)[1:], "pattern": self.pattern, "roundings": ROUNDINGS},
         }
         self.definite: bool | None = None
 
-    def at(self, t: float, q: Array, v: Array) -> int:
+    def evaluate(self, t: float, q: Array, v: Array) -> int:
         """Evaluate the callbacks at a start; return the flags of kernels/evaluation/checks.py, or 0 on an exception."""
         definite, indefinite = self.flags.DEFINITE, self.flags.INDEFINITE
-        looked, *arrays = self.arrays.values()
-        looked.fill(0.0)
+        values, *arrays = self.arrays.values()
+        values.fill(0.0)
         try:
-            bits: int = self._look(self.system.kit, t, q, v, self.sizes(), *arrays)
-        except Exception:  # a callback raised: it is called on its own afterwards, which gives the message
+            bits: int = self._evaluate(self.system.kit, t, q, v, self.sizes(), *arrays)
+        except Exception:  # a callback raised: the detailed checks call it again and give the message
             return 0
         self.definite = bool(bits & definite) if bits & (definite | indefinite) else None
         return bits
@@ -337,8 +339,8 @@ class Look:
         sizes: Array = self.system.derived.get("sizes", NONE)
         return sizes
 
-    def is_surely(self, bits: int, t: float, q: Array, v: Array) -> bool:
-        """Return whether `Violation` would certainly accept the last state, whose evaluation returned `found`."""
+    def is_surely_consistent(self, bits: int, t: float, q: Array, v: Array) -> bool:
+        """Return whether `Violation` would certainly accept the last state; `bits`: the flags of its evaluation."""
         if bits & self.flags.CONSISTENT:
             return True
         n, n_c, n_rows = self.system.n_q, self.system.n_c, len(self.rows)
@@ -346,20 +348,20 @@ class Look:
         return surely_consistent(self.system, t, q, v, self.mass, force, self.rows, C, rates)
 
 
-def _in_order(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
-    """Return whether compiled callbacks pass all checks at a start, so that none has to be repeated in detail."""
+def _passes_all_checks(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
+    """Return whether compiled callbacks pass all checks at a start, so that no check has to be repeated in detail."""
     if system.called_in_python or system.entries:
         return False
-    look = Look(system)
-    bits = look.at(t, np.ascontiguousarray(q, dtype=np.float64), np.ascontiguousarray(v, dtype=np.float64))
-    if not bits & look.flags.IN_ORDER:
+    evaluation = StartEvaluation(system)
+    bits = evaluation.evaluate(t, np.ascontiguousarray(q, dtype=np.float64), np.ascontiguousarray(v, dtype=np.float64))
+    if not bits & evaluation.flags.IN_ORDER:
         return False
     place = (t, q.tobytes())
-    system.remember_at("pattern", place, look.pattern)
-    system.remember_at("mass and rows", place, (look.mass, look.rows))
-    if look.definite is not None:
-        system.remember_at("definite mass", place_of_mass(system, t, q), look.definite)
-    return look.is_surely(bits, t, q, v)
+    system.remember_at("pattern", place, evaluation.pattern)
+    system.remember_at("mass and rows", place, (evaluation.mass, evaluation.rows))
+    if evaluation.definite is not None:
+        system.remember_at("definite mass", place_of_mass(system, t, q), evaluation.definite)
+    return evaluation.is_surely_consistent(bits, t, q, v)
 
 
 @cache

@@ -1,7 +1,7 @@
-"""Comparison of C_q, C_t, Q_d and the tangents of a system with differences; and the symmetry of M.
+"""Compare C_q, C_t, Q_d and the tangents of a system with differences, and check the symmetry of M.
 
-A run with a wrong sign in one of them often ends without an error and looks like a motion. At the start every entry is
-compared; along a run one direction through all of them.
+A run with a wrong sign in one of these often ends without an error and looks like a motion. At the start every entry is
+compared, later in a run only the derivative along one direction through all coordinates.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from twoloop.checks.scales import (
     EPS,
     Estimate,
     Function,
-    as_far_as_they_differ,
     confirms,
     defined,
     differentiate,
+    format_difference,
     generic_factors,
     generic_velocities,
     sizes,
 )
-from twoloop.checks.sparse_rows import SparseRows, apart, is_finite
+from twoloop.checks.sparse_rows import SparseRows, column_groups, is_finite
 from twoloop.checks.structure import changed_mass, check_bandwidth, wrong_kinematics
 from twoloop.kernels.data.indices import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN
 
@@ -34,14 +34,14 @@ if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
 
 
-ANYWHERE = (0, 1, -1)  # sides: around the place; if the callbacks are undefined there, after it or before it
-FORWARD = (1, -1)  # sides for times at the start: callbacks need not work before it
-TIME = 0.1  # s: first guess of the time scale of the constraints
+ALL_SIDES = (0, 1, -1)  # sides: around the place; if the callbacks are undefined there, after it or before it
+FORWARD = (1, -1)  # sides for times at the start: callbacks need not be defined before it
+FIRST_TIME_SCALE = 0.1  # s: first guess of the time scale of the constraints
 # displacement relative to the coordinates: tangents are checked a little off the start, where no symmetry hides terms
 NEAR_START = 1e-3
-ALONG_A_RUN = 9  # largest number of half-widths tried at a state of a run
+MAX_WIDTHS_IN_RUN = 9  # largest number of half-widths of intervals tried at a state of a run
 
-WHAT = {
+MEANINGS = {
     "jacobian": "the derivative of constraint with respect to q",
     "jacobian_values": "the entries of the derivative of constraint with respect to q, zero where none is named",
     "constraint_rate": "the derivative of constraint with respect to t",
@@ -93,10 +93,10 @@ def check_derivatives(system: ConstrainedSystem, t: float, q: Array, exact: Call
 def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) -> str | None:
     """Describe which of C_q, C_t and gamma is wrong at a state of a run, or None: formulas may hold at starts only.
 
-    One direction through all coordinates and time stands for all entries. So this mostly costs nine calls of
-    `constraint`, sixteen of `jacobian`, ten of `constraint_rate` and one of `gamma`, whatever n_q. Only if the
-    direction shows a difference are the entries compared one by one, as at the start. Tangents are not checked: they
-    decide whether Newton's method converges, not what it converges to.
+    One direction through all coordinates and time covers all entries. So this mostly costs nine calls of `constraint`,
+    sixteen of `jacobian`, ten of `constraint_rate` and one of `gamma`, whatever n_q. Only after a difference are the
+    entries compared one by one, as at the start. Tangents are not checked: they decide whether Newton's method
+    converges, not what it converges to.
     """
     jacobian, rate = system.sparse_rows(t, q), system.rates(t, q)
     if jacobian.size == 0 or not (is_finite(jacobian) and np.isfinite(rate).all()):
@@ -104,36 +104,36 @@ def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
     n_c = system.n_c
     generic = generic_velocities(system, t, q, jacobian, rate)[-1]
     generic = generic * max(1.0, float(np.abs(v).max()) / float(np.abs(generic).max()))
-    scale = min(TIME, _time_scale(q, generic))
+    scale = min(FIRST_TIME_SCALE, _time_scale(q, generic))
     noise = EPS * (abs(jacobian) @ np.abs(q))[:n_c]
     given = (jacobian @ generic + rate)[:n_c]
     spacing = _spacing(t, q, generic)
     suspicious = False
     if n_c > 0:
-        estimate = _along_a_run(lambda s: system.constraint(t + s, q + s * generic), scale, noise, given, spacing)
+        estimate = _estimate_in_run(lambda s: system.constraint(t + s, q + s * generic), scale, noise, given, spacing)
         suspicious = estimate.disagrees(given, EPS * (abs(jacobian) @ np.abs(generic))[:n_c]).max() > 1.0
-    for kind, rows in _gammas(system):
+    for kind, rows in _given_gammas(system):
         if suspicious:
             break
         right = defined(lambda kind=kind: system.evaluate(kind, t, q, generic))  # type: ignore[misc]
         if right is None:
             return None
         noise = EPS * (abs(jacobian) @ np.abs(generic) + np.abs(rate))[rows]
-        estimate = _along_a_run(_slowing(system, t, q, generic, rows), scale, noise, right, spacing)
+        estimate = _estimate_in_run(_negative_rates(system, t, q, generic, rows), scale, noise, right, spacing)
         suspicious = estimate.disagrees(right, 0.0 * right).max() > 1.0
-    return _wrong_constraint(system, t, q, ANYWHERE, generic) if suspicious else None
+    return _wrong_constraint(system, t, q, ALL_SIDES, generic) if suspicious else None
 
 
-def _along_a_run(function: Function, scale: float, noise: Array, given: Array, spacing: float) -> Estimate:
+def _estimate_in_run(function: Function, scale: float, noise: Array, given: Array, spacing: float) -> Estimate:
     largest = np.abs(given)
     return differentiate(
-        function, 0.0, scale, noise, given, largest, spacing=spacing, sides=ANYWHERE, max_widths=ALONG_A_RUN
+        function, 0.0, scale, noise, given, largest, spacing=spacing, sides=ALL_SIDES, max_widths=MAX_WIDTHS_IN_RUN
     )
 
 
 @dataclass(frozen=True)
 class _Comparison:
-    """Comparison of one column of a callback's values with the derivative of a function."""
+    """Comparison of one column of given values with the derivative of a function, by differences."""
 
     system: ConstrainedSystem
     kind: str
@@ -145,7 +145,7 @@ class _Comparison:
     spacing: float = 0.0
 
     def wrong(self, scale: float, noise: Array, largest: Array, rounding: Array, sides: tuple[int, ...]) -> str | None:
-        """Describe the entry that is wrong, or return None."""
+        """Describe the entry that is most certainly wrong, or return None."""
         best = differentiate(
             self.function, self.place, scale, noise, self.given, largest, spacing=self.spacing, sides=sides
         )
@@ -163,9 +163,9 @@ class _Comparison:
         hint = HINTS.get(self.kind, "")
         if self.kind == "force_by_v" and self.system.functions.flags[FORCE_BY_V_GIVEN] == 0:
             hint = ", that is, give force_by_v: beside force_by_q the force may depend on v only with it"
-        given, found = as_far_as_they_differ(float(self.given[row]), float(best.slope[row]))
+        given, found = format_difference(float(self.given[row]), float(best.slope[row]))
         return (
-            f"{self.kind} of {self.system.name!r} is not {WHAT[self.kind]}: entry {entry} is {given}, by "
+            f"{self.kind} of {self.system.name!r} is not {MEANINGS[self.kind]}: entry {entry} is {given}, by "
             f"differences it is {found} with an error of about {best.error[row]:.1g} (near t = "
             f"{self.t:.10g}; velocities are chosen at random). Correct its formula{hint}"
         )
@@ -174,9 +174,9 @@ class _Comparison:
 def _wrong_constraint(
     system: ConstrainedSystem, t: float, q: Array, sides: tuple[int, ...], *faster: Array
 ) -> str | None:
-    """Describe the first wrong entry of C_q, C_t or gamma, in this order, because each relies on those before.
+    """Describe the first wrong entry of C_q, C_t or gamma, in this order, because each check relies on those before.
 
-    `gamma` is compared at generic velocities and at the `faster` ones of a run, as it may be wrong only at high speed.
+    `gamma` is compared at generic velocities and at the `faster` ones of a run: it may be wrong only at high speed.
     """
     wrong = _wrong_jacobian(system, t, q, sides) if system.n_c > 0 else None
     if wrong is not None:
@@ -184,23 +184,23 @@ def _wrong_constraint(
     jacobian, rate = system.sparse_rows(t, q), system.rates(t, q)
     if not (is_finite(jacobian) and np.isfinite(rate).all()):
         return None
-    for kind, rows in _gammas(system):
+    for kind, rows in _given_gammas(system):
         for v in (*generic_velocities(system, t, q, jacobian, rate), *faster):
             given = defined(lambda kind=kind, v=v: system.evaluate(kind, t, q, v))  # type: ignore[misc]
             if given is None:
                 continue
             noise = EPS * (abs(jacobian) @ np.abs(v) + np.abs(rate))[rows]
             rounding = _rounding(lambda x, kind=kind, v=v: system.evaluate(kind, t, x, v), given, q)  # type: ignore[misc]
-            slowing = _slowing(system, t, q, v, rows)
-            compared = _Comparison(system, kind, t, slowing, 0.0, given, spacing=_spacing(t, q, v))
-            wrong = compared.wrong(min(TIME, _time_scale(q, v)), noise, np.abs(given), rounding, sides)
+            rates = _negative_rates(system, t, q, v, rows)
+            compared = _Comparison(system, kind, t, rates, 0.0, given, spacing=_spacing(t, q, v))
+            wrong = compared.wrong(min(FIRST_TIME_SCALE, _time_scale(q, v)), noise, np.abs(given), rounding, sides)
             if wrong is not None:
                 return wrong
     return None
 
 
 def _unsymmetric_near(system: ConstrainedSystem, t: float, q: Array) -> str | None:
-    """Check the symmetry of M a little off the start, where entries that are zero at the start show."""
+    """Describe an asymmetry of M a little off the start, where more entries are nonzero, or return None."""
     if system.constant_mass:
         return None
     near = q + NEAR_START * sizes(q) * np.abs(generic_factors(system.n_q))
@@ -211,7 +211,7 @@ def _unsymmetric_near(system: ConstrainedSystem, t: float, q: Array) -> str | No
     return None if wrong is None else f"{wrong} (near the start: at q = {near})"
 
 
-def _gammas(system: ConstrainedSystem) -> list[tuple[str, slice]]:
+def _given_gammas(system: ConstrainedSystem) -> list[tuple[str, slice]]:
     """Return the given right-hand sides of the acceleration constraints, with the rows they belong to."""
     rows = {"gamma": slice(0, system.n_c), "nonholonomic_gamma": slice(system.n_c, None)}
     return [(kind, part) for kind, part in rows.items() if kind in system.given]
@@ -232,7 +232,7 @@ def _wrong_jacobian(system: ConstrainedSystem, t: float, q: Array, sides: tuple[
     noise = EPS * (abs(jacobian) @ np.abs(q))
     rounding = _rounding(lambda x: system.constraint_rate(t, x), rate, q)
     in_t = _Comparison(system, "constraint_rate", t, lambda s: system.constraint(t + s, q), t, rate)
-    return in_t.wrong(TIME, noise, np.abs(rate), rounding, sides)
+    return in_t.wrong(FIRST_TIME_SCALE, noise, np.abs(rate), rounding, sides)
 
 
 def _wrong_tangent(system: ConstrainedSystem, t: float, q: Array) -> str | None:
@@ -277,7 +277,7 @@ def _wrong_column(
     function: Callable[[Array], Array],
     derivative: Callable[[Array], Array],
 ) -> str | None:
-    """Displace one coordinate (or velocity) after another and compare the columns of a matrix."""
+    """Displace one coordinate (or velocity) after another; describe the wrong entry of the matrix, or return None."""
     given = defined(lambda: derivative(x))
     if given is None:
         return None
@@ -293,7 +293,7 @@ def _wrong_column(
             return function(x + shift * unit)
 
         column = _Comparison(system, kind, t, displaced, float(x[j]), given[:, j], j)
-        wrong = column.wrong(float(scales[j]), noise, largest, rounding[:, j], ANYWHERE)
+        wrong = column.wrong(float(scales[j]), noise, largest, rounding[:, j], ALL_SIDES)
         if wrong is not None:
             return wrong
     return None
@@ -302,8 +302,8 @@ def _wrong_column(
 def _wrong_group(system: ConstrainedSystem, t: float, q: Array, jacobian: SparseRows) -> str | None:
     """Compare C_q given by entries: columns that share no row are displaced together, each by its own scale.
 
-    A group with a difference is compared column by column, to name the entry. This also finds an entry whose position
-    is not named: it adds to another column, or to a row that should have none.
+    A group with a difference is compared column by column, to name the entry. This also finds entries that
+    `jacobian_entries` does not name: they add to another column, or to a row without entries in the group.
     """
     noise = EPS * (abs(jacobian) @ np.abs(q))
     scales, largest = sizes(q), jacobian.largest()
@@ -313,26 +313,26 @@ def _wrong_group(system: ConstrainedSystem, t: float, q: Array, jacobian: Sparse
         rows = system.sparse_rows(t, x)
         return rows.matrix() if isinstance(rows, SparseRows) else rows
 
-    def product(way: Array) -> Array:
-        return _rounding(lambda x: system.sparse_rows(t, x) @ way, jacobian @ way, q)
+    def product(direction: Array) -> Array:
+        return _rounding(lambda x: system.sparse_rows(t, x) @ direction, jacobian @ direction, q)
 
-    for group in apart(jacobian):
-        way = np.zeros(len(q))
-        way[group] = scales[group] / unit
+    for group in column_groups(jacobian):
+        direction = np.zeros(len(q))
+        direction[group] = scales[group] / unit
 
-        def displaced(shift: float, way: Array = way) -> Array:
-            return system.constraint(t, q + shift * way)
+        def displaced(shift: float, direction: Array = direction) -> Array:
+            return system.constraint(t, q + shift * direction)
 
-        given = jacobian @ way
-        place = float(np.abs(q[group] / way[group]).max())
+        given = jacobian @ direction
+        place = float(np.abs(q[group] / direction[group]).max())
         compared = _Comparison(system, "jacobian", t, displaced, 0.0, given, spacing=float(np.spacing(place)))
-        if compared.wrong(unit, noise, np.maximum(largest, np.abs(given)), product(way), ANYWHERE) is not None:
+        if compared.wrong(unit, noise, np.maximum(largest, np.abs(given)), product(direction), ALL_SIDES) is not None:
             return _wrong_column(system, "jacobian_values", t, q, lambda x: system.constraint(t, x), full)
     return None
 
 
 def _rounding(derivative: Callable[[Array], Array], given: Array, x: Array) -> Array:
-    """Estimate the effect of rounding of the arguments on the given values."""
+    """Estimate the effect on the given values of rounding of the arguments x."""
     largest = EPS * np.abs(given)
     for signs in np.random.default_rng(2).choice((-2.0, 2.0), (3, len(x))):
         try:
@@ -349,10 +349,10 @@ def _time_scale(q: Array, v: Array) -> float:
 
 
 def _spacing(t: float, q: Array, v: Array) -> float:
-    """Return the time, s, from which on a straight motion moves every coordinate by more than rounding."""
+    """Return the shortest time, s, in which a straight motion moves every coordinate by more than rounding."""
     return max(float(np.spacing(abs(t))), float((np.spacing(np.abs(q)) / np.maximum(np.abs(v), 1e-300)).max()))
 
 
-def _slowing(system: ConstrainedSystem, t: float, q: Array, v: Array, rows: slice) -> Function:
+def _negative_rates(system: ConstrainedSystem, t: float, q: Array, v: Array, rows: slice) -> Function:
     """Return rows of -(C_q v + C_t, A v + b) along a straight motion; their derivatives are the right-hand sides."""
     return lambda s: -system.velocity_constraint(t + s, q + s * v, v)[rows]

@@ -1,14 +1,14 @@
 """Sizes of a mechanism, coordinate by coordinate, and derivatives by differences with estimates of their errors.
 
 Consistency is judged by the sizes, in any unit and with any offset. The offset of a coordinate is not a size, and
-millimetres and radians have none in common. The Jacobian has: it shows which displacements of two coordinates change a
-constraint equally, and how far they must move until the Jacobian itself is another one (a rod's length, a radian).
+millimetres and radians have no size in common. But the Jacobian shows which displacements of two coordinates change a
+constraint equally, and how far they must move until it changes itself (a rod's length, a radian).
 
 To differentiate a function, it is sampled at nine Chebyshev points around a place. If its expansion in Chebyshev
 polynomials decays before it ends, the slope of the interpolant is the derivative, and the last coefficients estimate
-its error: rounding, a kink, a step, and an oscillation that the points do not resolve all leave them large (Trefethen,
-Approximation Theory and Approximation Practice, 2013). Several widths of the interval are tried, because scales are not
-known beforehand.
+its error: with rounding, a kink, a step, or an oscillation that the points do not resolve, they remain large
+(Trefethen, Approximation Theory and Approximation Practice, 2013). Several widths of the interval are tried, because
+scales are not known beforehand.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from twoloop.kernels.compile.linking import entry_point
 if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
 
-# 1/s: largest speed of a drive, in sizes of the mechanism a second; a faster one means that C_q is nearly zero
+# 1/s: largest speed of a drive, in sizes of the mechanism per second; at a faster one C_q must be nearly zero
 FASTEST = 1e9
 EPS = float(np.finfo(np.float64).eps)
 DISPLACEMENTS = (1e-2, 1e-4, 1e-6)  # displacements in units of the coordinates, for the curvature of the constraints
-ROUNDS = 3  # iterations that find units: the first ones may be off by 1e5
+ROUNDS = 3  # number of iterations that find units: the first units may be off by 1e5
 MOST_PLACES = 16  # largest number of positions whose sizes are kept
 NONE = np.zeros(0)
-# distance in units: a row that is much shorter than its change over it is short only at this position
+# distance in units: if a row changes by much more than its length over it, the row is short only at this position
 TURNS = 0.1
 
 
 @dataclass(frozen=True)
 class Scales:
-    """Scales: units in which the entries of C_q are of like size, and the mechanism's size in these units."""
+    """Units in which the entries of C_q are of similar size, and the mechanism's size in these units."""
 
     columns: Array  # (n_q,), units of the coordinates
     rows: Array  # (n_c,), norms of the rows of C_q in these units, or their norms nearby if larger; 1 for zero rows
@@ -55,16 +55,16 @@ class Scales:
         return jacobian * self.columns / self.rows[:, None]
 
     def by_coordinate(self, per_row: Array, jacobian: Array) -> Array:
-        """Return the least value of the constraints on each coordinate, in its unit; of all if it has none."""
+        """Return for each coordinate the least value among its constraints, in its unit; of all if it has none."""
         values = np.where(jacobian != 0.0, per_row[:, None], np.inf).min(axis=0, initial=np.inf)
         return self.columns * np.where(np.isfinite(values), values, per_row.min(initial=np.inf))
 
     def keep(self, system: ConstrainedSystem, q: Array, jacobian: Array) -> None:
-        """Store the reach of the coordinates at a consistent position: relative to it, rounding is negligible.
+        """Store the reach of the coordinates at a consistent position, and the position and entries it belongs to.
 
-        Later checks of starts nearby use it if C_q has the same entries, and need not find these scales again.
-        Elsewhere the mechanism may be smaller by far. The latest positions are stored: the sizes, the position, and the
-        nonzero entries.
+        Relative to the reach, rounding is negligible. Checks of later starts near the position use it if C_q has the
+        same entries, and need not compute these scales again; elsewhere the mechanism may be much smaller. The latest
+        MOST_PLACES positions are stored.
         """
         from twoloop.kernels.evaluation.checks import NEAR_SHARE, NO_ENTRY
 
@@ -77,7 +77,7 @@ class Scales:
 
 
 def sizes(q: Array) -> Array:
-    """Return a first guess of the displacement of each coordinate that matters."""
+    """Return a first guess of the relevant displacement of each coordinate."""
     size, n = np.abs(q), q.size
     ordered = size.copy()
     ordered.sort()
@@ -102,7 +102,7 @@ def generic_factors(n_q: int) -> Array:
 
 
 def median(values: Array) -> float:
-    """Return the median of finite numbers, without NumPy's checks for others."""
+    """Return the median of finite numbers, without NumPy's checks for other values."""
     return _middle(np.sort(values))
 
 
@@ -112,7 +112,7 @@ def _middle(ordered: Array) -> float:
 
 
 def column_scales(jacobian: Rows, typical: Array) -> Array:
-    """Return units of the coordinates in which entries of C_q are of like size; the typical ones for zero columns."""
+    """Return units of the coordinates in which entries of C_q are of similar size; zero columns get typical ones."""
     from twoloop.kernels.evaluation.checks import column_units
 
     if isinstance(jacobian, SparseRows):
@@ -126,7 +126,7 @@ def column_scales(jacobian: Rows, typical: Array) -> Array:
 
 
 def _sparse_column_scales(jacobian: SparseRows, typical: Array) -> Array:
-    """Return the same units from the entries alone."""
+    """Return the units of `column_scales` from the entries alone."""
     size, (m, n) = np.abs(jacobian.values), jacobian.shape
     counts = size > 1e-12 * jacobian.largest()[jacobian.rows]
     i, j, logs = jacobian.rows[counts], jacobian.columns[counts], np.log(size[counts])
@@ -160,20 +160,20 @@ def scales_of(system: ConstrainedSystem, t: float, q: Array, jacobian: Array) ->
 
 
 def units(system: ConstrainedSystem, t: float, q: Array, jacobian: Rows, typical: Array) -> Array:
-    """Return units of the coordinates in which entries of C_q (and A) are of like size, here or a unit away.
+    """Return units of the coordinates in which entries of C_q (and A) are of similar size, here or a unit away.
 
-    An entry that is small only at this position, as of a bar that is almost upright, says nothing about units.
+    An entry that is small only at this position, as of a bar that is almost upright, does not determine units.
     """
-    columns, ways = column_scales(jacobian, typical), np.outer([1.0, -1.0], generic_factors(len(q)))
-    for _ in range(ROUNDS):  # a fixed number, so that rounding does not decide it
-        estimated = column_scales(_largest(system, t, q + columns * ways, jacobian), typical)
+    columns, shifts = column_scales(jacobian, typical), np.outer([1.0, -1.0], generic_factors(len(q)))
+    for _ in range(ROUNDS):  # a fixed number, so that rounding does not change the number of rounds
+        estimated = column_scales(_largest(system, t, q + columns * shifts, jacobian), typical)
         # an entry that grows with its coordinate has half the unit at twice the displacement
         columns = np.cbrt(columns * estimated * estimated)
     return columns
 
 
 def _largest(system: ConstrainedSystem, t: float, places: Array, here: Rows) -> Rows:
-    """Return the largest magnitude of each entry, here and at other places, at which callbacks may be undefined."""
+    """Return the largest magnitude of each entry, here and at other places; places outside the domain do not count."""
     if not isinstance(here, SparseRows):
         beside = rows_at(system, t, places)[0][:, : len(here)]
         return np.maximum(abs(here), abs(np.where(np.isfinite(beside), beside, 0.0)).max(axis=0))
@@ -190,12 +190,12 @@ def _largest(system: ConstrainedSystem, t: float, places: Array, here: Rows) -> 
 
 def rows_at(system: ConstrainedSystem, t: float, places: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Return C_q and A at positions, (n, n_c + n_a, n_q), and at which of these no callback raised, (n,)."""
-    from twoloop.kernels.evaluation import checks as first_look
+    from twoloop.kernels.evaluation import checks as start_checks
 
     check_callback(system, "jacobian", t, [places[0]])
     n, kit, defined = len(places), system.kit, np.ones(len(places), dtype=bool)
     rows = np.zeros((n, system.n_c + system.n_a, system.n_q))
-    evaluate = entry_point(first_look.rows_at)
+    evaluate = entry_point(start_checks.rows_at)
     try:
         evaluate(kit, t, places, system.n_c, rows.reshape(-1, system.n_q))
     except Exception:  # a position failed: evaluate one by one
@@ -215,23 +215,23 @@ def signs(n_q: int) -> Array:
 
 
 def _curvature(system: ConstrainedSystem, t: float, q: Array, columns: Array, n_rows: int) -> Array:
-    """Return how fast each row of C_q changes per unit of the coordinates; one digit is enough."""
+    """Return the rate of change of each row of C_q per unit of the coordinates; one correct digit is enough."""
     way = columns * signs(len(q))
     largest = np.zeros(n_rows)
     shifts = np.array([side * part for part in DISPLACEMENTS for side in (1.0, -1.0)])
     rows, defined = rows_at(system, t, q + shifts[:, None] * way)
     rows = rows[:, :n_rows]
     for k, part in enumerate(DISPLACEMENTS):
-        one, other = rows[2 * k : 2 * k + 2]
-        change = np.sqrt((((one - other) * columns) ** 2).sum(axis=1)) / (2.0 * part)
-        noise = EPS * (np.abs(one) @ (columns + np.abs(q))) / part
+        first, second = rows[2 * k : 2 * k + 2]
+        change = np.sqrt((((first - second) * columns) ** 2).sum(axis=1)) / (2.0 * part)
+        noise = EPS * (np.abs(first) @ (columns + np.abs(q))) / part
         if defined[2 * k : 2 * k + 2].all() and np.isfinite(change).all():
             largest = np.maximum(largest, np.where(change > noise, change, 0.0))
     return largest
 
 
 def generic_velocities(system: ConstrainedSystem, t: float, q: Array, jacobian: Rows, rate: Array) -> list[Array]:
-    """Return velocities in which each coordinate matters; if C_t is not zero, also some as fast as the drive (last)."""
+    """Return velocities in which no coordinate is negligible; last, if C_t is not zero, some as fast as the drive."""
     size = sizes(q)
     v = units(system, t, q, jacobian, size) * generic_factors(len(q))
     v = v / median(np.abs(v) / size)
@@ -252,20 +252,20 @@ SLOPES: dict[int, Array] = {  # slopes of the polynomials at the place, by the s
 }
 FIRST = 2.0**-5  # first half-width, relative to the scale
 RATIO = 16.0  # ratio of successive half-widths
-SMALLER, LARGER = 11, 8  # numbers of smaller and larger half-widths that are tried
-# ratio, and numbers of wider and narrower intervals that must confirm that an entry is wrong
-FINER, WIDER, CLOSER = 4.0, 8, 24
+N_SMALLER, N_LARGER = 11, 8  # numbers of smaller and larger half-widths that are tried
+# for intervals that must confirm that an entry is wrong: ratio of half-widths, and numbers of wider and narrower ones
+CONFIRM_RATIO, N_WIDER, N_NARROWER = 4.0, 8, 24
 BESIDE = (0.55, 1.8, 3.1)  # half-widths that confirm an estimate first, relative to its own
 RIPPLES = 3  # number of narrower intervals after which a smooth function shows only rounding
 LEAST_SPACINGS = 256.0  # smallest half-width, in spacings of floating-point numbers at the place
 # relative to an entry: at this agreement, error of the difference included, no other half-width is tried
 SETTLED = 2e-7
-AGREEMENT = 3e-7  # relative to an entry: a smaller difference is no error
+AGREEMENT = 3e-7  # relative to an entry: a smaller difference is not an error
 DECAYED = 0.01  # largest ratio of the last coefficients to the first, for a function that the points resolve
-# largest ratio of the last two coefficients to those before, if these are not rounding: above, they are a ripple
+# largest ratio of the last two coefficients to those before, unless all are rounding: a larger one shows a ripple
 DECAYING = 0.2
-NOTHING = 100.0  # in rounding errors: a function that varies by less counts as constant
-SAFETY = 5.0  # multiple of the estimated error of the difference that is allowed
+CONSTANT = 100.0  # in rounding errors: a function that varies by less counts as constant
+SAFETY = 5.0  # factor on the estimated error of the difference that gives the allowed difference
 # in rounding errors of the result: terms inside a function may be larger than its result, but hardly by more than this
 FROZEN = 1e4
 FLAT = 3  # number of intervals of different widths on which a constant function must be constant for the derivative 0
@@ -278,11 +278,11 @@ class Estimate:
 
     slope: Array
     error: Array
-    width: Array  # half-width that gave each estimate; infinite: none did
+    width: Array  # half-width of the interval of each estimate; infinite: no interval gave one
     side: int  # side of the interval, see `differentiate`
 
     def disagrees(self, given: Array, rounding: Array) -> Array:
-        """Return |given - slope| over its limit, (m,); above 1 the given value is wrong."""
+        """Return |given - slope| over its limit, (m,); where it exceeds 1 the given value is wrong."""
         allowed = SAFETY * self.error + AGREEMENT * np.abs(given) + SAFETY * rounding
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = np.abs(given - self.slope) / allowed
@@ -305,7 +305,7 @@ def _window(function: Function, place: float, width: float, side: int, noise: Ar
     try:
         with np.errstate(all="ignore"):
             values = np.array([function(float(shift)) for shift in shifts])
-    except Exception:  # outside the domain of the function: at the place itself it has been called before
+    except Exception:  # outside the domain of the function, which does not raise at the place itself
         return None
     if not np.isfinite(values).all():
         return None
@@ -324,22 +324,22 @@ def _window(function: Function, place: float, width: float, side: int, noise: Ar
     if not np.isfinite(error).all():
         return None
     last = np.abs(coefficients[TAIL + 2 :]).max(axis=0)
-    still = tail <= NOTHING * level
-    resolved = ((tail <= DECAYED * head) & (still | (last <= DECAYING * tail))) | (still & (head <= NOTHING * level))
+    still = tail <= CONSTANT * level
+    resolved = ((tail <= DECAYED * head) & (still | (last <= DECAYING * tail))) | (still & (head <= CONSTANT * level))
     ripple = np.where(tail > FROZEN * level, tail, 0.0)
-    nothing = np.maximum(head, tail) <= NOTHING * level
+    nothing = np.maximum(head, tail) <= CONSTANT * level
     return _Window(slope, np.where(resolved, error, np.inf), np.ptp(values, axis=0) == 0.0, nothing, ripple)
 
 
 def _widths(scale: float, spacing: float) -> Iterator[float]:
-    """Yield the half-widths to try: first a fraction of the scale, then smaller and larger ones in turn."""
+    """Yield the half-widths to try: first a share of the scale, then smaller and larger ones alternately."""
     least = LEAST_SPACINGS * spacing
     first = max(FIRST * scale, least)
     yield first
-    for k in range(1, max(SMALLER, LARGER) + 1):
-        if k <= SMALLER and first / RATIO**k >= least:
+    for k in range(1, max(N_SMALLER, N_LARGER) + 1):
+        if k <= N_SMALLER and first / RATIO**k >= least:
             yield first / RATIO**k
-        if k <= LARGER:
+        if k <= N_LARGER:
             yield first * RATIO**k
 
 
@@ -353,9 +353,9 @@ def differentiate(
     *,
     spacing: float = 0.0,
     sides: tuple[int, ...] = (0,),
-    max_widths: int = SMALLER + LARGER + 1,
+    max_widths: int = N_SMALLER + N_LARGER + 1,
 ) -> Estimate:
-    """Differentiate at a place until each entry is known well enough to judge the given one.
+    """Differentiate at a place until each entry is accurate enough to judge the given one.
 
     Parameters
     ----------
@@ -391,7 +391,7 @@ def differentiate(
             estimate = _window(function, place, h, side, noise)
             if estimate is None:
                 continue
-            # on a narrow interval, terms of a function may be constant by rounding while the rest looks smooth
+            # on a narrow interval, terms of a function may be constant by rounding while the others look smooth
             with np.errstate(invalid="ignore"):
                 agrees = ~(np.abs(estimate.slope - slope) > SAFETY * (estimate.error + error))
             too_wide = estimate.nothing & (h > RATIO * FIRST * scale)
@@ -399,7 +399,7 @@ def differentiate(
             slope[better], error[better], width[better] = estimate.slope[better], estimate.error[better], h
             better = estimate.flat & (FROZEN * estimate.error < flat_error)
             flat_error[better], flat_width[better] = FROZEN * estimate.error[better], h
-            # if a wider interval changes an entry, a narrower one without change showed only rounding, or a dead zone
+            # a narrow interval without change, inside a wider one with change, shows only rounding or a dead zone
             moved |= ~estimate.flat
             best = Estimate(
                 np.where(moved, slope, 0.0),
@@ -411,7 +411,7 @@ def differentiate(
             still = ~moved & (given == 0.0) & (tried >= FLAT)
             if (_settled(best, given, largest) | still).all():
                 return best
-        if tried:  # a kink at the place would not show on other sides
+        if tried:  # the function is defined on this side: others would hide a kink at the place
             return best
     return Estimate(np.zeros(m), np.full(m, np.inf), np.full(m, np.inf), 0)
 
@@ -429,7 +429,7 @@ def confirms(
     """Return whether other intervals, wider and narrower, also find that this entry differs from the given one.
 
     One disagreement may be an accident, and a function with a small fast part (a fine ripple on a long slope) shows it
-    on narrow intervals only. If an interval finds another derivative, nothing is certain.
+    on narrow intervals only. If an interval finds another derivative, the entry counts as correct.
     """
     width = float(best.width[entry])
     for part in BESIDE:
@@ -442,22 +442,22 @@ def confirms(
     if apart <= 0.6 * SAFETY * estimate.error[entry] or abs(estimate.slope[entry] - best.slope[entry]) >= 0.5 * apart:
         return False
     least = LEAST_SPACINGS * max(spacing, float(np.spacing(abs(place))))
-    for k in (*range(-WIDER, 0), *range(1, CLOSER)):
-        if width / FINER**k < least:
+    for k in (*range(-N_WIDER, 0), *range(1, N_NARROWER)):
+        if width / CONFIRM_RATIO**k < least:
             break
-        estimate = _window(function, place, width / FINER**k, best.side, noise)
+        estimate = _window(function, place, width / CONFIRM_RATIO**k, best.side, noise)
         if estimate is None or estimate.flat[entry]:
             continue
         if abs(estimate.slope[entry] - best.slope[entry]) > SAFETY * (estimate.error[entry] + best.error[entry]):
             return False
-        # not caused by the ends of the interval: a ripple may hide a steep slope
+        # `ripple` is not an effect of the ends of the interval: a ripple may hide a steep slope
         if k > RIPPLES and estimate.ripple[entry] > 0.0:
             return False
     return True
 
 
 def defined(function: Callable[[], Array]) -> Array | None:
-    """Return the value of a callback away from the state; None if it raises or is not finite: outside its domain."""
+    """Return the value of a callback away from the state; None outside its domain (it raises or is not finite)."""
     try:
         value = function()
     except Exception:
@@ -465,9 +465,9 @@ def defined(function: Callable[[], Array]) -> Array | None:
     return value if np.isfinite(value).all() else None
 
 
-def as_far_as_they_differ(one: float, other: float) -> tuple[str, str]:
-    """Format two numbers to the third digit of their difference; further digits are rounding, or of no interest."""
-    if not 0.0 < abs(one - other) < np.inf:
-        return f"{one:.3g}", f"{other:.3g}"
-    places = 2 - math.floor(math.log10(abs(one - other)))
-    return f"{round(one, places) + 0.0:.16g}", f"{round(other, places) + 0.0:.16g}"
+def format_difference(first: float, second: float) -> tuple[str, str]:
+    """Format two numbers to the third digit of their difference; further digits are rounding, or irrelevant."""
+    if not 0.0 < abs(first - second) < np.inf:
+        return f"{first:.3g}", f"{second:.3g}"
+    places = 2 - math.floor(math.log10(abs(first - second)))
+    return f"{round(first, places) + 0.0:.16g}", f"{round(second, places) + 0.0:.16g}"

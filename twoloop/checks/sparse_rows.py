@@ -1,4 +1,4 @@
-"""Rows of constraints by their entries, for checks of a Jacobian that must not become a full matrix."""
+"""Sparse rows of constraints, stored by entries, for checks that must not allocate a full Jacobian."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Integers = NDArray[np.int64]
 
 
 class SparseRows:
-    """Sparse matrix (m, n) by its entries, without duplicates, with the operations of an array that checks need.
+    """Sparse matrix (m, n) stored by entries, without duplicates, with the array operations that checks need.
 
     Attributes
     ----------
@@ -26,7 +26,7 @@ class SparseRows:
         self.values = self.added(values)
 
     def added(self, values: Array) -> Array:
-        """Reorder values from the order of the constructor's rows and columns to that of the entries."""
+        """Reorder values from the constructor's order to that of the entries, adding values of the same entry."""
         return np.bincount(self.place_of, values, len(self.rows)).astype(np.float64)
 
     @property
@@ -54,7 +54,7 @@ class SparseRows:
         return other
 
     def __getitem__(self, part: slice) -> SparseRows:
-        """Return all rows; no other part is supported."""
+        """Return all rows (slices that select all rows are the only ones supported)."""
         assert part == slice(self.shape[0])
         return self
 
@@ -109,7 +109,7 @@ def norms(rows: Rows) -> Array:
     return lengths
 
 
-def apart(rows: SparseRows) -> list[Integers]:
+def column_groups(rows: SparseRows) -> list[Integers]:
     """Group the columns so that no two columns of a group have entries in the same row."""
     in_row: list[list[int]] = [[] for _ in range(rows.shape[0])]
     in_column: list[list[int]] = [[] for _ in range(rows.shape[1])]

@@ -1,4 +1,4 @@
-"""Check M and the rows of C_q and A at a position: rank, pattern, definite and constant M, bandwidth, `kinematics`."""
+"""Check M, C_q and A at a position: rank and pattern of the rows, definiteness of M, bandwidth, and `kinematics`."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from twoloop.checks.arguments import Array
 from twoloop.checks.callbacks import SAME, UNSYMMETRIC, unsymmetric_mass, wrong_values
 from twoloop.checks.scales import (
     EPS,
-    as_far_as_they_differ,
     defined,
+    format_difference,
     generic_factors,
     generic_velocities,
     rows_at,
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 
 RANK_TOLERANCE = 1e-11  # relative to the largest diagonal entry of R: smaller pivots are zero
 SHOWN = 5  # largest number of dependent rows whose equations are written out
-# rows on which another one depends: largest number with coefficients, and largest number named
+# largest number of other rows that a message names with coefficients, and largest number that it names at all
 MOST_TERMS, MOST_NAMED = 3, 8
 WEAK = 1e-9  # relative to the largest singular value: above it, a direction certainly belongs to the pseudo-inverse
-NO_DIRECTION = 1e-12  # relative to a row: a smaller remainder, without its part in the rows it depends on, is rounding
+NO_DIRECTION = 1e-12  # relative to a row: a smaller remainder, after its dependent components are subtracted, is zero
 
 
 def eigenvalues(matrix: Array) -> Array:
@@ -46,7 +46,7 @@ def eigenvalues(matrix: Array) -> Array:
 def orthogonalised(rows: Array, least: float) -> tuple[Array, Array, list[int]]:
     """Orthonormalize rows; return the basis, the lower triangle that gives the independent rows, and their indices.
 
-    A row is independent if the share of it that no combination of the rows before gives is larger than `least`.
+    A row is independent if more than the share `least` of it is no combination of the rows before.
     """
     from twoloop.kernels.linalg.rank import independent_rows
 
@@ -57,9 +57,9 @@ def orthogonalised(rows: Array, least: float) -> tuple[Array, Array, list[int]]:
 
 
 def least_solution(rows: Array, values: Array) -> tuple[Array, Array] | None:
-    """Solve rows x = values by the pseudo-inverse, rows of length 1 or less; return x and the residual.
+    """Solve rows x = values by the pseudo-inverse, for rows of length 1 or less; return x and the residual.
 
-    None if a direction is so weak that it is not certain whether it belongs to the pseudo-inverse.
+    Returns None if a direction is so weak that it may not belong to the pseudo-inverse.
     """
     from twoloop.kernels.linalg import rank as independent
 
@@ -89,7 +89,7 @@ def surely_above(ratio: float, rows: Array, rank: int) -> bool:
 
 
 def redundant_rows(scaled: Array) -> list[int]:
-    """Return the rows of a Jacobian, scaled to like size, that depend on the others, by QR with pivoting."""
+    """Return the rows of a Jacobian, scaled to similar size, that depend on the others, by QR with pivoting."""
     if scaled.size == 0:
         return []
     R, order = qr(scaled.T, mode="r", pivoting=True)
@@ -99,7 +99,7 @@ def redundant_rows(scaled: Array) -> list[int]:
 
 
 def in_words(jacobian: Array, redundant: list[int]) -> str:
-    """Describe which rows depend on which others; with coefficients only if these are few: many vary between starts."""
+    """Describe which rows depend on which others, with coefficients only if they are few: many vary between starts."""
     from twoloop.kernels.linalg.rank import shares_of_others
 
     (n_rows, n_q), shown = jacobian.shape, redundant[:SHOWN]
@@ -116,7 +116,7 @@ def in_words(jacobian: Array, redundant: list[int]) -> str:
 
 
 def equations_in_words(redundant: list[int], others: list[int], shares: Array, lengths: Array) -> str:
-    """Describe the same from the shares (SHOWN, n) of the other rows in the first rows, and the lengths of all rows."""
+    """Describe the first redundant rows, by their coefficients `shares` (SHOWN, n) and the lengths of all rows."""
     equations = []
     counts = np.abs(shares) * lengths[others] > 1e-9 * lengths[redundant[: len(shares)], None]
     for i, factors, which in zip(redundant, shares.tolist(), counts, strict=False):
@@ -143,13 +143,13 @@ def pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
 
 def _pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
     size = np.maximum(np.abs(q), np.abs(q).max())
-    # entries that are missed here are found during the run
-    rows, defined = rows_at(system, t, q + size * ways(system.n_q))
+    # entries that are zero at all these positions are found during the run
+    rows, defined = rows_at(system, t, q + size * shifts(system.n_q))
     return (rows[defined] != 0.0).any(axis=0).astype(float)
 
 
 @cache
-def ways(n_q: int) -> Array:
+def shifts(n_q: int) -> Array:
     """Return fixed random displacements to nearby positions, relative to the coordinates, (len(NEARBY), n_q)."""
     return np.array(NEARBY)[:, None] * np.random.default_rng(4).uniform(-1.0, 1.0, (len(NEARBY), n_q))
 
@@ -182,8 +182,8 @@ def parts_of(value: Array | tuple[Array, ...]) -> tuple[Array, ...]:
 def not_finite(system: ConstrainedSystem, t: float, q: Array, v: Array) -> str | None:
     """Name the callbacks whose values are not finite at (t, q, v); None: all are finite."""
     state = {"q": q, "v": v, "lam": np.ones(system.n_c)}
-    looked = [kind for kind in system.given if kind not in system.entries]  # callbacks whose values are checked
-    values = {kind: system.evaluate(kind, t, *[state[name] for name in KINDS[kind].state]) for kind in looked}
+    kinds = [kind for kind in system.given if kind not in system.entries]  # callbacks whose values are checked
+    values = {kind: system.evaluate(kind, t, *[state[name] for name in KINDS[kind].state]) for kind in kinds}
     wrong = [kind for kind, value in values.items() if not all(np.isfinite(part).all() for part in parts_of(value))]
     return f"{' and '.join(wrong)} of {system.name!r} returned values that are not finite" if wrong else None
 
@@ -217,18 +217,18 @@ def least_inertia(system: ConstrainedSystem, t: float, q: Array) -> tuple[float,
 
 
 NEAR = 1e-3  # displacement relative to the coordinates: a little off the start, where no symmetry hides terms
-# allowed difference of C between two callbacks, beside SAME, in rounding errors of its terms
+# allowed difference of C between two callbacks, in addition to SAME, in rounding errors of its terms
 ROUNDED = 100.0
-MOST = 1_000_000  # largest number of entries of Jacobians that are evaluated together
-ROUNDING = 1e-12  # relative to the largest entry over the displacement: rounding error of a difference
+MAX_ENTRIES = 1_000_000  # largest number of entries of Jacobians that are evaluated together
+ROUNDING = 1e-12  # rounding error of a difference, relative to the largest entry over the displacement
 
 
-def unlike_itself(
+def run_inconsistency(
     system: ConstrainedSystem, states: Sequence[tuple[float, Array, Array]], t0: float, q0: Array
 ) -> tuple[float, str] | None:
     """Describe what is wrong in M, `kinematics` or values at states of a run from (t0, q0), and when; None: nothing.
 
-    Mostly all is equal to the bit, which is quick to see.
+    Mostly all values are equal to the bit, which is fast to check.
     """
     before = _mass_at(system, t0, q0).tobytes() if system.constant_mass else b""
     fused = "kinematics" in system.given
@@ -249,11 +249,11 @@ def unlike_itself(
 
 
 def wrong_kinematics(system: ConstrainedSystem, t: float, q: Array) -> str | None:
-    """Compare the fused callback with the separate ones, which the checks compare with differences."""
+    """Describe where the fused callback differs from the separate ones, which other checks compare with differences."""
     if "kinematics" not in system.given:
         return None
     _, rate, rows = _compared(system, t, q, 0.0 * q)
-    entries = system.sparse_rows(t, q)  # of large systems: units of full matrices take seconds
+    entries = system.sparse_rows(t, q)  # because for large systems units of full matrices take seconds
     v = generic_velocities(system, t, q, entries if isinstance(entries, SparseRows) else rows, rate)[-1]
     for place in (q, q + NEAR * v):
         if _compared(system, t, place, v)[0]:
@@ -271,7 +271,7 @@ def wrong_kinematics(system: ConstrainedSystem, t: float, q: Array) -> str | Non
             if (off > level).any():
                 entry = np.unravel_index(int((off - level).argmax()), off.shape)
                 where = int(entry[0]) if len(entry) == 1 else tuple(int(i) for i in entry)
-                here, there = as_far_as_they_differ(float(fused[entry]), float(given[entry]))
+                here, there = format_difference(float(fused[entry]), float(given[entry]))
                 return (
                     f"kinematics of {system.name!r} does not give what {kind} gives: entry {where} is "
                     f"{here} and {there} (near t = {t:.10g}). Correct it, or leave it out"
@@ -291,7 +291,7 @@ def _compared(system: ConstrainedSystem, t: float, q: Array, v: Array) -> tuple[
 
 
 def changed_mass(system: ConstrainedSystem, t0: float, q0: Array, t: float, q: Array) -> str | None:
-    """Report that M differs between two positions although constant_mass is set; None if it does not."""
+    """Describe a change of M between two positions if constant_mass is set; None: it does not change."""
     there, before = defined(lambda: _mass_at(system, t, q)), _mass_at(system, t0, q0)
     if there is None or there.tobytes() == before.tobytes():
         return None
@@ -317,7 +317,7 @@ def check_bandwidth(system: ConstrainedSystem, bandwidth: int, t: float, q: Arra
     q, shift = q + 1e-3 * v, 1e-3 * size
     steps, away = shift * np.eye(n), np.abs(places - places[:, None])
 
-    def look(what: str, first: int, answers: Array, level: float) -> None:
+    def record(what: str, first: int, answers: Array, level: float) -> None:
         """Find the farthest response: row k of `answers` is the response to coordinate first + k."""
         nonlocal farthest, where
         far = away[first : first + len(answers)]
@@ -329,21 +329,21 @@ def check_bandwidth(system: ConstrainedSystem, bandwidth: int, t: float, q: Arra
     def force(q: Array, v: Array) -> Array:
         try:
             return system.force(t, q, v)
-        except (ArithmeticError, ValueError):  # math.sqrt and its like, outside the domain of the callbacks
+        except (ArithmeticError, ValueError):  # math.sqrt and similar functions, outside their domains
             return np.full(n, np.nan)
 
-    look("M", 0, system.mass(t, q).T, 0.0)
+    record("M", 0, system.mass(t, q).T, 0.0)
     at = force(q, v)
     level = ROUNDING * float(np.abs(at).max()) / shift
-    look("the derivative of force by q", 0, (np.array([force(q + step, v) for step in steps]) - at) / shift, level)
-    look("the derivative of force by v", 0, (np.array([force(q, v + step) for step in steps]) - at) / shift, level)
-    for some in np.array_split(places, 1 + n * n * system.n_c // MOST):
+    record("the derivative of force by q", 0, (np.array([force(q + step, v) for step in steps]) - at) / shift, level)
+    record("the derivative of force by v", 0, (np.array([force(q, v + step) for step in steps]) - at) / shift, level)
+    for some in np.array_split(places, 1 + n * n * system.n_c // MAX_ENTRIES):
         rows, known = rows_at(system, t, np.vstack([q, q + steps[some]]))
         rows = np.where(known[:, None, None], rows[:, : system.n_c], np.nan)
         level = ROUNDING * float(np.abs(rows[0]).max(initial=0.0)) / shift
         for k in range(system.n_c):
             name = f"the second derivative of constraint {k} by q"
-            look(name, int(some[0]), (rows[1:, k] - rows[0, k]) / shift, level)
+            record(name, int(some[0]), (rows[1:, k] - rows[0, k]) / shift, level)
     if where:
         raise ValueError(
             f"bandwidth of {system.name!r} must be at least {farthest}: {where}; given {bandwidth}. Or number the "

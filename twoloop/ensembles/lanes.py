@@ -22,13 +22,13 @@ from twoloop.generate.program import Arrays, Program
 from twoloop.generate.series import series_for
 from twoloop.generate.time_dependence import BY_TIME, TIME, may_be_short, may_be_steep
 from twoloop.generate.trace import Equations
-from twoloop.kernels.control.discontinuities import FLOOR, LEAST, SHARE, STEEPER
+from twoloop.kernels.control.discontinuities import LEAST_RANGE, LEAST_VALUE, STEEPER, SUDDEN_SHARE
 from twoloop.kernels.control.discontinuities import N_SAMPLES as N_PLACES
 from twoloop.kernels.lanes import layout
 from twoloop.kernels.layout import cached_run
 from twoloop.methods import dop853
 from twoloop.methods.auto import TIGHTEST
-from twoloop.methods.dop853 import COARSE_SHARE, UNSEEN
+from twoloop.methods.dop853 import COARSE_SHARE, LONGEST_GAP
 from twoloop.methods.plan import Method, least_tolerance
 from twoloop.methods.presets import PRESETS
 from twoloop.methods.runge_kutta import RungeKutta
@@ -84,7 +84,7 @@ def _are_short(values: Array, rtol: float) -> NDArray[np.bool_]:
         return np.zeros(values.shape[1], dtype=bool)
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=(0, 2)))
     values = np.where(finite[:, None], values, 0.0)
-    least = np.maximum(FLOOR, LEAST * rtol * np.abs(values).max(axis=(0, 2)))
+    least = np.maximum(LEAST_VALUE, LEAST_RANGE * rtol * np.abs(values).max(axis=(0, 2)))
     size = N_PLACES + 1
     ranges = maximum_filter1d(values, size, axis=0) - minimum_filter1d(values, size, axis=0)
     change, within = np.diff(values, axis=0), np.maximum(ranges[:-1], ranges[1:])
@@ -92,7 +92,7 @@ def _are_short(values: Array, rtol: float) -> NDArray[np.bool_]:
     direction = np.sign(change)
     beside[1:] = change[:-1] * direction[1:]
     beside[:-1] = np.maximum(beside[:-1], change[1:] * direction[:-1])
-    flanks = (np.abs(change) > SHARE * within) & (STEEPER * beside < np.abs(change)) & (within > least[:, None])
+    flanks = (np.abs(change) > SUDDEN_SHARE * within) & (STEEPER * beside < np.abs(change)) & (within > least[:, None])
     short = (flanks[:-1] & flanks[1:]).any(axis=(0, 2)) | (flanks[:-2] & flanks[2:]).any(axis=(0, 2))
     return np.asarray(short | ~finite)
 
@@ -193,7 +193,7 @@ def _dop853(n: int, rtol: float, atol: float) -> LaneMethod:
 
     weights = dop853.A, dop853.B, dop853.C, dop853.E5, COARSE_SHARE * dop853.E3
     stages, options = len(dop853.B), _options(PRESETS["DOP853"], n, rtol, atol)
-    return LaneMethod("DOP853", False, 8, stages - 1, options, step, memory, weights, UNSEEN)
+    return LaneMethod("DOP853", False, 8, stages - 1, options, step, memory, weights, LONGEST_GAP)
 
 
 def _newton(name: str, tested: Literal["all", "positions"], n: int, rtol: float, atol: float) -> LaneMethod:

@@ -241,7 +241,7 @@ class CollocationCode:
 
         def otherwise() -> Value:
             if not self.has_reduced:
-                return constant(DOUBLE, float(at.LEFT))
+                return constant(DOUBLE, float(at.NOT_COMPUTED))
             one.store(constant(DOUBLE, CAREFULLY), room, at.CAREFUL)
             return careful()
 
@@ -261,7 +261,7 @@ class CollocationCode:
             inner, (room, state, tolerances, numbers) = emit.like(builder), builder.arguments
             inner.numbers = inner.constants = numbers
             self._call(inner, "begin_nodes", self._begin, [room, state, tolerances])
-            mass_first, given_up = self._caller(inner, room, -1), constant(DOUBLE, float(at.LEFT))
+            mass_first, given_up = self._caller(inner, room, -1), constant(DOUBLE, float(at.NOT_COMPUTED))
             builder.ret(self._iterate(inner, room, state, tolerances, mass_first, lambda: given_up))
         return name
 
@@ -449,9 +449,9 @@ class CollocationCode:
             builder.ret(otherwise())
         for value, place in ((m, at.SWEEPS), (change, at.CHANGE), (target, at.TARGETED), (rho_now, at.RHO)):
             one.store(value, room, place)
-        ended = builder.select(converged, number(at.MADE), number(at.REFUSED))
+        ended = builder.select(converged, number(at.CONVERGED), number(at.REFUSED))
         ended = builder.select(guessed, number(at.GUESSED), ended)
-        with builder.if_then(builder.both(builder.compare("fcmp oeq", ended, number(at.MADE)), estimated)):
+        with builder.if_then(builder.both(builder.compare("fcmp oeq", ended, number(at.CONVERGED)), estimated)):
             self._call(emit, "judge_nodes", self._judge, [room, state])
         return ended
 
@@ -727,8 +727,8 @@ def _compiled(own: SharedCode) -> Collocation:
         "audit_nodes": code.audit,
         "retry_nodes": code.retry,
         "end_nodes": code.end,
-        "closer_ends": code.project_positions,
-        "nearer_ends": code.project_states,
+        "correct_ends": code.project_positions,
+        "project_ends": code.project_states,
     }
     long, numbers = own.parts is not None, code.numbers.formulas
 

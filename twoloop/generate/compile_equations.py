@@ -217,9 +217,10 @@ class SplitFunctions:
 
     def write(self, module: Module, kinds: Callable[[str], tuple[str, list[str]]]) -> list[str]:
         """Write the functions that kernels call into a module and return their names; `kinds` returns their types."""
-        functions: dict[str, Callable[..., Any]] = {"own_closer": self.project_position, "own_nearer": self.project}
+        functions: dict[str, Callable[..., Any]]
+        functions = {"own_correct_positions": self.project_position, "own_project": self.project}
         if self.equations.reduced is None:
-            functions["own_there"] = self.accelerations
+            functions["own_accelerate"] = self.accelerations
         for name, emit in functions.items():
             llvm_code.write(module, name, kinds(name), emit)
         return list(functions)
@@ -422,7 +423,7 @@ class SharedCode:
         equations = self.equations
         outputs = {"own_redundant": equations.redundant_rows}
         if self.parts is None:
-            outputs |= {"own_closer": equations.position_projection, "own_nearer": equations.projection}
+            outputs |= {"own_correct_positions": equations.position_projection, "own_project": equations.projection}
         return outputs
 
     def _structure(self) -> Iterable[Any]:
@@ -441,9 +442,10 @@ class SharedCode:
         for name, outputs in self.outputs.items():
             write_function(module, name, KIT.llvm_type(name), outputs, self.numbers)
         parts = [] if self.parts is None else self.parts.write(module, KIT.llvm_type)
-        if "own_there" not in parts:
-            write_acceleration_function(module, "own_there", KIT.llvm_type("own_there"), equations, self.numbers)
-            parts.append("own_there")
+        name = "own_accelerate"
+        if name not in parts:
+            write_acceleration_function(module, name, KIT.llvm_type(name), equations, self.numbers)
+            parts.append(name)
         return [*self.outputs, *parts], str(module)
 
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.derivatives import TIME
+from twoloop.checks.derivatives import FIRST_TIME_SCALE
 from twoloop.checks.scales import generic_factors, sizes
 from twoloop.generate.graph import MOST_OPERATIONS, Affine, Untraceable
 from twoloop.generate.program import OperationTable
@@ -106,7 +106,7 @@ def _results(equations: Equations, absent: Sequence[str]) -> dict[str, dict[int,
 Array = NDArray[np.float64]
 
 MOST_ENTRIES = 50_000  # largest number of entries of C_q that are derived for a comparison
-# displacements at which derivatives are compared, relative to the sizes of coordinates, and to TIME
+# displacements at which derivatives are compared, relative to the sizes of coordinates, and to FIRST_TIME_SCALE
 DISPLACEMENTS = (0.0, 1e-3, 0.03)
 
 
@@ -142,7 +142,7 @@ def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
         If C_t is not given and C was traced to depend on time, though not near the start.
     """
     away = generic_factors(len(q)) * sizes(q)
-    places = [(t + share * TIME, q + share * away) for share in DISPLACEMENTS]
+    places = [(t + share * FIRST_TIME_SCALE, q + share * away) for share in DISPLACEMENTS]
 
     def check(traced: Traced) -> None:
         try:

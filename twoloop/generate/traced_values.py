@@ -136,7 +136,7 @@ class Traced:
         from twoloop.kernels.evaluation import checks as kernels
 
         called, traced, bounds = np.zeros((3, len(states), len(self.places)))
-        n_different = entry_point(kernels.compare)(
+        n_different = entry_point(kernels.compare_traces)(
             system.kit,
             self.sizes,
             self.is_compared,

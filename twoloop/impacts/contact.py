@@ -32,7 +32,7 @@ class Gap(NamedTuple):
 
 
 class Gaps:
-    """Evaluate the gap functions of stops, or the slides of stops with friction.
+    """Evaluate the gap functions of stops, or the displacement functions of stops with friction ("slide").
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class Gaps:
         from twoloop.bodies.program_results import results  # compiled on import
 
         state = t, q.tobytes(), v.tobytes()
-        if self._last is not None and self._last[0] == state:  # the events of all stops ask for the same state
+        if self._last is not None and self._last[0] == state:  # the events of all stops evaluate the same state
             return self._last[1]
         values = results(0, t, q, v, self._p)[: self.n * (3 + self._n_q)].reshape(self.n, 3 + self._n_q)
         self._last = state, Gap(values[:, 0], values[:, 1], values[:, 2], values[:, 3:])
@@ -78,7 +78,7 @@ class Gaps:
 
     def _compare(self, stops: Sequence[Stop], t0: float, q0: Array) -> None:
         """Raise unless the traced programs return the values of the functions, at q0 and near it."""
-        # a fixed seed: the same model is accepted or refused at every call
+        # a fixed seed, so that every call accepts or rejects the same model
         displacements = np.random.default_rng(4).uniform(-0.3, 0.3, (STATES, len(q0)))
         displacements[0] = 0.0
         for k, displacement in enumerate(displacements):
@@ -117,9 +117,9 @@ class ContactSystem:
     closed : list of int
         Indices of the closed stops.
     sticking : dict
-        Displacements along the surface that do not change, by indices of slides: these are constraints as well.
+        Displacements along the surface that remain constant, by indices of slides: these are constraints as well.
     slipping : list of (int, int, float)
-        For each stop that slides: its place in `closed`, the index of its slide, and its coefficient of friction, with
+        For each stop that slides: its index in `closed`, the index of its slide, and its coefficient of friction, with
         the sign of the sliding.
     """
 
@@ -139,7 +139,7 @@ class ContactSystem:
         self._derived = with_derived_callbacks(system, unchecked)[0] if slipping else system
 
     def _rows(self, part: str, t: float, q: Array, v: Array) -> Array:
-        """Return a part of a `Gap` for closed stops, followed by that for the displacements that do not change."""
+        """Return a part of a `Gap` for closed stops, followed by that for the displacements that remain constant."""
         rows = getattr(self._gaps.at(t, q, v), part)[self._closed]
         if not self._sticking:
             return rows
@@ -180,7 +180,7 @@ class ContactSystem:
         right_sides = [system.gamma(t, q, v)] if system.n_c else []
         right_sides += [system.nonholonomic_gamma(t, q, v)] if system.n_a else []
         n, first_stop = system.n_q, system.n_q + system.n_c + system.n_a
-        # the friction of sliding stops is proportional to their unknown forces, so it belongs in the matrix
+        # the friction of sliding stops is proportional to their unknown forces: it changes the matrix
         K = np.block([[self._call("mass", t, q), rows.T], [rows, np.zeros((len(rows),) * 2)]])
         for place, k, coefficient in self._slipping:
             K[:n, first_stop + place] -= coefficient * slides[k]
@@ -214,7 +214,7 @@ class Accelerations:
 
     def __init__(self, system: ConstrainedSystem, t: float, q: Array, v: Array, atol: Array):
         derived, _ = with_derived_callbacks(system, unchecked)
-        # any explicit method would do: only the accelerations at the start of its steps are used
+        # any explicit method will do: only the accelerations at the start of its steps are used
         plan = DOP853().plan(system.n_q, 1e-8, 1e-8, False)
         self._run = Run(derived, plan, t, q, v, 1e-8, atol, None)
         self._run.work.notes[indices.GENERATION] = 1.0  # the run has determined the ranks
@@ -222,9 +222,9 @@ class Accelerations:
         self._last: tuple[tuple[float, bytes, bytes], Array] | None = None
 
     def at(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return a (n_q,) and [lam; mu]; NaN if they do not exist."""
+        """Return the accelerations a (n_q,) and the multipliers [lam; mu]; NaN if they do not exist."""
         run, n, key = self._run, self._n, (t, q.tobytes(), v.tobytes())
-        if self._last is None or self._last[0] != key:  # the events of all rows ask for the same state
+        if self._last is None or self._last[0] != key:  # the events of all rows evaluate the same state
             state = np.concatenate([q, v, np.zeros(len(run.state) - 2 * n)])
             if entry_point(run.kernels.start)(run.kit, run.work, t, state) != indices.DONE:
                 state[2 * n :] = np.nan

@@ -18,9 +18,9 @@ from twoloop.run.fallbacks import NEGLIGIBLE, scaled_equations
 if TYPE_CHECKING:
     from twoloop.bodies.model_problem import ModelProblem
 
-Signs = list[int | None]  # for each joint the sliding direction, or one of the following
-STICKS, IDLE = 0, None  # held by friction; already held by stops and other joints
-INDEPENDENT = 1e-9  # relative: smallest compliance of a joint with the others held, compared with a free joint
+Signs = list[int | None]  # for each joint its sliding direction, STICKS or IDLE
+STICKS, IDLE = 0, None  # held by its friction; held by stops and other joints already
+INDEPENDENT = 1e-9  # relative to a free joint: smallest compliance of a joint while the other joints are held
 AT_REST = 1e-10  # relative to the largest velocities of the last arc: smaller rates count as zero
 COUPLING_TOLERANCE = 1e-6  # tolerance of the coefficients by which one displacement follows from another
 EVEN_WEIGHT = 1e-6  # relative weight of the regularisation that distributes a shared load evenly
@@ -28,13 +28,13 @@ SOLVER_SCALE = 1e3  # scales the problem so that its gradients exceed the tolera
 MAX_SOLVER_ITERATIONS = 1000
 MAX_LOAD_ITERATIONS = 200  # fixed-point iterations of the loads that bound the friction ...
 LOAD_TOLERANCE = 1e-10  # ... until they change by less, relative to the largest
-OUTSIDE = 1e-9  # relative: smallest part of rates and accelerations outside the range of D; smaller ones are rounding
+OUTSIDE = 1e-9  # relative: smaller components of rates and accelerations outside the range of D are rounding
 CLOSING_TOLERANCE = 1e-6  # relative: largest rate or acceleration at which a stop may still close
 SLIDING_TOLERANCE = 1e-9  # relative to the terms of an acceleration: smaller accelerations are rounding
 
 
 class Undetermined(ValueError):
-    """Report that no admissible distribution of the load among sticking joints and stops was found."""
+    """Error if no admissible distribution of the load among sticking joints and stops is found."""
 
 
 class Tangents(NamedTuple):
@@ -60,7 +60,7 @@ def solve_complementarity(D: Array, b: Array) -> Array:
     if not len(b):
         return np.zeros(0)
     x = nnls(*_squares(D, b))[0]
-    # nnls finds the active set; the forces follow again from D itself, without the rounding of its square root
+    # nnls finds the active set; the forces are then computed from D, without the rounding of its square root
     active = x > 0.0
     x[active] = np.linalg.lstsq(D[np.ix_(active, active)], -b[active], rcond=NEGLIGIBLE)[0]
     return np.maximum(x, 0.0)
@@ -86,22 +86,22 @@ def solve_bounded(D: Array, c: Array, n: int, limit: Array) -> Array:
         SOLVER_SCALE * matrix, SOLVER_SCALE * right, limits, "bvls", tol=1e-14, max_iter=MAX_SOLVER_ITERATIONS
     )
     x, free = solution.x, solution.active_mask == 0
-    residual = (D @ x + c / unit)[free]  # caused by the small weight
+    residual = (D @ x + c / unit)[free]  # due to the small weight
     x[free] -= np.linalg.lstsq(D[np.ix_(free, free)], residual, rcond=NEGLIGIBLE)[0]
     return np.asarray(unit * np.clip(x, *limits))
 
 
 def holding_forces(D: Array, c: Array, n: int, limit: Array) -> Array:
-    """Return forces of n stops, and of joints that friction of at most `limit` holds, for free accelerations c."""
+    """Return forces of n stops and of joints held by friction up to `limit`, for accelerations c without these."""
     return solve_bounded(D, c, n, limit) if len(limit) else solve_complementarity(D, c)
 
 
 def coulomb_forces(D: Array, c: Array, limit: Array, tangents: Tangents) -> tuple[Array, NDArray[np.int64]]:
-    """Return forces at stops, in joints at rest, and at stops that rub; and the directions in which the latter slide.
+    """Return forces at stops, in joints at rest, and at stops with friction; and the sliding directions of the latter.
 
-    The forces of stops are non-negative and complementary to the accelerations (or velocities) D x + c; friction
-    opposes sliding with its coefficient times the force of the stop, or is less than that at rest. These bounds follow
-    from the forces by fixed-point iteration; the state of each contact being known, the equations are then linear.
+    The forces of stops are non-negative and complementary to the accelerations (or velocities) D x + c. Friction
+    opposes sliding with its coefficient times the force of the stop; at rest it is less than that. Fixed-point
+    iteration finds these bounds from the forces. Once the state of each contact is known, the equations are linear.
     """
     n_tangents = len(tangents.normal)
     n = len(c) - len(limit) - n_tangents
@@ -131,7 +131,7 @@ def coulomb_forces(D: Array, c: Array, limit: Array, tangents: Tangents) -> tupl
 
 
 def _solve_contacts(D: Array, c: Array, x: Array, n: int, tangents: Tangents) -> Array:
-    """Solve the linear equations of contacts whose states are known; those of joints stay as they are."""
+    """Solve the linear equations of contacts whose states are known; forces of joints remain unchanged."""
     tangent_rows = np.arange(len(c) - len(tangents.normal), len(c))
     pushes = np.append(x[:n] > 0.0, np.zeros(len(c) - n, dtype=bool))
     loads = np.zeros((len(c), len(c)))  # x = loads y, where y are forces of stops and friction at rest
@@ -153,8 +153,8 @@ def _solve_contacts(D: Array, c: Array, x: Array, n: int, tangents: Tangents) ->
 def _squares(D: Array, b: Array) -> tuple[Array, Array]:
     """Return B and y with B^T B = D and B^T y = -b.
 
-    Where rows of stops depend on one another, b may have a part outside the range of D: of parallel stops, which close
-    at different rates. B has a small row for it.
+    With dependent rows of stops, b may have a component outside the range of D, for example if parallel stops close at
+    different rates. B has a small row for it.
     """
     values, vectors = np.linalg.eigh(0.5 * (D + D.T))
     components, threshold = vectors.T @ b, NEGLIGIBLE * values.max(initial=0.0)
@@ -164,12 +164,12 @@ def _squares(D: Array, b: Array) -> tuple[Array, Array]:
 
 
 def impulses(D: Array, u: Array, restitution: Array, tangents: Tangents) -> Array:
-    """Return the impulses at k stops, followed by those of friction, with rates u, by Moreau's law.
+    """Return the impulses at k stops, followed by those of friction, for rates u before the impact, by Moreau's law.
 
     J. J. Moreau, Unilateral contact and dry friction in finite freedom dynamics, CISM 302 (1988): u+ + e u- >= 0, the
     impulse is non-negative, and their product is zero; the impulse of friction opposes the rate of sliding after the
-    impact, and is at most the coefficient times the impulse. The energy does not increase without friction if all e
-    are equal; with friction it may where the rate of sliding is reversed (T. R. Kane, 1984), which is refused.
+    impact, and is at most the coefficient times the impulse. Without friction the energy does not increase if all e are
+    equal; with friction it may if the rate of sliding is reversed (T. R. Kane, 1984), which raises Undetermined.
     """
     shift = np.append(restitution * u[: len(restitution)], 0.0 * tangents.coefficient)
     P = coulomb_forces(D, u + shift, np.zeros(0), tangents)[0]
@@ -179,7 +179,7 @@ def impulses(D: Array, u: Array, restitution: Array, tangents: Tangents) -> Arra
 
 
 class Modes:
-    """Provide the system of each mode; in this base class a system without friction, which has a single mode."""
+    """Provide the system of each contact mode; this base class has one system without friction, in a single mode."""
 
     def __init__(self, system: ConstrainedSystem):
         self.system, self.n = system, 0
@@ -203,12 +203,12 @@ class Modes:
         return self.system, {}
 
     def row_sign(self, k: int, system: ConstrainedSystem, row: int, t: float, q: Array) -> float:
-        """Return the sign of the row of a sticking joint relative to its sliding direction."""
+        """Return the sign that a sticking joint's row has relative to its sliding direction."""
         return float(np.sign(system.jacobian(t, q)[row] @ self.gradients(q, k)))
 
 
 class FrictionModes(Modes):
-    """Provide the systems of a model with dry friction in joints, each of which slides, with a sign, or sticks: 0.
+    """Provide the systems of a model with dry friction in joints: each joint slides, with a sign, or sticks (0).
 
     Parameters
     ----------
@@ -235,7 +235,7 @@ class FrictionModes(Modes):
         return self._forces[k].force(0.0, q, np.zeros_like(q))
 
     def _check_independent(self, t: float, q: Array) -> None:
-        """Raise unless each joint can slide while the others stick; otherwise the frictions are not determined."""
+        """Raise unless each joint can slide while the others stick; otherwise their friction is not determined."""
         W = self.gradients(q)
         D = W @ responses(self.system, t, q, W)
         scale = (W**2).sum(axis=1) / float(np.abs(self.system.mass(t, q)).max())
@@ -270,7 +270,7 @@ class FrictionModes(Modes):
         if not {STICKS, IDLE} & set(signs):
             return self.sliding_system(signs, t, q), {}
         names = [name for name, sign in zip(self._names, signs, strict=True) if sign == STICKS]
-        # rows of the gauge hold each displacement at t: their residuals at t = 0 measure where the joints are
+        # each row of `gauge` holds a displacement at t: its residual at t = 0 measures the present displacement
         gauge, rows = self._build("gauge", signs, dict.fromkeys(names, np.nan), t, q)
         values, quarter = (gauge.constraint(t, q) for t in (0.0, 0.5 * np.pi)) if names else ((), ())
         positions = {}
@@ -302,7 +302,7 @@ class Mode(NamedTuple):
     slips : dict
         Direction of sliding by stop.
     sticks : dict
-        By one stop of each group that sticks together, all stops of the group.
+        Groups of stops that stick together, by one stop of each group.
     """
 
     signs: Signs
@@ -345,9 +345,9 @@ class StopFriction:
         return self._stops[k].friction
 
     def groups(self, D: Array, base: list[int], rows: dict[int, int]) -> dict[int, list[int]]:
-        """Return stops that stick, in groups with one displacement; D has the rows `base`, and `rows` of the stops."""
+        """Return stops that stick, in groups with one displacement; D has the rows `base`, and `rows` by stop."""
         groups: dict[int, list[int]] = {}
-        first: dict[int, int] = {}  # stop of a row
+        first: dict[int, int] = {}  # first stop of a group by its row
         for k, row in rows.items():
             weights = np.linalg.lstsq(D[np.ix_(base, base)], D[base, row], rcond=NEGLIGIBLE)[0]
             if D[row, row] - D[row, base] @ weights > INDEPENDENT * D[row, row]:
@@ -364,7 +364,7 @@ class StopFriction:
         return groups
 
     def update(self, mode: Mode, ended: set[int]) -> None:
-        """Update which stops came to rest or were released, from those whose events ended the arc."""
+        """Update which stops came to rest or were released; `ended`: stops whose events ended the arc."""
         self.released = {k for stop, group in mode.sticks.items() if stop in ended for k in group}
         self.still = {k for stop, group in mode.sticks.items() if stop not in ended for k in group}
         self.still |= mode.slips.keys() & ended

@@ -55,24 +55,24 @@ from twoloop.solve import solve_dae
 if TYPE_CHECKING:
     from twoloop.bodies.model_problem import ModelProblem
 
-LOW = 0.01  # relative to the absolute tolerance: a rebound below this height ends in contact
+REBOUND_HEIGHT = 0.01  # relative to the absolute tolerance: a rebound below this height ends in contact
 SAMPLES = 2000  # smallest number of evaluations of gaps, forces and rates of sliding over a motion
-CLOSED = 1e3  # squares of rates, over this height and the accelerations, of stops that may press one another
+CLOSED = 1e3  # squared rate over (REBOUND_HEIGHT times acceleration) below which a stop may press against others
 ROUNDING = 1e-13  # relative to max(1, |q|)
 LEAST_STEP = 1e-9  # first step of an arc, relative to max(1 s, t)
 ZERO = 1e-20  # m or rad, or per s: smaller coordinates and rates are rounding errors
 STALLED = 1e-13  # relative to max(1 s, t): shorter arcs count as stalled ...
 MAX_STALLED = 30  # ... and this many stalled arcs in a row end the motion
 RELEASED = 1e-7  # relative reduction of the static friction of a joint just released, which prevents chattering
-AT_MOST = 1e-9  # relative: margin of a joint held by its full friction
-EQUAL_GAPS = 4e-15  # relative to max(1, |q|): gaps of stops that close at once, which differ by rounding
-TIED = 0.01  # relative to the height LOW: gaps whose order the tolerance does not settle
-MOVED = 10.0  # in heights LOW: displacement during a sequence of impacts that are followed without integration
-WITHIN = 1e4  # in heights LOW: largest gap of a stop that such a sequence may reach
+MARGIN = 1e-9  # relative: margin of a joint held by its full friction
+EQUAL_GAPS = 4e-15  # relative to max(1, |q|): gaps of stops that close at once differ by less, because of rounding
+TIED_GAPS = 0.01  # in heights REBOUND_HEIGHT: the tolerance does not determine the order of gaps that differ by less
+MAX_DISPLACEMENT = 10.0  # in heights REBOUND_HEIGHT: motion during a sequence followed without integration
+MAX_GAP = 1e4  # in heights REBOUND_HEIGHT: largest gap of a stop that such a sequence may reach
 LEAST_RATE = 1e-13  # relative to the velocities: smaller rates in such a sequence are rounding errors
-DIFFERS = 1e-6  # relative to the velocities: outcomes of laws of impact that differ by more do not agree
-TOUCH = "an impact reaches stops that touch"
-LISTED = 100  # longest sequence of impacts that are listed one by one
+MAX_DIFFERENCE = 1e-6  # relative to the velocities: larger differences between two laws of impact count
+TOUCHING_EVENT = "an impact reaches stops that touch"
+MAX_LISTED = 100  # longest sequence of impacts that are listed one by one
 LAWS = ("moreau", "sequential")
 
 
@@ -106,9 +106,9 @@ class Motion:
         self.e = np.array([stop.restitution for stop in stops])
         self.gaps, self.friction = Gaps("gap", stops, t, q), StopFriction(stops, t, q)
         self.law, self.unfinished = law, []  # type: ignore[var-annotated]
-        self.depends: list[tuple[float, list[str], str]] = []  # time, stops, what they do, where the law decides
+        self.depends: list[tuple[float, list[str], str]] = []  # where the law matters: time, stops, event
         self.noise = EQUAL_GAPS * max(1.0, float(np.abs(q).max()))
-        self.low = max(LOW * float(options["atol"].min()), ROUNDING * max(1.0, float(np.abs(q).max())))
+        self.low = max(REBOUND_HEIGHT * float(options["atol"].min()), ROUNDING * max(1.0, float(np.abs(q).max())))
         closed = np.flatnonzero(self.gaps.at(t, q, v).g < -100.0 * self.low)
         if closed.size:
             gap = float(self.gaps.at(t, q, v).g[closed[0]])
@@ -123,7 +123,7 @@ class Motion:
         self._acceleration_cache: dict[int, tuple[ConstrainedSystem, Accelerations]] = {}
 
     def integrate(self, t1: float, times: Array | None) -> Result:
-        """Integrate to the end."""
+        """Integrate to t1 and return the result at the output times (None: at all steps)."""
         with SignalHandlers():
             return self._integrate(t1, times)
 
@@ -132,7 +132,7 @@ class Motion:
         while True:
             t_before = self.t
             try:
-                self._run_arc(self._resolve(), t1)
+                self._run_arc(self._resolve_contacts(), t1)
             except Undetermined as error:
                 if not self.arcs:
                     raise
@@ -163,7 +163,7 @@ class Motion:
         return f"{self._counts}{self._law_note()}"
 
     def _law_note(self) -> str:
-        """Describe where the outcome depends on the law of impacts, or a sequence was left unfinished."""
+        """Describe where the outcome depends on the law of impacts, or which sequence was not followed to its end."""
         note = ""
         if self.depends:
             t, stops, event = self.depends[0]
@@ -186,32 +186,32 @@ class Motion:
             return f"{len(self.impacts)} impacts, {len(self.arcs) - 1} changes of sliding, sticking or contact."
         return changes if self.modes.n else f"{len(self.impacts)} impacts."
 
-    def _resolve(self) -> Mode:
-        """Apply an impact; return which joints and stops slide or stick, and which stops stay closed."""
+    def _resolve_contacts(self) -> Mode:
+        """Apply an impact; return the mode after it: which joints and stops slide or stick, which stops are closed."""
         gap = self.gaps.at(self.t, self.q, self.v)
         near = np.flatnonzero(gap.g <= self.low)
         slow = np.zeros(near.size, dtype=bool)
         if near.size:
             if self._follow_impacts(gap, near):
                 gap = self.gaps.at(self.t, self.q, self.v)
-                # a stop that has yet to close is hit later, by itself
-                awaited = (gap.g > self.noise) & (gap.u < -AT_REST * (np.abs(gap.W) @ self.speeds))
-                near = np.flatnonzero((gap.g <= self.low) & ~awaited)
+                # stops that are still open will be hit later, in impacts of their own
+                open_stops = (gap.g > self.noise) & (gap.u < -AT_REST * (np.abs(gap.W) @ self.speeds))
+                near = np.flatnonzero((gap.g <= self.low) & ~open_stops)
             for _ in range(MAX_STALLED if near.size else 0):
                 slow = self._apply_impulses(gap, near)
                 gap = self.gaps.at(self.t, self.q, self.v)
-                # the law lets a stop close that opened before: it is hit next
+                # the law may let a stop close that had opened: it is hit next
                 if not (gap.u[near] < -AT_REST * (np.abs(gap.W[near]) @ self.speeds)).any():
                     break
             slow = slow[: near.size] & ~np.isin(near, self.opened)  # an opened stop has no force
         closing = near[slow]
-        signs, resting_joints = self._sliding(self.v)
+        signs, resting_joints = self._sliding_directions(self.v)
         if not closing.size and not resting_joints:
             return Mode(signs)
-        a, c_rubs = self._free(signs, resting_joints, self.v)
+        a, c_joints = self._free_accelerations(signs, resting_joints, self.v)
         gap = self.gaps.at(self.t, self.q, self.v)
         touching, slide, tangents = self.friction.rows(closing.tolist(), self.t, self.q, self.v, self.speeds)
-        c = np.concatenate([gap.W[closing] @ a + gap.bias[closing], c_rubs, slide.W @ a + slide.bias])
+        c = np.concatenate([gap.W[closing] @ a + gap.bias[closing], c_joints, slide.W @ a + slide.bias])
         W = np.vstack([gap.W[closing], self.modes.gradients(self.q)[resting_joints], slide.W])
         D = W @ responses(self.system, self.t, self.q, W)
         n, end = len(closing), len(closing) + len(resting_joints)
@@ -223,9 +223,13 @@ class Motion:
         accelerations = (D @ force + c)[n:end]  # accelerations of the joints
         terms = (np.abs(D) @ np.abs(force) + np.abs(c))[n:end] + D.diagonal()[n:end] * self.modes.static[resting_joints]
         for k, sign, moves, row in zip(
-            resting_joints, np.sign(accelerations), np.abs(accelerations) > AT_MOST * terms, range(n, end), strict=True
+            resting_joints,
+            np.sign(accelerations),
+            np.abs(accelerations) > MARGIN * terms,
+            range(n, end),
+            strict=True,
         ):
-            signs[k] = int(sign) if moves else self._sticks(k, force[row], D, row, base, pushes.sum())
+            signs[k] = int(sign) if moves else self._stick_or_idle(k, force[row], D, row, base, pushes.sum())
         rubbing = [(k, end + i, int(slides[i])) for i, k in enumerate(touching) if pushes[tangents.normal[i]]]
         sticks = self.friction.groups(D, base, {k: row for k, row, sign in rubbing if not sign})
         slips = {k: sign for k, _, sign in rubbing if sign}
@@ -236,10 +240,10 @@ class Motion:
         reduced = np.minimum(self.modes.kinetic, (1.0 - RELEASED) * self.modes.static)
         return np.array([(reduced if k in self.released else self.modes.static)[k] for k in joints])
 
-    def _sticks(self, k: int, force: float, D: Array, row: int, base: list[int], n_pushing: int) -> int | None:
+    def _stick_or_idle(self, k: int, force: float, D: Array, row: int, base: list[int], n_pushing: int) -> int | None:
         """Return STICKS, or IDLE if pushing stops and sticking joints already hold the joint.
 
-        The friction of an idle joint stays constant until one of these releases it; it is zero if stops alone hold it.
+        The friction of an idle joint is constant until one of these releases it; it is zero if stops alone hold it.
         """
         weights = np.linalg.lstsq(D[np.ix_(base, base)], D[base, row], rcond=NEGLIGIBLE)[0]
         if D[row, row] - D[row, base] @ weights > INDEPENDENT * D[row, row]:
@@ -251,7 +255,7 @@ class Motion:
     def _apply_impulses(self, gap: Gap, near: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Apply the impulses at closed stops to the velocities; return which of these stops would hardly open."""
         touching, slide, tangents = self.friction.rows(near.tolist(), self.t, self.q, self.v, self.speeds)
-        tangents = tangents._replace(sign=0 * tangents.sign)  # the direction after the impact counts
+        tangents = tangents._replace(sign=0 * tangents.sign)  # friction opposes the sliding after the impact
         W = np.vstack([gap.W[near], slide.W])
         X = responses(self.system, self.t, self.q, W)  # dry friction of joints causes no impulse
         D, n = W @ X, len(near)
@@ -259,18 +263,18 @@ class Motion:
         u[np.abs(u) <= ROUNDING * (np.abs(W) @ self.speeds)] = 0.0
         P = impulses(D, u, self.e[near], tangents)
         v = before + X @ P
-        slow = self._hardly_open(near, v)
+        slow = self._hardly_rebound(near, v)
         if (slow & (P[:n] > 0.0) & (self.e[near] > 0.0)).any():
             P = impulses(D, u, np.where(slow, 0.0, self.e[near]), tangents)
             v = before + X @ P
-            slow = self._hardly_open(near, v)
+            slow = self._hardly_rebound(near, v)
         self.v = v
         if (P[:n] > 0.0).any():
             self._record_impact(before, near, P, touching)
         return slow
 
     def _record_impact(self, before: Array, stops: NDArray[np.int64], P: Array, touching: list[int]) -> None:
-        """Record an impact after which the velocities are `self.v`; P: its impulses, of stops, then of friction."""
+        """Record an impact with velocities `self.v` after it; P: impulses of the stops, then of their friction."""
         n = len(stops)
         hit = P[:n] > 0.0
         rubs = {k: float(x) for k, x in zip(touching, P[n:], strict=True)}
@@ -282,12 +286,12 @@ class Motion:
     def _follow_impacts(self, gap: Gap, near: NDArray[np.int64]) -> bool:
         """Follow impacts that come faster than the motion between them can be integrated; return whether any did.
 
-        Stops that close at once share an impact by Moreau's law; all others are hit in the order in which they close,
-        however soon, because another order, or a joint impact, ends in other velocities.
+        Stops that close at once share an impact by Moreau's law. All others are hit in the order in which they close,
+        however soon, because another order or a shared impact would result in other velocities.
         """
         rounding = LEAST_RATE * np.abs(gap.W).sum(axis=1) * float(self.speeds.max())
         at_rest = AT_REST * (np.abs(gap.W) @ self.speeds) + rounding
-        reach = np.flatnonzero((gap.g <= WITHIN * self.low) | np.isin(np.arange(len(gap.g)), near))
+        reach = np.flatnonzero((gap.g <= MAX_GAP * self.low) | np.isin(np.arange(len(gap.g)), near))
         first = near[gap.u[near] < -at_rest[near]]
         if len(reach) < 2 or not first.size:
             return False
@@ -296,15 +300,15 @@ class Motion:
         X = responses(self.system, self.t, self.q, W)
         u = np.append(np.where(np.abs(gap.u) <= at_rest, 0.0, gap.u)[reach], slide.u)
         impacts = Impacts(W @ X, self.e[reach], tangents, self.noise, rounding[reach])
-        a = self._free(*self._sliding(self.v), self.v)[0]
+        a = self._free_accelerations(*self._sliding_directions(self.v), self.v)[0]
         fast, pull = float(np.abs(self.v).max()), float(np.abs(a).max())
-        limit = min(MOVED * self.low / max(fast, 1e-300), np.sqrt(2.0 * self.low / max(pull, 1e-300)))
+        limit = min(MAX_DISPLACEMENT * self.low / max(fast, 1e-300), np.sqrt(2.0 * self.low / max(pull, 1e-300)))
         g, together = gap.g[reach].copy(), self.law != "sequential"
-        tied = np.flatnonzero(np.isin(reach, first) & (g <= max(self.noise, TIED * self.low)))
+        tied = np.flatnonzero(np.isin(reach, first) & (g <= max(self.noise, TIED_GAPS * self.low)))
 
-        def differ(one: Sequence, other: Sequence) -> bool:
-            change = np.abs(X @ (one.impulses - other.impulses)).max()
-            return bool(change > DIFFERS * np.abs(X @ one.impulses).max())
+        def differ(order_a: Sequence, order_b: Sequence) -> bool:
+            change = np.abs(X @ (order_a.impulses - order_b.impulses)).max()
+            return bool(change > MAX_DIFFERENCE * np.abs(X @ order_a.impulses).max())
 
         ambiguous = False
         if together and len(tied) > 1:
@@ -324,34 +328,34 @@ class Motion:
             self.unfinished.append((self.t, names))
         touch = (g <= self.noise) & (u[: len(g)] <= 0.0)
         if self.law is None and course.shared and (ambiguous or differ(impacts.follow(g, u, limit, False), course)):
-            event = "stops close at once, in an order within the tolerance" if ambiguous else TOUCH
+            event = "stops close at once, in an order within the tolerance" if ambiguous else TOUCHING_EVENT
             self.depends.append((self.t, [self.stops[k].name for k in reach[g <= self.noise]] or names, event))
         at_once = {int(k) for k in reach[touch]}
         if len(course.steps) <= 1 and set(near.tolist()) <= at_once:
-            return False  # one impact at all of these stops
+            return False  # a single impact, which all of these stops share
         self.q = self.q + before * course.duration + X @ course.drift
-        for step in course.steps if len(course.steps) <= LISTED else [P]:
+        for step in course.steps if len(course.steps) <= MAX_LISTED else [P]:
             self.v = self.v + X @ step
             self._record_impact(before, reach, step, touching)
             before = self.v
         return True
 
-    def _hardly_open(self, near: NDArray[np.int64], v: Array) -> NDArray[np.bool_]:
-        """Return which stops would rebound by less than the relevant height, pressed together by the others."""
-        signs, resting_joints = self._sliding(v)
-        a, c_rubs = self._free(signs, resting_joints, v)
+    def _hardly_rebound(self, near: NDArray[np.int64], v: Array) -> NDArray[np.bool_]:
+        """Return which stops, pressed together by the others, would rebound by less than REBOUND_HEIGHT."""
+        signs, resting_joints = self._sliding_directions(v)
+        a, c_joints = self._free_accelerations(signs, resting_joints, v)
         gap = self.gaps.at(self.t, self.q, v)
         u, c = gap.u[near], gap.W[near] @ a + gap.bias[near]
         rounding = ROUNDING * np.abs(v).max() ** 2
         touching = u * np.abs(u) <= CLOSED * self.low * np.abs(c).max() + rounding
         W = np.vstack([gap.W[near[touching]], self.modes.gradients(self.q)[resting_joints]])
         D, n = W @ responses(self.system, self.t, self.q, W), int(touching.sum())
-        force = holding_forces(D, np.append(c[touching], c_rubs), n, self._available_friction(resting_joints))
+        force = holding_forces(D, np.append(c[touching], c_joints), n, self._available_friction(resting_joints))
         pressure = np.zeros(len(near))
         pressure[touching] = (D.diagonal() * force)[:n]
         return np.asarray(u * np.abs(u) <= 2.0 * self.low * pressure + rounding, dtype=bool)
 
-    def _sliding(self, v: Array) -> tuple[Signs, list[int]]:
+    def _sliding_directions(self, v: Array) -> tuple[Signs, list[int]]:
         """Return the sliding direction of each joint, and the joints at rest."""
         W = self.modes.gradients(self.q)
         u = W @ v
@@ -359,7 +363,7 @@ class Motion:
         slow = [k for k in range(len(u)) if k in self.still or k in self.released or not moves[k]]
         return [0 if k in slow else int(np.sign(u[k])) for k in range(len(u))], slow
 
-    def _free(self, signs: Signs, resting_joints: list[int], v: Array) -> tuple[Array, Array]:
+    def _free_accelerations(self, signs: Signs, resting_joints: list[int], v: Array) -> tuple[Array, Array]:
         """Return accelerations of coordinates and of joints at rest, without contact forces and friction at rest."""
         a = self._accelerations(self.modes.sliding_system(signs, self.t, self.q)).at(self.t, self.q, v)[0]
         return a, self.modes.joint_accelerations(signs, resting_joints, self.t, self.q, v, a)
@@ -373,7 +377,7 @@ class Motion:
         return accelerations
 
     def _with_contacts(self, system: ConstrainedSystem, mode: Mode, cached: bool) -> ConstrainedSystem:
-        """Return a system with some stops closed."""
+        """Return the system with the closed stops of a mode as constraints."""
         resting, friction = mode.resting, self.friction
         if not resting:
             return system
@@ -393,11 +397,11 @@ class Motion:
         return extended
 
     def _run_arc(self, mode: Mode, t1: float) -> None:
-        """Integrate until a gap closes or opens, or a joint or a stop that rubs comes to rest or is released."""
+        """Integrate until a gap closes or opens, or a joint or a stop with friction comes to rest or is released."""
         signs, resting = mode.signs, mode.resting
-        # rows of the extended system: C, then the gaps of the resting stops, then what sticks
+        # rows of the extended system: C, the gaps of the resting stops, then the rows of sticking joints and stops
         free, rows = self.modes.system_of(signs, self.t, self.q)
-        # the rows of what sticks depend on where it sticks
+        # a system with sticking parts cannot be cached: its rows depend on where these stick
         cacheable = not {STICKS, IDLE} & set(signs) and not mode.sticks
         system = self._with_contacts(free, mode, cacheable)
         if system.n_c and (resting or self.modes.n):
@@ -420,19 +424,19 @@ class Motion:
             loads = [(free.n_c + resting.index(k), self.friction.coefficient(k)) for k in group]
             return multiplier(row, t, q, v), sum(-mu * multiplier(normal, t, q, v) for normal, mu in loads)
 
-        events = [self._changes(k, sign, friction) for k, sign in enumerate(signs)]
-        events += [contact_force(k) if k in resting else self._closes(k, start) for k in range(len(self.stops))]
+        events = [self._joint_event(k, sign, friction) for k, sign in enumerate(signs)]
+        events += [contact_force(k) if k in resting else self._gap_event(k, start) for k in range(len(self.stops))]
         n = len(events)
-        events += [terminal(self._rests(k, sign)) for k, sign in mode.slips.items()]
+        events += [terminal(self._stop_rest_event(k, sign)) for k, sign in mode.slips.items()]
         for row, group in enumerate(mode.sticks.values(), free.n_c + len(resting)):
-            events.append(terminal(self._slips(partial(friction_balance, row, group))))
+            events.append(terminal(self._slip_event(partial(friction_balance, row, group))))
         for event in events:
             event.every = self.sample_interval
         options = {**self.options, "check_derivatives": self.options.get("check_derivatives", True) and not self.arcs}
         if self.arcs and self.options.get("first_step") is None and self.arcs[-1].h.size:
-            least_step = LEAST_STEP * max(1.0, abs(self.t))  # coordinates near zero have no scale for an initial step
+            least_step = LEAST_STEP * max(1.0, abs(self.t))  # coordinates near zero give no scale for a first step
             options["first_step"] = min(max(0.1 * float(self.arcs[-1].h.max()), least_step), t1 - self.t)
-        if resting:  # the callbacks of an extended system call others, which cannot be traced
+        if resting:  # the callbacks of an extended system call other callbacks, and cannot be traced
             options |= untraced(options)
         arc = solve_dae(system, (self.t, t1), self.q, self.v, events=events, dense_output=True, **options)
         self.arcs.append(arc)
@@ -442,21 +446,21 @@ class Motion:
         if arc.t.size:
             self.speeds = np.abs(arc.v).max(axis=1)
             t_before, self.t = self.t, float(arc.t[-1])
-            # else parallel stops take over from one another, with forces of rounding
+            # if the arc stalled, keep the opened stops: parallel stops would take turns, with forces of rounding size
             if not self._is_stalled(t_before):
                 self.opened = []
             self.q, self.v = arc.q[:, -1].copy(), arc.v[:, -1].copy()
             if any(n + k in ended for k in range(len(self.stops)) if k not in resting):
-                self.v = self._landing(arc)
+                self.v = self._impact_velocities(arc)
         self.opened += [k for k in resting if n + k in ended]
         self.released = {k for k in ended if k < n and signs[k] == STICKS}
         self.still = {k for k in range(n) if (not signs[k]) != (k in ended)}
 
-    def _landing(self, arc: Result) -> Array:
+    def _impact_velocities(self, arc: Result) -> Array:
         """Return the velocities at the end of an arc that ends in an impact.
 
-        The slope of a polynomial over short steps multiplies rounding of q. Where that may be more than the tolerance,
-        and explains how far the velocities are from those by Simpson's rule for the last step, the latter are taken.
+        In short steps the slope of the interpolating polynomial magnifies rounding of q. If this error may exceed the
+        tolerance and explains the difference from velocities by Simpson's rule, the latter are returned.
         """
         v, h = arc.v[:, -1].copy(), float(arc.t[-1] - arc.t[-2]) if arc.t.size > 1 else 0.0
         noise = ROUNDING * max(1.0, float(np.abs(arc.q[:, -1]).max()))
@@ -481,8 +485,8 @@ class Motion:
         self.v = self.v - np.linalg.lstsq(rows, violation, rcond=NEGLIGIBLE)[0]
         self.v[np.abs(self.v) < max(ZERO, 1e-16 * float(self.speeds.max()))] = 0.0
 
-    def _closes(self, k: int, start: Gap) -> Any:
-        """Return the event of a gap that is open or about to open; zero where it is as closed as at the start."""
+    def _gap_event(self, k: int, start: Gap) -> Any:
+        """Return the event of a gap that is open or about to open; its zero is where the gap has closed again."""
         g0, u0, t0, low = float(start.g[k]), float(start.u[k]), self.t, self.low
         opens = u0 > 0.0 and u0 * u0 > low * 1e-6
         noise, closing = self.noise, u0 < -AT_REST * float(np.abs(start.W[k]) @ self.speeds)
@@ -499,34 +503,34 @@ class Motion:
         event.gap_rate = lambda t, q, v: float(self.gaps.at(t, q, v).u[k])
         return event
 
-    def _changes(self, k: int, sign: int | None, friction: Any) -> Any:
-        """Return the event that ends the mode of a joint."""
+    def _joint_event(self, k: int, sign: int | None, friction: Any) -> Any:
+        """Return the event that ends the state of a joint: sliding, sticking or idle."""
         if sign is IDLE:
             return terminal(lambda t, q, v: 1.0)
         if sign != STICKS:
-            return terminal(self._stops(k, sign))
-        return terminal(self._slips(lambda t, q, v: (friction(k, t, q, v), self.modes.static[k])))
+            return terminal(self._joint_rest_event(k, sign))
+        return terminal(self._slip_event(lambda t, q, v: (friction(k, t, q, v), self.modes.static[k])))
 
-    def _rests(self, k: int, sign: int) -> Any:
-        """Return the event of a stop that ceases to slide; one that begins to slide is at rest initially."""
+    def _stop_rest_event(self, k: int, sign: int) -> Any:
+        """Return the event of a stop that ceases to slide; if sliding has just begun, its rate is zero initially."""
         slide, slides = self.friction.place[k], self.friction.slides
         u0 = sign * float(slides.at(self.t, self.q, self.v).u[slide])
         offset = u0 - self.low if k in self.friction.still | self.friction.released else 0.0
         return lambda t, q, v: sign * float(slides.at(t, q, v).u[slide]) - offset
 
-    def _stops(self, k: int, sign: int) -> Any:
-        """Return the event of a joint that comes to rest; a joint that begins to slide is at rest initially."""
+    def _joint_rest_event(self, k: int, sign: int) -> Any:
+        """Return the event of a joint that comes to rest; if sliding has just begun, its rate is zero initially."""
         u0 = sign * float(self.modes.gradients(self.q, k) @ self.v)
         offset = u0 - self.low if k in self.still or k in self.released else 0.0
         return lambda t, q, v: sign * float(self.modes.gradients(q, k) @ v) - offset
 
-    def _slips(self, balance: Any) -> Any:
-        """Return the event at which the needed friction exceeds the available one; all of it may be used at first."""
+    def _slip_event(self, balance: Any) -> Any:
+        """Return the event at which the needed friction exceeds the available one, which may be fully used at first."""
         needed, available = balance(self.t, self.q, self.v)
         if abs(needed) > (1.0 + RELEASED) * available:
             raise Undetermined(f"friction of {abs(needed):.10g} is needed, but it has {available:.10g}")
-        fully_used = abs(needed) > (1.0 - AT_MOST) * available
-        margin = max(1.0, abs(needed) / available) * (1.0 + AT_MOST) if fully_used else 1.0
+        fully_used = abs(needed) > (1.0 - MARGIN) * available
+        margin = max(1.0, abs(needed) / available) * (1.0 + MARGIN) if fully_used else 1.0
 
         def reserve(t: float, q: Array, v: Array) -> float:
             needed, available = balance(t, q, v)
@@ -536,13 +540,13 @@ class Motion:
 
 
 def untraced(options: dict[str, Any]) -> dict[str, Any]:
-    """Return the options that change for arcs with closed stops, whose callbacks cannot be traced."""
+    """Return the options to change for arcs with closed stops, whose callbacks cannot be traced."""
     method = PRESETS["auto"] if isinstance(check_method(options["method"]), Taylor) else options["method"]
     return {"method": method, "compiled": False}
 
 
 def terminal(event: Any) -> Any:
-    """Make an event terminal, with direction from positive to negative."""
+    """Make an event terminal, at zeros from positive to negative values."""
     event.terminal, event.direction = True, -1
     return event
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from twoloop.checks.arguments import Array
 from twoloop.impacts.friction import Tangents, impulses
 
-MAX_HITS = 20_000  # largest number of impacts of a sequence; more than one in 10,000 arises with masses of 1 to 1e8
-COLLAPSED = 1e-11  # relative to the first rates of closing: what is left of these when a sequence has died out
+MAX_HITS = 20_000  # largest number of impacts of a sequence; more than 10,000 occur with mass ratios of 1e8
+COLLAPSED = 1e-11  # relative to the first closing rates: a sequence has died out when its rates are smaller
 
 
 class ImpactWarning(UserWarning):
@@ -26,7 +26,7 @@ class ImpactWarning(UserWarning):
 
 
 class Sequence(NamedTuple):
-    """Impulses and course of a sequence of impacts.
+    """Impulses, drift and duration of a sequence of impacts.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Sequence(NamedTuple):
 
     @property
     def impulses(self) -> Array:
-        """Sums over the sequence."""
+        """Return the sum of the impulses over the sequence."""
         return sum(self.steps, 0.0 * self.drift)
 
 
@@ -64,9 +64,9 @@ class Impacts:
     restitution : ndarray (k,)
     tangents : Tangents
     noise : float
-        Gaps below this are closed; those of several stops are then closed at the same time.
+        Gaps below this are closed; if several are, they closed at the same time.
     least : ndarray (k,)
-        Smaller rates are rounding errors.
+        Smallest rates; smaller ones are rounding errors.
     """
 
     def __init__(self, D: Array, restitution: Array, tangents: Tangents, noise: float, least: Array):
@@ -97,7 +97,7 @@ class Impacts:
         limit : float
             Longest duration, s.
         together : bool
-            Whether stops that touch share an impact by Moreau's law. False: the one that closes fastest is hit first.
+            Whether stops that touch share an impact by Moreau's law. False: the stop that closes fastest is hit first.
         """
         n, D = self.n, self.D
         g, u = np.maximum(gaps, 0.0), rates.copy()
@@ -105,7 +105,7 @@ class Impacts:
         steps: list[Array] = []
         shared = False
         closing = u[:n] < -self.least
-        # the rates that remain of a collapse are compared with the largest ones so far
+        # to detect a collapse, rates are compared with the largest closing rate so far
         fastest, involved = float(-u[:n].min(initial=0.0)), np.zeros(n, dtype=bool)
         for _ in range(MAX_HITS):
             closing = u[:n] < -self.least
@@ -135,6 +135,6 @@ class Impacts:
                 break
         else:
             return Sequence(steps, drift, elapsed, shared, False)
-        # the limit of infinitely many impacts: what is left of the rates of closing vanishes
+        # limit of infinitely many impacts: the remaining closing rates become zero
         P = self.joint(np.flatnonzero(involved & (g <= limit * fastest)), u, np.zeros(n))
         return Sequence([*steps, P], drift, elapsed, shared, True)

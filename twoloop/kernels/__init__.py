@@ -1,1 +1,1 @@
-"""Compiled code only: one file a loop."""
+"""Kernels: the compiled numerics of a run, and the compiler that builds and caches them."""

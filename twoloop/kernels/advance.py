@@ -1,6 +1,6 @@
 """Advance by many steps with step-size control, until the last output time, a full buffer or a failure.
 
-`advance` knows nothing of the method: the step is the kit's, with its options and its memory.
+`advance` is the same for all methods: the kit `f` holds the functions of the step, `options` and `memory` its data.
 """
 
 import numpy as np
@@ -16,16 +16,16 @@ from twoloop.kernels.control.discontinuities import (
 )
 from twoloop.kernels.control.loop_state import EXPONENT, FACTOR_MIN, SAFETY
 from twoloop.kernels.control.singular_positions import (
-    SHORT,
+    SHORT_STEP,
     check_partition,
     comes_near_singular,
     ends_at_singular,
     fails_at_singular,
     near_singular,
     record_pivot_at_output,
-    retry_with_care,
+    retry_projected,
 )
-from twoloop.kernels.control.step_size import NEAR, count_step, factor_of, off_grid, on_grid, record_accepted
+from twoloop.kernels.control.step_size import EQUAL_SPACINGS, count_step, factor_of, off_grid, on_grid, record_accepted
 from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, WORK, f8, i8, kernel, merged
 from twoloop.kernels.data.indices import (
@@ -62,10 +62,10 @@ from twoloop.kernels.evaluation.inner_loop import (
 from twoloop.kernels.evaluation.partition import CHANGED
 from twoloop.kernels.linalg.dense import copy
 
-# error of a rejected step, over the tolerances, from which on the force is taken to jump or bend within it
-UNFORESEEN = 10.0
+# ratio of a rejected step's error to the tolerance above which the force is assumed to jump or bend within the step
+SUDDEN_ERROR = 10.0
 REFUSED = 0.95  # maximum ratio of the next step to a rejected one
-FIRST_JUDGED = 2  # accepted step from which on a trial method may be replaced: the first step may be a guess
+FIRST_JUDGED = 2  # number of accepted steps before the step size may replace a trial method: the first one is a guess
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR))
@@ -81,16 +81,14 @@ def start(f, w, t, state):
         code = find_tangents(f, w, t, q)
     if code == DONE:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
-    if (
-        code == DONE and f.flags[GAMMA_GIVEN] == 0
-    ):  # compute it again: the scale for judging the differences of Gamma is known now
+    if code == DONE and f.flags[GAMMA_GIVEN] == 0:  # again: the scale of the errors of Gamma is known only now
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
     return code
 
 
 @merged
-def _kink(f, w, t, size, tolerances, accepted, state, new_state):
-    """Locate a discontinuity in a step whose velocities change by more than its accelerations explain."""
+def _locate_kink(f, w, t, size, tolerances, accepted, state, new_state):
+    """Locate a jump or a ramp of C_t or b within a step; return its kind, SMOOTH if there is none, and its interval."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     if not accepted:
@@ -103,12 +101,12 @@ def _kink(f, w, t, size, tolerances, accepted, state, new_state):
 
 
 @merged
-def _attempt(f, w, options, memory, tolerances, control, clock, t, size, leaps, state, new_state):
+def _attempt(f, w, options, memory, tolerances, control, clock, t, size, jumps, state, new_state):
     """Attempt a step; return its code, its error and the factor of the next step."""
     w.notes[ORIENTATION_NEW] = 0.0
     if clock[at.FAILURE_CODE] == DONE:
         w.notes[FAULT_KIND] = -1.0
-    if leaps:
+    if jumps:
         w.notes[DEFECT] = 0.0
         w.notes[ORIENTATION_NEW] = w.notes[ORIENTATION]
         return DONE, 0.0, 0.0
@@ -125,11 +123,11 @@ def _attempt(f, w, options, memory, tolerances, control, clock, t, size, leaps, 
 
 
 @merged
-def _before_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
-    """Return whether C_t or b jumps or bends within a step, which then has to end there."""
-    kind, low, high = _kink(f, w, t, size, tolerances, accepted, state, new_state)
+def _ends_at_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
+    """Return whether C_t or b jumps or bends within a step, which is then repeated to end there."""
+    kind, low, high = _locate_kink(f, w, t, size, tolerances, accepted, state, new_state)
     if kind == JUMP:
-        clock[at.JUMP_FROM] = t if low - t <= NEAR * np.spacing(abs(t)) else low
+        clock[at.JUMP_FROM] = t if low - t <= EQUAL_SPACINGS * np.spacing(abs(t)) else low
         clock[at.JUMP_TO] = high
         w.notes[KINK_AFTER] = clock[at.JUMP_FROM]
         return True
@@ -140,18 +138,18 @@ def _before_kink(f, w, tolerances, control, clock, t, size, accepted, state, new
 
 
 @merged
-def _failed(f, w, control, clock, t, size, code, retried, state):
+def _handle_failure(f, w, control, clock, t, size, code, retried, state):
     """Handle a step that failed: shorten it, renew the partition, or return the code that ends the loop.
 
-    A step of fixed size cannot become shorter: only the partition is renewed. `retried` is the time at which that was
-    already tried.
+    A step of fixed size cannot become shorter: only the partition is renewed. `retried` is the time of the last step
+    that was repeated with a renewed partition.
     """
     n = w.Q.size
     poor = code in (SINGULAR, INNER_DIVERGED)
     if code == NEEDS_DENSE or fails_at_singular(f, clock, size):
         return at.NEEDS_DENSE
     w.counters[N_REJECTED_CONVERGENCE] += 1
-    if retry_with_care(f, w, control, clock, size):
+    if retry_projected(f, w, control, clock, size):
         return at.CONTINUE
     clock[at.FAILURE_CODE] = code
     clock[at.H_FAILED] = size
@@ -161,7 +159,7 @@ def _failed(f, w, control, clock, t, size, code, retried, state):
         if not poor or t == retried:
             return at.NEAR_SINGULAR if near_singular(f, w, control, clock, t, state[:n]) else at.FIXED_STEP_FAILED
     else:
-        if size < SHORT * clock[at.H_LONG] and near_singular(f, w, control, clock, t, state[:n]):
+        if size < SHORT_STEP * clock[at.H_LONG] and near_singular(f, w, control, clock, t, state[:n]):
             return at.NEAR_SINGULAR
         clock[at.H_LIMIT] = control[at.LIMIT_FACTOR] * size
         clock[at.LIMIT_AGE] = 0.0
@@ -172,24 +170,24 @@ def _failed(f, w, control, clock, t, size, code, retried, state):
 
 
 @merged
-def _refused(f, w, control, clock, t, size, proposal, state):
-    """Handle a step whose error is too large: shorten it, by a spacing at least, or stop at a singular position."""
+def _handle_rejection(f, w, control, clock, t, size, proposal, state):
+    """Handle a step whose error is too large: shorten it by one spacing of t at least, or stop if it is singular."""
     n = w.Q.size
     w.counters[N_REJECTED_ERROR] += 1
     clock[at.FAILURE_CODE] = DONE
-    if retry_with_care(f, w, control, clock, size):
+    if retry_projected(f, w, control, clock, size):
         return at.CONTINUE
     clock[at.H_NEXT] = min(proposal, REFUSED * size, size - np.spacing(abs(t + size)))
     if fails_at_singular(f, clock, size):
         return at.NEEDS_DENSE
-    if size < SHORT * clock[at.H_LONG] and near_singular(f, w, control, clock, t, state[:n]):
+    if size < SHORT_STEP * clock[at.H_LONG] and near_singular(f, w, control, clock, t, state[:n]):
         return at.NEAR_SINGULAR
     return at.CONTINUE
 
 
 @merged
-def _may_go_on(control, clock):
-    """Return whether the method may take many steps in a row, without checks before each of them."""
+def _may_take_many(control, clock):
+    """Return whether the method may take many steps in a row, without a check before each one."""
     if control[at.MAKES_MANY] == 0.0 or control[at.FIXED_STEP] > 0.0 or clock[at.APPLIES_JUMP] == 1.0:
         return False
     if control[at.SPACING] > 0.0 or clock[at.T] == clock[at.JUMP_FROM]:
@@ -198,8 +196,8 @@ def _may_go_on(control, clock):
 
 
 @merged
-def _was_last(f, w, clock, outputs, state):
-    """Advance to the next output time; return whether the last one was reached."""
+def _pass_output_time(f, w, clock, outputs, state):
+    """Advance to the next output time; return whether the one just reached was the last."""
     record_pivot_at_output(f, w, clock, state)
     clock[at.NEXT_OUTPUT] += 1.0
     return int(clock[at.NEXT_OUTPUT]) == outputs.size
@@ -212,12 +210,12 @@ _ADVANCE = i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS)
 def advance(
     f, w, options, memory, tolerances, control, clock, state, new_state, outputs, out_t, out_state, out_steps, filled
 ):
-    """Step on from (clock, state) until every time in `outputs` is reached; steps are shortened to land on them.
+    """Integrate from (clock, state) until every time in `outputs` is reached; return an end code of loop_state.py.
 
-    Times are floating-point numbers: a step is the difference of two of them, so that the sum of the steps is the time.
-
-    Stores every accepted step, or with STORE_ALL = 0 the landings only. `filled` counts the rows of
-    out_t / out_state and those of out_steps, every accepted step, that this call wrote.
+    Steps are shortened to end at output times. A step is the difference of two floating-point times, so that the steps
+    add up to the time exactly.
+    With STORE_ALL = 1 every accepted state is stored, otherwise the states at output times. `filled` becomes the
+    number of rows written to out_t and out_state, and to out_steps, which gets a row for every accepted step.
     """
     fixed = control[at.FIXED_STEP] > 0.0
     n = w.Q.size
@@ -230,7 +228,7 @@ def advance(
             return at.PAUSED
         if w.counters[N_ACCEPTED] >= control[at.MAX_STEPS]:
             return at.MAX_STEPS_REACHED
-        if _may_go_on(control, clock):
+        if _may_take_many(control, clock):
             first, target = filled[0], outputs[int(clock[at.NEXT_OUTPUT])]
             goal = min(target, clock[at.JUMP_FROM])
             if min(out_t.size - first, out_steps.shape[0] - filled[1]) < LANES and first + filled[1] > 0:
@@ -247,7 +245,7 @@ def advance(
                     filled[0] += 1
                 filled[1] += n_taken
                 attempts += n_taken
-                if lands and _was_last(f, w, clock, outputs, state):
+                if lands and _pass_output_time(f, w, clock, outputs, state):
                     return at.ALL_OUTPUT_DONE
                 end = check_partition(f, w, control, clock, out_steps[filled[1] - 1, at.H], lands, state)
                 if end != at.CONTINUE:
@@ -255,76 +253,76 @@ def advance(
                 continue
         attempts += 1.0
         t = clock[at.T]
-        leaps = clock[at.APPLIES_JUMP] == 1.0
-        if t == clock[at.JUMP_FROM] and not leaps:
+        jumps = clock[at.APPLIES_JUMP] == 1.0
+        if t == clock[at.JUMP_FROM] and not jumps:
             return at.AT_DISCONTINUITY
         target = outputs[int(clock[at.NEXT_OUTPUT])]
-        goal = min(target, clock[at.JUMP_TO] if leaps else clock[at.JUMP_FROM])
+        goal = min(target, clock[at.JUMP_TO] if jumps else clock[at.JUMP_FROM])
         h = control[at.FIXED_STEP] if fixed else min(clock[at.H_NEXT], clock[at.H_LIMIT], control[at.MAX_STEP])
         in_grid = 1.0  # number of steps of the fixed grid that this step covers
         if fixed:
             size, in_grid, reaches = on_grid(clock, t, h, target, goal)
         else:
-            size, reaches = off_grid(control, t, h, goal - t, leaps)
+            size, reaches = off_grid(control, t, h, goal - t, jumps)
         shortened = reaches or (h > 0.5 * (goal - t) and not fixed)
         lands = reaches and goal == target
         if reaches:
             size = goal - t
-        may_look = control[at.SPACING] > 0.0 and (control[at.BY_TIME] == 1.0 or size > control[at.SPACING])
-        if (may_look or t < clock[at.DISCONTINUITY_OF_MOTION] < t + size) and not leaps:
+        may_sample = control[at.SPACING] > 0.0 and (control[at.BY_TIME] == 1.0 or size > control[at.SPACING])
+        if (may_sample or t < clock[at.DISCONTINUITY_OF_MOTION] < t + size) and not jumps:
             whole, last = size, outputs[outputs.size - 1]
             size = limit_to_discontinuity(f, w, tolerances, control, clock, t, whole, last, state, new_state)
             if size < whole:
                 reaches, lands, shortened = False, False, True
-        if not reaches and size <= max(NEAR * np.spacing(abs(t)), control[at.SHORTEST]):
+        if not reaches and size <= max(EQUAL_SPACINGS * np.spacing(abs(t)), control[at.SHORTEST]):
             return at.STEP_TOO_SMALL
         code, error, factor = _attempt(
-            f, w, options, memory, tolerances, control, clock, t, size, leaps, state, new_state
+            f, w, options, memory, tolerances, control, clock, t, size, jumps, state, new_state
         )
         if code == NOT_LOADED:
             return at.NEEDS_COMPILATION
-        # at a jump the embedded formula may agree by chance: until ROUGH_TO the estimated error has to be smaller
+        # at a jump of the force an estimate may be small by chance: until ROUGH_TO it has to be smaller by `strict`
         strict = control[at.ROUGH] if t < clock[at.ROUGH_TO] else 1.0
         accepted = code == DONE and error * strict <= 1.0
         if accepted and not reaches and ends_at_singular(f, w, control, clock):
             f.settle(f, w, options, memory, tolerances, False)
             w.counters[N_REJECTED_ERROR] += 1
-            if not retry_with_care(f, w, control, clock, size):
+            if not retry_projected(f, w, control, clock, size):
                 clock[at.H_NEXT], clock[at.PIVOT_HERE] = 0.5 * size, w.notes[PIVOT]
             continue
-        if accepted and not leaps and comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_state):
+        if accepted and not jumps and comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_state):
             f.settle(f, w, options, memory, tolerances, False)
             w.counters[N_REJECTED_ERROR] += 1
             clock[at.FAILURE_CODE] = SINGULAR
             return at.NEAR_SINGULAR
-        driven = control[at.DRIVEN] == 1.0 and not leaps
-        if driven and _before_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
+        driven = control[at.DRIVEN] == 1.0 and not jumps
+        if driven and _ends_at_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
             f.settle(f, w, options, memory, tolerances, False)
             w.counters[N_REJECTED_ERROR] += 1
             clock[at.FAILURE_CODE] = DONE
             continue
-        if not leaps:
+        if not jumps:
             f.settle(f, w, options, memory, tolerances, accepted)
         if code != DONE:
-            end = _failed(f, w, control, clock, t, size, code, retried, state)
+            end = _handle_failure(f, w, control, clock, t, size, code, retried, state)
             if end != at.CONTINUE:
                 return end
             if fixed:
                 retried = t
             continue
-        if error > UNFORESEEN and not accepted:
+        if error > SUDDEN_ERROR and not accepted:
             clock[at.ROUGH_TO] = t + size
         error *= strict
         if factor == 0.0:
             factor = factor_of(control, clock, size, error)
-        elif strict > 1.0 and error > 0.0:  # the factor that the step chose is without `strict`, and may be above 1
+        elif strict > 1.0 and error > 0.0:  # the step chose its factor without `strict`: the factor may exceed 1
             factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
         proposal = min(size * factor, clock[at.H_LIMIT])
         if not accepted and factor > 1.0:
             clock[at.H_NEXT] = size if control[at.FIRST_GIVEN] == 1.0 else proposal
             continue
         if not accepted:
-            end = _refused(f, w, control, clock, t, size, proposal, state)
+            end = _handle_rejection(f, w, control, clock, t, size, proposal, state)
             if end != at.CONTINUE:
                 return end
             continue
@@ -339,7 +337,7 @@ def advance(
             clock[at.T] = goal
         else:
             clock[at.T] = clock[at.T_START] + clock[at.N_FIXED] * h if fixed else t + size
-        if leaps:
+        if jumps:
             clock[at.JUMP_FROM], clock[at.APPLIES_JUMP] = np.inf, 0.0
         copy(new_state, state)
         if lands or control[at.STORE_ALL] == 1.0:
@@ -351,15 +349,15 @@ def advance(
         clock[at.LIMIT_AGE] += 1.0
         if clock[at.LIMIT_AGE] > control[at.LIMIT_MEMORY]:
             clock[at.H_LIMIT] = control[at.LIMIT_START]
-            clock[at.FAILURE_CODE] = DONE  # the code was kept so far, as the reason why steps are short
-        if lands and _was_last(f, w, clock, outputs, state):
+            clock[at.FAILURE_CODE] = DONE  # until now it was kept as the reason for short steps
+        if lands and _pass_output_time(f, w, clock, outputs, state):
             return at.ALL_OUTPUT_DONE
         if fixed and not lands:
             record_pivot_at_output(f, w, clock, state)
         if FIRST_JUDGED <= w.counters[N_ACCEPTED] <= control[at.TRIAL_STEPS] and clock[at.H_NEXT] <= tolerances[GAP]:
             clock[at.H_FAILED] = clock[at.H_NEXT]
             return at.SWITCH_METHOD
-        if leaps:
+        if jumps:
             return at.PAUSED
         if control[at.SYMMETRIC] == 0.0:
             end = check_partition(f, w, control, clock, size, lands, state)

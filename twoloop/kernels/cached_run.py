@@ -1,13 +1,13 @@
-"""Run from a start to the end of the first chunk in one compiled call, and report on it.
+"""Start a run and take its first steps in one compiled call, and report on them in one array.
 
-`start_and_advance` checks the start, makes the same choices as the run before it, takes steps, and fills one block:
+`start_and_advance` checks the start, repeats the choices of the run before (independent rows, dependent coordinates),
+takes steps, and fills one block:
 
     ... | report: N_REPORT numbers, counters | times | steps | states ...
                                                              ^ a fixed place
-
-`advance` writes states as they come, from the fixed place on. The rest is as long as the run has steps, and is copied
-when these are over, so that it ends where states begin. All that a result needs is then one piece without gaps, which
-Python copies by one slice, and takes apart when a field of the result is used.
+`advance` writes states from the fixed place on. The report, whose length depends on the number of steps, is copied
+afterwards so that it ends where the states begin. A result is then one piece without gaps: Python copies it by one
+slice, and splits it when a field of the result is used.
 """
 
 import math
@@ -40,7 +40,7 @@ ROUNDING = 1e-15  # relative to the largest coordinate: smaller corrections are 
 
 @merged
 def prepare_work(w, numbers, integers, pattern, q, accuracy, reuse):
-    """Reset a workspace to its state before a run from q; `numbers` and `integers` are its lasting arrays."""
+    """Reset a workspace before a run from q; `numbers` and `integers` are its arrays that last from step to step."""
     for k in range(numbers.size):
         numbers[k] = 0.0
     for k in range(integers.size):
@@ -67,18 +67,18 @@ def prepare_workspace(w, numbers, integers, pattern, q, accuracy, reuse):
 
 FIRST_STEP = 0.01  # first step, relative to the shortest time scale of the state ...
 RESOLVED = 1e4  # ... but at least this many spacings of floating-point numbers at the start
-SHORTEST_STEP = 1e-16  # relative to the first step: shorter steps are too small
+SHORTEST_STEP = 1e-16  # shortest step, relative to the first step
 SHARPER = 10  # ratio of GAP to LOOK, if forces may change suddenly with place or speed
 
 
 @exact
-def _first_step(state, n, t, span, least):
+def _first_step(state, n, t, span, smallest):
     """Return the first step, s: a share of the time in which the state moves by the size of its coordinates.
 
-    `least` is the size of coordinates that are all zero, which have no length of their own. For coordinates close to
-    zero that time may be shorter than the spacing of floating-point numbers near t.
+    `smallest` replaces the size of coordinates that are all zero. Near zero the time may be shorter than the spacing of
+    floating-point numbers near t: a number of spacings is then the lower bound.
     """
-    far, fast, sharp = least, 0.0, 0.0
+    far, fast, sharp = smallest, 0.0, 0.0
     for j in range(n):
         far, fast = max(far, abs(state[j])), max(fast, abs(state[n + j]))
         sharp = max(sharp, abs(state[2 * n + j]))
@@ -94,9 +94,9 @@ def _first_step(state, n, t, span, least):
 
 @exact
 def _limit_steps(control, tolerances, span, longest, within):
-    """Limit gaps between evaluations to a hundredth of the run.
+    """Limit the time between two evaluations of the equations to a hundredth of the run.
 
-    With `within`, steps evaluate the equations within themselves, and only `longest` limits them.
+    `within`: steps evaluate the equations at interior points as well, so that only `longest` limits their size.
     """
     gap = LONGEST_UNSEEN * span
     tolerances[GAP], tolerances[LOOK] = gap, gap / (SHARPER if control[at.BY_STATE] > 0.0 else 1.0)
@@ -106,16 +106,16 @@ def _limit_steps(control, tolerances, span, longest, within):
 
 
 @kernel(f8(VECTOR, VECTOR, VECTOR, i8, f8, f8, f8, f8, types.boolean))
-def set_sizes(control, tolerances, state, n, t, t1, least, longest, within):
-    """Return the first step from a state, s; if `longest` is given, also bound the gaps between evaluations."""
+def set_sizes(control, tolerances, state, n, t, t1, smallest, longest, within):
+    """Return the first step from a state, s; if `longest` is given, also limit the time between two evaluations."""
     if longest > 0.0:
         _limit_steps(control, tolerances, t1 - t, longest, within)
-    return _first_step(state, n, t, t1 - t, least)
+    return _first_step(state, n, t, t1 - t, smallest)
 
 
 @merged
 def _all_within(t, rows, box):
-    """Return whether all times, and rows as far as the box has columns, lie between its rows [t, q, v]."""
+    """Return whether all times and rows are within the bounds `box` (lower, upper row) of as many of [t, q, v]."""
     for k in range(t.size):
         if not box[0, 0] <= t[k] <= box[1, 0]:
             return False
@@ -127,9 +127,9 @@ def _all_within(t, rows, box):
 
 @kernel(types.void(MATRIX, INTEGERS, VECTOR, types.int64[:, ::1], types.boolean[::1]))
 def split_steps(steps, counts, h, changes, untested):
-    """Split the rows of steps: size, what each added to `counts`, and whether it was implicit (used Newton's method).
+    """Split the rows of steps into sizes `h`, increments of the counters, and whether Newton's method was used.
 
-    `counts` are the rejections and partitions before these steps, and afterwards those after them.
+    `counts` are the rejections and partitions before these steps on entry, and after these steps on return.
     """
     for k in range(h.size):
         h[k], untested[k] = steps[k, at.H], steps[k, at.JACOBIANS] > 0.0
@@ -138,49 +138,49 @@ def split_steps(steps, counts, h, changes, untested):
             changes[i, k], counts[i] = count - counts[i], count
 
 
-# codes of `start_and_advance` other than a number of steps. REFUSED: the start needs other choices. IN_DOUBT: the start
-# may be inconsistent and needs a closer check. UNUSUAL: Python has to read the report, or has to take more steps
+# codes that `start_and_advance` returns instead of a number of steps. REFUSED: the start needs other choices. IN_DOUBT:
+# the start may be inconsistent and needs a closer check. UNUSUAL: Python has to read the report or to continue the run
 REFUSED, IN_DOUBT, UNUSUAL = -1, -2, -3
 
 # Arrays of a run that starts again and again: first for the checks of a start and for choices, then for the run.
 # - `start_numbers`: clock, control and tolerances at a start, which are copied to `numbers`
 # - `start_memory`: nonzero values of the method's `memory`, at `memory_places`; nearly all others are zero
-# - `last_start`: the last start, see START; `saved` and `saved_integers`: the whole state of the run there, from the
-#   second equal start on; `start_rows`: the independent rows there
+# - `last_start`: the last start, see START; `saved`, `saved_integers`: the state of the whole run at that start, stored
+#   when the start is repeated; `start_rows`: the independent rows there
 RUN_ARRAYS = Reference(
     "RunArrays",
     {
         **dict.fromkeys(
-            ("looked", "lam", "room", "least", "bounds", "scratch", "constants", "saved", "search"), VECTOR
+            ("start_values", "lam", "room", "roundings", "bounds", "scratch", "constants", "saved", "search"), VECTOR
         ),
         **dict.fromkeys(("start_numbers", "numbers", "start_memory", "memory", "lasting", "options"), VECTOR),
         **dict.fromkeys(
             ("tolerances", "control", "clock", "state", "new_state", "last_start", "end", "t", "report"), VECTOR
         ),
-        **dict.fromkeys(("mass", "rows", "ways", "pattern", "states", "steps"), MATRIX),
+        **dict.fromkeys(("mass", "rows", "shifts", "pattern", "states", "steps"), MATRIX),
         **dict.fromkeys(("chosen", "expected", "lapack", "lasting_integers", "saved_integers"), INTEGERS),
         **dict.fromkeys(("memory_places", "filled", "kinds", "counted", "search_places", "blocks", "found"), INTEGERS),
         "start_rows": INTEGERS,
     },
 )
-RUN_ARRAYS.add_function("look", i8(KIT, f8, *(VECTOR,) * 5, *(MATRIX,) * 4, VECTOR))
+RUN_ARRAYS.add_function("evaluate_start", i8(KIT, f8, *(VECTOR,) * 5, *(MATRIX,) * 4, VECTOR))
 RUN_ARRAYS.add_function("choose", i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS))
 RUN_ARRAYS.add_function("dependents", i8(MATRIX, INTEGERS, INTEGERS, i8, VECTOR, INTEGERS, INTEGERS))
 RUN_ARRAYS.add_function("start", i8(KIT, WORK, f8, VECTOR))
 RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS))
-# indices in `constants`. Starts: whether rows have entries wherever `kinds` says so, arguments of `choose`, the flag of
-# an M that varies (else 0), the smallest pivot of an accepted start, and the form of the equations. Steps: a first
-# step, or 0, and arguments of set_sizes. Ends: the pivot below which velocities are checked, the largest ratio of their
-# change to that by the accelerations, and the least distance of two sudden changes, in samples
-ACCURACY, REUSE, NEARLY_SINGULAR, IN_ALL_PLACES, RANK, WEAK, SCALE, CONTRADICTS = range(8)
-OF_MASS, LEAST_PIVOT, IN_FORM, FIRST, LEAST, LONGEST, LOOKS_WITHIN, NEAR, MOST_TURNED, LOOKS = range(8, 18)
-# in `expected`, which is empty without generated code; rows added for M follow the kept rows
+# indices in `constants`. Starts: whether rows have entries wherever `kinds` says so, arguments of `choose`, the flag
+# (DEFINITE, INDEFINITE or 0) of M, the smallest pivot of an accepted start, and the form of the equations. Steps: the
+# given first step, or 0, and arguments of set_sizes. Ends: the pivot below which velocities are checked, the largest
+# ratio of their change to that by the accelerations, and the least time between two sudden changes, in samples
+ACCURACY, REUSE, NEARLY_SINGULAR, HAS_ALL_ENTRIES, RANK, WEAK, SCALE, CONTRADICTS, MASS_FLAG, LEAST_PIVOT = range(10)
+EQUATION_FORM, FIRST, LEAST, LONGEST, EVALUATES_WITHIN, NEAR, MAX_CHANGE_RATIO, MIN_SAMPLES = range(10, 18)
+# indices in `expected`, the choices of the generated code (empty without it); rows added to M follow the kept rows
 PLACE, N_KEPT, N_ADDED, KEPT = range(4)
 
 
 @merged
-def _makes_same_choices(b):
-    """Return whether the independent rows, the rows added for M and the dependent coordinates are those of the code."""
+def _has_same_choices(b):
+    """Return whether independent rows, rows added to M and dependent coordinates are those of the generated code."""
     b.scratch[0] = 0.0
     place = b.choose(b.mass, b.rows, b.constants[RANK], b.constants[WEAK], b.bounds, b.scratch, b.chosen)
     n_kept, n_added = b.expected[N_KEPT], b.expected[N_ADDED]
@@ -204,14 +204,14 @@ def _makes_same_choices(b):
 
 
 @merged
-def _copy(one, other):
-    for k in range(other.size):
-        other[k] = one[k]
+def _copy(source, target):
+    for k in range(target.size):
+        target[k] = source[k]
 
 
 @merged
-def _left_out_rows_hold(w, b, n):
-    """Return whether the accelerations agree with all rows, also with redundant rows that were left out."""
+def _redundant_rows_hold(w, b, n):
+    """Return whether the accelerations satisfy all rows, the redundant rows that were left out included."""
     if w.rows_v.size == len(b.rows):
         return True
     for i in range(len(b.rows)):
@@ -225,15 +225,15 @@ def _left_out_rows_hold(w, b, n):
 
 
 @merged
-def _check_start(given, b, t, q, v, sizes, ways):
-    for k in range(b.looked.size):
-        b.looked[k] = 0.0
-    return b.look(given, t, q, v, sizes, b.lam, b.room, b.mass, b.rows, ways, b.pattern, b.least)
+def _check_start(given, b, t, q, v, sizes, shifts):
+    for k in range(b.start_values.size):
+        b.start_values[k] = 0.0
+    return b.evaluate_start(given, t, q, v, sizes, b.lam, b.room, b.mass, b.rows, shifts, b.pattern, b.roundings)
 
 
 @merged
 def _has_all_entries(b):
-    """Return whether all entries of the rows that may be nonzero are: then no position nearby has to be checked."""
+    """Return whether all entries of the rows that may be nonzero are nonzero: then no position nearby is checked."""
     n, same = b.rows.shape[1], True
     for k in range(b.kinds.size):
         same = same and (b.kinds[k] != 0) == (b.rows[k // n, k % n] != 0.0)
@@ -242,21 +242,22 @@ def _has_all_entries(b):
 
 @merged
 def _start_run(f, given, w, b, t, t1, q, v, sizes, sure):
-    """Begin a run to t1 at a state, with the choices of the run before it; return 0, or why that fails.
+    """Begin a run to t1 at a state with the choices of the run before; return 0, REFUSED or IN_DOUBT.
 
-    `given`: the system that is checked, with `sizes` as `look` takes them. `sure`: the state is known to be consistent.
+    `given`: the system that is checked, `sizes`: see `evaluate_start`. `sure`: the state is known to be consistent.
     """
     n = q.size
     if not (finite_vector(q) and finite_vector(v)):
         return REFUSED
-    flags = _check_start(given, b, t, q, v, sizes, b.ways[: 0 if b.constants[IN_ALL_PLACES] > 0.0 else len(b.ways)])
-    if b.constants[IN_ALL_PLACES] > 0.0 and not _has_all_entries(b):
-        flags = _check_start(given, b, t, q, v, sizes, b.ways)
-    if flags & IN_ORDER == 0 or flags & (DEFINITE | INDEFINITE) != int(b.constants[OF_MASS]):
+    all_entries = b.constants[HAS_ALL_ENTRIES] > 0.0
+    flags = _check_start(given, b, t, q, v, sizes, b.shifts[: 0 if all_entries else len(b.shifts)])
+    if all_entries and not _has_all_entries(b):
+        flags = _check_start(given, b, t, q, v, sizes, b.shifts)
+    if flags & IN_ORDER == 0 or flags & (DEFINITE | INDEFINITE) != int(b.constants[MASS_FLAG]):
         return REFUSED
     if flags & CONSISTENT == 0 and not sure:
         return IN_DOUBT
-    if b.expected.size > 0 and not _makes_same_choices(b):
+    if b.expected.size > 0 and not _has_same_choices(b):
         return REFUSED
     _copy(b.start_numbers, b.numbers)
     for j in range(b.state.size):
@@ -265,13 +266,13 @@ def _start_run(f, given, w, b, t, t1, q, v, sizes, sure):
     prepare_work(w, b.lasting, b.lasting_integers, b.pattern, q, b.constants[ACCURACY], b.constants[REUSE])
     _copy(b.lapack, w.lapack[: b.lapack.size])
     w.notes[indices.NEARLY_SINGULAR] = b.constants[NEARLY_SINGULAR]
-    if b.start(f, w, t, b.state) != indices.DONE or not _left_out_rows_hold(w, b, n):
+    if b.start(f, w, t, b.state) != indices.DONE or not _redundant_rows_hold(w, b, n):
         return REFUSED
     if w.notes[indices.PIVOT] < b.constants[LEAST_PIVOT]:
         return REFUSED
     w.notes[indices.KINK_AFTER] = t1
     if b.control[at.FIXED_STEP] == 0.0:
-        span, first, within = t1 - t, b.constants[FIRST], b.constants[LOOKS_WITHIN] > 0.0
+        span, first, within = t1 - t, b.constants[FIRST], b.constants[EVALUATES_WITHIN] > 0.0
         _limit_steps(b.control, b.tolerances, span, b.constants[LONGEST], within)
         b.clock[at.H_NEXT] = min(first if first > 0.0 else _first_step(b.state, n, t, span, b.constants[LEAST]), span)
         b.control[at.SHORTEST] = SHORTEST_STEP * b.clock[at.H_NEXT]
@@ -297,14 +298,14 @@ def _restore_start(b):
     _copy(b.saved_integers, b.lasting_integers)
 
 
-# in `last_start`, before t, t1, q and v: how often a run began there, at most IS_SAVED
+# indices in `last_start`: how often a run began there, at most IS_SAVED; from START on: t, t1, q and v
 N_EQUAL, START = 0, 1
 NEVER, IS_SAVED = 0.0, 2.0
 
 
 @exact
 def _is_last_start(last_start, t, t1, q, v):
-    """Return whether a start equals the last one to the bit, and store it as the last one."""
+    """Return whether a start equals the last one to the bit; store it as the last one."""
     n, same = q.size, last_start[N_EQUAL] > NEVER
     for k in range(2 + 2 * n):
         x = t if k == 0 else t1 if k == 1 else q[k - 2] if k < 2 + n else v[k - 2 - n]
@@ -314,11 +315,12 @@ def _is_last_start(last_start, t, t1, q, v):
     return same
 
 
-# entries of the report: number of states (with the first) and of steps; 1 or 0 for: nothing has to be checked,
-# velocities turned in the last step, all states are in the region where callbacks were compared, every step evaluated
-# its defect; then the largest defect, the widest gap without an evaluation, the code of `advance`, 1 if the start is
-# new, and the counters
-N_STATES, N_STEPS, PLAIN, TURNED, INSIDE, CHECKED, DEFECT, WIDEST, CODE, IS_NEW, N_REPORT = range(11)
+# entries of the report: number of states (with the first) and of steps; then 1 or 0 for: NO_REMARK, nothing has to be
+# checked; JUMPED, velocities changed suddenly in the last step; IN_CHECKED_REGION, all states are where callbacks were
+# compared with their traces; HAS_DEFECTS, every step evaluated its defect; then the largest defect, the longest time
+# between two evaluations, the code of `advance`, 1 if the start is new, and the counters
+N_STATES, N_STEPS, NO_REMARK, JUMPED, IN_CHECKED_REGION, HAS_DEFECTS = range(6)
+DEFECT, LONGEST_GAP, END_CODE, IS_NEW, N_REPORT = range(6, 11)
 N_HEAD = N_REPORT + N_COUNTERS
 
 
@@ -329,26 +331,26 @@ def _velocities_turned(b, k, n):
     for j in range(n):
         change = max(change, abs(b.states[k, n + j] - b.states[k - 1, n + j]))
         first, last = max(first, abs(b.states[k - 1, 2 * n + j])), max(last, abs(b.states[k, 2 * n + j]))
-    return change > b.constants[MOST_TURNED] * (b.t[k] - b.t[k - 1]) * min(first, last)
+    return change > b.constants[MAX_CHANGE_RATIO] * (b.t[k] - b.t[k - 1]) * min(first, last)
 
 
 @merged
 def _write_report(w, b, box, n_rows, n_steps, code, is_new):
     """Write the report of a run with n_rows states after the first, and n_steps steps.
 
-    Returns the number of steps if nothing has to be checked, else UNUSUAL. `box` has rows [t, q, v], or is empty.
+    Returns n_steps if nothing has to be checked, else UNUSUAL. `box`: bounds of [t, q, v], as in `_all_within`.
     """
     turned = n_rows > 0 and _velocities_turned(b, n_rows, w.Q.size)
     inside = box.shape[1] > 0 and _all_within(b.t[: 1 + n_rows], b.states, box)
     near = b.clock[at.PIVOT_AT_OUTPUT] < b.constants[NEAR]
-    missed = b.clock[at.SHORTEST_CHANGE] < b.constants[LOOKS] * b.clock[at.WIDEST_SAMPLING]
+    missed = b.clock[at.SHORTEST_CHANGE] < b.constants[MIN_SAMPLES] * b.clock[at.WIDEST_SAMPLING]
     plain, width = not (turned or near or missed), b.steps.shape[1]
     begin = b.report.size - N_HEAD - 1 - n_rows - width * n_steps
     report = b.report[begin:]
-    report[N_STATES], report[N_STEPS], report[PLAIN] = 1 + n_rows, n_steps, plain
-    report[TURNED], report[INSIDE], report[CODE], report[IS_NEW] = turned, inside, code, is_new
-    report[CHECKED] = w.counters[N_ACCEPTED] > 0 and w.notes[indices.UNCHECKED] == 0.0
-    report[DEFECT], report[WIDEST] = w.notes[indices.LARGEST_DEFECT], w.notes[indices.WIDEST_GAP]
+    report[N_STATES], report[N_STEPS], report[NO_REMARK] = 1 + n_rows, n_steps, plain
+    report[JUMPED], report[IN_CHECKED_REGION], report[END_CODE], report[IS_NEW] = turned, inside, code, is_new
+    report[HAS_DEFECTS] = w.counters[N_ACCEPTED] > 0 and w.notes[indices.UNCHECKED] == 0.0
+    report[DEFECT], report[LONGEST_GAP] = w.notes[indices.LARGEST_DEFECT], w.notes[indices.WIDEST_GAP]
     for k in range(N_COUNTERS):
         report[N_REPORT + k] = w.counters[k]
     _copy(b.t[: 1 + n_rows], report[N_HEAD : N_HEAD + 1 + n_rows])
@@ -361,11 +363,11 @@ def _write_report(w, b, box, n_rows, n_steps, code, is_new):
 
 @kernel(i8(KIT, KIT, WORK, RUN_ARRAYS, f8, f8, VECTOR, VECTOR, VECTOR, MATRIX, types.boolean), vectorized=True)
 def start_and_advance(f, given, w, b, t, t1, q, v, sizes, box, sure):
-    """Start a run to t1 and take the first chunk of steps; return how many if nothing has to be checked in Python.
+    """Start a run to t1 and take the first steps; return their number, or a code if Python has to check something.
 
-    A start that equals the last one to the bit is checked once more, and then saved for those that follow.
+    A start that equals the last one to the bit is checked a second time and then saved: further repetitions restore it.
     """
-    f.flags[FORM] = int(b.constants[IN_FORM])  # a run may have changed it
+    f.flags[FORM] = int(b.constants[EQUATION_FORM])  # a run may have changed it
     same, often = _is_last_start(b.last_start, t, t1, q, v), b.last_start[N_EQUAL]
     if same and often == IS_SAVED:
         _restore_start(b)

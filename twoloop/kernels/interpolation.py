@@ -30,9 +30,7 @@ LOOKS = len(PLACES)
 EPS = 2.0**-52
 EVEN = 8.0  # largest ratio of two gaps at which steps count as equally long
 NOISY = 10.0  # relative to the tolerance of velocities: rounding above this counts as noise
-SINGULAR_SHARE = (
-    0.01  # relative to the smallest pivots at the ends of an interval: below this a position counts as singular
-)
+SINGULAR_SHARE = 0.01  # relative to the smallest pivots at the ends of an interval: a smaller pivot is singular
 SINGULAR_PIVOT = 1e-5  # a smaller pivot (rows scaled to 1) counts as singular, too ...
 RESIDUAL, WEAK_PIVOT = 10.0, 0.05  # ... and one below WEAK_PIVOT if velocities violate rows by fewer tolerances
 
@@ -40,7 +38,7 @@ RESIDUAL, WEAK_PIVOT = 10.0, 0.05  # ... and one below WEAK_PIVOT if velocities 
 @merged
 def _window(low, high, i, last):
     """Return the first and last row of the polynomial of the interval from row i: centred, except at ends."""
-    if last > i + 1:  # the interval has states of its own
+    if last > i + 1:  # interior states of the interval are given
         return i, last
     size = min(kinds.WINDOW, high - low + 1)
     lo = max(low, min(i + 1 - size // 2, high + 1 - size))
@@ -94,7 +92,7 @@ def _interpolate(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
 
 @merged
 def _kind(kind, tolerances, h, states, i):
-    """Return APART also if an interval is so short that rounding of q exceeds the tolerances of its slope."""
+    """Return `kind`, but APART if an interval is so short that rounding of q exceeds the tolerances of its slope."""
     n = tolerances.size - ATOL
     for m in range(n):
         atol, rtol = tolerances[ATOL + m], tolerances[RTOL]
@@ -151,7 +149,7 @@ def between(f, w, tolerance, tolerances, t, states, groups, times, z, room, out)
         order = 3 if kind >= kinds.ACCELERATIONS else 2
         size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
         size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == kinds.APART else 0
-        # the choice of the independent coordinates must depend on the time alone, not on other output times
+        # the choice of independent coordinates must not depend on other output times
         chosen = False
         for p in range(groups[g, kinds.FIRST_TIME], groups[g, kinds.END_TIME]):
             q, v = out[p, :n], out[p, n : 2 * n]

@@ -14,13 +14,13 @@ from twoloop.kernels.data.indices import N_COUNTERS, N_NOTES
 from twoloop.kernels.linalg.band import N_ROUTINES
 from twoloop.kernels.linalg.markowitz_lu import MAX_ENTRIES_PER_LINE, N_COUNTS, N_LISTS, index_size, values_size
 
-# most unused workspaces that are kept for later runs, and most numbers that one of them may have
+# largest number of unused workspaces that are kept for later runs, and of numbers that one of them may have
 MOST_FREE, LARGEST_FREE = 32, 100_000
 WORD, LINE = 8, 8  # bytes of a number; numbers in a cache line, at the start of which each array begins
 
 
 class Static(NamedTuple):
-    """Sizes that the static form needs beside those of a system."""
+    """Sizes that the static form needs in addition to those of other forms."""
 
     n_factors: int
     n_mass_values: int
@@ -37,8 +37,8 @@ class Layout(NamedTuple):
     """Offsets of the arrays of a workspace, in one piece of memory for numbers and one for integers.
 
     The table of addresses and shapes is `table`, plus `of_numbers` times the address of the numbers, plus `of_integers`
-    times the address of the integers. A step reads the first `n_lasting` numbers and `n_lasting_integers` integers that
-    the step before has left; it fills all others before it reads them.
+    times the address of the integers. The first `n_lasting` numbers and `n_lasting_integers` integers keep data from
+    one step to the next; a step fills all others before it reads them.
     """
 
     numbers: Places
@@ -68,7 +68,7 @@ def make_work(
 
     The matrices of Newton's method get n_matrices numbers.
 
-    A workspace that a run of these sizes gave back is reused: to allocate the arrays takes longer than to clear them.
+    An unused workspace of these sizes is reused: to allocate the arrays takes longer than to clear them.
     """
     r = min(n_c, n_q) if rank is None else rank
     r_v = min(n_c + n_a, n_q) if rank_v is None else rank_v
@@ -78,14 +78,14 @@ def make_work(
 
 def empty(sizes: Sizes) -> Work:
     """Return a workspace of the given sizes, full of zeros."""
-    given_back = _given_back(sizes)
-    return _new(sizes) if given_back is None else cleared(given_back)
+    given_back = _take_unused(sizes)
+    return _allocate(sizes) if given_back is None else cleared(given_back)
 
 
 def copy_of(work: Work) -> Work:
     """Return a copy of a workspace."""
     sizes = work.sizes
-    other = _given_back(sizes) or _new(sizes)
+    other = _take_unused(sizes) or _allocate(sizes)
     for mine, given in zip(lasting(other), lasting(work), strict=True):
         mine[:] = given
     other.changes[:] = 0.0
@@ -93,12 +93,12 @@ def copy_of(work: Work) -> Work:
 
 
 def lasting(work: Work) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the numbers and integers of a workspace that count at the start of a step."""
+    """Return the numbers and integers of a workspace that keep data from one step to the next."""
     layout = _layout(*work.sizes)
     return work.notes.base[: layout.n_lasting], work.counters.base[: layout.n_lasting_integers]
 
 
-def _given_back(sizes: Sizes) -> Work | None:
+def _take_unused(sizes: Sizes) -> Work | None:
     free = _free.get(sizes)
     try:
         return free.pop() if free else None
@@ -106,7 +106,7 @@ def _given_back(sizes: Sizes) -> Work | None:
         return None
 
 
-def _new(sizes: Sizes) -> Work:
+def _allocate(sizes: Sizes) -> Work:
     layout = _layout(*sizes)
     numbers, integers = np.zeros(layout.n_numbers), np.zeros(layout.n_integers, dtype=np.int64)
     arrays: dict[str, Any] = {name: numbers[a:b].reshape(shape) for name, a, b, shape in layout.numbers}
@@ -117,7 +117,7 @@ def _new(sizes: Sizes) -> Work:
 
 
 def give_back(work: Work) -> None:
-    """Give a workspace that is no longer used to the next run of the same sizes."""
+    """Keep a workspace that is no longer used for the next run of the same sizes."""
     free = _free.pop(work.sizes, [])
     if work.notes.base.size <= LARGEST_FREE and len(free) < MOST_FREE:
         free.append(work)
@@ -132,7 +132,7 @@ _free: dict[Sizes, list[Work]] = {}  # unused workspaces, by sizes
 
 
 def cleared(work: Work) -> Work:
-    """Reset a workspace to its state when it was new."""
+    """Reset a workspace to its state after allocation."""
     for each in lasting(work):
         each[:] = 0
     work.G_of_S[:] = np.nan
@@ -148,9 +148,9 @@ def cached_run() -> Any:
 
 
 def _of_static_form(n_q: int, n_c: int, rank: int, static: Static) -> tuple[dict[str, tuple[int, ...]], ...]:
-    """Return the shapes of numbers and integers that the static form changes: no partition, no unused matrix.
+    """Return the shapes of numbers and integers that differ in the static form, which has no partition.
 
-    All coordinates stand for the dependent ones, whose predictions are compared, and for the independent ones.
+    All coordinates count as dependent, because the predictions of all are compared, and all as independent.
     """
     n, n_redundant = n_q + n_c, n_c - rank
     n_rows = n_c if static.dense_jacobian else 0
@@ -257,13 +257,12 @@ def _layout(
         del integers[f"{name}_v"]
     if n_a == 0:
         del numbers["values_v"]
-    of_numbers, n_numbers = _placed(numbers)
-    of_integers, n_integers = _placed(integers)
+    of_numbers, n_numbers = _place_arrays(numbers)
+    of_integers, n_integers = _place_arrays(integers)
     of_numbers["entries"], of_numbers["G"] = (0, n_entries, (n_entries,)), (0, n_entries, (rows_of_G, n_q))
     of_numbers["M"] = n_entries, n_entries + side * side, (side, side)
-    lists = (
-        (N_COUNTS + N_LISTS * min(r, MAX_ENTRIES_PER_LINE)) * r if static is None else 0
-    )  # lists in `index` that only the ordering uses
+    # numbers at the end of `index` that only the ordering uses
+    lists = (N_COUNTS + N_LISTS * min(r, MAX_ENTRIES_PER_LINE)) * r if static is None else 0
     lasting = of_numbers["matrices"][0], of_integers["index"][1] - lists
     if n_a == 0:
         of_numbers["values_v"] = of_numbers["values"]
@@ -279,7 +278,7 @@ def _layout(
     return Layout(named[0], named[1], n_numbers, n_integers, *lasting, table, masks[0], masks[1])
 
 
-def _placed(shapes: Mapping[str, tuple[int, ...]]) -> tuple[dict[str, tuple[int, int, tuple[int, ...]]], int]:
+def _place_arrays(shapes: Mapping[str, tuple[int, ...]]) -> tuple[dict[str, tuple[int, int, tuple[int, ...]]], int]:
     """Return where arrays begin and end, each at the start of a cache line, and the total length."""
     places, end = {}, 0
     for name, shape in shapes.items():

@@ -1,1 +1,1 @@
-"""Methods that a user can choose: frozen options, one file for each family, and the plan of a run."""
+"""Methods that a user can choose: one file of option classes for each family, and the plan of a run."""

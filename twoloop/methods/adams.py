@@ -6,8 +6,8 @@ import numpy as np
 
 from twoloop.methods.plan import LARGEST_MOVE, Plan
 
-# limits of h times the frequency of a vibration (it grows by 1 % a step), and of h times a rate of decay, for orders 1
-# to 12; for decay, the value of order 6 from there on, as the order does not stay higher if decay limits the steps
+# stability limits of h times the frequency of a vibration (which grows by 1 % a step), and of h times a rate of decay,
+# for orders 1 to 12; for decay from order 6 on that of order 6, because the order falls when decay limits the steps
 STABLE_TO = tuple(
     zip(
         (2.01, 2.01, 0.92, 0.97, 1.09, 1.23, 1.28, 1.13, 1.00, 0.89, 0.79, 0.71),

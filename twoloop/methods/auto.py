@@ -9,41 +9,42 @@ from twoloop.generate.series import is_quick, series_for
 from twoloop.generate.time_dependence import may_be_steep
 from twoloop.generate.traced_values import Check, unchecked
 from twoloop.methods.lobatto import Lobatto16
-from twoloop.methods.plan import Method, Plan, kept_plan, least_tolerance
+from twoloop.methods.plan import Method, Plan, cached_plan, least_tolerance
 from twoloop.methods.taylor import Taylor
 from twoloop.problem.system import ConstrainedSystem
 
 MANY = 16  # number of coordinates from which on evaluations cost more than the algebra of Adams' method ...
-# ... if the constraints are at most this share of the coordinates, as a projection costs more ...
+# ... if the constraints are at most this share of the coordinates (otherwise projections cost more) ...
 CONSTRAINED = 0.25
 TIGHT_MANY = 1e-10  # ... or if the tolerance is below this ...
 VERY_MANY = 64  # ... or from this number of coordinates on, in any case
 HUGE = 1000  # number of coordinates above which Newton's method, whose matrices are full, is not tried
-LONG_STEPS = 1e-9  # the rule for this tolerance also holds at looser ones, for runs of few steps
+LONG_STEPS = 1e-9  # the rule for this tolerance also applies to looser ones, if runs have few steps
 SERIES = 1e-6  # tolerance below which a Taylor series costs less than DOP853 ...
-INVOLVED = 12  # ... with up to this number of operations for each coordinate ...
+SOME_OPERATIONS = 12  # ... with up to this number of operations per coordinate ...
 # ... or up to this number with fewer than FEW coordinates, and with MANY coordinates at any looser tolerance
-SIMPLE = 8
+FEW_OPERATIONS = 8
 FEW = 5
 SERIES_OF_MANY = 1e-8  # as SERIES, for MANY coordinates with generated code
-LOOSE = 3e-5  # tolerance from which on stiff motion is integrated by the method for few digits ...
-TIGHTEST = 9e-7  # ... and below which by the method for many digits
+LOOSE = 3e-5  # tolerance from which on stiff motion is integrated by the method for few digits
+TIGHTEST = 9e-7  # tolerance below which stiff motion is integrated by the method for many digits
 LIMIT_FEW, LIMIT_MANY = 4.0, 0.25  # h rho from which on stiffness may limit DOP853 (stable to 5.9) and Adams
-LIMIT_FEW_OF_MANY = 2.0  # the same of DOP853 with MANY coordinates
-LOOKS_FEW = 2  # estimates in a row: accuracy may allow long steps for a while; steps of Adams are too short for that
-# times the order: the same of a series, whose limit of stability is 0.42 (decay) to 0.6 times its order
+LIMIT_FEW_OF_MANY = 2.0  # h rho from which on stiffness may limit DOP853 with MANY coordinates
+# number of successive estimates above the limit, because accuracy may allow long steps for a while (not with Adams)
+ESTIMATES_FEW = 2
+# times the order: h rho from which on stiffness may limit a series, stable to 0.42 (decay) or 0.6 times its order
 LIMIT_SERIES = 0.3
-DEARER = 4.0  # cost of an evaluation without generated code, in evaluations with it, estimated ...
-# ... and from HEAVY operations of callbacks for each coordinate on, as these cost both of them
-DEARER_HEAVY, HEAVY = 2.0, 17
+COST_RATIO = 4.0  # cost of an evaluation without generated code, in evaluations with it, estimated ...
+# ... and from MANY_OPERATIONS of callbacks per coordinate on, because these cost the same with and without code
+COST_RATIO_HEAVY, MANY_OPERATIONS = 2.0, 17
 MATRIX_COST = 3.0  # cost of a Newton matrix for few coordinates, in evaluations; plus one for every eight coordinates
 
 
-def switching(first: Plan, second: Plan, limit: float, n_q: int, looks: int = 1, dearer: float = 1.0) -> Plan:
+def switching(first: Plan, second: Plan, limit: float, n_q: int, estimates: int = 1, cost_ratio: float = 1.0) -> Plan:
     """Return the plan that switches from `first`, explicit or by fixed point, to `second`, Newton's method, and back.
 
-    `limit`: value of h rho (rho: largest rate of the motion) from which on `second` is tried, if `looks` estimates in a
-    row exceed it. `dearer`: cost of an evaluation of `second`, in evaluations of `first`.
+    `limit`: value of h rho (rho: largest rate of the motion) from which on `second` is tried, if this number of
+    `estimates` in a row exceeds it. `cost_ratio`: cost of an evaluation of `second`, in evaluations of `first`.
     """
     from twoloop.kernels.control import stiffness as kernels
 
@@ -52,7 +53,7 @@ def switching(first: Plan, second: Plan, limit: float, n_q: int, looks: int = 1,
     return first.changed(
         step=kernels.SWITCHING,
         options=kernels.switching_options(
-            limit, looks, MATRIX_COST + n_q / 8.0, dearer, each, first.options, second.options
+            limit, estimates, MATRIX_COST + n_q / 8.0, cost_ratio, each, first.options, second.options
         ),
         memory=kernels.switching_memory(n_q, first.memory, second.memory),
         first=first.step,
@@ -143,7 +144,7 @@ class Auto:
     lanes: Lobatto16 | None = None
     n_rows: int = 0  # number of constraints; solve_dae sets it
     # cost of an evaluation without generated code, in evaluations with it; None: there is no code
-    dearer: float | None = None
+    cost_ratio: float | None = None
     # whether the system gives its matrices by entries: an evaluation then costs no more than a projection
     sparse: bool = False
     # whether forces may change much over a short distance, so that every method must limit its steps
@@ -168,7 +169,7 @@ class Auto:
         if code is not None:
             lanes = self.lanes if compiles_quickly(code.shared) else None
             lanes = None if lanes is None else lanes.for_system(system, code)
-            chosen = replace(chosen, lanes=lanes, dearer=_dearer(system))
+            chosen = replace(chosen, lanes=lanes, cost_ratio=_cost_ratio(system))
         plain = code is None and (system.called_in_python or not is_quick(system))
         if self.series is None or plain:
             return chosen
@@ -182,11 +183,11 @@ class Auto:
         """Return whether a step of the series costs less than the steps that it replaces."""
         assert self.series is not None and self.series.program is not None
         operations = self.series.program.n_operations / n_q
-        if self.dearer is not None:  # near singular positions, where the series then takes over, it is more exact
+        if self.cost_ratio is not None:  # the series takes over only near singular positions: it is more exact
             return tolerance < (SERIES if n_q < MANY else SERIES_OF_MANY)
         if tolerance < SERIES:
-            return operations <= (INVOLVED if n_q >= FEW else SIMPLE)
-        return operations <= SIMPLE and n_q >= MANY
+            return operations <= (SOME_OPERATIONS if n_q >= FEW else FEW_OPERATIONS)
+        return operations <= FEW_OPERATIONS and n_q >= MANY
 
     def takes_code(self, fixed: bool) -> bool:
         """Return whether its steps may run with generated code."""
@@ -196,47 +197,47 @@ class Auto:
         """Return the plan of the method for a run of n_q coordinates."""
         if fixed:
             return self.fixed.plan(n_q, rtol, atol, True)
-        others = self._others(n_q, rtol, atol)
+        fallback = self._without_lanes(n_q, rtol, atol)
         if self.lanes is None or self.lanes.code is None:
-            return others
+            return fallback
         plan = self.lanes.plan(n_q, rtol, atol, False)
-        traced = (*plan.traced, *others.traced)
-        return plan.changed(substitute=others, traced=traced, within_newton=others.within_newton)
+        traced = (*plan.traced, *fallback.traced)
+        return plan.changed(substitute=fallback, traced=traced, within_newton=fallback.within_newton)
 
-    def _others(self, n_q: int, rtol: float, atol: float) -> Plan:
+    def _without_lanes(self, n_q: int, rtol: float, atol: float) -> Plan:
         """Return the plan without collocation in lanes: one evaluation at a time."""
         tolerance = least_tolerance(rtol, atol)
         implicit = self.loose if tolerance >= LOOSE else self.tight if tolerance >= TIGHTEST else self.tightest
-        second = kept_plan(implicit, n_q, rtol, atol)
-        dearer = 1.0 if self.dearer is None else self.dearer
+        second = cached_plan(implicit, n_q, rtol, atol)
+        cost_ratio = 1.0 if self.cost_ratio is None else self.cost_ratio
         if self.series is None or self.series.program is None:
-            return self._explicit(n_q, rtol, atol, second, dearer)
+            return self._explicit(n_q, rtol, atol, second, cost_ratio)
         pays = self._series_pays(n_q, tolerance)
-        explicit = self._explicit(n_q, rtol, atol, second, dearer)
-        # at looser tolerances as well if steps are long: most other methods are limited to a hundredth of the run
+        explicit = self._explicit(n_q, rtol, atol, second, cost_ratio)
+        # at looser tolerances the series also pays if the other methods are limited to a hundredth of the run
         stages_suffice = explicit.unseen < 1.0 and not self.narrow
         if not pays and (stages_suffice or not self._series_pays(n_q, LONG_STEPS)):
             return explicit
         series = self.series.plan(n_q, rtol, atol, False)
-        chosen = switching(series, second, LIMIT_SERIES / series.exponent, n_q, LOOKS_FEW, dearer)
+        chosen = switching(series, second, LIMIT_SERIES / series.exponent, n_q, ESTIMATES_FEW, cost_ratio)
         return chosen.changed(substitute=explicit, provisional=not pays)
 
-    def _explicit(self, n_q: int, rtol: float, atol: float, second: Plan, dearer: float) -> Plan:
+    def _explicit(self, n_q: int, rtol: float, atol: float, second: Plan, cost_ratio: float) -> Plan:
         """Return the plan of the explicit method and its switch to Newton's method, without a series."""
         many = n_q >= VERY_MANY and not self.sparse
-        if n_q >= MANY and self.dearer is None:
+        if n_q >= MANY and self.cost_ratio is None:
             many = many or self.n_rows <= CONSTRAINED * n_q or least_tolerance(rtol, atol) < TIGHT_MANY
-        explicit, limit, looks = (self.many, LIMIT_MANY, 1) if many else (self.few, LIMIT_FEW, LOOKS_FEW)
+        explicit, limit, estimates = (self.many, LIMIT_MANY, 1) if many else (self.few, LIMIT_FEW, ESTIMATES_FEW)
         if explicit is self.few and n_q >= MANY:  # here evaluations cost more than a trial
-            limit, looks = LIMIT_FEW_OF_MANY, 1
+            limit, estimates = LIMIT_FEW_OF_MANY, 1
         if n_q > HUGE:
             return explicit.plan(n_q, rtol, atol, False)
-        return switching(explicit.plan(n_q, rtol, atol, False), second, limit, n_q, looks, dearer)
+        return switching(explicit.plan(n_q, rtol, atol, False), second, limit, n_q, estimates, cost_ratio)
 
 
-def _dearer(system: ConstrainedSystem) -> float:
+def _cost_ratio(system: ConstrainedSystem) -> float:
     """Return the cost of an evaluation of the implicit method, in evaluations of generated code."""
     try:
-        return DEARER_HEAVY if series_for(system).n_operations >= HEAVY * system.n_q else DEARER
+        return COST_RATIO_HEAVY if series_for(system).n_operations >= MANY_OPERATIONS * system.n_q else COST_RATIO
     except Untraceable:
-        return DEARER
+        return COST_RATIO

@@ -1,8 +1,8 @@
 """DOP853(...): the explicit method of order 8 of Dormand and Prince, in the two-loop procedure.
 
 Tableau: Hairer, Nørsett and Wanner, Solving Ordinary Differential Equations I (1993), II.5. The numbers are those of
-`scipy.integrate.DOP853`; they are copied, because importing that package takes a tenth of a second, and a test compares
-them. Both error estimates weigh the slopes of the stages; the weight of the slope at the end is zero.
+`scipy.integrate.DOP853`. They are copied, because importing that package takes a tenth of a second; a test compares
+them. Both error estimates are weighted sums of the slopes of the stages; the slope at the end has the weight zero.
 """
 
 from dataclasses import dataclass
@@ -64,13 +64,13 @@ E5 = np.array(
 
 
 COARSE_SHARE = 0.1  # weight of the estimate of order 3 beside that of order 5
-# relative to the tolerance: largest distance of a stage from the position of the Jacobian for its velocities
+# relative to the tolerance: while a stage's position differs by less from that of a Jacobian, its velocity may use it
 REUSE = 1e-4
-# relative to the tolerance, in the trend: an error of order 8 falls a hundredfold if steps are halved
+# relative to the tolerance: smaller errors count as this in the trend; half the step has less than 1/100 of the error
 LEAST_ERROR = 1e-6
-SEEN = C[(B != 0.0) | (E5 != 0.0) | (E3 != 0.0)]  # nodes of the stages with nonzero weights
+EVALUATED_NODES = C[(B != 0.0) | (E5 != 0.0) | (E3 != 0.0)]  # nodes of the stages with nonzero weights
 # longest part of a step between two of these nodes, relative to the step: 4/15
-UNSEEN = float(np.diff([*np.sort(SEEN), 1.0]).max())
+LONGEST_GAP = float(np.diff([*np.sort(EVALUATED_NODES), 1.0]).max())
 STABLE_TO = (5.96, 6.39)  # limits of stability: h times the frequency of a vibration, and h times a rate of decay
 SAFETY = 0.8  # with 0.9 twice as many steps are rejected, and at equal error it costs about a tenth more
 
@@ -168,5 +168,5 @@ class DOP853:
             rough=ROUGH,
             stable_to=lambda memory: STABLE_TO,
             reuse=0.0 if fixed else REUSE * least_tolerance(rtol, atol),
-            unseen=UNSEEN if free else 1.0,
+            unseen=LONGEST_GAP if free else 1.0,
         )

@@ -14,8 +14,9 @@ from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import LARGEST_MOVE, Plan
 from twoloop.problem.system import ConstrainedSystem
 
-PARTS = 6  # number of parts of a step, computed again for the solution between its ends
-UNSEEN = float(np.diff([0.0, *tables().nodes]).max())  # longest part of a step between two nodes, relative to the step
+PARTS = 6  # number of parts into which a step is divided, and computed again, for the solution between its ends
+# longest part of a step between two nodes, relative to the step
+LONGEST_GAP = float(np.diff([0.0, *tables().nodes]).max())
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ class Lobatto16:
         options = np.zeros(kernels.N_OPTIONS)
         options[kernels.THETA] = LARGEST_MOVE
         options[kernels.N_ITERATED], options[kernels.N_ROWS] = len(made.code.iterated), made.code.n_rows
-        options[kernels.FREE] = 1.0 if self.narrow else 1.0 / UNSEEN
+        options[kernels.FREE] = 1.0 if self.narrow else 1.0 / LONGEST_GAP
         sizes = n_q, len(made.code.iterated), made.code.n_rows
         plan = Plan(
             kernels.LOBATTO,
@@ -97,7 +98,7 @@ class Lobatto16:
             watchful=True,
             projects=True,
             looks_within=True,
-            unseen=UNSEEN,
+            unseen=LONGEST_GAP,
             parts=PARTS,
             apart=True,
             own=(made.functions,),

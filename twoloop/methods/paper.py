@@ -9,8 +9,8 @@ from twoloop.methods.plan import INNER_TOL, Plan, check_tolerances, outer_tolera
 from twoloop.methods.runge_kutta import RungeKutta
 from twoloop.methods.tableaux import gauss, sun_radau_iib
 
-NO_ESTIMATE = 0.02  # smallest |beta - 1/6|: below, Newmark's error estimate is too close to zero
-# outer tolerance relative to err_out; the fixed-point iterations converge so fast that this costs next to nothing
+NO_ESTIMATE = 0.02  # smallest |beta - 1/6| for Newmark's error estimate, which vanishes with it
+# ratio of the outer tolerance to err_out; the iterations converge so fast that a small ratio costs next to nothing
 OUTER_SHARE_OF_ERROR = 1e-3
 
 

@@ -1,4 +1,4 @@
-"""Plan of a run, as a method sets it up; and rules that the methods share."""
+"""Plan of a run, as a method sets it up, and rules that methods share."""
 
 from dataclasses import dataclass, fields
 from functools import cache
@@ -12,14 +12,14 @@ from twoloop.kernels.compile.caches import BoundedCache
 
 Array = NDArray[np.float64]
 
-# Newton's method in the inner loop converges quadratically and tests its last correction: about the square remains
+# Newton's method in the inner loop converges quadratically and tests its last correction: the error is about its square
 INNER_TOL = 1e-8
 LEAST_ERROR = 0.01  # `least_error` of the plans of most methods
 ROUGH = 10.0  # `rough` of the plans of most methods, measured
-# largest correction of a position after which a projection is not repeated: velocities are then off by as much
+# largest correction of a position after which a projection is not repeated: the error of velocities is then as small
 LARGEST_MOVE = 1e-14
 OUTER_SHARE = 0.01  # tolerance of the outer loop, relative to that of the step
-OUTER_TOL_FIXED = 1e-14  # a fixed step has no tolerance to derive it from: iterate to rounding
+OUTER_TOL_FIXED = 1e-14  # fixed steps have no tolerance: iterate to rounding
 LEAST_TOLERANCE = 1e-14  # lower limit of the tolerance that a loop has to reach
 
 
@@ -43,27 +43,27 @@ class Plan:
     least_error: float = 0.0  # lower limit of the error in the trend that the step size follows; 0: no trend
     rough: float = 1.0  # largest ratio of error to estimate of a step in which a force jumps
     reuse: float = 0.0  # correction of a position, within a step, up to which the previous Jacobian is used again
-    watchful: bool = False  # whether short steps cause a check for a singular position nearby
+    watchful: bool = False  # whether short steps trigger a check for a singular position nearby
     # whether steps evaluate accelerations without a projection, and call the projection separately
     projects: bool = False
     lands: bool = False  # whether steps are shortened to end at output times
     apart: bool = False  # whether errors of q and v are independent: then v is not the slope of q between steps
-    # memory -> largest h rho for which vibration and decay are stable, see kernels/control/stiffness.py
+    # function of `memory` that returns the largest stable h rho for vibration and for decay, see control/stiffness.py
     stable_to: Any = None
     inner: Any = None  # inner loop that calls generated code; None: the general one
     own: tuple[Any, ...] = ()  # generated functions, see kernels/data/common.py
-    numbers: Any = None  # coefficients that the inner loop's code reads ...
-    own_numbers: Any = None  # ... and those that the code for collocation reads
-    matrices: int = 0  # number of (n_q, n_q) matrices of Newton's method that the workspace needs
+    numbers: Any = None  # data of the generated functions of the inner loop ...
+    own_numbers: Any = None  # ... and of those of collocation
+    matrices: int = 0  # number of (n_q, n_q) matrices of Newton's method in the workspace
     parts: int = 1  # number of equal steps into which a step is divided to get the solution between its ends ...
     interior: "Plan | None" = None  # ... and the plan of these steps; None: the method itself
     # whether steps evaluate the equations between their ends; if not, their length is limited
     looks_within: bool = False
     unseen: float = 1.0  # longest part of such a step without an evaluation, relative to the step
     substitute: "Plan | None" = None  # plan that continues the run if values of this one are not finite
-    provisional: bool = False  # whether the substitute also takes over if steps are no longer than its own may be
+    provisional: bool = False  # whether the substitute also takes over if steps are not longer than it could take
     traced: tuple[Any, ...] = ()  # traces of the callbacks, for steps that rely on them: see traced_values.py
-    # plan of the steps that give the solution between the ends of Newton steps, with their `parts`; None: not divided
+    # plan of the `parts` of Newton steps, for the solution between their ends; None: these steps are not divided
     within_newton: "Plan | None" = None
 
     @property
@@ -88,9 +88,9 @@ class Plan:
 
 
 def takes_code(method: Any, fixed: bool) -> bool:
-    """Return whether steps of a method call only those functions of the inner loop that generated code has."""
-    said = getattr(method, "takes_code", None)
-    return said is not None and bool(said(fixed))
+    """Return whether steps of a method only call functions of the inner loop that generated code provides."""
+    takes = getattr(method, "takes_code", None)
+    return takes is not None and bool(takes(fixed))
 
 
 def needs_code(method: Any) -> bool:
@@ -99,7 +99,7 @@ def needs_code(method: Any) -> bool:
 
 
 def least_tolerance(rtol: float, atol: float) -> float:
-    """Return the smaller tolerance, but not less than rounding."""
+    """Return the smaller tolerance, but not less than LEAST_TOLERANCE."""
     return max(min(rtol, atol), LEAST_TOLERANCE)
 
 
@@ -109,7 +109,7 @@ def outer_tolerance(rtol: float, atol: float, fixed: bool) -> float:
 
 
 class Method(Protocol):
-    """Protocol of a method, as solve_dae uses it."""
+    """Interface of a method that solve_dae uses."""
 
     @property
     def name(self) -> str:
@@ -138,12 +138,12 @@ def check_choices(method: Any) -> None:
 _PLANS = BoundedCache()  # plans of methods that do not depend on the system
 
 
-def kept_plan(method: Method, n_q: int, rtol: float, atol: float) -> Plan:
-    """Return the cached plan of a method that does not depend on the system, for use in other plans."""
+def cached_plan(method: Method, n_q: int, rtol: float, atol: float) -> Plan:
+    """Return the cached plan of a method that does not depend on the system; other plans contain it."""
     key = (id(method), n_q, rtol, atol)
     known: tuple[Method, Plan] | None = _PLANS.get(key)
     if known is None:
-        # the method is stored, too: its id must not be reused
+        # store the method, too, so that no other object gets its id
         _PLANS[key] = known = method, method.plan(n_q, rtol, atol, False)
     return known[1]
 

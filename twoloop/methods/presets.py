@@ -49,7 +49,7 @@ PRESETS: dict[str, Method] = {
 }
 
 
-OWN = (
+OPTION_CLASSES = (
     Adams,
     BDF,
     DOP853,
@@ -59,31 +59,31 @@ OWN = (
     RungeKutta,
     Taylor,
 )  # methods that are determined by the values of their options
-PLAIN = (str, int, float, np.generic, type(None))  # types of such values, beside tableaux
+OPTION_TYPES = (str, int, float, np.generic, type(None))  # types of option values, in addition to tableaux
 _OF_PRESETS = frozenset(map(id, PRESETS.values()))
 
 
 def is_preset(method: Any) -> bool:
-    """Return whether a method is a preset or the name of one; these never change."""
+    """Return whether a method is a preset or the name of a preset; presets never change."""
     return isinstance(method, str) or id(method) in _OF_PRESETS
 
 
 def identity(method: Method) -> Any:
-    """Return a key shared by methods with the same options, by which runs are cached; None: the method has no key."""
+    """Return a key shared by methods with the same options, for caches of runs; None: the method has no key."""
     if is_preset(method):
         return id(method)
-    if type(method) not in OWN:
+    if type(method) not in OPTION_CLASSES:
         return None
     values = [value.content if type(value) is Tableau else value for value in vars(method).values()]
-    return (type(method), *values) if all(isinstance(value, (*PLAIN, tuple)) for value in values) else None
+    return (type(method), *values) if all(isinstance(value, (*OPTION_TYPES, tuple)) for value in values) else None
 
 
 Array = NDArray[np.float64]
 Compiled = bool | Literal["auto"]
 
-# largest number of operations of the series of a small mechanism; it does not depend on the position. Code of
-# mechanisms with 230 to 280 operations takes 0.6 s to build, two thirds of it in LLVM; with 370 to 690 it takes 0.7 to
-# 1.9 s (Bricard 1.6, governor 1.9, whose stiff motion takes a tenth longer with code)
+# largest number of operations in the series of a small mechanism, which does not depend on the position. Generated code
+# with 230 to 280 operations takes 0.6 s to build, two thirds of it in LLVM; with 370 to 690 it takes 0.7 to 1.9 s
+# (Bricard 1.6, governor 1.9, whose stiff motion takes a tenth longer with code)
 SMALL = 300
 
 
@@ -101,17 +101,17 @@ def check_compiled(value: Compiled) -> Compiled:
 def code_for(
     system: ConstrainedSystem, method: Method, fixed: bool, compiled: Compiled, t0: float, q0: Array, check: Check
 ) -> GeneratedCode | None:
-    """Return the generated code for a run, or None if the run gets none.
+    """Return the generated code for a run, or None if the run uses none.
 
-    "auto" depends only on the arguments of the call, so that the same call gives the same numbers whatever ran before.
+    "auto" depends only on the arguments of the call, so that the same call always gives the same numbers.
 
     Raises ValueError if code is requested but does not suit the method, or cannot be generated.
     """
     if compiled is True:
-        _refuse(method, fixed)
+        _check_takes_code(method, fixed)
         return generated_code(system, t0, q0, check)
     if needs_code(method):
-        return _needed(system, method, compiled, t0, q0, check)
+        return _required_code(system, method, compiled, t0, q0, check)
     if not may_have_code(system, method, fixed, compiled):
         return None
     try:
@@ -121,7 +121,7 @@ def code_for(
 
 
 def may_have_code(system: ConstrainedSystem, method: Method, fixed: bool, compiled: Compiled) -> bool:
-    """Return whether a run gets code if it can be generated."""
+    """Return whether a run uses generated code if it can be generated."""
     if needs_code(method):
         return True
     if compiled == "auto":
@@ -129,7 +129,7 @@ def may_have_code(system: ConstrainedSystem, method: Method, fixed: bool, compil
     return compiled
 
 
-def _needed(
+def _required_code(
     system: ConstrainedSystem, method: Method, compiled: Compiled, t0: float, q0: Array, check: Check
 ) -> GeneratedCode:
     """Return the code for a method that needs it, or raise ValueError."""
@@ -142,8 +142,8 @@ def _needed(
         raise ValueError(f"{what}, which cannot be had; {error.__cause__}. Take method='auto'") from error
 
 
-def _refuse(method: Method, fixed: bool) -> None:
-    """Raise if code does not suit the method, before it is generated."""
+def _check_takes_code(method: Method, fixed: bool) -> None:
+    """Raise ValueError if the method cannot use generated code; called before code is generated."""
     if not takes_code(method, fixed):
         implicit = " with step_size, by which it is implicit" if takes_code(method, False) else ""
         raise ValueError(
@@ -155,18 +155,18 @@ def _refuse(method: Method, fixed: bool) -> None:
 def is_small(system: ConstrainedSystem) -> bool:
     """Return whether the callbacks of a system are compiled, can be traced, and take few operations."""
 
-    def look() -> bool:
+    def takes_few_operations() -> bool:
         try:
             return is_quick(system) and series_for(system).n_operations <= SMALL
         except Untraceable:
             return False
 
-    return not system.called_in_python and bool(system.remembered("small", look))
+    return not system.called_in_python and bool(system.remembered("small", takes_few_operations))
 
 
-MOST = 16  # largest number of plans cached with a system
+MAX_PLANS = 16  # largest number of plans cached with a system
 
-# the plan of the steps, and by kind the plans of their parts, for the solution between their ends; runs may share these
+# the plan of the steps, and by kind of interval the plans for the solution within steps; runs may share the latter
 Plans = tuple[Plan, dict[int, Plan]]
 
 
@@ -185,31 +185,31 @@ def plans_for(
     """
     known, choice = identity(method), None if code is None else code.shared.equations.choice
     key, methods = (known, rtol, atol, fixed, choice), system.remembered("methods", dict)
-    kept: dict[tuple[object, ...], Plans] = system.remembered("plans", dict)
-    made = None if known is None else kept.get(key)
-    if made is None:
+    cached: dict[tuple[object, ...], Plans] = system.remembered("plans", dict)
+    plans = None if known is None else cached.get(key)
+    if plans is None:
         # the prepared method does not depend on tolerances
         ready = None if known is None else methods.get((known, choice))
         if ready is None:
             ready = method.for_system(system, code, check) if hasattr(method, "for_system") else method
-        made = _made(system, ready, rtol, atol, fixed, code)
-        settled = code is not None or _series(ready) == _series(method)
-        if known is not None and settled and all(each.trusted for each in made[0].traced):
-            while len(kept) >= MOST:  # a loop, because other threads may add plans
-                kept.pop(next(iter(kept.copy())), None)
-            kept[key] = made
-            if len(methods) < MOST:
+        plans = _make_plans(system, ready, rtol, atol, fixed, code)
+        is_final = code is not None or _has_series(ready) == _has_series(method)
+        if known is not None and is_final and all(each.trusted for each in plans[0].traced):
+            while len(cached) >= MAX_PLANS:  # a loop, because other threads may add plans
+                cached.pop(next(iter(cached.copy())), None)
+            cached[key] = plans
+            if len(methods) < MAX_PLANS:
                 methods[known, choice] = ready
-    plan, interiors = made
+    plan, interiors = plans
     return plan.fresh(), interiors
 
 
-def _series(method: Method) -> bool:
-    """Return whether a method has a series: it may lose it for one start, if `check` finds other values."""
+def _has_series(method: Method) -> bool:
+    """Return whether a method has a series, which it loses for one start if `check` finds other values."""
     return getattr(method, "series", None) is not None
 
 
-def _made(
+def _make_plans(
     system: ConstrainedSystem, method: Method, rtol: float, atol: float, fixed: bool, code: GeneratedCode | None
 ) -> Plans:
     plan = method.plan(system.n_q, rtol, atol, fixed)

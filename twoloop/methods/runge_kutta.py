@@ -20,15 +20,15 @@ from twoloop.methods.plan import (
 )
 from twoloop.methods.tableaux import Tableau
 
-NEWTON_TOL_FIXED = 1e-12  # outer tolerance of fixed steps by Newton's method, as stiff forces magnify rounding
+NEWTON_TOL_FIXED = 1e-12  # outer tolerance of fixed steps by Newton's method, because stiff forces magnify rounding
 # h rho above which the fixed-point iteration converges slowly, so that Newton's method is tried
 LIMIT_OF_FIXED_POINT = 1.5
-# largest condition number of the eigenvectors of A that count as a basis; 1 over it: smallest nonzero eigenvalue
+# largest condition number of the eigenvectors of A that count as a basis; its inverse: smallest nonzero eigenvalue
 ILL_CONDITIONED = 1e8
-# number of parts of a step by the highest order for which it suffices: with fewer parts the error between steps is more
-# than a few times that at the steps (four-bar linkage, tolerances of 1e-4 to 1e-12)
+# number of parts of a step for the solution within it, by the highest order for which the number suffices: with fewer
+# parts the error is more than a few times that at the ends (four-bar linkage, tolerances of 1e-4 to 1e-12)
 PARTS = {5: 1, 6: 2, 8: 3, 10: 4, np.inf: 6}
-UNDIVIDED = 6  # highest order for which steps by Newton's method, whose accelerations are of no use, are not divided
+UNDIVIDED = 6  # highest order for which Newton steps are not divided (accelerations cannot be used for interpolation)
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,7 @@ class RungeKutta:
         return made.changed(within_newton=made.changed(memory=made.memory.copy(), parts=tableau.stages - 1))
 
     def _parts(self) -> int:
-        """Return the number of parts of a step that makes the solution between its ends as accurate."""
+        """Return the number of parts of a step that makes the solution within it as accurate as that at its ends."""
         if self.outer in ("newton", "paper"):
             return 1
         return next(parts for order, parts in PARTS.items() if self.tableau.order <= order)
@@ -201,11 +201,11 @@ class RungeKutta:
 
 Array = NDArray[np.float64]
 
-# correction over the tolerance at which iteration stops: it is still applied, and convergence is quadratic
+# ratio of the correction to the tolerance at which iteration stops: it is applied first, and convergence is quadratic
 STAGE_SHARE = 3.0
-LOOSEST_OUTER = 3e-3  # relative: with larger corrections stiff problems are solved so badly that steps become short
-FEW_STEPS = 1e-3  # tolerance below which the share decreases with the number of steps, over which corrections add up
-STAGE_TOL_FIXED = 1e-12  # relative; stiff forces magnify rounding
+LOOSEST_OUTER = 3e-3  # relative: larger corrections solve stiff problems so inaccurately that steps become short
+FEW_STEPS = 1e-3  # below it the share decreases with the number of steps, over which corrections add up
+STAGE_TOL_FIXED = 1e-12  # relative, for fixed steps, because stiff forces magnify rounding
 STAGE_SAFETY = 0.8  # with 0.9 one attempt in seven is rejected if the motion is not smooth, as for the stiff beam
 
 
@@ -235,11 +235,11 @@ FORMULAS = {"TRBDF2": (_trbdf2, 2), "ESDIRK4": (_esdirk4, 4)}  # with their orde
 def _jump_weights(c: Array) -> Array:
     """Return weights of ESDIRK4's stages, exact for quadratic accelerations, that detect a jump at any place in a step.
 
-    Their sum over the stages behind a jump is about half of the largest error of the step.
+    The sum of the weights of the stages after a jump is about half of the largest error of the step.
     """
     order = np.argsort(c)
     at = c[order]
-    behind = np.array([0.1392, 0.0, -0.16, -0.16, 0.0])  # the second and the last follow from exactness, see below
+    behind = np.array([0.1392, 0.0, -0.16, -0.16, 0.0])  # exactness below determines the second and the last weight
     moments = np.array([np.diff(at), np.diff(at**2)])
     behind[[1, 4]] = np.linalg.solve(moments[:, [1, 4]], -moments @ behind)
     weights = np.zeros(len(c))
@@ -248,8 +248,8 @@ def _jump_weights(c: Array) -> Array:
 
 
 LOWER = {"TRBDF2": np.zeros(3), "ESDIRK4": _jump_weights(_esdirk4()[0].sum(axis=1))}
-# `rough` of their plans: the weights of ESDIRK4 differ from the embedded ones by 0.04 at most, and if a force jumps in
-# the first half of a step, the estimate is 1/300 of the error
+# `rough` of their plans: the weights of ESDIRK4 differ from the embedded ones by 0.04 at most, so that the estimate is
+# 1/300 of the error if a force jumps in the first half of a step
 ROUGH_OF_FORMULAS = {"TRBDF2": 1.0, "ESDIRK4": 300.0}
 
 

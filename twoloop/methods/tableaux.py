@@ -1,8 +1,8 @@
 """Runge-Kutta tableaux, generated for any number of stages.
 
-Every family is the collocation method at its nodes, made symplectic by averaging with its symplectic adjoint where
-the family asks for it: A_S = (A + B)/2 with B_ij = b_j (1 - A_ji / b_i). Sun's Radau IIB is that average of Radau IIA
-(its 3-stage tableau is Table 1 of Zhang & Zhang 2016), Lobatto IIIE that of Lobatto IIIA.
+Every family is the collocation method at its nodes. Symplectic families average it with its symplectic adjoint: A_S =
+(A + B)/2 with B_ij = b_j (1 - A_ji / b_i). Sun's Radau IIB is this average of Radau IIA (its 3-stage tableau is Table 1
+of Zhang & Zhang 2016), Lobatto IIIE that of Lobatto IIIA.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from twoloop.checks.arguments import check_real, check_size, check_text, check_v
 Array = NDArray[np.float64]
 
 CONSISTENT = 1e-12  # relative to the sum of magnitudes of coefficients: rounding error of their sum
-MOST_STAGES = 100  # largest number of stages: longer steps than these suit no motion, as none is smooth for so long
+MOST_STAGES = 100  # largest number of stages: no motion is smooth for as long as steps with more stages would be
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +112,7 @@ def _collocation(c: Array) -> tuple[Array, Array]:
     values = np.column_stack([p(x) for p in basis])
     integrals = np.column_stack([p.integ(lbnd=-1)(x) / 2.0 for p in basis])
     A = np.asarray(np.linalg.solve(values.T, integrals.T).T, dtype=np.float64)
-    b = np.asarray(np.linalg.solve(values.T, np.eye(s)[0]), dtype=np.float64)  # only P_0 has an integral over [0, 1]
+    b = np.asarray(np.linalg.solve(values.T, np.eye(s)[0]), dtype=np.float64)  # the integrals of P_1, P_2, ... are zero
     return A, b
 
 

@@ -18,12 +18,12 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 LOWEST, HIGHEST = 4, 40  # limits of the option `order`
-PER_DIGIT, LEAST = 1.15, 5.0  # order = LEAST + PER_DIGIT digits: about the cheapest on the mechanisms of the bench
+PER_DIGIT, LEAST = 1.15, 5.0  # order = LEAST + PER_DIGIT digits: about the cheapest on the benchmark mechanisms
 PER_DIGIT_IN_LANES, LEAST_IN_LANES = 1.25, 3.5  # the same for code in SIMD lanes
 FIXED = 19  # order of fixed steps
-# number of parts of a step for the solution between its ends: states of the step's series, projected
-FEWEST, MOST = 3, 6
-PADDED = 8  # the number of operations in a table is padded to a multiple of this
+# limits of the number of parts of a step for the solution within it: states of the step's series, projected
+MIN_PARTS, MAX_PARTS = 3, 6
+PADDING = 8  # a table is padded to a multiple of this number of operations
 
 
 def order_in_lanes(rtol: float, atol: float) -> int:
@@ -124,7 +124,7 @@ class Taylor:
         elif order is None:
             order = _order(rtol, atol, LEAST, PER_DIGIT)
         highest = order + 1
-        widths = [-(-len(table.first.column) // PADDED) * PADDED for table in (program.early, program.late)]
+        widths = [-(-len(table.first.column) // PADDING) * PADDING for table in (program.early, program.late)]
         plan = Plan(
             kernels.TAYLOR,
             _options(program, highest, widths),
@@ -135,7 +135,7 @@ class Taylor:
             watchful=True,
             projects=True,
             looks_within=True,
-            parts=min(max(highest // 3, FEWEST), MOST),
+            parts=min(max(highest // 3, MIN_PARTS), MAX_PARTS),
             traced=(program.traced,),
         )
         kept = plan.options.copy()

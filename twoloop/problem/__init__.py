@@ -1,1 +1,1 @@
-"""Parts of a model that a user writes: systems, callbacks in plain Python, joints, events, drawings, and problems."""
+"""What a user writes: systems, callbacks in plain Python, joints, events, drawings, and problems."""

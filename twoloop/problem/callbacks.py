@@ -1,4 +1,4 @@
-"""Turn plain functions and entries of matrices into callbacks, and substitute those left out."""
+"""Turn plain functions and matrices given by entries into callbacks, and replace callbacks that are not given."""
 
 import ctypes
 import inspect
@@ -24,13 +24,13 @@ from twoloop.kernels.compile.linking import Dispatcher
 Integers = NDArray[np.int64]
 Entries = tuple[Integers, Integers]  # row and column indices
 
-LARGE = 64  # number of coordinates from which on entries are faster than dense matrices; on chains of bars it is 36
+LARGE = 64  # number of coordinates from which on entries are faster than dense matrices (from 36 on for chains of bars)
 # kinds that return the values of entries, by their dense kinds
 VALUES_OF = {"mass": "mass_values", "jacobian": "jacobian_values"}
 
 
 def check_entries(name: str, given: Any, shape: tuple[int, int], symmetric: bool) -> Entries:
-    """Return the rows and columns of the entries of a matrix as vectors, or say what is wrong with them."""
+    """Return the rows and columns of the entries of a matrix as vectors, or raise if they are wrong."""
     try:
         rows, columns = map(np.asarray, given)
     except (TypeError, ValueError):
@@ -62,7 +62,7 @@ def _check_both_triangles(name: str, rows: Integers, columns: Integers) -> None:
 
 
 def dense_callback(kind: str, values: Dispatcher, entries: Entries) -> Dispatcher:
-    """Compile the dense callback "mass" or "jacobian" from one that returns values at these entries."""
+    """Compile the dense callback "mass" or "jacobian" from a callback that returns values at these entries."""
     rows, columns = entries
     n = len(rows)
 
@@ -77,7 +77,7 @@ def dense_callback(kind: str, values: Dispatcher, entries: Entries) -> Dispatche
 
 @dataclass(frozen=True, eq=False)
 class DenseFunction:
-    """Make the dense matrix of a plain Python function that returns values of entries; called in the same way."""
+    """Build the dense matrix from a plain Python function that returns values of entries; called in the same way."""
 
     values: Callable[..., Any]
     entries: Entries
@@ -87,7 +87,7 @@ class DenseFunction:
         """Return the matrix; of symbols if the function returns symbols."""
         values = np.asarray(self.values(t, q, *p))
         if values.shape != self.entries[0].shape:
-            return values  # its shape is refused when it is stored
+            return values  # the caller refuses its shape
         matrix = np.zeros(self.shape, dtype=values.dtype if values.dtype == object else np.float64)
         for i, j, value in zip(*(indices.tolist() for indices in self.entries), values, strict=True):
             matrix[i, j] = matrix[i, j] + value
@@ -96,7 +96,7 @@ class DenseFunction:
 
 # first displacement, relative to max(1, |q|); a power of two, so that q + displacement is exact
 FIRST_DISPLACEMENT = 2.0**-6
-SHRINKAGE = 0.125  # factor after a displacement over which the constraints bend too much
+SHRINKAGE = 0.125  # factor on the next displacement, if the constraints bend too much over this one
 N_DISPLACEMENTS = 9
 AGREEMENT = 1e-11  # relative to an entry: if the formulas of order 6 and 8 agree to this, the displacement is kept
 ROUNDING = 1e-14  # rounding error of a constraint, relative to its largest value at the displaced points
@@ -113,9 +113,9 @@ def differenced_jacobian(constraint: Dispatcher) -> Dispatcher:
     Central differences of order 8 at four displacements to either side, multiples of 1/64 of max(1, |q_j|) for each
     coordinate: 8 n_q calls of the constraint. If a formula of order 6 at the same points differs by more than 1e-11 of
     an entry, the constraint bends on a shorter scale (a coordinate of 3e5 m on a bar of 1 m, a mechanism of
-    micrometres). The displacements are then shortened by 8, again and again, at another 8 calls each, and each entry is
-    taken where the two formulas agree best. For constraints that are smooth on the scale of a metre and a radian,
-    entries are good to about 1e-13 of the largest term in the constraint.
+    micrometres). Displacements are then repeatedly divided by 8, at another 8 calls each, and each entry is taken where
+    the two formulas agree best. For constraints that are smooth on the scale of a metre and a radian, entries are good
+    to about 1e-13 of the largest term in the constraint.
     """
 
     def jacobian(t, q, p, Cq):  # type: ignore[no-untyped-def]
@@ -149,7 +149,7 @@ def differenced_jacobian(constraint: Dispatcher) -> Dispatcher:
                         best[i] = doubt
                         Cq[i, j] = entry
                     elif not np.isfinite(doubt) and best[i] == np.inf:
-                        Cq[i, j] = entry  # nothing finite so far
+                        Cq[i, j] = entry  # no finite entry so far
                     accepted &= abs(high[i] - low[i]) <= AGREEMENT * abs(high[i]) + ROUNDING * size[i]
                 if accepted:
                     break
@@ -158,25 +158,25 @@ def differenced_jacobian(constraint: Dispatcher) -> Dispatcher:
     return compile_callback("jacobian", jacobian, digests_of(jacobian))
 
 
-Address = tuple[int, tuple[int, ...]]  # address and shape of a contiguous float64 array: numba boxes an array in 0.5 us
+Address = tuple[int, tuple[int, ...]]  # address and shape of a contiguous float64 array, whose boxing would take 0.5 us
 
 KIND_NAMES = tuple(KINDS)
 _ARRAYS: dict[Address, Array] = {}  # by address: arrays of a run do not move
 MAX_ARRAYS = 1000
-REAL = "fiu"  # kinds of dtypes; NumPy counts durations as integers, and these are no forces
-HANDLE_BITS = 52  # a float64 holds the handle exactly; a handle of another process matches none of this one
+REAL_DTYPES = "fiu"  # kinds of real dtypes; durations, which NumPy counts as integers, are excluded
+HANDLE_BITS = 52  # so that a float64 holds a handle exactly, and handles of different processes differ
 
 
 class PythonFunctions:
-    """Register the plain Python functions of a system, which the compiled `through_python` calls.
+    """Register the plain Python functions of a system, so that the compiled `through_python` can call them.
 
-    The handle, stored before the parameters, leads to them. It is valid in this process and its forks; unpickled
-    elsewhere, the functions are registered again. Functions of the kinds in `taking` get the parameters.
+    A number, the handle, is stored before the parameters and identifies this object. It is valid in this process and
+    its forks; unpickling registers the functions again. Functions of the kinds in `taking` get the parameters.
 
     Attributes
     ----------
     samples : list of (arguments, value)
-        Forces of the calls 1, 2, 4, 8, ... since `restart`, which have to come out again at the end of a run.
+        Forces of the calls 1, 2, 4, 8, ... since `restart`, which are computed again and compared at the end of a run.
     """
 
     registry: ClassVar[WeakValueDictionary[float, "PythonFunctions"]] = WeakValueDictionary()
@@ -188,12 +188,12 @@ class PythonFunctions:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the samples: a run begins."""
+        """Forget the samples at the beginning of a run."""
         self.samples: list[tuple[tuple[Any, ...], Any]] = []
         self._calls, self._next = 0, 1
 
     def call(self, kind: str, arguments: tuple[Any, ...], p: Address, out: Array) -> None:
-        """Call one function with copies of the arrays, check what comes back and write it to `out`."""
+        """Call one function with copies of the arrays, check the returned value and write it to `out`."""
         t = arguments[0]
         if kind in self.taking:
             arguments = (*arguments, array_at(*p)[1:].copy())
@@ -211,10 +211,10 @@ class PythonFunctions:
 
 
 def store(kind: str, name: str, t: float, value: Any, out: Array) -> None:
-    """Write what a Python function returned to `out`; raise if its shape or type is wrong."""
+    """Write the value that a Python function returned to `out`; raise if its shape or type is wrong."""
     try:
         array = np.asarray(value)
-        real = array.dtype.kind in REAL
+        real = array.dtype.kind in REAL_DTYPES
     except ValueError:
         real = False
     if not real:
@@ -253,23 +253,23 @@ def _call(number: int, handle: float, t: float, state: tuple[Address, ...], p: A
 
 @cache
 def through_python(kind: str) -> Dispatcher:
-    """Compile the callback that calls the Python function of this kind to which `p` leads."""
+    """Compile the callback that calls the Python function of this kind, which the handle in `p` identifies."""
     place = KIND_NAMES.index(kind)
 
-    def with_two(t, q, p, out):  # type: ignore[no-untyped-def]
+    def at_position(t, q, p, out):  # type: ignore[no-untyped-def]
         number, handle = place, p[0] if p.size > 0 else np.nan
         at_q, at_p, at_out = (q.ctypes.data, q.shape), (p.ctypes.data, p.shape), (out.ctypes.data, out.shape)
         with objmode():
             _call(number, handle, t, (at_q,), at_p, at_out)
 
-    def with_three(t, q, x, p, out):  # type: ignore[no-untyped-def]
+    def at_state(t, q, x, p, out):  # type: ignore[no-untyped-def]
         number, handle = place, p[0] if p.size > 0 else np.nan
         at_q, at_x = (q.ctypes.data, q.shape), (x.ctypes.data, x.shape)
         at_p, at_out = (p.ctypes.data, p.shape), (out.ctypes.data, out.shape)
         with objmode():
             _call(number, handle, t, (at_q, at_x), at_p, at_out)
 
-    callback_function = with_two if len(KINDS[kind].state) == 1 else with_three
+    callback_function = at_position if len(KINDS[kind].state) == 1 else at_state
     callback = compile_callback(kind, callback_function, ("through Python", str(place)))
     digest_as(callback, digest_of(f"through Python, {place}", __file__))
     return callback
@@ -285,10 +285,10 @@ def _fill(value, out):  # type: ignore[no-untyped-def]
 def compile_returning(kind: str, function: Callable[..., Any], takes_p: bool) -> Dispatcher:
     """Compile a function that returns its array, and wrap it to the in-place signature of its kind.
 
-    The machine code is kept beside the source of the function, if it has one.
+    The machine code is stored beside the source file of the function, if there is one.
     """
     if isinstance(function, ConstantMatrix):
-        matrix = function.matrix  # numba knows what a function encloses, but not the attributes of an object
+        matrix = function.matrix  # numba freezes what a function encloses, but not the attributes of an object
 
         def function(t, q):  # type: ignore[no-untyped-def]
             return matrix
@@ -301,35 +301,35 @@ def compile_returning(kind: str, function: Callable[..., Any], takes_p: bool) ->
     user = function if isinstance(function, Dispatcher) else njit(with_unique_name(function, digests_of(function)))
     message = f"{kind} returned an array of the wrong shape"
 
-    def with_two(t, q, p, out):  # type: ignore[no-untyped-def]
+    def at_position(t, q, p, out):  # type: ignore[no-untyped-def]
         value = user(t, q)
         if value.shape != out.shape:
             raise ValueError(message)
         _fill(value, out)
 
-    def with_three(t, q, x, p, out):  # type: ignore[no-untyped-def]
+    def at_state(t, q, x, p, out):  # type: ignore[no-untyped-def]
         value = user(t, q, x)
         if value.shape != out.shape:
             raise ValueError(message)
         _fill(value, out)
 
-    def with_two_and_p(t, q, p, out):  # type: ignore[no-untyped-def]
+    def at_position_with_p(t, q, p, out):  # type: ignore[no-untyped-def]
         value = user(t, q, p)
         if value.shape != out.shape:
             raise ValueError(message)
         _fill(value, out)
 
-    def with_three_and_p(t, q, x, p, out):  # type: ignore[no-untyped-def]
+    def at_state_with_p(t, q, x, p, out):  # type: ignore[no-untyped-def]
         value = user(t, q, x, p)
         if value.shape != out.shape:
             raise ValueError(message)
         _fill(value, out)
 
-    wrappers: Any = ((with_two, with_two_and_p), (with_three, with_three_and_p))
+    wrappers: Any = ((at_position, at_position_with_p), (at_state, at_state_with_p))
     in_place = wrappers[len(KINDS[kind].state) > 1][takes_p]
     watched = digests_of(in_place)
     code = user.py_func.__code__
-    # numba caches machine code beside the file that the code claims to come from: that of the user's function
+    # numba stores machine code beside the file that the code object names: name that of the user's function
     in_place.__code__ = in_place.__code__.replace(co_filename=code.co_filename, co_firstlineno=code.co_firstlineno)
     in_place.__qualname__ = f"{user.py_func.__qualname__}.{kind}"
     return compile_callback(kind, in_place, watched, named=user.py_func)
@@ -337,7 +337,7 @@ def compile_returning(kind: str, function: Callable[..., Any], takes_p: bool) ->
 
 @dataclass(frozen=True, eq=False)
 class ConstantMatrix:
-    """Return a constant mass matrix as mass(t, q)."""
+    """Return a constant mass matrix when called as mass(t, q)."""
 
     matrix: Array
 
@@ -354,7 +354,7 @@ def check_arguments(kind: str, function: Callable[..., Any], parameters: bool) -
     Raises
     ------
     TypeError
-        If it names its arguments t, q, v, but in another order, or takes another number of them.
+        If the function names its arguments t, q, v in another order, or takes another number of arguments.
     """
     expected = ("t", *KINDS[kind].state)
     try:
@@ -421,7 +421,7 @@ def given_callbacks(callbacks: dict[str, Any], n_c: int, n_a: int) -> dict[str, 
 
 
 def _is_left_out(kind: str, callbacks: dict[str, Any]) -> bool:
-    """Return whether a kind is missing, None, or the stand-in that another system has in its place."""
+    """Return whether a kind is missing, None, or the replacement that another system uses for it."""
     entry, given = KINDS[kind], callbacks.get(kind)
     if given is None:
         return kind not in callbacks or entry.optional or kind == "mass"  # mass_values may replace it
@@ -429,7 +429,7 @@ def _is_left_out(kind: str, callbacks: dict[str, Any]) -> bool:
 
 
 def checked_entries(callbacks: dict[str, Any], n_q: int, n_c: int, mass: Any, jacobian: Any) -> dict[str, Entries]:
-    """Return the rows and columns of entries of M and C_q whose values callbacks return; raise if they do not fit."""
+    """Return the rows and columns of the entries of M and C_q whose values are given; raise if they do not fit."""
     checked: dict[str, Entries] = {}
     for kind, entries, shape in (("mass", mass, (n_q, n_q)), ("jacobian", jacobian, (n_c, n_q))):
         values, name = VALUES_OF[kind], f"{kind}_entries"
@@ -487,7 +487,7 @@ def plain_functions(
 
 
 def substitute(kind: str, given: dict[str, Dispatcher]) -> Dispatcher:
-    """Return the callback that stands in for one that is not given."""
+    """Return the replacement of a callback that is not given."""
     if KINDS[kind].absent != "differences" or "constraint" not in given:
         return zero_callback(kind)
     return differenced_jacobian(given["constraint"])

@@ -1,4 +1,4 @@
-"""Compiled functions of a system: source generated from equations, values that numba froze, pickles."""
+"""Compiled functions of a system: generated source, values that numba has frozen, and pickling."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class GeneratedCode:
-    """Hold the callbacks of a mechanism and its energy as source.
+    """Source code of the callbacks of a mechanism and of its energy.
 
     Attributes
     ----------
     key : str
         Digest of the equations.
     source : str
-        A function for each callback, under the name of its kind, and energy(t, q, v, p).
+        One function for each callback, named by its kind, and energy(t, q, v, p).
     """
 
     key: str
@@ -58,7 +58,7 @@ class GeneratedCode:
 
     @classmethod
     def stored(cls, key: str) -> GeneratedCode | None:
-        """Read what an earlier process wrote for these equations; None without a file, or if it is damaged."""
+        """Read the source that an earlier process wrote for these equations; None if it is missing or damaged."""
         try:
             digest, _, source = read_trusted(_path(key)).decode("utf-8").partition("\n")
         except (OSError, UnicodeDecodeError):
@@ -71,7 +71,7 @@ class GeneratedCode:
         return [kind for kind in KINDS if f"def {kind}(" in self.source]
 
     def value(self, name: str) -> Any:
-        """Return what the source defines under a name: functions as plain Python."""
+        """Return the object that the source defines under a name: functions as plain Python."""
         return _functions(self)[name]
 
     def callback(self, kind: str) -> Dispatcher:
@@ -81,7 +81,7 @@ class GeneratedCode:
 
 @dataclass(frozen=True)
 class GeneratedEnergy:
-    """Evaluate kinetic plus potential energy, J, at t, q and v: of one state or of the columns of many."""
+    """Evaluate kinetic plus potential energy, J, at t, q and v: for one state or for the columns of many."""
 
     code: GeneratedCode
     parameters: tuple[float, ...]
@@ -92,7 +92,7 @@ class GeneratedEnergy:
 
 
 def code_of(function: Any) -> GeneratedCode | None:
-    """Return the generated code that a compiled callback comes from, or None."""
+    """Return the generated code from which a callback was compiled, or None."""
     code = function.py_func.__globals__.get("GENERATED")
     return code if isinstance(code, GeneratedCode) else None
 
@@ -105,12 +105,12 @@ def _functions(code: GeneratedCode) -> dict[str, Any]:
 
 
 def module_of(name: str, path: Path, text: str, missing: bool, names: dict[str, Any]) -> dict[str, Any]:
-    """Execute generated source, with the names that it uses, as a module; write it to a file first if it is missing."""
+    """Execute generated source as a module with the given names; first write it to a file if that is missing."""
     if missing:
         _write(path, text)
     module = types.ModuleType(name)
     vars(module).update(names)
-    sys.modules[name] = module  # numba reads no machine code of functions whose module it cannot import
+    sys.modules[name] = module  # numba loads machine code only for functions whose module can be imported
     exec(compile(text, str(path), "exec"), vars(module))
     linecache.checkcache(str(path))
     return vars(module)
@@ -131,7 +131,7 @@ def _head(source: str) -> str:
 
 
 def _write(path: Path, text: str) -> None:
-    """Write a file atomically; where none can be written, every process derives and compiles."""
+    """Write a file atomically; if no folder can be written, every process derives and compiles again."""
     unfinished = path.with_suffix(f".{uuid.uuid4().hex}")
     try:
         make_trusted_folder(path.parent)
@@ -144,7 +144,7 @@ def _write(path: Path, text: str) -> None:
 
 
 class Change(NamedTuple):
-    """Value that has changed since it was compiled: the callback, the name in it, and both values."""
+    """Value that has changed since compilation: the callback, the name in it, and both values."""
 
     kind: str
     name: str
@@ -152,7 +152,7 @@ class Change(NamedTuple):
     now: Any
 
     def message(self, system: str) -> str:
-        """Return what is wrong and what to do."""
+        """Return the error message: what has changed, and what to do."""
         number = "" if callable(self.compiled) else f"pass {self.name} through parameters, "
         return (
             f"{self.kind} of {system!r} was compiled with {self.name} = {shown(self.compiled)}, which is "
@@ -162,12 +162,12 @@ class Change(NamedTuple):
 
 
 class FrozenValues:
-    """Keep the values that numba froze into compiled callbacks, to detect that they changed since.
+    """Values that numba froze into compiled callbacks, stored to detect later changes.
 
     Parameters
     ----------
     callbacks : dict of str to Dispatcher
-        By kind. Compiled helpers are followed, and tuples, and modules of the user.
+        Callbacks by kind. Their compiled helpers, tuples and the user's modules are followed.
     """
 
     def __init__(self, callbacks: dict[str, Dispatcher]):
@@ -184,7 +184,7 @@ class FrozenValues:
         self.any = bool(cells or names or arrays)
 
     def change(self) -> Change | None:
-        """Return the first change, or None. Every `solve_dae` checks, so this calls hardly anything."""
+        """Return the first change, or None. It must be fast, because every call of `solve_dae` checks it."""
         for cell, value, kind, name in self._cells:
             if cell.cell_contents is not value and _differ(cell.cell_contents, value):
                 return Change(kind, name, value, cell.cell_contents)
@@ -198,7 +198,7 @@ class FrozenValues:
 
 
 def _differ(a: Any, b: Any) -> bool:
-    """Return whether two values differ to a compiled function; helpers do if their codes or numbers do."""
+    """Return whether two values differ for a compiled function; helpers are compared by code and frozen values."""
     if a is b:
         return False
     if isinstance(a, tuple) and isinstance(b, tuple):
@@ -220,7 +220,7 @@ def _code_of(helper: Any) -> str:
 
 
 class PickledCall:
-    """Object that pickles as a call, `find(*arguments)`, which the other process makes."""
+    """Object that is pickled as a call, `find(*arguments)`, which unpickling makes."""
 
     def __init__(self, find: Callable[..., Any], *arguments: Any):
         self.call = find, arguments
@@ -230,12 +230,12 @@ class PickledCall:
 
 
 def by_name(module: str, name: str) -> Any:
-    """Return a compiled callback at the top level of a module; AttributeError or ImportError if there is none."""
+    """Return a compiled callback at the top level of a module; raise AttributeError or ImportError if there is none."""
     return attrgetter(name)(importlib.import_module(module))
 
 
 def portable(system_name: str, kind: str, function: Any) -> Any:
-    """Return what to pickle in place of a function.
+    """Return the object to pickle in place of a function.
 
     Raises
     ------
@@ -248,7 +248,7 @@ def portable(system_name: str, kind: str, function: Any) -> Any:
         path = function.py_func.__module__, function.py_func.__qualname__
         try:
             return PickledCall(by_name, *path) if by_name(*path) is function else function
-        except (AttributeError, ImportError):  # made within a function: numba sends its source along
+        except (AttributeError, ImportError):  # defined within a function: numba pickles its source
             return function
     try:
         pickle.dumps(function)
@@ -264,7 +264,7 @@ def portable(system_name: str, kind: str, function: Any) -> Any:
 
 
 def pickled(system: ConstrainedSystem) -> tuple[Any, ...]:
-    """Return the arguments of `unpickled`, beside the class of the system."""
+    """Return the arguments of `unpickled`, except the class of the system."""
     plain = system._returning or system.python_functions
     options: dict[str, Any] = {"n_q": system.n_q, "n_c": system.n_c, "n_a": system.n_a}
     options |= {"bandwidth": system.bandwidth, "joints": system.joints, "name": system.name}
@@ -292,7 +292,7 @@ def unpickled(
     flags: Array,
     description: Description,
 ) -> ConstrainedSystem:
-    """Make the pickled system from the functions that this process finds by the same names."""
+    """Create the pickled system from the functions that this process finds under the same names."""
     for kind in ("mass", "mass_values") if plain else ():
         if isinstance(functions.get(kind), ConstantMatrix):
             functions[kind] = functions[kind].matrix

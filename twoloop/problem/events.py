@@ -12,7 +12,7 @@ import numpy as np
 from twoloop.checks.arguments import Array, check_call, shown
 
 SAMPLES = 4  # least number of parts of a step, at whose ends the sign is checked
-WHOLE = 1.0 - 1e-9  # so that rounding does not add a part to a step of SAMPLES times the time between samples
+WHOLE = 1.0 - 1e-9  # factor on the number of parts before rounding up, so that rounding errors do not add a part
 PRECISION = 4.0 * float(np.finfo(float).eps)  # relative precision of the time of an event, as in SciPy
 # iterations of Brent's method, which halves the interval at least every 53rd time: for zeros of high order
 MAX_ITERATIONS = 3000
@@ -21,7 +21,7 @@ _checked: WeakSet[FunctionType] = WeakSet()  # functions whose arguments were ch
 
 
 class States(Protocol):
-    """Interpolate the states of a run as rows [q, v]."""
+    """Interface of interpolants of a run, whose states are rows [q, v]."""
 
     def at(self, times: Array) -> Array:
         """Return the rows at sorted times."""
@@ -34,7 +34,7 @@ class States(Protocol):
 
 @dataclass(frozen=True)
 class Event:
-    """Hold an event function with its checked attributes."""
+    """Event function with its checked attributes."""
 
     number: int
     function: Callable[..., Any]
@@ -43,7 +43,7 @@ class Event:
 
     @property
     def name(self) -> str:
-        """Return the name that messages show."""
+        """Return the name of the function, for messages."""
         name = getattr(self.function, "__name__", "")
         return f"events[{self.number}]" + (f" ({name})" if name and name != "<lambda>" else "")
 
@@ -137,7 +137,7 @@ class EventSearch:
         """Search the steps that end at ends[1:], the first of which begins at ends[0]; stop at a terminal event."""
         if len(ends) < 2 or self.ended is not None:
             return
-        # all samples of many steps in one evaluation of the dense solution, which is several times faster
+        # evaluate all samples of many steps in one call of the dense solution, which is several times faster
         steps = np.diff(ends)
         counts = np.maximum(SAMPLES, np.ceil(WHOLE * steps / self._every)).astype(int)
         first = np.append(0, np.cumsum(counts))
@@ -156,12 +156,12 @@ class EventSearch:
                 return
 
     def break_off(self) -> None:
-        """Drop the events of a step whose search was interrupted."""
+        """Drop the events of a step whose search was interrupted by an exception."""
         if self.ended is None:
             self.found = [[(t, row) for t, row in events if t <= self.reached] for events in self.found]
 
     def _with_turns(self, states: States, times: Array, rows: Array) -> tuple[Array, Array]:
-        """Add the times at which a gap ceases to close: it may be open at both samples and closed between them."""
+        """Insert times at which a gap's rate changes its sign: a gap may be open at both samples, closed between."""
         if not self._rates:
             return times, rows
         states_at = zip(times.tolist(), *np.split(rows, 2, axis=1), strict=True)
@@ -200,7 +200,7 @@ class EventSearch:
                 self.reached, end = end, next(steps, np.inf)
 
     def _record(self, roots: list[tuple[float, Array, Event]]) -> None:
-        """Record the events up to the first terminal one, and those at the same time."""
+        """Record the events up to the first terminal one, and others at the same time."""
         for t, row, event in roots:
             if self.ended is not None and t > self.ended[1]:
                 return
@@ -213,7 +213,7 @@ class EventSearch:
 def _root(
     event: Callable[..., float], states: States, ends: tuple[float, float], values: tuple[float, float]
 ) -> tuple[float, Array]:
-    """Return when an event is zero between two times of known values, to rounding, and the row [q, v] then."""
+    """Return the time, to rounding, at which an event is zero between two times of known values, and the row there."""
     from scipy.optimize import brentq  # takes a tenth of a second to import, and few runs need it
 
     values_at_ends = dict(zip(ends, values, strict=True))

@@ -1,4 +1,4 @@
-"""Define `Problem`, a mechanism with its start, energy and references."""
+"""Define `Problem`: a mechanism with its start, energy and references."""
 
 import copy
 from collections.abc import Callable, Mapping
@@ -58,7 +58,7 @@ class Reference:
 
 @dataclass(frozen=True)
 class Condition:
-    """Decide by the rule of a benchmark's authors whether a run is right.
+    """Pass rule of a benchmark's authors, which decides whether a run is accurate enough.
 
     The error is the root mean square, over outputs and quantities, of |difference| / max(|reference|, threshold).
 

@@ -37,7 +37,7 @@ from twoloop.problem.callbacks import (
 from twoloop.problem.compiled_functions import FrozenValues, pickled, unpickled
 from twoloop.problem.description import Description, Joint, check_joints
 
-# placeholder in a docstring, which has the indentation of the source before Python 3.13, and none since
+# placeholder in a docstring; Python before 3.13 keeps the indentation of the source, which the expression allows for
 PLACEHOLDER = re.compile(r"^( *)\{callbacks\}\n", re.MULTILINE)
 
 
@@ -73,12 +73,12 @@ def _method(kind: str) -> Callable[..., Any]:
 
 
 def _with_entries(text: str | None, plain: bool) -> str | None:
-    """Return a docstring with the callbacks in their place; None without docstrings (python -OO)."""
+    """Return a docstring with the callbacks in place of PLACEHOLDER; None without docstrings (python -OO)."""
     return text and PLACEHOLDER.sub(lambda place: "".join(_entry(kind, plain, place[1]) for kind in KINDS), text)
 
 
 def _entry(kind: str, plain: bool, indent: str) -> str:
-    """Return the entry of a kind for the parameters of a docstring."""
+    """Return the entry of a kind of callback in the section Parameters of a docstring."""
     entry = KINDS[kind]
     called = f"{kind}({', '.join(('t', *entry.state))}) -> {entry.size}: " if plain else ""
     text = f"{called}{entry.meaning}{'' if plain else ', ' + entry.size}. {entry.note}"
@@ -90,7 +90,7 @@ def _entry(kind: str, plain: bool, indent: str) -> str:
 
 
 def _full_signature(function: Any) -> inspect.Signature:
-    """Return the signature of a constructor, with the callbacks by name."""
+    """Return the signature of a constructor, with each callback as a named argument."""
     parameters = inspect.signature(function).parameters.values()
     keyword = inspect.Parameter.KEYWORD_ONLY
     defaults = {kind: None if entry.optional else inspect.Parameter.empty for kind, entry in KINDS.items()}
@@ -210,7 +210,7 @@ class ConstrainedSystem:
         flags = np.zeros(N_FLAGS, dtype=np.int64)
         flags[CONSTANT_MASS] = self.constant_mass
         flags[[place for kind, place in GIVEN.items() if kind in self.given]] = 1
-        flags[BANDWIDTH] = -1  # a run decides by the size
+        flags[BANDWIDTH] = -1  # each run decides by the size whether to use the bandwidth
         all_callbacks = {kind: self.given.get(kind) or substitute(kind, self.given) for kind in KINDS}
         none = (np.zeros(0, np.int64), np.zeros(0))
         programs = dict(zip(PROGRAMS, (*none, *none, *[np.zeros(0, np.int32)] * 2), strict=True))
@@ -238,7 +238,7 @@ class ConstrainedSystem:
         return len(self.entries["jacobian"][0]) if "jacobian" in self.entries else 0
 
     def _scatter(self) -> None:
-        """Add dense callbacks for those that return values of entries, where there are none."""
+        """Add dense callbacks computed from values of entries, where no dense ones are given."""
         missing = [kind for kind in self.entries if kind not in self.given]
         dense = {kind: dense_callback(kind, self.given[VALUES_OF[kind]], self.entries[kind]) for kind in missing}
         callbacks = self.given | dense
@@ -251,8 +251,8 @@ class ConstrainedSystem:
     @property
     def parameters(self) -> Array:
         """Return the vector `p` that every callback gets, read-only: `with_parameters` makes a system of others."""
-        # the handle of Python functions comes first, and is no parameter of the user
-        p = self.functions.p[self.called_in_python :].copy()  # kernels want an array that may be written
+        # the first number is the handle of Python functions, not a parameter of the user
+        p = self.functions.p[self.called_in_python :].copy()  # kernels require writable arrays
         p.setflags(write=False)
         return p.view()  # users cannot make this view writable again
 
@@ -384,7 +384,7 @@ class ConstrainedSystem:
         python = PythonFunctions(name, functions, taking)
         wrappers: dict[str, Any] = {kind: through_python(kind) for kind in functions}
         system = cls(**sizes, **options, **wrappers, parameters=np.append(python.handle, plain.p))
-        system._python, system._taking = python, taking  # the registry holds it weakly
+        system._python, system._taking = python, taking  # keeps the functions alive: the registry holds them weakly
         system.scattered = frozenset(missing)
         return system
 
@@ -394,7 +394,7 @@ class ConstrainedSystem:
         return {} if self._python is None else self._python.functions
 
     def parameters_for(self, kind: str) -> tuple[Array, ...]:
-        """Return what a plain function of a kind takes after the state: the parameters, or nothing."""
+        """Return the additional arguments of a plain function of a kind: the parameters, or nothing."""
         return (self.parameters.copy(),) if self.takes_parameters(kind) else ()
 
     def takes_parameters(self, kind: str) -> bool:
@@ -408,11 +408,11 @@ class ConstrainedSystem:
 
     @property
     def kit(self) -> Kit:
-        """Return the callbacks as kernels take them."""
+        """Return the callbacks as a `Kit`, in the form that kernels take."""
         return self.remembered(("kit", id(self.functions)), lambda: Kit(self.functions))
 
     def remembered(self, key: Any, make: Callable[[], Any]) -> Any:
-        """Return `make()` and cache it for these parameters; not cached for Python functions, which may change."""
+        """Return `make()`, cached for these parameters; not cached for Python functions, which may change."""
         if self._python is not None:
             return make()
         if key not in self.derived:
@@ -420,7 +420,7 @@ class ConstrainedSystem:
         return self.derived[key]
 
     def remembered_at(self, key: Any, state: Any, make: Callable[[], Any]) -> Any:
-        """Return `make()` and cache it for this state."""
+        """Return `make()`, cached for this state."""
         if self._python is not None:
             return make()
         cached = self.derived.get(key)
@@ -434,7 +434,7 @@ class ConstrainedSystem:
             self.derived[key] = state, value
 
     def arrays_of(self, kind: str) -> list[Array]:
-        """Return zeros for a kind of callback to fill."""
+        """Return arrays of zeros for a callback of a kind to fill."""
         return [np.zeros(shape) for shape in self._shapes[kind]]
 
     def evaluate(self, kind: str, t: float, *state: ArrayLike) -> Any:
@@ -510,7 +510,7 @@ class ConstrainedSystem:
     def __deepcopy__(self, memo: dict[int, Any]) -> ConstrainedSystem:
         system = memo[id(self)] = copy.copy(self)
         p = self.functions.p.copy()
-        if self._python is not None:  # numbers of its own for functions of its own
+        if self._python is not None:  # copied functions need a registration of their own
             system._python = PythonFunctions(self.name, copy.deepcopy(self._python.functions, memo), self._taking)
             p[0] = system._python.handle
         system.functions = self.functions._replace(p=p, flags=self.functions.flags.copy())
@@ -521,7 +521,7 @@ class ConstrainedSystem:
 
 
 def check_system(system: object) -> None:
-    """Raise unless this is a ConstrainedSystem whose compiled functions enclose the same values as when compiled."""
+    """Raise unless this is a ConstrainedSystem whose compiled functions still enclose the values as compiled."""
     if isinstance(system, ConstrainedSystem):
         change = None if system.enclosed is None else system.enclosed.change()
         if change is None:

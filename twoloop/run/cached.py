@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import check_vector
-from twoloop.checks.consistency import Look, check_start
+from twoloop.checks.consistency import StartEvaluation, check_start
 from twoloop.checks.structure import has_definite_mass
 from twoloop.generate.compile_equations import GeneratedCode
 from twoloop.generate.derived_callbacks import exact_near, with_derived_callbacks
@@ -135,8 +135,8 @@ class CachedIntegrator:
         self.region = run.region = checked_region_of(run, checks) if shared is None else shared.region(checks)
         run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, (room := first_chunk(run))
         checked = system if self.parametric is None else self.parametric.system
-        self.look, self.loops, self.skips = Look(checked), cached_run(), 0
-        self.arrays, self.given = arrays_of(run, self.look, code, definite, options, room), checked.kit
+        self.evaluation, self.loops, self.skips = StartEvaluation(checked), cached_run(), 0
+        self.arrays, self.given = arrays_of(run, self.evaluation, code, definite, options, room), checked.kit
         self._start_and_advance = entry_point(self.loops.start_and_advance)
         # indices in `arrays.block`: the beginning of the states, and of the report of a run with a single state
         self.states_from, self.width = self.arrays.report.size, len(run.state)
@@ -184,19 +184,19 @@ class CachedIntegrator:
             return None
         if parametric is not None:
             if parametric.use(system):
-                self.look.system, arrays.last_start[loops.N_EQUAL] = parametric.system, loops.NEVER
+                self.evaluation.system, arrays.last_start[loops.N_EQUAL] = parametric.system, loops.NEVER
         elif self.check_derivatives and not system.checked:
             return None
         if self.moved:
             self._return_to_start()
         run.t0 = t0
-        kit, work, sizes, box = run.kit.address, run.work.address, self.look.sizes(), region.bounds
+        kit, work, sizes, box = run.kit.address, run.work.address, self.evaluation.sizes(), region.bounds
         start = kit, self.given.address, work, arrays.address, t0, t1, q0, v0, sizes, box
         clock = time.perf_counter if self.cpu_time < SHORT_RUN else time.process_time
         began = clock()
         try:
             n = self._start_and_advance(*start, False)
-            if n == loops.IN_DOUBT and self.look.is_surely(0, t0, q0, v0):
+            if n == loops.IN_DOUBT and self.evaluation.is_surely_consistent(0, t0, q0, v0):
                 n = self._start_and_advance(*start, True)
         except Exception:  # raised by a callback: `IntegrationLoop` will handle it
             self.skips, arrays.last_start[loops.N_EQUAL] = AFTER_ERROR, loops.NEVER
@@ -247,11 +247,11 @@ class CachedIntegrator:
             if not self._check_new_start(t1, q0, v0):
                 arrays.last_start[loops.N_EQUAL] = loops.NEVER
                 return None
-        if report[loops.CODE] != run.a.ALL_OUTPUT_DONE or not report[loops.PLAIN]:
+        if report[loops.END_CODE] != run.a.ALL_OUTPUT_DONE or not report[loops.NO_REMARK]:
             self.moved = True
             arguments = output.request(run), silent, output.time_limit, interrupts, False
             loop = IntegrationLoop(run, t1, *arguments, start=rows[0], system=system)
-            loop.resume(int(report[loops.CODE]), t[1:], rows[1:], steps, self.cpu_time)
+            loop.resume(int(report[loops.END_CODE]), t[1:], rows[1:], steps, self.cpu_time)
             record = loop.to_end(self.check_derivatives)
             if record.status >= 0 and may_have_missed_changes(run):
                 return MissedChanges(closer_sampling(run), record.stats.cpu_time)
@@ -260,9 +260,9 @@ class CachedIntegrator:
         kinds = interval_kinds(run, steps) if output.dense or output.between is not None else NO_KINDS
         if output.between is not None:
             began = time.process_time()
-            self.between.find(output.between, t, rows, kinds, self.look.pattern)
+            self.between.find(output.between, t, rows, kinds, self.evaluation.pattern)
             self.cpu_time += time.process_time() - began
-        if not self._compare_callbacks(t, rows, t1, bool(report[loops.INSIDE]), due):
+        if not self._compare_callbacks(t, rows, t1, bool(report[loops.IN_CHECKED_REGION]), due):
             arrays.last_start[loops.N_EQUAL] = loops.NEVER
             return None
         if output.dense:
@@ -288,7 +288,7 @@ class CachedIntegrator:
                 self.redundancy[independent] = new_run.redundant, new_run.rows_warning
             run.redundant, run.rows_warning = self.redundancy[independent]
             self.of_run, self.independent = (run.rank, run.redundant, self.of_run[-1]), independent
-        mass, derivatives = self.look.mass, self.check_derivatives
+        mass, derivatives = self.evaluation.mass, self.check_derivatives
         return self.parametric is None or self.parametric.agrees(run.t0, q0, v0, t1, mass, derivatives)
 
     def _return_to_start(self) -> None:
@@ -355,9 +355,9 @@ def _field(
         by_step = step_fields(data[begin:end].reshape(n_steps, N_STEP_COLUMNS), BEFORE.copy())
         return by_step | {"stats": statistics(counts, cpu_time)} | options.metadata
     rank, redundant, own = of_run
-    defect = float(data[loops.DEFECT]) if data[loops.CHECKED] else None
+    defect = float(data[loops.DEFECT]) if data[loops.HAS_DEFECTS] else None
     fields = {"rank": rank, "redundant": redundant.copy(), "defect": defect, "compiled": own}
-    fields |= {"widest_gap": float(data[loops.WIDEST]), "system": system, "atol": options.atol.copy(), "t_end": t1}
+    fields |= {"widest_gap": float(data[loops.LONGEST_GAP]), "system": system, "atol": options.atol.copy(), "t_end": t1}
     t, rows = (data[loops.N_HEAD : begin], data[end:].reshape(n_states, -1)) if at_times is None else at_times
     return OTHER_DEFAULTS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
@@ -371,19 +371,19 @@ def first_chunk(run: Run) -> int:
 
 
 def arrays_of(
-    run: Run, look: Look, code: GeneratedCode | None, definite: bool, options: Options, room: int
+    run: Run, evaluation: StartEvaluation, code: GeneratedCode | None, definite: bool, options: Options, room: int
 ) -> SimpleNamespace:
     """Create the arrays that `start_and_advance` of kernels/cached_run.py reads and writes, for at most `room` steps.
 
-    `run` is at its start; its clock, control and tolerances become parts of one array. `look` belongs to the system of
+    `run` is at its start: its clock, control and tolerances become one array. `evaluation` is for the system of
     the call. The other arguments are those of `CachedIntegrator`.
     """
-    from twoloop.kernels.evaluation import checks as first_look
+    from twoloop.kernels.evaluation import checks as start_checks
     from twoloop.kernels.linalg import rank as pivots
     from twoloop.kernels.linalg.dependent_columns import choose_dependent_columns as find
 
-    loops, system = cached_run(), look.system
-    of_mass = 0 if system.constant_mass else first_look.DEFINITE if definite else first_look.INDEFINITE
+    loops, system = cached_run(), evaluation.system
+    of_mass = 0 if system.constant_mass else start_checks.DEFINITE if definite else start_checks.INDEFINITE
     numbers, n_rows = np.concatenate([run.clock, run.control, run.tolerances]), system.n_c + system.n_a
     i, j = run.clock.size, run.clock.size + run.control.size
     run.clock, run.control, run.tolerances = numbers[:i], numbers[i:j], numbers[j:]
@@ -404,7 +404,7 @@ def arrays_of(
     block = np.empty(loops.N_HEAD + 1 + (1 + columns) * room + width * (1 + room))
     report_part, states = np.split(block, [len(block) - width * (1 + room)])
     arrays = SimpleNamespace(
-        **look.arrays,
+        **evaluation.arrays,
         **{"numbers": numbers, "start_numbers": numbers.copy()},
         **{"memory": memory, "memory_places": places, "start_memory": memory[places]},
         **{"clock": run.clock, "control": run.control, "tolerances": run.tolerances, "options": run.plan.options},
@@ -419,7 +419,7 @@ def arrays_of(
         **{"end": np.zeros(1), "t": np.empty(room + 1), "states": states.reshape(room + 1, width)},
         **{"steps": np.empty((room, columns)), "filled": np.zeros(2, dtype=np.int64)},
         **{"report": report_part, "block": block},
-        **{"look": first_look.evaluate_start, "choose": pivots.choose_rows, "dependents": find},
+        **{"evaluate_start": start_checks.evaluate_start, "choose": pivots.choose_rows, "dependents": find},
         **{"start": run.kernels.start, "advance": run.kernels.advance},
     )
     arrays.table = loops.RUN_ARRAYS.table(arrays)

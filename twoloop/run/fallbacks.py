@@ -108,10 +108,10 @@ def may_cross(run: Run, code: int) -> bool:
     """Return whether steps across a singular position follow, given the code with which `advance` returned."""
     a, notes = run.a, run.work.notes
     if code == a.SWITCH_METHOD:
-        from twoloop.kernels.steps.lobatto_step import TIGHT
+        from twoloop.kernels.steps.lobatto_step import TIGHT_TOLERANCE
 
         near = notes[indices.NEARLY_SINGULAR] == notes[indices.NEAR_NOW] == 1.0
-        return bool(near and run.control[a.BRIDGE] == 1.0 and run.tolerances[indices.LEAST] >= TIGHT)
+        return bool(near and run.control[a.BRIDGE] == 1.0 and run.tolerances[indices.LEAST] >= TIGHT_TOLERANCE)
     return code == a.NEAR_SINGULAR
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twoloop.checks.derivatives import wrong_derivative
-from twoloop.checks.structure import unlike_itself
+from twoloop.checks.structure import run_inconsistency
 from twoloop.generate.derived_callbacks import exact_derivatives, generic_states
 from twoloop.generate.traced_values import CLEAR, MAX_IN_PYTHON, CheckedRegion, Sample
 from twoloop.kernels.data import indices
@@ -101,7 +101,7 @@ def _check_derivatives(run: Run, states: Array, first: Array, status: Status, me
     some = [(float(each[0]), each[1 : 1 + n], each[1 + n :]) for each in chosen]
     exact = exact_derivatives(run.system)
     fine = exact is not None and exact.difference(run.system, generic_states(some)) is None
-    difference = unlike_itself(run.system, some, float(first[0]), first[1 : 1 + n])
+    difference = run_inconsistency(run.system, some, float(first[0]), first[1 : 1 + n])
     for t, q, v in () if fine or difference is not None else some:
         wrong = wrong_derivative(run.system, t, q, v)
         if wrong is not None:

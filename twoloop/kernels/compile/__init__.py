@@ -4,16 +4,16 @@ import re
 
 import numba
 
-LEAST, BELOW = (0, 61), (0, 69)  # limits of the version, as in pyproject.toml
+LEAST, BELOW = (0, 61), (0, 69)  # supported versions of numba: from LEAST to below BELOW, as in pyproject.toml
 
 
 def check_version(installed: str) -> None:
-    """Raise unless the private parts of this version of numba are known.
+    """Raise unless this version of numba is supported, because twoloop replaces private parts of numba.
 
     Raises
     ------
     ImportError
-        If it is not; says which is needed.
+        If the version is not supported; the message names those that are.
     """
     if not LEAST <= tuple(int(number) for number in re.findall(r"\d+", installed)[:2]) < BELOW:
         least, below = (".".join(map(str, version)) for version in (LEAST, BELOW))

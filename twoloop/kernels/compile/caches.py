@@ -1,11 +1,11 @@
-"""Cache machine code on disk: where numba keeps it, when it is out of date, and what happens if it cannot be kept.
+"""Cache machine code on disk: where it is stored, when it is out of date, and what happens if it cannot be stored.
 
-Numba watches the file in which a function stands, and nothing else: not the helpers in other files, and not the values
-of globals, which it freezes. It raises when no folder can be written and when a file is damaged, and runs what others
-have put into one. Here each function and key has a file of its own behind a checksum, and code is loaded only from
-files and folders that belong to the user, or to root, and that no other user can write. That is what ssh asks of keys:
-whoever can write a file of machine code, or put another in its place, runs what he likes in the name of whoever loads
-it. A checksum within the file does not help, as he writes that, too.
+Numba's cache watches only the file in which a function is defined: neither helpers in other files nor the values of
+globals, which numba freezes. It raises if no folder can be written or a file is damaged, and it runs code that other
+users have put into its folder. Here each function and key has its own file with a checksum, and code is loaded only
+from files and folders that belong to the user or root and that no other user can write. SSH has the same rule for its
+keys: whoever can write or replace a file of machine code can run any code in the name of the user who loads it. A
+checksum does not prevent this, because the attacker can write the checksum, too.
 """
 
 import gc
@@ -44,7 +44,7 @@ ADVICE = (
 
 
 class Untrusted(OSError):
-    """Error for a file or folder that somebody else could have written; the text gives the reason."""
+    """Error for a file or folder that another user could have written; the text gives the reason."""
 
 
 def read_trusted(path: Path) -> bytes:
@@ -53,7 +53,7 @@ def read_trusted(path: Path) -> bytes:
     Raises
     ------
     OSError
-        If there is none; `Untrusted` if somebody else could have written it, which is said on stderr.
+        If there is no file. `Untrusted`, with a warning on stderr, if another user could have written it.
     """
     with path.open("rb") as file:
         if why := _reason_of_mode(os.fstat(file.fileno())):
@@ -79,7 +79,7 @@ def make_trusted_folder(folder: Path) -> None:
 def trusted_folder(folder: Path) -> Path:
     """Return the folder if only the user can write it and change the folders above it; otherwise a replacement.
 
-    The replacement is in the folder of the user's caches or, if that is in doubt too, a temporary one of this process.
+    The replacement is in the user's cache folder; if others can write that too, a temporary folder of this process.
     """
     why = reason_to_distrust(folder)
     if not why:
@@ -93,44 +93,44 @@ def trusted_folder(folder: Path) -> Path:
 
 
 def reason_to_distrust(folder: Path) -> str:
-    """Return why somebody else may have written a folder, or one above it; "" if nobody can."""
+    """Return why another user may have written a folder, or one above it; "" if nobody else can."""
     if os.name != "posix":  # other systems do not keep access rights in the mode
         return ""
     real = Path(os.path.realpath(folder))
     for each in [real, *real.parents]:
         try:
-            found = each.stat()
+            status = each.stat()
         except FileNotFoundError:  # the folder does not exist yet
             continue
         except OSError as error:
             return f"{each} cannot be looked at ({error.strerror})"
         # in a sticky folder only the owner of an entry can replace it
-        sticky = each != real and found.st_mode & stat.S_ISVTX
-        why = _reason_of_owner(found) if sticky else _reason_of_mode(found)
+        sticky = each != real and status.st_mode & stat.S_ISVTX
+        why = _reason_of_owner(status) if sticky else _reason_of_mode(status)
         if why:
             return f"{each} {why}"
     return ""
 
 
-def _reason_of_mode(found: os.stat_result) -> str:
+def _reason_of_mode(status: os.stat_result) -> str:
     if os.name != "posix":
         return ""
-    if why := _reason_of_owner(found):
+    if why := _reason_of_owner(status):
         return why
-    if found.st_mode & stat.S_IWOTH:
-        return f"can be written by everybody (mode {stat.S_IMODE(found.st_mode):o})"
-    if found.st_mode & stat.S_IWGRP and not _is_private_group(found.st_gid):
-        return f"can be written by group {found.st_gid} (mode {stat.S_IMODE(found.st_mode):o})"
+    if status.st_mode & stat.S_IWOTH:
+        return f"can be written by everybody (mode {stat.S_IMODE(status.st_mode):o})"
+    if status.st_mode & stat.S_IWGRP and not _is_private_group(status.st_gid):
+        return f"can be written by group {status.st_gid} (mode {stat.S_IMODE(status.st_mode):o})"
     return ""
 
 
-def _reason_of_owner(found: os.stat_result) -> str:
-    return "" if found.st_uid in (0, os.geteuid()) else f"belongs to user {found.st_uid}"
+def _reason_of_owner(status: os.stat_result) -> str:
+    return "" if status.st_uid in (0, os.geteuid()) else f"belongs to user {status.st_uid}"
 
 
 @cache
 def _is_private_group(gid: int) -> bool:
-    """Return whether a group has no other member: root's, or the user's own, as distributions with umask 0002 make."""
+    """Return whether a group has no other member: root's, or the user's own, which some distributions create."""
     import grp  # not on Windows
     import pwd
 
@@ -155,21 +155,21 @@ _warnings: list[str] = []
 
 
 def _warn_first(text: str) -> None:
-    """Print the first warning of a process on stderr."""
+    """Print a warning on stderr if it is the first of this process."""
     if not _warnings:
         _warnings.append(text)
         print(text, file=sys.stderr, flush=True)
 
 
-MAX_ON_DISK = 500  # most sets of functions generated for single mechanisms, of each kind, on disk
+MAX_ON_DISK = 500  # largest number of files on disk of each kind of function generated for single mechanisms
 CHECKSUM = hashlib.sha256().digest_size
 
 
 class CodeFiles:
-    """Store machine code of one function: a file for each key, behind a checksum, that only the user can write.
+    """Store machine code of one function: a file for each key, with a checksum, that only the user can write.
 
-    A file that is damaged or out of date counts as missing. Numba's own keep an index, through which two processes that
-    write at the same time may lead one function to the machine code of another.
+    A file that is damaged or out of date counts as missing. Numba's own cache has an index, through which two processes
+    that write at the same time may give one function the machine code of another.
     """
 
     def __init__(self, folder: Path, name: str, stamp: Any, limited: bool = False):
@@ -230,8 +230,8 @@ UNWRITABLE = (
     "twoloop: machine code cannot be kept on disk, so every process compiles again. Set NUMBA_CACHE_DIR to a folder "
     "that only you can write"
 )
-MAX_IN_MEMORY = 50  # most sets of functions generated for single mechanisms, of each kind, in memory
-# numba 0.61 has this class under a private name
+MAX_IN_MEMORY = 50  # the same limit in memory
+# numba 0.61 has a private name for this class
 _LOCATOR: Any = vars(caching).get("UserProvidedCacheLocator") or vars(caching)["_UserProvidedCacheLocator"]
 
 
@@ -248,16 +248,16 @@ def compile_cached(
     Parameters
     ----------
     function : callable
-        What numba compiles.
+        Function to compile.
     signature : numba signature
-        The only one that it will have.
+        Its only signature.
     watched : (str, str) or None
-        What the machine code depends on beside the file of the function, see `digests_of`: when the first changes, all
-        is compiled again; the second tells functions apart that share their source. None: the machine code is not kept.
+        Digests of what the machine code depends on, see `digests_of`. If the first changes, all is compiled again; the
+        second tells functions apart that share their source. None: the machine code is not stored.
     announcement : str
-        Said on stderr, once a process, before it compiles.
+        Printed on stderr before the first compilation of a process.
     **options
-        Of numba.njit.
+        Options of numba.njit.
     """
     dispatcher = njit(**options)(with_unique_name(function, watched))
     function = dispatcher.py_func
@@ -276,7 +276,7 @@ def compile_cached(
 
 @contextmanager
 def garbage_collection_off() -> Iterator[None]:
-    """Suspend the collection of cycles, which takes a sixth of the time: numba's objects live until the end."""
+    """Suspend the collection of cycles, a sixth of the compile time: numba's objects live until the process ends."""
     collecting = gc.isenabled()
     gc.disable()
     try:
@@ -287,7 +287,7 @@ def garbage_collection_off() -> Iterator[None]:
 
 
 class BoundedCache(dict[Any, Any]):
-    """Cache data of single mechanisms by digests: the newest MAX_IN_MEMORY, because a sweep adds one for each run."""
+    """Cache data of single mechanisms by digest: the newest MAX_IN_MEMORY, because a sweep adds one for each run."""
 
     def __setitem__(self, key: Any, made: Any) -> None:
         super().__setitem__(key, made)
@@ -299,20 +299,20 @@ _N_COMPILED = [0]
 
 
 def n_compiled() -> int:
-    """Return the number of numba functions, all in memory, that this process has compiled or read from the disk."""
+    """Return the number of numba functions that this process has compiled or read from the disk; all are in memory."""
     return _N_COMPILED[0]
 
 
 def cache_folder(package: types.ModuleType) -> Path | None:
     """Return the folder of the machine code of a package; None if no folder can be written."""
 
-    def anything() -> None:
+    def placeholder() -> None:
         pass
 
-    code = anything.__code__.replace(co_filename=str(package.__file__))
-    anything.__code__ = code
+    code = placeholder.__code__.replace(co_filename=str(package.__file__))
+    placeholder.__code__ = code
     try:
-        return trusted_folder(Path(FunctionCache(anything).cache_path))
+        return trusted_folder(Path(FunctionCache(placeholder).cache_path))
     except RuntimeError:
         return None
 
@@ -321,8 +321,7 @@ def with_unique_name(function: Callable[..., Any], watched: tuple[str, str] | No
     """Return a copy of a nested function, or a lambda, under a unique name; return any other function unchanged.
 
     Numba's symbols consist of the qualified name and of a number that counts within a process. Two closures of one name
-    whose machine code comes from different processes may share a symbol: the one that is loaded first is then called in
-    the place of both.
+    whose machine code comes from different processes may share a symbol: then both call the code that was loaded first.
     """
     if watched is None or "<" not in function.__qualname__:
         return function
@@ -337,11 +336,11 @@ def with_unique_name(function: Callable[..., Any], watched: tuple[str, str] | No
 
 
 class _Cache(FunctionCache):
-    """Extend numba's cache of one function by the stamp of twoloop; its errors cost time but are never raised."""
+    """Extend numba's cache of one function by the digests of twoloop; an error costs time but is never raised."""
 
     def __init__(self, function: Callable[..., Any], stamp: str, key: str, announcement: str):
         chosen: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
-        if chosen:  # numba would create the folder by the umask
+        if chosen:  # numba would create the folder with the rights that the umask allows
             with suppress(OSError):
                 make_trusted_folder(Path(chosen, _LOCATOR.get_suitable_cache_subpath(inspect.getfile(function))))
         super().__init__(function)
@@ -357,7 +356,7 @@ class _Cache(FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         try:
             found = super().load_overload(sig, target_context)
-        except Exception:  # a file of another installation: the function is compiled again and the file overwritten
+        except Exception:  # a file of another installation: compile again, and overwrite the file
             found = None
         if found is None and self._announcement:
             warn_once(self._announcement)
@@ -371,9 +370,9 @@ class _Cache(FunctionCache):
 
 
 def sources_folder() -> Path:
-    """Return the folder of generated source: NUMBA_CACHE_DIR if it is set, else the folder of the user's caches.
+    """Return the folder of generated source: in NUMBA_CACHE_DIR if it is set, else in the user's cache folder.
 
-    If others can write there, return a folder that they cannot write.
+    If other users can write there, return a folder that they cannot write.
     """
     chosen: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
     folder = chosen or AppDirs(appname="twoloop", appauthor=False).user_cache_dir
@@ -387,15 +386,14 @@ def warn_once(text: str) -> None:
 
 
 def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
-    """Decorate a closure of callbacks by `numba.njit(**options)`: compiled when called, with machine code on disk."""
+    """Return a decorator, numba.njit(**options) with a cache on disk; the function is compiled at its first call."""
 
     def decorate(function: Callable[..., Any]) -> Dispatcher:
         watched = digests_of(function)
         dispatcher = njit(**options)(with_unique_name(function, watched))
         if watched is not None:
-            _COMPILED_DIGESTS[dispatcher] = (
-                watched  # then a closure that encloses this function does not compile it again
-            )
+            # then a closure that encloses this function does not compile it again
+            _COMPILED_DIGESTS[dispatcher] = watched
             with suppress(RuntimeError):  # no folder can be written
                 dispatcher._cache = _Cache(dispatcher.py_func, *watched, "")
         return dispatcher
@@ -406,19 +404,19 @@ def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispa
 def digests_of(function: Callable[..., Any]) -> tuple[str, str] | None:
     """Return digests of all that the machine code of a function depends on, and of the values that it encloses.
 
-    The first is of its code, its defaults, and the values of the globals and of the attributes of modules that it
-    names; of compiled helpers among them the same, and so on. None: something among it cannot be watched.
+    The first covers its code, its defaults, the globals and attributes of modules that it names, and all of this for
+    the compiled helpers among them. Returns None if one of these values may change unnoticed.
     """
     watched, helpers = _digests_and_helpers(function)
     for each in helpers:
-        _put_under_cache(each)
+        _use_cache(each)
     return watched
 
 
 def _digests_and_helpers(function: Callable[..., Any]) -> tuple[tuple[str, str] | None, list[Any]]:
-    """Return the digests of `digests_of`, and the helpers found, each after those that it names."""
+    """Return the digests of `digests_of`, and all helpers: each one follows the helpers that it names."""
     code, enclosed = Digest(), Digest()
-    enclosed.names = names_reached(function)  # names of attributes of the modules that it encloses
+    enclosed.names = names_reached(function)  # names of module attributes that it may use
     try:
         code.add_function(function, enclosed=False)
         enclosed.add(enclosed_by(function))
@@ -431,25 +429,24 @@ def _digests_and_helpers(function: Callable[..., Any]) -> tuple[tuple[str, str] 
 def helper(function: Callable[..., Any]) -> Any:
     """Decorate a function that compiled callbacks call: numba's `njit` with the cache of twoloop.
 
-    Such a function allocates nothing. So it needs no numba runtime, whose counts of references to arrays take longer
-    than a row of C_q.
+    Such a function allocates nothing and needs no numba runtime, whose reference counts take longer than a row of C_q.
     """
     options: dict[str, Any] = {"_nrt": False, "error_model": "numpy"}
     dispatcher = njit(**options)(function)
     dispatcher.enable_caching()
-    _put_under_cache(dispatcher)
+    _use_cache(dispatcher)
     return dispatcher
 
 
-# digests of what helpers depended on when they were compiled
+# digests of each helper when it was compiled
 _COMPILED_DIGESTS: WeakKeyDictionary[Any, tuple[str, str]] = WeakKeyDictionary()
 
 
-def _put_under_cache(helper: Any) -> None:
-    """Replace numba's cache of a helper by that of twoloop, and recompile a helper that names other values now.
+def _use_cache(helper: Any) -> None:
+    """Replace numba's cache of a helper by that of twoloop, and recompile a helper whose digests have changed.
 
-    Numba's cache does not see what a helper calls in other files. Numba keeps what it has compiled, or read, for all
-    functions that call it later; it may have done so before the helper came here, unless the signatures were given.
+    Numba's cache does not see what a helper calls in other files, and functions compiled later use the helper as numba
+    first compiled or loaded it. Unless its signatures were given, that may have been before the helper came here.
     """
     watched, known = _digests_and_helpers(getattr(helper, "py_func", helper))[0], _COMPILED_DIGESTS.get(helper)
     changed = known is not None and known != watched

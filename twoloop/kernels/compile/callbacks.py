@@ -1,12 +1,12 @@
 """Define the kinds of callback that a mechanism may have, in one table, and the decorator that compiles one.
 
-All other definitions of a kind follow from its entry in `KINDS`: the signature that numba compiles, the fields of
+`KINDS` is the one place where a kind is defined. From its entry follow the signature that numba compiles, the fields of
 `Functions` that the kernels see, the methods and the documentation of `ConstrainedSystem`, and the adapters for plain
 Python functions.
 
-Functions that index arrays by computed numbers, as in a table, have their bounds checked in every call. Otherwise
-machine code would read other memory beyond the end of a table, or end the process. The first call shows whether
-functions with constant indices and loop counters are correct: they are not checked.
+Functions that compute indices, for example into a table, have their bounds checked in every call. Otherwise machine
+code would read memory beyond the end of a table, or crash the process. Functions that use only constant indices and
+loop counters are not checked: their first call shows whether these are correct.
 """
 
 import ast
@@ -29,13 +29,13 @@ from twoloop.kernels.compile.dependencies import (
     frozen_places,
     frozen_values,
     is_library,
-    is_ours,
+    is_twoloop,
     python_function,
 )
 from twoloop.kernels.compile.linking import add_signature, options_of
 
 BOUNDS_CHECK = {"boundscheck": True}  # option of numba
-# calls that are safe if their arguments are
+# calls whose result is safe as an index if their arguments are
 SAFE_CALLS = ("len", "min", "max", "abs", "range", "enumerate", "zip", "reversed")
 
 
@@ -48,7 +48,7 @@ def with_bounds_checks(function: Callable[..., Any]) -> tuple[Callable[..., Any]
 
 
 def _with_bounds_checks(copy: Any, original: Any) -> Any:
-    """Recompile a copy of a helper with its options and bounds checks; return other functions unchanged."""
+    """Recompile a copy of a helper, with the helper's options and bounds checks; return other functions unchanged."""
     helper = python_function(original)
     if helper is None:
         return copy
@@ -57,22 +57,22 @@ def _with_bounds_checks(copy: Any, original: Any) -> Any:
 
 
 def has_computed_indices(function: Callable[..., Any]) -> bool:
-    """Return whether an index in the source of a function may depend on more than constants and counters of loops."""
-    if is_ours(function.__module__ or "") or is_library(function.__module__ or ""):
+    """Return whether an index in the source of a function may depend on more than constants and loop counters."""
+    if is_twoloop(function.__module__ or "") or is_library(function.__module__ or ""):
         return False
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
-    except (OSError, TypeError, SyntaxError):  # the source was typed at a prompt, or is a part of a statement
+    except (OSError, TypeError, SyntaxError):  # typed at a prompt, or only part of a statement
         return True
     computed = _computed_names(tree)
     return any(not _is_safe(node.slice, computed) for node in ast.walk(tree) if isinstance(node, ast.Subscript))
 
 
 def _computed_names(tree: ast.AST) -> set[str]:
-    """Return the names that may have other values than constants and loop counters."""
-    safe = {node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)}
+    """Return the names that may have values other than constants and loop counters."""
+    computed = {node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)}
     while True:
-        before = len(safe)
+        before = len(computed)
         for node in ast.walk(tree):
             if isinstance(node, ast.For):
                 targets, value = [node.target], node.iter
@@ -82,15 +82,15 @@ def _computed_names(tree: ast.AST) -> set[str]:
                 targets, value = [node.target], None
             else:
                 continue
-            if value is None or not _is_safe(value, safe):
-                names = (each for target in targets for each in ast.walk(target))
-                safe |= {each.id for each in names if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store)}
-        if len(safe) == before:
-            return safe
+            if value is None or not _is_safe(value, computed):
+                names = [node for target in targets for node in ast.walk(target) if isinstance(node, ast.Name)]
+                computed |= {name.id for name in names if isinstance(name.ctx, ast.Store)}
+        if len(computed) == before:
+            return computed
 
 
 def _is_safe(node: ast.AST | None, computed: set[str]) -> bool:
-    """Return whether an expression consists of constants, loop counters and sizes only."""
+    """Return whether an expression consists of constants, loop counters and array sizes only."""
     if node is None or isinstance(node, ast.Constant):
         return True
     if isinstance(node, ast.Name):
@@ -125,23 +125,23 @@ class Kind:
     Attributes
     ----------
     state : tuple of str
-        What it depends on beside t and p, keys of `STATE`.
+        Arguments beside t and p, keys of `STATE`.
     output : str
-        Name of the array that it fills.
+        Name of the array that the callback fills.
     shape : tuple of str
         Sizes of that array: attributes of a system.
     meaning : str
-        What it fills the array with, in a few words, for messages.
+        Meaning of the output in a few words, for messages.
     note : str
-        What else there is to know, for the documentation.
+        Remarks for the documentation.
     absent : str
-        What is in its place where it is left out. "": it must be given; "zeros": a callback that leaves zeros;
-        "differences": one that differences C, see `jacobian.py`; "kernels": nothing that could be called, as the
-        kernels take differences of their own.
+        Replacement if the callback is not given. "": it must be given; "zeros": a callback that leaves zeros;
+        "differences": one that differences C, see `jacobian.py`; "kernels": none, because the kernels take their own
+        differences.
     needed_by : str
-        The size of the system, "n_c" or "n_a", above zero of which it must be given.
+        Size of the system, "n_c" or "n_a"; the callback must be given if this is above zero.
     more : tuple
-        Name and shape of further arrays that it fills. Such a callback must be compiled.
+        Names and shapes of further arrays that the callback fills. Such a callback must be compiled.
     """
 
     state: tuple[str, ...]
@@ -175,7 +175,7 @@ class Kind:
 
     @property
     def reading(self) -> Any:
-        """Return the signature that numba compiles: a callback cannot write to what is not its own."""
+        """Return the signature that numba compiles: arrays other than the output cannot be written."""
         return self._signature(READ)
 
     def _signature(self, given: Any) -> Any:
@@ -378,9 +378,9 @@ def compile_callback(
     named: Callable[..., Any] | None = None,
     allocates: bool = True,
 ) -> Dispatcher:
-    """Compile a function that works in place for the signature of its kind, or say in two lines why that fails.
+    """Compile a function that works in place for the signature of its kind; raise TypeError if that fails.
 
-    `watched` is that of `compile_cached`; `named` is the function to name in the message, if it is another.
+    `watched`: see `compile_cached`; `named`: the function that the message names, if it is another one.
     """
     compiled, more = with_bounds_checks(function)
     options = {**_OPTIONS, **more} if allocates else {**_OPTIONS, **more, "_nrt": False}
@@ -393,7 +393,7 @@ def compile_callback(
     else:
         add_signature(made, KINDS[kind].signature)
     if watched is not None:
-        # the digest stays that of this compilation, whatever becomes of the values that it names
+        # keep the digest of this compilation: the values that the function names may change later
         digest_as(made, f"{kind} {watched}")
     frozen_values(made, function)
     return made
@@ -407,7 +407,7 @@ def _compile_writable(
     error: Exception,
     options: dict[str, Any],
 ) -> Dispatcher:
-    """Compile a function whose helpers require writable arrays; refuse one that writes to them itself."""
+    """Compile a function whose helpers require writable arrays; refuse one that itself writes to its arguments."""
     try:
         made = compile_cached(function, KINDS[kind].signature, watched, **options)
     except Exception as its_own:
@@ -415,9 +415,9 @@ def _compile_writable(
     if _ONLY_A_HELPER.search(plain := _without_colours(error)) and "setitem" not in plain:
         return made
     raise TypeError(
-        f"{kind}: the function {_named(named)} must not change the arrays that it is given "
+        f"{kind}: the function {_described(named)} must not change the arrays that it is given "
         f"({', '.join([*KINDS[kind].state, 'p'])}), which are those of the run. Copy first\n"
-        f"Numba says: {_telling_line(error)}"
+        f"Numba says: {_informative_line(error)}"
     ) from None
 
 
@@ -426,7 +426,7 @@ _ONLY_A_HELPER = re.compile(r"Invalid use of type\(CPUDispatcher\(")
 
 @cache
 def zero_callback(kind: str) -> Dispatcher:
-    """Compile the replacement of an optional callback that is missing: it leaves zeros."""
+    """Compile the replacement of an optional callback that is missing: it leaves the output zero."""
 
     def leaves_zeros(t, q, p, out):
         pass
@@ -444,13 +444,13 @@ def zero_callback(kind: str) -> Dispatcher:
 def _failure_message(kind: str, function: Callable[..., Any], error: Exception) -> str:
     """Return the message for a function that numba cannot compile, with the best line of numba's message."""
     return (
-        f"{kind}: numba cannot compile the function {_named(function)}; it must use numbers, numpy arrays of one type "
-        f"and of the shape that {kind} asks for, and functions that numba knows (helpers need numba.njit)\n"
-        f"Numba says: {_telling_line(error)}"
+        f"{kind}: numba cannot compile the function {_described(function)}; it must use numbers, numpy arrays of one "
+        f"type and of the shape that {kind} asks for, and functions that numba knows (helpers need numba.njit)\n"
+        f"Numba says: {_informative_line(error)}"
     )
 
 
-def _named(function: Callable[..., Any]) -> str:
+def _described(function: Callable[..., Any]) -> str:
     name, code = getattr(function, "__name__", "?"), getattr(function, "__code__", None)
     return f"{name!r} ({code.co_filename}, line {code.co_firstlineno})" if code else repr(name)
 
@@ -467,9 +467,9 @@ def _without_colours(error: Exception) -> str:
     return re.sub(r"\x1b\[[0-9;]*m", "", str(error))
 
 
-def _telling_line(error: Exception) -> str:
+def _informative_line(error: Exception) -> str:
     plain = _without_colours(error)
-    plain = re.sub(r":\s*>>> ", ": ", _SOURCE.sub("", plain))  # remove a signature that was not found
+    plain = re.sub(r":\s*>>> ", ": ", _SOURCE.sub("", plain))  # remove the mark before a signature without a match
     lines = [line.strip() for line in plain.splitlines() if line and not line.startswith("    ")]
     telling = [line for line in lines if line and not _UNINFORMATIVE.match(line) and not line.startswith("def ")]
     return f"{type(error).__name__}: {telling[-1] if telling else plain.strip()[:200]}"

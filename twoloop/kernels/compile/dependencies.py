@@ -1,8 +1,8 @@
-"""Find what machine code depends on: all values that a function names, encloses and freezes; their digests and copies.
+"""Find the values that machine code depends on, all that a function names, encloses and freezes; digest or copy them.
 
 Numba freezes globals, free variables, defaults, attributes of modules, items of tuples and compiled helpers in the
-functions that it compiles. `Digest` hashes them, `frozen_places` lists them, and `FunctionCopier` copies a function
-with other helpers.
+functions that it compiles. `Digest` hashes these values, `frozen_places` lists where they are stored, and
+`FunctionCopier` copies a function with other helpers.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from numba.core.types import Type
 
 from twoloop.kernels.compile.linking import Dispatcher, jitable_templates, options_of
 
-# libraries whose functions are identified by name; the versions of numba and numpy are compared, too
+# libraries whose functions are identified by name; versions of numba and numpy are compared as well
 LIBRARIES = {*sys.stdlib_module_names, "numpy", "numba", "scipy"}
 
-# number of codes whose names are cached: the same code gives new functions again and again, and to read the
-# instructions of helpers again takes most of the time of tracing
+# number of code objects whose names are cached: each run creates new functions of the same code, and reading the
+# instructions of helpers again would take most of the time of tracing
 MAX_CODES = 2000
-FORM = 2  # change this if files of earlier versions may have wrong machine code
+FORM = 2  # version of the digests: increase it if files of earlier versions may have wrong machine code
 
 
 def digest_of(text: str, *sources: str | types.ModuleType) -> str:
@@ -45,7 +45,7 @@ _DIGEST_TEXTS: WeakKeyDictionary[Dispatcher, str] = WeakKeyDictionary()
 
 
 def digest_as(callback: Dispatcher, what: str) -> None:
-    """Register a text as the digest of a callback that calls Python and so cannot be digested itself."""
+    """Register a text as the digest of a callback that calls Python: its code cannot be digested."""
     _DIGEST_TEXTS[callback] = what
 
 
@@ -59,16 +59,16 @@ class NotDigestible(Exception):
 
 
 class Digest:
-    """Hash values of many types, and follow functions to all values that they name."""
+    """Hash values of many types; follow functions to all values that they name."""
 
     def __init__(self) -> None:
         self.hash = hashlib.sha256(f"{FORM} {np.__version__}".encode())
-        self.names: set[str] = set()  # names of attributes that the current code, or its helpers, may take of modules
-        self.seen: dict[tuple[int, str], int] = {}  # values seen, with their order
-        self.helpers: list[Any] = []  # helpers that were followed, each after those that it names
+        self.names: set[str] = set()  # attributes that the current code, or its helpers, may take from modules
+        self.seen: dict[tuple[int, str], int] = {}  # values added so far, with their order
+        self.helpers: list[Any] = []  # compiled helpers added so far, each after the helpers that it names
 
     def add(self, value: Any) -> None:
-        """Add a value."""
+        """Add a value of any type to the hash; raise NotDigestible for one that may change unnoticed."""
         self.hash.update(f"<{type(value).__qualname__}>".encode())
         if value is None or isinstance(value, (bool, int, float, complex, str, bytes, np.generic, Type)):
             self.hash.update(repr(value).encode())
@@ -143,7 +143,7 @@ class Digest:
 
 
 def names_in(code: types.CodeType) -> set[str]:
-    """Return the names of globals and attributes in a code and in the functions within it."""
+    """Return the names of globals and attributes in a code object and in the functions within it."""
     inner = [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
     return set(code.co_names).union(*map(names_in, inner))
 
@@ -155,7 +155,7 @@ def globals_of(function: Any) -> dict[str, Any]:
 
 
 def names_reached(function: Any, seen: set[int] | None = None) -> set[str]:
-    """Return the names in a function and in the compiled helpers that it names, to which it may pass a module."""
+    """Return the names used in a function and in its compiled helpers, to which it may pass a module."""
     seen = set() if seen is None else seen
     seen.add(id(function))
     names = names_in(function.__code__)
@@ -172,7 +172,7 @@ def is_library(module: str) -> bool:
     return module.partition(".")[0] in LIBRARIES
 
 
-def is_ours(module: str) -> bool:
+def is_twoloop(module: str) -> bool:
     """Return whether a module belongs to twoloop or is generated: its names are constant, its indices in bounds."""
     return f"{module}.".startswith(("twoloop.", "twoloop_equations_"))
 
@@ -184,18 +184,18 @@ NO_EFFECT = ("EXTENDED_ARG", "CACHE", "NOP", "PUSH_NULL")  # instructions that d
 
 
 class Place(NamedTuple):
-    """Say where a function finds a value.
+    """Describe where a function finds a value.
 
     Attributes
     ----------
     holder : cell, dict or None
-        What holds it, and may hold another later; None: a default, or an item of a tuple, which stays.
+        Container whose value may be replaced later; None: a default, or an item of a tuple, which cannot be replaced.
     key : str
-        By which a dict has it.
+        Key of the value in a dict.
     name : str
-        In messages, such as "package.module.K" or "TABLES[0]".
+        Name in messages, such as "package.module.K" or "TABLES[0]".
     value : object
-        What is there now.
+        Present value.
     """
 
     holder: CellType | dict[str, Any] | None
@@ -205,7 +205,7 @@ class Place(NamedTuple):
 
 
 class _Loaded(NamedTuple):
-    """Global or free variable that a code loads, and the chain of attributes that it takes of it."""
+    """Global or free variable that a code object loads, and the chain of attributes taken from it."""
 
     free: bool
     name: str
@@ -213,18 +213,18 @@ class _Loaded(NamedTuple):
 
 
 def frozen_values(compiled: Any, function: Any = None) -> list[tuple[Place, bytes | None]]:
-    """Return the result of the first `frozen_places` of a function, each value with the bytes of an array.
+    """Return the `frozen_places` of a function at the first call, each with the bytes of its value if it is an array.
 
     `function` is the one that was compiled, or the original of its copy.
     """
     found: list[tuple[Place, bytes | None]] | None = getattr(compiled, FROZEN_VALUES, None)
     if found is None:
-        found = [(each, _bytes(each.value)) for each in frozen_places(function or compiled.py_func)]
+        found = [(each, _content(each.value)) for each in frozen_places(function or compiled.py_func)]
         setattr(compiled, FROZEN_VALUES, found)
     return found
 
 
-def _bytes(value: Any) -> bytes | None:
+def _content(value: Any) -> bytes | None:
     return value.tobytes() if isinstance(value, (np.ndarray, np.void)) else None
 
 
@@ -237,10 +237,10 @@ def frozen_places(function: Any, seen: set[int] | None = None) -> Iterator[Place
     if id(function) in seen:
         return
     seen.add(id(function))
-    ours = is_ours(function.__globals__.get("__name__", ""))
+    ours = is_twoloop(function.__globals__.get("__name__", ""))
     for found in _direct_places(function):
         for place in _with_items(found, seen):
-            if not ours and _freezes(place.value):
+            if not ours and _is_frozen(place.value):
                 yield place
             helper = python_function(place.value)
             if helper is not None:
@@ -259,7 +259,7 @@ def python_function(value: Any) -> FunctionType | None:
     return None
 
 
-def _freezes(value: Any) -> bool:
+def _is_frozen(value: Any) -> bool:
     if isinstance(value, ModuleType):
         return not is_library(value.__name__)
     if isinstance(value, (np.ndarray, np.void)):
@@ -282,7 +282,7 @@ def _with_items(place: Place, seen: set[int]) -> Iterator[Place]:
 
 
 def _direct_places(function: FunctionType) -> Iterator[Place]:
-    """Yield defaults, and the globals and free variables that are loaded, with the attributes taken of modules."""
+    """Yield defaults, and the globals and free variables that are loaded, with the attributes taken from modules."""
     code, space = function.__code__, function.__globals__
     last = code.co_varnames[: code.co_argcount][::-1]
     for name, value in zip(last, (function.__defaults__ or ())[::-1], strict=False):
@@ -299,7 +299,7 @@ def _direct_places(function: FunctionType) -> Iterator[Place]:
 
 
 def _places_of_module(place: Place, attributes: tuple[str, ...], names: set[str]) -> Iterator[Place]:
-    """Yield the attributes that are taken of a module of the user, and of modules within it.
+    """Yield the attributes that are taken from a module of the user, and from modules within it.
 
     If the module itself is passed on, as to a local variable or a helper, all attributes with `names` are yielded.
     """
@@ -315,7 +315,7 @@ def _places_of_module(place: Place, attributes: tuple[str, ...], names: set[str]
 
 @lru_cache(MAX_CODES)
 def _loads(code: CodeType) -> tuple[_Loaded, ...]:
-    """Return the globals and free variables that a code and the functions within it load."""
+    """Return the globals and free variables that a code object and the functions within it load."""
     found: dict[_Loaded, None] = {}
     loaded = None
     for each in dis.get_instructions(code):
@@ -340,8 +340,8 @@ class FunctionCopier:
         self.known: dict[Any, Any] = {}
 
     def value(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        """Return the replacement of a value; `names` are the attributes that may be taken of a module."""
-        if self.copies(value):
+        """Return the replacement of a value; `names` are the attributes that may be taken from a module."""
+        if self.is_copied(value):
             if id(value) not in self.known:
                 self._rewrite(value)
             return self.known[id(value)]
@@ -351,8 +351,8 @@ class FunctionCopier:
             return self._module(value, names)
         return value
 
-    def copies(self, value: Any) -> bool:
-        """Return whether a value is a function that is copied."""
+    def is_copied(self, value: Any) -> bool:
+        """Return whether a value is a compiled helper, which has to be copied."""
         return isinstance(value, Dispatcher) or bool(jitable_templates(value))
 
     def _module(self, module: types.ModuleType, names: frozenset[str]) -> types.ModuleType:
@@ -376,7 +376,7 @@ class FunctionCopier:
         own_globals = dict(function.__globals__)
         copy = types.FunctionType(function.__code__, own_globals, function.__name__, function.__defaults__, cells)
         copy.__kwdefaults__, copy.__qualname__ = function.__kwdefaults__, function.__qualname__
-        self.known[id(helper)] = self.wrap(copy, helper)  # before the values that it names, which may include itself
+        self.known[id(helper)] = self.wrap(copy, helper)  # set first, because the values that it names may include it
         for name in own & set(own_globals):
             own_globals[name] = self.value(own_globals[name], names)
         if function.__defaults__ is not None:

@@ -1,8 +1,8 @@
-"""Compile functions of LLVM generated for one mechanism without numba, cache them on disk, and load their addresses.
+"""Compile LLVM functions generated for one mechanism, cache them on disk, and load them; numba is not involved.
 
 Numba writes, parses and optimises some thousand lines around each function, and its front end takes ten milliseconds
-for a line of source. Code generated for a mechanism is arithmetic on numbers in memory, already in the right order, so
-that LLVM has little to do before it emits machine code.
+for a line of source. Generated code is arithmetic on numbers in memory, already in the right order, so that LLVM has
+little to do before it emits machine code.
 """
 
 from collections import defaultdict
@@ -19,18 +19,18 @@ SINGLE_PASSES = hasattr(binding.ModulePassManager, "add_reassociate_pass")
 
 
 class GeneratedFunctions:
-    """Load generated functions into memory, as long as this object lives.
+    """Load generated functions into memory for as long as this object lives.
 
     Parameters
     ----------
     names : list of str
     content : bytes
-        Of `object_code`.
+        Result of `object_code`.
 
     Attributes
     ----------
     addresses : dict
-        By their names.
+        Addresses of the functions by name.
     """
 
     def __init__(self, names: list[str], content: bytes):
@@ -42,7 +42,7 @@ class GeneratedFunctions:
 
 
 class DeferredFunctions:
-    """Generate functions when their addresses are first used, because a run may not need them."""
+    """Generate functions when their addresses are first used: many runs do not need them."""
 
     def __init__(self, make: Callable[[], GeneratedFunctions]):
         self._make = make
@@ -68,15 +68,16 @@ def generated_functions(
     write: Callable[[], tuple[list[str], str]],
     passes: bool = True,
 ) -> GeneratedFunctions:
-    """Return the functions of a module that `write` writes, from memory or the disk if they are there.
+    """Return the functions of a module, from memory or the disk if they are there; otherwise call `write`, and compile.
 
     Parameters
     ----------
     kind : str
-        Under which they are kept, the newest MAX_ON_DISK of each kind.
+        Name of the cache; it holds the newest MAX_ON_DISK modules.
     stamp, key : str
-        What the functions depend on: a digest of what writes them, and of their own content.
+        Digests of the code that writes the functions, and of what they compute.
     write : callable
+        Returns the names of the functions and the text of the LLVM module.
     passes : bool
         See `object_code`.
     """
@@ -85,7 +86,7 @@ def generated_functions(
     files, place = _code_files(kind, stamp), _disk_key(key)
     try:
         kept = files.load(place)
-    except Exception:  # a file of another installation: it is written again
+    except Exception:  # a file of another installation: compile again, and overwrite it
         kept = None
     if kept is None:
         names, text = write()
@@ -113,7 +114,7 @@ def _disk_key(key: str) -> Any:
 
 
 def object_code(text: str, passes: bool = True) -> bytes:
-    """Compile a module for this processor; with `passes`, simplify the operations first."""
+    """Compile an LLVM module for this processor to object code; with `passes`, simplify the operations first."""
     machine = _compiler()
     target = f'target triple = "{_triple()}"\ntarget datalayout = "{machine.target_data}"\n'
     module = binding.parse_assembly(target + text)
@@ -133,7 +134,7 @@ def _compiler() -> Any:
 def _two_passes() -> tuple[Any, Any]:
     """Create the two passes that speed up small mechanisms by a tenth; all other passes together gain nothing more.
 
-    They are created once a process, because each discarded pass leaves about 300 kB.
+    They are created once per process, because LLVM leaks about 300 kB for each pass.
     """
     passes = binding.create_new_module_pass_manager()
     passes.add_reassociate_pass()
@@ -142,7 +143,7 @@ def _two_passes() -> tuple[Any, Any]:
 
 
 def _all_passes() -> tuple[Any, Any]:
-    """Create the passes of llvmlite 0.44, which serve one module."""
+    """Create the passes of llvmlite 0.44, which can be used for one module only."""
     builder = _pass_builder()
     return builder.getModulePassManager(), builder
 
@@ -157,13 +158,13 @@ def _triple() -> str:
 
 
 def _machine() -> Any:
-    """Create LLVM's description of the processor as numba sees it (NUMBA_CPU_NAME); an engine keeps the one it gets."""
+    """Create LLVM's description of the processor that numba uses (NUMBA_CPU_NAME); an engine takes ownership of it."""
     options: dict[str, Any] = {"opt": 1}  # level 2 takes a quarter longer and gains nothing in straight-line code
     cpu_target.target_context.codegen()._customize_tm_options(options)
     return binding.Target.from_triple(_triple()).create_target_machine(**options)
 
 
 def has_wide_vectors() -> bool:
-    """Return whether vectors of the processor, as numba sees it, hold eight doubles."""
+    """Return whether a vector of the processor that numba uses holds eight doubles."""
     _, _, features = cpu_target.target_context.codegen().magic_tuple()
     return "+avx512f" in features.split(",")

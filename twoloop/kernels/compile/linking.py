@@ -1,14 +1,14 @@
-"""Compile kernels: helpers are not compiled alone, but within the kernels that call them.
+"""Compile kernels together with their helpers, which get no machine code of their own.
 
-Numba optimises each function together with all that it calls and emits its machine code, so that a helper at depth five
-is optimised six times, and its own machine code is never called. Here helpers are passed on as LLVM's intermediate
-code, and the kernel at the top is optimised once. Passes of numba's front end (half of the time) that find nothing to
-do are left out. Loops are neither unrolled nor vectorised: those of a mechanism are short, and the tests of their
-length cost more than they gain.
+Numba optimises each function together with all that it calls and emits its machine code. So a helper at depth five is
+optimised six times, and its own machine code is never called. Here numba passes helpers on as LLVM's intermediate code,
+and only the kernel at the top is optimised. Passes of numba's front end (half of the time) that find nothing to do are
+left out. Loops are neither unrolled nor vectorised: those of a mechanism are short, and the tests of their length cost
+more than they gain.
 
 While a kernel is compiled, `kernel_rules` replaces some of numba's functions; compilations of other functions meanwhile
-are not affected. A negative index of a kernel does not count from the end, as none is negative: the code for this would
-hide from LLVM that elements are adjacent. The other rules give the same machine code in less time: half of a
+are not affected. In a kernel no index is negative, so negative indices do not count from the end: the code for this
+would hide from LLVM that elements are adjacent. The other rules give the same machine code in less time: half of a
 compilation is Python, in which numba computes the same results again and again.
 
 Other modules import the private parts of numba that code generation uses from here.
@@ -43,7 +43,7 @@ __all__ = ["Dispatcher", "add_signature", "cgutils", "forget_compiled", "jitable
 
 
 def jitable_templates(function: Any) -> list[Any]:
-    """Return numba's templates of a function made by `register_jitable`, which it compiles again in each caller.
+    """Return numba's templates of a function made by `register_jitable`, which each caller compiles again.
 
     The list is empty for any other function.
     """
@@ -57,7 +57,7 @@ def jitable_templates(function: Any) -> list[Any]:
         return []
     sources = [getattr(getattr(each, "_overload_func", None), "__closure__", None) for each in templates]
     own = [any(cell.cell_contents is function for cell in source or ()) for source in sources]
-    return templates if all(own) else []  # another implementation may replace it
+    return templates if all(own) else []  # else another implementation may replace the function
 
 
 def add_signature(function: Dispatcher, signature: Any) -> None:
@@ -66,7 +66,7 @@ def add_signature(function: Dispatcher, signature: Any) -> None:
     (compiled,) = own.overloads.values()
     own._insert([each._code for each in signature.args], compiled.entry_point, False)
     own.overloads[signature.args] = compiled._replace(signature=signature)
-    described = copy(compiled.fndesc)  # for compiled functions that call it
+    described = copy(compiled.fndesc)  # compiled callers use this description
     described.argtypes = signature.args
     own.targetctx.insert_user_function(compiled.entry_point, described, [compiled.library])
 
@@ -77,7 +77,7 @@ def options_of(helper: Any) -> dict[str, Any]:
 
 
 def forget_compiled(function: Any) -> None:
-    """Let numba compile a function made by `register_jitable` again at its next call."""
+    """Make numba compile a function made by `register_jitable` again at its next call."""
     for template in jitable_templates(function):
         template._impl_cache.clear()
 
@@ -85,8 +85,8 @@ def forget_compiled(function: Any) -> None:
 _index_from_either_end = arrayobj.fix_integer_index
 
 
-def _index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
-    if kind.signed and isinstance(context.active_code_library, _Linked | _Whole):
+def _resolve_index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
+    if kind.signed and isinstance(context.active_code_library, _HelperLibrary | _KernelLibrary):
         return context.cast(builder, index, kind, types.intp)
     return _index_from_either_end(context, builder, kind, index, size)
 
@@ -95,7 +95,7 @@ _any_indexing: Any = arrayobj.basic_indexing
 
 
 def _indexing(context: Any, builder: Any, kind: Any, array: Any, index_types: Any, indices: Any, **options: Any) -> Any:
-    """Return the address of one element of a contiguous array, without the code that only views need."""
+    """Return the address of one element of a contiguous array, without the code that only slices need."""
     of_element = len(indices) == kind.ndim and all(isinstance(each, types.Integer) for each in index_types)
     if kind.layout != "C" or not of_element or options.get("boundscheck"):
         return _any_indexing(context, builder, kind, array, index_types, indices, **options)
@@ -107,7 +107,7 @@ def _indexing(context: Any, builder: Any, kind: Any, array: Any, index_types: An
 
 _plain_call_type: Any = BaseFunction.get_call_type
 _call_types: dict[Any, tuple[Any, Any]] = {}
-# options of functions and their texts; kept, so that no other object gets their id
+# options and their texts by id; the options are stored so that no other object gets their id
 _options: dict[int, tuple[Any, str]] = {}
 
 
@@ -120,7 +120,7 @@ def _text_of(options: Any) -> str:
 def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
     """Return the signature of a call of one of numba's functions, cached for the same types and options.
 
-    Numba tries all implementations of an operator at each call, which is a tenth of a compilation.
+    Without the cache numba tries all implementations of an operator at each call, a tenth of a compilation.
     """
     key = self, args, tuple(kws.items()), _text_of(ConfigStack.top_or_none())
     if key not in _call_types:
@@ -130,15 +130,15 @@ def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
     return signature
 
 
-_found_size: Any = BaseContext.get_abi_sizeof
+_compute_size: Any = BaseContext.get_abi_sizeof
 _sizes: dict[str, int] = {}
 
 
 def _size_of(self: Any, kind: Any) -> Any:
-    """Return the size of a type, cached, because numba lets LLVM read a module at each variable."""
+    """Return the size of a type, cached, because numba has LLVM parse a module for each variable."""
     name = str(kind)
     if name not in _sizes:
-        _sizes[name] = _found_size(self, kind)
+        _sizes[name] = _compute_size(self, kind)
     return _sizes[name]
 
 
@@ -147,7 +147,7 @@ _inlined: dict[Any, Any] = {}
 
 
 def _inlined_code(self: Any, function: Any, enable_ssa: bool = False) -> Any:
-    """Return the cached code of an inlined function, which numba would read again at each call."""
+    """Return the cached code of an inlined function, which numba would analyse again at each call."""
     if (function, enable_ssa) not in _inlined:
         _inlined[function, enable_ssa] = _inlined_passes(self, function, enable_ssa)
     self.flags.enable_ssa = enable_ssa
@@ -156,11 +156,11 @@ def _inlined_code(self: Any, function: Any, enable_ssa: bool = False) -> Any:
     return code
 
 
-_LEAVES = {ir.Loc, str, int, bool, type(None)}  # types of a statement's parts that contain no variables
+_LEAF_TYPES = {ir.Loc, str, int, bool, type(None)}  # types within a statement that contain no variables
 
 
 def _variables(self: Any, held: Any) -> list[Any]:
-    """Return the variables that a statement names, faster than numba, which calls a function for each of its parts."""
+    """Return the variables of a statement; numba's version is slower because it calls a function for each part."""
     if isinstance(held, ir.Var):
         return [held]
     if isinstance(held, ir.Inst):
@@ -170,7 +170,7 @@ def _variables(self: Any, held: Any) -> list[Any]:
         for each in held.values() if isinstance(held, dict) else held:
             if type(each) is ir.Var:
                 found.append(each)
-            elif type(each) not in _LEAVES:
+            elif type(each) not in _LEAF_TYPES:
                 found += _variables(self, each)
     return found
 
@@ -178,10 +178,10 @@ def _variables(self: Any, held: Any) -> list[Any]:
 _load_registries: Any = CPUContext.load_additional_registries
 
 
-def _load_once(self: Any) -> None:
+def _load_registries_once(self: Any) -> None:
     """Install numba's implementations of Python's and NumPy's functions, which numba imports again for each function.
 
-    A new intrinsic is added to one of the existing registries; copies of a context share them.
+    All copies of a context share the registries; a new intrinsic is added to one of these.
     """
     if self._registries:
         for registry in list(self._registries):
@@ -194,19 +194,19 @@ _LOCKS = ("numba:llvm_lock", "numba:compiler_lock")
 
 
 def _ignoring_locks(tell: Any) -> Any:
-    """Report events, but not those of locks: some thousand for each kernel, and each measures all before it."""
+    """Report events, but not those of locks: there are thousands for each kernel, and numba sums the times of all."""
     return lambda kind, *args, **named: None if kind in _LOCKS else tell(kind, *args, **named)
 
 
-# owner, name and replacement of each function; Function inherits the one that it gets here
+# owner, name and replacement of each of numba's functions
 _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
     (Function, "get_call_type", _call_type),
-    (arrayobj, "fix_integer_index", _index),
+    (arrayobj, "fix_integer_index", _resolve_index),
     (arrayobj, "basic_indexing", _indexing),
     (BaseContext, "get_abi_sizeof", _size_of),
     (InlineWorker, "run_untyped_passes", _inlined_code),
     (ir.Inst, "_rec_list_vars", _variables),
-    (CPUContext, "load_additional_registries", _load_once),
+    (CPUContext, "load_additional_registries", _load_registries_once),
     (event, "start_event", _ignoring_locks(event.start_event)),
     (event, "end_event", _ignoring_locks(event.end_event)),
 ]
@@ -235,7 +235,7 @@ def kernel_rules() -> Iterator[None]:
 
 
 class _WithoutEnvironment:
-    """Code generator of code that is not loaded, so that its environment has no address."""
+    """Code generator for code that is never loaded, so that its environment has no address."""
 
     def __init__(self, codegen: Any):
         self._codegen = codegen
@@ -247,7 +247,7 @@ class _WithoutEnvironment:
         """Ignore the environment."""
 
 
-class _Linked(CPUCodeLibrary):
+class _HelperLibrary(CPUCodeLibrary):
     """Code of a helper, to be linked into its callers."""
 
     @property
@@ -261,7 +261,7 @@ class _Linked(CPUCodeLibrary):
         pass  # its callers optimise it
 
     def _get_module_for_linking(self) -> Any:
-        """Return the code itself, not a copy: nothing else uses it, and numba links a copy."""
+        """Return the code itself instead of a copy, because nothing else uses it."""
         if self._shared_module is None:
             self._ensure_finalized()
             for function in self._final_module.functions:
@@ -274,7 +274,7 @@ class _Linked(CPUCodeLibrary):
         self._finalized = True
 
 
-class _Whole(JITCodeLibrary):
+class _KernelLibrary(JITCodeLibrary):
     """Code of a kernel and of all that it calls."""
 
     vectorized = False
@@ -286,20 +286,19 @@ class _Whole(JITCodeLibrary):
         builder.getModulePassManager().run(self._final_module, builder)
 
 
-class _Vectorized(_Whole):
+class _VectorizedLibrary(_KernelLibrary):
     """Code of a kernel whose loops are worth vectorizing."""
 
     vectorized = True
 
 
-# passes over every function that find nothing to do in kernels: functions within functions; expressions of whole
-# arrays, as none is allocated; overloads that replace calls before lowering; code that a compiled function cannot
-# contain
+# passes that find nothing to do in kernels: functions within functions; expressions of whole arrays, as none is
+# allocated; overloads that replace calls before lowering; code that a compiled function cannot contain
 _SKIPPED_PASSES = {InlineClosureLikes, NopythonRewrites, InlineOverloads, IRLegalization}
 
 
 class _Compiler(Compiler):
-    """Compile as numba does, without the passes that kernels do not need."""
+    """Numba's compiler without the passes that kernels do not need."""
 
     def define_pipelines(self) -> list[Any]:
         """Return the passes."""
@@ -313,13 +312,13 @@ class HelperCompiler(_Compiler):
     """Compile a function that only compiled functions call; a call from Python would crash."""
 
     def __init__(self, typing_context: Any, target_context: Any, library: Any, *others: Any):
-        super().__init__(typing_context, target_context, _Linked(target_context.codegen(), "helper"), *others)
+        super().__init__(typing_context, target_context, _HelperLibrary(target_context.codegen(), "helper"), *others)
 
 
 class KernelCompiler(_Compiler):
     """Compile a function and optimise it together with its helpers, once."""
 
-    library: type[_Whole] = _Whole
+    library: type[_KernelLibrary] = _KernelLibrary
 
     def __init__(self, typing_context: Any, target_context: Any, library: Any, *others: Any):
         library = self.library(target_context.codegen(), "kernel")
@@ -335,25 +334,25 @@ class KernelCompiler(_Compiler):
 class VectorizingCompiler(KernelCompiler):
     """Compile a kernel whose loops are long enough to be unrolled and vectorised."""
 
-    library = _Vectorized
+    library = _VectorizedLibrary
 
 
 @cache
 def entry_point(function: Dispatcher) -> Any:
-    """Return the function that Python calls for a compiled function, without a check of types: these must fit.
+    """Return the function that Python calls for a compiled function, without the check of argument types.
 
-    That check costs as much as two steps of a small mechanism.
+    That check costs as much as two steps of a small mechanism; the caller has to pass the right types.
     """
     compiled: Any = next(iter(function.overloads.values()))
     return compiled.entry_point
 
 
-# addresses of functions, which have one signature each
+# addresses of compiled functions, each with one signature
 _ADDRESSES: WeakKeyDictionary[Dispatcher, int] = WeakKeyDictionary()
 
 
 def machine_code(function: Dispatcher, signature: Any) -> int:
-    """Return the address of a compiled function; its arguments and errors are passed as for numba's functions."""
+    """Return the address of a compiled function; arguments and errors are passed by numba's calling convention."""
     if function not in _ADDRESSES:
         compiled: Any = function.overloads.get(signature.args) or function.get_compile_result(signature)
         _ADDRESSES[function] = int(compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name))

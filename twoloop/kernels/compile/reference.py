@@ -1,7 +1,7 @@
 """Structures that kernels get by reference: one pointer to a table of addresses and lengths.
 
-Numba passes a named tuple by value, member by member: a workspace of forty arrays is some three hundred arguments, and
-each call that LLVM does not inline stores them all. A `Reference` has the same attributes and is one argument.
+Numba passes a named tuple by value, member by member: a workspace of forty arrays becomes some three hundred arguments,
+which each call that LLVM does not inline writes to memory. A `Reference` has the same attributes and is one argument.
 """
 
 import hashlib
@@ -21,47 +21,47 @@ from numba.np.numpy_support import as_dtype
 from twoloop.kernels.compile.caches import BoundedCache
 from twoloop.kernels.compile.linking import machine_code
 
-_KNOWN: dict[str, Any] = {}
+_REFERENCES: dict[str, Any] = {}
 
 
-def _known(name: str) -> Any:
-    """Return the reference of a name; numba unpickles it by this, because functions may require that very object."""
-    return _KNOWN[name]
+def _reference(name: str) -> Any:
+    """Return the `Reference` with a name; pickle calls this, because functions may require that very object."""
+    return _REFERENCES[name]
 
 
 class Reference(types.Type):
-    """Pass a structure by one pointer to a table: of each array its address and shape, of each function its address.
+    """Pass a structure by one pointer to a table: address and shape of each array, address of each function.
 
-    Functions are of numba, or of LLVM (see generated_functions.py): these get addresses of arrays,
-    and report no errors.
+    Functions are compiled by numba, or generated as LLVM (see generated_functions.py): the latter get addresses of
+    arrays, and report no errors.
 
     Parameters
     ----------
     name : str
-        Tells references apart.
+        Unique name of the type.
     arrays : dict
-        Types of the fields that are arrays, one- or two-dimensional, without gaps.
+        Types of the fields that are contiguous arrays, one- or two-dimensional.
     """
 
     def __init__(self, name: str, arrays: Mapping[str, types.Array]):
         super().__init__(name)
-        _KNOWN[name] = self
+        _REFERENCES[name] = self
         self.arrays = dict(arrays)
         self.dtypes = {field: as_dtype(kind.dtype) for field, kind in self.arrays.items()}
         self.functions: dict[str, Signature] = {}
-        self.llvm_functions: set[str] = set()  # names of the LLVM functions among these
+        self.llvm_functions: set[str] = set()  # names of the generated functions among `functions`
         self.places: dict[str, int] = {}
         self.n_words = 0
-        self._addresses: Any = BoundedCache()  # addresses of the functions of a value, whose look-up is slow
+        self._addresses: Any = BoundedCache()  # addresses by tuple of functions, because finding them is slow
         for field, kind in self.arrays.items():
             self.places[field] = self.n_words
             self.n_words += 1 + kind.ndim
 
     def __reduce__(self) -> Any:
-        return _known, (self.name,)
+        return _reference, (self.name,)
 
     def __repr__(self) -> str:
-        """Return the name with a digest of the layout: machine code on disk is kept by it."""
+        """Return the name with a digest of the layout, because it is part of the key of machine code on disk."""
         fields: list[Any] = [(field, str(kind)) for field, kind in self.arrays.items()]
         fields += [
             (field, str(self.functions[field])) if field in self.llvm_functions else field for field in self.functions
@@ -69,14 +69,14 @@ class Reference(types.Type):
         return f"{self.name}-{hashlib.sha256(repr(fields).encode()).hexdigest()[:16]}"
 
     def add_function(self, field: str, signature: Signature) -> None:
-        """Add a function, whose signature may name this very type."""
+        """Add a function; its signature may contain this type."""
         self.functions[field] = signature
         self.places[field] = self.n_words
         self.n_words += 1
         _define_call(self, field, signature)
 
     def add_llvm_functions(self, signatures: Mapping[str, Signature]) -> None:
-        """Add generated functions, which may be called if they are present; arrays are one-dimensional."""
+        """Add generated functions, which may be called only if present; arrays are passed as one-dimensional."""
         for field, signature in signatures.items():
             self.functions[field] = signature
             self.llvm_functions.add(field)
@@ -92,7 +92,7 @@ class Reference(types.Type):
     def table(self, values: Any) -> Any:
         """Return the int64 table of an object with arrays and functions of these names; the object has to outlive it.
 
-        Generated functions are given by their addresses; 0: missing.
+        For generated functions the object holds addresses, 0 if a function is missing.
         """
         words: list[int] = []
         for field, kind in self.arrays.items():
@@ -119,9 +119,9 @@ register_model(Reference)(models.OpaqueModel)
 
 @unbox(Reference)
 def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
-    """Unbox a Python object that represents a reference: its attribute `address`, or itself if it is a number.
+    """Unbox a Python object that represents a reference: its attribute `address`, or the object if it is a number.
 
-    To look up an attribute takes a tenth of a microsecond.
+    Callers that pass the number save the lookup of the attribute, a tenth of a microsecond.
     """
     kind = c.builder.load(
         c.builder.gep(c.builder.bitcast(obj, obj.type.as_pointer()), [ir.Constant(ir.IntType(32), 1)])
@@ -139,7 +139,7 @@ def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
     return NativeValue(pointer, is_error=c.pyapi.c_api_error())
 
 
-def _load(context: Any, builder: Any, pointer: Any, place: int, kind: Any) -> Any:
+def _load_word(context: Any, builder: Any, pointer: Any, place: int, kind: Any) -> Any:
     """Load a word of a table; mark it as constant, so that LLVM loads it only once."""
     slot = builder.gep(builder.bitcast(pointer, ir.IntType(64).as_pointer()), [ir.Constant(ir.IntType(64), place)])
     word = builder.load(builder.bitcast(slot, kind.as_pointer()))
@@ -165,13 +165,13 @@ class _Fields(AttributeTemplate):
 
 
 @lower_getattr_generic(Reference)
-def _array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) -> Any:
-    if field in typ.functions:  # a call gets the reference itself
+def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) -> Any:
+    if field in typ.functions:  # the lowering of a call needs the table itself
         return pointer
     kind, place = typ.arrays[field], typ.places[field]
     item = context.get_data_type(kind.dtype)
     word = ir.IntType(64)
-    shape = [_load(context, builder, pointer, place + 1 + axis, word) for axis in range(kind.ndim)]
+    shape = [_load_word(context, builder, pointer, place + 1 + axis, word) for axis in range(kind.ndim)]
     size = ir.Constant(word, context.get_abi_sizeof(item))
     strides = [size] if kind.ndim == 1 else [builder.mul(shape[1], size), size]
     fields = {
@@ -179,13 +179,13 @@ def _array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) -> An
         "parent": None,
         "nitems": shape[0] if kind.ndim == 1 else builder.mul(*shape, flags=["nsw"]),
         "itemsize": size,
-        "data": _load(context, builder, pointer, place, item.as_pointer()),
+        "data": _load_word(context, builder, pointer, place, item.as_pointer()),
         "shape": cgutils.pack_array(builder, shape),
         "strides": cgutils.pack_array(builder, strides),
     }
     model = context.data_model_manager[kind]
     array = ir.Constant(context.get_value_type(kind), ir.Undefined)
-    for name, value in fields.items():  # in registers; numba's helper would write the fields to memory, one by one
+    for name, value in fields.items():  # keep the array in registers; numba's helper would store it to memory
         at = model.get_field_position(name)
         element = ir.Constant(array.type.elements[at], None) if value is None else value
         array = builder.insert_value(array, element, at)
@@ -199,7 +199,7 @@ def _define_call(typ: Reference, field: str, signature: Signature) -> None:
     def call(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         convention = context.call_conv
         kind = convention.get_function_type(signature.return_type, signature.args).as_pointer()
-        function = _load(context, builder, args[0], place, kind)
+        function = _load_word(context, builder, args[0], place, kind)
         status, value = convention.call_function(builder, function, signature.return_type, signature.args, args[1:])
         with builder.if_then(status.is_error, likely=False):
             convention.return_status_propagate(builder, status)
@@ -225,7 +225,7 @@ def _define_llvm_call(typ: Reference, field: str, signature: Signature) -> None:
     @lower_builtin((typ.name, field), typ, *signature.args)
     def call(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         kind = ir.FunctionType(_llvm_type(signature.return_type), [_llvm_type(each) for each in signature.args])
-        function = _load(context, builder, args[0], place, kind.as_pointer())
+        function = _load_word(context, builder, args[0], place, kind.as_pointer())
         plain = [
             make_array(kind)(context, builder, value).data if isinstance(kind, types.Array) else value
             for kind, value in zip(signature.args, args[1:], strict=True)

@@ -1,1 +1,1 @@
-"""Control of steps, whatever their formulas: step size, switching, discontinuities, singular positions."""
+"""Control of steps of any method: step size, switching of methods, discontinuities, singular positions."""

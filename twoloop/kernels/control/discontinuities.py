@@ -1,22 +1,22 @@
 """Detect sudden changes of forces, C_t and b ahead of a step: a gust, a blow, a switch, a magnet.
 
-A step evaluates the equations at its stages only, and may pass over what happens between two of them. So forces, C_t
-and b are sampled ahead: a sample calls single callbacks and costs less than an evaluation of the equations.
+A step evaluates the equations at its stages only, and may pass over a force that acts between two stages. So forces,
+C_t and b are sampled ahead: a sample calls single callbacks and costs less than an evaluation of the equations.
 
-- Second differences of the samples are small where a value is smooth, against its range less the line from the first
-  sample to the last. Of what happens within one or two samples they are as large as the range. The step then ends
-  there, so that the run meets the change. It also ends where a value is not finite.
-- Samples follow the parabola on which the motion sets out, where forces may change suddenly with place or speed and
-  steps are longer than the spacing: each long step is sampled, and all short ones that end within LONG spacings at
-  once. Elsewhere the samples stay at the state at which the step begins.
+- A value is smooth if the second differences of its samples are small against its range (of which the straight line
+  from the first to the last sample is subtracted). A change within one or two samples makes them as large as the range.
+  The step then ends there, and the run does not miss the change. It also ends where a value is not finite.
+- Where forces may change suddenly with place or speed and steps are longer than the spacing, samples follow the
+  parabola of the present position, velocity and acceleration: each long step is sampled, and all short ones that end
+  within LEAST_DISTANCE spacings at once. Elsewhere the samples stay at the state at which the step begins.
 - Samples in time alone are also no further apart than a share of the step.
 - The shortest time between two changes is recorded, and the shortest time for which a value differs from those before
-  and behind. Changes as short may have been missed where samples were further apart: a message says so.
+  and after. Where samples were further apart, other changes as short may have been missed: a message says so.
 
-A jump of C_t or b, as at the end of a ramp in a drive, changes velocities as an impulse does: methods that restore the
-dependent coordinates leave the independent ones unchanged, which no momentum balance allows. So a step is checked if
-its velocities change by more than its accelerations explain: C_t and b are sampled at thirteen times along a line. What
-a polynomial of degree 11 leaves of them is almost zero if they are smooth on the scale of the step, and falls by 2^12
+A jump of C_t or b, as at the end of a ramp in a drive, changes velocities as an impulse does. Methods that restore the
+dependent coordinates leave the independent ones unchanged, which violates the balance of momentum. So a step is checked
+if its velocities change by more than its accelerations explain: C_t and b are sampled at thirteen times along a line.
+The twelfth difference of these samples is almost zero if they are smooth on the scale of the step, and falls by 2^12
 where an interval is halved. At a jump it is the size of the jump, in one of the halves, however short they are.
 """
 
@@ -34,9 +34,9 @@ N_PARTS = 12
 BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.0, 66.0, -12.0, 1.0)
 RATE_HALVINGS = 60
 RATE_ROUNDING = 1e-11  # relative to C_t: rounding errors of the twelfth difference
-TIME_ROUNDING = 5e3  # times the slope and the rounding of t: rounding errors that come from t
-# relative to the mean slope over the step: a part steeper than this is a ramp, for which the step is too long, if its
-# length is at most ...
+TIME_ROUNDING = 5e3  # times the slope and the spacing of t: rounding errors that are due to t
+# relative to the mean slope over the step: a steeper part is a ramp, which the step must not pass over if the length of
+# the part is at most ...
 STEEPNESS = 4.0
 MAX_RAMP_SHARE = 0.125  # ... this share of the step
 MIN_SPACINGS = 8.0  # shortest interval that is halved, in spacings of floating-point numbers
@@ -45,7 +45,7 @@ SMOOTH, RAMP, JUMP = range(3)
 
 @compiled
 def _sample_rates(f, w, t, q, way, begin, end):
-    """Evaluate C_t and b at thirteen times from begin to end, on the line q + way (time - t), into w.rates."""
+    """Evaluate C_t and b at thirteen times from begin to end, at q + way (time - t), into w.rates."""
     for k in range(N_PARTS + 1):
         time = end if k == N_PARTS else begin + (end - begin) * (k / N_PARTS)
         for m in range(q.size):
@@ -65,7 +65,7 @@ def _twelfth_difference(w, row):
 
 @compiled
 def _slope_and_size(w, row, length):
-    """Return the mean absolute slope of a row over the samples, and its largest value."""
+    """Return the mean absolute slope of a row over the samples, and its largest absolute value."""
     change = 0.0
     largest = abs(w.rates[0, row])
     for k in range(N_PARTS):
@@ -75,8 +75,8 @@ def _slope_and_size(w, row, length):
 
 
 @compiled
-def _allowed(f, w, tolerances, x, row):
-    """Return the error in a row that the tolerances of coordinates, or velocities, x allow."""
+def _allowed_error(f, w, tolerances, x, row):
+    """Return the error in a row that the tolerances of x (coordinates or velocities) allow."""
     largest = 0.0
     if f.flags[FORM] == STATIC:
         rows, columns, _ = jacobian_of(f.static_program)
@@ -93,7 +93,7 @@ def _allowed(f, w, tolerances, x, row):
 
 @compiled
 def unexplained_velocity_change(tolerances, h, state, new_state, n):
-    """Return the largest change of a velocity that accelerations at both ends do not explain, over the tolerances."""
+    """Return the largest change of a velocity that accelerations at both ends do not explain, over its tolerance."""
     largest = 0.0
     for m in range(n):
         v, v1, a, a1 = state[n + m], new_state[n + m], state[2 * n + m], new_state[2 * n + m]
@@ -104,10 +104,10 @@ def unexplained_velocity_change(tolerances, h, state, new_state, n):
 
 @compiled
 def locate_discontinuity(f, w, t, end, q, v, way, tolerances):
-    """Return SMOOTH, RAMP or JUMP, and the interval from t to `end` in which the least smooth row rises.
+    """Return SMOOTH, RAMP or JUMP, and the interval from t to `end` in which the least smooth row changes.
 
-    After RAMP, the next step is at most as long as the interval. Methods whose accelerations at both ends are zero see
-    nothing of a ramp that fills their step.
+    After RAMP, the next step is at most as long as the interval. A ramp that fills a whole step is invisible to methods
+    whose accelerations at both ends are zero.
     """
     begin = t
     h = end - t
@@ -119,7 +119,7 @@ def locate_discontinuity(f, w, t, end, q, v, way, tolerances):
             continue
         slope, size = _slope_and_size(w, i, h)
         least = max(
-            _allowed(f, w, tolerances, v, i), RATE_ROUNDING * size, TIME_ROUNDING * slope * np.spacing(abs(end))
+            _allowed_error(f, w, tolerances, v, i), RATE_ROUNDING * size, TIME_ROUNDING * slope * np.spacing(abs(end))
         )
         if bend > most * least:
             row, limit, mean, most = i, least, slope, bend / least
@@ -156,31 +156,31 @@ def locate_discontinuity(f, w, t, end, q, v, way, tolerances):
 
 
 N_SAMPLES = 20  # number of sample times ahead that are compared
-LONG = 12.0  # spacings: shortest distance ahead over which the motion is sampled
-SHARE = 0.1  # relative to the range: second difference of a sudden change, equal to that of a bell four spacings wide
-LEAST = 0.1  # relative to rtol times the largest value so far: smallest range that may matter
+LEAST_DISTANCE = 12.0  # shortest distance ahead over which the motion is sampled, in spacings of samples
+SUDDEN_SHARE = 0.1  # relative to the range: second difference of a sudden change, as of a bell four spacings wide
+LEAST_RANGE = 0.1  # relative to rtol times the largest value so far: smallest range that may matter
 # ... and its lower bound in any units: squares below this underflow, and subnormal numbers change in steps
-FLOOR = 1e-150
-IN_A_STEP = 8.0  # samples within a step: stages are up to a quarter of it apart, and may all miss a shorter force
-SHRUNK = 0.25  # relative to the last spacing: below this, samples are taken again
+LEAST_VALUE = 1e-150
+N_IN_STEP = 8.0  # samples within a step: stages are up to a quarter of it apart, and may all miss a shorter force
+RESAMPLE_BELOW = 0.25  # ratio of the spacing to the last one below which the rest of the samples is taken again
 LEAST_APART = 16.0  # smallest spacing of samples, in spacings of floating-point numbers
 HALVINGS = 20  # number of bisections to find when a value changes between two samples
-SAME = 1e-5  # relative to the widest spacing: changes closer than this are one change
+SAME_CHANGE = 1e-5  # relative to the widest spacing: changes closer than this are one change
 # relative to a hundredth of the run: before that, a force that begins at zero (1 - cos(t)) changes by rounding
-SOON = 5e-5
+SOONEST = 5e-5
 STEEPER = 2.0  # ratio to the changes before and after: the flank of a pulse is steeper than this, a slope is not
-SHORT = 0.5  # relative to the longest of the last steps: shorter steps show that something has happened
-IN_SHORT = 4  # number of samples within a short step
+SHORT_STEP = 0.5  # relative to the longest of the last steps: shorter steps suggest a discontinuity
+N_IN_SHORT = 4  # number of samples within a short step
 DECAYED = 0.5  # relative to an acceleration: a larger change, while velocities change by their tolerance, is a decay
-NEARLY = 0.01  # relative to the spacing: a step that begins closer than this to a change begins at the change
-LARGEST = N_SAMPLES + 1  # row of w.changes for the largest values so far, behind those of the values
+AT_CHANGE = 0.01  # relative to the spacing: a step that begins closer than this to a change begins at the change
+LARGEST = N_SAMPLES + 1  # row of w.changes for the largest values so far; the samples are in the rows before
 MIDDLE = N_SAMPLES + 2  # row of w.changes for values between two samples
 N_CHANGES = N_SAMPLES + 3
 
 
 @compiled
 def _sample(f, w, time, since, q, v, a, now):
-    """Sample forces, C_t and b at a time, at the state `since` seconds after (q, v, a)."""
+    """Write forces, C_t and b into `now`, at a time and at the state `since` seconds after (q, v, a)."""
     for m in range(q.size):
         w.x[m] = q[m] + since * (v[m] + 0.5 * since * a[m])
         w.y[m] = v[m] + since * a[m]
@@ -191,7 +191,7 @@ def _sample(f, w, time, since, q, v, a, now):
 
 @compiled
 def _largest(values):
-    """Return the largest value so far, over all columns: a coordinate without a force has no scale of its own."""
+    """Return the largest of these values: a coordinate without a force has no scale of its own."""
     largest = 0.0
     for x in values:
         largest = max(largest, x)
@@ -200,59 +200,59 @@ def _largest(values):
 
 @compiled
 def _is_smooth(values, k, n):
-    """Return whether the second difference at place k of n + 1 values is close to that of its neighbour."""
-    other = k + 1 if k + 2 <= n else k - 1
-    if other < 1:
+    """Return whether the second difference at index k of n + 1 values is close to that of its neighbour."""
+    second_value = k + 1 if k + 2 <= n else k - 1
+    if second_value < 1:
         return False
     here = values[k + 1] - 2.0 * values[k] + values[k - 1]
-    there = values[other + 1] - 2.0 * values[other] + values[other - 1]
+    there = values[second_value + 1] - 2.0 * values[second_value] + values[second_value - 1]
     return here * there > 0.0 and abs(there) > 0.5 * abs(here)
 
 
 @compiled
-def _bend(values, n, slope, least, within):
-    """Return the first index at which n + 1 values, less a line, bend suddenly (0: nowhere), and the limit."""
+def _find_bend(values, n, slope, least, within):
+    """Return the first index at which n + 1 values, less a line, bend suddenly (0: nowhere), and the limit for that."""
     low = high = 0.0
     for k in range(1, n + 1):
         off = values[k] - values[0] - k * slope
         low, high = min(low, off), max(high, off)
-    sudden = SHARE * (high - low)
+    limit = SUDDEN_SHARE * (high - low)
     if high - low > least:
         for k in range(1, n):
             second = values[k + 1] - 2.0 * values[k] + values[k - 1]
-            if abs(second) > sudden and not (within and _is_smooth(values, k, n)):
-                return k, sudden
-    return 0, sudden
+            if abs(second) > limit and not (within and _is_smooth(values, k, n)):
+                return k, limit
+    return 0, limit
 
 
 @compiled
 def _first_sudden_bend(values, n, along, least):
-    """Return the index of the first sudden bend of sampled values, and the limit that it exceeds; 0 if there is none.
+    """Return the index of the first sudden bend of sampled values (0: there is none), and the limit that it exceeds.
 
     With `along` = 1 the straight line from the first to the last value is subtracted before. The search is repeated
-    among the values before a bend, until there is no earlier one.
+    among the values before the bend, until it finds no earlier one.
     """
-    place, sudden = _bend(values, n, along * (values[n] - values[0]) / max(n, 1), least, False)
-    while place > 1:  # a smooth curve may bend as much within few values
-        before, share = _bend(values, place, along * (values[place] - values[0]) / place, least, True)
+    place, limit = _find_bend(values, n, along * (values[n] - values[0]) / max(n, 1), least, False)
+    while place > 1:  # among few values a smooth curve may bend as much: _is_smooth excludes it
+        before, share = _find_bend(values, place, along * (values[place] - values[0]) / place, least, True)
         if before == 0:
             break
-        place, sudden = before, share
-    return place, sudden
+        place, limit = before, share
+    return place, limit
 
 
 @compiled
-def _is_sudden_change(previous, one, other, following, sudden):
-    """Return whether values change suddenly between two samples, and much less before and after."""
-    change = other - one
+def _is_sudden_change(previous, first_value, second_value, following, limit):
+    """Return whether values change suddenly between two samples, and much less before and after these two."""
+    change = second_value - first_value
     sign = 1.0 if change > 0.0 else -1.0
-    beside = max(sign * (one - previous), sign * (following - other))
-    return abs(change) > sudden and STEEPER * beside < abs(change)
+    beside = max(sign * (first_value - previous), sign * (following - second_value))
+    return abs(change) > limit and STEEPER * beside < abs(change)
 
 
 @compiled
-def _flank(f, w, t, low, high, k, j, q, v, a):
-    """Return the time just behind the change of value j between the times low and high (samples k and k + 1)."""
+def _locate_change(f, w, low, high, k, j, q, v, a):
+    """Return the time just after the change of value j between the times low and high (samples k and k + 1)."""
     changes = w.changes
     before, after = changes[k, j], changes[k + 1, j]
     for _ in range(HALVINGS):
@@ -267,10 +267,10 @@ def _flank(f, w, t, low, high, k, j, q, v, a):
 
 
 @compiled
-def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, place, column, sudden, q, v, a):
-    """Record the time of a change next to the index where a value bends, and the time since the change before."""
-    values, apart = w.changes[:, column], max(NEARLY * spacing, SAME * clock[at.WIDEST_SAMPLING])
-    soonest = clock[at.T_START] + SOON * tolerances[GAP]
+def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, place, column, limit, q, v, a):
+    """Record the time of a change next to the bend at index `place`, and the time since the previous change."""
+    values, apart = w.changes[:, column], max(AT_CHANGE * spacing, SAME_CHANGE * clock[at.WIDEST_SAMPLING])
+    soonest = clock[at.T_START] + SOONEST * tolerances[GAP]
     for k in range(place - 1, place + 1):
         low, high = begin + k * spacing, begin + (k + 1) * spacing
         known = low - apart <= clock[at.LAST_CHANGE] <= high + apart
@@ -278,8 +278,8 @@ def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, place, column
             continue
         if k == 0:
             _sample(f, w, low - spacing, 0.0, q, v, a, w.changes[MIDDLE])
-        if _is_sudden_change(values[MIDDLE if k == 0 else k - 1], values[k], values[k + 1], values[k + 2], sudden):
-            time = _flank(f, w, t, low, high, k, column, q, v, a)
+        if _is_sudden_change(values[MIDDLE if k == 0 else k - 1], values[k], values[k + 1], values[k + 2], limit):
+            time = _locate_change(f, w, low, high, k, column, q, v, a)
             if clock[at.LAST_CHANGE] > -np.inf:
                 clock[at.SHORTEST_CHANGE] = min(clock[at.SHORTEST_CHANGE], abs(time - clock[at.LAST_CHANGE]))
             clock[at.LAST_CHANGE] = time
@@ -287,10 +287,9 @@ def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, place, column
 
 @compiled
 def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, along, q, v, a):
-    """Return the first sample ahead at which something changes suddenly, or infinity; and the end of the samples.
+    """Return the time of the first sample at which a value changes suddenly, or infinity; and the end of the samples.
 
-    The state is that at t, the times go from `begin`, none is after `last`; `along` tells whether the state goes with
-    them.
+    (q, v, a) is the state at t; samples go from `begin` to `last` at most. `along` = 1: they follow the motion.
     """
     changes, n, first = w.changes, 0, np.inf
     for k in range(N_SAMPLES + 1):
@@ -306,36 +305,36 @@ def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, along,
         if first < np.inf:
             break
         n = k
-    least = LEAST * tolerances[RTOL]
-    of_forces = max(FLOOR, least * _largest(changes[LARGEST, : q.size]))
-    of_rates = max(FLOOR, least * _largest(changes[LARGEST, q.size :]))
-    bend, column, sudden = n, -1, 0.0
+    least = LEAST_RANGE * tolerances[RTOL]
+    of_forces = max(LEAST_VALUE, least * _largest(changes[LARGEST, : q.size]))
+    of_rates = max(LEAST_VALUE, least * _largest(changes[LARGEST, q.size :]))
+    bend, column, limit = n, -1, 0.0
     for j in range(changes.shape[1]):
         values = changes[:, j]
         place, least = _first_sudden_bend(values, n, along, of_forces if j < q.size else of_rates)
         if 0 < place < bend:
-            bend, column, sudden = place, j, least
+            bend, column, limit = place, j, least
     if column >= 0:
         first = min(first, begin + bend * spacing)
         if along == 0.0:
-            _record_changes(f, w, tolerances, clock, t, begin, spacing, n, bend, column, sudden, q, v, a)
+            _record_changes(f, w, tolerances, clock, t, begin, spacing, n, bend, column, limit, q, v, a)
     return first, min(first, begin + N_SAMPLES * spacing if n == N_SAMPLES else last)
 
 
 @compiled
 def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, a):
-    """Record how long a value in a short step differs from its neighbours: the samples have missed that change."""
+    """Record how long a value in a short step differs from its neighbours: the samples ahead have missed it."""
     changes, wide, begin, end = w.changes, control[at.APART], clock[at.T_START], t + size
     clock[at.COMPARED] = t
     if end + wide > last or (t - 2.0 * wide < begin and end + 2.0 * wide > last):
         return
     for k, time in enumerate((t - 2.0 * wide, t - wide, end + wide, end + 2.0 * wide)):
         _sample(f, w, min(max(time, begin), last), 0.0, q, v, a, changes[k + (k > 1)])
-    least = LEAST * tolerances[RTOL]
-    of_forces = max(FLOOR, least * _largest(changes[LARGEST, : q.size]))
-    of_rates = max(FLOOR, least * _largest(changes[LARGEST, q.size :]))
-    for k in range(IN_SHORT):
-        time = t + k * size / IN_SHORT
+    least = LEAST_RANGE * tolerances[RTOL]
+    of_forces = max(LEAST_VALUE, least * _largest(changes[LARGEST, : q.size]))
+    of_rates = max(LEAST_VALUE, least * _largest(changes[LARGEST, q.size :]))
+    for k in range(N_IN_SHORT):
+        time = t + k * size / N_IN_SHORT
         _sample(f, w, time, 0.0, q, v, a, changes[2])
         for j in range(changes.shape[1]):
             values = changes[:, j]
@@ -343,8 +342,8 @@ def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, 
             high = max(max(values[0], values[1]), max(values[3], values[4]))
             beyond = max(values[2] - high, low - values[2])
             if beyond > max(STEEPER * (high - low), of_forces if j < q.size else of_rates):
-                first = _flank(f, w, t, max(t - wide, begin), time, 1, j, q, v, a)
-                second = _flank(f, w, t, time, end + wide, 2, j, q, v, a)
+                first = _locate_change(f, w, max(t - wide, begin), time, 1, j, q, v, a)
+                second = _locate_change(f, w, time, end + wide, 2, j, q, v, a)
                 clock[at.SHORTEST_CHANGE] = min(clock[at.SHORTEST_CHANGE], second - first)
 
 
@@ -352,8 +351,8 @@ def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, 
 def _acceleration_lasts(f, w, tolerances, t, way, q, v, a, Q, V, A):
     """Return whether accelerations hardly change until they have changed a velocity by its tolerance.
 
-    Those of a body that stiff friction holds do change: they are what the tolerances, or rounding, leave of balanced
-    forces. A parabola that continued them would leave the state of rest far behind.
+    The accelerations of a body that stiff friction holds do change: they are rounding errors of balanced forces. A
+    parabola that continued them would leave the state of rest far behind.
     """
     n, time, largest, change = w.Q.size, way, 0.0, 0.0
     for m in range(n):
@@ -373,10 +372,10 @@ def _acceleration_lasts(f, w, tolerances, t, way, q, v, a, Q, V, A):
 
 @compiled
 def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a, Q, V, A):
-    """Sample once along the motion of a step, and of the following steps that end within LONG spacings."""
-    if clock[at.MOTION_SAMPLED_TO] >= t + (1.0 - NEARLY) * size:
+    """Sample along the motion of a step, and of all following steps that end within LEAST_DISTANCE spacings."""
+    if clock[at.MOTION_SAMPLED_TO] >= t + (1.0 - AT_CHANGE) * size:
         return
-    way = min(max(size, LONG * spacing), last - t)
+    way = min(max(size, LEAST_DISTANCE * spacing), last - t)
     clock[at.SAMPLES_MOTION] = 1.0
     first, clock[at.MOTION_SAMPLED_TO] = first_discontinuity(
         f, w, tolerances, clock, t, t, way / N_SAMPLES, last, 1.0, q, v, a
@@ -387,28 +386,28 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
             f, w, tolerances, clock, t, t, way / N_SAMPLES, last, 1.0, q, v, A
         )
     clock[at.SAMPLES_MOTION] = 0.0
-    # a change that samples in time have found at their end: they continue from there, and have to be as close
+    # a change found by the last samples in time: the next samples in time begin there, and need their own spacing
     known = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t
-    if not known and way <= N_SAMPLES * min(control[at.APART], size / IN_A_STEP):  # as close as samples in time alone
+    if not known and way <= N_SAMPLES * min(control[at.APART], size / N_IN_STEP):  # as close as samples in time alone
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], way / N_SAMPLES)
         if clock[at.MOTION_SAMPLED_TO] > clock[at.SAMPLED_TO]:
             clock[at.SAMPLED_TO], clock[at.SAMPLED_EVERY] = clock[at.MOTION_SAMPLED_TO], way / N_SAMPLES
             clock[at.DISCONTINUITY] = first
-    if first < clock[at.DISCONTINUITY_OF_MOTION] or clock[at.DISCONTINUITY_OF_MOTION] <= t + NEARLY * spacing:
+    if first < clock[at.DISCONTINUITY_OF_MOTION] or clock[at.DISCONTINUITY_OF_MOTION] <= t + AT_CHANGE * spacing:
         clock[at.DISCONTINUITY_OF_MOTION] = first
 
 
 @compiled
 def _sample_ahead(f, w, tolerances, control, clock, known, t, size, last, q, v, a):
-    """Return the next sudden change with time ahead of a step, or `known` (infinite if none) if that is earlier."""
-    every = max(min(control[at.APART], size / IN_A_STEP), LEAST_APART * np.spacing(abs(t)))
-    # a multistep method restarts only after a rejected step, as no jump deceives its formula; steps find jumps of C_t
-    # and b if they do not end next to them
+    """Return the next sudden change with time ahead of a step, or `known` (infinite: none) if that is earlier."""
+    every = max(min(control[at.APART], size / N_IN_STEP), LEAST_APART * np.spacing(abs(t)))
+    # multistep methods (ROUGH = 1) restart only after a rejected step, because no jump deceives their formula; steps
+    # find jumps of C_t and b themselves unless they end next to them
     closer = control[at.ROUGH] > 1.0 and control[at.DRIVEN] == 0.0
-    if closer and every < SHRUNK * clock[at.SAMPLED_EVERY]:
+    if closer and every < RESAMPLE_BELOW * clock[at.SAMPLED_EVERY]:
         clock[at.SAMPLED_TO] = t
     begin = max(t, clock[at.SAMPLED_TO])
-    at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # the change has to be found again
+    at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # samples from here have to find the change again
     while begin < min(t + size, last, known):
         apart, at_change = min(every, clock[at.SAMPLED_EVERY]) if at_change else every, False
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], apart)
@@ -420,23 +419,23 @@ def _sample_ahead(f, w, tolerances, control, clock, known, t, size, last, q, v, 
 
 @compiled
 def limit_to_discontinuity(f, w, tolerances, control, clock, t, size, last, state, new_state):
-    """Return the size of a step that does not pass over a sudden change; `new_state` is scratch."""
+    """Return the size of a step, reduced to end at the next sudden change; `new_state` is scratch."""
     n, spacing = w.Q.size, control[at.SPACING]
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
-    shortest = (1.0 if control[at.BY_STATE] == 1.0 else LONG) * spacing
-    if control[at.SAMPLE_MOTION] == 1.0 and shortest < size < (N_SAMPLES + NEARLY) * spacing:
+    shortest = (1.0 if control[at.BY_STATE] == 1.0 else LEAST_DISTANCE) * spacing
+    if control[at.SAMPLE_MOTION] == 1.0 and shortest < size < (N_SAMPLES + AT_CHANGE) * spacing:
         _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a, Q, V, A)
-    near = t + NEARLY * min(spacing, size / IN_A_STEP)
+    near = t + AT_CHANGE * min(spacing, size / N_IN_STEP)
     known = clock[at.DISCONTINUITY] if clock[at.DISCONTINUITY] > near else np.inf
     along = clock[at.DISCONTINUITY_OF_MOTION] if clock[at.DISCONTINUITY_OF_MOTION] > near else np.inf
     at_change = known == np.inf and clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO] > -np.inf
-    # except at the end of a run, where samples of ever shorter remaining spans would find the change again
-    if control[at.BY_TIME] == 1.0 and not (at_change and size <= (1.0 + NEARLY) * clock[at.SAMPLED_EVERY]):
+    # not at the end of a run, where samples of ever shorter remaining spans would find the change again
+    if control[at.BY_TIME] == 1.0 and not (at_change and size <= (1.0 + AT_CHANGE) * clock[at.SAMPLED_EVERY]):
         known = _sample_ahead(f, w, tolerances, control, clock, known, t, size, last, q, v, a)
         clock[at.DISCONTINUITY] = known
     size = min(size, representable_step(t, min(known, along) - t))
-    is_short = size < SHORT * clock[at.H_LONG] or t < clock[at.T_START] + 2.0 * control[at.APART]
+    is_short = size < SHORT_STEP * clock[at.H_LONG] or t < clock[at.T_START] + 2.0 * control[at.APART]
     if control[at.BY_TIME] == 1.0 and is_short and size < control[at.APART] and clock[at.COMPARED] < t:
         _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, a)
     return size

@@ -21,28 +21,28 @@ from twoloop.kernels.evaluation.inner_loop import find_tangents, renew_partition
 from twoloop.kernels.evaluation.partition import MAX_ROWS_ELIMINATED, least_pivot, partition_is_poor, smallest_pivot
 from twoloop.kernels.evaluation.sparse_inner_loop import PROJECT_STAGES
 
-SHORT = 0.5  # relative to the longest of the last steps: a shorter step may be near a singular position ...
+SHORT_STEP = 0.5  # relative to the longest of the last steps: a shorter step may be near a singular position ...
 COLLAPSED = 0.2  # relative to the longest of the last steps: after a shorter one the pivots of C_q are computed again
-SINGULAR_PIVOT = 0.2  # ... and is near one if the smallest pivot of C_q is below this share of the largest it had
-STATIC_SINGULAR = 0.01  # the same share for the static form, whose pivots are sines of single rows ...
-CARE = 0.05  # ... share below which a rejected step that begins there is repeated with care ...
-LESS = 0.8  # ... by steps each of which is this times the one before ...
-LOST = 0.001  # ... and share of the longest of the last steps below which steps there are given up
+SINGULAR_PIVOT = 0.2  # ... and is near one if the smallest pivot of C_q is below this share of the largest so far
+STATIC_SINGULAR = 0.01  # the same share for the static form, whose pivots are sines of single rows
+REPEAT_BELOW = 0.05  # share below which a rejected step of the static form is repeated with projected stages ...
+SHRINKAGE = 0.8  # ... at ever smaller sizes, by this factor ...
+GIVE_UP_BELOW = 0.001  # ... down to this size relative to the longest of the last steps
 # share of the largest pivot below which rounding determines accelerations: short steps must not continue
 UNDETERMINED = 1e-6
-RARELY = 16  # accepted steps from one check of the partition to the next, if steps do not use it
-FEW = 32  # degrees of freedom; k times as many mean that a partition is checked every k + 1 steps, because T is full
-N_CHECKED = 8  # positions within an accepted step at which the pivots of C_q are computed ...
-CHECKED = 0.5  # ... if it begins below this share of the largest pivot ...
-PASSED = 0.6  # ... and share of the largest change from one to the next below which the position is within the step
-# share of the largest pivot below which nothing of a step may be, by tolerance, see crossing_step.py
+CHECK_INTERVAL = 16  # accepted steps from one check of the partition to the next, if steps do not use it
+FREEDOMS_PER_CHECK = 32  # with k times as many, a partition is checked every k + 1 steps, because T is a full matrix
+N_CHECKED = 8  # number of parts of an accepted step at whose ends the pivots of C_q are computed ...
+CHECKED_BELOW = 0.5  # ... if it begins or ends below this share of the largest pivot
+PASSED_SHARE = 0.6  # relative to the largest change from one to the next: a smaller pivot passes zero within the step
+# near_share: its bounds, the share of the tolerances that rounding may take, and the unit roundoff
 NEAR_LEAST, NEAR_MOST, SHARE_OF_NOISE, EPS = 0.02, 0.1, 0.2, 2.0**-53
-NEARER = 0.25  # relative to the smallest sine at the start of a step: a step that ends below this is halved
+END_SHARE = 0.25  # relative to the smallest sine at the start of a step: a step that ends below this is halved
 
 
 @merged
 def near_singular(f, w, control, clock, t, q):
-    """Return whether C_q was close to losing rank when the partition was chosen, and the caller wants to know.
+    """Return whether C_q was close to losing rank when the partition was chosen, if the caller stops there (BRIDGE).
 
     Steps that do not use partitions may have an old one: it is renewed once the run has come near such a position.
     """
@@ -56,33 +56,33 @@ def near_singular(f, w, control, clock, t, q):
 
 @merged
 def ends_at_singular(f, w, control, clock):
-    """Return whether a step of the sparse form ends so near a singular position that the next would begin there.
+    """Return whether a step of the sparse form ends so near a singular position that the next one would begin there.
 
-    Steps cross such a position unharmed where it lies well between their ends.
+    A singular position well between the ends of a step does no harm.
     """
     if f.flags[FORM] != STATIC or control[at.FIXED_STEP] > 0.0:
         return False
-    return w.notes[PIVOT] < min(STATIC_SINGULAR * clock[at.LARGEST_PIVOT], NEARER * clock[at.PIVOT_HERE])
+    return w.notes[PIVOT] < min(STATIC_SINGULAR * clock[at.LARGEST_PIVOT], END_SHARE * clock[at.PIVOT_HERE])
 
 
 @merged
 def fails_at_singular(f, clock, size):
-    """Return whether a failed, very short step of the static form near a singular position is left to dense forms."""
+    """Return whether a very short step of the static form fails near a singular position: dense forms take over."""
     near = clock[at.PIVOT_HERE] < STATIC_SINGULAR * clock[at.LARGEST_PIVOT]
-    return f.flags[FORM] == STATIC and near and size < LOST * clock[at.H_LONG]
+    return f.flags[FORM] == STATIC and near and size < GIVE_UP_BELOW * clock[at.H_LONG]
 
 
 @merged
-def retry_with_care(f, w, control, clock, size):
-    """Return whether a step of the static form that begins near a singular position is repeated with more care.
+def retry_projected(f, w, control, clock, size):
+    """Return whether a rejected step of the static form near a singular position is repeated with projected stages.
 
-    Stages off the constraints have accelerations whose errors grow near such a position. A step that ends well
-    beyond may succeed where shorter ones, which end nearer, fail: lengths are tried from the longest of the last down.
+    The errors of accelerations at stages off the constraints grow near such a position. A long step that ends well
+    beyond it may succeed where shorter ones fail: sizes are tried from the longest of the last steps downwards.
     """
-    near = clock[at.PIVOT_HERE] < CARE * clock[at.LARGEST_PIVOT]
+    near = clock[at.PIVOT_HERE] < REPEAT_BELOW * clock[at.LARGEST_PIVOT]
     if f.flags[FORM] != STATIC or control[at.FIXED_STEP] > 0.0 or w.notes[NEARLY_SINGULAR] == 1.0 or not near:
         return False
-    clock[at.H_NEXT] = LESS * size
+    clock[at.H_NEXT] = SHRINKAGE * size
     if w.notes[NEARLY_SINGULAR] == 0.0:
         w.notes[NEARLY_SINGULAR] = PROJECT_STAGES
         clock[at.H_NEXT] = max(size, clock[at.H_LONG])
@@ -98,9 +98,9 @@ def near_share(tolerances):
 
 @compiled
 def _least_pivot_within(f, w, t, size, before, end, state, new_state):
-    """Return the smallest pivot within a step, on the cubic through its ends, and its largest change between two looks.
+    """Return the smallest pivot within a step, and the largest change of the pivot between neighbouring samples.
 
-    `before` and `end` are the pivots at its ends.
+    Positions are those of the cubic through the ends of the step, whose pivots are `before` and `end`.
     """
     n, least, change = w.Q.size, min(before, end), 0.0
     for k in range(1, N_CHECKED):
@@ -117,9 +117,9 @@ def _least_pivot_within(f, w, t, size, before, end, state, new_state):
 
 @compiled
 def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_state):
-    """Return whether an accepted step comes so near a singular position that another step has to lead across.
+    """Return whether an accepted step comes so near a singular position that a crossing step has to replace it.
 
-    Rounding of its stages there may change the result by more than the tolerances, of which estimates see a part.
+    Rounding of its stages there may change the result by more than the tolerances; error estimates see only part of it.
     """
     bridge = control[at.BRIDGE]
     if bridge == 0.0 or control[at.WATCHFUL] == 0.0 or w.notes[NEARLY_SINGULAR] != 1.0 or control[at.FIXED_STEP] > 0.0:
@@ -130,7 +130,7 @@ def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_st
     before = smallest_pivot(f, w, t, state[:n])
     end = smallest_pivot(f, w, t + size, new_state[:n])
     w.notes[PIVOT] = end
-    if min(before, end) > CHECKED * largest:
+    if min(before, end) > CHECKED_BELOW * largest:
         control[at.BRIDGE] = 1.0
         return False
     least, change = _least_pivot_within(f, w, t, size, before, end, state, new_state)
@@ -138,7 +138,7 @@ def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_st
         passed = max(least / largest, EPS)
         clock[at.PIVOT_PASSED] = passed if clock[at.PIVOT_PASSED] == 0.0 else min(clock[at.PIVOT_PASSED], passed)
         return False
-    if least < max(near_share(tolerances) * largest, min(PASSED * change, SINGULAR_PIVOT * largest)):
+    if least < max(near_share(tolerances) * largest, min(PASSED_SHARE * change, SINGULAR_PIVOT * largest)):
         w.notes[PIVOT] = before
         return True
     return False
@@ -149,37 +149,37 @@ def record_pivot_at_output(f, w, clock, state):
     """Record the distance from a singular position at an output time, or at the end of a step of fixed size."""
     pivot = least_pivot(f, w, clock[at.T], state[: w.Q.size])
     if f.flags[FORM] == STATIC and pivot > 0.0:
-        # sines are small in large mechanisms: take their ratio to the largest
+        # sines are small in large mechanisms: only their ratio to the largest shows a singular position
         pivot /= max(pivot, clock[at.LARGEST_PIVOT])
     clock[at.PIVOT_AT_OUTPUT] = min(clock[at.PIVOT_AT_OUTPUT], pivot)
 
 
 @merged
 def check_partition(f, w, control, clock, size, lands, state):
-    """Renew a poor partition, and check how near a singular position is.
+    """Renew a poor partition, and check how near a singular position is; return CONTINUE or an end code.
 
-    The state is full (q, v, a, lam): a new choice of independent coordinates needs no conversion.
+    The state is complete (q, v, a, lam): a new choice of independent coordinates needs no conversion.
     """
-    short = size < SHORT * clock[at.H_LONG] and control[at.FIXED_STEP] == 0.0 and not lands
+    short = size < SHORT_STEP * clock[at.H_LONG] and control[at.FIXED_STEP] == 0.0 and not lands
     if f.flags[FORM] == STATIC:
         clock[at.PIVOT_HERE] = w.notes[PIVOT]
         clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.notes[PIVOT])
-        if w.notes[NEARLY_SINGULAR] == PROJECT_STAGES and w.notes[PIVOT] >= CARE * clock[at.LARGEST_PIVOT]:
+        if w.notes[NEARLY_SINGULAR] == PROJECT_STAGES and w.notes[PIVOT] >= REPEAT_BELOW * clock[at.LARGEST_PIVOT]:
             w.notes[NEARLY_SINGULAR] = 0.0
         return at.CONTINUE
     n = w.Q.size
     straight = f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0
     every = 1
     if f.flags[FORM] == AUGMENTED:
-        every += w.independent_v.size // FEW
+        every += w.independent_v.size // FREEDOMS_PER_CHECK
     if straight:
-        every = RARELY
+        every = CHECK_INTERVAL
     looked = w.counters[N_ACCEPTED] % every == 0
     if looked and (straight or f.flags[FORM] != NULL_SPACE):
         find_tangents(f, w, clock[at.T], state[:n])
     if looked and partition_is_poor(w) and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
-    # a renewed partition shows whether the position is left behind: these steps do not use it, so an old one may last
+    # only a renewed partition shows whether the position is left behind: these steps do not use partitions
     if f.flags[STRAIGHT] == 1 and w.notes[NEAR_NOW] == 2.0 and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
     clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.notes[PIVOT])
@@ -187,16 +187,16 @@ def check_partition(f, w, control, clock, size, lands, state):
     if w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
         w.notes[NEARLY_SINGULAR] = w.notes[NEAR_NOW] = 1.0
     if size < COLLAPSED * clock[at.H_LONG] and w.notes[NEARLY_SINGULAR] == 0.0 and control[at.BRIDGE] == 1.0:
-        # a motion may approach a singular position although its partition shows nothing of it
+        # the pivots of an old partition may not show that the motion approaches a singular position
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
-        w.notes[SENSITIVITY] = 1.0  # the value of a partition far from there, so that this one is renewed soon
+        w.notes[SENSITIVITY] = 1.0  # as for a partition chosen far from singular positions, so that it is renewed soon
         if w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
             w.notes[NEARLY_SINGULAR] = w.notes[NEAR_NOW] = 1.0
-    if short and size < LOST * clock[at.H_LONG] and w.notes[NEARLY_SINGULAR] == 1.0:
-        # the partition, which serves implicit methods well up to there, was chosen far from there
+    if short and size < GIVE_UP_BELOW * clock[at.H_LONG] and w.notes[NEARLY_SINGULAR] == 1.0:
+        # an implicit method can still use a partition chosen far away: choose one here before giving up
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
         if control[at.BRIDGE] != 1.0 and w.notes[PIVOT] < UNDETERMINED * clock[at.LARGEST_PIVOT]:
-            return at.RANK_LOST  # no step has crossed the position, and rounding would determine velocities
+            return at.RANK_LOST  # no step leads across the position, and rounding would determine velocities
     return at.NEAR_SINGULAR if short and near_singular(f, w, control, clock, clock[at.T], state[:n]) else at.CONTINUE

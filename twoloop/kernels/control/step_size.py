@@ -1,19 +1,19 @@
-"""Step-size control: the size of the next step, the times on which steps land, and additional error measures.
+"""Step-size control: the size of the next step, the times at which steps end, and additional error measures.
 
-The length follows from the error of the last step. With the trend (Gustafsson, ACM TOMS 20 (1994), 496) the factor also
-follows how the error has changed since the last accepted step.
+The size follows from the error of the last step. With the trend (Gustafsson, ACM TOMS 20 (1994), 496) the factor also
+depends on how the error has changed since the last accepted step.
 
-Errors that the embedded formula does not see are measured in two ways:
+Errors that the embedded formula does not show are measured in two ways:
 
-- `departure` compares the dependent positions that the formula predicts with those that the constraints then give. On
-  one assembly of the mechanism the difference is of the order of the step's error. On another assembly it is not,
-  however smooth the independent coordinates are. A mechanism without any (every coordinate prescribed) has no other
-  estimate. Where two assemblies come close to one another, a large step may end on the wrong one with a small
-  difference; it has then passed a zero of det C_qd, which a motion does only through a singular position. So a change
-  of this sign needs a prediction that is nearly exact, as short steps through a singular position have it.
-- `excess` is the defect of a Taylor step: how far its accelerations are from those of the equations at the same states.
-  A series knows the forces at its beginning, to all orders, and nothing of what comes later. So the equations are
-  evaluated where the step ends, and within it at most tolerances[LOOK] apart.
+- `departure` compares the dependent positions that the formula predicts with those that the constraints give. On one
+  assembly of the mechanism the difference is of the order of the step's error. On another assembly it is larger,
+  however smooth the independent coordinates are. A mechanism without independent coordinates (each is prescribed) has
+  no other estimate. Where two assemblies come close to one another, a large step may end on the wrong one with a small
+  difference; det C_qd then changes sign, which a motion does only through a singular position. So after a change of
+  sign the prediction must be nearly exact, as it is in short steps through a singular position.
+- `defect_ratio` is the defect of a Taylor step: how far its accelerations are from those of the equations at the same
+  states. A series contains the forces at its beginning, to all orders, and no later change of them. So the equations
+  are evaluated where the step ends, and within it at most tolerances[LOOK] apart.
 """
 
 import numpy as np
@@ -57,12 +57,12 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, restore
 from twoloop.kernels.evaluation.tasks import PROJECT
 from twoloop.kernels.linalg.markowitz_lu import sign_of
 
-KEPT = 1.2  # with the trend, a factor between 1 and this keeps the step size: a new one would need new Newton factors
+KEEP_BELOW = 1.2  # with the trend, a factor from 1 to this becomes 1, because a new size needs a new factorization
 
 
 @compiled
 def factor_of(rule, past, h, error):
-    """Return the step factor after a step h with this error, accepted from 1 down."""
+    """Return the factor of the next step after a step h with this error, which is accepted up to 1."""
     if not error > 0.0:
         return rule[FACTOR_MAX]
     follows = error <= 1.0 and rule[LEAST_ERROR] > 0.0
@@ -71,20 +71,20 @@ def factor_of(rule, past, h, error):
         trend = h / past[H_BEFORE] * (past[ERROR_BEFORE] / error) ** rule[EXPONENT]
         factor = min(factor, factor * trend)
     factor = min(rule[FACTOR_MAX], max(rule[FACTOR_MIN], factor))
-    return 1.0 if follows and 1.0 <= factor <= KEPT else factor
+    return 1.0 if follows and 1.0 <= factor <= KEEP_BELOW else factor
 
 
 @merged
 def record_accepted(rule, past, h, error):
-    """Record an accepted step as the last one."""
+    """Record size and error of an accepted step."""
     past[H_BEFORE], past[ERROR_BEFORE] = h, max(error, rule[LEAST_ERROR])
 
 
 @compiled
 def evaluate_near(f, w, t, Q, V, A):
-    """Evaluate accelerations A at a state (Q, V) near the constraints, which is moved onto them."""
-    # generated code projects to the nearest state at less cost; with the static form, `evaluate` would not project at
-    # all
+    """Project a state (Q, V) near the constraints onto them, and evaluate its accelerations A; return the code."""
+    # generated code projects to the nearest state at less cost; with the static form `evaluate` would not project
+    # at all
     if (f.flags[STRAIGHT] == 1 and w.Rate.size == w.C.size) or f.flags[FORM] == STATIC:
         return f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
     return evaluate(f, w, t, Q, V, INNER_TOL, A)
@@ -92,19 +92,19 @@ def evaluate_near(f, w, t, Q, V, A):
 
 @kernel(SETTLE)
 def commit_nothing(f, w, options, memory, tolerances, accepted):
-    """Do nothing, for a step without a memory."""
+    """Do nothing: the method of the step has no memory."""
 
 
-NEAR = 4.0  # times closer than this many spacings of floating-point numbers count as equal
+EQUAL_SPACINGS = 4.0  # times closer than this many spacings of floating-point numbers count as equal
 
 
 @merged
 def on_grid(clock, t, h, target, goal):
     """Return the size of a step of a fixed grid, how many grid steps it covers, and whether it reaches the goal.
 
-    Times are counted, not added up; an output time within a millionth of a step of a grid point counts as on the grid.
+    Times are multiples of h, not sums; an output time within a millionth of a step of a grid point counts as on it.
     """
-    rounding = NEAR * np.spacing(max(abs(t), abs(target)))
+    rounding = EQUAL_SPACINGS * np.spacing(max(abs(t), abs(target)))
     near = max(1e-6 * h, rounding)
     in_grid = 1.0
     if target <= clock[at.T_START] + clock[at.N_FIXED] * h + near:
@@ -120,9 +120,9 @@ def on_grid(clock, t, h, target, goal):
 
 
 @merged
-def off_grid(control, t, h, left, leaps):
+def off_grid(control, t, h, left, jumps):
     """Return the size of a step under step-size control, and whether it reaches the goal in `left` seconds."""
-    reaches = leaps or h >= left * (1.0 - 1e-10)
+    reaches = jumps or h >= left * (1.0 - 1e-10)
     size = h
     if h > 0.5 * left and not reaches:
         size = 0.5 * left  # two equal steps rather than a long and a tiny one
@@ -162,7 +162,7 @@ def count_step(w, tolerances, control, clock, size, out_step):
 SHARE_OF_MOTION = 0.1
 SHARE_THROUGH_ZERO = 1e-6  # ... if the sign of det C_qd changes
 LEAST = 1e-300  # replaces a scale of zero, so that a distance of zero needs no branch
-FLOOR = 0.01  # relative to the tolerances: a smaller distance is allowed whatever SHARE_OF_MOTION says
+FLOOR = 0.01  # relative to the tolerances: smaller distances are allowed even where SHARE_OF_MOTION is stricter
 
 
 @merged
@@ -176,7 +176,7 @@ def store_prediction(w, q1):
 def departure(w, tolerances, h, q, v, q1):
     """Return the largest distance of the stored prediction from q1, over the tolerances or over a share of the motion.
 
-    Needs the factors of C_qd at q1, as they stand after the inner loop. Fixed steps test nothing.
+    Needs the factors of C_qd at q1, which the inner loop leaves. With fixed steps the distance is 0.
     """
     if tolerances[ESTIMATE] == 0.0:
         return 0.0
@@ -207,17 +207,17 @@ ROUNDING = 1e-13  # relative to the largest acceleration: a smaller defect is ro
 
 
 @compiled
-def excess(tolerances, h, order, found, a, q, v):
+def defect_ratio(tolerances, h, order, predicted, a, q, v):
     """Return the defect |found - a| of a step h over what the tolerances allow; infinite where it is not finite.
 
-    The defect of a series of this order grows with the last power of the time: its integral is h / order times what it
-    is at the end.
+    The defect of a series of this order grows as the highest power of the time: its integral is h / order times its
+    value at the end.
     """
     rtol, share, largest, worst = tolerances[RTOL], h / order, 0.0, 0.0
     for j in range(a.size):
         largest = max(largest, abs(a[j]))
     for j in range(a.size):
-        defect = abs(found[j] - a[j])
+        defect = abs(predicted[j] - a[j])
         if not np.isfinite(defect):
             return np.inf
         defect = (defect - ROUNDING * largest) * share

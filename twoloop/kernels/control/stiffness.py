@@ -1,25 +1,25 @@
 """Combine two methods in one run: an explicit one, and an implicit one where stiffness would make its steps tiny.
 
 The largest rate of the motion, rho, is the root of the largest eigenvalue of dF/dq, or that of dF/dv, F being the
-accelerations. A few power iterations, one evaluation each, estimate it now and then. While the explicit method takes
-steps of h rho well below its limit of stability, nothing is stiff. Near the limit, stiffness or accuracy may be the
-reason. Then the implicit method is tried for a window of steps, in which its errors count tenfold, and is kept if a
-second of motion costs less.
+accelerations. From time to time a few power iterations, one evaluation each, estimate it. While the explicit method
+takes steps of h rho well below its limit of stability, nothing is stiff. Near the limit, stiffness or accuracy may be
+the reason. Then the implicit method is tried for a window of steps, in which its errors count tenfold, and is kept if
+it costs less per second of motion.
 
 A trial also begins where h rho is smaller, but
 
-- rho is far above the rates that the motion shows: what decays so fast may keep the estimate of the error from longer
-  steps;
-- all that could move at that rate is about the tolerances, as steps at the limit of stability keep it from dying away;
+- rho is far above the rates that the motion shows: a component that decays so fast may prevent longer steps through the
+  error estimate;
+- all components that could move at that rate are about the tolerances: steps at the limit of stability excite them;
 - the run would cost a thousand trials.
 
 A trial that may be in vain waits until the run has cost a few times as much, unless the run as a whole is to cost ten
-times as much at its present price. Costs are counted in evaluations of the explicit method; with generated code one
-of the implicit method counts several times. The implicit method is left in the same way, after a trial of the explicit
-one, where its steps have come below that limit, or a second of motion costs more than the explicit method took when it
-was left. A method that was tried in vain is next tried after twice as many estimates.
+times as much at its present rate. Costs are counted in evaluations of the explicit method; with generated code an
+evaluation of the implicit method counts several times. The implicit method is left in the same way, after a trial of
+the explicit one, if its steps are below that limit, or if a second of motion costs more than with the explicit method
+before. A method that was tried in vain is next tried after twice as many estimates.
 
-Both methods are called by their addresses, and are compiled once, where they are.
+Both methods are called by their addresses: their own modules compile them.
 """
 
 import numpy as np
@@ -42,10 +42,10 @@ from twoloop.kernels.data.common import (
     Step,
     allowed,
     compiled,
+    gap_ratio,
     inlined,
     kernel,
     merged,
-    times_gap,
 )
 from twoloop.kernels.data.indices import (
     DONE,
@@ -67,37 +67,37 @@ from twoloop.kernels.data.indices import (
 from twoloop.kernels.evaluation.inner_loop import renew_partition
 from twoloop.kernels.linalg.dense import copy
 
-# evaluations before the first estimate of the rate, and between two estimates; DEARER times as many with generated code
+# evaluations before the first estimate of the rate, and between two estimates; with generated code times COST_RATIO
 EARLY, INTERVAL = 100.0, 600.0  # an estimate takes about eight evaluations by the general code
 ITERATIONS = 4  # iterations of the power method for dF/dq, and for dF/dv
 NEGLIGIBLE = 1e-3  # relative to 1 / h: a rate of decay below this needs no second iteration
 SEED = 1e-3  # relative to the largest component of a direction: start value of a component that was zero
-SURELY = 3.0  # times LIMIT: above this, the step is at the limit of stability
-EARN = 64.0  # evaluations per independent coordinate before a trial that differences, which takes about eight for each
+AT_LIMIT = 3.0  # times LIMIT: above this, the step is at the limit of stability
+MIN_COST = 64.0  # evaluations per independent coordinate before a trial with differences, which takes about eight
 TRIAL = 300.0  # approximate number of evaluations that a trial of the implicit method takes
-AFFORDED = 3.0  # number of trials whose cost the run has to exceed before a trial that may be in vain ...
-OF_RUN = 0.3  # ... where this share of the expected cost of the whole run counts as its cost, if it is larger
-# times the cost of AFFORDED trials, and once more for each trial so far: then a trial begins whatever the rates
-ANYWAY = 100.0
-APART = 30.0  # a rate this many times above those that the motion shows counts as hidden ...
-QUIET = 10.0  # tolerances of velocities: residual oscillation of a decay under steps at the limit of stability
-WORTH = 0.05  # ... and h rho relative to LIMIT: above this, an implicit method that damps may allow longer steps
+AFFORDED = 3.0  # number of trials whose cost the run has to exceed before a trial that may be in vain
+OF_RUN = 0.3  # relative to the expected cost of the whole run: its cost so far counts as at least this
+# times the cost of AFFORDED trials, and once more for each trial so far: then a trial begins whatever the rates are
+COST_OF_ANY_TRIAL = 100.0
+HIDDEN_RATIO = 30.0  # a rate this many times above those that the motion shows counts as hidden
+QUIET_TOLERANCES = 10.0  # tolerances of velocities: residual oscillation of a decay at the limit of stability
+HIDDEN_FROM = 0.05  # h rho relative to LIMIT: above this, damping a hidden rate may allow longer steps
 INSTANT = 1e-4  # relative to 1 / rate: time step of the difference that estimates the rate of the motion
-BELOW = 0.4  # relative to LIMIT: if h rho is below this, the explicit method is tried again
+RETURN_BELOW = 0.4  # relative to LIMIT: if h rho is below this, the explicit method is tried again
 # factor on the error during a trial of the implicit method, whose order is lower than that of the explicit one
 STRICT = 10.0
 MEAN = 0.8  # weight of the previous mean in the mean step
 SETTLED = 5.0  # number of accepted steps of a trial before its cost is measured
 WINDOW = 10.0  # number of accepted steps over which the cost of the method on trial is measured
-GAIN = 1.2  # ratio of costs above which the method on trial replaces the other
+MIN_GAIN = 1.2  # ratio of costs above which the method on trial replaces the other
 PATIENCE = 4.0  # number of estimates before the next trial
 
 EXPLICIT, ON_TRIAL, IMPLICIT, BACK_ON_TRIAL = range(4)  # phases
 
 # indices in `options`: first those of the pair, then for each method its step-size rule (see loop_state.py) and
-# REUSE_OF, then the options of each method. LIMIT: h rho above which the implicit method is tried, if LOOKS estimates
-# in a row exceed it. DEARER: cost of an evaluation of the second method in evaluations of the first
-LIMIT, LOOKS, MATRIX_COST, DEARER, SIZE_1, N_PAIR = range(6)
+# REUSE_OF, then the options of each method. LIMIT: h rho above which the implicit method is tried, if N_ESTIMATES
+# successive estimates exceed it. COST_RATIO: cost of an evaluation of the second method in evaluations of the first
+LIMIT, N_ESTIMATES, MATRIX_COST, COST_RATIO, SIZE_1, N_PAIR = range(6)
 REUSE_OF, N_OF_EACH = N_RULE, N_RULE + 1
 N_OPTIONS = N_PAIR + 2 * N_OF_EACH
 
@@ -105,32 +105,32 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
 (
     PHASE,
     STEPS,  # number of accepted steps in this phase
-    MAY_LOOK,  # 1: the last attempt was accepted
-    LOOK_AT,  # number of evaluations at which the rate is estimated again
-    LOOKS_TO_WAIT,
+    MAY_ESTIMATE,  # 1: the last attempt was accepted, so that the rate may be estimated
+    NEXT_ESTIMATE,  # number of evaluations at which the rate is estimated again
+    ESTIMATES_TO_WAIT,  # number of estimates before the next trial
     WAIT,
     T_BEGIN,
     COST_BEGIN,
-    PRICE,  # cost of a second of motion by the method before the trial
+    COST_PER_SECOND,  # cost of a second of motion by the method before the trial
     RATE,  # last estimate of the largest rate, 1 / s
     FIRST_MEMORY,
     H_MEAN,
-    PAST,  # history of the steps of this phase, see loop_state.py
-    _PAST_ERROR,
+    HISTORY,  # history of the steps of this phase, see loop_state.py
+    _HISTORY_ERROR,
     H_TRIED,
     ERROR_TRIED,
     N_TRIALS,
-    NEAR,  # number of estimates in a row with h rho above LIMIT
+    N_ABOVE_LIMIT,  # number of estimates in a row with h rho above LIMIT
     N_SCALARS,
 ) = range(19)
 
 
 def switching_options(
-    limit: float, looks: int, matrix_cost: float, dearer: float, each: ArrayLike, first: ArrayLike, second: ArrayLike
+    limit: float, estimates: int, matrix_cost: float, ratio: float, each: ArrayLike, first: ArrayLike, second: ArrayLike
 ) -> NDArray[np.float64]:
-    """Return `options`: of the pair (from LIMIT on); step-size rule and REUSE_OF of each method; their own options."""
-    first = np.asarray(first)  # array of numbers, or of formulas
-    scalars = [limit, float(looks), matrix_cost, dearer, float(first.size)]
+    """Return `options`: of the pair (from LIMIT on); `each`: rule and REUSE_OF of each method; their own options."""
+    first = np.asarray(first)  # array of numbers, or of expressions in the parameters
+    scalars = [limit, float(estimates), matrix_cost, ratio, float(first.size)]
     return np.concatenate([scalars, np.asarray(each, dtype=np.float64).ravel(), first, np.asarray(second)])
 
 
@@ -149,8 +149,8 @@ def _is_explicit(memory):
 
 
 @inlined
-def _past(memory):
-    return memory[PAST : PAST + N_PAST]
+def _history(memory):
+    return memory[HISTORY : HISTORY + N_PAST]
 
 
 @inlined
@@ -160,8 +160,8 @@ def _memories(memory, n):
 
 
 @compiled
-def _along(f, w, t, state, direction, by_v, Q, V, A):
-    """Take one step of a power iteration: return the growth of `direction` under dF/dq or dF/dv.
+def _power_iteration(f, w, t, state, direction, by_v, Q, V, A):
+    """Take one step of a power iteration: return the growth of `direction` under dF/dq (with `by_v` under dF/dv).
 
     `direction`, of the independent coordinates, becomes its image, scaled to length 1.
     """
@@ -197,19 +197,17 @@ def _largest_rate(f, w, memory, t, state, new_state):
     by_q, by_v = memory[N_SCALARS : N_SCALARS + n], memory[N_SCALARS + n : N_SCALARS + 2 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
     squared = damping = 0.0
-    # generated code does not use the partition: it may be an old one whose independent coordinates hardly move
+    # with generated code the partition may be an old one, whose independent coordinates hardly move
     explicit = memory[PHASE] == EXPLICIT
     if explicit and f.flags[STRAIGHT] == 1 and renew_partition(f, w, t, state[:n]) != DONE:
         return 0.0
     for _ in range(ITERATIONS):
-        squared = _along(f, w, t, state, by_q, False, Q, V, A)
+        squared = _power_iteration(f, w, t, state, by_q, False, Q, V, A)
     for _ in range(ITERATIONS):
-        damping = _along(f, w, t, state, by_v, True, Q, V, A)
+        damping = _power_iteration(f, w, t, state, by_v, True, Q, V, A)
         if damping * memory[H_MEAN] < NEGLIGIBLE:
             break
-    for m in range(
-        n
-    ):  # restart coordinates that are zero in the direction, as they were dependent at all estimates so far
+    for m in range(n):  # zero components belong to coordinates that were dependent at all estimates so far
         if by_q[m] == 0.0:
             by_q[m] = SEED
         if by_v[m] == 0.0:
@@ -218,7 +216,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
 
 
 @compiled
-def _shown_rate(f, w, t, state, rate, Q, V, A):
+def _motion_rate(f, w, t, state, rate, Q, V, A):
     """Return the rate, 1/s, at which the motion changes its velocities or accelerations; infinite where unknown."""
     n = Q.size
     instant = INSTANT / rate
@@ -239,11 +237,11 @@ def _shown_rate(f, w, t, state, rate, Q, V, A):
 
 @compiled
 def _is_quiet(w, tolerances, state, rate):
-    """Return whether velocities that change at this rate would change by about the tolerances only."""
+    """Return whether all velocities would change by about the tolerances only, if they changed at this rate."""
     n = w.Q.size
     for i in w.independent_v:
         v = state[n + i]
-        if abs(state[2 * n + i]) > QUIET * rate * allowed(tolerances, i, v, v):
+        if abs(state[2 * n + i]) > QUIET_TOLERANCES * rate * allowed(tolerances, i, v, v):
             return False
     return True
 
@@ -255,78 +253,78 @@ def _cost(w, options):
 
 
 @compiled
-def _price(w, options, memory, t):
+def _cost_per_second(w, options, memory, t):
     """Return the cost of a second of motion since the count last began, in evaluations of the first method."""
     price = (_cost(w, options) - memory[COST_BEGIN]) / (t - memory[T_BEGIN])
-    return price if _is_explicit(memory) else options[DEARER] * price
+    return price if _is_explicit(memory) else options[COST_RATIO] * price
 
 
 @compiled
 def _interval(options, memory):
-    """Return the number of evaluations until the next estimate of the rate, which itself takes general code."""
-    return INTERVAL * options[DEARER] if _is_explicit(memory) else INTERVAL
+    """Return the number of evaluations until the next estimate of the rate, which itself uses the general code."""
+    return INTERVAL * options[COST_RATIO] if _is_explicit(memory) else INTERVAL
 
 
 @compiled
-def _enter(w, options, memory, phase, t):
+def _begin_phase(w, options, memory, phase, t):
     """Begin another phase: its method starts without a history of steps."""
     memory[PHASE] = phase
     memory[STEPS] = 0.0
-    memory[PAST + ERROR_BEFORE] = 0.0
+    memory[HISTORY + ERROR_BEFORE] = 0.0
     memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
-    memory[LOOK_AT] = w.counters[N_EVALUATIONS] + _interval(options, memory)
+    memory[NEXT_ESTIMATE] = w.counters[N_EVALUATIONS] + _interval(options, memory)
 
 
 @compiled
-def _settle_trial(w, options, memory, t):
-    """Decide whether the method on trial is kept; return the phase to begin, or -1 during the trial."""
+def _judge_trial(w, options, memory, t):
+    """Decide whether to keep the method on trial; return the phase to begin, or -1 while the trial continues."""
     if memory[STEPS] == SETTLED:
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
     if memory[STEPS] < SETTLED + WINDOW:
         return -1
-    price = _price(w, options, memory, t)
-    keeps = price * GAIN <= memory[PRICE]
+    price = _cost_per_second(w, options, memory, t)
+    keeps = price * MIN_GAIN <= memory[COST_PER_SECOND]
     memory[WAIT] = PATIENCE if keeps else 2.0 * memory[WAIT]
-    memory[LOOKS_TO_WAIT] = memory[WAIT]
+    memory[ESTIMATES_TO_WAIT] = memory[WAIT]
     if memory[PHASE] == ON_TRIAL:
         return IMPLICIT if keeps else EXPLICIT
     return EXPLICIT if keeps else IMPLICIT
 
 
 @compiled
-def _look(f, w, options, memory, tolerances, t, state, new_state):
-    """Estimate the rate and decide whether the other method is due for a trial; return the phase to begin, or -1."""
+def _choose_phase(f, w, options, memory, tolerances, t, state, new_state):
+    """Estimate the rate and decide whether to try the other method; return the phase to begin, or -1."""
     n = w.Q.size
     memory[RATE] = _largest_rate(f, w, memory, t, state, new_state)
-    price, cost = _price(w, options, memory, t), _cost(w, options)
+    price, cost = _cost_per_second(w, options, memory, t), _cost(w, options)
     memory[T_BEGIN], memory[COST_BEGIN] = t, cost
-    memory[LOOK_AT] = w.counters[N_EVALUATIONS] + _interval(options, memory)
-    memory[LOOKS_TO_WAIT] -= 1.0
+    memory[NEXT_ESTIMATE] = w.counters[N_EVALUATIONS] + _interval(options, memory)
+    memory[ESTIMATES_TO_WAIT] -= 1.0
     share = memory[H_MEAN] * memory[RATE] / options[LIMIT]
     if share > 1.0:
-        memory[NEAR] += 1.0
-    if memory[LOOKS_TO_WAIT] > 0.0:
+        memory[N_ABOVE_LIMIT] += 1.0
+    if memory[ESTIMATES_TO_WAIT] > 0.0:
         return -1
-    # a trial that may be in vain, and that differences, has to cost little compared with the run so far
-    paid, afforded = cost, AFFORDED * TRIAL * options[DEARER]
+    # a trial that may be in vain, or that needs differences, has to cost little compared with the run so far
+    paid, afforded = cost, AFFORDED * TRIAL * options[COST_RATIO]
     if np.isfinite(tolerances[GAP]):
         paid = max(paid, OF_RUN * tolerances[GAP] / LONGEST_UNSEEN * price)
-    cheap = paid > afforded and (f.flags[FORCE_BY_Q_GIVEN] == 1 or paid > EARN * w.independent.size)
+    cheap = paid > afforded and (f.flags[FORCE_BY_Q_GIVEN] == 1 or paid > MIN_COST * w.independent.size)
     hidden = False
-    if memory[PHASE] == EXPLICIT and cheap and share > WORTH:
+    if memory[PHASE] == EXPLICIT and cheap and share > HIDDEN_FROM:
         Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
         hidden = _is_quiet(w, tolerances, state, memory[RATE])
         if not hidden:
-            hidden = memory[RATE] > APART * _shown_rate(f, w, t, state, memory[RATE], Q, V, A)
-    # a trial begins whatever the estimated rate if the explicit steps have cost so much: near a speed at which friction
-    # reverses, few states show its rate, and the cost of a run is known only after the short steps of its start
-    anyway = cheap and cost > afforded and paid > ANYWAY * afforded * (1.0 + memory[N_TRIALS])
-    due = share > SURELY or hidden or anyway or (memory[NEAR] >= options[LOOKS] and cheap)
-    if cheap and share <= 1.0:  # while a trial would cost too much, NEAR stores that it is due
-        memory[NEAR] = 0.0
-    dear = price > GAIN * memory[PRICE]  # compared with the explicit method when it was left
-    if (memory[PHASE] == EXPLICIT and due) or (memory[PHASE] == IMPLICIT and (share < BELOW or dear)):
-        memory[PRICE] = price
+            hidden = memory[RATE] > HIDDEN_RATIO * _motion_rate(f, w, t, state, memory[RATE], Q, V, A)
+    # explicit steps that have cost this much start a trial at any rate: near a speed at which friction reverses, few
+    # states show the rate, and the cost of a run is known only after the short steps of its start
+    costs_enough = cheap and cost > afforded and paid > COST_OF_ANY_TRIAL * afforded * (1.0 + memory[N_TRIALS])
+    due = share > AT_LIMIT or hidden or costs_enough or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and cheap)
+    if cheap and share <= 1.0:  # while a trial is too expensive, N_ABOVE_LIMIT remembers that one is due
+        memory[N_ABOVE_LIMIT] = 0.0
+    expensive = price > MIN_GAIN * memory[COST_PER_SECOND]  # compared with the explicit method before it was left
+    if (memory[PHASE] == EXPLICIT and due) or (memory[PHASE] == IMPLICIT and (share < RETURN_BELOW or expensive)):
+        memory[COST_PER_SECOND] = price
         memory[N_TRIALS] += 1.0
         return ON_TRIAL if memory[PHASE] == EXPLICIT else BACK_ON_TRIAL
     return -1
@@ -341,41 +339,41 @@ def _restart(memory):
 
 @kernel(SETTLE)
 def settle_switching(f, w, options, memory, tolerances, accepted):
-    """Commit or discard the attempt in the method that made it, and count its accepted steps."""
+    """Commit or discard the attempt in the memory of the method that made it, and count its accepted steps."""
     first, second = _memories(memory, w.Q.size)
     begin = N_OPTIONS + int(options[SIZE_1])
-    memory[MAY_LOOK] = 0.0
+    memory[MAY_ESTIMATE] = 0.0
     if _is_explicit(memory):
         f.settle_first(f, w, options[N_OPTIONS:begin], first, tolerances, accepted)
     else:
         f.settle_second(f, w, options[begin:], second, tolerances, accepted)
     if accepted:
         memory[STEPS] += 1.0
-        memory[MAY_LOOK] = 1.0
-        past = _past(memory)
+        memory[MAY_ESTIMATE] = 1.0
+        past = _history(memory)
         past[H_BEFORE], past[ERROR_BEFORE] = memory[H_TRIED], memory[ERROR_TRIED]
 
 
 @kernel(ATTEMPT)
 def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step by the active method, with the step factor that the controller would choose for it alone.
+    """Attempt a step by the active method, with the factor of step-size control that this method would have alone.
 
-    A method restarts at each change to it, with a memory of zeros.
+    At each change to a method its memory is cleared.
     """
     n = w.Q.size
     first, second = _memories(memory, n)
-    if np.isnan(memory[T_BEGIN]):  # at the start of a run, or of its rest behind a singular position
+    if np.isnan(memory[T_BEGIN]):  # at the start of a run, or of its part behind a singular position
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
-        memory[LOOK_AT] = w.counters[N_EVALUATIONS] + EARLY * options[DEARER]
-    if memory[MAY_LOOK] == 1.0 and tolerances[ESTIMATE] == 1.0:
+        memory[NEXT_ESTIMATE] = w.counters[N_EVALUATIONS] + EARLY * options[COST_RATIO]
+    if memory[MAY_ESTIMATE] == 1.0 and tolerances[ESTIMATE] == 1.0:
         phase = -1
         if memory[PHASE] == ON_TRIAL or memory[PHASE] == BACK_ON_TRIAL:
-            phase = _settle_trial(w, options, memory, t)
-        elif w.counters[N_EVALUATIONS] >= memory[LOOK_AT]:
-            phase = _look(f, w, options, memory, tolerances, t, state, new_state)
+            phase = _judge_trial(w, options, memory, t)
+        elif w.counters[N_EVALUATIONS] >= memory[NEXT_ESTIMATE]:
+            phase = _choose_phase(f, w, options, memory, tolerances, t, state, new_state)
         if phase >= 0:
             was_explicit = _is_explicit(memory)
-            _enter(w, options, memory, phase, t)
+            _begin_phase(w, options, memory, phase, t)
             if was_explicit != _is_explicit(memory):
                 _restart(second if was_explicit else first)
     explicit = _is_explicit(memory)
@@ -385,16 +383,15 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.notes[REUSE] = max(each[REUSE_OF], w.notes[ROUNDED])
     if explicit:
         code, error, factor = f.attempt_first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
-        if (
-            code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.flags[FORM] != STATIC
-        ):  # a constant step cannot become shorter
-            _enter(w, options, memory, IMPLICIT, t)
+        # a step of fixed size cannot become shorter
+        if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.flags[FORM] != STATIC:
+            _begin_phase(w, options, memory, IMPLICIT, t)
             _restart(second)
             w.notes[EXPLICIT_STEP] = 0.0
             code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     else:
-        # only the first method may take longer steps: it evaluates within its steps, or has closely spaced stages
-        longer = times_gap(tolerances, h)
+        # only the first method may take steps longer than GAP: it evaluates within them, or has closely spaced stages
+        longer = gap_ratio(tolerances, h)
         if longer > 0.0:
             return Attempt(DONE, longer, 1.0 / longer)
         code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
@@ -407,7 +404,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
         error *= STRICT
     memory[H_TRIED], memory[ERROR_TRIED] = h, max(error, each[LEAST_ERROR])
     if factor == 0.0:
-        factor = factor_of(each, _past(memory), h, error)
+        factor = factor_of(each, _history(memory), h, error)
     if not explicit:
         factor = min(factor, max(tolerances[GAP] / h, 1.0))
     return Attempt(DONE, error, factor)

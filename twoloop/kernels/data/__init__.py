@@ -1,1 +1,1 @@
-"""Arrays and numbers that all kernels share."""
+"""Arrays, indices and types that all kernels share."""

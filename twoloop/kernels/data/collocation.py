@@ -1,15 +1,15 @@
 """Layout of the memory of collocation steps, which generated code fills and steps/lobatto_step.py reads.
 
-Offsets are counted in numbers from an aligned place on. A group of eight numbers, "lanes", has one for each unknown
+Offsets are counted in numbers from an aligned address on. A group of eight numbers, "lanes", has one for each unknown
 node, or one for each of eight steps that are projected together.
 """
 
 LANES = 8
 ORDER = 12.0  # order of the estimated error
-NOISE = 1e-13  # relative: differences of values below this may be rounding
-# results of the iteration of the stages. GUESSED: the step size was a guess, and another one is tried. LEFT: the
-# accelerations could not be computed
-MADE, REFUSED, GUESSED, LEFT = range(4)
+NOISE = 1e-13  # relative: smaller differences of values may be rounding
+# results of the iteration of the stages. GUESSED: the step size was a guess, and another one has to be tried.
+# NOT_COMPUTED: the accelerations could not be computed
+CONVERGED, REFUSED, GUESSED, NOT_COMPUTED = range(4)
 
 (
     T,  # beginning of the step
@@ -21,31 +21,31 @@ MADE, REFUSED, GUESSED, LEFT = range(4)
     TRIED,  # 1: the other polynomial is that of the step just attempted
     NEXT_DEGREE,
     KEPT_DEGREE,  # degree of the prediction before a rejected step; 0: none was rejected
-    MAY_GUESS,  # 1: the step size is a guess, and another is tried if the contraction is far from what is aimed at
+    MAY_GUESS,  # 1: the step size is a guess, and another is tried if the contraction is far from its target
     CAREFUL,  # number of steps that still use the elimination that begins with M
     STARTS,  # guesses of the first step size so far
     N_STEPS,  # number of steps since the beginning
     LIMITED,  # number of steps that convergence limited, less those that accuracy limited
-    UNMADE,  # twice the number of steps that did not converge, less those accepted
-    DEFECT,  # largest defect between nodes, over what is allowed; -1: there was no audit
+    FAILURES,  # twice the number of steps that did not converge, less those accepted
+    DEFECT,  # largest defect between nodes, over what is allowed; -1: it was not evaluated
     RHO,  # contraction of a sweep
     SWEEPS,  # number of sweeps of the step
-    TARGETED,  # number of sweeps aimed at
+    TARGETED,  # target of that number
     CHANGE,  # change of velocities by the last sweep, over the tolerances
     ERROR,  # error of the step, over the tolerances
     CURVED,  # Legendre coefficients of degree 5 and 6 of the accelerations, over the tolerances
     FACTOR,  # factor of the next step size by convergence ...
-    FACTOR_OF_ERROR,  # ... factor by the error ...
-    FACTOR_OF_DEFECT,  # ... and factor by the defect
+    FACTOR_OF_ERROR,  # ... by the error ...
+    FACTOR_OF_DEFECT,  # ... and by the defect
     ALLOWED_H,  # step size that the error would have allowed
     SIZE,  # size of velocities and their changes, over the tolerances
     STRICTER,  # ratio by which the tolerances of other coordinates are stricter than those of the iterated ones
 ) = range(28)
-POWERS = 32  # lanes: powers 1 to 8 of the step size over the one before
+POWERS = 32  # lanes: powers 1 to 8 of the ratio of the step size to the one before
 SCALED = 40  # lanes: coefficients of a polynomial times these powers
-MOVED = 48  # lanes: largest move of a coordinate by the last projection
+MOVED = 48  # lanes: largest change of a coordinate by the last projection
 FINE = 56  # lanes: 1 where the projection succeeded
-DEFECTS = 64  # lanes: defects of steps in a row
+DEFECTS = 64  # lanes: defects of successive steps
 WEIGHTS = 72  # (n): reciprocals of the allowed errors of velocities
 
 

@@ -26,7 +26,7 @@ from twoloop.kernels.data.indices import ATOL, ESTIMATE, FAULT_KIND, FAULT_TIME,
 
 i8 = types.int64
 INTEGERS = types.int64[::1]
-PLACES = types.int32[::1]  # indices of long programs; 32 bits, so that they fit in the cache
+PLACES = types.int32[::1]  # type of long programs: 32-bit integers, so that they fit in the cache
 
 # Programs that replace missing callbacks (evaluation/operations.py), and those of the sparse elimination of large
 # systems and of their Newton matrices (linalg/symbolic_factorization.py); of size 0 if there is none
@@ -43,10 +43,10 @@ Functions: Any = namedtuple("Functions", [*KINDS, "p", "flags", *PROGRAMS])  # t
 
 
 class Work(NamedTuple):
-    """Arrays that an evaluation writes; allocated once a run.
+    """Arrays that an evaluation writes; allocated once per run.
 
-    Sizes: n_q coordinates; n_c + n_a rows of C_q and A, of which r_v have full rank, among them r of C_q; n_dof = n_q -
-    r_v. Fields that end in _v belong to velocities; without rows of A they are the same arrays as those of positions.
+    Sizes: n_q coordinates; n_c + n_a rows of C_q and A, of which r_v are independent, r of them in C_q; n_dof is
+    n_q - r_v. Fields that end in _v belong to velocities; without rows of A these are the arrays of positions.
     """
 
     M: Any  # (n_q, n_q) mass matrix
@@ -58,15 +58,15 @@ class Work(NamedTuple):
     W: Any  # (r_v, n_q) rows G M^-1 of the independent rows
     A: Any  # (n_dof, n_dof) T^T M T and its factors; empty where S is used
     MT: Any  # (n_q, n_dof) M T
-    D: Any  # (n_dof + 1, r_v) rows of -(G_d^-1 G_i)^T, and the dependent velocities at v_i = 0: in order of elimination
+    D: Any  # (n_dof + 1, r_v) rows of -(G_d^-1 G_i)^T, and the dependent velocities at v_i = 0; in elimination order
     Gx: Any  # (n_c + n_a, n_q) rows at a displaced point (Q_d by differences); scratch for full pivoting
-    G_of_S: Any  # (n_c + n_a, n_q) the G of which S and W were computed, if M is constant and not diagonal; NaN: none
+    G_of_S: Any  # (n_c + n_a, n_q) the G from which S and W were computed, if M is constant and not diagonal; NaN: none
     pattern: Any  # (n_c + n_a, n_q) 1 where G has had a nonzero entry
     mass_pattern: Any  # (n_q, n_q) 1 where M has had a nonzero entry; empty without the augmented form
-    places: Any  # where the entries of each row of G begin (n_c + n_a + 1), then their columns
-    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences over a double length, and with the length tried before
+    places: Any  # index of the first entry of each row of G (n_c + n_a + 1), then the columns of the entries
+    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences: over twice the length, and over the length tried before
     rates: Any  # (13, n_c + n_a) C_t and b at times within a step, see discontinuities.py
-    changes: Any  # (8, n_q + n_c + n_a) changes of forces, C_t and b with time, see discontinuities.py
+    changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces, C_t and b ahead, see discontinuities.py
     Q: Any  # (n_q) force
     x: Any  # (n_q) scratch
     y: Any  # (n_q) scratch
@@ -81,7 +81,7 @@ class Work(NamedTuple):
     dependent: Any  # (r) columns of the coordinates that they determine
     independent: Any  # (n_q - r) columns of the independent coordinates
     index: Any  # program of the factors of C_qd, see markowitz_lu.py
-    values: Any  # the factors
+    values: Any  # the factors of C_qd
     rows_v: Any  # (r_v) independent rows of G
     dependent_v: Any  # (r_v)
     independent_v: Any  # (n_dof)
@@ -91,14 +91,14 @@ class Work(NamedTuple):
     values_a: Any
     right: Any  # (2 (n_q + r_v)) right-hand side of the augmented matrix, and scratch
     order: Any  # (n_q) scratch: column order of the full pivoting
-    row_order: Any  # (n_c + n_a) scratch: row order
+    row_order: Any  # (n_c + n_a) scratch: row order of the full pivoting
     counters: Any  # (N_COUNTERS) see indices.py
-    lapack: Any  # addresses of lapack.ROUTINES; 0 where linear algebra is dense
+    lapack: Any  # addresses of band.ROUTINES; 0 where linear algebra is dense
     predicted: Any  # (r) dependent positions that the integration formula gives, before the constraints restore them
     notes: Any  # (N_NOTES) see indices.py
     nodes: Any  # results of the operations of a program
     matrices: Any  # matrices of Newton's method, see steps/stages.py and steps/newton_systems.py
-    # fields of the static form, empty in others; N is n_q + n_c; fields that this form does not use are empty in it
+    # fields of the static form, empty in other forms, as are fields of other forms in this one; N is n_q + n_c
     mass_values: Any  # entries of M, see linalg/symbolic_factorization.py
     jacobian_values: Any  # entries of G
     counts: Any  # (n_c) 1 for independent rows, else 0
@@ -107,7 +107,7 @@ class Work(NamedTuple):
     unknowns: Any  # (N) right-hand side and solution
     solutions: Any  # (3 N) scratch, and (n_c) the stiffening of M along rows, see linalg/sparse_ldl.py
 
-    sizes: Any = None  # arguments from which it was allocated
+    sizes: Any = None  # arguments of `empty` that allocated it
     address: Any = 0  # address of the table by which kernels find these arrays
     table: Any = None
 
@@ -134,11 +134,11 @@ def _type_of_work(value: Any, context: Any) -> Any:
 class Attempt(NamedTuple):
     """Result of an attempted step: its code, its error and the factor of the next step.
 
-    code : DONE, or why it could not be made.
-    error : over the tolerances; it is accepted from 1 down. A step that is longer than the method allows, and was not
-        made, is wrong by as many times as it is too long.
-    factor : the length that the method asks for next, over this one; 0: the controller chooses it from the error. Over
-        1 after an error over 1: the step was a guess, and was not made, as a longer one will do.
+    code : DONE, or the reason why the step failed.
+    error : over the tolerances; up to 1 the step is accepted. If a step is longer than the method allows, it is not
+        taken, and the error is the ratio of the two lengths.
+    factor : ratio of the next step size to this one; 0: the controller chooses it from the error. Above 1 after an
+        error above 1: the step size was a guess, and the step was not taken, because a longer one will do.
     """
 
     code: int
@@ -147,9 +147,9 @@ class Attempt(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Compiled functions of a step: `attempt` makes it, `settle` commits or discards it in the method's memory.
+    """Compiled functions of a step: `attempt` takes it, `settle` commits or discards it in the method's memory.
 
-    `many` makes steps in a row, where a method has it.
+    `many` takes several steps in one call, for methods that can.
     """
 
     attempt: Any = None
@@ -185,21 +185,21 @@ KIT.add_function("attempt_many", MANY)
 # Functions generated for a mechanism, see generate/elimination.py and collocation_code.py. Those that return a flag
 # say whether their conditions hold, and fill their arrays only then
 OWN_FUNCTIONS = {
-    # (t, q, v, numbers, ...): accelerations; positions moved towards the constraints, by x; these with velocities,
-    # accelerations and multipliers; accelerations if redundant rows hold, too
-    "own_there": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
-    "own_closer": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR),
-    "own_nearer": types.boolean(f8, *[VECTOR] * 8),
+    # arguments (t, q, v, numbers, ...); results: accelerations; corrected positions and the correction x; these with
+    # velocities, accelerations and multipliers; accelerations if redundant rows hold, too
+    "own_accelerate": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
+    "own_correct_positions": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR),
+    "own_project": types.boolean(f8, *[VECTOR] * 8),
     "own_redundant": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
-    # functions of collocation, on a memory that data/collocation.py describes: (room, state, tolerances, numbers),
-    # which returns how the stages ended; (room, state, numbers), which returns the defect between nodes; (room,
-    # state); (room, state, new_state); (room, numbers)
+    # functions of collocation, on a memory that data/collocation.py describes. attempt_nodes (room, state, tolerances,
+    # numbers) returns how the iteration ended; audit_nodes (room, state, numbers) the defect between nodes; then
+    # (room, state); (room, state, new_state); (room, numbers)
     "attempt_nodes": f8(*[VECTOR] * 4),
     "audit_nodes": f8(*[VECTOR] * 3),
     "retry_nodes": types.none(*[VECTOR] * 2),
     "end_nodes": types.none(*[VECTOR] * 3),
-    "closer_ends": types.none(*[VECTOR] * 2),
-    "nearer_ends": types.none(*[VECTOR] * 2),
+    "correct_ends": types.none(*[VECTOR] * 2),
+    "project_ends": types.none(*[VECTOR] * 2),
 }
 KIT.add_llvm_functions(OWN_FUNCTIONS)
 
@@ -255,7 +255,7 @@ _ANNOUNCEMENT = "twoloop: compiling the integrator, about a minute; later proces
 
 
 def kernel(signature: Any, vectorized: bool = False) -> Callable[[Callable[..., Any]], Dispatcher]:
-    """Compile a function of the integrator, and keep the machine code until a file that it needs changes."""
+    """Return a decorator that compiles a kernel, or reads its machine code if no file that it needs has changed."""
 
     def compile_now(function: Callable[..., Any]) -> Dispatcher:
         return compile_cached(
@@ -270,8 +270,8 @@ def kernel(signature: Any, vectorized: bool = False) -> Callable[[Callable[..., 
     return compile_now
 
 
-# NaN and infinity keep their meaning. Without numba's runtime, code that allocates arrays does not compile. It also
-# avoids reference counts, which would take a third of the time of an evaluation of the four-bar
+# NaN and infinity keep their meaning. `_nrt`: without numba's runtime, code that allocates arrays does not compile, and
+# there are no reference counts, which would take a third of the time of an evaluation of the four-bar
 OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "fastmath": {"contract", "reassoc", "nsz", "arcp"},
@@ -286,12 +286,12 @@ def _helper(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
     return njit(**{**OPTIONS, **wrappers, "pipeline_class": HelperCompiler, **options})
 
 
-# Flags are given explicitly because a callee inherits those of its caller: what a merged helper calls would be merged,
-# too. `exact` keeps the order of floating-point operations
+# Flags are given explicitly because a callee inherits those of its caller: all that a merged helper calls would be
+# merged, too. `exact` keeps the order of floating-point operations
 exact = _helper(fastmath=False, forceinline=False)
 compiled = _helper(forceinline=False)  # compiled as one copy, unless LLVM finds it short enough to inline
-inlined = _helper(inline="always")  # inlined into its caller; only such a helper can return views of arrays
-# inlined later, by LLVM, and so typed once: for short helpers, or those of every evaluation; each call is a copy
+inlined = _helper(inline="always")  # inlined by numba; only such a helper can return views of arrays
+# typed once, inlined by LLVM: for short helpers and those of every evaluation; each call becomes a copy of the code
 merged = _helper(forceinline=True)
 
 
@@ -301,10 +301,10 @@ NONE = np.zeros(0)
 class Kit:
     """Data of a system and a method that kernels get by one reference: callbacks, inner loop and step.
 
-    The latter two are compiled once, and not again in what calls them; None where they are not called. A step that
-    chooses between two others has these as `first` and `second`. An inner loop that calls functions made for the
-    mechanism leaves to `general` what these do not do. `own` are sets of such functions; `numbers` is what those of the
-    inner loop read, `own_numbers` what those of collocation read.
+    Inner loop and step are compiled once, and not again in each caller; None: never called. A step that chooses between
+    two steps has these as `first` and `second`. `own` are sets of functions generated for the mechanism: an inner loop
+    that calls them leaves other tasks to `general`. `numbers` are the data of these functions, `own_numbers` those of
+    the collocation functions.
     """
 
     def __init__(
@@ -369,15 +369,15 @@ def finite(A):
 
 @compiled
 def not_finite(notes, kind, t, q):
-    """Record, for the message, which callback gave a value that is not finite; none if q itself is not finite."""
+    """Record which callback gave a value that is not finite, for the message; none if q itself is not finite."""
     notes[FAULT_KIND] = kind if finite_vector(q) else -1.0
     notes[FAULT_TIME] = t
     return NOT_FINITE
 
 
 @compiled
-def source_of_acceleration(w):
-    """Return the index in Functions of the callback that gave an acceleration that is not finite; -1: none."""
+def faulty_callback(w):
+    """Return the index in Functions of the callback that made an acceleration not finite; -1: unknown."""
     n_c = w.C.size
     if not finite_vector(w.Rate[:n_c]):
         return RATE
@@ -392,12 +392,12 @@ def source_of_acceleration(w):
     return FORCE if not finite_vector(w.Q) else -1
 
 
-SLACK = 1e-9  # relative: rounding may make a step longer than GAP by this much
+SLACK = 1e-9  # relative: a step may exceed GAP by this much because of rounding
 
 
 @merged
 def allowed(tolerances, m, x, x1):
-    """Return the error allowed of coordinate m, or of its velocity, in a step from x to x1."""
+    """Return the allowed error of coordinate m, or of its velocity, in a step from x to x1."""
     return tolerances[ATOL + m] + tolerances[RTOL] * max(abs(x), abs(x1))
 
 
@@ -408,8 +408,8 @@ def is_beyond_gap(tolerances, h):
 
 
 @merged
-def times_gap(tolerances, h):
-    """Return the length of a step over GAP, or 0 if it is no longer than GAP or has a fixed size."""
+def gap_ratio(tolerances, h):
+    """Return the ratio of a step to GAP; 0 if it is at most 1, or if the step size is fixed."""
     if tolerances[ESTIMATE] == 1.0 and is_beyond_gap(tolerances, h):
         return h / tolerances[GAP]
     return 0.0

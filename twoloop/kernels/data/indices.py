@@ -1,12 +1,12 @@
 """Indices into the arrays that kernels share, and the codes that they return.
 
-Kernels keep their state in arrays of numbers, as compiled code passes these by reference. Each group below names the
-places of one array. What only the loop over steps reads stands in control/loop_state.py.
+Kernels keep their state in arrays of numbers, because compiled code passes these by reference. Each group below names
+the indices of one array; those that only the loop over steps reads are in control/loop_state.py.
 """
 
 from twoloop.kernels.compile.callbacks import OPTIONAL
 
-# codes: DONE, or why an evaluation or a step failed
+# codes: DONE, or the reason why an evaluation or a step failed
 (
     DONE,
     OUTER_DIVERGED,
@@ -17,16 +17,16 @@ from twoloop.kernels.compile.callbacks import OPTIONAL
     GAMMA_INACCURATE,
     RANK_DIFFERS,
     ROWS_CONTRADICT,
-    NEEDS_DENSE,  # the sparse form cannot decide it
-    NOT_LOADED,  # the step is not loaded yet: the caller loads its machine code
-    UNSUITED,  # the method does not suit the motion here: another one takes over
+    NEEDS_DENSE,  # the sparse form cannot decide whether rows are independent
+    NOT_LOADED,  # the caller has to load the machine code of the step
+    UNSUITED,  # the method does not suit the motion here: the caller continues with another one
 ) = range(12)
 
 # Functions.flags: whole numbers that describe a system to kernels. BANDWIDTH is -1 if linear algebra is not banded.
 # FORM is the form of the linear equations of accelerations, see linalg/saddle_point.py; DENSE_FORM replaces it if
 # sparse factors have too many entries. STRAIGHT is 1 if the inner loop is code generated for the mechanism
 CONSTANT_MASS, DIAGONAL_MASS, BANDWIDTH, FORM, DENSE_FORM, STRAIGHT, FIRST_GIVEN = range(7)
-MULTIPLIERS, NULL_SPACE, AUGMENTED, STATIC = range(4)  # values of FORM; the last has sparse_inner_loop.py
+MULTIPLIERS, NULL_SPACE, AUGMENTED, STATIC = range(4)  # values of FORM; for STATIC see sparse_inner_loop.py
 GIVEN = {name: place for place, name in enumerate(OPTIONAL, FIRST_GIVEN)}  # whether an optional callback is given
 N_FLAGS = FIRST_GIVEN + len(GIVEN)
 CONSTRAINT_RATE_GIVEN, GAMMA_GIVEN, FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, KINEMATICS_GIVEN = (
@@ -56,51 +56,51 @@ MASS_VALUES_GIVEN, JACOBIAN_VALUES_GIVEN = (GIVEN[name] for name in ("mass_value
     SENSITIVITY,  # max|Cqd^-1 Cqi| after the first step under this partition; 0: not known yet
     ORIENTATION,  # sign of det C_qd at the last accepted state under this partition; 0: not known
     ORIENTATION_NEW,  # ... and at the end of this attempt
-    FAULT_KIND,  # place in Functions of the callback that gave a value that is not finite; -1: none known
+    FAULT_KIND,  # index in Functions of the callback that gave a value that is not finite; -1: none known
     FAULT_TIME,  # time of that evaluation
-    GAMMA_REQUIRED,  # relative accuracy that Q_d by differences must have, see evaluation/constraints.py
+    GAMMA_REQUIRED,  # required relative accuracy of Q_d by differences, see evaluation/constraints.py
     GAMMA_SHARE,  # length of the differences, as a share of the longest one
     GAMMA_ACCURACY,  # accuracy that was reached when that share was chosen
     GAMMA_SCALE,  # largest entry of Q_d so far
-    REUSE,  # correction of a position below which the Jacobian before it serves for velocities and accelerations
-    ROUNDED,  # as REUSE, at a state that may be accepted: rounding of the positions
+    REUSE,  # correction of a position below which the Jacobian before it still serves for velocities and accelerations
+    ROUNDED,  # the same limit at a state that may be accepted: rounding of the positions
     GENERATION,  # number of partitions so far
     RANK,  # rank of C_q, if it differs from the rank of the workspace
     RANK_V,  # rank of C_q and A, likewise
-    CONTRADICTION,  # row that was taken for redundant but is violated
+    CONTRADICTION,  # index of a row that was taken for redundant but is violated
     PIVOT,  # smallest pivot of the last full pivoting, rows scaled to 1: small near a singular position
     NEARLY_SINGULAR,  # 1: the run has come near a singular position, or does not watch for one
-    NEAR_NOW,  # 1: a singular position was near at the last check; 2: a step that could look within did not for it
+    NEAR_NOW,  # 1: a singular position was near at the last check; 2: near one a step skipped the check of its defect
     MASS_SCALE,  # s of the augmented matrix, see linalg/saddle_point.py
     FACTORED,  # 1: the factors of the linear problem belong to w.M and w.G
-    KNOWN,  # 1: w.Rate and w.Gamma[:n_c] belong to the state, from the fused callback
+    KNOWN,  # 1: w.Rate and w.Gamma[:n_c] belong to the state, computed by the fused callback
     BY_GENERAL,  # 1: generated code left the last state to the general inner loop
     EXPLICIT_STEP,  # 1: a method that switches took an explicit step
     DEFECT,  # largest defect of this attempt over what the tolerances allow; -1: none was evaluated
     LARGEST_DEFECT,  # largest defect of the accepted steps
     UNCHECKED,  # number of accepted steps for which no defect was evaluated
     WIDEST_GAP,  # s, the longest time between two evaluations within accepted steps
-    KINK_BEFORE,  # times between which no jump of C_t or b is known
+    KINK_BEFORE,  # times of the last and the next jump of C_t or b that are known
     KINK_AFTER,
     LEANING,  # largest coefficient of an independent row in a redundant one, when this partition was chosen
     SMALLEST,  # sparse form: least pivot of a row over its size, the squared sine of its angle to the others
     N_NOTES,
 ) = range(32)
 
-# tolerances of eq. (26) of the paper, as a step gets them
+# tolerances of eq. (26) of the paper, as the array that steps read
 (
     RTOL,
     ESTIMATE,  # 0 for a fixed step, else 1
     LEAST,  # the smallest tolerance
     GAP,  # s, the longest time between two evaluations of the equations
-    LOOK,  # s, the same of steps that evaluate their defect between nodes
-    ATOL,  # from here on: the absolute tolerance of each coordinate and of its velocity
+    LOOK,  # s, the same for steps that evaluate their defect between nodes
+    ATOL,  # from this index on: the absolute tolerance of each coordinate and of its velocity
 ) = range(6)
 LONGEST_UNSEEN = 0.01  # GAP over the length of the run
-UNTRUE = 30.0  # times the tolerances: velocity errors above this next to a singular position are reported
+UNTRUE = 30.0  # times the tolerances: larger errors of velocities next to a singular position are reported
 
 # kinds of intervals between accepted states, for dense output: which values of the states the polynomials take
-WINDOW = 4  # states that a polynomial goes through
+WINDOW = 4  # number of states that a polynomial goes through
 (
     APART,  # q and v in one polynomial, v and a in another: errors of q and v are independent, and steps are small
     VELOCITIES,  # q and v in one polynomial and its derivative: a holds the noise of stiff modes
@@ -108,6 +108,6 @@ WINDOW = 4  # states that a polynomial goes through
     ACROSS,  # as ACCELERATIONS, for a step across a singular position
     JUMP,  # no polynomial: velocities jump within a few spacings of floating-point numbers
 ) = range(5)
-# columns of the table of intervals; a row stands for all output times within one interval. No polynomial extends beyond
+# columns of the table of intervals; a row is for all output times within one interval. No polynomial extends beyond
 # the rows LOW and HIGH, at which velocities jump
 FIRST_OWN, LAST_OWN, KIND, FIRST_TIME, END_TIME, LOW, HIGH, N_COLUMNS = range(8)

@@ -1,10 +1,10 @@
-"""Compiled parts of the checks of a start: one evaluation of all callbacks, rows, and units of the rows.
+"""Compiled parts of the checks of a start: evaluation of all callbacks, checks of the rows, and units of coordinates.
 
-Where the evaluation finds nothing wrong, no other check needs to run. Units are those in which the entries of a matrix
-are of like size; the reach of a row says how far it stays what it is (checks/scales.py).
+If the evaluation finds nothing wrong, no other check needs to run. In units of rows and of coordinates the entries of a
+matrix are of similar size; the reach of a row says how far coordinates can move until it changes (checks/scales.py).
 
-Calls of callbacks are also compared with their traces, see generate/traced_values.py. There every number has a bound of
-its rounding error, in units of EPS, which is at least the size of its terms.
+Callbacks are also compared with their traces, see generate/traced_values.py. Each traced number has a bound of its
+rounding error, in units of EPS, which is at least the sum of the sizes of its terms.
 """
 
 import math
@@ -27,7 +27,7 @@ from twoloop.kernels.linalg.dense import largest_of, ldl_factor
 
 NO_ENTRY = 1e-12  # relative to the largest entry of a row: smaller entries are rounding errors
 MAX_SWEEPS = 20  # largest number of sweeps of the alternating least squares
-NEGLIGIBLE = 1e-6  # relative to the largest coordinate: smaller ones are zero by chance and give no size
+NEGLIGIBLE = 1e-6  # relative to the largest coordinate: smaller ones are zero up to rounding and give no size
 
 
 @exact
@@ -71,9 +71,9 @@ def _rows_from(columns, rows, counts, logs):
 def column_units(matrix, typical, columns, counts, logs, rows, room):
     """Estimate the units of the coordinates from a constraint Jacobian, so that lengths and angles can be compared.
 
-    An entry (i, j) is about unit of row i / unit of coordinate j: least squares of log|entry| + log column - log row.
-    This leaves one factor free, which makes the median unit that of `typical`. Coordinates without entries get their
-    typical units. The results are in `columns`; the other arrays are scratch.
+    |entry (i, j)| is about unit of row i / unit of coordinate j: log|entry| + log column - log row has least squares.
+    One factor is left free: the median unit is that of `typical`. Coordinates without entries get their typical units.
+    The results are in `columns`; the other arrays are scratch.
     """
     n_used, shift = 0, 0.0
     for i in range(rows.size):
@@ -107,7 +107,7 @@ def column_units(matrix, typical, columns, counts, logs, rows, room):
 def row_reaches(in_units, radius, negligible, room, reach):
     """Compute the reach of each row: its radius, or the values of its coordinates if these are smaller.
 
-    Only the smaller half of the values counts, so that an offset has no effect; negligible values do not count.
+    Of the values the lower median is taken, so that an offset has no effect; negligible values are left out.
     """
     for i in range(reach.size):
         largest, n = 0.0, 0
@@ -126,15 +126,15 @@ def row_reaches(in_units, radius, negligible, room, reach):
 
 
 # flags of results. IN_ORDER: all values are finite, M is symmetric, no row is empty. CONSISTENT: the state is on the
-# rows up to rounding. DEFINITE, INDEFINITE: of an M that varies, both by a margin
+# constraints up to rounding. DEFINITE, INDEFINITE: an M that varies is so by a margin
 IN_ORDER, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
 NEAR_SHARE = 0.5  # relative to the sizes of the coordinates: a position within this distance has the same sizes
 ROUNDING_OF_ZERO = 2.0**-52  # relative to the largest coordinate: a smaller one is a rounded zero
-EIGENVALUE_MARGIN = 2.0  # factor on the eigenvalue that counts as zero: more than rounding changes it by
+EIGENVALUE_MARGIN = 2.0  # factor on the eigenvalue that counts as zero: rounding changes it by less
 
 
 def room_size(n: int, n_c: int, n_a: int) -> int:
-    """Return the length of `room`: numbers that callbacks fill, beside M and the rows, and scratch."""
+    """Return the length of `room`: the outputs of callbacks other than M and the rows, and scratch."""
     return n + 2 * (n_c + n_a) + n_c * (n + 4) + n * max(n, n_c + n_a + 1)
 
 
@@ -146,7 +146,7 @@ def _clear(A):
 
 
 @exact
-def _empty(rows):
+def _has_empty_row(rows):
     """Return whether there is a row without entries."""
     empty = False
     for i in range(len(rows)):
@@ -155,8 +155,8 @@ def _empty(rows):
 
 
 @exact
-def _symmetric(mass, allowed):
-    """Return whether no entry differs from its counterpart by more than this share of the largest."""
+def _is_symmetric(mass, allowed):
+    """Return whether no entry differs from its transposed entry by more than this share of the largest entry."""
     largest, off, same = 0.0, 0.0, True
     for i in range(len(mass)):
         for j in range(i):
@@ -170,8 +170,8 @@ def _symmetric(mass, allowed):
 
 
 @exact
-def _rounding(value, row, state, sizes, least, rate, allowed):
-    """Return whether a value is rounding: at most this share of the terms of its sum, each at the size of its state."""
+def _is_rounding(value, row, state, sizes, least, rate, allowed):
+    """Return whether a sum is rounding: at most this share of its terms, each at the size of its state."""
     size = abs(rate)
     for j in range(state.size):
         size += abs(row[j]) * max(abs(state[j]), sizes[j], least)
@@ -180,7 +180,7 @@ def _rounding(value, row, state, sizes, least, rate, allowed):
 
 @exact
 def _is_near(q, sizes, place):
-    """Return whether a position is so near to another one that the sizes known there hold for it, too."""
+    """Return whether a position is so near to `place` that the sizes of coordinates known there hold for it, too."""
     near = True
     for j in range(q.size):
         near = near and abs(q[j] - place[j]) <= NEAR_SHARE * sizes[j]
@@ -189,7 +189,7 @@ def _is_near(q, sizes, place):
 
 @exact
 def _has_entries(rows, entries):
-    """Return whether exactly these entries of rows are nonzero; if one of them vanishes, the sizes mean little."""
+    """Return whether exactly these entries of rows are nonzero; without one of them the sizes would not apply."""
     same, n = True, rows.shape[1]
     for i in range(entries.size // n):
         largest = largest_of(rows[i])
@@ -200,7 +200,7 @@ def _has_entries(rows, entries):
 
 @exact
 def _find_known_sizes(q, rows, n_c, sizes):
-    """Return the place of the sizes that are known of a position near this one; -1: there are none."""
+    """Return the index of the sizes that belong to a position near this one; -1: there are none."""
     n = q.size
     width = 2 * n + n_c * n
     for k in range(0, sizes.size, width):
@@ -210,11 +210,11 @@ def _find_known_sizes(q, rows, n_c, sizes):
 
 
 @exact
-def _consistent(C, rate, rows, q, v, sizes, allowed):
+def _is_consistent(C, rate, rows, q, v, sizes, allowed):
     """Return whether positions and velocities satisfy the rows up to rounding.
 
-    No coordinate counts as less than its size, where that is known, or than what rounding leaves of the largest: of
-    coordinates that are zero but for rounding, as in a plane, a constraint is not zero to rounding of its terms.
+    A coordinate counts with its known size at least, and with the rounding error of the largest coordinate: where the
+    coordinates of a constraint are zero but for rounding, as in a plane, its value is not small relative to its terms.
     """
     fastest, nothing = largest_of(v), ROUNDING_OF_ZERO * largest_of(q)
     begin = _find_known_sizes(q, rows, C.size, sizes)
@@ -223,36 +223,36 @@ def _consistent(C, rate, rows, q, v, sizes, allowed):
         speed = 0.0
         for j in range(q.size):
             speed += rows[i, j] * v[j]
-        if not _rounding(speed + rate[i], rows[i], v, v, fastest, rate[i], allowed):
+        if not _is_rounding(speed + rate[i], rows[i], v, v, fastest, rate[i], allowed):
             return False
-        if i < C.size and not _rounding(C[i], rows[i], q, known, nothing, 0.0, allowed):
+        if i < C.size and not _is_rounding(C[i], rows[i], q, known, nothing, 0.0, allowed):
             return False
     return True
 
 
 @exact
-def _note_entries(rows, pattern):
+def _record_entries(rows, pattern):
     for i in range(len(rows)):
         for j in range(rows.shape[1]):
-            # written in any case, so that the loop is vectorized
+            # an unconditional store, so that LLVM vectorizes the loop
             pattern[i, j] = 1.0 if rows[i, j] != 0.0 else pattern[i, j]
 
 
 @exact
-def _note_entries_near(f, t, q, ways, place, rows, n_c, pattern):
-    """Add entries of rows to the pattern at positions whose distances from q are `ways` times its size."""
+def _record_entries_near(f, t, q, shifts, place, rows, n_c, pattern):
+    """Add entries of rows to the pattern at positions that differ from q by `shifts` times the size of q."""
     largest = largest_of(q)
-    for k in range(len(ways)):
+    for k in range(len(shifts)):
         for j in range(q.size):
-            place[j] = q[j] + max(abs(q[j]), largest) * ways[k, j]
+            place[j] = q[j] + max(abs(q[j]), largest) * shifts[k, j]
         _clear(rows)
         f.jacobian(t, place, f.p, rows[:n_c])
         f.nonholonomic(t, place, f.p, rows[n_c:])
-        _note_entries(rows, pattern)
+        _record_entries(rows, pattern)
 
 
 @exact
-def _definite(mass, least, factors):
+def _is_definite(mass, least, factors):
     """Return whether all eigenvalues of a symmetric matrix are at least `least` times its largest entry."""
     n, largest = len(mass), 0.0
     for i in range(n):
@@ -265,14 +265,14 @@ def _definite(mass, least, factors):
 
 
 @kernel(i8(KIT, f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR), vectorized=True)
-def evaluate_start(f, t, q, v, sizes, lam, room, mass, rows, ways, pattern, least):
-    """Evaluate all callbacks at (t, q, v); return flags of what is found.
+def evaluate_start(f, t, q, v, sizes, lam, room, mass, rows, shifts, pattern, roundings):
+    """Evaluate all callbacks at (t, q, v); return flags of the results.
 
-    Arrays are full of zeros, but for `lam`, and these. `least` are relative: what counts as rounding of a state, as the
-    asymmetry of M, and as an eigenvalue of M. In what counts as rounding, no coordinate is less than its size near one
-    of some positions (`keep` of checks/scales.py). `ways` say how far from q, over its size, rows are evaluated, too.
-    `mass` and `rows` become M, and C_q with A, `pattern` 1 where rows have entries; `room`, of `room_size` numbers,
-    begins with the force, C, and C_t with b.
+    Arrays other than `lam` and the following arguments are full of zeros. `roundings`: relative rounding of a state, of
+    the symmetry of M, and of its eigenvalues. `sizes`: positions with the sizes of their coordinates (`keep` of
+    checks/scales.py), which count as smallest sizes near these positions. `shifts`: displacements of q, over its size,
+    at which entries of rows are also recorded. `mass` and `rows` become M, and C_q with A, `pattern` becomes 1 where
+    rows have entries; `room`, of `room_size` numbers, begins with the force, C, and C_t with b.
     """
     n, n_c, n_rows, flags = q.size, lam.size, rows.shape[0], f.flags
     force, C, rate, gamma = n, n + n_c, n + n_c + n_rows, n + n_c + 2 * n_rows  # ends of the parts of `room`
@@ -310,24 +310,24 @@ def evaluate_start(f, t, q, v, sizes, lam, room, mass, rows, ways, pattern, leas
         if not finite(scratch):
             return 0
     bits = 0
-    if _symmetric(mass, least[1]) and not _empty(rows):
+    if _is_symmetric(mass, roundings[1]) and not _has_empty_row(rows):
         bits = IN_ORDER
-        if _consistent(room[force:C], room[C:rate], rows, q, v, sizes, least[0]):
+        if _is_consistent(room[force:C], room[C:rate], rows, q, v, sizes, roundings[0]):
             bits |= CONSISTENT
-    if flags[CONSTANT_MASS] == 0:  # an M between the two margins gets neither flag
-        if _definite(mass, EIGENVALUE_MARGIN * least[2], scratch):
+    if flags[CONSTANT_MASS] == 0:  # neither flag if the smallest eigenvalue is between the two margins
+        if _is_definite(mass, EIGENVALUE_MARGIN * roundings[2], scratch):
             bits |= DEFINITE
-        elif not _definite(mass, least[2] / EIGENVALUE_MARGIN, scratch):
+        elif not _is_definite(mass, roundings[2] / EIGENVALUE_MARGIN, scratch):
             bits |= INDEFINITE
-    _note_entries(rows, pattern)
+    _record_entries(rows, pattern)
     near = room[end : end + n_rows * n].reshape((n_rows, n))
-    _note_entries_near(f, t, q, ways, room[end + n_rows * n : end + n_rows * n + n], near, n_c, pattern)
+    _record_entries_near(f, t, q, shifts, room[end + n_rows * n : end + n_rows * n + n], near, n_c, pattern)
     return bits
 
 
 @kernel(types.void(KIT, f8, MATRIX, i8, MATRIX))
 def rows_at(f, t, places, n_c, rows):
-    """Evaluate C_q, of n_c rows, and A at each of these positions, one below the other; `rows` contains zeros."""
+    """Evaluate C_q (n_c rows) and A at each of these positions, one below the other; `rows` contains zeros."""
     n_rows = len(rows) // len(places)
     for k in range(len(places)):
         begin = k * n_rows
@@ -336,8 +336,8 @@ def rows_at(f, t, places, n_c, rows):
 
 
 @exact
-def _agree(fused, given, allowed, more):
-    """Return whether no number differs by more than this share of the largest, plus `more` of its row."""
+def _agrees(fused, given, allowed, more):
+    """Return whether no number differs by more than this share of the largest, plus the number that `more` adds."""
     largest = 0.0
     for i in range(given.shape[0]):
         for j in range(given.shape[1]):
@@ -354,7 +354,7 @@ def kinematics_agree(f, t, q, v, fused, given, more, allowed, rounding):
     """Return whether the fused callback agrees with the separate ones, up to a share of the largest number of each.
 
     Constraints may also differ by rounding of their terms. Arrays are full of zeros: `fused` and `given` have the rows
-    C, C_t and gamma, and C_q below, (3 + n_q, n_c); `more` has n_c numbers.
+    C, C_t and gamma, then C_q, (3 + n_q, n_c); `more` has n_c numbers.
     """
     n, n_c = q.size, more.size
     by_one, by_others = fused[3:].reshape((n_c, n)), given[3:].reshape((n_c, n))
@@ -363,13 +363,13 @@ def kinematics_agree(f, t, q, v, fused, given, more, allowed, rounding):
     f.jacobian(t, q, f.p, by_others)
     f.constraint_rate(t, q, f.p, given[1])
     f.gamma(t, q, v, f.p, given[2])
-    agree = _agree(by_one, by_others, allowed, more)
+    agree = _agrees(by_one, by_others, allowed, more)
     for k in range(1, 3):
-        agree = agree and _agree(fused[k : k + 1].reshape((n_c, 1)), given[k : k + 1].reshape((n_c, 1)), allowed, more)
+        agree = agree and _agrees(fused[k : k + 1].reshape((n_c, 1)), given[k : k + 1].reshape((n_c, 1)), allowed, more)
     for i in range(n_c):
         for j in range(n):
             more[i] += rounding * abs(by_others[i, j]) * abs(q[j])
-    return agree and _agree(fused[:1].reshape((n_c, 1)), given[:1].reshape((n_c, 1)), allowed, more)
+    return agree and _agrees(fused[:1].reshape((n_c, 1)), given[:1].reshape((n_c, 1)), allowed, more)
 
 
 VALUE, BOUND = range(2)  # rows of `nodes`
@@ -381,7 +381,7 @@ ROUNDED = 200.0 * EPS  # ... this multiple of the bound
 
 @exact
 def _sum(columns, coefficients, constant, nodes, begin, end):
-    """Return an affine expression, and its bound."""
+    """Return an affine expression, and a bound of its rounding error."""
     total, bound = constant, abs(constant)
     for k in range(begin, end):
         term = coefficients[k] * nodes[VALUE, columns[k]]
@@ -392,7 +392,7 @@ def _sum(columns, coefficients, constant, nodes, begin, end):
 
 @exact
 def _operation(kind, x, dx, y, dy):
-    """Return the result of an operation, and its bound."""
+    """Return the result of an operation, and a bound of its rounding error."""
     z = operation(kind, x, y)
     if kind == op.PRODUCT:
         dz = abs(x) * dy + abs(y) * dx
@@ -413,8 +413,8 @@ def _operation(kind, x, dx, y, dy):
 
 
 @exact
-def _traced(program, columns, coefficients, constants, nodes, values, bounds):
-    """Compute results and bounds from the inputs, which are the first nodes."""
+def _run_trace(program, columns, coefficients, constants, nodes, values, bounds):
+    """Compute results and bounds of a traced program from its inputs, which are the first nodes."""
     for i in range(len(program)):
         first, second, end = program[i, op.FIRST], program[i, op.SECOND], program[i, op.END]
         x, dx = _sum(columns, coefficients, constants[i, 0], nodes, first, second)
@@ -427,8 +427,8 @@ def _traced(program, columns, coefficients, constants, nodes, values, bounds):
 
 
 @exact
-def _differences(called, traced, bounds):
-    """Count the numbers that differ beyond rounding; those that are not finite do."""
+def _count_differences(called, traced, bounds):
+    """Count the numbers that differ by more than rounding, or are not finite."""
     count = 0
     for i in range(called.shape[1]):
         largest = 0.0
@@ -444,10 +444,10 @@ def _differences(called, traced, bounds):
 @kernel(
     i8(KIT, INTEGERS, INTEGERS, MATRIX, types.int64[:, ::1], INTEGERS, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, MATRIX)
 )
-def compare(f, sizes, which, states, program, columns, coefficients, constants, nodes, called, traced, bounds):
-    """Compare callbacks at states [t, q, v] with their traces, with bounds of rounding; each row is a state.
+def compare_traces(f, sizes, which, states, program, columns, coefficients, constants, nodes, called, traced, bounds):
+    """Compare callbacks at states [t, q, v], one a row, with their traces; return how many numbers differ.
 
-    Returns how many numbers differ by more than SAME of the largest at these states plus ROUNDED times the bound.
+    A number differs if it is off by more than SAME of the largest at these states plus ROUNDED times its bound.
 
     `sizes`: n_q, n_c and n_a; `which`: 1 for each of KINDS in traced_values.py to be compared; `called`: zeros.
     """
@@ -456,7 +456,7 @@ def compare(f, sizes, which, states, program, columns, coefficients, constants, 
         t, q, v, out = states[k, 0], states[k, 1 : 1 + n], states[k, 1 + n :], called[k]
         for i in range(1 + 2 * n):
             nodes[VALUE, i], nodes[BOUND, i] = states[k, i], 0.0
-        _traced(program, columns, coefficients, constants, nodes, traced[k], bounds[k])
+        _run_trace(program, columns, coefficients, constants, nodes, traced[k], bounds[k])
         place = 0
         if which[0]:
             f.mass(t, q, f.p, out[: n * n].reshape((n, n)))
@@ -484,4 +484,4 @@ def compare(f, sizes, which, states, program, columns, coefficients, constants, 
             place += n_a
         if which[8]:
             f.nonholonomic_gamma(t, q, v, f.p, out[place : place + n_a])
-    return _differences(called, traced, bounds)
+    return _count_differences(called, traced, bounds)

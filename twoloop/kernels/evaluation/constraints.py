@@ -2,8 +2,8 @@
 
 Rows are C_q of C(t, q) = 0, then A of A(t, q) v + b(t, q) = 0.
 
-Q_d, and its like for non-holonomic rows, is differenced along the motion over a length that is checked: two central
-differences, over a length e and over 2 e, give the derivative to order 4, and their disagreement its error.
+Q_d, and the right-hand side of non-holonomic rows, are differenced along the motion: two central differences, over a
+length e and over 2 e, give the derivative to order 4, and their disagreement its error, by which the length is chosen.
 """
 
 import numpy as np
@@ -48,7 +48,7 @@ def _clear_places(w):
 def clear_rows(f, w):
     """Set w.G to zero.
 
-    If it is large, only the places of its entries are cleared. An entry at another place is found at the end of a step.
+    In large matrices only recorded entries are cleared; another entry is found by VERIFY_PATTERN after the step.
     """
     if f.flags[FORM] == AUGMENTED:
         _clear_places(w)
@@ -105,8 +105,8 @@ def gather_independent_columns(G, rate, rows, independent, D):
 
 
 MAX_DIFFERENCE, MIN_SHARE = 2e-4, 1e-4  # see longest_difference
-LEVELS = 12  # lengths tried by _choose_length, each a quarter of the one before
-ROUNDING_DISAGREEMENT = 1e-9  # relative disagreement below which nothing but rounding is left
+LEVELS = 12  # number of lengths that _choose_length tries, each a quarter of the one before
+ROUNDING_DISAGREEMENT = 1e-9  # relative disagreement that rounding alone may cause
 # relative disagreement below which a longer length loses nothing and has less rounding
 LENGTHENING_DISAGREEMENT = 1e-11
 # weights of values at 0, e, 2 e and 4 e: first derivatives of order 2, over e and over 2 e
@@ -120,15 +120,15 @@ CONVERGED_SHARE = 0.01  # relative to the required accuracy: a smaller change en
 
 @exact
 def representable_step(t, h):
-    """Return the difference of t + h and t as floating-point numbers: times near 1e9 s have spacings of 2e-7 s."""
+    """Return (t + h) - t, the step that floating-point times can make: near 1e9 s their spacing is 2e-7 s."""
     return (t + h) - t
 
 
 @merged
 def longest_difference(q, v):
-    """Return the time, s, over which to difference: MAX_DIFFERENCE, or until q moves by that share of max|q|.
+    """Return the longest time over which to difference, s: MAX_DIFFERENCE, or less if q moves fast.
 
-    It is at least MIN_SHARE times MAX_DIFFERENCE.
+    Within it q moves by at most MAX_DIFFERENCE times max|q|; its lower bound is MIN_SHARE times MAX_DIFFERENCE.
     """
     size, speed = largest_of(q), largest_of(v)
     if speed <= size:
@@ -138,7 +138,7 @@ def longest_difference(q, v):
 
 @merged
 def _one_sided_direction(notes, t, e):
-    """Return the side of t on which to difference because of a known jump of C_t or b; 0: both sides."""
+    """Return the side of t (1 or -1) on which to difference near a known jump of C_t or b; 0: both sides."""
     before, after = t - notes[KINK_BEFORE], notes[KINK_AFTER] - t
     if min(before, after) >= 2.0 * e:
         return 0.0
@@ -147,7 +147,7 @@ def _one_sided_direction(notes, t, e):
 
 @compiled
 def _differences(f, w, t, q, v, e, first, last):
-    """Difference Gamma over e and 2 e; return its largest entry, the largest disagreement and the largest G v."""
+    """Difference Gamma over e and 2 e; return its largest entry, the largest disagreement and largest term of G v."""
     twice = w.Gamma_tried[0]
     side = _one_sided_direction(w.notes, t, e)
     shorter = representable_step(t, ONE_SIDED_LENGTH * e)
@@ -188,15 +188,15 @@ def _differences(f, w, t, q, v, e, first, last):
 
 @merged
 def _max_disagreement(notes):
-    """Return the largest disagreement that needs no other length: the result is far better, up to rounding."""
+    """Return the disagreement up to which a length is accepted: the combination of both differences is far better."""
     return max(notes[GAMMA_REQUIRED], ROUNDING_DISAGREEMENT) * notes[GAMMA_SCALE]
 
 
 @compiled
 def _choose_length(f, w, t, q, v, longest, first, last):
-    """Difference over ever shorter lengths until the result no longer changes, or use the one that changed it least.
+    """Difference over ever shorter lengths until the result no longer changes, or use the length with the least change.
 
-    Returns DONE, or GAMMA_INACCURATE if it changed by more than is allowed.
+    Returns GAMMA_INACCURATE if this change exceeds the required accuracy, else DONE.
     """
     best = np.inf
     share = 1.0
@@ -229,15 +229,15 @@ def gamma_by_differences(f, w, t, q, v, first, last):
 
     Gamma = -d/de [G v + (C_t, b)](t + e, q + e v) at e = 0.
 
-    Errors are judged relative to the largest entry that Gamma has had in this run. The length is a share of
-    longest_difference, found by trial where the two differences disagree: a drive of kilohertz needs a short one.
+    Errors are relative to the largest entry of Gamma so far in this run. The length is a share of longest_difference;
+    if the two differences disagree, it is chosen anew: a drive of kilohertz needs a short one.
     """
     longest = longest_difference(q, v)
     e = representable_step(t, w.notes[GAMMA_SHARE] * longest)
     if e > 0.0:
         largest, disagreement, terms = _differences(f, w, t, q, v, e, first, last)
         if np.isnan(largest) or disagreement == 0.0 or w.notes[GAMMA_SCALE] == 0.0:
-            return DONE  # values that are not finite are found at their use; without a scale nothing can be judged
+            return DONE  # other code reports values that are not finite; without a scale nothing can be judged
         rounding = ROUNDING_OF_TERMS * terms / longest
         w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], largest, rounding / w.notes[GAMMA_REQUIRED])
         if disagreement < LENGTHENING_DISAGREEMENT * w.notes[GAMMA_SCALE]:

@@ -16,11 +16,11 @@ from twoloop.kernels.data.common import (
     INNER,
     MASS,
     compiled,
+    faulty_callback,
     finite,
     kernel,
     merged,
     not_finite,
-    source_of_acceleration,
 )
 from twoloop.kernels.data.indices import (
     BY_GENERAL,
@@ -134,7 +134,7 @@ def accelerate(f, w, t, q, v, a):
     solve(f, w, w.Q, w.Gamma, a)
     for j in range(a.size):
         if not np.isfinite(a[j]):
-            source = source_of_acceleration(w)
+            source = faulty_callback(w)
             return not_finite(w.notes, source if source >= 0 or finite(w.M) else MASS, t, q)
     if f.flags[GAMMA_GIVEN] == 0 or w.Rate.size > w.C.size:
         _record_gamma_scale(w, a)
@@ -143,7 +143,7 @@ def accelerate(f, w, t, q, v, a):
 
 @compiled
 def _record_gamma_scale(w, a):
-    """Record the largest sum of terms in G a, by which Gamma by differences is judged."""
+    """Record the largest sum of |terms| in G a, the scale of the errors of Gamma by differences."""
     for i in range(w.Rate.size):
         total = 0.0
         for p in range(w.places[i], w.places[i + 1]):
@@ -257,7 +257,7 @@ ROUNDING_OF_Q = 2e-14  # about a hundred times the rounding of q, see rounding_f
 
 @merged
 def _verify_pattern(w):
-    """Write new programs if the Jacobian has a new entry: values computed without it are wrong."""
+    """Write new programs if the Jacobian has a new entry: results without this entry are wrong."""
     if not record_entries(w):
         return DONE
     return INNER_DIVERGED if write_programs(w) else SINGULAR
@@ -283,7 +283,7 @@ def _other_task(f, w, task, t, q, v):
 
 @kernel(INNER)
 def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
-    """Do a task of tasks.py at (t, q, v); the functions below explain each task."""
+    """Do a task of tasks.py at (t, q, v): the functions below are named like the tasks and explain them."""
     if task >= tasks.FIND_NULL_SPACE:
         return _other_task(f, w, task, t, q, v)
     if task == tasks.EVALUATE_AS_GIVEN:  # this task and PROJECT serve methods that integrate all coordinates
@@ -389,7 +389,7 @@ def check_redundant(f, w, t, q, v):
 
 @merged
 def rounding_floor(q):
-    """Return the relative change at which a fixed-point iteration that stops shrinking has converged: q is rounded."""
+    """Return the relative change, the rounding of q, at which a stagnant fixed-point iteration counts as converged."""
     return max(ROUNDING_OF_CORRECTIONS, ROUNDING_OF_Q * largest_of(q))
 
 
@@ -399,7 +399,7 @@ def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
     if task == tasks.EVALUATE_AS_GIVEN:
         w.counters[N_EVALUATIONS] += 1
         w.counters[N_FACTORIZATIONS] += 1
-        if f.own_there(t, q, v, f.numbers, a):
+        if f.own_accelerate(t, q, v, f.numbers, a):
             return DONE
     elif task == tasks.PROJECT:
         least, before = max(theta, MIN_CORRECTION * w.notes[ROUNDED]), np.inf
@@ -407,9 +407,9 @@ def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
             w.counters[N_INNER] += 1
             w.counters[N_FACTORIZATIONS] += 1
             if k == 0:
-                fine = f.own_closer(t, q, v, f.numbers, w.x, q)
+                fine = f.own_correct_positions(t, q, v, f.numbers, w.x, q)
             else:
-                fine = f.own_nearer(t, q, v, f.numbers, a, w.x, q, v, lam)
+                fine = f.own_project(t, q, v, f.numbers, a, w.x, q, v, lam)
             if not fine:
                 break
             moved = 0.0

@@ -1,8 +1,8 @@
 """Operations of traced programs: their kinds, the layout of their tables, and an interpreter in compiled code.
 
 Programs compute C_q and Gamma where no callback gives them (generate/derived_callbacks.py), and forces, motions and
-rows of models that are functions (bodies/program_results.py). An exact derivative may overflow where the callback does
-not, as that of tanh does for large numbers.
+rows of models that are functions (bodies/program_results.py). An exact derivative may overflow where the function does
+not: for example that of tanh for large numbers.
 """
 
 import math
@@ -12,11 +12,11 @@ from twoloop.kernels.data.common import compiled, exact
 # kinds of operations. PENDING: product in a Taylor series whose second factor is known only after the linear equations
 # of the present order are solved. RESULT: output of a table
 PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGENT, PENDING, SUM, RESULT = range(11)
-# columns of a row of a table: kind; node (or entry of the results) that it defines; where the terms of its first and
-# second argument begin, and where those of the second end
+# columns of a row of a table: kind; index of its result among the nodes (or results); first term of its first argument
+# and of its second, and end of these terms
 KIND, NODE, FIRST, SECOND, END, N_COLUMNS = range(6)
-# a table is stored as a vector of integers: these sizes, the rows, the nodes of all terms, and the entry of each
-# result; results are the last nodes
+# a table is stored as a vector of integers: these sizes, the rows, the node of each term, and the entry of each result
+# in its array; results are the last nodes
 N_NODES, N_ROWS, N_TERMS, N_RESULTS, HEAD = range(5)
 
 
@@ -46,7 +46,7 @@ def operation(kind, x, y):
 
 @exact
 def affine(nodes, table, columns, numbers, coefficients, constant, begin, end):
-    """Return a constant plus the multiples of nodes in terms begin to end."""
+    """Return numbers[constant] plus the sum of coefficient times node for the terms begin to end."""
     total = numbers[constant]
     for k in range(begin, end):
         total = total + numbers[coefficients + k] * nodes[int(table[columns + k])]
@@ -55,10 +55,10 @@ def affine(nodes, table, columns, numbers, coefficients, constant, begin, end):
 
 @exact
 def run_table(table, rows, n_rows, columns, numbers, coefficients, constants, nodes, inputs, t, q, v):
-    """Compute all nodes from t, q and v, which become the nodes from `inputs` on.
+    """Compute all nodes of a table from t, q and v, which become the nodes from `inputs` on.
 
-    The table may hold integers, or whole floats among the parameters of a model. `rows` and `columns` are places in it,
-    `coefficients` and `constants` places in `numbers`.
+    The table holds integers, or whole floats if it is among the parameters of a model. `rows` and `columns` are indices
+    in it, `coefficients` and `constants` indices in `numbers`.
     """
     nodes[inputs] = t
     for j in range(q.size):
@@ -82,7 +82,7 @@ def _run(program, numbers, nodes, t, q, v):
 
 @exact
 def _results(program):
-    """Return the number of results, their first node, and the place of their entries."""
+    """Return the number of results, the first node that is a result, and the first index of their entries."""
     n = program[N_RESULTS]
     return n, program[N_NODES] - n, HEAD + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
 

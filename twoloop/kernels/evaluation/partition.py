@@ -53,7 +53,7 @@ from twoloop.kernels.linalg.markowitz_lu import (
     solve_rows,
 )
 
-RANK_TOLERANCE = 1e-11  # a pivot below this counts as zero; rows are scaled to 1
+RANK_TOLERANCE = 1e-11  # a smaller pivot counts as zero; rows are scaled to 1
 CHANGED = -1  # returned like DONE: the partition has changed
 MAX_ROWS_ELIMINATED = 200  # largest number of rows that are eliminated only to measure how near a singular position is
 SENSITIVITY_GROWTH = 3.0  # growth of max|C_qd^-1 C_qi| since the choice of a partition above which it is renewed
@@ -81,11 +81,11 @@ def _largest_from(row, first):
 
 @compiled
 def full_pivoting(A, order, row_order, largest, first, last, max_rank):
-    """Eliminate A by Gauss with full pivoting, in place: pivots `first`, first + 1, ... from rows up to `last`.
+    """Eliminate A by Gauss with full pivoting, in place: pivots `first`, first + 1, ... from rows below `last`.
 
-    The elimination ends with `max_rank` pivots. `order` and `row_order` become the order of columns and rows. Returns
-    the number of pivots, the numerical rank. `largest` is scratch: the largest entry of each row, updated where a row
-    has changed.
+    At most `max_rank` pivots are eliminated. `order` and `row_order` become the order of columns and rows. Returns the
+    number of pivots, the numerical rank. `largest` is scratch: the largest entry of each row, updated where a row has
+    changed.
     """
     n_q = A.shape[1]
     k = first
@@ -123,10 +123,10 @@ def full_pivoting(A, order, row_order, largest, first, last, max_rank):
 
 @compiled
 def least_pivot(f, w, t, q):
-    """Return the smallest over the largest pivot at a position, without scaling of rows; the partition stays.
+    """Return the ratio of the smallest to the largest pivot at a position, without scaling; the partition stays.
 
-    Nothing is scaled, because a row or a column may be short at a singular position. With sparse factors, or too many
-    rows, it is the smallest pivot of the last partition.
+    Scaling would hide that a row or a column is short at a singular position. With sparse factors or too many rows the
+    result is the smallest pivot of the last partition.
     """
     if f.flags[FORM] == STATIC or w.rows_v.size > MAX_ROWS_ELIMINATED:
         return w.notes[PIVOT]
@@ -165,7 +165,7 @@ def _eliminate(w, max_rank, max_rank_v):
     w.notes[PIVOT] = abs(G[rank - 1, rank - 1]) if rank > 0 else 1.0
     if n_rows == n_c:
         return rank, rank
-    last = rank  # rows of A come next, in the place of the redundant rows of C
+    last = rank  # end of the rows to be eliminated: rows of A replace the redundant rows of C
     for i in range(n_c, n_rows):
         row_order[last], row_order[i] = row_order[i], row_order[last]
         for j in range(G.shape[1]):
@@ -176,7 +176,7 @@ def _eliminate(w, max_rank, max_rank_v):
 
 @compiled
 def smallest_pivot(f, w, t, q):
-    """Return the smallest pivot at a position, as w.notes[PIVOT] has it; the partition stays."""
+    """Return the smallest pivot at a position, scaled as in w.notes[PIVOT]; the partition stays."""
     rank = w.rows.size
     if rank == 0:
         return 1.0
@@ -222,7 +222,7 @@ def _adopt_order(w):
     if w.G_of_S.size > 0:
         w.G_of_S[0, 0] = np.nan
     if rank_v < w.Rate.size:
-        w.index_a[SIZE] = 0  # the independent rows may be others
+        w.index_a[SIZE] = 0  # the program is for other independent rows
     return write_programs(w)
 
 
@@ -239,7 +239,7 @@ def write_programs(w):
 
 @compiled
 def _record_places(w):
-    """Record where the entries of the rows are, see Work."""
+    """Record the columns of the entries of each row in w.places, see Work."""
     n_rows = w.Rate.size
     place = n_rows + 1
     for i in range(n_rows):
@@ -253,7 +253,7 @@ def _record_places(w):
 
 @compiled
 def record_entries(w):
-    """Record the entries of w.G; return whether there are new ones, so that its programs must be written again."""
+    """Record the entries of w.G; return whether there are new ones, so that programs must be written again."""
     if not note_pattern(w.G, w.pattern):
         return False
     w.index_a[SIZE] = 0
@@ -264,8 +264,8 @@ def record_entries(w):
 def choose_partition(f, w, t, q):
     """Choose dependent and independent coordinates at (t, q), and the independent rows.
 
-    Returns SINGULAR if the rank is less than that of the partition before; RANK_DIFFERS, with the ranks in w.notes, if
-    this is the first partition and the workspace has other ranks.
+    Returns SINGULAR if the rank is less than that of the partition before. Returns RANK_DIFFERS, with the ranks in
+    w.notes, if this is the first partition and the workspace has other ranks.
     """
     w.entries[:] = 0.0
     constraint_rows(f, w, t, q, w.G)
@@ -286,14 +286,14 @@ def choose_partition(f, w, t, q):
 
 @compiled
 def partition_of_midpoint(f, w, t_mid, state, new_state):
-    """Adopt the partition that full pivoting finds in the middle of a step; return DONE (= 0) if it is the present one.
+    """Adopt the partition that full pivoting finds in the middle of a step; return CHANGED, or DONE if it is the same.
 
-    Both directions of a step have the same middle, so that the choice, and with it the map of a symmetric tableau,
-    is symmetric in time: where the partition changes, no direction is preferred, as it is by waiting until it has to be
-    renewed.
-    The middle is that of the attempt made under the current partition, and is not checked again once the step has
-    been redone under the new one: where two choices tie to within the difference of the two attempts, O(h^(p+1)), the
-    reverse step may choose the other.
+    The reversed step has the same middle, so that the choice, and with it the map of a symmetric tableau, is symmetric
+    in time. A partition that is kept until it is poor would depend on the direction of time.
+
+    The middle is computed from the attempt under the current partition, and is not checked again after the step is
+    repeated under the new one. Where two choices tie within the difference of the two attempts, O(h^(p+1)), the
+    reversed step may choose the other one.
     """
     n = w.Q.size
     for j in range(n):
@@ -338,7 +338,7 @@ def choose_oriented_partition(f, w, t, q):
 
 @compiled
 def _largest_share(w):
-    """Return the largest coefficient of an independent row in a redundant one (rows scaled to 1), from w.minimum."""
+    """Return the largest coefficient, from w.minimum, of an independent row in a redundant one (rows scaled to 1)."""
     rows = rows_of(w.index_v)
     largest = 0.0
     place = 0
@@ -359,8 +359,8 @@ def partition_is_poor(w):
     """Return whether dependents move much faster per independent than when the partition was chosen.
 
     Measures max|C_qd^-1 C_qi|, which is in w.D. Full pivoting leaves it near 1; it grows without bound where the
-    independent coordinates stop being valid. So do the coefficients of independent rows in a redundant one, where they
-    come to depend on each other: C_qd is singular there, but not C_q.
+    independent coordinates stop being valid. The coefficients of independent rows in a redundant one grow in the same
+    way where these rows become dependent: C_qd is singular there, but not C_q.
     """
     largest = 0.0
     for j in range(w.independent_v.size):
@@ -379,15 +379,15 @@ def partition_is_poor(w):
 
 
 MAX_ITERATIONS = 25  # Newton iterations; quadratic convergence needs 2 to 5
-CONTRACTION = 0.5  # each correction must be at most this times the one before
+CONTRACTION = 0.5  # largest ratio of a correction to the one before
 ROUNDING_OF_CORRECTIONS = 1e-12  # relative to the largest value: changes of this size no longer shrink
-MIN_CORRECTION = 10.0  # in units of the rounding of positions: smaller corrections are never required
+MIN_CORRECTION = 10.0  # smallest correction that is required, in units of the rounding of positions
 MAX_VIOLATION = 1e-7  # relative to the mechanism's size: largest violation of a redundant row
 
 
 @compiled
 def _factor_anew(w, t, q):
-    """Factor by a new order of elimination, or return why that failed."""
+    """Factor in a new order of elimination; return DONE, SINGULAR or NOT_FINITE."""
     record_entries(w)
     if not finite(w.G):
         return not_finite(w.notes, JACOBIAN, t, q)
@@ -406,7 +406,7 @@ def factor_rows(w, t, q):
     if w.Rate.size > w.C.size:
         ratio = min(ratio, factor(w.entries, w.index_v, w.values_v))
         w.counters[N_FACTORIZATIONS] += 1
-    # small pivots: the order of elimination no longer suits these numbers, or they are not finite
+    # after small pivots or NaN: the order of elimination no longer suits these numbers, or they are not finite
     return DONE if ratio > RANK_TOLERANCE else _factor_anew(w, t, q)
 
 
@@ -421,10 +421,10 @@ def factor_dependent(f, w, t, q):
 
 @merged
 def restore_positions(f, w, t, q, v, tolerance, reuse):
-    """Solve eq. (15) by Newton's method for the dependent positions: update first, then test the correction.
+    """Solve eq. (15) by Newton's method for the dependent positions; correct first, then test the correction.
 
-    Leaves rows and factors at q in w, or those before a last correction of at most `reuse`; by the fused callback also
-    w.Rate and w.Gamma at v, which is not restored yet.
+    Leaves rows and factors in w: those at q, or before a last correction of at most `reuse`. The fused callback also
+    leaves w.Rate and w.Gamma at v, which is not restored yet.
     """
     before = np.inf
     converged = w.C.size == 0
@@ -455,8 +455,8 @@ def restore_positions(f, w, t, q, v, tolerance, reuse):
             return DONE
         converged = correction <= tolerance
         if not converged and correction > CONTRACTION * before:
-            # rounding of large coordinates may exceed the tolerance; otherwise Newton's method has left its region, and
-            # could converge to another assembly of the mechanism
+            # accept if rounding of large coordinates exceeds the tolerance; otherwise Newton's method has left its
+            # region of convergence, and could converge to another assembly of the mechanism
             converged = correction <= ROUNDING_OF_CORRECTIONS * largest_of(q)
             if not converged:
                 return INNER_DIVERGED
@@ -476,9 +476,9 @@ def find_null_space(f, w, t, q):
 
 @merged
 def restore_velocities(f, w, t, q, v, reuse):
-    """Solve eq. (14) for the dependent velocities, G_d v_d = -(C_t, b) - G_i v_i, by the rows and factors in w.
+    """Solve eq. (14) for the dependent velocities, G_d v_d = -(C_t, b) - G_i v_i, with the rows and factors in w.
 
-    After the fused callback w.Gamma is known where they change by at most `reuse`.
+    If the fused callback has computed w.Gamma, it stays valid for changes of velocities up to `reuse`.
     """
     rows, columns = rows_of(w.index_v), columns_of(w.index_v)
     n_dof = w.independent_v.size

@@ -71,17 +71,17 @@ from twoloop.kernels.linalg.dense import copy, has_new_entries, largest_of
 from twoloop.kernels.linalg.sparse_ldl import factor, load, solve, solve_refined
 from twoloop.kernels.linalg.symbolic_factorization import N_OFF, N_PIVOTS, jacobian_of, mass_of, order_of
 
-SUSPECT_PIVOT = 1e-6  # a pivot below this share of its size is checked: that of a redundant row is rounding
-MIN_PIVOT = 1e-10  # ... and below this share the factorization fails, as it has pivots of one row only
+SUSPECT_PIVOT = 1e-6  # relative to the size of a row: a smaller pivot is checked, because it may be rounding
+MIN_PIVOT = 1e-10  # ... and below this the factorization fails, as its pivots are single rows
 DEPENDENT = 1e-11  # sine of the angle to the other rows, computed without cancellation, up to which a row is redundant
-PROJECT_STAGES = 2.0  # value of NEARLY_SINGULAR: project stages onto the constraints, whose errors matter there
-# smallest pivot over its size below which solutions are refined once, and twice
+PROJECT_STAGES = 2.0  # value of NEARLY_SINGULAR: stages have to be projected, because their errors matter there
+# ratio of the smallest pivot to its row below which solutions are refined once, and twice
 REFINED_ONCE, REFINED_TWICE = 1e-3, 1e-7
 
 
 @compiled
 def fill_mass_values(f, w, t, q):
-    """Evaluate the entries of M into w.mass_values; those of a constant dense M stand there from the beginning."""
+    """Evaluate the entries of M into w.mass_values; those of a constant dense M are there from the beginning."""
     if f.flags[MASS_VALUES_GIVEN] == 1:
         w.mass_values[:] = 0.0
         f.mass_values(t, q, f.p, w.mass_values)
@@ -112,7 +112,7 @@ def fill_jacobian_values(f, w, t, q):
 
 @compiled
 def _factor(f, w, least):
-    """Factor the current values; return the smallest pivot over its size, see sparse_ldl.py."""
+    """Factor the current values; return the smallest ratio of a pivot to its row, see sparse_ldl.py."""
     w.counters[N_FACTORIZATIONS] += 1
     stiffness = w.solutions[3 * f.static_program[N_PIVOTS] :]
     load(f.static_program, w.mass_values, w.jacobian_values, w.factors, stiffness, w.pivot_sizes)
@@ -124,7 +124,7 @@ def _factor(f, w, least):
 
 @compiled
 def _factor_fault(w, t, q):
-    """Return why factors failed: values that are not finite, a singular M (which dense forms accept), or the rows."""
+    """Return why factors failed: values that are not finite, a singular M (for dense forms), or dependent rows."""
     if not finite_vector(w.mass_values):
         return not_finite(w.notes, MASS, t, q)
     if not finite_vector(w.jacobian_values):
@@ -134,7 +134,7 @@ def _factor_fault(w, t, q):
 
 @compiled
 def factor_at(f, w, t, q):
-    """Factor at (t, q), with the independent rows."""
+    """Evaluate the entries at (t, q), and factor with the independent rows."""
     if f.flags[CONSTANT_MASS] == 0:
         fill_mass_values(f, w, t, q)
     fill_jacobian_values(f, w, t, q)
@@ -264,7 +264,7 @@ MAX_SOLUTIONS = 30  # largest number of solutions, i.e. refinements
 
 @compiled
 def _load(program, jacobian, n_q, weights, values):
-    """Copy the entries of the matrix to their slots; `weights` is scratch for n_q numbers."""
+    """Copy the numbers of the matrix for least norm to their slots; `weights` is scratch for n_q numbers."""
     rows, columns, slots = jacobian_of(program)
     for j in range(n_q):
         weights[j] = 0.0
@@ -285,7 +285,7 @@ def _load(program, jacobian, n_q, weights, values):
 
 @compiled
 def _residual(program, jacobian, force, x, r):
-    """Compute [b - G^T lam, lam - G x] for x = [x, lam]; return the largest of its forces over the largest of b."""
+    """Compute r = [b - G^T lam, lam - G x] for x = [x, lam] and the force b; return its largest force over b's."""
     n_q, largest, left = force.size, 0.0, 0.0
     copy(force, r[:n_q])
     for i in range(n_q, x.size):
@@ -302,7 +302,7 @@ def _residual(program, jacobian, force, x, r):
 
 @compiled
 def least_norm(f, w, lam):
-    """Replace lam by the multipliers of least norm with the same G^T lam; return NEEDS_DENSE if they are not found."""
+    """Replace lam by the multipliers of least norm with the same G^T lam; return NEEDS_DENSE if that fails."""
     program, n_q = f.static_program, w.Q.size
     n = program[N_PIVOTS]
     n_factors = n + program[N_OFF] + 1
@@ -359,7 +359,7 @@ def _gamma(f, w, t, q, v):
 
 @compiled
 def _acceleration_fault(w, t, q):
-    """Return which callback gave an acceleration that is not finite."""
+    """Record which callback gave an acceleration that is not finite; return NOT_FINITE."""
     if not finite_vector(w.Gamma):
         return not_finite(w.notes, GAMMA, t, q)
     if not finite_vector(w.Q):
@@ -410,7 +410,7 @@ def _move(f, w, x):
 
 @compiled
 def _to_constraints(f, w, t, q, v, theta):
-    """Project (q, v) onto the constraints as inner_loop.py does; factors are those before the last correction."""
+    """Project (q, v) onto the constraints as inner_loop.py does, but keep the factors before the last correction."""
     before = np.inf
     theta = max(theta, MIN_CORRECTION * w.notes[ROUNDED])
     for _ in range(MAX_ITERATIONS):

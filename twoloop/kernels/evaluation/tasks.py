@@ -1,4 +1,4 @@
-"""Tasks of an inner loop; inner_loop.py has a function for each."""
+"""Tasks of an inner loop: for each of them inner_loop.py has a function of the same name."""
 
 (
     EVALUATE,

@@ -1,1 +1,1 @@
-"""Runs of one mechanism side by side, one in each SIMD lane: their memory, their loop, and a file for each method."""
+"""Runs of one mechanism, one in each SIMD lane: their memory, their loop, and a file for each method."""

@@ -20,6 +20,7 @@ from twoloop.kernels.lanes.layout import (
     FINE,
     FRESH,
     GAP,
+    H_FREE,
     H_LIMIT,
     H_NEXT,
     LANES,
@@ -45,7 +46,6 @@ from twoloop.kernels.lanes.layout import (
     T0,
     T1,
     UNIT,
-    WANTED,
     H,
     N,
     T,
@@ -58,20 +58,20 @@ from twoloop.kernels.lanes.layout import (
 )
 
 # `options` begin with the rule of step-size control, then ROUGH: factor by which errors may exceed their estimates
-# where a force jumps; FIRST: first step, relative to the shortest time scale of the start; LEAST: tolerance. Options of
-# the single step follow
+# where a force jumps; FIRST: first step, relative to the shortest time scale of the start; LEAST: tolerance. The
+# options of the method's single step follow
 ROUGH, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
 
-# as UNFORESEEN, REFUSED and the rounding of the last step in kernels/advance.py and step_size.py
-SUDDEN, SHORTENED, WHOLE = 10.0, 0.95, 1e-10
-LIMIT_FACTOR, LIMIT_MEMORY = 0.7, 10.0  # as in the Plan of a run
+# as SUDDEN_ERROR, REFUSED and the rounding of the last step in kernels/advance.py and step_size.py
+SUDDEN_ERROR, AFTER_REJECTION, ROUNDING_OF_END = 10.0, 0.95, 1e-10
+LIMIT_FACTOR, LIMIT_MEMORY = 0.7, 10.0  # as in methods/plan.py
 RESOLVED = 20.0 * SHORTEST  # relative to the time at the start: lower bound of the first step
-MOST_REFUSED = 30  # rejected steps in a row: estimates may say little about how much shorter a stiff step has to be
-MOST_STEPS = 100_000  # largest number of steps of a run in lanes, which nothing can interrupt
+MOST_REFUSED = 30  # rejected steps in a row: estimates may not show how much shorter a stiff step has to be
+MOST_STEPS = 100_000  # largest number of steps of a run in lanes, because the user cannot interrupt it
 
 
 @inlined
-def _past(work, k):
+def _history(work, k):
     return work[PAST * LANES + N_PAST * k : PAST * LANES + N_PAST * (k + 1)]
 
 
@@ -110,21 +110,21 @@ def begin_control(options, control, work, n, state, a, start):
 
 @compiled
 def choose_steps(work, control, status, n_steps):
-    """Choose H and X of each lane, at most the gap, 0 in lanes without a run; FINE marks lanes with a run."""
+    """Choose H and X of each lane, at most GAP; 0 in lanes without a run. FINE marks lanes with a run."""
     t1 = control[T1]
     for k in range(LANES):
         work[H * LANES + k], t = 0.0, work[T * LANES + k]
         if work[RUNNING * LANES + k] == 1.0:
             wanted = min(work[H_NEXT * LANES + k], work[H_LIMIT * LANES + k], control[GAP])
             h, left = wanted, t1 - t
-            if h >= left * (1.0 - WHOLE):
+            if h >= left * (1.0 - ROUNDING_OF_END):
                 h = left
             elif h > 0.5 * left:
                 h = 0.5 * left  # two equal steps rather than a long and a tiny one
             if n_steps[int(work[RUN * LANES + k])] >= MOST_STEPS:
                 leave_run(work, status, k, MANY_STEPS)
             elif h > SHORTEST * max(abs(t), abs(t1)):
-                work[H * LANES + k], work[WANTED * LANES + k] = h, wanted
+                work[H * LANES + k], work[H_FREE * LANES + k] = h, wanted
             else:
                 failed = work[H_LIMIT * LANES + k] < np.inf and work[LIMIT_AGE * LANES + k] == 0.0
                 leave_run(work, status, k, NO_VALUES if failed else OFTEN_REFUSED)
@@ -142,10 +142,10 @@ def set_end(work, control):
 
 @compiled
 def end_steps(code, settings, control, work, predicted_v):
-    """Project NEW; ERROR is at least the distance of the prediction, in positions and velocities.
+    """Project NEW; raise ERROR to the distance from the prediction, in positions and velocities.
 
-    Velocities that the constraints change by more than the tolerances show a drive that jumps or bends between the
-    stages. `predicted_v`: scratch for velocities.
+    If the projection changes velocities by more than the tolerances, a drive jumps or bends between the stages.
+    `predicted_v`: scratch for velocities.
     """
     n, order = settings[N], settings[ORDER]
     state, new, predicted, _, _, _, _, _ = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
@@ -166,26 +166,26 @@ def end_steps(code, settings, control, work, predicted_v):
 
 
 @merged
-def _accepted(options, work, k):
+def _accept_or_shorten(options, work, k):
     """Return whether the step of a lane is accepted, and choose the size of the next one."""
     h, t, error = work[H * LANES + k], work[T * LANES + k], work[ERROR * LANES + k]
     if work[FINE * LANES + k] == 0.0 or not np.isfinite(error):
         work[H_NEXT * LANES + k], work[H_LIMIT * LANES + k] = 0.5 * h, LIMIT_FACTOR * h
         work[LIMIT_AGE * LANES + k] = 0.0
         return False
-    # at a jump the embedded formula may agree by chance: until ROUGH_TO the estimated error has to be smaller
+    # at a jump of the force an estimate may be small by chance: until ROUGH_TO it has to be smaller by `strict`
     strict = options[ROUGH] if t < work[ROUGH_TO * LANES + k] else 1.0
     accepted = error * strict <= 1.0
-    if error > SUDDEN and not accepted:
+    if error > SUDDEN_ERROR and not accepted:
         work[ROUGH_TO * LANES + k] = t + h
     error *= strict
-    past = _past(work, k)
+    past = _history(work, k)
     proposal = min(h * factor_of(options, past, h, error), work[H_LIMIT * LANES + k])
     if not accepted:
-        work[H_NEXT * LANES + k] = min(proposal, SHORTENED * h)
+        work[H_NEXT * LANES + k] = min(proposal, AFTER_REJECTION * h)
         return False
     record_accepted(options, past, h, error)
-    work[H_NEXT * LANES + k] = max(proposal, work[WANTED * LANES + k]) if h < work[WANTED * LANES + k] else proposal
+    work[H_NEXT * LANES + k] = max(proposal, work[H_FREE * LANES + k]) if h < work[H_FREE * LANES + k] else proposal
     work[LIMIT_AGE * LANES + k] += 1.0
     if work[LIMIT_AGE * LANES + k] > LIMIT_MEMORY:
         work[H_LIMIT * LANES + k] = np.inf
@@ -194,12 +194,12 @@ def _accepted(options, work, k):
 
 @compiled
 def judge_steps(options, work, n, a, start, status):
-    """Set ACCEPTED by ERROR and FINE; copy the accelerations A at the ends of these steps to `start`."""
+    """Set ACCEPTED from ERROR and FINE; copy the accelerations A at the ends of accepted steps to `start`."""
     for k in range(LANES):
         work[ACCEPTED * LANES + k] = 0.0
         if work[RUNNING * LANES + k] == 0.0:
             continue
-        if _accepted(options, work, k):
+        if _accept_or_shorten(options, work, k):
             work[ACCEPTED * LANES + k] = 1.0
             for j in range(n):
                 work[(start + j) * LANES + k] = work[(a + j) * LANES + k]
@@ -216,7 +216,7 @@ def memory_size(s: int, n: int) -> int:
 
 @kernel(STEP)
 def step_by_dop853(code, settings, control, options, work, status, n_steps, within):
-    """Make a step that is not longer than the largest gap between evaluations, or compute states within a step."""
+    """Take a step, at most GAP long; or compute the states X seconds after its beginning (`within`)."""
     n = settings[N]
     state, _, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     start = memory + START * n
@@ -234,19 +234,19 @@ def step_by_dop853(code, settings, control, options, work, status, n_steps, with
 
 @kernel(STEP)
 def step_by_series(code, settings, control, options, work, status, n_steps, within):
-    """Make a step by the series about its beginning, or compute states within one."""
+    """Take a step by the series about its beginning; or compute the states X seconds after it (`within`)."""
     order = settings[ORDER]
     if within:
         for k in range(LANES):
             work[X * LANES + k] = work[X * LANES + k] / work[UNIT * LANES + k]
         code.evaluate(order, control, work)
         return
-    for k in range(LANES):  # stiff motion takes as many steps as its time scales
+    for k in range(LANES):  # with stiff motion the number of steps is not bounded by the tolerance
         if work[RUNNING * LANES + k] == 1.0 and n_steps[int(work[RUN * LANES + k])] >= MOST_STEPS:
             leave_run(work, status, k, MANY_STEPS)
     code.series(order, control, work)
     code.lengths(order, control, work)
-    for k in range(LANES):  # add the evaluations at places within the step
+    for k in range(LANES):  # count the evaluations of the defect within the step
         if work[FINE * LANES + k] == 1.0 and work[H * LANES + k] > control[GAP]:
             work[EVALUATED * LANES + k] = np.ceil(work[H * LANES + k] / control[GAP]) - 1.0
     code.check_within(order, control, work)

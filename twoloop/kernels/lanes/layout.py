@@ -1,8 +1,8 @@
 """Layout of the memory of runs in lanes, operations on it, functions that kernels call, and codes for how a run ends.
 
 Kernels call functions generated for a mechanism, and the step of a method. Operations work on vectors with one number
-for each lane: LU factors of one matrix per lane, and projections. There places are counted in vectors. The imaginary
-part of a complex number is `imaginary` vectors behind the real part; 0: the number is real.
+for each lane: LU factors of one matrix per lane, and projections. Their arguments are offsets counted in vectors. The
+imaginary part of a complex number is `imaginary` vectors after the real part; 0: the number is real.
 """
 
 from typing import Any
@@ -15,14 +15,14 @@ from twoloop.kernels.compile.generated_functions import GeneratedFunctions, has_
 from twoloop.kernels.compile.reference import Reference
 from twoloop.kernels.data.common import INTEGERS, compiled, inlined, merged
 
-# how a run ends: at the end of the span, or in a run of its own outside the lanes, for one of these reasons
+# how a run ends: at the end of the span, or outside the lanes, where it is repeated alone for one of these reasons
 UNDECIDED, ENDED = 0, 1
 NO_START, NO_STATE, NO_VALUES, OFTEN_REFUSED, MANY_STEPS, UNLIKE = range(-6, 0)
 
 
 LANES = 8 if has_wide_vectors() else 4  # runs side by side; with two vectors, each number would take two registers
 
-# vectors in `work`, with one number for each lane; followed by STATE, NEW, PREDICTED, ..., see `places`
+# offsets in `work` of vectors with one number for each lane; STATE, NEW, PREDICTED, ... follow, see `places`
 (
     T,
     AHEAD,
@@ -35,7 +35,7 @@ LANES = 8 if has_wide_vectors() else 4  # runs side by side; with two vectors, e
     LENGTH,
     LONGEST,  # longest step allowed, s
     REQUESTED,  # 1 in lanes that begin a run, or for which a state within a step is requested
-    WORST,  # defect within the step
+    WORST,  # largest defect within the step
     REFUSED,  # number of rejected steps in a row
     RUNNING,
     RUN,  # index of the run in this lane
@@ -45,18 +45,18 @@ LANES = 8 if has_wide_vectors() else 4  # runs side by side; with two vectors, e
     ACCEPTED,
     FRESH,  # 1 in lanes whose run has not taken a step yet
     ERROR,  # error of a step, over the tolerances
-    WANTED,  # size of the step before the end of the run shortens it
+    H_FREE,  # size of the step before it is shortened to the end of the run
     H_NEXT,
     H_LIMIT,  # limit of the step size after a step that failed ...
     LIMIT_AGE,  # ... and number of accepted steps since then
     ROUGH_TO,  # end of the last step that was rejected for a sudden error
-    SHIFT,  # shift of places within a step
-    EVALUATED,  # number of evaluations within the step, besides those that `settings` give
+    SHIFT,  # shift of the times within a step at which the defect is evaluated
+    EVALUATED,  # number of evaluations within the step, besides the number in `settings`
     PAST,  # history of step-size control, lane by lane, see control/step_size.py
     _MORE_PAST,
     N_FIELDS,
 ) = range(31)
-# functions generated for a mechanism, (order, control, work), which work on the vectors of `work`
+# functions generated for a mechanism, with arguments (order, control, work), which work on the vectors of `work`
 TASKS = (
     "approach",  # move positions of NEW, at AHEAD, towards the constraints, in lanes that are FINE
     "refine",  # move positions that are LEFT_TO_MOVE, and velocities; compute A and LAM there; FINE: converged
@@ -64,12 +64,11 @@ TASKS = (
     "departure",  # OFF: departure of a step H from STATE by PREDICTED to NEW
     "commit",  # NEW becomes STATE where ACCEPTED
 )
-TASKS_OF_STARTS = (
-    "rows",
-)  # C, C_t, entries of C_q at NEW and AHEAD, in the memory of the method; FINE: all of them are finite
+# "rows": compute C, C_t and the entries of C_q at NEW and AHEAD, into the method's memory; FINE: all are finite
+TASKS_OF_STARTS = ("rows",)
 TASKS_OF_STAGES = ("accelerate",)  # compute the accelerations A at the state NEW, without a projection
 # "stages": compute the state NEW at the time X after the beginning of the step, and ERROR if X is the whole step; FINE
-# stays 1 in lanes where that succeeded
+# remains 1 in lanes where that succeeded
 TASKS_OF_EXPLICIT = ("stages",)
 TASKS_OF_SERIES = (
     "series",  # coefficients about STATE at T, in units of time UNIT
@@ -82,9 +81,9 @@ TASKS_OF_SERIES = (
 CODE = Reference("LaneKit", {})
 ALL_TASKS = (*TASKS, *TASKS_OF_STARTS, *TASKS_OF_STAGES, *TASKS_OF_EXPLICIT, *TASKS_OF_SERIES)
 CODE.add_llvm_functions(dict.fromkeys(ALL_TASKS, types.none(types.int64, VECTOR, VECTOR)))
-# step of a method, (code, settings, control, options, work, status, n_steps, within): a step H of each lane that runs,
-# and whether it is ACCEPTED, with its end in NEW, A and LAM. With `within`, the state X seconds after the beginning of
-# the step that was just accepted, in NEW, for lanes that are FINE, not yet projected
+# step of a method, (code, settings, control, options, work, status, n_steps, within): take a step H in each lane that
+# runs; set ACCEPTED, and NEW, A and LAM to its end. With `within`, write the state X seconds after the beginning of the
+# step just accepted to NEW, not yet projected, in lanes that are FINE
 STEP = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[INTEGERS] * 2, types.boolean)
 CODE.add_function("step", STEP)
 
@@ -99,7 +98,7 @@ SHORTEST = 1e-13  # shortest step, relative to the time
 
 
 class LaneKit:
-    """Functions generated for a mechanism and the step of a method, as kernels get them."""
+    """Functions generated for a mechanism, and the step of a method, passed to kernels as one reference."""
 
     def __init__(self, own: GeneratedFunctions, step: Any = None):
         self.__dict__.update(dict.fromkeys(ALL_TASKS, 0))
@@ -115,7 +114,7 @@ def _type_of_kit(value: Any, context: Any) -> Any:
 
 
 def places(n, n_rows, n_numbers):
-    """Return where STATE, NEW, PREDICTED, FOUND, A, LAM, the numbers of the code and the method's memory begin.
+    """Return the offsets of STATE, NEW, PREDICTED, FOUND, A, LAM, the numbers of the code and the method's memory.
 
     Offsets are counted in vectors.
     """
@@ -141,7 +140,7 @@ def fill_field(work, field, value):
 
 @merged
 def leave_run(work, status, k, reason):
-    """Take a run out of its lane, to be repeated on its own outside the lanes."""
+    """Take a run out of its lane, with the reason why it has to be repeated alone."""
     work[RUNNING * LANES + k] = 0.0
     status[int(work[RUN * LANES + k])] = reason
 
@@ -154,7 +153,7 @@ def vectors(work, begin, count):
 
 @inlined
 def table(work, begin, rows, count):
-    """Return a view of rows of vectors."""
+    """Return a view of vectors as rows of a table, `count` vectors each."""
     return work[begin * LANES : (begin + rows * count) * LANES].reshape((rows, count * LANES))
 
 
@@ -215,7 +214,7 @@ def enlarge(work, most, error, factor, one, other, atol, rtol):
 
 @merged
 def _scale(work, target, apart, x, imaginary):
-    """Multiply an entry of a matrix, target, by x."""
+    """Multiply entry `target` of a matrix by x, real or complex."""
     for k in range(LANES):
         t, p = target * LANES + k, x * LANES + k
         if imaginary == 0:
@@ -228,7 +227,7 @@ def _scale(work, target, apart, x, imaginary):
 
 @merged
 def _subtract(work, target, x, y, imaginary, imaginary_y):
-    """Subtract x y from target; for vectors y and target, imaginary parts are elsewhere than for matrices."""
+    """Subtract x y from target; y and target have their imaginary parts `imaginary_y` vectors behind, x `imaginary`."""
     add_product(work, target, x, y, -1.0)
     if imaginary > 0:
         add_product(work, target, x + imaginary, y + imaginary_y, 1.0)
@@ -250,7 +249,7 @@ def _size(work, place, imaginary, k):
 
 @compiled
 def _pivot(work, matrix, pivots, n, imaginary, c):
-    """Exchange rows so that the largest entry of a column is the pivot, and invert it; clear FINE if all are zero."""
+    """Exchange rows so that the largest entry of a column is the pivot, and invert it; clear FINE if it is zero."""
     for k in range(LANES):
         best, top = c, _size(work, matrix + c * n + c, imaginary, k)
         for i in range(c + 1, n):
@@ -276,7 +275,7 @@ def _pivot(work, matrix, pivots, n, imaginary, c):
 
 @compiled
 def factor_lanes(work, matrix, pivots, n, imaginary):
-    """Replace a matrix (n, n) by its LU factors; each lane exchanges its own rows."""
+    """Replace a matrix (n, n) by its LU factors, with row exchanges for each lane."""
     for c in range(n):
         _pivot(work, matrix, pivots, n, imaginary, c)
         for i in range(c + 1, n):
@@ -311,7 +310,7 @@ MOST_PASSES = 10
 
 @compiled
 def project_lanes(code, order, control, work):
-    """Project NEW of the lanes that are FINE onto the constraints; FINE stays 1 where it converged."""
+    """Project NEW onto the constraints in lanes that are FINE; FINE remains 1 where the projection converges."""
     code.approach(order, control, work)
     for _ in range(MOST_PASSES):
         code.refine(order, control, work)

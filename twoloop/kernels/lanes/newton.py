@@ -5,8 +5,8 @@ The unknowns are the accelerations a_j of all coordinates at the stages,
     F(t_j, Q_j, V_j) - a_j = 0,  Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k,  V_j = v + h sum_k A_jk a_k,
 
 F being the accelerations at a state without a projection: stages are off the constraints by the error of the formula,
-and only the end of the step is projected. Derivatives are differences, computed for all lanes at once and again for
-each step.
+and only the end of the step is projected. Derivatives are differences, computed for all lanes at once, anew in each
+step.
 """
 
 import numpy as np
@@ -59,18 +59,18 @@ from twoloop.kernels.steps.stages import (
 )
 from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STEPS_TO_DECAY
 
-# fields of the method's memory, in vectors: first one number for each lane, ...
+# offsets in the method's memory, in vectors: first one number for each lane, ...
 (
-    TO_GO,  # 1: lanes in which the iteration has not ended
+    ITERATING,  # 1: lanes in which the iteration has not ended
     DONE,  # 1 in lanes whose iteration has converged
-    BEFORE,  # size of the previous correction
+    CHANGE_BEFORE,  # size of the previous correction
     SCALE_Q,
     SCALE_V,
     LARGEST_Q,  # largest correction of positions; LARGEST_V: of velocities
     LARGEST_V,
     H_PREVIOUS,  # size of the step to which PREVIOUS belongs; 0: none
-    CONSTANT,  # 1: the stages are predicted as constant accelerations, those at the beginning
-    DURATION,  # s: duration of an error of velocity; 0: not known
+    CONSTANT,  # 1: predicted accelerations of the stages are constant, those at the beginning
+    DURATION,  # s: how long an error of velocity lasts, see velocity_errors.py; 0: not known
     N_OF_LANES,
 ) = range(11)
 # ... then blocks of n: accelerations at STATE; q, v and a at the beginning of the step; sums; a state in the middle of
@@ -87,9 +87,9 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     MIDDLE_A,
     E_Q,
     E_V,
-    RAW,
-    ONCE,
-    ONE,
+    UNFILTERED,
+    FILTERED_ONCE,
+    COMPLEX,
     _IMAGINARY,
     N_VECTORS,
 ) = range(15)
@@ -123,7 +123,7 @@ def _weights_at(memory, n, s):
 
 @merged
 def matrix_at(memory, n, s, which):
-    """Return the place of a matrix (n, n); that of system k is SYSTEMS + 2 k."""
+    """Return the offset of a matrix (n, n); that of system k is SYSTEMS + 2 k."""
     return _weights_at(memory, n, s) + s * s + which * n * n
 
 
@@ -134,7 +134,7 @@ def pivots_at(memory, n, s, n_systems, k):
 
 
 @compiled
-def _middle(code, settings, control, c, work, new, a, memory):
+def _evaluate_middle(code, settings, control, c, work, new, a, memory):
     """Compute the state in the middle of the step, near the constraints, and its accelerations."""
     n, order = settings[N], settings[ORDER]
     share, begin = middle_node(c), vector_at(memory, n, BEGIN_Q)
@@ -161,7 +161,7 @@ def find_derivatives(code, settings, control, c, work):
     n, order = settings[N], settings[ORDER]
     _, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     s = c.size
-    _middle(code, settings, control, c, work, new, a, memory)
+    _evaluate_middle(code, settings, control, c, work, new, a, memory)
     middle, middle_a = vector_at(memory, n, MIDDLE_Q), vector_at(memory, n, MIDDLE_A)
     for column in range(2 * n):
         copy_vectors(work, middle, new, 2 * n)
@@ -203,7 +203,7 @@ def factor_systems_of_lanes(settings, own, s, work):
 
 @compiled
 def predict_stages(settings, c, work, begins):
-    """Predict stages by the polynomial of the last step, or as constant; with `begins` = 0 by that of this step."""
+    """Predict stages from the polynomial of the last step (`begins` = 0: of this step), or as constant."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     s = c.size
@@ -234,7 +234,7 @@ def predict_stages(settings, c, work, begins):
 
 @compiled
 def _residuals(code, settings, control, A, A2, c, work):
-    """Compute the residuals of the stages and the largest entries; FINE stays 1 in lanes with finite values."""
+    """Compute the residuals of the stages and their largest entries; FINE remains 1 in lanes with finite values."""
     n, order = settings[N], settings[ORDER]
     _, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     s = c.size
@@ -273,7 +273,7 @@ def _correct(settings, own, s, work):
     n_systems, place = count_eigenvalues(own, s), eigen_place(s)
     n_real = int(own[place + N_REAL])
     place += N_EIGEN_SCALARS + s
-    one, changes = vector_at(memory, n, ONE), block_at(memory, n, s, CHANGES)
+    one, changes = vector_at(memory, n, COMPLEX), block_at(memory, n, s, CHANGES)
     residual, stages = block_at(memory, n, s, RESIDUAL), block_at(memory, n, s, STAGES)
     left, width = table(work, residual, s, n), n * LANES
     for i in range(s * width):
@@ -293,13 +293,13 @@ def _correct(settings, own, s, work):
                 change = re * work[one * LANES + i] - im * work[one * LANES + width + i]
                 work[(changes + j * n) * LANES + i] += change
     for i in range(s * width):
-        if work[(memory + TO_GO) * LANES + i % LANES] == 1.0:
+        if work[(memory + ITERATING) * LANES + i % LANES] == 1.0:
             work[stages * LANES + i] += work[changes * LANES + i]
 
 
 @merged
 def _enlarge(work, most, sums, n):
-    """Raise `most` to the largest entries of n vectors; NaN counts as largest."""
+    """Raise `most` in each lane to the largest entry of n vectors; NaN counts as largest."""
     for i in range(n * LANES):
         size, at = abs(work[sums * LANES + i]), most * LANES + i % LANES
         if size > work[at] or size != size:
@@ -308,7 +308,7 @@ def _enlarge(work, most, sums, n):
 
 @compiled
 def _largest_corrections(settings, A, A2, work):
-    """Compute the largest corrections of positions and velocities of the stages, for a step of 1."""
+    """Compute the largest corrections that CHANGES make to positions and velocities of the stages, for a step of 1."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     s = A.shape[0]
@@ -329,8 +329,8 @@ def _end_iteration(options, work, memory, iteration, k):
     floor = STAGNATION * options[LEAST]
     fast = x * work[(memory + LARGEST_V) * LANES + k] / work[(memory + SCALE_V) * LANES + k]
     far = x * x * work[(memory + LARGEST_Q) * LANES + k] / work[(memory + SCALE_Q) * LANES + k]
-    change, before = max(fast, far), work[(memory + BEFORE) * LANES + k]
-    work[(memory + BEFORE) * LANES + k] = change
+    change, before = max(fast, far), work[(memory + CHANGE_BEFORE) * LANES + k]
+    work[(memory + CHANGE_BEFORE) * LANES + k] = change
     if not np.isfinite(fast + far) or work[FINE * LANES + k] == 0.0:
         return True
     left = MAX_ITERATIONS - 1 - iteration
@@ -351,10 +351,10 @@ def _end_iteration(options, work, memory, iteration, k):
 
 @compiled
 def solve_stages(code, settings, control, options, own, A, A2, c, work):
-    """Solve the predicted stages of a step X in lanes that are FINE; FINE stays 1 where they converged."""
+    """Solve for the stages of a step X from their prediction, in lanes that are FINE; FINE remains 1 on convergence."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
-    to_go, done = memory + TO_GO, memory + DONE
+    to_go, done = memory + ITERATING, memory + DONE
     for k in range(LANES):
         work[to_go * LANES + k] = work[FINE * LANES + k]
         work[done * LANES + k] = 0.0
@@ -378,7 +378,7 @@ def solve_stages(code, settings, control, options, own, A, A2, c, work):
 
 @compiled
 def end_of_stages(settings, b, bA, work):
-    """Compute NEW, X after the beginning of the step, from its stages."""
+    """Compute NEW, the state X after the beginning of the step, from the stages."""
     n = settings[N]
     _, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     s = b.size
@@ -396,13 +396,13 @@ def end_of_stages(settings, b, bA, work):
 
 @merged
 def _allowed(control, work, state, new, j, place, k):
-    """Return the allowed error of entry `place` of a state, of coordinate j."""
+    """Return the allowed error of entry `place` of a state, which belongs to coordinate j."""
     size = max(abs(work[(state + place) * LANES + k]), abs(work[(new + place) * LANES + k]))
     return control[ATOL + j] + control[RTOL] * size
 
 
 @compiled
-def _embedded(settings, own, A, work, memory):
+def _embedded_estimate(settings, own, A, work, memory):
     """Compute the embedded estimate of the error, unfiltered, into E_Q and E_V."""
     n, s = settings[N], A.shape[0]
     place = eigen_place(s)
@@ -430,7 +430,7 @@ def _filter(settings, own, s, work, memory):
     """Apply (I - z J)^-1 to (E_Q, E_V), z = gamma0 H, J being the Jacobian of (v, F)."""
     n = settings[N]
     gamma0 = own[eigen_place(s) + GAMMA0]
-    e_q, e_v, one = vector_at(memory, n, E_Q), vector_at(memory, n, E_V), vector_at(memory, n, ONE)
+    e_q, e_v, one = vector_at(memory, n, E_Q), vector_at(memory, n, E_V), vector_at(memory, n, COMPLEX)
     by_q = matrix_at(memory, n, s, BY_Q)
     for i in range(n):
         for k in range(LANES):
@@ -447,8 +447,8 @@ def _filter(settings, own, s, work, memory):
 
 @compiled
 def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
-    """Return the error that an error of the velocities causes in the positions, see velocity_errors.py."""
-    raw, once, twice = vector_at(memory, n, RAW), vector_at(memory, n, ONCE), vector_at(memory, n, E_V)
+    """Return the error of positions that an error of velocities causes, over the tolerances, see velocity_errors.py."""
+    raw, once, twice = vector_at(memory, n, UNFILTERED), vector_at(memory, n, FILTERED_ONCE), vector_at(memory, n, E_V)
     begin = vector_at(memory, n, BEGIN_V)
     largest = turn = fastest = change = 0.0
     for j in range(n):
@@ -467,7 +467,7 @@ def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
 
 @compiled
 def _velocity_error(control, work, n, error_v, duration, state, new, k):
-    """Return the largest component of an error of the velocities of some duration, over the tolerances."""
+    """Return the largest component of an error of the velocities that lasts for `duration`, over the tolerances."""
     error = 0.0
     for j in range(n):
         share_q = duration / _allowed(control, work, state, new, j, j, k)
@@ -490,10 +490,10 @@ def _motion_time(control, work, n, memory, k):
 
 @compiled
 def _slow_error(settings, control, own, s, work):
-    """Raise ERROR to the error that velocity errors, in E_V, leave in slow directions, as in newton_step.py."""
+    """Raise ERROR to the error that velocity errors (E_V) leave in slow directions, as in newton_step.py."""
     n = settings[N]
     state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
-    e_v, most, fine = vector_at(memory, n, E_V), memory + LARGEST_V, memory + TO_GO
+    e_v, most, fine = vector_at(memory, n, E_V), memory + LARGEST_V, memory + ITERATING
     anywhere = False
     for k in range(LANES):
         error = 0.0
@@ -516,7 +516,7 @@ def _slow_error(settings, control, own, s, work):
     solve_lanes(work, matrix, pivots, n, 0, e_v)
     for k in range(LANES):
         error = work[most * LANES + k]
-        if work[FINE * LANES + k] == 1.0:  # the solution may be large where the motion is unstable
+        if work[FINE * LANES + k] == 1.0:  # where the motion is unstable the solution may be too large
             long = _motion_time(control, work, n, memory, k)
             error = min(error, _velocity_error(control, work, n, e_v, long, state, new, k))
         work[FINE * LANES + k] = work[fine * LANES + k]
@@ -531,8 +531,8 @@ def _estimate(settings, control, own, A, work):
     state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     place = eigen_place(s)
     e_q, e_v = vector_at(memory, n, E_Q), vector_at(memory, n, E_V)
-    _embedded(settings, own, A, work, memory)
-    copy_vectors(work, e_v, vector_at(memory, n, RAW), n)
+    _embedded_estimate(settings, own, A, work, memory)
+    copy_vectors(work, e_v, vector_at(memory, n, UNFILTERED), n)
     _filter(settings, own, s, work, memory)
     tests_velocities = own[place + VELOCITIES] == 1.0
     fill_field(work, ERROR, 0.0)
@@ -543,7 +543,7 @@ def _estimate(settings, control, own, A, work):
             enlarge(work, ERROR, e_v + j, RUNNING, state + n + j, new + n + j, atol, rtol)
     if tests_velocities:
         return
-    copy_vectors(work, e_v, vector_at(memory, n, ONCE), n)
+    copy_vectors(work, e_v, vector_at(memory, n, FILTERED_ONCE), n)
     _filter(settings, own, s, work, memory)
     for k in range(LANES):
         z = own[place + GAMMA0] * work[H * LANES + k]
@@ -565,7 +565,7 @@ def _keep_stages(work, memory, n, s):
 
 @kernel(STEP, vectorized=True)
 def step_by_newton(code, settings, control, options, work, status, n_steps, within):
-    """Make a step that is not longer than the largest gap between evaluations, or compute states within a step."""
+    """Take a step, at most GAP long; or compute the states X seconds after its beginning (`within`)."""
     n = settings[N]
     state, _, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     own = options[N_HEAD:]

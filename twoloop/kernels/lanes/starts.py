@@ -1,10 +1,10 @@
-"""Project starts onto the constraints by the least change, in lanes, and check for another assembly about as near.
+"""Project initial states onto the constraints by the least change, in lanes, and check for a second assembly as near.
 
-The least change follows from Cholesky's factors of G G^T, rows of G of length 1. Redundant rows depend on one another
-on the constraints, and beside them only nearly: combinations of rows that vanish there, the vectors Z, are left out, as
-the sum of z z^T is added to G G^T. Lanes are independent of one another.
+The least change follows from the Cholesky factors of G G^T, with the rows of G scaled to length 1. Redundant rows are
+dependent on the constraints, but only nearly so beside them. Eigenvectors z of G G^T, combinations of rows that vanish
+on the constraints, are therefore removed: the sum of z z^T is added to G G^T. Lanes are independent of one another.
 
-`pattern` says where in it the columns of the entries of each row begin, and end, and these columns.
+`pattern` gives the columns of the entries of each row: first where they begin and end in `pattern`, then the columns.
 
 Residuals of the constraints and of the equations of motion, which check runs in lanes, are computed by the callbacks.
 """
@@ -32,11 +32,10 @@ from twoloop.kernels.lanes.layout import (
 )
 
 LEAST = 1e-15  # added to the diagonal of G G^T, so that it has an inverse ...
-MORE = 1e-8  # ... and for inverse iteration, when some of its eigenvalues vanish
-WEAK = 1e-4  # eigenvalue of redundant rows, relative to the largest, above which they count as independent
-REDUNDANT_ITERATIONS = (
-    5  # number of inverse iterations for eigenvectors of redundant rows, whose eigenvalues are far smaller
-)
+ITERATION_SHIFT = 1e-8  # ... and for inverse iteration, when some of its eigenvalues vanish
+WEAK = 1e-4  # relative to the largest eigenvalue: redundant rows have a smaller one
+# number of inverse iterations for eigenvectors of redundant rows, whose eigenvalues are far smaller
+REDUNDANT_ITERATIONS = 5
 GOLDEN = 0.6180339887498949
 
 
@@ -62,7 +61,7 @@ def subtract_products(work, target, x, dx, y, dy, count):
 
 @merged
 def subtract_row(work, target, entries, pattern, i, y):
-    """Subtract row i of G times y from target; entries stand behind one another."""
+    """Subtract row i of G times y from target; the entries of all rows follow one another."""
     for e in range(pattern[i], pattern[i + 1]):
         subtract_products(work, target, entries + e - pattern[0], 1, y + pattern[e], 1, 1)
 
@@ -101,7 +100,7 @@ def _cholesky(work, pattern, n_rows, n_redundant, row, factors, shift):
 
 @compiled
 def factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors):
-    """Scale the rows, without fixed coordinates, to length 1; compute 1 / their lengths, factors of G G^T, and Z."""
+    """Scale the rows, without fixed coordinates, to length 1; compute 1 / lengths, the factors of G G^T, and Z."""
     n_entries = pattern[n_rows] - pattern[0]
     for i in range(n_rows):
         length = factors + n_entries + i
@@ -129,7 +128,7 @@ def _find_redundant(work, pattern, n_rows, n_redundant, row, factors):
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
     Z = gram + n_rows * n_rows
     spare = Z + n_redundant * n_rows
-    _cholesky(work, pattern, n_rows, 0, row, factors, MORE)
+    _cholesky(work, pattern, n_rows, 0, row, factors, ITERATION_SHIFT)
     for w in range(n_redundant):
         z = Z + w * n_rows
         for i in range(n_rows):
@@ -140,13 +139,13 @@ def _find_redundant(work, pattern, n_rows, n_redundant, row, factors):
             _remove_redundant(work, n_rows, w, Z, z, spare)
         normalise(work, z, n_rows, spare)
         for k in range(LANES):
-            if not work[spare * LANES + k] < WEAK:  # `spare` is the eigenvalue plus MORE
+            if not work[spare * LANES + k] < WEAK:  # `spare` is the eigenvalue plus ITERATION_SHIFT
                 work[z * LANES + k] = np.nan
 
 
 @compiled
 def normalise(work, x, n_rows, spare):
-    """Scale x to length 1; `spare` is 1 over its length before."""
+    """Scale x to length 1; `spare` becomes 1 over its length before."""
     fill_field(work, spare, 0.0)
     subtract_products(work, spare, x, 1, x, 1, n_rows)
     for k in range(LANES):
@@ -157,7 +156,7 @@ def normalise(work, x, n_rows, spare):
 
 @compiled
 def _remove_redundant(work, n_rows, n_redundant, Z, x, spare):
-    """Subtract from x its parts in Z."""
+    """Remove the components along Z from x."""
     for w in range(n_redundant):
         z = Z + w * n_rows
         fill_field(work, spare, 0.0)
@@ -181,7 +180,7 @@ def _solve(work, n_rows, gram, x):
 
 @compiled
 def along_rows(work, pattern, n, n_rows, n_redundant, factors, x, out):
-    """Replace x by the solution y of G G^T y = x, rows of length 1, without redundant parts; out = -G^T y."""
+    """Replace x by y with G G^T y = x, for rows of length 1 and without redundant components; out = -G^T y."""
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
     Z = gram + n_rows * n_rows
     _remove_redundant(work, n_rows, n_redundant, Z, x, Z + n_redundant * n_rows)
@@ -195,27 +194,27 @@ def along_rows(work, pattern, n, n_rows, n_redundant, factors, x, out):
 
 @compiled
 def least_change(work, pattern, n, n_rows, n_redundant, factors, x, change):
-    """Compute the smallest change with G change = -x; not finite where rows depend on one another. x is lost."""
+    """Compute the smallest change with G change = -x; not finite where rows are dependent. x is overwritten."""
     for i in range(n_rows):
         _scale(work, x + i, factors + pattern[n_rows] - pattern[0] + i)
     along_rows(work, pattern, n, n_rows, n_redundant, factors, x, change)
 
 
 MOST_ITERATIONS = 12
-AT_ROUNDING = 64.0  # times the rounding of its terms: an equation of a start holds within this
-STRAIGHT = 0.25  # relative to a displacement: largest distance of its projection from where C_q sends it
+AT_ROUNDING = 64.0  # largest residual of a constraint, in rounding errors of its terms
+MAX_CURVATURE = 0.25  # relative to a displacement: largest distance of its projection from the prediction by C_q
 SINGULAR = 1e-12  # smallest eigenvalue of G G^T, rows of length 1, of independent rows
 # number of inverse iterations for the eigenvector of the smallest eigenvalue of independent rows
 WEAKEST_ITERATIONS = 10
-N_REDUNDANT = 5  # in `settings`, behind those of layout.py: number of redundant rows
-# displacements from the state found: factors of the way of the guess, and of the weakest direction
-WAYS = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))
+N_REDUNDANT = 5  # index in `settings`, after those of layout.py: number of redundant rows
+# other guesses: factors of the way from the guess to the state found, and of the weakest direction, for their distances
+OTHER_GUESSES = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
 
 def places_of_starts(n, n_rows, n_entries, n_redundant):
-    """Return where parts of `work` begin, counted from the memory of the method, and its length.
+    """Return the offsets of the parts of `work`, from the memory of the method on, and its length.
 
-    The parts are: C, C_t and the entries of G, as the code writes them; numbers of rows; changes of positions or
+    The parts are: C, C_t and the entries of G, as generated code writes them; numbers of rows; changes of positions or
     velocities; positions found; the way to them; the direction that the rows determine least; a displacement; a row;
     the results of `factor_gram` at the positions found, and at NEW.
     """
@@ -245,8 +244,8 @@ def _largest(work, place, count, k):
 
 
 @merged
-def _holds(work, pattern, n, n_rows, C, G, new, k):
-    """Return whether each constraint holds to the rounding of its terms."""
+def _constraints_hold(work, pattern, n, n_rows, C, G, new, k):
+    """Return whether each constraint holds up to the rounding of its terms."""
     allowed = AT_ROUNDING * np.finfo(np.float64).eps * _largest(work, new, n, k)
     for i in range(n_rows):
         off, terms = abs(work[(C + i) * LANES + k]), 0.0
@@ -259,7 +258,7 @@ def _holds(work, pattern, n, n_rows, C, G, new, k):
 
 @compiled
 def _gauss_newton(code, settings, control, pattern, moves, work):
-    """Move NEW onto the constraints by steps of least change; RUNNING stays 1 in lanes where that converges."""
+    """Move NEW onto the constraints by steps of least change; RUNNING remains 1 in lanes where that converges."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = places_of(n, n_rows, settings[N_NUMBERS])
     G, x, change, _, _, _, _, row, _, here, _ = _places(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
@@ -281,8 +280,8 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
                 continue
             for j in range(n):
                 work[(new + j) * LANES + k] += work[(change + j) * LANES + k]
-            # check after the change, which is applied to the last bit
-            if _holds(work, pattern, n, n_rows, memory, G, new, k):
+            # check after the change, so that it is applied to the last bit
+            if _constraints_hold(work, pattern, n, n_rows, memory, G, new, k):
                 work[LEFT_TO_MOVE * LANES + k] = 0.0
             else:
                 left += 1.0
@@ -295,7 +294,7 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
 
 @compiled
 def _change_velocities(code, settings, control, pattern, moves, work):
-    """Move velocities of NEW onto the rows at its positions; keeps their factors."""
+    """Project velocities of NEW onto the rows at its positions; the factors of the rows are kept."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = places_of(n, n_rows, settings[N_NUMBERS])
     G, x, change, _, _, _, _, row, there, _, _ = _places(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
@@ -319,7 +318,7 @@ def _change_velocities(code, settings, control, pattern, moves, work):
 
 @compiled
 def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, moved, weakest):
-    """Find the direction that rows determine least, scaled to the way of the guess; clear RUNNING if rows depend."""
+    """Find the direction that rows determine least, as long as the way of the guess; clear RUNNING if rows depend."""
     spare = factors + pattern[n_rows] - pattern[0] + n_rows * (1 + n_rows + n_redundant)
     for i in range(n_rows):
         fill_field(work, x + i, 0.5 + (GOLDEN * (i + 1)) % 1.0)
@@ -338,7 +337,7 @@ def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, m
 
 @compiled
 def _compare_with_other_starts(code, settings, control, pattern, moves, work):
-    """Clear RUNNING where other guesses, as far off, do not end where C_q at FOUND sends them."""
+    """Clear RUNNING where other guesses, about as far away, do not end where C_q at FOUND predicts."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = places_of(n, n_rows, settings[N_NUMBERS])
     _, x, change, found, moved, weakest, way, _, there, _, _ = _places(
@@ -347,7 +346,7 @@ def _compare_with_other_starts(code, settings, control, pattern, moves, work):
     x, change, found, moved = memory + x, memory + change, memory + found, memory + moved
     weakest, way, factors = memory + weakest, memory + way, memory + there
     _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, moved, weakest)
-    for own, other in WAYS:
+    for own, other in OTHER_GUESSES:
         for j in range(n * LANES):
             off = own * work[moved * LANES + j] + other * work[weakest * LANES + j]
             work[way * LANES + j], work[new * LANES + j] = off, work[found * LANES + j] + off
@@ -363,7 +362,7 @@ def _compare_with_other_starts(code, settings, control, pattern, moves, work):
                 m = j * LANES + k
                 expected = work[found * LANES + m] + work[way * LANES + m] - work[change * LANES + m]
                 apart = max(apart, abs(work[new * LANES + m] - expected))
-            if not apart <= STRAIGHT * _largest(work, way, n, k) + rounding:
+            if not apart <= MAX_CURVATURE * _largest(work, way, n, k) + rounding:
                 work[RUNNING * LANES + k] = 0.0
 
 
@@ -374,8 +373,7 @@ _START = types.void(CODE, INTEGERS, VECTOR, *[INTEGERS] * 2, *[types.float64[:, 
 def start_lanes(code, settings, control, pattern, moves, numbers, q, v, fine, work):
     """Project states, one for each row of `numbers`, onto the constraints at t0, in place; `fine`: 1 on success.
 
-    pattern : where in it the columns of the entries of each row of G begin, and end, and these columns. moves : (n,) 1
-    for coordinates that may move.
+    pattern : columns of the entries of G, see above. moves : (n,) 1 for coordinates that may move.
     """
     n, n_rows, n_redundant, n_runs = settings[N], settings[N_ROWS], settings[N_REDUNDANT], numbers.shape[0]
     _, new, _, _, _, _, own, memory = places_of(n, n_rows, numbers.shape[1])
@@ -411,7 +409,7 @@ TABLE, STATES = types.float64[:, ::1], types.float64[:, :, ::1]
 
 @compiled
 def _relative_residual(value, allowed):
-    """Divide a residual by its allowed size."""
+    """Return a residual relative to its allowed size."""
     if not np.isfinite(value):
         return np.inf
     if value == 0.0:
@@ -423,10 +421,10 @@ def _relative_residual(value, allowed):
 def motion_residuals(f, sizes, t, share, atol, runs, parameters, states_q, states_v, ends, room, worst):
     """Compute each run's largest residual of C = 0, C_q v + C_t = 0, C_q a = gamma, M a + C_q^T lam = Q over `share`.
 
-    That is a share of the terms of a row, beside which positions and velocities may be off by `atol`.
-    runs : of each row its run, -1: it is left out; parameters : of all runs, (., n_p), from sizes[2] on in p; states_q,
-    states_v : (n_rows, n, n_t), of which the last count; ends : (n_rows, n + n_c), a and lam;
-    room : (n (n + 3) + n_c (n + 3),).
+    `share` is relative to the terms of a row; positions and velocities may also be off by `atol`.
+    runs : index of the run of each row, -1: the row is left out; parameters : of all runs, (., n_p), stored in p from
+    index sizes[2] on; states_q, states_v : (n_rows, n, n_t), of which the last time counts; ends : (n_rows, n + n_c), a
+    and lam; room : (n (n + 3) + n_c (n + 3),).
     """
     n, n_c, first = sizes[0], sizes[1], sizes[2]
     M, Q = room[: n * n].reshape((n, n)), room[n * n : n * n + n]
@@ -485,7 +483,7 @@ def motion_residuals(f, sizes, t, share, atol, runs, parameters, states_q, state
 def constraint_residuals(f, sizes, t, slow, parameters, q, v, room, worst):
     """Compute each state's largest |C| and |C_q v + C_t|, relative to the row of |C_q| and the largest entry of q or v.
 
-    slow : speed below which velocities count as if one of them were as large; room : (n_c (n + 2),).
+    slow : smallest speed by which velocities are divided, so that a state at rest has a scale; room : (n_c (n + 2),).
     """
     n, n_c, first = sizes[0], sizes[1], sizes[2]
     C, rate, G = room[:n_c], room[n_c : 2 * n_c], room[2 * n_c :].reshape((n_c, n))

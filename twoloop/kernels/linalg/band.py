@@ -1,11 +1,11 @@
 """Factor and solve banded matrices by LAPACK: the constant mass matrix, and systems with a border of constraints.
 
-A band is kept as LAPACK wants it, entry (i, j) at [j, top + i - j] of a C-ordered array: top = b for the upper triangle
-of M, 2 b for an LU, whose row exchanges fill another b diagonals. b is the bandwidth that the system declares.
+LAPACK's band storage has entry (i, j) at [j, top + i - j] of a C-ordered array: top = b for the upper triangle of M,
+2 b for an LU, whose row exchanges fill another b diagonals. b is the bandwidth that the system declares.
 
-The routines are those of the library that SciPy brings. Addresses differ from process to process and kernels are kept
-on disk, so no address is compiled in: a run puts `lapack_addresses` into its workspace, and `call_lapack` takes one of
-them. (Numba has LAPACK only for dense matrices and with allocation.)
+The routines are those of the library that SciPy uses. Their addresses differ from process to process and kernels are
+stored on disk, so no address is compiled in: a run puts `lapack_addresses` into its workspace, and `call_lapack` takes
+one of them. (Numba has LAPACK only for dense matrices and with allocation.)
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ from twoloop.kernels.data.common import compiled, inlined, merged
 from twoloop.kernels.data.indices import BANDWIDTH, DIAGONAL_MASS, DONE, MASS_NOT_DEFINITE, SINGULAR
 from twoloop.kernels.linalg.dense import lu_factor, lu_solve
 
-# indices in `lapack_addresses`: Cholesky of a banded matrix and its solve, LU with row exchanges, real and complex
+# indices in `lapack_addresses`: Cholesky factorization of a banded matrix, its solve; LU with row exchanges, its solve
 ROUTINES = ("dpbtrf", "dpbtrs", "dgbtrf", "dgbtrs", "zgbtrf", "zgbtrs")
 DPBTRF, DPBTRS, DGBTRF, DGBTRS, ZGBTRF, ZGBTRS, N_ROUTINES = range(7)
 
@@ -32,7 +32,7 @@ def lapack_addresses() -> list[int]:
     Raises
     ------
     ImportError
-        If this SciPy's LAPACK has other than 32-bit integers.
+        If SciPy's LAPACK does not use 32-bit integers.
     """
     for name in ROUTINES:
         signature = repr(scipy.linalg.cython_lapack.__pyx_capi__[name])
@@ -68,9 +68,9 @@ def call_lapack(typing_context, address, arguments):
     return types.int64(address, arguments), generate
 
 
-# number of coordinates from which on a Newton step by banded algebra is faster: measured 36 to 75, on chains of
-# bandwidth 1 to 11 and on beams. Evaluations alone, as a fixed-point iteration makes them, gain from about 150 on, and
-# lose a third here
+# number of coordinates above which a Newton step by banded algebra is faster: measured 36 to 75, on chains of bandwidth
+# 1 to 11 and on beams. Single evaluations, as in a fixed-point iteration, gain above about 150 only, and at 56 they
+# take a third longer
 BANDED_FROM = 56
 
 
@@ -81,7 +81,7 @@ def banded_pays(n_q: int, n_c: int, bandwidth: int) -> bool:
 
 @merged
 def banded_mass(f):
-    """Return whether M is factored as a band; a diagonal M is simpler still."""
+    """Return whether M is factored as a band; not if it is diagonal, which is simpler still."""
     return f.flags[BANDWIDTH] >= 0 and f.flags[DIAGONAL_MASS] == 0
 
 

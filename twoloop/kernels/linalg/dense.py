@@ -8,7 +8,7 @@ from twoloop.kernels.data.common import compiled, merged
 
 @merged
 def copy(source, target):
-    """Copy element by element: numba's slice assignment allocates."""
+    """Copy element by element, because numba's slice assignment allocates."""
     for i in range(source.size):
         target[i] = source[i]
 
@@ -41,7 +41,7 @@ def contains(numbers, number):
 
 @merged
 def _magnitude(x):
-    """Return |x|, or |Re x| + |Im x| of a complex number as LAPACK does: no square root."""
+    """Return |x|, or |Re x| + |Im x| of a complex number, which needs no square root (as in LAPACK)."""
     return abs(x.real) + abs(x.imag)
 
 

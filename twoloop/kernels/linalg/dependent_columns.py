@@ -1,31 +1,31 @@
-"""Choose coordinates that follow from the others by rows of G: pivots, in blocks of one or two, of generated code.
+"""Choose the coordinates that rows of G determine from the others: pivots, in blocks of one or two, for generated code.
 
 Constant entries come first: they need no division and do not change. Among other entries that are large enough, those
-with the least fill are chosen instead of the largest, so that neighbouring positions mostly have the same.
+with the least fill are chosen instead of the largest, so that neighbouring positions mostly have the same pivots.
 """
 
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, i8, kernel
 
 NONE, NUMBER, VARIES = 0, 1, 2  # kinds of entries
-# number of rows of which two are searched for a block: a search of all takes milliseconds for 60 rows
+# number of shortest rows among which pairs are searched: a search among all takes milliseconds for 60 rows
 ROWS_SEARCHED = 4
-# limits of a block. MAX_SQUARES: sum of squares of the changes of its coordinates, if each other one moves by 1.
-# MIN_SINE_SQUARES: square of the sine between its columns, or of one pivot over its column of G. With the first tier
-# pivots stay large for most of a turn (spatial four-bar: 98 % of the time, 34 % with the second tier); the last tier is
-# far enough from LEAST of generate/null_space.py
+# limits of a block, in three tiers. MAX_SQUARES: sum of squares of the changes of its coordinates, if each other
+# coordinate moves by 1. MIN_SINE_SQUARES: squared sine between its columns, or of a single pivot over its column of G.
+# With the first tier pivots stay large for most of a turn (spatial four-bar: 98 % of the time, 34 % with the second
+# tier); the last tier is far enough from LEAST of generate/null_space.py
 MAX_SQUARES, MIN_SINE_SQUARES = (4.0, 20.0, 200.0), (0.2**2, 0.1**2, 0.04**2)
-SMALL = 1e-3  # relative to the largest entry of its row: a smaller number is no divisor
-CANCELLATION = 1e-12  # relative: remainder of numbers that cancel
+SMALL = 1e-3  # relative to the largest entry of its row: a smaller constant is not used as a pivot
+CANCELLATION = 1e-12  # relative: a smaller difference of constants counts as zero
 
 
 def room_size(n_rows: int, n: int) -> tuple[int, int]:
-    """Return the numbers of scratch reals, and integers, for `choose_dependent_columns`."""
+    """Return how many real numbers, and integers, `choose_dependent_columns` needs as scratch."""
     return n_rows * n + n, n_rows * n + 3 * n_rows + 2 * n
 
 
 @compiled
 def _find_constant_pivot(R, K, row_left, row_sizes, column_sizes):
-    """Return the place, n times the row plus the column, of the constant entry with the least fill; -1: none."""
+    """Return the index n row + column of the constant entry with the least fill; -1: there is none."""
     best, best_fill, best_size, (m, n) = -1, 0, 0, R.shape
     for i in range(m):
         if not row_left[i]:
@@ -68,7 +68,7 @@ def _is_pivot_block(R, column_left, squares, i, k, j, l, largest, parallel):
 
 @compiled
 def _find_varying_pivots(R, K, row_left, column_left, squares, rows, column_sizes, found):
-    """Find pivots among entries that vary; `found` becomes two rows and two columns, or one of each, twice."""
+    """Find pivots among entries that vary; `found` becomes two rows and two columns, or one row and column, twice."""
     m, n = R.shape
     n_rows = 0
     column_sizes[:] = 0
@@ -140,9 +140,9 @@ def _subtract(R, K, column_left, row_sizes, column_sizes, r, j, i):
 
 @compiled
 def _eliminate(R, K, row_left, column_left, row_sizes, column_sizes, i, k, j, l):
-    """Solve rows i and k for columns j and l, or one row for one column, and eliminate these from the other rows.
+    """Solve rows i and k for columns j and l, or row i for column j, and eliminate these columns from the other rows.
 
-    `row_sizes` and `column_sizes` hold the numbers of entries; they are updated for single rows only.
+    `row_sizes` and `column_sizes` are the numbers of entries; they are updated for single rows only.
     """
     m, n = R.shape
     row_left[i] = row_left[k] = column_left[j] = column_left[l] = 0
@@ -175,8 +175,8 @@ def _eliminate(R, K, row_left, column_left, row_sizes, column_sizes, i, k, j, l)
 def choose_dependent_columns(G, kinds, rows, n_kept, room, work, out):
     """Choose dependent columns for the first `n_kept` of the rows `rows` of G; return the number of blocks, 0: none.
 
-    kinds : of the entries of G, row by row. out : of each block two rows, as places in `rows`, and two columns, or one
-    of each twice.
+    kinds : of the entries of G, row by row. out : for each block two rows, as indices in `rows`, and two columns, or
+    one row and one column, each twice.
     """
     n = G.shape[1]
     if n_kept > n:

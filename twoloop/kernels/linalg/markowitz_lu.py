@@ -1,39 +1,39 @@
 """Factor the dependent columns of the constraint Jacobian by LU, with a program for their pattern.
 
 A mechanism's Jacobian has few entries, always in the same places. The order of elimination is chosen once for each
-partition (Markowitz's rule with a threshold), and with it the list of operations: later factorizations run down this
-list, without a search for pivots and without tests for zeros. Multipliers that have grown show that the order no longer
-suits the numbers. If the list would be as long as that of a full matrix, the factors are dense with row exchanges.
+partition (Markowitz's rule with a threshold), and with it the list of operations: later factorizations follow this
+list, without a search for pivots and without tests for zeros. Large multipliers show that the order no longer suits the
+numbers. If the list would be as long as that of a full matrix, the factors are dense with row exchanges.
 
 To choose an order, entries are stored in lists by row and by column, and each step of the elimination uses only the
 lists that it changes: the work is proportional to size times entries, whereas full matrices would take the third power
 of the size.
 
-The factors of one matrix are two arrays: `index`, the program, and `values`. Vectors to solve for are in the order of
-elimination: entry k belongs to row rows_of(index)[k] of the Jacobian, that of the solution to columns_of(index)[k].
+The factors of a matrix are two arrays: `index`, the program, and `values`. Vectors to solve for are in the order of
+elimination: entry k belongs to row rows_of(index)[k] of the Jacobian, the solution's to columns_of(index)[k].
 """
 
 from twoloop.kernels.data.common import compiled, inlined, merged
 from twoloop.kernels.linalg.dense import copy, lu_factor, lu_sign, lu_solve
 
 THRESHOLD = 0.1  # smallest pivot, relative to the largest entry in its column
-FULL = 0.5  # share of the operations of a dense factorization above which a dense one is used
-SMALL = 3  # number of rows up to which factors are never dense
-ZERO = 1e-11  # a pivot below this fraction of the largest one counts as zero
-# a list has at most MIN_SUBTRACTIONS + PER_ROW r subtractions, for which there is memory
+DENSE_SHARE = 0.5  # share of the operations of a dense factorization above which a dense one is used
+SMALL_SIZE = 3  # number of rows up to which factors are never dense
+ZERO_PIVOT = 1e-11  # a pivot below this fraction of the largest one counts as zero
+# largest number of subtractions in a list: MIN_SUBTRACTIONS + PER_ROW r, for which memory is allocated
 MIN_SUBTRACTIONS, PER_ROW = 2000, 100
-MAX_ENTRIES_PER_LINE = 64  # entries that a row or a column of the factors may have
+MAX_ENTRIES_PER_LINE = 64  # largest number of entries in a row or a column of the factors
 
 ORDERED, SINGULAR_MATRIX, TOO_MANY = range(3)  # results of `order`; TOO_MANY: too many entries for sparse factors
 
-# places in `index`: the size r, whether the factors are dense, the sign of the permutations, the number of entries of
+# indices in `index`: the size r, whether the factors are dense, the sign of the permutations, the number of entries of
 # the factors, the first entry of L, and the number of columns of the Jacobian; then rows (r), columns (r), row
 # exchanges of dense factors (r), where rows of U begin (r) and end (r) and where rows of L begin (r + 1); then the row,
-# the column and the source of each entry; then the targets of the subtractions. Entries: the diagonal, U from its last
-# row up, L from its first. The lists for ordering follow
+# the column and the source of each entry; then the targets of the subtractions. Order of entries: the diagonal, U from
+# its last row up, L from its first row down. The lists for ordering follow
 SIZE, DENSE, SIGN, N_SLOTS, FIRST_LOWER, WIDTH, N_HEAD = range(7)
-# of every row and column of the matrix: number of entries in its list (a column loses those of eliminated rows); of a
-# row, number of entries left; places in the order so far; and of a row, its place in the list of a column, from 1 on
+# for each row and column of the matrix: number of entries in its list (a column loses those of eliminated rows); of a
+# row, number of entries left; position in the order so far; and of a row, its index in the list of a column, from 1 on
 ROW_SIZE, COLUMN_SIZE, ROW_LEFT, ROW_PLACE, COLUMN_PLACE, FOUND, N_COUNTS = range(7)
 COLUMNS, SOURCES, ROWS, N_LISTS = range(4)  # lists of a row: columns and sources of its entries; list of a column: rows
 
@@ -73,25 +73,25 @@ def pivots_of(index):
 
 @merged
 def begin_upper(r):
-    """Return the place in `index` of the places where the rows of U begin."""
+    """Return the index in `index` of the list of the beginnings of the rows of U."""
     return N_HEAD + 3 * r
 
 
 @merged
 def end_upper(r):
-    """Return the place in `index` of the places where the rows of U end."""
+    """Return the index in `index` of the list of the ends of the rows of U."""
     return N_HEAD + 4 * r
 
 
 @merged
 def begin_lower(r):
-    """Return the place in `index` of the places where the rows of L begin, and where the last one ends."""
+    """Return the index in `index` of the list of the beginnings of the rows of L, and the end of the last one."""
     return N_HEAD + 5 * r
 
 
 @merged
 def begin_entries(r):
-    """Return the place in `index` where rows, columns and sources of the entries stand."""
+    """Return the index in `index` of the lists of rows, columns and sources of the entries."""
     return N_HEAD + 6 * r + 1
 
 
@@ -116,7 +116,7 @@ def clear_lists(index, r):
 
 @compiled
 def put_entry(matrix, i, j, number, source):
-    """Add entry (i, j), which is not in the lists yet; return whether it fits."""
+    """Add entry (i, j), which is not in the lists yet; return whether there is room for it."""
     counts, lists, numbers = matrix
     n, m = counts[ROW_SIZE, i], counts[COLUMN_SIZE, j]
     if n == numbers.shape[1] or m == numbers.shape[1]:
@@ -131,9 +131,9 @@ def put_entry(matrix, i, j, number, source):
 
 @compiled
 def _choose_pivot(matrix, rows, columns, k):
-    """Return row and column of pivot k: the one with the least fill among those large enough; (-1, -1): none.
+    """Return row and column of pivot k: the one with the least fill among those large enough; (-1, -1): there is none.
 
-    Among equal ones it is the largest, then the first in the order so far.
+    Among pivots with equal fill it is the largest, then the first in the order so far.
     """
     counts, lists, numbers = matrix
     r = rows.size
@@ -162,7 +162,7 @@ def _choose_pivot(matrix, rows, columns, k):
 
 @merged
 def _exchange(order, place, k, chosen):
-    """Move `chosen` to place k; return the sign of the permutation: -1, or 1 if `chosen` is already there."""
+    """Move `chosen` to position k; return the sign of the permutation: -1, or 1 if `chosen` is already there."""
     p, other = place[chosen], order[k]
     order[k], order[p] = chosen, other
     place[chosen], place[other] = k, p
@@ -171,7 +171,7 @@ def _exchange(order, place, k, chosen):
 
 @compiled
 def _subtract(matrix, row, column, pivot, j, nothing):
-    """Subtract the pivot's row from the others in column j, and remove it from that list; return whether all fit."""
+    """Subtract the pivot's row from the others in column j, and remove it there; return False if lists are full."""
     counts, lists, numbers = matrix
     for m in range(counts[COLUMN_SIZE, j]):
         counts[FOUND, lists[ROWS, j, m]] = m + 1
@@ -197,9 +197,9 @@ def _subtract(matrix, row, column, pivot, j, nothing):
 
 @compiled
 def order(index, matrix, nothing, zero):
-    """Eliminate the entries in the lists with free choice of pivots, and write the program of that order.
+    """Choose pivots one after another by eliminating the entries in the lists; write the program of that order.
 
-    New entries get the source `nothing`, where there is a zero. A pivot of at most `zero` times the largest counts as
+    New entries get the source `nothing`, which holds a zero. A pivot of at most `zero` times the largest counts as
     zero. Returns ORDERED, with rows and columns of the matrix in `index`, SINGULAR_MATRIX or TOO_MANY.
     """
     counts, lists, numbers = matrix
@@ -244,7 +244,7 @@ def _sort(columns, sources, size, place):
 def _size_of_program(rows, counts, lists):
     """Count the entries of the factors and the subtractions that compute them; sort the lists of the rows.
 
-    Leaves the number of entries of U of the row at each place in counts[ROW_LEFT].
+    Leaves the number of entries of each row of U, in elimination order, in counts[ROW_LEFT].
     """
     place = counts[COLUMN_PLACE]
     entries, subtractions = 0, 0
@@ -267,7 +267,7 @@ def _store_program(index, counts, lists):
     rows = rows_of(index)
     n_slots, subtractions = _size_of_program(rows, counts, lists)
     full = (r * (r - 1) * (2 * r - 1)) / 6.0
-    if subtractions > MIN_SUBTRACTIONS + PER_ROW * r or (r > SMALL and subtractions > FULL * full):
+    if subtractions > MIN_SUBTRACTIONS + PER_ROW * r or (r > SMALL_SIZE and subtractions > DENSE_SHARE * full):
         return False
     in_row, in_column = begin_entries(r), begin_entries(r) + n_slots
     source, target = in_column + n_slots, in_column + 2 * n_slots
@@ -301,7 +301,7 @@ def _store_program(index, counts, lists):
     return True
 
 
-GROWTH = 1e3  # largest multiplier; if one is larger, the order of elimination is chosen again
+GROWTH = 1e3  # largest multiplier; after a larger one the order of elimination is chosen again
 
 
 @compiled
@@ -322,7 +322,7 @@ def make_program(G, pattern, rows, columns, index, values):
                 if code == ORDERED and not put_entry(matrix, i, k, number, source):
                     code = TOO_MANY
     if code == ORDERED:
-        code = order(index, matrix, pattern.size, ZERO)
+        code = order(index, matrix, pattern.size, ZERO_PIVOT)
     if code == ORDERED:
         for k in range(r):
             rows_of(index)[k], columns_of(index)[k] = rows[rows_of(index)[k]], columns[columns_of(index)[k]]
@@ -381,7 +381,7 @@ def run_program(index, values):
     if not growth <= GROWTH:
         return -1.0
     in_row = begin_entries(r)
-    for u in range(r, index[FIRST_LOWER]):  # rows of U with 1 on the diagonal make solutions faster
+    for u in range(r, index[FIRST_LOWER]):  # scale U to 1 on the diagonal, which makes solutions faster
         values[u] *= values[index[in_row + u]]
     return smallest / largest if r > 0 else 1.0
 

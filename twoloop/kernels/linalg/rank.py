@@ -9,7 +9,7 @@ from twoloop.kernels.linalg.dense import copy_matrix, ldl_factor, ldl_solve, ldl
 
 # rounding errors of a product of rows, relative to the sum of squares of all entries, for each row
 ROUNDING_OF_SQUARES = 4.0 * 2.0**-52
-MOST_OF_SQUARE = 0.5  # relative to the square of a row's length: if more is left, the rest is orthogonal up to rounding
+MOST_OF_SQUARE = 0.5  # share of a row's squared length: if more is left, the rest is orthogonal up to rounding
 
 
 @compiled
@@ -21,8 +21,8 @@ def _dot(x, y):
 
 
 @compiled
-def _without_parts(basis, n, rest, parts):
-    """Subtract a row's parts along n orthonormal rows; return the squared length of the rest."""
+def _orthogonalise(basis, n, rest, parts):
+    """Subtract a row's components along n orthonormal rows; return the squared length of the rest."""
     for i in range(n):
         part = _dot(basis[i], rest)
         if part != 0.0:
@@ -34,9 +34,9 @@ def _without_parts(basis, n, rest, parts):
 
 @merged
 def select_rows(G, least, basis, factors, kept):
-    """Select the first rows that are independent of those before, into `kept`; return their number.
+    """Select the rows that are independent of those selected before, into `kept`; return their number.
 
-    Such a row keeps more than the share `least` of its length without its part in those before, by Gram-Schmidt
+    A row is independent if more than the share `least` of its length is orthogonal to the rows before, by Gram-Schmidt
     orthogonalisation, repeated if most of the row is lost. `basis` gets orthonormal rows, and `factors` the lower
     triangle whose product with them gives the selected rows. Both have as many rows as can be independent, and one more
     for scratch.
@@ -51,9 +51,9 @@ def select_rows(G, least, basis, factors, kept):
         for i in range(n_kept):
             parts[i] = 0.0
         length = _dot(G[k], G[k])
-        square = _without_parts(basis, n_kept, rest, parts)
+        square = _orthogonalise(basis, n_kept, rest, parts)
         if square < MOST_OF_SQUARE * length:
-            square = _without_parts(basis, n_kept, rest, parts)
+            square = _orthogonalise(basis, n_kept, rest, parts)
         if square > least**2 * length:
             parts[n_kept] = math.sqrt(square)
             for j in range(rest.size):
@@ -71,7 +71,7 @@ def independent_rows(G, least, basis, factors, kept):
 
 @merged
 def _find_shares(n, basis, factors, row, shares):
-    """Express a row as a combination of the n selected rows, by least squares."""
+    """Express a row as a combination of the n selected rows, by least squares; `shares` are its coefficients."""
     for k in range(n):
         shares[k] = _dot(basis[k], row)
     for k in range(n - 1, -1, -1):
@@ -84,8 +84,8 @@ def _find_shares(n, basis, factors, row, shares):
 def size_of_inverse(factors, n, column):
     """Return the Frobenius norm of the inverse of a lower triangle of n rows; `column` is scratch.
 
-    It bounds solutions of least norm, relative to the right-hand side, with independent rows, or with these and
-    redundant ones.
+    Times the norm of the right-hand side it bounds the solutions of least norm of G x = b, if `factors` are those of
+    the independent rows of G.
     """
     total = 0.0
     for j in range(n):
@@ -102,8 +102,8 @@ def size_of_inverse(factors, n, column):
 def shares_of_others(rows, order, least, others, basis, factors, kept, shares, lengths):
     """Return whether `others` are independent; then express some rows as combinations of them, by least squares.
 
-    `order` has the places among all `rows` of those to put into `others`, then of those to find the shares of;
-    `lengths` become those of all rows, and the rest is as in `select_rows`.
+    `order` has the indices in `rows` of those to put into `others`, then of the rows to express; `lengths` become those
+    of all rows; for the other arguments see `select_rows`.
     """
     n = len(others)
     for i in range(len(rows)):
@@ -122,8 +122,8 @@ def shares_of_others(rows, order, least, others, basis, factors, kept, shares, l
 def least_solution(rows, values, least, basis, factors, kept, shares, gram, parts, x):
     """Compute the x of least norm that gives rows these values, by least squares; return how many are independent.
 
-    S are the shares of the independent rows y in the others, of values b: these are least squares for y + S^T z with (1
-    + S S^T) z = b - S y. `values` become the residuals; `parts` is scratch for y and z.
+    With b the values and S the coefficients of the other rows in the independent rows, the latter's values are y + S^T
+    z, (1 + S S^T) z = b - S y. `values` become the residuals; `parts` is scratch for y and z.
     """
     n, m = select_rows(rows, least, basis, factors, kept), 0
     y, z = parts[0], parts[1]
@@ -156,9 +156,9 @@ def least_solution(rows, values, least, basis, factors, kept, shares, gram, part
 
 @kernel(types.boolean(MATRIX, f8, MATRIX), vectorized=True)
 def singular_values_exceed(rows, ratio, gram):
-    """Return whether all singular values exceed this share of the largest, by factoring G G^T less its square.
+    """Return whether all singular values exceed this share of the largest: whether G G^T less its square is definite.
 
-    The Frobenius norm replaces the largest; `gram` is scratch.
+    The Frobenius norm of the rows replaces the largest singular value; `gram` is scratch.
     """
     n, total = len(rows), 0.0
     for i in range(n):
@@ -170,21 +170,21 @@ def singular_values_exceed(rows, ratio, gram):
     return math.isfinite(total) and ldl_factor(gram)
 
 
-BOUND_ROUNDING = 1e-12  # relative: a bound may be missed by this much
+BOUND_ROUNDING = 1e-12  # relative: pivots may be below a bound by this much
 NOT_DEFINITE, STAYS_SINGULAR = -1, -2
 TINY = 1e-300
-# smallest over largest eigenvalue of M. Above it, pivots that keep one of the bounds, 1e-5 at least, show that all rows
-# are independent and that M needs none: the rest of a row is then 1e-6 of it, where 1e-9 would do
+# smallest ratio of two eigenvalues of M. Above it, pivots that keep one of the bounds, 1e-5 at least, show that all
+# rows are independent and that M needs none: the orthogonal part of a row is then 1e-6 of it, where 1e-9 would do
 SIMILAR_EIGENVALUES = 1e-7
-# largest share of an independent row in a redundant one, both scaled to length 1: above it the two change places. If
-# the share passes zero on the way, the independent rows become dependent, as at each dead centre of the slider-crank
-# with two rods; so choose rows whose share is far from zero. The limit is above 1, because dependent rows often have
-# equal shares
+# largest coefficient of an independent row in a redundant one, both scaled to length 1: above it the rows change roles.
+# If the coefficient passes zero on the way, the independent rows become dependent, as at each dead centre of the
+# slider-crank with two rods; so rows are chosen whose coefficient is far from zero. The limit is above 1, because
+# dependent rows often have equal coefficients
 MAX_SHARE = 1.5
 
 
 def room_size(n_rows: int, n: int) -> int:
-    """Return the number of scratch numbers for `choose_rows`."""
+    """Return the length of `room`, the scratch of `choose_rows`."""
     most = min(n_rows, n) + 1
     return most * (n + most) + 2 * n * n + n_rows * (2 * n + 2 * n_rows + 1) + n
 
@@ -209,7 +209,7 @@ def _factor_and_count_negative(A):
 
 @compiled
 def _count_weak(mass, weak, A):
-    """Count eigenvalues of M below a share of (a bound of) the largest; leave the factors of M less that share in A."""
+    """Count eigenvalues of M below a share of (a bound of) the largest; A gets the factors of M less that share."""
     largest = 0.0
     for i in range(len(mass)):
         total = 0.0
@@ -223,7 +223,7 @@ def _count_weak(mass, weak, A):
 
 
 @compiled
-def _dominates(mass):
+def _has_similar_eigenvalues(mass):
     """Return whether Gershgorin's circles show that the eigenvalues of M are of similar size."""
     least, largest = math.inf, 0.0
     for i in range(len(mass)):
@@ -249,7 +249,7 @@ def _scale(mass, G):
 
 @merged
 def _sort_by_entries(G, order, counts):
-    """Sort the places of the rows by their number of entries, few first."""
+    """Sort the indices of the rows by their number of entries, few first."""
     for k in range(len(G)):
         count, i = 0.0, k
         for j in range(G.shape[1]):
@@ -262,7 +262,7 @@ def _sort_by_entries(G, order, counts):
 
 @merged
 def _removes_weak_eigenvalue(A, g, scale, x):
-    """Return whether adding g g^T leaves one negative eigenvalue less, by the sign of the determinant."""
+    """Return whether adding g g^T makes one negative eigenvalue positive: whether the determinant changes its sign."""
     for j in range(x.size):
         x[j] = g[j]
     ldl_solve(A, x)
@@ -296,10 +296,10 @@ def _add_rows(mass, G, weak, scale, A, x, order, added):
 
 @compiled
 def _exchange_rows(G, n_kept, basis, factors, kept, order, shares, others):
-    """Exchange independent rows for redundant ones in which they have large shares, so that they stay independent.
+    """Exchange independent rows for redundant ones in which they have large coefficients, to keep them independent.
 
-    An exchange multiplies the volume that the independent rows span by the share. `basis`, `factors` and `kept` are as
-    `select_rows` left them; `order` and `shares` (n_rows each) and `others` (n, n) are scratch.
+    An exchange multiplies the volume that the independent rows span by the coefficient. `basis`, `factors` and `kept`
+    are results of `select_rows`; `order` and `shares` (n_rows each) and `others` (n, n) are scratch.
     """
     for _ in range(2 * (len(G) - n_kept)):
         largest, leaves, enters, place = MAX_SHARE, -1, -1, 0
@@ -316,7 +316,7 @@ def _exchange_rows(G, n_kept, basis, factors, kept, order, shares, others):
                     largest, leaves, enters = share, k, i
         if leaves < 0:
             return
-        k = leaves  # the other rows move up, or down, so that they stay sorted
+        k = leaves  # move the rows between, so that `kept` stays sorted
         while k + 1 < n_kept and kept[k + 1] < enters:
             kept[k] = kept[k + 1]
             k += 1
@@ -332,10 +332,10 @@ def _exchange_rows(G, n_kept, basis, factors, kept, order, shares, others):
 
 @merged
 def _first_bound_kept(mass, G, kept, n_rows, bounds, factors, solved_room, S_room, sizes):
-    """Return the place of the first bound below all pivots, each relative to its size without the other rows.
+    """Return the index of the first bound below all pivots, where pivots are relative to their rows alone.
 
-    No pivot is below the least eigenvalue of S = G M^-1 G^T with a diagonal of 1, and that is above a bound if S less
-    the bound is definite. Returns the number of bounds if none is kept, and NOT_DEFINITE if M is not.
+    No pivot is below the least eigenvalue of S = G M^-1 G^T, scaled to a diagonal of 1. This eigenvalue exceeds a bound
+    if S less the bound is definite. Returns the number of bounds if pivots keep none, and NOT_DEFINITE if M is not.
     """
     copy_matrix(mass, factors)
     if not ldl_factor(factors):
@@ -370,12 +370,12 @@ def _first_bound_kept(mass, G, kept, n_rows, bounds, factors, solved_room, S_roo
 
 @kernel(i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS), vectorized=True)
 def choose_rows(given, G, least, weak, bounds, room, chosen):
-    """Choose the independent rows of G and the rows that make M invertible; return the place of the first bound kept.
+    """Choose the independent rows of G and the rows that make M invertible; return the index of the first bound kept.
 
-    Rows of G are independent as in `select_rows` for `least`, except for exchanges. Rows are added to M if eigenvalues
-    of it are below the share `weak` of the largest; 0: none is. `chosen`, of 2 + 3 n_rows numbers, begins with the
-    numbers of independent and of added rows, then lists them, each list in n_rows places. `room` begins with the factor
-    of the added rows. See generate/elimination.py.
+    Rows of G are independent as in `select_rows` for `least`, except for exchanges. Rows are added to M if it has
+    eigenvalues below the share `weak` of the largest; weak = 0: no rows. `chosen`, of 2 + 3 n_rows numbers, begins with
+    the numbers of independent and of added rows; two lists of these follow, of length n_rows each. `room` begins with
+    the factor of the added rows. See generate/elimination.py.
     """
     n_rows, n = G.shape
     most = min(n_rows, n) + 1
@@ -387,11 +387,11 @@ def choose_rows(given, G, least, weak, bounds, room, chosen):
     x, end = room[end : end + n], end + n
     sizes, end = room[end : end + n_rows], end + n_rows
     solved, S = room[end : end + n * n_rows], room[end + n * n_rows :]
-    if n_rows <= n and _dominates(given):
+    if n_rows <= n and _has_similar_eigenvalues(given):
         for k in range(n_rows):
             kept[k] = k
         place = _first_bound_kept(given, G, kept, n_rows, bounds, A, solved, S, sizes)
-        if 0 <= place < bounds.size:  # the rows are clearly independent, and M has an inverse
+        if 0 <= place < bounds.size:  # all rows are independent, and M is invertible
             chosen[0], chosen[1], room[0] = n_rows, 0, 1.0
             return place
     n_kept = select_rows(G, least, basis, factors, kept)

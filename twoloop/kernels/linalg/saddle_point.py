@@ -1,6 +1,6 @@
-"""Solve the linear problem of accelerations on the velocities that the constraints allow: for few degrees of freedom.
+"""Solve the linear problem of accelerations; first on the velocities that the constraints allow, for few freedoms.
 
-With T = [I; D^T], D^T = -G_d^-1 G_i, whose columns are these velocities, a = g + T x, where g, with G g = c, has no
+With T = [I; D^T], D^T = -G_d^-1 G_i, whose columns are these velocities, a = g + T x. g satisfies G g = c with zero
 independent entries, and (T^T M T) x = T^T (r - M g): M need only be positive definite on these velocities.
 """
 
@@ -118,7 +118,7 @@ def solve_reduced(f, w, r, c, a):
     for k in range(rows.size):
         z[k] = c[rows[k]]
     solve_dependent(w.index_v, w.values_v, z)
-    copy(r, a)  # temporarily: r - M g
+    copy(r, a)  # a holds r - M g for now
     for k in range(columns.size):
         m = columns[k]
         if f.flags[DIAGONAL_MASS] == 1:
@@ -244,14 +244,14 @@ def solve_schur(f, w, r, c, a):
             a[j] -= solved[i, j] * w.z[i]
 
 
-MIN_ROWS = 8  # smallest number of rows and of freedoms for which this form is the fastest (measured on chains: about 7)
-# smallest number of coordinates for which it is the fastest with few degrees of freedom, too, unless M is diagonal:
+MIN_ROWS = 8  # smallest number of rows and of freedoms for which this form is the fastest (on chains from about 7 on)
+# smallest number of coordinates from which it is the fastest with few degrees of freedom, too, unless M is diagonal:
 # measured about 30
 MIN_COORDINATES = 32
 
 
 def sparse_pays(n_q: int, n_rows: int, diagonal: bool) -> bool:
-    """Return whether this form is faster than the dense ones for a sparse pattern; `diagonal`: M stays diagonal."""
+    """Return whether this form is faster than the dense ones for a sparse pattern; `diagonal`: M is always diagonal."""
     return n_rows >= MIN_ROWS and (n_q - n_rows >= MIN_ROWS or (n_q >= MIN_COORDINATES and not diagonal))
 
 
@@ -289,7 +289,7 @@ def _make_program(w):
 
 @compiled
 def _factor(w):
-    """Factor by the current program; return whether it suits these numbers."""
+    """Factor by the current program; return False if its order of elimination does not suit these numbers."""
     index, values, scale, first_of_mass = w.index_a, w.values_a, w.notes[MASS_SCALE], w.entries.size
     source = begin_entries(index[at.SIZE]) + 2 * index[at.N_SLOTS]
     for s in range(index[at.N_SLOTS]):
@@ -371,7 +371,7 @@ def factor(f, w):
 
 @merged
 def solve(f, w, r, c, a):
-    """Solve for a with any right-hand side; r, c and a are three arrays."""
+    """Solve for a with any right-hand side; r, c and a are different arrays."""
     if f.flags[FORM] == NULL_SPACE:
         solve_reduced(f, w, r, c, a)
     elif f.flags[FORM] == MULTIPLIERS:

@@ -1,15 +1,15 @@
 """Factor and solve the matrix of a large system by its program, see symbolic_factorization.py.
 
-An independent row of G has a negative pivot, the square of the part of the row that the rows before do not span.
+An independent row of G has a negative pivot: minus the square of the part of the row that rows before it do not span.
 Divided by the sum of the bodies' contributions, it is the squared sine of the angle between the row and those before,
-in the metric of M^-1: `smallest` is the least of these. A redundant row has 0 in the place of 1 / pivot, which removes
-it from the solution without another program. Solutions lose as many digits as the smallest pivot has; refinement
-against M and G recovers them.
+in the metric of M^-1: `smallest` is the least of these. For a redundant row 0 replaces 1 / pivot, which removes it from
+the solution without another program. Solutions lose as many digits as the smallest pivot has; refinement against M and
+G recovers them.
 
 If a body's M is singular, as with four Euler parameters, rows that touch this body alone stiffen it: with M + s g g^T
 accelerations are the same, as g a is given, and the multiplier of g is less by s g a. So M need only be positive
 definite on the velocities that such rows allow. Such a row stiffens M even where other rows imply it, as loops through
-a hub do; then s g (g a) goes to the right-hand side.
+a hub do; then s g (g a) is added to the right-hand side.
 """
 
 from twoloop.kernels.data.common import compiled, merged
@@ -29,7 +29,7 @@ NOT_DEFINITE = -1.0  # returned instead of the smallest pivot if a pivot of M is
 
 @compiled
 def _find_stiffness(program, mass, jacobian, stiffness, scratch):
-    """Compute how much each row stiffens M: as much as the largest diagonal entry of M that it touches."""
+    """Compute how much each row stiffens M: by the largest diagonal entry of M among the coordinates of the row."""
     n_q = program[N_COORDINATES]
     for k in range(program[N_PIVOTS]):
         scratch[k] = 0.0
@@ -73,11 +73,11 @@ def load(program, mass, jacobian, values, stiffness, scratch):
 
 @compiled
 def factor(program, counts, values, sizes, least):
-    """Factor the numbers in place, with 1/pivot on the diagonal; return the smallest pivot of a row over its size.
+    """Factor the numbers in place, with 1/pivot on the diagonal; return the smallest ratio of a pivot to its row.
 
     Returns NOT_DEFINITE if M is not positive definite on what the rows so far allow. `counts` is 0 for redundant rows,
-    and becomes 0 for those whose pivot is below `least` of its size; these are not among the smallest. `sizes` is
-    scratch.
+    and becomes 0 for rows with a ratio below `least`, which does not count as the smallest. `sizes`, the sizes of the
+    rows, is scratch.
     """
     (n_q, n) = program[N_COORDINATES], program[N_PIVOTS]
     order, runs = order_of(program), runs_of(program)
@@ -128,7 +128,7 @@ def factor(program, counts, values, sizes, least):
 def solve(program, values, stiffness, x, y):
     """Solve in place for x = [r, c] by the factors; y is scratch."""
     n, order, n_q = program[N_PIVOTS], order_of(program), program[N_COORDINATES]
-    # with M + s g g^T the right-hand side is r + s g c, and the multiplier is less by s c, so that r can be used
+    # with M + s g g^T the right-hand side is r + s g c, and the multiplier is less by s c: r can be used unchanged
     begin, row_of = columns_of(program)
     for k in range(n):
         y[k] = x[order[k]]

@@ -3,9 +3,9 @@
     [M - z^2 K - z D  G^T]
     [G                 0 ]  = L U
 
-in the order of symbolic_factorization.py with couplings, with pivots of one row and no look at the numbers. The numbers
-of M come first among the entries, then those of K and D. Behind the program stand groups of these, each of columns of
-which no two have an entry in the same row, so that one displacement serves all (Curtis, Powell & Reid 1974, doi
+in the order of symbolic_factorization.py with couplings; pivots are single rows, chosen without regard to the numbers.
+The entries of M come first, then those of K and D. After the program follow groups of columns of K and D: no two
+columns of a group have an entry in the same row, so that one displacement serves all (Curtis, Powell & Reid 1974, doi
 10.1093/imamat/13.1.117).
 """
 
@@ -32,7 +32,7 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     stiffened_of,
 )
 
-MIN_PIVOT = 1e-11  # relative to the numbers of which the pivot is the difference: a smaller one is rounding
+MIN_PIVOT = 1e-11  # relative to the terms whose difference is the pivot: a smaller pivot is rounding
 
 
 def newton_program(
@@ -57,13 +57,13 @@ def newton_program(
 
 
 def grouped_entries(tangents: Entries, n_q: int) -> Entries:
-    """Sort the entries by group of columns."""
+    """Sort the entries by the groups of their columns."""
     sequence = np.argsort(column_groups(tangents, n_q)[tangents[1]], kind="stable")
     return tangents[0][sequence], tangents[1][sequence]
 
 
 def column_groups(entries: Entries, n_q: int) -> Integers:
-    """Return the group of each column; columns of a group have no entry in the same row."""
+    """Return the group of each column; the columns of a group have no entry in the same row."""
     rows_of: list[list[int]] = [[] for _ in range(n_q)]
     for i, j in zip(*(each.tolist() for each in entries), strict=True):
         rows_of[j].append(i)
@@ -79,7 +79,7 @@ def column_groups(entries: Entries, n_q: int) -> Integers:
 
 @inlined
 def tangents_of(program):
-    """Return rows and columns of the entries of K and D, where each group begins, and where the last one ends."""
+    """Return rows and columns of the entries of K and D, and where each group begins and the last one ends."""
     begins = program[end_of_sections(program) :]
     rows, columns, _ = mass_of(program)
     n_mass = rows.size - begins[begins.size - 1]
@@ -88,7 +88,7 @@ def tangents_of(program):
 
 @compiled
 def load(program, mass, jacobian, K, D, z, stiffness, values):
-    """Copy the numbers of the matrix for z to their slots."""
+    """Copy the numbers of Newton's matrix for z to their slots."""
     for s in range(values.size):
         values[s] = 0.0
     off = program[N_OFF]

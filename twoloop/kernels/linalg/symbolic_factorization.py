@@ -3,16 +3,15 @@
     [M  G^T]
     [G   0 ]  = L D L^T
 
-is factored in an order that is chosen once from where entries are, with pivots of one row and no look at the numbers:
-see sparse_ldl.py and sparse_lu.py. A slot holds a number of the factors: the pivots in their order, then the columns of
-L, each downwards.
+is factored in an order that is chosen once from the pattern of entries. Pivots are single rows, chosen without regard
+to the numbers: see sparse_ldl.py and sparse_lu.py. A slot holds a number of the factors: the pivots in their order,
+then the columns of L, each downwards.
 
-The coordinates that M couples, or that a joint names together, are a body; the rows that touch the same bodies are a
-joint. Bodies of a few joints come first: what they leave is G M^-1 G^T, positive definite, and any order of its joints
-is a stable one. A body with more joints than that, a hub, would couple all of them, and waits among the joints: with
-hubs the order is that of constrained minimum degree. A joint may come before a hub that it touches, or that others
-before it touch, only where its rows cannot have become dependent for want of the hub's motion: one of its bodies must
-hang on nothing yet.
+Coordinates that M couples, or that a joint names together, form a body; the rows that touch the same bodies form a
+joint. Bodies of a few joints come first. What remains is G M^-1 G^T, positive definite, and any order of its joints is
+stable. A body with more joints, a hub, would couple all of them, and is ordered among the joints: with hubs the order
+is that of constrained minimum degree. A joint may precede a hub that it touches, or that joints before it touch, only
+if its rows are independent even without the hub's motion: one of its bodies must not be supported by anything yet.
 """
 
 import heapq
@@ -52,11 +51,11 @@ class _Supports:
 
     def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int], lone: AbstractSet[int]):
         self.joints, self.hubs = joints, set(hubs)  # hubs that are not eliminated yet
-        self.lone = lone  # bodies of one known coordinate only: no part with one of them is surely free
+        self.lone = lone  # bodies with a single known coordinate: parts that contain one may be fixed
         self.parts = _DisjointSets(n_bodies)
         self.grounded = [False] * n_bodies
         self.hangs: list[set[int]] = [set() for _ in range(n_bodies)]
-        # bodies whose parts hang, or have hung, on a hub
+        # bodies whose parts are, or were, supported by a hub
         self.hanging: dict[int, list[int]] = {hub: [] for hub in hubs}
 
     def lets(self, joint: int) -> bool:
@@ -111,14 +110,14 @@ def elimination_order(
     ----------
     n_q, n_rows : int
     mass_entries, jacobian_entries : (rows, columns)
-        Of M and of G.
+        Entries of M and of G.
     together : iterable of sequence of int
-        Coordinates of one body each, beyond those that M couples.
+        Coordinates that form one body although M does not couple them.
     first : sequence of int
-        Rows of single bodies that come before all joints, but for those of hubs, so that they always count.
+        Rows of single bodies that precede all joints (unless the body is a hub), so that they are always independent.
     couplings : (rows, columns), optional
-        Entries by which bodies are coupled beside their joints, as by springs. All bodies then are hubs, each with the
-        first of its rows.
+        Entries by which bodies are coupled other than by joints, as by springs. All bodies then are hubs, each with its
+        rows in `first`.
     """
     body_of = bodies_of(n_q, mass_entries, together)
     touched: list[set[int]] = [set() for _ in range(n_rows)]
@@ -183,9 +182,9 @@ def _minimum_degree(
     pairs: Iterable[tuple[int, int]],
     lone: AbstractSet[int],
 ) -> list[int]:
-    """Order joints, and hubs as len(joints) + their place: always the allowed one with the fewest neighbours.
+    """Order joints, and hubs as len(joints) + their index: always next the allowed one with the fewest neighbours.
 
-    `pairs`: hubs that are coupled beside their joints. `lone`: see `_Supports`.
+    `pairs`: hubs that are coupled other than by joints. `lone`: see `_Supports`.
     """
     n_joints = len(joints)
     place = {hub: n_joints + k for k, hub in enumerate(hubs)}
@@ -216,7 +215,7 @@ def _minimum_degree(
         if done[node] or known != degree(node):
             continue  # the heap has a newer entry
         if node < n_joints and not holds.lets(node):
-            continue  # it comes up again once the hub is eliminated on which its parts hang: the two are neighbours
+            continue  # it returns to the heap when the hub that supports its parts, a neighbour, is eliminated
         done[node] = True
         order.append(node)
         changed = near[node]
@@ -234,7 +233,7 @@ def _minimum_degree(
 
 Entries = tuple[Integers, Integers]  # rows and columns
 
-# places in the program; the sections that the functions below return follow
+# indices in the program; the sections that the functions below return follow
 N_COORDINATES, N_PIVOTS, N_OFF, N_UPDATES, N_RUNS, N_OF_MASS, N_OF_JACOBIAN, N_STIFFENED, N_HEAD = range(9)
 ALWAYS_ALLOWED_UPDATES = 3_000_000  # largest number of updates (multiplications) for which a program always pays ...
 MAX_UPDATE_SHARE = 1e-3  # ... above it, a program pays up to this share of n^3 ...
@@ -309,10 +308,10 @@ def program_in_order(
 
 
 def _runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
-    """Return length and first target of each run of updates off the diagonal whose targets follow one another.
+    """Return length and first target of each run: updates off the diagonal with consecutive targets.
 
-    The rows of a joint are neighbours in all columns, so that runs are long: the numbers of one are read and written as
-    vectors, and the program is a tenth as long as a list of all targets.
+    The rows of a joint are neighbours in all columns, so that runs are long: the numbers of a run are read and written
+    as vectors, and the program is a tenth as long as a list of all targets.
     """
     off = np.flatnonzero(~diagonal)
     begins = np.flatnonzero(diagonal[off - 1] | (targets[off] != targets[off - 1] + 1))
@@ -321,7 +320,7 @@ def _runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
 
 
 def _products(rows: Integers, chosen: Sequence[int]) -> tuple[Integers, Integers, Integers]:
-    """Return all products of two entries of one of these rows: the row, and the places of both entries."""
+    """Return all products of two entries of one of these rows: the row, and the indices of both entries."""
     parts: list[tuple[Integers, Integers, Integers]] = [(rows[:0], rows[:0], rows[:0])]
     where = np.argsort(rows, kind="stable")
     ordered = rows[where]
@@ -337,14 +336,14 @@ _PAIRS: dict[int, Entries] = {}
 
 
 def _pairs(m: int) -> Entries:
-    """Return first and second index of all pairs of m things, including each with itself."""
+    """Return first and second index of all pairs of m items, each with itself included."""
     if m not in _PAIRS:
         _PAIRS[m] = tuple(each.astype(np.int64) for each in np.triu_indices(m))  # type: ignore[assignment]
     return _PAIRS[m]
 
 
 def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]:
-    """Return the rows below the diagonal of each column of L; each column passes its rows to the first of them."""
+    """Return the row indices of each column of L below the diagonal; a column passes its rows on to its first row's."""
     below: list[set[int]] = [set() for _ in range(n)]
     for column, row in zip(low.tolist(), high.tolist(), strict=True):
         below[column].add(row)
@@ -361,7 +360,7 @@ def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]
 
 @inlined
 def end_of_sections(program):
-    """Return the place behind the sections of a program."""
+    """Return the end of the sections of a program."""
     first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_RUNS]
     return first + 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN]) + 4 * program[N_STIFFENED]
 
@@ -374,7 +373,7 @@ def order_of(program):
 
 @inlined
 def columns_of(program):
-    """Return where the columns of L begin, and the last one ends; and the place of each entry among the pivots."""
+    """Return where each column of L begins and the last one ends; and the position of each entry among the pivots."""
     first = N_HEAD + program[N_PIVOTS]
     middle = first + program[N_PIVOTS] + 1
     return program[first:middle], program[middle : middle + program[N_OFF]]
@@ -405,7 +404,7 @@ def jacobian_of(program):
 
 @inlined
 def stiffened_of(program):
-    """Return rows, two entries of each, and slots of the products that stiffen M."""
+    """Return rows, both entries and slots of the products that stiffen M."""
     n = program[N_STIFFENED]
     first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_RUNS]
     first += 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN])

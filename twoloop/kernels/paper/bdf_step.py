@@ -1,7 +1,7 @@
 """Step of the backward differentiation formulas, orders 1 to 5, for (q_i, v_i), its outer loop by fixed point.
 
-The history is kept in modified divided differences (Krogh), which are scaled to the step as in DASSL and IDA (fixed
-leading coefficient): any step size may follow any other, and with equal steps they are backward differences. They are
+The history consists of modified divided differences (Krogh), scaled to the step as in DASSL and IDA (fixed leading
+coefficient): any step size may follow any other, and with equal steps they are backward differences. They are
 differences of the full (q, v), dependents with their restored values, so that a new partition needs no conversion.
 """
 
@@ -24,10 +24,10 @@ STARTER_STAGES = 3  # number of stages of the Gauss steps that begin a run of fi
 MAX_ITERATIONS = 60
 SAFETY = 0.9  # safety factor of the step factor
 LEAST_FACTOR = 0.2
-STRICT = 10.0  # factor on an estimate: errors of many short steps add up, and then come close to the tolerance
+STRICT = 10.0  # factor on the error estimate: errors of many short steps add up, and then come close to the tolerance
 BIAS = 6.0  # factor on the estimate that chooses the step size, as in VODE; with less, more steps are rejected
-NEIGHBOUR = 1.4  # ... and a further factor for another order, so that the order does not flutter
-HOLD = 1.2  # a step that could grow by less than this keeps its size
+OTHER_ORDER = 1.4  # ... and a further factor for another order, so that the order rarely changes back and forth
+KEEP_BELOW = 1.2  # a step that could grow by less than this keeps its size
 GROWTH = 2.0  # largest growth of a step
 
 # places in `options`: scalars, then the parameter block of the Gauss steps
@@ -42,8 +42,8 @@ HIGHEST, INNER_TOL, OUTER_TOL, N_SCALARS = range(4)
     NEXT_DEPTH,
     N_MEMORY_SCALARS,
 ) = range(7)
-# rows of coefficients: times since the points of the history, from its last point and from the end of the step; the
-# error constants of orders 0, 1, ...
+# rows of coefficients: times since the points of the history, from its last point and from the end of the step; error
+# constants of orders 0, 1, ...
 SPANS, NEW_SPANS, ERROR_CONSTANTS, N_ROWS = range(4)
 
 
@@ -66,7 +66,7 @@ def _coefficients(memory, row):
 
 @inlined
 def _blocks(memory, n):
-    """Return differences and trial differences (N_DIFFERENCES, 2 n), prediction and its rate (2 n), scratch."""
+    """Return differences and trial differences (N_DIFFERENCES, 2 n), prediction and its derivative (2 n), scratch."""
     o = N_MEMORY_SCALARS + N_ROWS * N_DIFFERENCES
     size = N_DIFFERENCES * 2 * n
     differences = memory[o : o + size].reshape((N_DIFFERENCES, 2 * n))
@@ -97,7 +97,7 @@ def settle_bdf(f, w, options, memory, tolerances, accepted):
 
 @compiled
 def _begin(memory, differences, state, h, order):
-    """Start a history: with order 1 from the state and its rate, with order 0 from the state alone."""
+    """Start a history: with order 1 from the state and its derivative, with order 0 from the state alone."""
     size = differences.shape[1]
     for m in range(size):
         differences[0, m] = state[m]
@@ -136,8 +136,8 @@ def _predict(memory, differences, trial, h, prediction, rate):
 
 
 @merged
-def _spread(h, k):
-    """Return c = h / (1 + 1/2 + ... + 1/k)."""
+def _corrector_length(h, k):
+    """Return the length c of the corrector, h / (1 + 1/2 + ... + 1/k)."""
     leading = 0.0
     for j in range(k):
         leading += 1.0 / (j + 1.0)
@@ -152,7 +152,7 @@ def _correct(f, w, options, t, c, prediction, rate, new_state, a_new):
     """
     n = w.Q.size
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    copy(prediction, new_state[: 2 * n])  # for the dependent coordinates, start values of Newton's method
+    copy(prediction, new_state[: 2 * n])  # dependent coordinates: start values of Newton's method
     copy(rate[n:], a1)
     before = np.inf
     for iteration in range(MAX_ITERATIONS):
@@ -194,11 +194,11 @@ def _norm(tolerances, y, y1, d, sign, difference):
 
 @compiled
 def _judge(options, memory, tolerances, trial, y, y1, d):
-    """Estimate the error from d = y1 - prediction; choose the next order, into memory, and the step factor."""
+    """Estimate the error from d = y1 - prediction; store the next order in `memory`; return error and step factor."""
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, constants = _coefficients(memory, NEW_SPANS), _coefficients(memory, ERROR_CONSTANTS)
     norm = STRICT * _norm(tolerances, y, y1, d, 0.0, d)
-    # with unequal steps the interpolation of the history has an error as well; the larger one counts (as in DASSL)
+    # with unequal steps the interpolation of the history has an error, too; as in DASSL the larger one counts
     interpolation = spans[0] / spans[k]
     for j in range(k):
         interpolation += spans[0] / spans[j] - 1.0 / (j + 1.0)
@@ -206,9 +206,9 @@ def _judge(options, memory, tolerances, trial, y, y1, d):
     here = norm * constants[k]
     below, above = np.inf, np.inf
     if k > 1:
-        below = STRICT * NEIGHBOUR * constants[k - 1] * _norm(tolerances, y, y1, d, 1.0, trial[k])
+        below = STRICT * OTHER_ORDER * constants[k - 1] * _norm(tolerances, y, y1, d, 1.0, trial[k])
     if k < options[HIGHEST] and depth > k:
-        above = STRICT * NEIGHBOUR * constants[k + 1] * _norm(tolerances, y, y1, d, -1.0, trial[k + 1])
+        above = STRICT * OTHER_ORDER * constants[k + 1] * _norm(tolerances, y, y1, d, -1.0, trial[k + 1])
     memory[NEXT_ORDER] = k
     if not error <= 1.0:
         if below < here:
@@ -222,7 +222,7 @@ def _judge(options, memory, tolerances, trial, y, y1, d):
         elif higher > factor:
             memory[NEXT_ORDER] = k + 1
         factor = max(factor, lower, higher)
-        if 1.0 < factor < HOLD:
+        if 1.0 < factor < KEEP_BELOW:
             factor = 1.0
     else:
         factor = min(factor, 1.0)
@@ -292,7 +292,7 @@ def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if fixed and k < options[HIGHEST]:
         code = _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch)
     else:
-        code = _correct(f, w, options, t + h, _spread(h, k), prediction, rate, new_state, scratch[:n])
+        code = _correct(f, w, options, t + h, _corrector_length(h, k), prediction, rate, new_state, scratch[:n])
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
     y, y1, d = state[: 2 * n], new_state[: 2 * n], prediction

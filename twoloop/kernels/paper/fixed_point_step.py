@@ -10,11 +10,11 @@ from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.paper import iterations as at
 from twoloop.kernels.paper.iterations import (
     block,
-    conclude,
+    estimate_and_extrapolate,
     iterate_accelerations,
     iterate_first_order,
-    keep_rest,
     rests_of,
+    store_rest,
     vector,
 )
 from twoloop.kernels.steps.stages import (
@@ -39,7 +39,7 @@ def settle_runge_kutta(f, w, options, memory, tolerances, accepted):
             copy(trial[j], previous[j])
         memory[at.H_PREVIOUS] = memory[at.H_TRIAL]
         memory[at.HAS_PREVIOUS] = 1.0
-        keep_rest(rests_of(memory, s, n, tolerances))
+        store_rest(rests_of(memory, s, n, tolerances))
     memory[at.HAS_TRIAL] = 0.0
 
 
@@ -48,8 +48,8 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt a step by fixed-point iteration; to estimate the error, take a step of h and two of h/2.
 
     The result is that of the half steps, or with EXTRAPOLATION = 1 / (2^order - 1) their extrapolation with the whole
-    step, put back on the constraints. Stages are predicted from the polynomial through the stage accelerations of the
-    last accepted step, those of the half steps from the whole step's.
+    step, projected onto the constraints. The polynomial through the stage accelerations of the last accepted step
+    predicts the stages of the whole step, which in turn predict those of the half steps.
     """
     s, _, _, _, _, c = tableau_of(options)
     n = w.Q.size
@@ -92,8 +92,8 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
         )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
-        off = max(off, off_mid)  # the distance of the two half steps, from which the run continues
-        code, error = conclude(
+        off = max(off, off_mid)  # departure of the two half steps, from which the run continues
+        code, error = estimate_and_extrapolate(
             f, w, options[EXTRAPOLATION], options[INNER_TOL], t + h, tolerances, q, v, q_full, v_full, q1, v1
         )
         if code != DONE:
@@ -114,7 +114,7 @@ SUDDEN = 10.0  # value of `end_error` above which it counts; the paper's procedu
 
 @kernel(ATTEMPT)
 def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step as in Sects. 3.1-3.3: take a step of h and two of h/2; their difference is the error."""
+    """Attempt a step as in Sects. 3.1-3.3: one step of h and two of h/2, whose difference is the error."""
     s, _, _, _, _, _ = tableau_of(options)
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
@@ -146,7 +146,7 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
         )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
-        code, error = conclude(
+        code, error = estimate_and_extrapolate(
             f, w, options[EXTRAPOLATION], options[INNER_TOL], t + h, tolerances, q, v, q_full, v_full, q1, v1
         )
         if code != DONE:

@@ -4,7 +4,7 @@
 `iterate_first_order` is the paper's loop on y_i = [v_i, q_i]. They are compiled in the steps that call them,
 fixed_point_step.py. Equation numbers are the paper's.
 
-Richardson's estimate: the difference of one step and two half steps is the error, and may improve the result.
+Richardson's estimate: the difference of one step and two half steps is the error, and may be used to extrapolate.
 """
 
 import numpy as np
@@ -47,28 +47,28 @@ def vector(memory, s, n, which):
 
 @inlined
 def rests_of(memory, s, n, tolerances):
-    """Return the rows of REST; none with step-size control, whose errors exceed rounding."""
+    """Return the rows of REST; no rows with step-size control, whose errors exceed rounding."""
     start, count = N_MEMORY_SCALARS + (N_BLOCKS * s + REST) * n, N_RESTS if tolerances[ESTIMATE] == 0.0 else 0
     return memory[start : start + count * n].reshape((count, n))
 
 
 @merged
-def keep_rest(rest):
-    """Store the rests of an accepted attempt for the next step."""
+def store_rest(rest):
+    """Store the rounding errors of an accepted attempt for the next step."""
     for i in range(rest.shape[0] // 2):
         copy(rest[rest.shape[0] // 2 + i], rest[i])
 
 
 MAX_ITERATIONS = 60
-MAX_ITERATIONS_PAPER = 200  # the paper gives no limit; (33) ends a divergent loop long before
-GROWTH = 1e3  # largest growth of the differences: they may grow at first, because the iteration is not normal
-PATIENCE = 8  # number of iterations after which a difference that grows again means divergence
+MAX_ITERATIONS_PAPER = 200  # the paper gives no limit; (33) ends a divergent loop long before this
+GROWTH = 1e3  # largest growth of the changes: at first they may grow, because the iteration matrix is not normal
+PATIENCE = 8  # number of iterations after which a growing change means divergence
 UNDECIDED, CONVERGED, DIVERGED = range(3)
 
 
 @merged
 def _judge(change, before, first, iteration, tolerance, q):
-    """Decide whether an iteration has converged, from its changes (last, before, first) and the rounding of q."""
+    """Return UNDECIDED, CONVERGED or DIVERGED, from the last, previous and first change and the rounding of q."""
     if change <= tolerance:
         return CONVERGED
     if not change <= GROWTH * first:
@@ -83,15 +83,15 @@ def _judge(change, before, first, iteration, tolerance, q):
 
 @exact
 def _compensated(x, rest, increment):
-    """Return the sum of the three, and its rounding error (W. Kahan, Commun. ACM 8 (1965), 40)."""
+    """Return the sum of the arguments, and its rounding error (W. Kahan, Commun. ACM 8 (1965), 40)."""
     increment += rest
     total = x + increment
     return total, increment - (total - x)
 
 
 @merged
-def _forget(coordinates, rest):
-    """Clear the rests of coordinates that the constraints determine."""
+def _clear_rests(coordinates, rest):
+    """Clear the rounding errors of coordinates that the constraints determine."""
     for i in range(N_RESTS // 2, rest.shape[0]):
         for m in coordinates:
             rest[i, m] = 0.0
@@ -99,13 +99,12 @@ def _forget(coordinates, rest):
 
 @compiled
 def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1, rest):
-    """Make a step of size h from (q, v) by a fixed-point iteration on the stage accelerations.
+    """Take a step of size h from (q, v) by a fixed-point iteration on the stage accelerations.
 
-    A_stage holds their prediction on entry.
-    Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k have the same solution as (17); for
-    undamped systems the iteration's rate is the square of the first-order one. On return A_stage has converged and
-    (q1, v1) is the end of the step, on the constraints. The sums are compensated where `rest` has rows. Returns the
-    code, and how far the prediction of the dependents was off.
+    A_stage is their prediction on entry; on return it has converged, and (q1, v1) is the end of the step, on the
+    constraints. Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k have the same solution as
+    (17); for undamped systems the iteration's rate is the square of the first-order one. The sums are compensated
+    where `rest` has rows. Returns the code, and the departure of the predicted dependents.
     """
     s, A, A2, b, bA, c = tableau_of(options)
     n = q.size
@@ -121,7 +120,7 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
     verdict = UNDECIDED
     for iteration in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1
-        # set all stages before any is evaluated: Gauss-Seidel would converge for smaller h only
+        # compute all stages before evaluating any: in Gauss-Seidel order the iteration converges for smaller h only
         for j in range(s):
             for m in w.independent:
                 in_q = 0.0
@@ -161,7 +160,7 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
         else:
             q1[m], rest[2, m] = _compensated(q[m], rest[0, m], h * v[m] + h * h * in_q)
             v1[m], rest[3, m] = _compensated(v[m], rest[1, m], h * in_v)
-    _forget(w.dependent, rest)
+    _clear_rests(w.dependent, rest)
     return project_prediction(f, w, tolerances, t + h, h, q, v, q1, v1, tolerance)
 
 
@@ -176,11 +175,10 @@ def _largest_change(coordinates, q, v, q_old, v_old):
 
 @compiled
 def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1):
-    """Make a step of size h by the paper's outer loop on y_i = [v_i, q_i]: Euler start, tests (32) and (33).
+    """Take a step of size h by the paper's outer loop on y_i = [v_i, q_i]: Euler start, tests (32) and (33).
 
-    `a` is the acceleration at (t, q, v); K_j = [a_j; v_j] are the rows of A_stage and V_stage. An iteration goes from
-    stage to stage with the latest K, in the manner of Gauss and Seidel. On return (q1, v1) is the end of the step, on
-    the constraints.
+    `a` is the acceleration at (t, q, v); K_j = [a_j; v_j] are the rows of A_stage and V_stage. An iteration updates one
+    stage after another with the latest K (Gauss-Seidel). On return (q1, v1) is the end of the step, on the constraints.
     """
     s, A, _, b, _, c = tableau_of(options)
     n = q.size
@@ -257,8 +255,8 @@ def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
 
 
 @compiled
-def conclude(f, w, share, inner_tol, t, tolerances, q, v, q_full, v_full, q1, v1):
-    """Return the error of two half steps and, if a share is given, extrapolate them with the whole step."""
+def estimate_and_extrapolate(f, w, share, inner_tol, t, tolerances, q, v, q_full, v_full, q1, v1):
+    """Return the error of two half steps; if a share is given, extrapolate these with the whole step."""
     error = _richardson_error(tolerances, share > 0.0, q, v, q_full, v_full, q1, v1)
     if not (share > 0.0 and error <= 1.0):
         return DONE, error

@@ -9,8 +9,8 @@ from twoloop.kernels.evaluation.inner_loop import evaluate_state, rounding_floor
 from twoloop.kernels.linalg.dense import copy
 
 MAX_ITERATIONS = 60
-GROWN = 2.0  # ratio of the size to that before the step above which most of it comes from this step
-TINY = 1e-300  # a mechanism at rest at the origin has neither size nor rate
+GROWN = 2.0  # ratio of the size to that before the step above which most of it is due to this step
+TINY = 1e-300  # replaces size and rate of a mechanism at rest at the origin
 
 # places in `memory` before the new accelerations
 SIZE, SPEED, ACCELERATION, N_MEMORY_SCALARS = range(4)
@@ -31,8 +31,8 @@ def _rate(memory, gap, q, v, a, q1, v1, a1):
     """Return the reciprocal of the time in which velocities and accelerations change the coordinates as a whole.
 
     It uses the largest values so far, because at a single time coordinates may be near zero, wherever the origin is. If
-    most of their size comes from this step, as from rest at the origin, they say nothing of that time, which is then
-    taken as at least `gap`.
+    most of their size is due to this step, as after rest at the origin, they do not determine that time: it is then at
+    least `gap`.
     """
     memory[SIZE] = _largest(q, memory[SIZE])
     memory[SPEED] = _largest(v, memory[SPEED])
@@ -63,7 +63,7 @@ def _error(options, tolerances, rate, h, q, v, a, a1):
 
 @kernel(ATTEMPT)
 def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step: (12) for the independents, inner loop, accelerations, until these no longer change."""
+    """Attempt a step: (12) for the independents, inner loop, accelerations, repeated until the latter converge."""
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
@@ -71,7 +71,7 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
     a_new = memory[N_MEMORY_SCALARS : N_MEMORY_SCALARS + n]
     for m in range(n):
         a1[m] = a[m]
-        q1[m] = q[m] + h * v[m] + 0.5 * h * h * a[m]  # for the dependent coordinates, start values of Newton's method
+        q1[m] = q[m] + h * v[m] + 0.5 * h * h * a[m]  # for the dependents these are start values of Newton's method
     before = np.inf
     for _ in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1

@@ -1,1 +1,1 @@
-"""Steps of the integration methods: one file for each outer loop, and files for their parts."""
+"""Steps of the integration methods: one file for each outer loop, and files for common parts."""

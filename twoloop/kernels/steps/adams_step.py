@@ -1,9 +1,9 @@
 """Step of the Adams methods, orders 1 to 12, for all coordinates: predict, evaluate, correct, evaluate.
 
-Variable order and step in modified divided differences of a, as Krogh's DVDQ and Shampine and Gordon's STEP have them,
-for second-order equations: positions are the double integral of the polynomial through the accelerations, velocities
-the single one. The first evaluation is at the prediction, off the constraints by its error; the second is at the
-corrected state, projected onto them. Differences are of all coordinates, so that a new partition needs no conversion.
+Variable order and step in modified divided differences of a, as in Krogh's DVDQ and Shampine and Gordon's STEP, for
+second-order equations: positions are the double integral of the polynomial through the accelerations, velocities the
+single one. The first evaluation is at the prediction, off the constraints by its error; the second is at the corrected
+state, projected onto them. Differences are of all coordinates, so that a new partition needs no conversion.
 
 With t_n the times of the accepted steps, psi_i(n) = t_n - t_{n-i}, and i counted from 1 as in the literature:
 beta_i = prod_{j<i} psi_j(n+1) / psi_j(n), and on the step, s from 0 to 1, the polynomial through the last k
@@ -20,10 +20,10 @@ from twoloop.kernels.evaluation.inner_loop import evaluate_as_given, project
 
 HIGHEST = 12  # largest order; above 13 the nodes below would not be exact
 N_TERMS = HIGHEST + 2  # number of differences of a step, and of coefficients g and G
-STRICT = 5.0  # factor on an estimate: errors of many short steps add up, and then come close to the tolerance
+STRICT = 5.0  # factor on the error estimate: errors of many short steps add up, and then come close to the tolerance
 SAFETY = 0.8  # safety factor of the step factor
 GROWTH, SHRINKAGE = 1.2, 0.5  # limits of the step factor ...
-START_GROWTH = 2.0  # ... while the order still rises with every step
+START_GROWTH = 2.0  # ... and its upper limit while the order still rises with every step
 LEAST_FACTOR = 0.1  # smallest step factor after a step whose dependents are far from the prediction
 RESTART_AFTER = 3  # number of failures in a row after which the method restarts with order 1
 
@@ -32,19 +32,19 @@ NODES, WEIGHTS = (0.5 * (1.0 + x) if k == 0 else 0.5 * x for k, x in enumerate(n
 REST = WEIGHTS * (1.0 - NODES)
 
 
-def _equal_steps():
-    """Return |g_k - g_k+1| of equal steps by the order k: the error of velocities over h times a difference."""
+def _error_constants():
+    """Return |g_k - g_k+1| of equal steps for each order k: the error of velocities over h times a difference."""
     coefficients = np.ones(HIGHEST + 1)
     for k in range(1, HIGHEST + 1):
         coefficients[k] = -np.sum(coefficients[:k] / np.arange(k + 1.0, 1.0, -1.0))
     return np.abs(coefficients)
 
 
-# error constants; a step much shorter than those before has smaller ones, but not if the force jumps within it
-EQUAL_STEPS = _equal_steps()
+# error constants; those of the present steps are smaller after a decrease of h, but not correct if the force jumps
+EQUAL_STEPS = _error_constants()
 
 # places in `options`
-THETA, N_OPTIONS = range(2)  # a second evaluation that moved a position by more is repeated
+THETA, N_OPTIONS = range(2)  # THETA: a second evaluation that moves a position by more is repeated
 # places in `memory`: scalars, rows of coefficients (N_TERMS + 1 each), then tables; see _table
 (
     WHICH,  # index of the table of the last accepted step
@@ -92,7 +92,7 @@ def _scratch(memory, n):
 
 @kernel(SETTLE)
 def settle_adams(f, w, options, memory, tolerances, accepted):
-    """Make an accepted attempt part of the history; otherwise record that it failed."""
+    """Make an accepted attempt part of the history; count a rejected one."""
     if not accepted:
         memory[FAILED] += 1.0
         memory[AGE] = 0.0
@@ -134,7 +134,7 @@ def _coefficients(memory, h, k):
     for i in range(N_TERMS):
         new_psi[i + 1] = psi[i] + h
     beta[0] = 1.0
-    for i in range(k):  # all quotients first, so that none waits for the one before
+    for i in range(k):  # compute all quotients first, so that divisions do not wait for one another
         beta[i + 1] = new_psi[i] / psi[i] if psi[i] > 0.0 else 0.0
     for i in range(k):
         beta[i + 1] *= beta[i]
@@ -161,7 +161,7 @@ def _predict(memory, h, k, old, new, state, q1, v1, n):
     in_v, in_q = _scratch(memory, n)
     for m in range(0, old.shape[1], 4):
         d0, d1, d2, d3 = old[N_TERMS, m], old[N_TERMS, m + 1], old[N_TERMS, m + 2], old[N_TERMS, m + 3]
-        # an accepted step adds d to this: phi_k+2 = d - beta_k+1 phi_k+1
+        # if the step is accepted, d is added to this: phi_k+2 = d - beta_k+1 phi_k+1
         b = beta[k]
         new[k + 1, m] = -b * (old[k, m] + d0)
         new[k + 1, m + 1] = -b * (old[k, m + 1] + d1)
@@ -217,7 +217,7 @@ def _error(g, G, h, order, largest_v, largest_q):
 
 
 @merged
-def _next(memory, h, k, table, d, n):
+def _choose_order(memory, h, k, table, d, n):
     """Return the largest error of the attempt over the tolerances and the step factor; choose the next order.
 
     Order rules are those of STEP: lower if the error would not be larger; higher if it would be smaller, after k + 1
@@ -277,7 +277,7 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
     old, new = _table(memory, n, memory[WHICH]), _table(memory, n, 1.0 - memory[WHICH])
     _coefficients(memory, h, k)
     _predict(memory, h, k, old, new, state, q1, v1, n)
-    memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # used if the evaluation fails
+    memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # used if the attempt fails
     code = evaluate_as_given(f, w, t + h, q1, v1, a1)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
@@ -290,7 +290,7 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
         per_v[m] = STRICT / (tolerances[ATOL + m] + rtol * max(abs(v[m]), abs(v1[m])))
     for m in range(n):
         per_q[m] = STRICT / (tolerances[ATOL + m] + rtol * max(abs(q[m]), abs(q1[m])))
-    error, factor = _next(memory, h, k, new, d, n)
+    error, factor = _choose_order(memory, h, k, new, d, n)
     if not error <= 1.0:
         return Attempt(DONE, error, factor)
     g, G = _row(memory, SPEED)[k], _row(memory, PLACE)[k]

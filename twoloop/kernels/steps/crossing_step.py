@@ -8,7 +8,7 @@ motion, and the fixed-point iteration converges as it does elsewhere.
 - At a distance s from the position (relative, as pivots measure it) rounding changes positions by eps/s, velocities by
   eps/s^2 and accelerations by eps/s^3. Nodes at which this would show are left out: the accelerations there are those
   of the polynomial through the other nodes on both sides, because the motion through the position is analytic.
-- Of the state at the beginning only q and v enter the result: its accelerations may be rounding.
+- Only q and v at the beginning enter the result: the accelerations there may be rounding.
 - The end is put on the constraints with a partition of its own.
 - Stages are projected by the generated code of the mechanism. A partition is chosen at a stage only where there is no
   such code, or where its pivots are too small.
@@ -54,11 +54,11 @@ SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2  # of a polynomial, relative to its le
 # longest part of a step without a node, relative to the step, if all nodes are evaluated
 UNSEEN = 0.0767
 BACK = 0.4  # part of the polynomial before the state from which the step begins
-ORDER, SHARE = 12.0, 0.5  # order of the estimated error; and factor on it
+ORDER, SHARE = 12.0, 0.5  # order of the estimated error; factor on the estimate
 MOVED = 0.5  # weight of the correction of a stage by its projection, as an error
 ROUNDING = 1e-13  # relative: accuracy of the iteration in steps without an estimate, and of times
 NEARER = 0.5  # smallest ratio of the pivots at the end and at the start of a step ...
-ENDS = 4.0  # ... and 1 below so many times the pivot at which nodes are left out
+ENDS = 4.0  # ... unless the pivot at the end is this many times the one below which nodes are left out
 FOUND = 2.0  # error and factor returned with a polynomial that was found, so that its pieces follow
 SMALL = 1e-300  # replaces a coefficient of zero
 
@@ -362,7 +362,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     last_0, last_1, last_2 = -1, -1, -1  # nodes from which the first sweep extrapolates
     for sweep in range(MOST):
         change, moved = 0.0, 0.0
-        chooses = sweep in (0, 2, FEW)  # whether nodes are left out anew
+        chooses = sweep in (0, 2, FEW)  # whether to choose anew which nodes are left out
         if estimated and chooses and sweep == FEW:
             near = min(FARTHER * near, NEAR_MOST)
         for i in range(S):
@@ -386,7 +386,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if chooses:
                 code = renew_partition(f, w, time, q_stage)
                 left_out[j] = 0.0
-                if code == DONE:  # a run that begins near the position has not seen larger ones
+                if code == DONE:  # a run that begins near the position has only seen small pivots
                     largest_pivot = max(largest_pivot, w.notes[PIVOT])
                 if estimated and (code != DONE or w.notes[PIVOT] < near * largest_pivot):
                     left_out[j], code = 1.0, DONE
@@ -430,7 +430,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             converged = True
             break
         _set_base(whole, c_base, to_v, to_q, a, q_base, v_base, q_0, v_0)
-        # most rejected steps are rejected for their end, which is known well enough by now
+        # most rejections are due to the end of the step, which is accurate enough for that test by now
         if sweep == 1 and estimated:
             _integrate(whole, 1.0, b, bA, a, q_0, v_0, q1, v1)
             code = _choose_partition_at_end(f, w, t + h, q1, pivot, near * largest_pivot)

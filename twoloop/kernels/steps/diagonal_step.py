@@ -6,18 +6,18 @@ stage j, z = gamma h:
     F(t_j, Q, V) - a = 0,  V = v_j + z a,  Q = q_j + z V,
     v_j = v + h sum_k a_jk a_k,  q_j = q + h sum_k a_jk V_k over the stages before.
 
-The corrections d solve (I - z^2 J_q - z J_v) d = F - a with the derivatives of the right-hand side F. Where the
-system gives tangents, they are those of each iterate: stiff directions turn as the body moves, and after the turn of a
+The corrections d solve (I - z^2 J_q - z J_v) d = F - a with the derivatives of the right-hand side F. If the system
+gives tangents, each iterate has its own derivatives: stiff directions turn as the body moves, and after the turn of a
 large step an older matrix no longer contracts. Methods whose stages are solved together, as in newton_step.py, share
 one matrix.
 
-The dense matrix of one iteration from tangents is factored as it stands, T^T (M - z^2 K - z D) T: no inverse of T^T M T
-is applied to the derivatives, as newton_systems.py does for many systems. This is half the work where a matrix serves
-one iteration only.
+The dense matrix of one iteration from tangents is factored as it stands, T^T (M - z^2 K - z D) T, whereas
+newton_systems.py first applies the inverse of T^T M T to the derivatives, for many systems. This is half the work
+where a matrix serves one iteration only.
 
 With step-size control TR-BDF2 continues from the embedded formula of order 3, with the difference filtered three times,
-which leaves the method L-stable: so the errors of many short steps add up to the tolerance, and not to their number
-times it.
+which keeps the method L-stable: then the errors of many short steps add up to the tolerance, and not to the tolerance
+times their number.
 """
 
 import numpy as np
@@ -88,7 +88,7 @@ def _symmetric(A):
 
 @compiled
 def _fill(w, memory, n, m, z, H):
-    """Compute T^T M T - z^2 T^T K T - z T^T D T into H."""
+    """Compute the matrix T^T M T - z^2 T^T K T - z T^T D T into H."""
     N, Kr, Dr = space(w, n, at.SYSTEMS), space(w, n, at.BY_Q), space(w, n, at.BY_V)
     square = z * z
     if memory[at.DAMPED] == 1.0:
@@ -100,8 +100,8 @@ def _fill(w, memory, n, m, z, H):
 
 
 @compiled
-def factor_again(w, memory, z):
-    """Factor the matrix at the last state for another z."""
+def refactor(w, memory, z):
+    """Factor the matrix for another z, with the tangents of the last state."""
     n, m = w.Q.size, w.independent.size
     numbers = space(w, n, at.FILTER)
     H = square(numbers, m)
@@ -118,7 +118,7 @@ def factor_again(w, memory, z):
 
 @compiled
 def factor_iteration(f, w, memory, t, q, v, z):
-    """Factor the matrix at a state that was evaluated just before, with its multipliers in w.lam."""
+    """Factor the matrix at a state that was just evaluated, with its multipliers in w.lam."""
     n = q.size
     m = w.independent.size
     w.counters[N_JACOBIANS] += 1
@@ -138,7 +138,7 @@ def factor_iteration(f, w, memory, t, q, v, z):
     if memory[at.DAMPED] == 1.0:
         reduce(w, K, AT, square(space(w, n, at.BY_V), m))
     reduce(w, w.M, AT, square(space(w, n, at.SYSTEMS), m))
-    return factor_again(w, memory, z)
+    return refactor(w, memory, z)
 
 
 @compiled
@@ -153,7 +153,7 @@ def _solve_iteration(w, memory, x):
 
 @compiled
 def solve_iteration(w, memory, residual, a):
-    """Add the correction to the independent coordinates of a; it replaces the residual (n_q)."""
+    """Add the correction to the independent coordinates of a; the residual (n_q) becomes the correction."""
     n = w.Q.size
     m = w.independent.size
     N, x = square(space(w, n, at.SYSTEMS), m), vector(memory, 1, n, at.V_MOVED)[:m]
@@ -187,7 +187,7 @@ def filter_by_iteration(w, memory, z, e_q, e_v):
 MAX_ITERATIONS = 8
 GROWTH = 2.0  # growth of a correction above which the iteration fails
 SHARE_IF_LINEAR = 0.01  # relative to the tolerance of the outer loop, if the iteration does not converge quadratically
-KEPT_WHILE = 0.1  # contraction up to which differenced derivatives are reused
+KEEP_CONTRACTION = 0.1  # contraction up to which differenced derivatives are reused
 SHARE_OF_VELOCITY = 0.1  # weight of a correction measured by the position error that its velocity causes
 
 
@@ -204,13 +204,13 @@ def stages_of(memory, s, n):
 
 @merged
 def gamma_of(options):
-    """Return the diagonal entry of A."""
+    """Return gamma, the diagonal entry of A."""
     s = int(options[TAIL])
     return options[TAIL + s * s]
 
 
 @merged
-def _place(z, q_bar, v_bar, a, Q, V):
+def _set_stage_state(z, q_bar, v_bar, a, Q, V):
     """Set the independent Q and V from the acceleration a of the stage, and start values of the dependent ones."""
     for m in range(Q.size):
         V[m] = v_bar[m] + z * a[m]
@@ -219,7 +219,7 @@ def _place(z, q_bar, v_bar, a, Q, V):
 
 @merged
 def has_dense_tangents(f, w):
-    """Return whether each iteration has its own matrix, which is factored in the form T^T (M - z^2 K - z D) T."""
+    """Return whether each iteration factors a matrix of its own, T^T (M - z^2 K - z D) T."""
     return (
         f.flags[FORCE_BY_Q_GIVEN] == 1
         and f.flags[BANDWIDTH] < 0
@@ -230,13 +230,13 @@ def has_dense_tangents(f, w):
 
 @merged
 def one_stage_of(options):
-    """Return the number of stages, 1, hidden from the compiler: it would compile newton_systems.py again for a 1."""
+    """Return the number of stages, 1; a literal 1 would make the compiler specialize newton_systems.py for it."""
     return int(options[STAGES])
 
 
 @compiled
 def _prepare(f, w, options, memory, t, h, Q, V, F):
-    """Prepare factors for an iteration at (Q, V), evaluated just before, with accelerations F; return the code."""
+    """Prepare factors for an iteration at (Q, V), just evaluated, with accelerations F; return the code."""
     if f.flags[FORCE_BY_Q_GIVEN] == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
         memory[at.HAS_JACOBIAN] = 1.0
@@ -254,7 +254,7 @@ def _prepare(f, w, options, memory, t, h, Q, V, F):
 
 @compiled
 def solve_stage(f, w, options, memory, t, h, A_stage):
-    """Solve one stage by Newton's method from A_stage (1, n_q); return the code; (Q, V) are in Q_MID, V_MID."""
+    """Solve one stage by Newton's method from A_stage (1, n_q), with (Q, V) in Q_MID, V_MID; return the code."""
     n = w.Q.size
     z = h * gamma_of(options)
     q_bar, v_bar = block(memory, 1, n, at.PREVIOUS)[0], block(memory, 1, n, at.TRIAL)[0]
@@ -265,7 +265,7 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
     before = 0.0
     for iteration in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1
-        _place(z, q_bar, v_bar, a, Q, V)
+        _set_stage_state(z, q_bar, v_bar, a, Q, V)
         code = evaluate(f, w, t, Q, V, options[INNER_TOL], F)
         if code != DONE:
             return code
@@ -304,7 +304,7 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
             share = 1.0 if tangents_given else SHARE_IF_LINEAR
             if contraction < 1.0 and contraction / (1.0 - contraction) * change <= share * options[OUTER_TOL]:
                 break
-            if contraction > KEPT_WHILE and memory[at.FRESH] == 0.0:
+            if contraction > KEEP_CONTRACTION and memory[at.FRESH] == 0.0:
                 memory[at.HAS_JACOBIAN] = 0.0
         if iteration == MAX_ITERATIONS - 1:
             return OUTER_DIVERGED
@@ -315,11 +315,11 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
     return DONE
 
 
-# number of filters: with fewer the extrapolated method is unstable for vibrations, see tests/kernels/test_diagonal.py
-FILTERED = 3
+# number of filters: with fewer, extrapolation is unstable for vibrations, see tests/kernels/test_diagonal.py
+N_FILTERS = 3
 
-# relative to the width of accelerations that jump: if `lower` misses this much, its difference counts in full
-AT_JUMP = 0.174
+# largest error of `lower` at a jump, relative to the width of the accelerations: its difference then counts in full
+JUMP_SHARE = 0.174
 
 
 @compiled
@@ -337,15 +337,15 @@ def _filter(f, w, options, memory, h, e_q, e_v):
 
 @compiled
 def _factor_filter(f, w, options, memory, h):
-    """Compute the factors of `_filter` for steps of h."""
+    """Compute the factors that `_filter` uses for steps of h; return the code."""
     if has_dense_tangents(f, w):
-        return factor_again(w, memory, h * gamma_of(options))
+        return refactor(w, memory, h * gamma_of(options))
     return factor_filter(f, w, options, memory, one_stage_of(options), h)
 
 
 @compiled
 def _difference(w, h, V_stage, A_stage, weights, share, e_q, e_v):
-    """Compute `share` times the weighted sum of the stages for the independent coordinates; n_dof numbers each."""
+    """Compute `share` times h times the weighted sum of the stages, for the independent coordinates (n_dof)."""
     for i in range(w.independent.size):
         j = w.independent[i]
         in_q, in_v = 0.0, 0.0
@@ -357,8 +357,8 @@ def _difference(w, h, V_stage, A_stage, weights, share, e_q, e_v):
 
 
 @compiled
-def _renew(f, w, options, memory, t, h, new_state):
-    """Compute derivatives at the end of the step, and their factors."""
+def _renew_derivatives(f, w, options, memory, t, h, new_state):
+    """Compute derivatives at the end of the step, and their factors; return the code."""
     n = w.Q.size
     Q, V, F = vector(memory, 1, n, at.Q_MID), vector(memory, 1, n, at.V_MID), vector(memory, 1, n, at.A_MID)
     copy(new_state[:n], Q)
@@ -396,7 +396,7 @@ def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A
         f, w, options, memory, 1, t + h, z, tolerances, raw, e_q, e_v, state, new_state, A_stage[-1]
     ):
         memory[at.CHANGED] = 1.0
-        if _renew(f, w, options, memory, t + h, h, new_state) != DONE:
+        if _renew_derivatives(f, w, options, memory, t + h, h, new_state) != DONE:
             return np.inf
         _difference(w, h, V_stage, A_stage, weights, share, e_q, e_v)
         copy(e_v, raw)
@@ -416,9 +416,9 @@ def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A
 
 @compiled
 def _extrapolate(f, w, options, memory, h, q1, v1):
-    """Replace the end of the step by that of the embedded formula; the difference has already been filtered twice."""
+    """Replace the end of the step by that of the embedded formula; the difference has been filtered twice before."""
     e_q, e_v = vector(memory, 1, w.Q.size, at.E_Q), vector(memory, 1, w.Q.size, at.E_V)
-    for _ in range(2, FILTERED):
+    for _ in range(2, N_FILTERS):
         _filter(f, w, options, memory, h, e_q, e_v)
     for i in range(w.independent.size):
         q1[w.independent[i]] -= e_q[i]
@@ -427,7 +427,7 @@ def _extrapolate(f, w, options, memory, h, q1, v1):
 
 @compiled
 def _slow_error(f, w, options, memory, h, tolerances, state, new_state, A_stage):
-    """Return the error that an error of the velocities, in E_V, leaves in slow directions, as in newton_step.py."""
+    """Return the error that velocity errors (E_V) leave in slow directions, as in newton_step.py."""
     n = w.Q.size
     e_q, e_v = vector(memory, 1, n, at.E_Q), vector(memory, 1, n, at.E_V)
     longest = motion_time(w, tolerances, state, state[2 * n :])
@@ -441,7 +441,7 @@ def _slow_error(f, w, options, memory, h, tolerances, state, new_state, A_stage)
     longer = STEPS_TO_DECAY * h / gamma_of(options)
     if _factor_filter(f, w, options, memory, longer) == DONE:
         _filter(f, w, options, memory, longer, e_q, e_v)
-        # if the motion is unstable the system may be nearly singular, and the solution large
+        # where the motion is unstable the system may be nearly singular, and the solution too large
         error = min(error, velocity_error(w, tolerances, e_v, longest, state, new_state))
     memory[at.H_FACTORED] = 0.0
     return error
@@ -449,11 +449,11 @@ def _slow_error(f, w, options, memory, h, tolerances, state, new_state, A_stage)
 
 @compiled
 def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, lower):
-    """Return the error by `lower`, weights of another embedded formula, for jumps of accelerations.
+    """Return the error that `lower`, the weights of another embedded formula, shows where accelerations jump.
 
     The weights of the first formula are so small at the stages of the first half that a jump there hardly shows.
-    `lower` is exact for accelerations quadratic in time. If these are smooth, it misses a small share of their width,
-    and its difference counts less by that factor, so that it is of a higher order than the first estimate.
+    `lower` is exact for accelerations quadratic in time. The error of smooth ones is a small share of their width: its
+    difference is multiplied by this share, which makes it of a higher order than the first estimate.
     """
     n = w.Q.size
     missed, widest = 0.0, 0.0
@@ -468,7 +468,7 @@ def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V
         return 0.0
     if memory[at.H_FACTORED] == 0.0 and _factor_filter(f, w, options, memory, h) != DONE:
         return np.inf
-    share = min(1.0, missed / (AT_JUMP * widest))
+    share = min(1.0, missed / (JUMP_SHARE * widest))
     error = _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, lower, share)
     if error <= 1.0:
         error = max(error, _slow_error(f, w, options, memory, h, tolerances, state, new_state, A_stage))
@@ -481,7 +481,7 @@ def settle_diagonal(f, w, options, memory, tolerances, accepted):
     if accepted:
         s = int(options[TAIL])
         _, A_stage, a_end = stages_of(memory, s, w.Q.size)
-        copy(A_stage[s - 1], a_end)  # F at the state would magnify the residual of Newton's method by the stiffness
+        copy(A_stage[s - 1], a_end)  # F at the state would be the residual of Newton's method times the stiffness
         memory[at.FRESH] = 0.0
 
 
@@ -502,7 +502,7 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
         memory[at.PARTITION_NUMBER] = w.notes[GENERATION]
         memory[at.HAS_JACOBIAN] = 0.0
         copy(a, a_end)
-    if memory[at.FRESH] == 0.0 and memory[at.CONTRACTION] > KEPT_WHILE:
+    if memory[at.FRESH] == 0.0 and memory[at.CONTRACTION] > KEEP_CONTRACTION:
         memory[at.HAS_JACOBIAN] = 0.0
     copy(v, V_stage[0])
     copy(a_end, A_stage[0])
@@ -527,7 +527,7 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
             return Attempt(code, np.inf, 0.0)
         copy(V, V_stage[j])
     copy(V, v1)
-    for m in w.dependent:  # by the formula, to be compared with those that the constraints give
+    for m in w.dependent:  # prediction by the formula, to be compared with the values that the constraints give
         q1[m] = q_bar[m] + h * A[s - 1, s - 1] * V[m]
     for m in w.independent:
         q1[m] = Q[m]

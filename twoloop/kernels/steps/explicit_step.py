@@ -1,16 +1,16 @@
 """Step of an explicit Runge-Kutta method for (q_i, v_i): every stage is one evaluation, without an outer loop.
 
 The tableau is any whose first stage is the state itself and that estimates its error by two embedded formulas. The
-inner loop restores the dependents of every stage, so that the step never leaves the constraints. With FREE, unlike in
-the paper's procedure, all coordinates are integrated alike: stages are not projected, but off the constraints by the
-error of the formula; only the end of the step is projected.
+inner loop restores the dependents of every stage, so that the step never leaves the constraints. With FREE all
+coordinates are integrated alike, unlike in the paper: stages are off the constraints by the error of the formula, and
+only the end of the step is projected.
 """
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twoloop.kernels.control.step_size import commit_nothing, departure, store_prediction
-from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, inlined, kernel, times_gap
+from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, gap_ratio, inlined, kernel
 from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, LEAST, N_OUTER, NEARLY_SINGULAR, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_as_given, evaluate_state, project
 from twoloop.kernels.linalg.dense import copy
@@ -20,8 +20,8 @@ STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)  # FREE: stages are not pro
 # vectors in `memory`, then the slopes of the stages. Each has 2 n_q numbers, and zeros up to a multiple of BLOCK
 STAGE, FINE, COARSE, N_VECTORS = range(4)
 BLOCK = 8
-# factor on errors once a singular position was near, as errors of the phase grow from one passage to the next, but no
-# tolerance becomes smaller than LEAST_STRICT by it
+# factor on errors once a singular position was near, because errors of the phase grow from one passage to the next; it
+# makes no tolerance smaller than LEAST_STRICT
 STRICT, LEAST_STRICT = 10.0, 1e-11
 
 
@@ -80,7 +80,7 @@ def _slopes(memory, s, n):
 
 @compiled
 def _weighted(weights, slopes, total):
-    """Compute the sum of weights[k] slopes[k], block by block, each in registers."""
+    """Compute the sum of weights[k] slopes[k], block by block, each block in registers."""
     for m in range(0, total.size, BLOCK):
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
         for k in range(weights.size):
@@ -113,11 +113,11 @@ def _move(y, h, weights, slopes, total, y1):
 
 @compiled
 def largest_error(tolerances, y, y1, one, other, strict):
-    """Return e^2 / sqrt(e^2 + d^2) of the largest components of both estimates, of q and v, dependents too.
+    """Return e^2 / sqrt(e^2 + d^2) of the largest components e and d of both estimates, of q and v, dependents too.
 
-    Each is an estimate over atol + rtol |y|. Taken component by component e^2 / sqrt(e^2 + d^2) would be e, of low
-    order, where d passes through zero: up to 30 % more evaluations. If `strict`, e^(3/2) / (e^2 + d^2)^(1/4): near a
-    singular position terms of high order are not small, and 1.4 tolerances were estimated where 47 were lost.
+    Estimates are relative to atol + rtol |y|. Component by component e^2 / sqrt(e^2 + d^2) would be e, of low order,
+    where d passes through zero: up to 30 % more evaluations. If `strict`, e^(3/2) / (e^2 + d^2)^(1/4): near a singular
+    position terms of high order are not small (an error of 47 tolerances was estimated as 1.4).
     """
     n = one.size // 2
     rtol = tolerances[RTOL]
@@ -155,10 +155,10 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
     stage, one, other = _vector(memory, n, STAGE), _vector(memory, n, FINE), _vector(memory, n, COARSE)
     slopes = _slopes(memory, s, n)
-    # near a singular position it matters on which side of it a stage is, and how exactly velocities satisfy the rows
+    # near a singular position, the side of it on which a stage is and the exact velocities matter
     near = options[FREE] == 1.0 and w.notes[NEARLY_SINGULAR] != 0.0
     free = options[FREE] == 1.0 and not near
-    longer = times_gap(tolerances, h)
+    longer = gap_ratio(tolerances, h)
     if longer > 0.0 and not free:
         return Attempt(DONE, longer, 1.0 / longer)
     w.counters[N_OUTER] += 1

@@ -2,13 +2,13 @@
 
 The stages are found by fixed-point iteration without any Jacobian, as in the paper, all of them at once. The generated
 code of generate/collocation_code.py does the arithmetic; this file chooses the step size. (M. Antonana, J. Makazaga and
-A. Murua iterate so on ordinary differential equations at high precision, arXiv 2511.03655.)
+A. Murua use the same iteration for ordinary differential equations at high precision, arXiv 2511.03655.)
 
 One sweep over the stages multiplies their error by the contraction rho, which grows with the step size and with the
 derivatives of the accelerations. Two things limit the step size:
 
-- convergence: a given number of sweeps is to suffice;
-- accuracy: the last Legendre coefficients of the accelerations are to be as small as the tolerance asks for.
+- convergence: a target number of sweeps has to suffice;
+- accuracy: the last Legendre coefficients of the accelerations have to be as small as the tolerance requires.
 
 The integrator calls for one step at a time, or for several in a row while it has nothing to check between them. The
 ends of steps in a row are projected onto the constraints together, one in each lane.
@@ -17,10 +17,10 @@ ends of steps in a row are projected onto the constraints together, one in each 
 import math
 
 from twoloop.kernels.control import loop_state as at
-from twoloop.kernels.control.singular_positions import COLLAPSED, SHORT, SINGULAR_PIVOT
+from twoloop.kernels.control.singular_positions import COLLAPSED, SHORT_STEP, SINGULAR_PIVOT
 from twoloop.kernels.control.step_size import count_step, departure, off_grid, store_prediction
 from twoloop.kernels.data import collocation as room_at
-from twoloop.kernels.data.collocation import GUESSED, LANES, LEFT, MADE, REFUSED, places
+from twoloop.kernels.data.collocation import CONVERGED, GUESSED, LANES, NOT_COMPUTED, REFUSED, places
 from twoloop.kernels.data.common import (
     ATTEMPT,
     MANY,
@@ -60,42 +60,42 @@ from twoloop.kernels.evaluation.inner_loop import check_redundant, project, rene
 from twoloop.kernels.evaluation.partition import MIN_CORRECTION
 from twoloop.kernels.linalg.dense import copy
 
-# FREE: longest step, in units of LOOK, whose nodes alone are close enough; a longer one is audited between its nodes
+# FREE: longest step, in units of LOOK, whose nodes alone are close enough; longer ones are also checked between nodes
 THETA, N_ITERATED, N_ROWS, FREE, N_OPTIONS = range(5)
 
-WANTED_START = 0.12  # contraction aimed at in the first step, between the limits of collocation_code.py
-MOST_STARTS = 4
-SHORTER, SAFETY = 0.6, 0.75
+WANTED_START = 0.12  # target of the contraction in the first step, between the limits of collocation_code.py
+MOST_STARTS = 4  # largest number of guesses of the first step size
+SHORTER, SAFETY = 0.6, 0.75  # factor after a step that did not converge; safety factor of the error
 # number of steps limited by convergence after which another method takes over, because the motion is stiff; and the
 # value of CURVED below which accelerations hardly vary within a step
 LIMITED, STRAIGHT = 24.0, 0.1
-# number of parts of a step at whose ends pivots are checked, and their least ratio to the first
+# number of parts of a step at whose ends pivots are checked, and their least ratio to the pivot at the beginning
 N_CHECKED, MUCH_NEARER = 4, 0.4
-# tolerance below which another method takes over behind a singular position: here five more runs of A02 were wrong
-TIGHT = 1e-8
-REFUSALS = 12.0  # limit of UNMADE: each accepted step lowers it by 1 and each step that did not converge raises it by 2
-# longest part of a step without an evaluation after an audit, relative to the step: half that between two nodes
-BETWEEN = 0.0908
-EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
+# tolerance below which another method takes over after a singular position: here five more runs of A02 were wrong
+TIGHT_TOLERANCE = 1e-8
+REFUSALS = 12.0  # limit of FAILURES: an accepted step lowers it by 1, a step that did not converge raises it by 2
+# longest part of a step without an evaluation if also checked between nodes, relative to the step
+CHECKED_GAP = 0.0908
+N_EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3  # largest factor: in the first N_EARLY steps, and after them
 GROWTH_AT_ONCE = 30.0  # largest factor after a step at the beginning that needed a single sweep
-LEAST_TREND, FAR = 0.4, 3.0
+LEAST_TREND, MAX_EXTRAPOLATION = 0.4, 3.0  # limits of the trend of the step size, and of its factor by the error
 _places = merged(places)
 
 
 def memory_size(n, n_iterated, n_rows):
-    """Return the length of `memory`, with a margin for alignment."""
+    """Return the length of `memory`, with a margin for its alignment."""
     return places(n, n_iterated, n_rows)[-1] + LANES
 
 
 @inlined
-def _room(memory):
-    """Return the memory from the first place that is aligned for vector loads."""
+def _aligned(memory):
+    """Return the memory from the first address that is aligned for vector loads."""
     return memory[(-(memory.ctypes.data >> 3)) & (LANES - 1) :]
 
 
 @merged
-def _keep_refused(f, room, state):
-    """Let the polynomial of a step whose error is too large predict the shorter step that replaces it."""
+def _predict_from_rejected(f, room, state):
+    """Make the polynomial of a step whose error is too large predict the shorter step that replaces it."""
     f.retry_nodes(room, state)
     if room[room_at.KEPT_DEGREE] == 0.0:
         room[room_at.KEPT_DEGREE] = max(room[room_at.DEGREE], 3.0)
@@ -106,7 +106,7 @@ def _keep_refused(f, room, state):
 def _collocate(f, w, options, room, tolerances, t, h, state):
     """Iterate the stages of a step; return how the iteration ended, the error, and the factor of the next step size."""
     first, estimated = room[room_at.PREDICTS] == 0.0, tolerances[ESTIMATE] == 1.0
-    longest = tolerances[LOOK] / BETWEEN
+    longest = tolerances[LOOK] / CHECKED_GAP
     if estimated and h > longest * (1.0 + SLACK):
         return REFUSED, h / longest, longest / h
     room[room_at.T], room[room_at.H], room[room_at.DEFECT] = t, h, -1.0
@@ -122,26 +122,26 @@ def _collocate(f, w, options, room, tolerances, t, h, state):
     if ended == GUESSED:
         room[room_at.STARTS] += 1.0
         return ended, 2.0, min(max(WANTED_START / room[room_at.RHO], 0.05), 30.0)
-    if ended != MADE:
-        room[room_at.UNMADE] += 2.0
+    if ended != CONVERGED:
+        room[room_at.FAILURES] += 2.0
         return ended, 2.0, SHORTER
     if not estimated:
-        return MADE, 0.0, 1.0
+        return CONVERGED, 0.0, 1.0
     error = room[room_at.ERROR]
     if not error <= 1.0:
-        _keep_refused(f, room, state)
+        _predict_from_rejected(f, room, state)
         return REFUSED, error, min(max(0.9 * room[room_at.FACTOR_OF_ERROR], 0.3), 0.9)
-    most = GROWTH_EARLY if room[room_at.N_STEPS] < EARLY else GROWTH
+    most = GROWTH_EARLY if room[room_at.N_STEPS] < N_EARLY else GROWTH
     if most > GROWTH and m == 1:
         most = GROWTH_AT_ONCE
     if h > options[FREE] * tolerances[LOOK] * (1.0 + SLACK):
         w.counters[N_EVALUATIONS] += LANES
         defect = f.audit_nodes(room, state, f.own_numbers)
         if defect < 0.0:
-            return LEFT, 2.0, SHORTER
+            return NOT_COMPUTED, 2.0, SHORTER
         of_defect = 0.9 * room[room_at.FACTOR_OF_DEFECT]
         if defect > 1.0:
-            _keep_refused(f, room, state)
+            _predict_from_rejected(f, room, state)
             return REFUSED, defect, max(0.3, of_defect)
         room[room_at.DEFECT] = defect
         most = min(most, of_defect)
@@ -151,33 +151,33 @@ def _collocate(f, w, options, room, tolerances, t, h, state):
     limited = room[room_at.CURVED] < STRAIGHT and beyond >= -1.0
     room[room_at.LIMITED] = max(0.0, room[room_at.LIMITED] + (1.0 if limited else -1.0))
     factor = room[room_at.FACTOR]
-    # the step size that accuracy allows is extrapolated: it mostly changes as it did from the step before to this one
-    allowed_h = h * min(room[room_at.FACTOR_OF_ERROR], FAR)
+    # extrapolate the step size that accuracy allows: it mostly changes as it did from the step before to this one
+    allowed_h = h * min(room[room_at.FACTOR_OF_ERROR], MAX_EXTRAPOLATION)
     if error > 1e-6 and room[room_at.CURVED] >= STRAIGHT:
         trend = 1.0 if first else min(max(allowed_h / room[room_at.ALLOWED_H], LEAST_TREND), 1.0)
         factor = min(factor, SAFETY * trend * room[room_at.FACTOR_OF_ERROR])
     room[room_at.ALLOWED_H] = allowed_h
     if beyond > 1.0:
         most = min(most, 0.9)
-    return MADE, error, min(max(factor, 0.4), most)
+    return CONVERGED, error, min(max(factor, 0.4), most)
 
 
 @merged
 def _accept(room):
-    """Let the polynomial of this step predict the next."""
+    """Make the polynomial of this step predict the next one."""
     if room[room_at.KEPT_DEGREE] > 0.0:
         room[room_at.NEXT_DEGREE], room[room_at.KEPT_DEGREE] = room[room_at.KEPT_DEGREE], 0.0
     room[room_at.WHICH] = 1.0 - room[room_at.WHICH]
     room[room_at.DEGREE], room[room_at.H_BEFORE] = room[room_at.NEXT_DEGREE], room[room_at.H]
-    room[room_at.PREDICTS], room[room_at.UNMADE] = 1.0, max(0.0, room[room_at.UNMADE] - 1.0)
+    room[room_at.PREDICTS], room[room_at.FAILURES] = 1.0, max(0.0, room[room_at.FAILURES] - 1.0)
     room[room_at.N_STEPS] += 1.0
 
 
 @merged
 def _is_unsuited(w, room, tolerances):
     """Return whether another method has to take over: near a singular position, or if stiffness limits the steps."""
-    stiff = room[room_at.LIMITED] >= LIMITED or room[room_at.UNMADE] >= REFUSALS
-    near = w.notes[NEAR_NOW] == 1.0 or tolerances[LEAST] < TIGHT
+    stiff = room[room_at.LIMITED] >= LIMITED or room[room_at.FAILURES] >= REFUSALS
+    near = w.notes[NEAR_NOW] == 1.0 or tolerances[LEAST] < TIGHT_TOLERANCE
     return stiff or (w.notes[NEARLY_SINGULAR] == 1.0 and near)
 
 
@@ -202,8 +202,8 @@ def _passes_singular(f, w, t, h, state, new_state):
 
 @kernel(SETTLE)
 def settle_lobatto(f, w, options, memory, tolerances, accepted):
-    """Commit a step: the polynomial of an accepted one predicts the next."""
-    room = _room(memory)
+    """Commit or discard an attempt: the polynomial of an accepted step predicts the next one."""
+    room = _aligned(memory)
     if accepted and room[room_at.TRIED] == 1.0:
         _accept(room)
     room[room_at.TRIED] = 0.0
@@ -211,15 +211,15 @@ def settle_lobatto(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt one step."""
-    room, n = _room(memory), w.Q.size
+    """Attempt one step and project its end onto the constraints."""
+    room, n = _aligned(memory), w.Q.size
     room[room_at.TRIED] = 0.0
     if tolerances[ESTIMATE] == 1.0 and _is_unsuited(w, room, tolerances):
         return Attempt(UNSUITED, math.inf, 0.0)
     ended, error, factor = _collocate(f, w, options, room, tolerances, t, h, state)
-    if ended == LEFT or (ended == REFUSED and tolerances[ESTIMATE] == 0.0):
+    if ended == NOT_COMPUTED or (ended == REFUSED and tolerances[ESTIMATE] == 0.0):
         return Attempt(OUTER_DIVERGED, math.inf, 0.0)
-    if ended != MADE:
+    if ended != CONVERGED:
         return Attempt(DONE, error, factor)
     w.notes[DEFECT] = room[room_at.DEFECT]
     f.end_nodes(room, state, new_state)
@@ -230,7 +230,7 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if code == DONE:
         error = max(error, departure(w, tolerances, h, state[:n], state[n : 2 * n], q1))
     if code == DONE and error <= 1.0 and w.notes[NEARLY_SINGULAR] == 1.0 and tolerances[ESTIMATE] == 1.0:
-        w.notes[NEAR_NOW] = 2.0  # pivots are checked behind the step, too
+        w.notes[NEAR_NOW] = 2.0  # also check the pivots after the step
         if _passes_singular(f, w, t, h, state, new_state):
             code = SINGULAR
     return Attempt(code, error, factor if error <= 1.0 else 0.0)
@@ -247,9 +247,9 @@ def _project_all(f, w, options, room, n, n_ends, out_t, out_state):
             room[ends + LANES * (1 + i) + k] = out_state[row, i]
         room[room_at.FINE + k] = 1.0
     least = max(options[THETA], MIN_CORRECTION * w.notes[ROUNDED])
-    f.closer_ends(room, f.own_numbers)
+    f.correct_ends(room, f.own_numbers)
     for _ in range(4):
-        f.nearer_ends(room, f.own_numbers)
+        f.project_ends(room, f.own_numbers)
         w.counters[N_INNER] += n_ends
         w.counters[N_FACTORIZATIONS] += n_ends
         moved = 0.0
@@ -263,11 +263,11 @@ def _project_all(f, w, options, room, n, n_ends, out_t, out_state):
 
 
 @merged
-def _take(f, w, options, room, tolerances, driven, n, k, t, row, state):
+def _adopt_projection(f, w, options, room, tolerances, driven, n, k, t, row, state):
     """Replace `row` by its projection in lane k; return whether the projection moved it by the tolerance at most.
 
     Where constraints depend on time (`driven`), velocities are compared, too: a change that the accelerations at the
-    nodes do not explain may come from a discontinuity of the drive, see discontinuities.py.
+    nodes do not explain may be due to a discontinuity of the drive, see discontinuities.py.
     """
     _, _, _, _, _, ends, end_a, lam, _ = _places(n, int(options[N_ITERATED]), int(options[N_ROWS]))
     if room[room_at.FINE + k] == 0.0:
@@ -294,16 +294,16 @@ def _take(f, w, options, room, tolerances, driven, n, k, t, row, state):
 
 @merged
 def _may_follow(w, room, tolerances, control, clock, h):
-    """Return whether a step of this length may be taken without a check by the integrator before it."""
+    """Return whether a step of this length may be taken before the integrator checks the previous one."""
     long = clock[at.H_LONG]
     if h <= control[at.SHORTEST] or h < COLLAPSED * long or _is_unsuited(w, room, tolerances):
         return False
     near = control[at.BRIDGE] == 1.0 and w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]
-    return not (near and h < SHORT * long)
+    return not (near and h < SHORT_STEP * long)
 
 
 @merged
-def _make(f, w, options, room, tolerances, control, clock, goal, state, n_most, out_t, out_state, out_steps):
+def _advance(f, w, options, room, tolerances, control, clock, goal, state, n_most, out_t, out_state, out_steps):
     """Take at most n_most steps in a row without projecting their ends; return their number."""
     n, t, n_ends = w.Q.size, clock[at.T], 0
     while n_ends < n_most and t < goal:
@@ -314,9 +314,9 @@ def _make(f, w, options, room, tolerances, control, clock, goal, state, n_most, 
         if reaches:
             h = goal - t
         ended, _, factor = _collocate(f, w, options, room, tolerances, t, h, state)
-        if ended == LEFT:
+        if ended == NOT_COMPUTED:
             break
-        if ended != MADE:
+        if ended != CONVERGED:
             clock[at.H_NEXT] = h * factor
             w.counters[N_REJECTED_ERROR] += 1 if ended == REFUSED else 0
             continue
@@ -338,10 +338,10 @@ def lobatto_steps(
 ):
     """Take steps in a row, at most as many as there are lanes, and project their ends together; return their number.
 
-    A group ends if the number of accepted steps is a multiple of the lanes, whatever else makes the integrator pause:
-    which steps are projected together depends on the run alone, so that results can be repeated.
+    A group ends when the number of accepted steps is a multiple of the lanes, even if the integrator has paused within
+    it: then the grouping depends on the run alone, and results can be repeated.
     """
-    room, n = _room(memory), w.Q.size
+    room, n = _aligned(memory), w.Q.size
     if out_t.size < LANES or w.notes[NEARLY_SINGULAR] == 1.0:
         return 0
     if control[at.FIRST_GIVEN] == 1.0:
@@ -351,13 +351,13 @@ def lobatto_steps(
         n_most = int(control[at.MAX_STEPS]) - w.counters[N_ACCEPTED]
     copy(state, new_state)
     driven = control[at.DRIVEN] == 1.0
-    n_ends = _make(f, w, options, room, tolerances, control, clock, goal, state, n_most, out_t, out_state, out_steps)
+    n_ends = _advance(f, w, options, room, tolerances, control, clock, goal, state, n_most, out_t, out_state, out_steps)
     if n_ends == 0:
         return 0
     _project_all(f, w, options, room, n, n_ends, out_t, out_state)
     for k in range(n_ends):
         h = out_steps[k, at.H]
-        if not _take(f, w, options, room, tolerances, driven, n, k, out_t[k], out_state[k], state):
+        if not _adopt_projection(f, w, options, room, tolerances, driven, n, k, out_t[k], out_state[k], state):
             if k == 0:
                 copy(new_state, state)
             clock[at.H_NEXT], room[room_at.PREDICTS] = SHORTER * h, 0.0

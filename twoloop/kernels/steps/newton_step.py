@@ -44,12 +44,12 @@ from twoloop.kernels.steps.stages import (
 from twoloop.kernels.steps.velocity_errors import STEPS_TO_DECAY, filtered_velocity_error, motion_time, velocity_error
 
 SLOW = 0.05  # contraction above which the derivatives are renewed before the next step
-STAGNATION_FIXED = 1e-9  # as STAGNATION, for fixed steps, relative to max(1, |value|)
+STAGNATION_FIXED = 1e-9  # STAGNATION of fixed steps, relative to max(1, |value|)
 
 
 @compiled
 def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
-    """Solve for the stage accelerations, predicted in A_stage, by Newton's method; return the code."""
+    """Solve for the stage accelerations by Newton's method from their prediction in A_stage; return the code."""
     s, A, A2, _, _, c = tableau_of(options)
     n = q.size
     residual = block(memory, s, n, at.RESIDUAL)
@@ -171,10 +171,10 @@ def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
 
 @compiled
 def _slow_error(f, w, options, memory, h, tolerances, state, new_state):
-    """Return the error that an error of the velocities, in E_V, leaves in directions that are slow beside the step.
+    """Return the error that velocity errors (E_V) leave in directions that are slow relative to the step.
 
-    The fastest part of an error shows how long all of it lasts. The part left a few steps later lasts as long as the
-    motion itself.
+    The rate of change of an error is that of its fastest component. So the component that is left after a few steps is
+    taken to last as long as the motion itself.
     """
     s, n = int(options[STAGES]), w.Q.size
     z = STEPS_TO_DECAY * h / options[eigen_place(s) + at.GAMMA0]
@@ -187,7 +187,7 @@ def _slow_error(f, w, options, memory, h, tolerances, state, new_state):
         e_q[i] = 0.0
     if factor_filter(f, w, options, memory, s, z) == DONE:
         filter_error(f, w, options, memory, s, z, e_q, e_v)
-        # if the motion is unstable the system may be nearly singular, and the solution large
+        # where the motion is unstable the system may be nearly singular, and the solution too large
         error = min(error, velocity_error(w, tolerances, e_v, longest, state, new_state))
     if factor_filter(f, w, options, memory, s, h) != DONE:
         memory[at.H_FACTORED] = 0.0
@@ -226,8 +226,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     node = middle_node(c)
     while True:
         if memory[at.HAS_JACOBIAN] == 0.0:
-            # stiff directions turn as the body moves: in the middle they are at most half a step's turn from any
-            # stage's. The time is that of a stage, so that the derivatives see no force that the stages do not see
+            # stiff directions turn as the body moves: those in the middle differ least from those of all stages. The
+            # time is that of a stage, so that the derivatives see no force that the stages do not see
             x = node * h
             for m in range(n):
                 q_mid[m] = q[m] + x * (v[m] + 0.5 * x * a[m])
@@ -258,7 +258,7 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             break
         if memory[at.FRESH] == 1.0 and (node == 0.0 or code != OUTER_DIVERGED):
             return Attempt(code, np.inf, 0.0)
-        # the middle by the accelerations may be far off, for example where friction is no longer stiff
+        # extrapolation by the accelerations may miss the middle, for example where friction is no longer stiff
         if memory[at.FRESH] == 1.0:
             node = 0.0
         memory[at.HAS_JACOBIAN] = 0.0

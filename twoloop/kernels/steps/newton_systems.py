@@ -6,14 +6,14 @@ v = T v_i are the velocities that the constraints allow, T = [I; -Cqd^-1 Cqi], t
 
     T^T (M - z^2 K - z D) T x = T^T M T r,    K, D = derivatives by q, v of Q - Cq^T lam, lam held
 
-but for how T and M change with the position and Q_d with the velocity. That term, zero for linear constraints, has no
-stiffness, and a simplified Newton may leave it out: at a tolerance the steps are the same, but fixed steps in which a
-body turns by some 0.4 rad on its constraints may fail where differences of the right-hand side converge. X = T x is
+except for the changes of T and M with the position, and of Q_d with the velocity. These terms, zero for linear
+constraints, have no stiffness, and a simplified Newton may leave them out: at a tolerance the steps are the same, but
+fixed steps in which a body turns by some 0.4 rad may fail where differences of the right-hand side converge. X = T x is
 also the solution of a matrix with a border,
 
     [[M - z^2 K - z D, Cq^T], [Cq, 0]] [X; mu] = [M T r; 0].
 
-Three storages serve:
+There are three kinds of storage:
 
 - dense: J_q and J_v, (n_dof, n_dof), from the tangents K and D that the system gives, else by differences of the
   right-hand side;
@@ -22,8 +22,8 @@ Three storages serve:
   1974, doi 10.1093/imamat/13.1.117). On the beam of 32 elements, sparse factors take 2.5 to 7 times as long;
 - sparse, for large systems, of which all coordinates count as independent: static factors of the matrix with the
   border, its right-hand side [M r; G r]. K and D are differenced in groups of columns. Each time, the change that they
-  predict is compared with a displacement of all coordinates at once: if entries are missing, which no position showed
-  when the pattern was made, another storage has to take over.
+  predict is compared with the effect of displacing all coordinates at once: if entries are missing, which were zero
+  when the pattern was recorded, another storage has to take over.
 """
 
 import numpy as np
@@ -95,14 +95,14 @@ SAME_STEP = 1e-9  # relative: steps are differences of times, so that equal step
 STAGNATION = 0.1  # relative to the step tolerance: corrections of this size that no longer shrink are rounding
 
 DIFFERENCE = 1e-7  # displacement for derivatives, relative to max(1, |value|)
-# factors between displacements that are made at once, so that their effects do not cancel
+# factors between displacements made at once, so that their effects do not cancel: UNEQUAL^k, k below N_UNEQUAL
 UNEQUAL, N_UNEQUAL = 0.37, 7
 
 # --- tangents: K and D, of which only the band |i - j| <= b is used
 
 
 @inlined
-def displaced_with_all(value, place):
+def displace_unequally(value, place):
     """Displace a coordinate or velocity along with all others, by unequal amounts, so that nothing cancels."""
     return value + DIFFERENCE * max(1.0, abs(value)) * (1.0 + UNEQUAL * (place % N_UNEQUAL))
 
@@ -125,7 +125,7 @@ def _finite(A, b):
 
 @compiled
 def _constraints_bend(f, w, t, q):
-    """Return whether C_q at q differs from w.G; leaves it in w.Gx."""
+    """Return whether C_q at q differs from w.G; w.Gx becomes C_q at q."""
     w.Gx[:, :] = 0.0
     constraint_rows(f, w, t, q, w.Gx)
     for i in range(w.C.size):
@@ -140,7 +140,7 @@ def _subtract_reaction_differences(f, w, t, q, moved, b, K):
     """Subtract d(Cq^T lam)/dq from K, by displacing coordinates j, j + 2 b + 1, ... at once."""
     n = q.size
     for j in range(n):
-        moved[j] = displaced_with_all(q[j], j)
+        moved[j] = displace_unequally(q[j], j)
     if not _constraints_bend(f, w, t, moved):
         return
     width = min(n, 2 * b + 1)
@@ -159,7 +159,7 @@ def _subtract_reaction_differences(f, w, t, q, moved, b, K):
 
 @compiled
 def tangent_by_q(f, w, t, q, v, b, moved, K, R):
-    """Compute the band |i - j| <= b of K (n_q, n_q), at a state that was evaluated just before."""
+    """Compute the band |i - j| <= b of K (n_q, n_q), at a state that was just evaluated."""
     _clear(K, b)
     f.force_by_q(t, q, v, f.p, K)
     if f.flags[REACTION_BY_Q_GIVEN] == 1:
@@ -211,11 +211,11 @@ def reduce(w, A, AT, B):
 
 @compiled
 def _dense_from_tangents(f, w, memory, s, t, q, v):
-    """Compute J_q and J_v from the tangents of the system, at a state that was evaluated just before."""
+    """Compute J_q and J_v from the tangents of the system, at a state that was just evaluated."""
     n = q.size
     m = w.independent.size
     w.counters[N_JACOBIANS] += 1
-    # factors are no longer needed: their spaces hold K or D, then T^T M T and T^T A
+    # factors are no longer needed: K or D use their memory, then T^T M T and T^T A
     K, R = square(space(w, n, FILTER), n), square(space(w, n, SYSTEMS), n)
     code = tangent_by_q(f, w, t, q, v, n - 1, vector(memory, s, n, Q_MOVED), K, R)
     if code != DONE:
@@ -241,7 +241,7 @@ def _dense_from_tangents(f, w, memory, s, t, q, v):
 
 @compiled
 def _dense_derivatives(f, w, options, memory, s, t, q, v, a):
-    """Compute J_q and J_v at (t, q, v), whose accelerations a were evaluated just before."""
+    """Compute J_q and J_v at (t, q, v), whose accelerations a were just evaluated."""
     if f.flags[FORCE_BY_Q_GIVEN] == 1 and w.Rate.size == w.C.size:
         return _dense_from_tangents(f, w, memory, s, t, q, v)
     n = q.size
@@ -262,11 +262,11 @@ def _dense_derivatives(f, w, options, memory, s, t, q, v, a):
         for row in range(m):
             i = w.independent[row]
             Jq[row, column] = (a_new[i] - a[i]) / size
-    # one displacement of all velocities shows whether there is anything to difference
+    # displace all velocities at once: if nothing changes, no differences are needed
     copy(q, q_moved)
     for column in range(m):
         j = w.independent[column]
-        v_moved[j] = displaced_with_all(v[j], column)
+        v_moved[j] = displace_unequally(v[j], column)
     code = evaluate(f, w, t, q_moved, v_moved, options[INNER_TOL], a_new)
     if code != DONE:
         return code
@@ -401,7 +401,7 @@ def _band_from_tangents(f, w, memory, s, t, q, v, b):
 
 @compiled
 def _banded_derivatives(f, w, memory, s, t, q, v):
-    """Compute K and D at a state that was evaluated just before."""
+    """Compute K and D at a state that was just evaluated."""
     n = q.size
     b = f.flags[BANDWIDTH]
     w.counters[N_JACOBIANS] += 1
@@ -421,9 +421,9 @@ def _banded_derivatives(f, w, memory, s, t, q, v):
     code = _difference_groups(f, w, t, q, v, False, base, moved, b, _band(space(w, n, BY_Q), n, b))
     if code != DONE:
         return code
-    # one displacement of all velocities shows whether there is anything to difference
+    # displace all velocities at once: if nothing changes, no differences are needed
     for j in range(n):
-        moved[j] = displaced_with_all(v[j], j)
+        moved[j] = displace_unequally(v[j], j)
     _banded_residual(f, w, t, q, moved)
     memory[DAMPED] = 0.0
     for i in range(n):
@@ -469,7 +469,7 @@ def _solve_for_independents(w, b, numbers, pivots, substitute, x):
     """Solve with the full right-hand side x (n_q); its first n_dof numbers become the independent coordinates."""
     Cq, _, _ = _border(w, x.size, w.rows.size, b)
     solve_bordered(w, b, Cq, numbers, pivots, substitute, x)
-    for k in range(w.independent.size):  # ascending, so that none is overwritten before its turn
+    for k in range(w.independent.size):  # ascending, so that no number is overwritten before it is read
         x[k] = x[w.independent[k]]
 
 
@@ -501,8 +501,8 @@ def _filter_banded(f, w, options, memory, s, h, e_q, e_v):
 
 
 # --- sparse storage, of all coordinates
-# relative to the change that the entries of a row predict: a larger difference shows that entries are missing
-MISSED = 0.2
+# relative to the change that the entries of a row predict: a larger deviation shows that entries are missing
+MAX_DEVIATION = 0.2
 NOISE = 1e-13  # relative to the largest force: rounding errors of a difference
 N_SPARSE_VECTORS = 3  # number of vectors of all coordinates: the force, the displaced force, and the displaced state
 
@@ -517,7 +517,7 @@ def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_eigenvalu
 
 @inlined
 def _sparse_state(f, w):
-    """Return the numbers of M, G, K and D, and for each row whether it was independent and how much it stiffens M."""
+    """Return the numbers of M, G, K and D, and for each row whether it is independent and how much it stiffens M."""
     n_mass, n_jacobian, n_rows = w.mass_values.size, w.jacobian_values.size, w.counts.size
     a = n_mass + n_jacobian
     b = a + mass_of(f.newton_program)[0].size - n_mass
@@ -552,7 +552,7 @@ def _sparse_vectors(f, w):
 
 @inlined
 def _sparse_factors(f, w, k):
-    """Return the factors for gamma0, k = 0, or the complex ones of the (k - 1)-th eigenvalue, as real numbers."""
+    """Return the factors for gamma0 (k = 0), or for eigenvalue k - 1: complex numbers as pairs of real numbers."""
     n = f.newton_program[N_PIVOTS]
     one = n + 2 * f.newton_program[N_OFF]
     begin = w.mass_values.size + w.jacobian_values.size + (N_SPARSE_VECTORS + 7) * n
@@ -603,7 +603,7 @@ def _sparse_differences(f, w, t, q, v, by_v, base, other, moved, entries):
 
 
 @compiled
-def _explains(f, base, other, given, moved, largest, entries, predicted):
+def _entries_explain(f, base, other, given, moved, largest, entries, predicted):
     """Return whether these entries explain the change from base to other; `predicted` is scratch."""
     rows, columns, _ = tangents_of(f.newton_program)
     predicted[:] = 0.0
@@ -614,13 +614,13 @@ def _explains(f, base, other, given, moved, largest, entries, predicted):
         predicted[i] += abs(part)
     worst = 0.0
     for i in range(base.size):
-        worst = max(worst, abs(other[i] - base[i]) - MISSED * predicted[i])
+        worst = max(worst, abs(other[i] - base[i]) - MAX_DEVIATION * predicted[i])
     return worst <= NOISE * largest
 
 
 @compiled
 def _sparse_derivatives(f, w, memory, t, q, v):
-    """Compute K and D at a state that was evaluated just before; return NEEDS_DENSE if entries are missing."""
+    """Compute K and D at a state that was just evaluated; return NEEDS_DENSE if entries are missing."""
     if f.newton_program.size == 0:
         return NEEDS_DENSE
     w.counters[N_JACOBIANS] += 1
@@ -635,12 +635,12 @@ def _sparse_derivatives(f, w, memory, t, q, v):
     if code != DONE:
         return code
     for j in range(q.size):
-        moved[j] = displaced_with_all(q[j], j)
+        moved[j] = displace_unequally(q[j], j)
     _sparse_residual(f, w, t, moved, v, True, other)
-    complete = _explains(f, base, other, q, moved, largest, K, sizes[: q.size])
+    complete = _entries_explain(f, base, other, q, moved, largest, K, sizes[: q.size])
     copy(jacobian, w.jacobian_values)
     for j in range(q.size):
-        moved[j] = displaced_with_all(v[j], j)
+        moved[j] = displace_unequally(v[j], j)
     _sparse_residual(f, w, t, q, moved, False, other)
     memory[DAMPED] = 0.0
     for i in range(q.size):
@@ -653,9 +653,9 @@ def _sparse_derivatives(f, w, memory, t, q, v):
     if code != DONE:
         return code
     for j in range(q.size):
-        moved[j] = displaced_with_all(v[j], j)
+        moved[j] = displace_unequally(v[j], j)
     _sparse_residual(f, w, t, q, moved, False, other)
-    complete = _explains(f, base, other, v, moved, largest, D, sizes[: q.size]) and complete
+    complete = _entries_explain(f, base, other, v, moved, largest, D, sizes[: q.size]) and complete
     return DONE if complete else NEEDS_DENSE
 
 
@@ -669,7 +669,7 @@ def _factor_sparse(f, w, z, values):
 
 @compiled
 def _sparse_right_side(f, w, r, right):
-    """Compute [M r; G r], with M as the matrix has it where redundant rows stiffen it."""
+    """Compute the right-hand side [M r; G r]; M includes the stiffening by redundant rows."""
     mass, jacobian, _, _, counts, stiffness = _sparse_state(f, w)
     right[:] = 0.0
     rows, columns, _ = mass_of(f.newton_program)
@@ -701,7 +701,7 @@ def _filter_sparse(f, w, options, s, h, e_q, e_v):
 
 @compiled
 def derivatives_at(f, w, options, memory, s, t, q, v, a):
-    """Compute derivatives at a state (q, v) that was evaluated just before, with a as its accelerations."""
+    """Compute derivatives at a state (q, v) that was just evaluated, with accelerations a."""
     if f.flags[FORM] == STATIC:
         return _sparse_derivatives(f, w, memory, t, q, v)
     if f.flags[BANDWIDTH] >= 0:
@@ -735,7 +735,7 @@ def _factor_system(f, w, memory, s, k, z):
 
 @compiled
 def factor_systems(f, w, options, memory, s, h):
-    """Factor the systems for steps of h, of gamma0 and of every eigenvalue."""
+    """Factor the systems of gamma0 and of every eigenvalue for steps of h; return the code."""
     place = eigen_place(s)
     n_eigen, n_real = count_eigenvalues(options, s), int(options[place + N_REAL])
     code = factor_filter(f, w, options, memory, s, h)
@@ -817,7 +817,7 @@ def correct(f, w, options, memory, s, residual, A_stage):
     n_eigen = count_eigenvalues(options, s)
     x = complex_vector(memory, s, n, n_eigen, 0)
     place += N_EIGEN_SCALARS + s
-    d = block(memory, s, n, Q_STAGE)  # unused between two evaluations
+    d = block(memory, s, n, Q_STAGE)  # not used between two evaluations
     d[:, :] = 0.0
     for k in range(n_eigen):
         row = place + 2

@@ -1,6 +1,6 @@
 """Common parts of implicit Runge-Kutta steps: parameters, prediction of stages, error at jumps, memory.
 
-Implicit steps take a third of the time of a cold first run, so they are loaded when a run needs them (`LazyStep`).
+To compile implicit steps takes a third of the time of the first run, so they are loaded when needed (`LazyStep`).
 """
 
 from importlib import import_module
@@ -14,11 +14,11 @@ from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed, compile
 from twoloop.kernels.data.indices import NOT_LOADED
 
 FARTHEST = 3.0  # largest step ratio over which the old stage polynomial is extrapolated
-# weight of `end_error` beside Richardson's estimate, because it serves jumps between ends and stages
+# weight of `end_error` beside Richardson's estimate, because it is meant for jumps between ends and stages only
 END_ERROR_WEIGHT = 0.01
 
-# places in `options`: scalars, then A (s, s), A A (s, s), b (s), b A (s), c (s) and two rows (s) for `end_error`.
-# EXTRAPOLATION: 1 / (2^order - 1), or 0 without; POWER: order - 1
+# indices in `options`: scalars, then A (s, s), A A (s, s), b (s), b A (s), c (s) and two rows (s) for `end_error`.
+# EXTRAPOLATION: 1 / (2^order - 1), or 0: no extrapolation; POWER: order - 1
 STAGES, INNER_TOL, OUTER_TOL, EXTRAPOLATION, OUTER_TEST, POWER, N_SCALARS = range(7)
 
 
@@ -32,7 +32,7 @@ def options_array(
     outer_test: float = 1.0,
     power: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Return the parameter block that `tableau_of` reads; `outer_test` 1: (32) over dependent coordinates too."""
+    """Return the parameter block that `tableau_of` reads; `outer_test` = 1: test (32) covers dependents, too."""
     A, b, c = np.asarray(A), np.asarray(b), np.asarray(c)
     scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation, outer_test, power])
     rows = (b, b @ A, c, _lagrange(c, 0.0), _lagrange(c, 1.0))
@@ -88,10 +88,10 @@ def interpolate(c, theta, A_stage, weights, a):
 def end_error(tolerances, options, h, state, new_state, A_stage):
     """Estimate the error of a step from the polynomial through the stage accelerations, over (26).
 
-    The accelerations of the stages differ by w, a term of order h. The polynomial through them misses that at an end of
-    the step by a term of order h^s. If terms fall evenly, by a factor f an order, that of the method's own order makes
-    the error h w f^(order - 1). Where terms do not fall, as at a jump of the force, even one between an end and the
-    stage beside it, the error is h w: steps shrink until it does not matter. It is no estimate to rely on alone: the
+    The accelerations of the stages differ by w, a term of order h. At an end of the step the polynomial through them is
+    off by a term of order h^s. If each order is smaller by the same factor f, the term of the method's own order is h w
+    f^(order - 1). At a jump of the force terms do not become smaller, and the error is h w: steps shrink until the jump
+    does not matter. This includes jumps between an end and its nearest stage. The estimate must not be used alone: the
     one term may pass through zero, and on pendulums errors of single steps then were 100 tolerances.
     """
     s, n = A_stage.shape
@@ -119,11 +119,11 @@ def end_error(tolerances, options, h, state, new_state, A_stage):
 
 
 # `options` of Newton's method: the parameter block above, then these scalars, the weights e (s) of the estimate, and
-# for each eigenvalue its real and imaginary part, and its row of T^-1 and column of T (s real, s imaginary parts
-# each). VELOCITIES: 1 if their error is tested, too
+# for each eigenvalue its real and imaginary part, its row of T^-1 and its column of T (s real, s imaginary parts each).
+# VELOCITIES: 1 if the error of velocities is tested, too
 N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
 
-# places in `memory`
+# indices in `memory`
 (
     HAS_TRIAL,
     H_TRIAL,
@@ -134,15 +134,15 @@ N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
     PARTITION_NUMBER,
     H_FACTORED,
     CONTRACTION,  # contraction of the last iteration
-    DAMPED,  # 0: no derivative by v
+    DAMPED,  # 0: forces do not depend on v
     SYMMETRIC,  # 1: the matrix of diagonal_step.py was factored as a symmetric one
-    DURATION,  # s: duration of an error of velocity; 0: not known
+    DURATION,  # s: how long an error of velocity lasts, see velocity_errors.py; 0: not known
     CHANGED,  # 1: diagonal_step.py has computed new derivatives at the end of the step
     N_MEMORY_SCALARS,
 ) = range(14)
 PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
-# spaces in w.matrices, of n_q^2 numbers each; from SYSTEMS on a complex pair for each eigenvalue
+# parts of w.matrices, of n_q^2 numbers each; from SYSTEMS on a complex pair for each eigenvalue
 BY_Q, BY_V, FILTER, SYSTEMS = range(4)
 
 
@@ -192,8 +192,8 @@ def n_matrices(n_eigenvalues: int) -> int:
     return SYSTEMS + 2 * n_eigenvalues
 
 
-# `options` are those of a Newton method of one stage, A = [[gamma]]; then the stages, A, c and b - b^ of this method,
-# and 1 if steps with an error estimate continue from the embedded formula
+# `options` are those of a Newton method of one stage, A = [[gamma]]; then the number of stages, A, c, b - b^ and
+# `lower` of this method, and 1 if steps with an error estimate continue from the embedded formula
 PLACE = N_SCALARS + 2 + 5
 TAIL = PLACE + N_EIGEN_SCALARS + 1 + 2 + 4
 
@@ -210,8 +210,8 @@ def diagonal_options(
 ) -> NDArray[np.float64]:
     """Return the parameter block: A (s, s) has zeros in its first row, then gamma on the diagonal; b is its last row.
 
-    `lower`: weights of the estimate for accelerations that jump. `embedded`: the embedded formula is the one of higher
-    order, from which steps continue.
+    `lower`: weights of the estimate for accelerations that jump. `embedded`: the embedded formula has the higher order,
+    and steps continue from it.
     """
     A, c, weights, lower = (np.asarray(x, dtype=np.float64) for x in (A, c, weights, lower))
     gamma = A[-1, -1]
@@ -223,7 +223,7 @@ def diagonal_options(
 def diagonal_memory(s: int, n_q: int) -> NDArray[np.float64]:
     """Allocate `memory`: that of a Newton method of one stage, then velocities and accelerations (s, n_q).
 
-    The accelerations (n_q) of the last stage of the last accepted step follow.
+    Last come the accelerations (n_q) of the last stage of the last accepted step.
     """
     return np.zeros(memory_size(1, 1, n_q) + (2 * s + 1) * n_q)
 
@@ -294,7 +294,7 @@ def complex_vector(memory, s, n, n_eigen, which):
 
 @kernel(ATTEMPT)
 def stop_to_load(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Stop the run, so that its caller can load the step."""
+    """Return NOT_LOADED, which stops the run, so that its caller loads the step."""
     return Attempt(NOT_LOADED, np.inf, 0.0)
 
 
@@ -302,7 +302,7 @@ PLACEHOLDER = Step(stop_to_load, commit_nothing)
 
 
 class LazyStep(NamedTuple):
-    """Name of a step: its module, such as "steps.newton_step", and its name there."""
+    """Reference to a step that is not imported yet: its module, such as "steps.newton_step", and its name there."""
 
     module: str
     name: str

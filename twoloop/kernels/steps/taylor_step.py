@@ -1,25 +1,25 @@
 """Step by the Taylor series of the motion, computed from the index-3 equations themselves.
 
-With G = [C_q; A] the motion obeys G v + G_t = 0 and M a + G^T lam = Q. Written for the coefficients of the series, of
-order k in a and lam and of order k + 1 in v, all but the last coefficients of a, lam and v are known, and these solve
+With G = [C_q; A] the motion satisfies G v + G_t = 0 and M a + G^T lam = Q. In the coefficients of the series, of order
+k in a and lam and of order k + 1 in v, all but the last coefficients of a, lam and v are known, and these solve
 
     M_0 a_k + G_0^T lam_k = r_k,    G_0 a_k = c_k,
 
-with the matrix of the accelerations at the beginning of the step, whose factors are there: one solution with them an
-order, and no derivative of the constraints beyond G (J. D. Pryce's structural analysis, BIT 41 (2001), 364-394, finds
-these offsets for any equations). What r and c need of G, M and Q follows from a program of products and functions, see
+with the matrix of the accelerations at the beginning of the step. Its factors exist already: each order takes one
+solution with them, and no derivative of the constraints beyond G (J. D. Pryce's structural analysis, BIT 41 (2001),
+364-394, finds these offsets for any equations). What r and c need of G, M and Q follows from a program, see
 `twoloop.generate.series`, and the recurrences for their coefficients (R. E. Moore, Interval Analysis (1966), ch. 11).
 
-The series has the order that the tolerance asks for, and the step the length at which its last terms are as large as
+The order of the series depends on the tolerance. The step is so long that the last terms of the series are as large as
 the tolerance (A. Jorba and M. Zou, Experimental Mathematics 14 (2005), 99-117). Time is counted in units of the step
-before, so that no power of a short time underflows. The end of the step is moved to the constraints.
+before, so that no power of a short time underflows. The end of the step is projected onto the constraints.
 
 Where no code is generated, the program of the series is interpreted, order by order.
 """
 
 import numpy as np
 
-from twoloop.kernels.control.step_size import departure, excess, store_prediction
+from twoloop.kernels.control.step_size import defect_ratio, departure, store_prediction
 from twoloop.kernels.data.common import (
     ATTEMPT,
     SETTLE,
@@ -27,10 +27,10 @@ from twoloop.kernels.data.common import (
     Attempt,
     Step,
     compiled,
+    gap_ratio,
     inlined,
     kernel,
     merged,
-    times_gap,
 )
 from twoloop.kernels.data.indices import (
     ATOL,
@@ -55,9 +55,9 @@ from twoloop.kernels.evaluation.tasks import EVALUATE_AS_GIVEN, SOLVE
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.linalg.saddle_point import solve_both
 
-# places in `options`: scalars (ORDER is that of the series of q); where each array of the program begins, and where the
-# last ends; then the arrays, integers by their bits. KEEP: consecutive
-# steps evaluate one series about the first state, to interpolate within a step
+# indices in `options`: scalars (ORDER is that of the series of q); where each array of the program begins and the last
+# one ends; then the arrays, integers by their bits. KEEP: consecutive steps evaluate one series about the first state,
+# to interpolate within a step
 ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, N_SCALARS = range(7)
 # arrays of a table; arrays of sums as twoloop.generate.series.Sums has them
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
@@ -75,12 +75,12 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns o
     NEXT_UNIT,
     LENGTH,  # length of the step that each series allows, in its unit
     NEXT_LENGTH,
-    TRIED,  # 1: the last attempt stored a series, which is used from now on if the attempt was accepted
+    TRIED,  # 1: the last attempt stored a series, which replaces the other one if the attempt was accepted
     PASSED,  # with KEEP: time since the state of the series, s
     TARGET,  # index of the series that is computed
-    # ratio of the step to LENGTH that the distance of its end from the constraints allowed before; 0: not known
+    # ratio of the step to LENGTH that the distance of its end from the constraints allowed last; 0: not known
     SHORTER,
-    ATTEMPTS,  # number of attempts, so that each attempt checks other places
+    ATTEMPTS,  # number of attempts: each one evaluates the defect at other times
     SUSPECTED,  # 1: a step was rejected for its defect at time SUSPECT, and no accepted step has reached that time
     SUSPECT,
     N_MEMORY_SCALARS,
@@ -96,7 +96,7 @@ def memory_size(order: int, n_q: int, n_rows: int, n_nodes: int, early: int, lat
 
 @inlined
 def accelerations_found(memory, n):
-    """Return the last numbers of `memory`: the accelerations of the series at one time."""
+    """Return the last numbers of `memory`: the accelerations that the series gives at one time."""
     return memory[memory.size - n :]
 
 
@@ -157,7 +157,7 @@ def _gather(options, sums, groups, g, more, values, out):
 
 @merged
 def _sum(options, sums, scale, values, out):
-    """Compute all sums of a list without their constants, times a factor; other entries of `out` stay."""
+    """Compute all sums of a list without their constants, times a factor; other entries of `out` are unchanged."""
     column, coefficient = _integers(options, sums + COLUMN), _numbers(options, sums + COEFFICIENT)
     places = _integers(options, sums + PLACES)
     for o in range(column.size):
@@ -170,7 +170,7 @@ def _sum(options, sums, scale, values, out):
 
 @compiled
 def begin_operations(options, table, values, z, x, y):
-    """Compute order zero of the operations of a table; pending products stay zero."""
+    """Compute order zero of the operations of a table; pending products remain zero."""
     groups = _integers(options, table + GROUPS)
     constant, constant_2 = _numbers(options, table + FIRST + CONSTANT), _numbers(options, table + SECOND + CONSTANT)
     for g in range(0, groups.size, N_GROUP):
@@ -205,7 +205,7 @@ def begin_operations(options, table, values, z, x, y):
 
 @merged
 def _operate(options, table, K, values, z, x, y, x0, y0, total):
-    """Compute order K > 0 of the operations of a table; for pending products the part known before the solution."""
+    """Compute order K > 0 of the operations of a table; of pending products only the part known before the solution."""
     groups = _integers(options, table + GROUPS)
     inverse = 1.0 / K
     for g in range(0, groups.size, N_GROUP):
@@ -301,7 +301,7 @@ def take_order(K, unit, N, series, a):
 
 @merged
 def end_series(w, order, series):
-    """Count evaluations, and check that the last order is finite."""
+    """Count evaluations, and return whether the last order is finite, as a code."""
     w.counters[N_EVALUATIONS] += order - 1
     n = series.size // (order + 1)
     for j in range(n):
@@ -312,7 +312,7 @@ def end_series(w, order, series):
 
 @compiled
 def expand(f, w, options, memory, t, state, unit):
-    """Compute the series about a state whose factors are in w, in a unit of time; return DONE or a reason."""
+    """Compute the series, in a unit of time, about a state whose factors are in w; return DONE or a reason."""
     n, n_rows, order = w.Q.size, w.Rate.size, int(options[ORDER])
     N, X1, Y1, X2, Y2, total1, total2, r, c = arrays_of(options, memory, n, n_rows)
     series = series_of(memory, order, n, memory[TARGET])
@@ -351,17 +351,17 @@ def expand(f, w, options, memory, t, state, unit):
     return end_series(w, order, series)
 
 
-# relative to the tolerances: distance of the unprojected end of a step from the constraints that is aimed at
+# target of the distance of the unprojected end of a step from the constraints, over the tolerances
 ALLOWED = 0.3
-# a defect up to LOUDEST is rounding if the one near the beginning is at least a LOUDER-th of it
-LOUDEST, LOUDER = 1e4, 10.0
-NEAR_BEGIN = 1e-5  # relative to the step: distance from its start within which no force is taken to change
+# a defect up to MAX_NOISE is rounding if the one near the beginning is at least a NOISE_RATIO-th of it
+MAX_NOISE, NOISE_RATIO = 1e4, 10.0
+NEAR_BEGIN = 1e-5  # relative to the step: distance from its start within which no force is assumed to change
 GOLDEN = 0.6180339887498949  # fractional parts of its multiples are evenly distributed between 0 and 1
-BEYOND = 1e300  # replaces an infinite defect, if a function has no value within the step
-MOST_SHORTENED = 0.1  # smallest factor of a step that is rejected for its defect
-GROWTH = 5.0  # largest ratio of two steps in a row: coefficients belong to the unit of the step before
-FARTHEST = 1e6  # relative to the guess of the first step: largest factor, so that no power of it overflows
-TOO_SHORT = 2.0  # error of a first step that is not made, because the series allows a longer one
+MAX_DEFECT = 1e300  # replaces an infinite defect, if a function has no value within the step
+MIN_FACTOR = 0.1  # smallest factor of a step that is rejected for its defect
+GROWTH = 5.0  # largest ratio of successive steps, because coefficients are scaled by the unit of the step before
+MAX_FIRST_FACTOR = 1e6  # relative to the guess of the first step: largest factor, so that no power of it overflows
+TOO_SHORT = 2.0  # error that rejects a first step because the series allows a longer one
 
 
 @merged
@@ -379,7 +379,7 @@ def _find_series(f, w, options, memory, t, state, unit, which):
 
 @merged
 def _length(tolerances, series, unit, order, n):
-    """Return the step, in units, at which the last two terms of positions and velocities are within the tolerances."""
+    """Return the step, in units, at which the last two terms of positions and velocities equal the tolerances."""
     rtol, last, before = tolerances[RTOL], 0.0, 0.0
     row, row_before = order * n, (order - 1) * n
     for j in range(n):
@@ -400,7 +400,7 @@ def _length(tolerances, series, unit, order, n):
 def _evaluate(series, unit, order, x, q, v, a):
     """Evaluate q, v and a at x units of time by Horner's scheme, four or two coordinates at a time.
 
-    The recurrence of the second derivative gives half of it.
+    Horner's recurrence of the second derivative gives half of it.
     """
     n, per_unit = q.size, 1.0 / unit
     twice = 2.0 * per_unit * per_unit
@@ -433,30 +433,30 @@ def _evaluate(series, unit, order, x, q, v, a):
 
 @compiled
 def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
-    """Return the defect at the share s of the step over the allowed one; infinite if it cannot be evaluated."""
+    """Return the defect after the share s of the step, over the allowed defect; infinite if it cannot be evaluated."""
     found = accelerations_found(memory, q.size)
     _evaluate(series, memory[UNIT], order, s * h / memory[UNIT], q, v, found)
     if evaluate_as_given(f, w, t + s * h, q, v, a) != DONE:
         return np.inf
-    return excess(tolerances, h, order, found, a, q, v)
+    return defect_ratio(tolerances, h, order, found, a, q, v)
 
 
 @compiled
 def _is_noise(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
     """Return whether a defect is rounding, i.e. as large near the beginning, where the series is exact."""
-    if defect > LOUDEST:
+    if defect > MAX_NOISE:
         return False
     noise = 0.0
     for k in range(1, 4):
         noise = max(noise, _defect_at(f, w, memory, t, h, k * NEAR_BEGIN, tolerances, series, order, q, v, a))
-    return defect <= LOUDER * noise
+    return defect <= NOISE_RATIO * noise
 
 
 @compiled
-def _refused_within(f, w, memory, t, h, tolerances, series, order, q, v, a):
+def _defect_within(f, w, memory, t, h, tolerances, series, order, q, v, a):
     """Return the defect for which the step is rejected before its end is evaluated, or 0; record the largest one.
 
-    Each attempt checks other places, except for the last place at which a step was rejected.
+    Each attempt evaluates it at other times, and at the time for which a step was last rejected.
     """
     look, shift = tolerances[LOOK], memory[ATTEMPTS] * GOLDEN % 1.0
     n_places = 0
@@ -477,9 +477,9 @@ def _refused_within(f, w, memory, t, h, tolerances, series, order, q, v, a):
 
 
 @merged
-def _shortened(defect, order):
+def _shrink_factor(defect, order):
     """Return the factor for a step that was rejected for its defect."""
-    return max(MOST_SHORTENED, 0.9 * defect ** (-1.0 / order))
+    return max(MIN_FACTOR, 0.9 * defect ** (-1.0 / order))
 
 
 @kernel(SETTLE)
@@ -509,19 +509,19 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if estimated:
             memory[LENGTH] = _length(tolerances, series_of(memory, order, n, memory[WHICH]), h, order, n)
             if memory[LENGTH] > GROWTH:
-                return Attempt(DONE, TOO_SHORT, min(memory[LENGTH], FARTHEST))
+                return Attempt(DONE, TOO_SHORT, min(memory[LENGTH], MAX_FIRST_FACTOR))
     series, unit = series_of(memory, order, n, memory[WHICH]), memory[UNIT]
     x = (memory[PASSED] + h) / unit
     error, checked, found = 0.0, False, accelerations_found(memory, n)
     if estimated:
-        error = x / memory[LENGTH]  # larger than the estimated error, which is a power of it
+        error = x / memory[LENGTH]  # the estimated error is a power of this, and smaller
         if error > 1.0 + SLACK:
             return Attempt(DONE, error, 1.0 / error)
         error = min(error, 1.0)
-        singular = w.notes[NEARLY_SINGULAR] != 0.0  # it stays so until the end of the run
+        singular = w.notes[NEARLY_SINGULAR] != 0.0  # from the first such position on
         checked = w.notes[NEAR_NOW] == 0.0  # near such a position accelerations off the constraints are meaningless
         w.notes[NEAR_NOW] = 0.0 if checked else 2.0
-        longer = times_gap(tolerances, h)
+        longer = gap_ratio(tolerances, h)
         if longer > 0.0 and singular:
             return Attempt(DONE, longer, 1.0 / longer)
         if checked:
@@ -529,9 +529,9 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if memory[SUSPECTED] == 1.0 and memory[SUSPECT] <= t:
                 memory[SUSPECTED] = 0.0
             w.notes[DEFECT] = 0.0
-            defect = _refused_within(f, w, memory, t, h, tolerances, series, order, q1, v1, a1)
+            defect = _defect_within(f, w, memory, t, h, tolerances, series, order, q1, v1, a1)
             if defect > 0.0:
-                return Attempt(DONE, min(defect, BEYOND), _shortened(defect, order))
+                return Attempt(DONE, min(defect, MAX_DEFECT), _shrink_factor(defect, order))
     _evaluate(series, unit, order, x, q1, v1, found)
     store_prediction(w, q1)
     code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
@@ -542,17 +542,17 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
         return Attempt(DONE, 0.0, 0.0)
     off = departure(w, tolerances, h, q, v, q1)
     memory[SHORTER], allowed = 1.0, np.inf
-    if off > 0.0:  # if growth, or a force ahead, made the step shorter than LENGTH, its length says nothing
+    if off > 0.0:  # a step shorter than LENGTH, because of GROWTH or of a force ahead, counts as at least 1 / GROWTH
         allowed = (ALLOWED / off) ** (1.0 / order)
         memory[SHORTER] = min(1.0, max(x / memory[LENGTH], 1.0 / GROWTH) * allowed)
     if off > 1.0:
         return Attempt(DONE, off, allowed)
     if checked:
-        defect = excess(tolerances, h, order, found, a1, q1, v1)
+        defect = defect_ratio(tolerances, h, order, found, a1, q1, v1)
         if defect > 1.0:
             noise = _is_noise(f, w, memory, t, h, tolerances, series, order, q1, v1, a1, defect)
             if not noise:
-                return Attempt(DONE, min(defect, BEYOND), _shortened(defect, order))
+                return Attempt(DONE, min(defect, MAX_DEFECT), _shrink_factor(defect, order))
             _evaluate(series, unit, order, x, q1, v1, found)
             code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
             if code != DONE:

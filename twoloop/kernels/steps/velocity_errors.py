@@ -1,11 +1,11 @@
-"""Estimate the position errors that errors of the velocities cause, for methods that pass over vibrations.
+"""Estimate the position errors that errors of the velocities cause, for methods that step over vibrations.
 
-An error e of the velocities moves the positions until it turns back or decays. J J e, J being the Jacobian of (v, F),
-shows the square of the rate at which it does. So the error of a force that jumps within a step is found, and vibrations
-that do not matter are passed over.
+An error e of the velocities moves the positions until it changes its sign or decays. J J e, J being the Jacobian of
+(v, F), shows the square of the rate at which it does. So the error due to a force that jumps within a step counts, and
+the error of vibrations that do not matter does not.
 
-- This is the rate of the fastest part of the error. If a stiff damper acts beside a contact, the part in slow
-  directions lasts much longer: it is what the filter for some steps at once leaves of the error.
+- This is the rate of the fastest component of the error. If a stiff damper acts beside a contact, the component in slow
+  directions lasts much longer: a filter for several steps at once leaves just this component.
 - If J was differenced before a contact began or ended, it has another rate, though Newton's method still contracts.
 """
 
@@ -19,8 +19,8 @@ from twoloop.kernels.steps import stages as at
 from twoloop.kernels.steps.newton_systems import DIFFERENCE
 from twoloop.kernels.steps.stages import INNER_TOL, block, vector
 
-# factor on the duration of an error that turns back as slowly as the motion itself: such an error is no vibration, and
-# the errors of the next steps have the same sign
+# factor on the duration of an error that changes its sign as slowly as the motion: it is no vibration, and the errors
+# of the next steps have the same sign
 SLOW_FACTOR = 10.0
 LONGEST_GAPS = 10.0  # times GAP: longest duration of an error
 STEPS_TO_DECAY = 10.0  # number of steps after which a fast error has decayed
@@ -32,9 +32,9 @@ UNLIKE = 0.3  # relative difference of accelerations above which derivatives do 
 def filtered_velocity_error(w, memory, tolerances, z, raw, once, twice, state, new_state, a_end):
     """Return the largest component of an error, filtered by (I - z J)^-1 `once` and `twice`, over the tolerances.
 
-    A velocity error counts as the smaller of two values: itself over the tolerance of the velocity, or the position
-    error that it causes until it turns back or decays, over that of the position. `a_end`: accelerations at the end,
-    where a contact that begins in the step shows how fast the motion changes.
+    A velocity error counts as the smaller of two ratios: its ratio to the tolerance of the velocity, and the ratio of
+    the position error that it causes, until it changes its sign or decays, to that of the position. `a_end`: the
+    accelerations at the end, where a contact that begins in the step shows how fast the motion changes.
     """
     n = w.Q.size
     v, a = state[n : 2 * n], state[2 * n : 3 * n]
@@ -68,7 +68,7 @@ def velocity_error(w, tolerances, e_v, duration, state, new_state):
 
 @compiled
 def motion_time(w, tolerances, state, a):
-    """Return the time in which such accelerations change the velocities of the motion, s."""
+    """Return the time in which accelerations a change the velocities of the motion, s."""
     n = w.Q.size
     fastest = change = 0.0
     for j in w.independent:
@@ -80,11 +80,10 @@ def motion_time(w, tolerances, state, a):
 
 @compiled
 def _derivatives_matter(w, memory, tolerances, z, raw, longest, state, new_state):
-    """Return whether it matters if J is not that of the end of the step.
+    """Return whether an outdated J, not that of the end of the step, would change the estimate.
 
-    It matters if an error of the velocities, `raw`, would count if it lasted longer than J says; and if J has
-    directions that are fast beside the step while Newton's method, which uses J, contracts no better than if they were
-    slow.
+    It would if the velocity error `raw` mattered when it lasted longer than J shows, or if J has directions that are
+    fast relative to the step while Newton's method, which uses J, contracts as if they were slow.
     """
     duration = memory[at.DURATION]
     if duration < min(longest, FAST * z) and memory[at.CONTRACTION] * duration * duration > UNLIKE * z * z:
@@ -94,7 +93,7 @@ def _derivatives_matter(w, memory, tolerances, z, raw, longest, state, new_state
 
 @compiled
 def derivatives_agree(f, w, options, memory, s, t, z, tolerances, raw, e_q, e_v, state, new_state, a_end):
-    """Return whether J is that of the end of the step, at time t, as far as it matters.
+    """Return whether J is that of the end of the step, at time t, or does not matter.
 
     (e_q, e_v) is (I - z J)^-1 of the error, and `raw` its velocities; the product with J is compared with a difference
     of accelerations.
