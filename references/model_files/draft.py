@@ -121,7 +121,7 @@ class Draft:
         while self.has("frame", 0.2):
             text = f'<frame pos="{self.some(3)}"{self.turn()}>{text}</frame>'
         if replicable and self.has("replicate"):
-            text = f'<replicate count="3" offset="{self.some(3)}" euler="0 0 {self.angle(1)}">{text}</replicate>'
+            text = f'<replicate count="3" offset="{self.some(3)}" euler="{self.angle(3)}">{text}</replicate>'
         return self.apart(lambda: text) if replicable else text
 
     def apart(self, caller: Callable[[], str]) -> str:
