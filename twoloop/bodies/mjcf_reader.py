@@ -132,7 +132,9 @@ class _Reader:
     def __init__(self, path: str | os.PathLike[str], key: Any, commands: dict[str, Any], limits: bool):
         (self.root, self.compilers), self.ignored = expanded(path), list[str]()
         root = self.root
-        self.total_mass = [each.get("settotalmass", "-1") for each in root.findall("compiler")]
+        settings = [each.attrib for each in root.findall("compiler")]
+        self.total_mass = [float(each["settotalmass"]) for each in settings if "settotalmass" in each][-1:]
+        self.fused = [each["fusestatic"] for each in settings if "fusestatic" in each][-1:] == ["true"]
         self.defaults: dict[str, dict[str, dict[str, str]]] = {"main": {}}
         for each in root.findall("default"):
             self._default(each, each.attrib["class"], self.defaults.get(each.attrib["class"], {}))
@@ -167,7 +169,7 @@ class _Reader:
             for mesh in asset.findall("mesh"):
                 self.meshes[mesh.get("name", Path(mesh.get("file", "")).stem)] = mesh
         self.triangles: dict[str, Array | None] = {}
-        self.n_geoms, self.n_bodies, self.total = 0, 0, 0.0
+        self.n_geoms, self.n_bodies, self.total, self.static = 0, 0, 0.0, False
         self.taken = {"ground", *(each.get("name", "") for each in root.iter("body"))}
         acting = [each for tag in ("equality", "actuator", "tendon") for group in root.findall(tag) for each in group]
         self.referred = [
@@ -182,7 +184,9 @@ class _Reader:
                 self.ignored += [f"{each.tag}: {name_of(part)}" for part in each] or [each.tag]
         for each in self.root.findall("worldbody"):
             self._within(each, None, Pose(np.zeros(3), np.eye(3)), "main")
-        total = max(map(float, self.total_mass[-1:]), default=-1.0)
+        total = max(self.total_mass, default=-1.0)
+        if total > 0.0 and self.fused and self.static:  # if MuJoCo fuses them with the world, it does not count them
+            self.ignored.append("fusestatic of the compiler, for the mass that settotalmass scales")
         scale = total / self.total if total > 0.0 and self.total > 0.0 else 1.0
         loads = Loads(self)
         loads.start(self.key)
@@ -262,6 +266,7 @@ class _Reader:
             if lump.mass and not (lumps or stated) and numbers(element.get("pos", "0 0 0"), 3, "pos").any():
                 self.ignored.append(f"where boundmass puts the mass of {name_of(element)}")  # in MuJoCo at its pos
             self.total += lump.mass
+            self.static |= part is None and lump.mass > 0.0
             gravcomp = float(element.get("gravcomp", 0.0))
             if part is not None:
                 lump = lump if lump.axes is not None else replace(lump, axes=principal_axes(lump.J))
