@@ -393,8 +393,6 @@ class _Reader:
         kind, compiler = given.get("type", "sphere"), self.compiler(given)
         if not weighs or int(float(given.get("group", 0))) not in compiler.groups or kind in UNWEIGHED:
             return None
-        if given.get("shellinertia", "false") == "true" and kind == "ellipsoid":
-            self.ignored.append(f"shellinertia of {what}")
         if kind != "mesh" and "mesh" not in given:
             return geom_lump(given, what, compiler.degrees, compiler.sequence)
         triangles, inertia = self._mesh(given.get("mesh", ""))

@@ -330,6 +330,8 @@ class _Reader:
         else:
             self.ignored += [f"damping of joint {name!r}"] if damping else []
             self.ignored += [f"friction of joint {name!r}"] if friction else []
+        more = freed.attributes.keys() - {"damping", "friction"}  # such as the springs of other readers
+        self.ignored += [f"{key} of the dynamics of joint {name!r}" for key in sorted(more)]
         limit = element.find("limit")
         if limit is not None and self._type(element) in ("revolute", "prismatic") and not self._limit(limit, freed):
             self.ignored.append(f"limits of joint {name!r}")
@@ -434,6 +436,8 @@ class _Reader:
         entries = " ".join(inertia.get(key, "0") for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
         J = tensor_of(*numbers(entries, 6, f"inertia of link {name!r}"))
         (value,) = numbers(mass.get("value", ""), 1, f"mass of link {name!r}")
+        if not value and J.any():
+            self.ignored.append(f"the mass of link {name!r}, whose inertia has none")
         part.lumps.append(Lump(float(value), np.zeros(3), J).transformed(pose.then(_origin(inertial, what))))
 
 
