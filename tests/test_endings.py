@@ -46,6 +46,21 @@ def test_a_time_limit_keeps_what_there_is():
     assert solve_dae(pendulum(), (0.0, 0.1), *HORIZONTAL, time_limit=60.0).success
 
 
+def test_a_time_limit_ends_slow_steps():
+    """A chunk has dozens of steps of eleven evaluations each; without a check within it all are made."""
+    calls = []
+
+    def force(t, q, v):
+        calls.append(t)
+        time.sleep(0.005)
+        return np.array([0.0, -9.81])
+
+    start = (0.0, 100.0), *HORIZONTAL
+    result = solve_dae(pendulum(force=force), *start, "DOP853", time_limit=0.2, check_derivatives=False)
+    assert result.status is Status.TIME_LIMIT and result.t.size == result.stats.n_accepted + 1
+    assert len(calls) < 200
+
+
 def stiffening_pendulum(stiffness):
     """A pendulum whose rod is met by a stiff spring after 0.5 s: an explicit method then needs tiny steps."""
 

@@ -27,7 +27,7 @@ from twoloop.run.fallbacks import MOST, closer_sampling, may_have_missed_changes
 from twoloop.run.loop import IntegrationLoop, Interrupts, interrupted_record
 from twoloop.run.options import options_of
 from twoloop.run.record import FileStore, MemoryStore, OutputRequest, Status, record_of
-from twoloop.run.run import Run
+from twoloop.run.run import SMALL, Run
 from twoloop.run.signals import interrupted
 
 Array = NDArray[np.float64]
@@ -95,7 +95,7 @@ def solve_dae(
     progress : bool, optional
         True: show a bar (needs the package rich).
     time_limit : float, optional
-        Wall-clock time, s, after which the run ends with the status TIME_LIMIT. It is checked about every 0.1 s.
+        Wall-clock time of all steps, s, after which the run ends with the status TIME_LIMIT.
     check_derivatives : bool
         Whether to compare C_q, C_t, gamma and the tangents with exact derivatives or differences. This is done at the
         first start of a system and at a few states of its runs.
@@ -202,7 +202,7 @@ def solve_dae(
     try:
         at_ends = times is not None and times.size <= 2 and set(times.tolist()) <= {t0, t1}
         run, every, spent, repeats = None, np.inf, 0.0, MOST
-        in_time = time_limit is None or time_limit >= LONGEST
+        in_time = time_limit is None or (time_limit >= LONGEST and system.n_q <= SMALL)
         if folder is event_functions is options.own_tolerance is None and in_time and not progress:
             is_default = times is time_limit is None and not dense_output
             output = STEPS if is_default else Output(times, at_ends, bool(dense_output), time_limit)
@@ -218,7 +218,7 @@ def solve_dae(
                 run = outcome
         interrupts.listen()
         q0, v0 = check_vector("q0", q0, system.n_q), check_vector("v0", v0, system.n_q)
-        deadline = None if time_limit is None else time.monotonic() + time_limit
+        deadline = None
         for left in range(repeats, -1, -1):
             if run is None:
                 run, _ = set_up(system, t0, t1, q0, v0, options)
@@ -230,6 +230,8 @@ def solve_dae(
             with _progress_bar(options.method.name, t0, t1) if progress else NO_BAR as report:
                 kept = MemoryStore() if folder is None else begin_folder(folder, system.n_q)
                 wanted = OutputRequest(times, lands, bool(dense_output), event_functions, kept)
+                if deadline is None and time_limit is not None:  # setting up does not count
+                    deadline = time.monotonic() + time_limit
                 limit = None if deadline is None else max(0.0, deadline - time.monotonic())
                 last = left == 0 or folder is not None
                 record = IntegrationLoop(run, t1, wanted, report, limit, interrupts, last).to_end(check_derivatives)

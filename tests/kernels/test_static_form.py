@@ -12,7 +12,7 @@ from tests.large_systems import spatial_chain, started_run
 from tests.marks import slow
 from tests.problems import worst
 from twoloop import ConstrainedSystem, solve_dae
-from twoloop.bodies import SpatialModel
+from twoloop.bodies import PlanarModel, SpatialModel
 from twoloop.checks.callbacks import MAX_ENTRIES
 from twoloop.kernels import advance
 from twoloop.kernels.data import indices
@@ -134,6 +134,27 @@ def test_starts_make_no_full_matrix_beyond_those_of_four_million_numbers():
         most = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
     assert system.n_c * system.n_q > MAX_ENTRIES and most < 0.7 * 8 * system.n_c * system.n_q
+
+
+def test_rods_of_ten_micrometres_a_metre_from_the_origin(any_size, both):
+    """Rounding of their positions turns them by 2e-11, which is more than corrections of 1 m may keep."""
+    angles = np.linspace(-1.0, 1.0, 12)
+    ways = 1e-5 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+    def run(place):
+        model, pin, before = PlanarModel(gravity=(0.0, -9.81)), np.array(place), "ground"
+        for k, (angle, way) in enumerate(zip(angles, ways, strict=True)):
+            rod = model.body(str(k), mass=1e-5, inertia=1e-15 / 12.0, position=pin + 0.5 * way, angle=angle)
+            model.revolute(before, rod, at=pin)
+            before, pin = rod, pin + way
+        model.revolute(before, "ground", at=pin)
+        problem = model.problem((0.0, 5e-4))
+        return solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "DOP853", 1e-8, 1e-8, compiled=False)
+
+    near = run((0.0, 0.0))
+    for far in both(lambda: run((1.0, 0.5))):
+        assert far.success and far.stats.n_rejected_convergence == 0 and far.stats.n_accepted < 40
+        assert worst(far.q[2::3, -1], near.q[2::3, -1]) < 1e-6 < worst(far.q[2::3, -1], angles)
 
 
 def test_bodies_whose_mass_matrix_is_singular(any_size, both):

@@ -49,6 +49,7 @@ from twoloop.kernels.data.indices import (
     PIVOT,
     SINGULAR,
     STATIC,
+    TIME_IS_UP,
     UNSUITED,
 )
 from twoloop.kernels.evaluation.inner_loop import (
@@ -281,6 +282,9 @@ def advance(
         )
         if code == NOT_LOADED:
             return at.NEEDS_COMPILATION
+        if w.notes[TIME_IS_UP] == 1.0:  # evaluations of this attempt may have ended early
+            f.settle(f, w, options, memory, tolerances, False)
+            return at.PAUSED
         # at a jump of the force an estimate may be small by chance: until ROUGH_TO it has to be smaller by `strict`
         strict = control[at.ROUGH] if t < clock[at.ROUGH_TO] else 1.0
         accepted = code == DONE and error * strict <= 1.0

@@ -8,9 +8,10 @@ Elsewhere it is stored until the loop checks for it.
 
 import _signal  # type: ignore[import-not-found]  # `signal` makes enumerations of handlers, which takes 8 microseconds
 import signal
+import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from types import FrameType
 from typing import Any
@@ -66,7 +67,7 @@ from twoloop.run.record import (
     step_fields,
 )
 from twoloop.run.rerun import compare_callbacks
-from twoloop.run.run import Buffers, Run
+from twoloop.run.run import SMALL, Buffers, Run
 from twoloop.run.signals import SignalHandlers, within_a_users_function
 from twoloop.run.singular_positions import Place, turned_last
 
@@ -284,7 +285,8 @@ class IntegrationLoop:
         run.control[a.MAX_ATTEMPTS] = min(run.chunk, max(0, self.next_check - run.attempts()))
         self.filled[:] = 0  # Ctrl-C may arrive before `advance` sets it
         try:
-            self.code = run.advance(self.outputs, buffers, self.filled, (self.plan, self.control, self.kit))
+            with self._stopped_in_time():
+                self.code = run.advance(self.outputs, buffers, self.filled, (self.plan, self.control, self.kit))
         except KeyboardInterrupt:
             self.code = INTERRUPTED
         except (
@@ -299,6 +301,23 @@ class IntegrationLoop:
                     error.add_note(_where(run.system.name, float(run.clock[a.T]), error))
         if self.interrupts.handlers is not None:
             self.interrupts.handlers.check()
+
+    @contextmanager
+    def _stopped_in_time(self) -> Iterator[None]:
+        """End the steps of a chunk at the deadline, where one attempt may take long: machine code reads no clock."""
+        run, notes = self.run, self.run.work.notes
+        if self.deadline == np.inf or (run.system.n_q <= SMALL and not run.system.called_in_python):
+            yield
+            return
+        timer = threading.Timer(self.deadline - time.monotonic(), notes.__setitem__, (indices.TIME_IS_UP, 1.0))
+        timer.daemon = True
+        timer.start()
+        try:
+            yield
+        finally:
+            timer.cancel()
+            timer.join()
+            notes[indices.TIME_IS_UP] = 0.0
 
     def _store_chunk(self, t: Array, rows: Array, steps: Array, kinds: NDArray[np.int64]) -> None:
         """Store the states and the steps of a chunk."""
@@ -332,7 +351,8 @@ class IntegrationLoop:
                 self.code = STAGNATED
         if spent < CHUNK_TIME:
             run.chunk = min(2 * run.chunk, self.largest_chunk)
-        if self.code in (a.PAUSED, a.NEEDS_COMPILATION) and time.monotonic() > self.deadline:
+        goes_on = self.code in (a.PAUSED, a.NEEDS_COMPILATION, a.NEEDS_DENSE, a.SWITCH_METHOD, a.NEAR_SINGULAR)
+        if goes_on and time.monotonic() > self.deadline:
             self.code = OUT_OF_TIME
         if self.code in (a.PAUSED, a.NEEDS_COMPILATION) and (self.interrupts.n_signals or self.recorder.interrupted):
             self.code = INTERRUPTED

@@ -20,7 +20,8 @@ from twoloop.kernels.compile.callbacks import OPTIONAL
     NEEDS_DENSE,  # the sparse form cannot decide whether rows are independent
     NOT_LOADED,  # the caller has to load the machine code of the step
     UNSUITED,  # the method does not suit the motion here: the caller continues with another one
-) = range(12)
+    STOPPED,  # time_limit is over, see Work.notes
+) = range(13)
 
 # Functions.flags: whole numbers that describe a system to kernels. BANDWIDTH is -1 if linear algebra is not banded.
 # FORM is the form of the linear equations of accelerations, see linalg/saddle_point.py; DENSE_FORM replaces it if
@@ -84,8 +85,9 @@ MASS_VALUES_GIVEN, JACOBIAN_VALUES_GIVEN = (GIVEN[name] for name in ("mass_value
     KINK_AFTER,
     LEANING,  # largest coefficient of an independent row in a redundant one, when this partition was chosen
     SMALLEST,  # sparse form: least pivot of a row over its size, the squared sine of its angle to the others
+    TIME_IS_UP,  # 1: evaluations of stages return STOPPED; another thread sets it during a chunk of steps
     N_NOTES,
-) = range(32)
+) = range(33)
 
 # tolerances of eq. (26) of the paper, as the array that steps read
 (

@@ -43,11 +43,14 @@ from twoloop.kernels.data.indices import (
     REUSE,
     ROUNDED,
     SINGULAR,
+    STOPPED,
+    TIME_IS_UP,
 )
 from twoloop.kernels.evaluation import tasks
 from twoloop.kernels.evaluation.constraints import constraint_rates, gamma_by_differences, kinematics, row_residual
 from twoloop.kernels.evaluation.operations import gamma_by_program
 from twoloop.kernels.evaluation.partition import (
+    AMPLIFIED,
     CONTRACTION,
     MAX_ITERATIONS,
     MIN_CORRECTION,
@@ -61,6 +64,7 @@ from twoloop.kernels.evaluation.partition import (
     redundant_rows_hold,
     restore_positions,
     restore_velocities,
+    rows_hold,
     write_programs,
 )
 from twoloop.kernels.linalg import saddle_point
@@ -242,7 +246,8 @@ def project_state(f, w, t, q, v, theta, a, lam):
             w.notes[KNOWN] = 0.0  # Gamma was computed at the old velocities: compute it again
             break
         if moved > CONTRACTION * before:
-            if not moved <= ROUNDING_OF_CORRECTIONS * largest_of(q):
+            limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
+            if not (moved <= limit or (moved <= AMPLIFIED * limit and rows_hold(w, q))):
                 return INNER_DIVERGED
             break
         before = max(moved, theta)
@@ -286,6 +291,8 @@ def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     """Do a task of tasks.py at (t, q, v): the functions below are named like the tasks and explain them."""
     if task >= tasks.FIND_NULL_SPACE:
         return _other_task(f, w, task, t, q, v)
+    if task in (tasks.EVALUATE, tasks.EVALUATE_AS_GIVEN) and w.notes[TIME_IS_UP] == 1.0:
+        return STOPPED
     if task == tasks.EVALUATE_AS_GIVEN:  # this task and PROJECT serve methods that integrate all coordinates
         return accelerate_at(f, w, t, q, v, a)
     if task == tasks.PROJECT:

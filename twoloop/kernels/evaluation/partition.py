@@ -381,6 +381,10 @@ def partition_is_poor(w):
 MAX_ITERATIONS = 25  # Newton iterations; quadratic convergence needs 2 to 5
 CONTRACTION = 0.5  # largest ratio of a correction to the one before
 ROUNDING_OF_CORRECTIONS = 1e-12  # relative to the largest value: changes of this size no longer shrink
+# corrections may be so many times larger where all rows hold to rounding: the rounding of a position of 1 m turns a rod
+# of 1 mm by 1e-13, and a chain of 1,000 such rods by more
+AMPLIFIED = 1e3
+CLOSED = 2e-15  # relative to the largest of its terms: violation of a row that is rounding
 MIN_CORRECTION = 10.0  # smallest correction that is required, in units of the rounding of positions
 MAX_VIOLATION = 1e-7  # relative to the mechanism's size: largest violation of a redundant row
 
@@ -417,6 +421,18 @@ def factor_dependent(f, w, t, q):
     clear_rows(f, w)
     constraint_rows(f, w, t, q, w.G)
     return factor_rows(w, t, q)
+
+
+@compiled
+def rows_hold(w, q):
+    """Return whether w.C is rounding: |C_i| at most a few roundings of the largest |G_ij q_j|."""
+    for i in range(w.C.size):
+        size = 0.0
+        for p in range(w.places[i], w.places[i + 1]):
+            size = max(size, abs(w.G[i, w.places[p]] * q[w.places[p]]))
+        if not abs(w.C[i]) <= CLOSED * size:
+            return False
+    return True
 
 
 @merged
@@ -457,7 +473,8 @@ def restore_positions(f, w, t, q, v, tolerance, reuse):
         if not converged and correction > CONTRACTION * before:
             # accept if rounding of large coordinates exceeds the tolerance; otherwise Newton's method has left its
             # region of convergence, and could converge to another assembly of the mechanism
-            converged = correction <= ROUNDING_OF_CORRECTIONS * largest_of(q)
+            limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
+            converged = correction <= limit or (correction <= AMPLIFIED * limit and rows_hold(w, q))
             if not converged:
                 return INNER_DIVERGED
         before = correction

@@ -56,11 +56,15 @@ from twoloop.kernels.data.indices import (
     ROWS_CONTRADICT,
     SINGULAR,
     SMALLEST,
+    STOPPED,
+    TIME_IS_UP,
 )
 from twoloop.kernels.evaluation import tasks
 from twoloop.kernels.evaluation.constraints import constraint_rates
 from twoloop.kernels.evaluation.operations import gamma_by_program, jacobian_by_program
 from twoloop.kernels.evaluation.partition import (
+    AMPLIFIED,
+    CLOSED,
     CONTRACTION,
     MAX_ITERATIONS,
     MAX_VIOLATION,
@@ -409,6 +413,20 @@ def _move(f, w, x):
 
 
 @compiled
+def _rows_hold(f, w, q):
+    """Return whether w.C is rounding: |C_i| at most a few roundings of the largest |G_ij q_j|."""
+    rows, columns, _ = jacobian_of(f.static_program)
+    size = w.solutions[: w.g.size]
+    size[:] = 0.0
+    for k in range(rows.size):
+        size[rows[k]] = max(size[rows[k]], abs(w.jacobian_values[k] * q[columns[k]]))
+    held = True
+    for i in range(size.size):
+        held = held and abs(w.C[i]) <= CLOSED * size[i]
+    return held
+
+
+@compiled
 def _to_constraints(f, w, t, q, v, theta):
     """Project (q, v) onto the constraints as inner_loop.py does, but keep the factors before the last correction."""
     before = np.inf
@@ -438,7 +456,8 @@ def _to_constraints(f, w, t, q, v, theta):
         if moved <= w.notes[PIVOT] * theta:
             return DONE
         if moved > CONTRACTION * before:
-            return DONE if moved <= ROUNDING_OF_CORRECTIONS * largest_of(q) else INNER_DIVERGED
+            limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
+            return DONE if moved <= limit or (moved <= AMPLIFIED * limit and _rows_hold(f, w, q)) else INNER_DIVERGED
         before = max(moved, theta)
     return INNER_DIVERGED
 
@@ -501,8 +520,8 @@ def _other_task(f, w, task, t, q, v, a, lam):
 def sparse_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     """Do a task at (t, q, v), see inner_loop.py; for SOLVE, q and v are the right-hand side."""
     if task in (tasks.EVALUATE, tasks.EVALUATE_AS_GIVEN):
-        code = DONE
-        if task == tasks.EVALUATE and w.notes[NEARLY_SINGULAR] == PROJECT_STAGES:
+        code = STOPPED if w.notes[TIME_IS_UP] == 1.0 else DONE
+        if code == DONE and task == tasks.EVALUATE and w.notes[NEARLY_SINGULAR] == PROJECT_STAGES:
             code = _to_constraints(f, w, t, q, v, tolerance)
         if code == DONE:
             code = factor_at(f, w, t, q)
