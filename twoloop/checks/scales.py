@@ -263,7 +263,7 @@ SETTLED = 2e-7
 AGREEMENT = 3e-7  # relative to an entry: a smaller difference is not an error
 DECAYED = 0.01  # largest ratio of the last coefficients to the first, for a function that the points resolve
 # largest ratio of the last two coefficients to those before, unless all are rounding: a larger one shows a ripple
-DECAYING = 0.2
+RIPPLE = 0.2
 CONSTANT = 100.0  # in rounding errors: a function that varies by less counts as constant
 SAFETY = 5.0  # factor on the estimated error of the difference that gives the allowed difference
 # in rounding errors of the result: terms inside a function may be larger than its result, but hardly by more than this
@@ -325,7 +325,7 @@ def _window(function: Function, place: float, width: float, side: int, noise: Ar
         return None
     last = np.abs(coefficients[TAIL + 2 :]).max(axis=0)
     still = tail <= CONSTANT * level
-    resolved = ((tail <= DECAYED * head) & (still | (last <= DECAYING * tail))) | (still & (head <= CONSTANT * level))
+    resolved = ((tail <= DECAYED * head) & (still | (last <= RIPPLE * tail))) | (still & (head <= CONSTANT * level))
     ripple = np.where(tail > FROZEN * level, tail, 0.0)
     nothing = np.maximum(head, tail) <= CONSTANT * level
     return _Window(slope, np.where(resolved, error, np.inf), np.ptp(values, axis=0) == 0.0, nothing, ripple)

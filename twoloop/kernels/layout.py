@@ -29,6 +29,8 @@ class Static(NamedTuple):
     dense_jacobian: bool
 
 
+# n_q, n_c, n_a, ranks of C_q and of all rows, whether T^T M T and whether the augmented matrix is used, numbers of
+# nodes of programs, sizes of the static form, numbers in the matrices of Newton's method
 Sizes = tuple[int, int, int, int, int, bool, bool, int, Static | None, int]
 Places = list[tuple[str, int, int, tuple[int, ...]]]  # arrays in a piece of memory: name, begin, end, shape
 
@@ -52,32 +54,8 @@ class Layout(NamedTuple):
     of_integers: NDArray[np.int64]
 
 
-def make_work(
-    n_q: int,
-    n_c: int,
-    n_a: int = 0,
-    rank: int | None = None,
-    rank_v: int | None = None,
-    reduced: bool = True,
-    augmented: bool = False,
-    n_nodes: int = 0,
-    static: Static | None = None,
-    n_matrices: int = 0,
-) -> Work:
-    """Return the workspace of one run; ranks are those of C_q, and of C_q and A, at most n_c and n_c + n_a.
-
-    The matrices of Newton's method get n_matrices numbers.
-
-    An unused workspace of these sizes is reused: to allocate the arrays takes longer than to clear them.
-    """
-    r = min(n_c, n_q) if rank is None else rank
-    r_v = min(n_c + n_a, n_q) if rank_v is None else rank_v
-    sizes = (n_q, n_c, n_a, r, r_v, reduced and n_q > r_v, augmented, n_nodes, static, n_matrices)
-    return empty(sizes)
-
-
 def empty(sizes: Sizes) -> Work:
-    """Return a workspace of the given sizes, full of zeros."""
+    """Return a workspace full of zeros; an unused one of these sizes is cleared, which is faster than allocation."""
     given_back = _take_unused(sizes)
     return _allocate(sizes) if given_back is None else cleared(given_back)
 

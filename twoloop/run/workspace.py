@@ -21,7 +21,7 @@ from twoloop.kernels.data.indices import (
     STRAIGHT,
 )
 from twoloop.kernels.evaluation.operations import N_NODES
-from twoloop.kernels.layout import Static, cached_run, lasting, make_work
+from twoloop.kernels.layout import Static, cached_run, empty, lasting
 from twoloop.kernels.linalg.band import banded_pays, lapack_addresses
 from twoloop.kernels.linalg.saddle_point import sparse_pays
 from twoloop.kernels.linalg.sparse_lu import column_groups, grouped_entries, newton_program
@@ -409,9 +409,12 @@ def workspace(
     reduced, augmented = flags[DENSE_FORM] == NULL_SPACE, flags[FORM] == AUGMENTED
     programs = [each for each in (kit.jacobian_program, kit.gamma_program) if each.size]
     n_nodes = max((int(each[N_NODES]) for each in programs), default=0)
-    sizes = (system.n_q, system.n_c, system.n_a, *ranks, bool(reduced), bool(augmented), n_nodes)
-    n_matrices = matrices * system.n_q**2 if static is None else static.n_matrices(matrices)
-    work = make_work(*sizes, None if static is None else static.static, n_matrices)
+    n_q, n_c, n_a = system.n_q, system.n_c, system.n_a
+    full = min(n_c, n_q), min(n_c + n_a, n_q)
+    rank, rank_v = (given if given is not None else most for given, most in zip(ranks, full, strict=True))
+    sizes = n_q, n_c, n_a, rank, rank_v, bool(reduced and n_q > rank_v), bool(augmented), n_nodes
+    n_matrices = matrices * n_q**2 if static is None else static.n_matrices(matrices)
+    work = empty((*sizes, None if static is None else static.static, n_matrices))
     return prepare_workspace(work, system, flags, pattern, q0, rtol, reuse, static)
 
 
