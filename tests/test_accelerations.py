@@ -15,7 +15,7 @@ from tests.problems import assert_same, quick, worst
 from twoloop import mechanisms, solve_dae
 from twoloop.bodies import PlanarModel
 from twoloop.generate.compile_equations import generated_code, write_accelerations, write_function
-from twoloop.generate.elimination import Choice, Elimination
+from twoloop.generate.elimination import Elimination, PivotChoice
 from twoloop.generate.lane_series import LaneEmitter
 from twoloop.generate.llvm_text import BIT, Module
 from twoloop.generate.null_space import LEAST
@@ -201,7 +201,7 @@ def test_pivots_are_one_for_each_row_and_not_small(m, freedom, seed):
 
 
 def blocks_along(system, known):
-    return [Choice.at(system, t, q).blocks for t, q in zip(known.t, known.q.T, strict=True)]
+    return [PivotChoice.at(system, t, q).blocks for t, q in zip(known.t, known.q.T, strict=True)]
 
 
 def test_neighbouring_starts_have_the_same_code_and_any_start_its_own():
@@ -230,7 +230,7 @@ def test_in_lanes_no_run_depends_on_those_beside_it():
     problem = mechanisms.four_bar()
     system, n = problem.system, problem.system.n_q
     known = solve_dae(system, (0.0, 5.0), problem.q0, problem.v0, t_eval=np.linspace(0.0, 5.0, 801))
-    equations = Elimination(system, Choice.at(system, 0.0, problem.q0))
+    equations = Elimination(system, PivotChoice.at(system, 0.0, problem.q0))
     module, numbers = Module(), Coefficients()
     for outputs in equations.accelerations:
         list(numbers.structure(outputs))

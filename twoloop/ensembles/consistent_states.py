@@ -1,6 +1,6 @@
-"""consistent_states: project many guesses onto the constraints at once."""
+"""Project many guesses onto the constraints at once (`consistent_states`)."""
 
-from __future__ import annotations  # ArrayLike stays a word in help()
+from __future__ import annotations  # so that help() shows the name ArrayLike
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twoloop.checks.arguments import Array, check_finite, check_indices
-from twoloop.ensembles.lanes import Integers, aligned, in_blocks, threads_of
-from twoloop.ensembles.starts import Starts, all_starts, far_off, generic_parameters, kit_to_write, system_of
+from twoloop.ensembles.lanes import Integers, aligned, run_in_blocks, threads_of
+from twoloop.ensembles.starts import Starts, all_starts, generic_parameters, is_inconsistent, kit_to_write, system_of
 from twoloop.generate.graph import Untraceable
 from twoloop.generate.parameter_expressions import ParameterTape
 from twoloop.problem.system import ConstrainedSystem, check_system
@@ -20,8 +20,8 @@ from twoloop.run.projection import ConsistentState, consistent_state
 if TYPE_CHECKING:
     from twoloop.generate.lane_code import GeneratedLanes, LaneConstraints
 
-MOST_ROWS = 200  # largest number of constraints in lanes, where factors are dense
-SINGLY = 0.01  # s, estimated time of one call of `consistent_state`
+MOST_ROWS = 200  # largest number of constraints for SIMD lanes, which use dense factors
+SECONDS_PER_CALL = 0.01  # estimated time of one call of `consistent_state`, s
 
 
 def consistent_states(
@@ -35,10 +35,10 @@ def consistent_states(
 ) -> tuple[Array, Array]:
     """Project many guesses onto the constraints, each by the least change, as `consistent_state` does with one.
 
-    Guesses that are near the constraints are projected together, by Gauss-Newton on the equations that the callbacks
-    were traced to, in SIMD lanes on all cores; the callbacks themselves then check each result. `consistent_state`
-    projects all others one at a time: guesses farther away, large systems, systems with nonholonomic rows or whose
-    callbacks cannot be traced, and so few guesses that compiling code for them does not pay.
+    Guesses near the constraints are projected together, by Gauss-Newton in SIMD lanes on all cores, with the equations
+    that were traced from the callbacks. The callbacks themselves then check each result. `consistent_state` projects
+    the others one at a time: guesses farther away, large systems, systems with nonholonomic rows or with callbacks that
+    cannot be traced, and guesses that are too few for code to be compiled.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def consistent_states(
     parameters : array_like (n_runs, n_p), optional
         Parameters of each run, instead of `system.parameters`.
     keep : sequence of int, optional
-        Coordinates that stay as given, position and velocity. None: all may move.
+        Coordinates whose position and velocity are not changed. None: all may change.
 
     Returns
     -------
@@ -59,7 +59,7 @@ def consistent_states(
     Raises
     ------
     TypeError, ValueError
-        If an argument is wrong, or a guess cannot be projected: as `consistent_state`, and which.
+        If an argument is wrong, or a guess cannot be projected: the message of `consistent_state` with its number.
 
     Examples
     --------
@@ -77,41 +77,41 @@ def consistent_states(
     kept = [] if keep is None else check_indices("keep", keep, system.n_q)
     moves = np.array([j not in kept for j in range(system.n_q)], dtype=np.int64)
 
-    def singly(run: int) -> ConsistentState:
+    def project_one(run: int) -> ConsistentState:
         try:
             return consistent_state(system_of(system, starts, run), t, starts.q[run], starts.v[run], keep=keep)
         except ValueError as error:
             raise ValueError(f"guess {run}: {error}") from error
 
     fine = np.zeros(len(starts.q), dtype=bool)
-    made_q, made_v = starts.q.copy(), starts.v.copy()
+    new_q, new_v = starts.q.copy(), starts.v.copy()
     with suppress(Untraceable):
-        lanes = _InLanes(system, starts)
-        made_q, made_v, fine = lanes.put(starts, moves, 0)
+        lanes = _LaneProjection(system, starts)
+        new_q, new_v, fine = lanes.project(starts, moves, 0)
         left = np.flatnonzero(~fine)
-        for run in left[:1].tolist():  # its result tells how many rows are redundant, if that is the reason
-            found = singly(run)
-            n_redundant = system.n_c - len(found.dependent)
+        for run in left[:1].tolist():  # redundant rows may be the reason: project one guess, to count them
+            projected = project_one(run)
+            n_redundant = system.n_c - len(projected.dependent)
             if n_redundant > 0:
-                made_q[left], made_v[left], fine[left] = lanes.put(starts.some(left), moves, n_redundant)
+                new_q[left], new_v[left], fine[left] = lanes.project(starts.some(left), moves, n_redundant)
             if not fine[run]:
-                made_q[run], made_v[run], fine[run] = *found, True
-    # without a trace, compiled callbacks may exceed their arrays: single calls check this, so only traced ones are run
+                new_q[run], new_v[run], fine[run] = *projected, True
+    # callbacks that were not traced may write beyond their arrays, which only single calls check: call traced ones only
     traced = np.flatnonzero(fine)
-    made = Starts(t, made_q[traced], made_v[traced], starts.parameters[traced])
-    fine[traced] = ~far_off(kit_to_write(system), made)
+    projections = Starts(t, new_q[traced], new_v[traced], starts.parameters[traced])
+    fine[traced] = ~is_inconsistent(kit_to_write(system), projections)
     for run in np.flatnonzero(~fine).tolist():
-        made_q[run], made_v[run] = singly(run)
-    return made_q, made_v
+        new_q[run], new_v[run] = project_one(run)
+    return new_q, new_v
 
 
-class _InLanes:
-    """Generated code that projects guesses onto the constraints of a system.
+class _LaneProjection:
+    """Generated code that projects guesses onto the constraints of a system, in SIMD lanes.
 
     Raises
     ------
     Untraceable
-        If lanes cannot do it; the message says why.
+        If code cannot be generated, or does not pay; the message says why.
     """
 
     def __init__(self, system: ConstrainedSystem, starts: Starts):
@@ -128,11 +128,14 @@ class _InLanes:
             return GeneratedLanes(record, LaneConstraints(system, record.parameters))
 
         self._own = system.remembered_at(("starts", tuple(varying)), generic.tobytes(), make)
-        if self._own.seconds_to_build > SINGLY * len(starts.q):
+        if self._own.seconds_to_build > SECONDS_PER_CALL * len(starts.q):
             raise Untraceable("it is not worth the code for so few")
 
-    def put(self, starts: Starts, moves: Integers, n_redundant: int) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Project positions and velocities onto the constraints, some of them redundant; also return which to take."""
+    def project(self, starts: Starts, moves: Integers, n_redundant: int) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Project guesses; return positions, velocities, and which of them are valid.
+
+        `moves`: 1 for coordinates that may change. `n_redundant`: number of constraints that depend on the others.
+        """
         from twoloop.kernels.lanes import layout
         from twoloop.kernels.lanes import starts as kernels
 
@@ -152,5 +155,5 @@ class _InLanes:
             given = code.pattern, moves, numbers, q[rows], v[rows]
             kernels.start_lanes(kit, settings, control, *given, fine[rows], room)
 
-        in_blocks(block, len(q), threads_of(None))
+        run_in_blocks(block, len(q), threads_of(None))
         return q, v, fine == 1

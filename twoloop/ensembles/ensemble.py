@@ -1,6 +1,6 @@
-"""ensemble: integrate thousands of runs of one system, in SIMD lanes and threads, or one at a time."""
+"""Integrate thousands of runs of one system (`ensemble`), in SIMD lanes and threads, or one at a time."""
 
-from __future__ import annotations  # ArrayLike stays a word in help()
+from __future__ import annotations  # so that help() shows the name ArrayLike
 
 import time
 from collections.abc import Callable
@@ -11,8 +11,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twoloop.checks.arguments import Array, check_positive, check_size, check_span, check_times, check_tolerance
-from twoloop.ensembles.lanes import IN_LANES, LOOKS, SHORT, WHY, LaneRuns, is_involved, lane_methods, threads_of
-from twoloop.ensembles.starts import Starts, all_starts, far_off, generic_system, system_of
+from twoloop.ensembles.lanes import (
+    IN_LANES,
+    N_SHORT,
+    REASONS,
+    SHORT,
+    LaneRuns,
+    is_series_costly,
+    lane_methods,
+    threads_of,
+)
+from twoloop.ensembles.starts import Starts, all_starts, generic_system, is_inconsistent, system_of
 from twoloop.generate.graph import Untraceable
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
@@ -42,13 +51,14 @@ class Runs:
     n_evaluations : ndarray (n_runs,)
         Solutions for accelerations, as `Statistics` counts them.
     singly : ndarray (n_runs,) of bool
-        Runs that were not integrated in lanes, but one at a time, as by `solve_dae`.
+        Runs that `solve_dae` integrated one at a time, not in SIMD lanes.
     message : str
-        How many runs reached the end, how many went in lanes, by which method, how many one at a time, and why.
+        How many runs reached the end, how many were integrated in lanes and by which method, how many one at a time and
+        why.
     messages : dict of int to str
-        Messages of `solve_dae` for the runs that failed.
+        Messages of `solve_dae` for the runs that failed, by their numbers.
     reasons : dict of int to str
-        Why each run that did not go in lanes was integrated one at a time.
+        Why runs were integrated one at a time, by their numbers.
 
     Examples
     --------
@@ -77,8 +87,8 @@ class Runs:
     @property
     def success(self) -> NDArray[np.bool_]:
         """Whether each run reached its end."""
-        made: NDArray[np.bool_] = self.status >= 0
-        return made
+        success: NDArray[np.bool_] = self.status >= 0
+        return success
 
     def __len__(self) -> int:
         return len(self.status)
@@ -89,9 +99,10 @@ class Runs:
 
 Flags = NDArray[np.bool_]
 
-FAR = 1e5  # in tolerances: a motion that is not chaotic does not end farther from the first run
-CALL = 1e-3  # s, time of a call of solve_dae besides its steps
-WORTH = 20.0  # largest time of compilation over that of single runs: the code is cached for later calls
+FAR = 1e5  # largest distance of a run in lanes from the first run, in tolerances, unless the motion is chaotic
+CALL = 1e-3  # time of a call of solve_dae without its steps, s
+# largest ratio of the time to compile to that of single runs; it may exceed 1, as code is cached for later calls
+MAX_COMPILATION = 20.0
 
 
 @dataclass
@@ -111,12 +122,12 @@ class LaneEnsemble:
     n_steps, n_evaluations : ndarray (n_runs,)
     methods : list of str
         Methods that integrated runs in lanes.
-    turn : ndarray (n_runs,)
-        Index of the method that integrated each run; -1: none.
+    method_of : ndarray (n_runs,)
+        Index in `methods` of the method that integrated each run; -1: none.
     reasons : dict
         Why runs were left to `solve_dae`, by their numbers.
     why : str
-        Why no run went in lanes, or none by the first method.
+        Why no run was integrated in lanes, or none by the first method.
     deadline : float
         Time of `time.monotonic` at which runs stop; compilation delays it.
     """
@@ -131,7 +142,7 @@ class LaneEnsemble:
     v: Array = field(init=False)
     n_steps: Integers = field(init=False)
     n_evaluations: Integers = field(init=False)
-    turn: NDArray[np.int8] = field(init=False)
+    method_of: NDArray[np.int8] = field(init=False)
     methods: list[str] = field(default_factory=list)
     reasons: dict[int, str] = field(default_factory=dict)
     why: str = ""
@@ -141,19 +152,19 @@ class LaneEnsemble:
         n_runs = len(self.starts.q)
         self.q, self.v = np.full((2, n_runs, self.system.n_q, len(self.times)), np.nan)
         self.n_steps, self.n_evaluations = np.zeros((2, n_runs), dtype=np.int64)
-        self.turn = np.full(n_runs, -1, dtype=np.int8)
+        self.method_of = np.full(n_runs, -1, dtype=np.int8)
 
     @property
     def in_lanes(self) -> Flags:
         """Whether each run was integrated in lanes."""
-        made: Flags = self.turn >= 0
-        return made
+        in_lanes: Flags = self.method_of >= 0
+        return in_lanes
 
-    def make_in_lanes(self, method: str, first: Result, threads: int) -> None:
-        """Integrate the runs that lanes can do, by the methods of a preset.
+    def integrate_in_lanes(self, method: str, first: Result, threads: int) -> None:
+        """Integrate the runs that can be integrated in lanes, by the methods of a preset.
 
-        `first` is the first run, integrated by `solve_dae`: it tells whether the motion is stiff and what runs cost.
-        Lanes have to end where it does.
+        `first` is the first run, integrated by `solve_dae`. It shows whether the motion is stiff and what runs cost,
+        and its end is compared with that of the same run in lanes.
 
         Raises
         ------
@@ -161,7 +172,7 @@ class LaneEnsemble:
             If a start is not consistent, naming the run.
         """
         stiff = (first.stats.n_jacobians or 0) > 0
-        involved = method == "auto" and not stiff and is_involved(generic_system(self.system, self.starts))
+        involved = method == "auto" and not stiff and is_series_costly(generic_system(self.system, self.starts))
         tolerances = self.rtol, float(self.atol.min())
         for each in lane_methods(method, stiff, self.system.n_q, *tolerances, involved):
             left = np.flatnonzero(~self.in_lanes)
@@ -172,36 +183,36 @@ class LaneEnsemble:
                 lanes = LaneRuns(self.system, self.starts, each)
                 self.deadline += time.monotonic() - began
                 singly = len(left) * (first.stats.cpu_time + CALL)
-                if lanes.own.seconds_to_build > WORTH * singly:
+                if lanes.own.seconds_to_build > MAX_COMPILATION * singly:
                     raise Untraceable(f"to compile them does not pay for these runs, which take about {singly:.2g} s")
-                self._make(lanes, left, first, threads)
+                self._integrate(lanes, left, first, threads)
             except Untraceable as reason:
                 self.why = self.why or str(reason)
 
     def max_step(self, run: int) -> float:
-        """Return the largest step of a run that is left: a short force that samples met must be met again."""
-        return (self.t1 - self.starts.t0) / LOOKS if self.reasons.get(run) == WHY[SHORT] else np.inf
+        """Return the largest step of a run that is integrated singly: short, if samples in lanes met a short force."""
+        return (self.t1 - self.starts.t0) / N_SHORT if self.reasons.get(run) == REASONS[SHORT] else np.inf
 
-    def _make(self, lanes: LaneRuns, which: Integers, first: Result, threads: int) -> None:
-        """Integrate these runs in lanes.
+    def _integrate(self, lanes: LaneRuns, which: Integers, first: Result, threads: int) -> None:
+        """Integrate the runs `which` in lanes.
 
         Raises
         ------
         Untraceable
-            If the first one ends elsewhere than by `solve_dae`.
+            If the first run does not end where it does by `solve_dae`.
         """
         starts, t1, times, rtol, atol = self.starts, self.t1, self.times, self.rtol, self.atol
-        for run in which[far_off(lanes.kit, starts)[which]].tolist():
+        for run in which[is_inconsistent(lanes.kit, starts)[which]].tolist():
             _check_start(self.system, starts, run)
         within = times[times > starts.t0]
         ends = within if within.size and within[-1] == t1 else np.append(within, t1)
         q, v = np.full((2, len(which), self.system.n_q, len(ends)), np.nan)
-        status, steps, evaluations, at_end = lanes.make(which, t1, ends, rtol, atol, threads, q, v, self.deadline)
-        fine = lanes.judge(which, status, t1, rtol, float(atol.min()), q, v, at_end)
+        status, steps, evaluations, at_end = lanes.integrate(which, t1, ends, rtol, atol, threads, q, v, self.deadline)
+        fine = lanes.check(which, status, t1, rtol, float(atol.min()), q, v, at_end)
         if fine[0] and first.success:
-            known = first.q[:, -1:]
-            off = np.abs(q[0][:, ends == first.t[-1]] - known)  # empty if that time is not among these
-            if (off > FAR * (atol[:, None] + rtol * np.abs(known))).any():
+            reference = first.q[:, -1:]
+            off = np.abs(q[0][:, ends == first.t[-1]] - reference)  # empty if `ends` has no such time
+            if (off > FAR * (atol[:, None] + rtol * np.abs(reference))).any():
                 raise Untraceable(f"the first run ends elsewhere by itself, {FAR:g} tolerances and more away")
         fine[0] = False
         n, runs = len(within), which[fine]
@@ -213,10 +224,10 @@ class LaneEnsemble:
             if n < len(times):
                 states[runs, :, 0] = start[runs]
         self.n_steps[runs], self.n_evaluations[runs] = steps[fine], evaluations[fine]
-        self.turn[runs] = len(self.methods)
+        self.method_of[runs] = len(self.methods)
         self.methods.append(lanes.method.name)
         left = np.flatnonzero(~fine)
-        self.reasons |= {int(which[i]): WHY[int(status[i])] for i in left.tolist() if which[i] > 0}
+        self.reasons |= {int(which[i]): REASONS[int(status[i])] for i in left.tolist() if which[i] > 0}
 
 
 def _check_start(system: ConstrainedSystem, starts: Starts, run: int) -> None:
@@ -230,19 +241,20 @@ def _check_start(system: ConstrainedSystem, starts: Starts, run: int) -> None:
 
 
 def of_run(run: int, error: ValueError) -> ValueError:
-    """Return the error of a single run with its number; its advice names the function for many runs."""
+    """Return the error of a single run with the number of the run, and with `consistent_states` in its advice."""
     return ValueError(f"run {run}: {error}".replace("twoloop.consistent_state(", "twoloop.consistent_states("))
 
 
 SHOWN = 5  # largest number of runs that a message names
 FIRST = "the first, which checks the system"  # reason for which the first run is not in lanes
-ROUNDS = 3  # of runs that are integrated one at a time within a time limit
-LARGEST_SHARE, TIMES = 0.1, 3.0  # such a run may take this part of the remaining time, or of the longest run so far
-FIRST_SHARE = 0.5  # largest part of the time limit that the first run takes
+ROUNDS = 3  # number of times that runs are tried one at a time within a time limit
+# a run that is integrated singly may take this share of the remaining time, or this multiple of the longest run so far
+LARGEST_SHARE, TIMES = 0.1, 3.0
+FIRST_SHARE = 0.5  # largest share of the time limit that the first run takes
 NOT_ENDED = (
     "time_limit ended before the run began or, in lanes, ended: raise it, loosen rtol and atol, or shorten t_span."
 )
-CLOSER, TIGHT = 0.1, 1e-9  # factor of the tolerances of the first run, unless these are as tight as TIGHT
+TIGHTER, TIGHT = 0.1, 1e-9  # factor on the tolerances of the first run, unless they are TIGHT or smaller already
 
 
 def ensemble(
@@ -262,16 +274,20 @@ def ensemble(
 ) -> Runs:
     """Integrate many runs of one system, each with parameters and a start of its own.
 
-    Runs use code generated for the system, one run in each lane of the processor's vectors. Each run has its own
-    steps, which are checked as those of a single run. A lane whose run has ended takes the next one. All parameters use
-    the same code, which is kept on disk.
+    Runs use code generated for the system, one run in each SIMD lane of the processor. Each run has its own steps,
+    which are checked like those of a single run. A lane whose run has ended takes the next run. The code serves all
+    parameters and is cached on disk.
 
-    Some runs are integrated by `solve_dae` one at a time: runs that come near a singular position, systems whose
-    callbacks branch or that have nonholonomic rows, events, and other methods. So are runs whose forces or drives were
-    seen to act for less than a thousandth of the run, with a `max_step` of half of that, and runs that take less than a
-    twentieth of the estimated time to compile their code. The first run is also integrated by `solve_dae`, with all of
-    its checks, and with a tenth of the tolerances if these are above 1e-9, because lanes are compared with it. At the
-    end of every other run, the callbacks are compared with the state found there.
+    `solve_dae` integrates some runs one at a time:
+
+    - the first run, with all checks, and with a tenth of the tolerances if they are above 1e-9: the lanes are compared
+      with it
+    - runs that come near a singular position; runs with events, nonholonomic rows, callbacks that branch, or other
+      methods
+    - runs whose forces or drives act for less than a thousandth of the run, with a `max_step` of half of that
+    - all runs, if they take less than a twentieth of the estimated time to compile their code
+
+    At the end of every run in lanes, the equations are evaluated by the callbacks, and compared with its state.
 
     Parameters
     ----------
@@ -285,18 +301,17 @@ def ensemble(
     rtol, atol, t_eval, events
         As for `solve_dae`; t_eval None: states are stored at the start and the end.
     method : str or method object
-        "auto", "Taylor", "DOP853", "RadauIIA5", "RadauIIA9" and "RadauIIA13" go in lanes. "auto" takes Taylor series
-        there, and DOP853 for runs that these cannot do and for systems that have none; at tolerances from 1e-9 on it
-        takes DOP853 first where series take more than six operations a coordinate, no force may act for a short time,
-        and no callback has quotients, roots or fast vibrations. If the first run came to Newton's method, it takes a
-        Radau method for all runs, of order 5 at tolerances from 9e-7 on and of order 9 below, with errors tested as by
-        `Auto`.
+        "auto", "Taylor", "DOP853", "RadauIIA5", "RadauIIA9" and "RadauIIA13" run in lanes. There "auto" takes Taylor
+        series, and DOP853 for runs and systems that have no series. It takes DOP853 first if the tolerances are 1e-9 or
+        larger, series take more than six operations a coordinate, no force may act for a short time, and no callback
+        has quotients, roots or fast vibrations. If the first run switched to Newton's method, it takes a Radau method
+        for all runs: of order 5 at tolerances of 9e-7 and larger, else of order 9, with the error test of `Auto`.
     threads : int, optional
         None: one for each core that this process may use. Results do not depend on it.
     time_limit : float, optional
         Wall-clock time of all runs, s, without compilation. Runs that have not ended by then get the status TIME_LIMIT
-        and, if they were integrated one at a time, keep their states so far. Such runs share the time, so that a run
-        that never ends does not take that of others.
+        and, if they were integrated one at a time, keep their states so far. Runs that are integrated one at a time
+        share the remaining time, so that a run that never ends does not take all of it.
 
     Returns
     -------
@@ -319,8 +334,7 @@ def ensemble(
     only the forces so often. Stages violate the constraints by the error of the formula, also in the Radau methods,
     whose unknowns in lanes are the accelerations of all coordinates. The end of each step is projected onto the
     constraints. States at `t_eval` within a step are the ends of shorter steps from its beginning. `solve_dae`
-    integrates runs that would take more than 100,000 steps, and runs by series that meet a place at which the equations
-    have no values.
+    integrates runs that would take more than 100,000 steps, and runs by series in which the equations become undefined.
 
     Examples
     --------
@@ -385,11 +399,11 @@ def _integrate(
 
     def single(run: int, max_step: float = np.inf, limit: float = np.inf) -> Result:
         limited = {"time_limit": limit} if limit < np.inf else {}
-        result = _alone(system, starts, run, (t0, t1), options | {"max_step": max_step} | limited)
+        result = _solve_one(system, starts, run, (t0, t1), options | {"max_step": max_step} | limited)
         if result.status is Status.INTERRUPTED:  # Ctrl-C ends all runs, as it does in lanes
             raise KeyboardInterrupt
-        for out, found in ((runs.q, result.q), (runs.v, result.v)):
-            out[run, :, : len(result.t)], out[run, :, len(result.t) :] = found, np.nan
+        for out, states in ((runs.q, result.q), (runs.v, result.v)):
+            out[run, :, : len(result.t)], out[run, :, len(result.t) :] = states, np.nan
         status[run], runs.n_steps[run] = int(result.status), result.stats.n_accepted or 0
         runs.n_evaluations[run] = result.stats.n_evaluations or 0
         messages.pop(run, None)
@@ -399,7 +413,7 @@ def _integrate(
 
     may_go = events is None and method in IN_LANES and n_runs > 1
     if may_go and float(rtol) > TIGHT and tolerance.min() > TIGHT:  # lanes are compared with the first run
-        options |= {"rtol": CLOSER * float(rtol), "atol": CLOSER * tolerance}
+        options |= {"rtol": TIGHTER * float(rtol), "atol": TIGHTER * tolerance}
     total = np.inf if time_limit is None else float(time_limit)
     first = single(0, limit=total if n_runs == 1 else FIRST_SHARE * total)  # checks the system, derivatives and all
     runs.deadline = time.monotonic() + total - min(first.stats.cpu_time, FIRST_SHARE * min(total, 1e9))
@@ -409,39 +423,39 @@ def _integrate(
     elif method not in IN_LANES:
         runs.why = f"{chosen.name} does not go in lanes"
     elif n_runs > 1:
-        runs.make_in_lanes(str(method), first, n_threads)
-    alone = ~runs.in_lanes
-    _share_time(np.flatnonzero(alone).tolist(), single, status, messages, runs)
-    reasons = {run: runs.reasons.get(run, runs.why) for run in np.flatnonzero(alone).tolist()}
+        runs.integrate_in_lanes(str(method), first, n_threads)
+    singly = ~runs.in_lanes
+    _share_time(np.flatnonzero(singly).tolist(), single, status, messages, runs)
+    reasons = {run: runs.reasons.get(run, runs.why) for run in np.flatnonzero(singly).tolist()}
     if runs.methods or not runs.why:
         reasons[0] = FIRST
     message, counts = _message(status, runs, reasons), (runs.n_steps, runs.n_evaluations)
-    return Runs(times, runs.q, runs.v, status, *counts, alone, message, messages, reasons)
+    return Runs(times, runs.q, runs.v, status, *counts, singly, message, messages, reasons)
 
 
 def _share_time(
     left: list[int], single: Callable[..., Result], status: Integers, messages: dict[int, str], runs: LaneEnsemble
 ) -> None:
-    """Integrate runs one at a time; within a time limit none takes most of it, and later rounds what others leave."""
+    """Integrate runs one at a time; each has a share of the time limit, and later rounds share the rest."""
     queue = [run for run in left if run > 0 or status[run] == Status.TIME_LIMIT]
-    had, longest = dict.fromkeys(queue, 0.0), 0.0
+    limits, longest = dict.fromkeys(queue, 0.0), 0.0
     for _ in range(ROUNDS):
         for place, run in enumerate(queue):
             began = time.monotonic()
             remaining = runs.deadline - began
             limit = min(remaining, max(remaining / (len(queue) - place), LARGEST_SHARE * remaining, TIMES * longest))
-            if limit > 2.0 * had[run]:  # a run begins anew
-                had[run] = limit
+            if limit > 2.0 * limits[run]:  # each attempt starts from t0
+                limits[run] = limit
                 if single(run, runs.max_step(run), limit).success:
                     longest = max(longest, time.monotonic() - began)
-            elif had[run] == 0.0 and run > 0:
+            elif limits[run] == 0.0 and run > 0:
                 status[run], messages[run] = int(Status.TIME_LIMIT), NOT_ENDED
                 if runs.times[0] == runs.starts.t0:
                     runs.q[run, :, 0], runs.v[run, :, 0] = runs.starts.q[run], runs.starts.v[run]
         queue = [run for run in queue if status[run] == Status.TIME_LIMIT]
 
 
-def _alone(
+def _solve_one(
     system: ConstrainedSystem, starts: Starts, run: int, span: tuple[float, float], options: dict[str, Any]
 ) -> Result:
     own = system_of(system, starts, run)
@@ -453,19 +467,19 @@ def _alone(
 
 def _message(status: Integers, runs: LaneEnsemble, reasons: dict[int, str]) -> str:
     failed, n_runs = int((status < 0).sum()), len(status)
-    said = f"{n_runs - failed} of {n_runs} runs reached the end or an event"
-    alike: dict[str, list[int]] = {}
+    reached = f"{n_runs - failed} of {n_runs} runs reached the end or an event"
+    by_reason: dict[str, list[int]] = {}
     for run, reason in reasons.items():
-        alike.setdefault(reason, []).append(run)
-    if not runs.methods and FIRST not in alike:
-        return f"{said}; none went in lanes: {reasons[0]}."
-    made_by = ((name, int((runs.turn == turn).sum())) for turn, name in enumerate(runs.methods))
-    in_lanes = "".join(f"{count} in lanes by {name}, " for name, count in made_by if count > 0)
-    others = "".join(f"; {_numbered(runs)}: {reason}" for reason, runs in alike.items() if reason != FIRST)
-    return f"{said}; {in_lanes}{len(reasons)} made singly: {FIRST}{others}."
+        by_reason.setdefault(reason, []).append(run)
+    if not runs.methods and FIRST not in by_reason:
+        return f"{reached}; none went in lanes: {reasons[0]}."
+    counts = ((name, int((runs.method_of == k).sum())) for k, name in enumerate(runs.methods))
+    in_lanes = "".join(f"{count} in lanes by {name}, " for name, count in counts if count > 0)
+    others = "".join(f"; {_describe_numbers(runs)}: {reason}" for reason, runs in by_reason.items() if reason != FIRST)
+    return f"{reached}; {in_lanes}{len(reasons)} made singly: {FIRST}{others}."
 
 
-def _numbered(runs: list[int]) -> str:
-    """Describe how many runs there are, and which."""
-    told = ", ".join(map(str, runs[:SHOWN])) + (", ..." if len(runs) > SHOWN else "")
-    return f"run {told}" if len(runs) == 1 else f"{len(runs)} runs ({told})"
+def _describe_numbers(runs: list[int]) -> str:
+    """Describe how many runs are in a list, with the numbers of the first ones."""
+    numbers = ", ".join(map(str, runs[:SHOWN])) + (", ..." if len(runs) > SHOWN else "")
+    return f"run {numbers}" if len(runs) == 1 else f"{len(runs)} runs ({numbers})"

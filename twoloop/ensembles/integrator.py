@@ -1,6 +1,6 @@
-"""Integrator: one system, method and tolerances for run after run."""
+"""Define `Integrator`: one system, method and tolerances for many runs, one after another."""
 
-from __future__ import annotations  # ArrayLike stays a word in help()
+from __future__ import annotations  # so that help() shows the name ArrayLike
 
 import copy
 import inspect
@@ -24,17 +24,17 @@ from twoloop.run.sampled import SampledRun, SampledState
 from twoloop.run.signals import signals_of
 from twoloop.solve import solve_dae
 
-MOST = 64  # largest number of cached systems with other parameters
-FOR_SAMPLES = {"method", "rtol", "atol", "max_step", "check_derivatives"}
-OF_A_RUN = {"system", "t_span", "q0", "v0", "method", "rtol", "atol", "t_eval", "store"}
+MAX_SYSTEMS = 64  # largest number of cached systems with other parameters
+OPTIONS_OF_START = {"method", "rtol", "atol", "max_step", "check_derivatives"}
+ARGUMENTS_OF_RUN = {"system", "t_span", "q0", "v0", "method", "rtol", "atol", "t_eval", "store"}  # no options
 
 
 class Integrator:
     """Integrator of one system with a method and tolerances, for many runs one after another, or from sample to sample.
 
-    Plans, machine code, checks of the same start, and the systems of the latest parameters do not change from run to
-    run: they are created once and cached. A copy begins without a motion: give it a `start`. For thousands of runs at
-    once see `ensemble`.
+    Plans, machine code, checks of equal starts, and systems with the latest parameters are created once and cached.
+    `start` and `step` integrate sample by sample; a copy of the integrator needs a new `start`. For thousands of runs
+    at once see `ensemble`.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class Integrator:
     method, rtol, atol
         As for `solve_dae`.
     **options
-        Further keyword arguments of `solve_dae`, of all runs: events, compiled, max_step, ...
+        Further keyword arguments of `solve_dae`, used in all runs: events, compiled, max_step, ...
 
     Raises
     ------
@@ -73,11 +73,11 @@ class Integrator:
     ):
         check_system(system)
         parameters = inspect.signature(solve_dae).parameters
-        known = parameters.keys() - OF_A_RUN
-        unknown = [name for name in options if name not in known]
+        names = parameters.keys() - ARGUMENTS_OF_RUN
+        unknown = [name for name in options if name not in names]
         if unknown:
-            raise TypeError(f"Integrator has no option {unknown[0]!r}; its options are {', '.join(sorted(known))}")
-        given = {name: options.get(name, parameters[name].default) for name in known - {"events"}}
+            raise TypeError(f"Integrator has no option {unknown[0]!r}; its options are {', '.join(sorted(names))}")
+        given = {name: options.get(name, parameters[name].default) for name in names - {"events"}}
         check_options(system, method, rtol, atol, **given)
         check_events(options.get("events"))
         self.system = system
@@ -94,14 +94,14 @@ class Integrator:
         parameters: ArrayLike | None = None,
         t_eval: ArrayLike | None = None,
     ) -> Result:
-        """Integrate from a consistent start, with other parameters where these are given.
+        """Integrate from a consistent start, with other parameters if they are given.
 
         Parameters
         ----------
         t_span, q0, v0, t_eval
             As for `solve_dae`.
         parameters : array_like, optional
-            The vector `p` of this run. None: that of the system.
+            Parameters `p` of this run. None: those of the system.
 
         Returns
         -------
@@ -121,7 +121,7 @@ class Integrator:
         Parameters
         ----------
         t0 : float
-            s.
+            Time, s.
         q0, v0 : array_like (n_q,)
             Consistent coordinates and velocities.
         parameters : array_like, optional
@@ -135,9 +135,9 @@ class Integrator:
         Raises
         ------
         TypeError, ValueError
-            If the start is refused, or the integrator has the method "Taylor" or an option that is for runs alone.
+            If the start is refused, or the integrator has the method "Taylor" or an option that only `run` supports.
         """
-        for name in self._options.keys() - FOR_SAMPLES:
+        for name in self._options.keys() - OPTIONS_OF_START:
             if self._options[name] not in (None, False, "auto"):
                 raise ValueError(f"start takes no {name}, which is for run alone; the integrator was made with it")
         check_system(self.system)
@@ -149,14 +149,11 @@ class Integrator:
         if self.system.parameters.size:
             system = self.system.with_parameters(self.system.parameters if parameters is None else parameters)
         atol = check_tolerance("atol", self._options["atol"], n)
-        q, v, checks = (
-            check_vector("q0", q0, n),
-            check_vector("v0", v0, n),
-            self._options.get("check_derivatives", True),
-        )
-        asked = self._options["method"], float(rtol), atol, float(max_step), checks
+        q, v = check_vector("q0", q0, n), check_vector("v0", v0, n)
+        checks = self._options.get("check_derivatives", True)
+        settings = self._options["method"], float(rtol), atol, float(max_step), checks
         with signals_of(system):
-            self._sampled = SampledRun(system, *asked, t0, q, v)
+            self._sampled = SampledRun(system, *settings, t0, q, v)
         if self._sampled.run.rows_warning:
             warnings.warn(self._sampled.run.rows_warning, ConstraintWarning, stacklevel=2)
         return self._sampled.state
@@ -164,15 +161,16 @@ class Integrator:
     def step(self, dt: float, inputs: Mapping[int, float] | ArrayLike | None = None) -> SampledState:
         """Integrate to the next sample, with inputs that are constant until then.
 
-        No checks are repeated. Accelerations jump with the inputs, and the method restarts there. Error control is that
-        of `run`. As in a run, the equations are evaluated at least every hundredth of the time since the start, so the
-        first samples are divided into many steps. A sample that meets a force too short for them is repeated, and
-        a `ConstraintWarning` says where earlier samples may have missed one.
+        The checks of `start` are not repeated. When inputs change, accelerations jump and the method restarts. Errors
+        are controlled as in `run`. As in a run, the equations are evaluated at least every hundredth of the time since
+        the start, so the first samples are divided into many steps. If a sample meets a force that is shorter than the
+        time between evaluations, it is repeated with more evaluations. A `ConstraintWarning` then says that earlier
+        samples may have missed such a force.
 
         Parameters
         ----------
         dt : float
-            s.
+            Duration of the sample, s.
         inputs : mapping from int to float, or array_like (n_p,), optional
             Parameters of the system that change, by their indices, or all parameters. They may enter only forces. None:
             no parameter changes. `problem.place("value of motor of shoulder")` is the index of a parameter of a model.
@@ -187,7 +185,7 @@ class Integrator:
         TypeError, ValueError
             If an argument is wrong, an input enters more than forces, or there was no `start`.
         RuntimeError
-            If the step fails; the message says why, as that of a run. `result()` has what was computed before.
+            If the step fails; the message says why, like that of a run. `result()` has the samples before.
         """
         if self._sampled is None:
             raise ValueError("step goes on from a start: call integrator.start(t0, q0, v0) first")
@@ -208,8 +206,8 @@ class Integrator:
         Returns
         -------
         Result
-            Without a dense solution. `result.changes` says that inputs changed. Its energy is that of the parameters
-            of the system, whatever inputs changed; it has none if `start` was given others.
+            It has no dense solution. `result.changes` says that inputs changed. Its energy is computed with the
+            parameters of the system, whatever inputs changed; it has no energy if `start` was given other parameters.
 
         Raises
         ------
@@ -223,22 +221,20 @@ class Integrator:
         return record_of(Result, vars(record) | {"compiled": False, "rtol": float(self._options["rtol"]), "atol": atol})
 
     def _system_of(self, parameters: ArrayLike) -> ConstrainedSystem:
-        made = self.system.with_parameters(parameters)
-        kept = self._systems.setdefault(made.parameters.tobytes(), made)
-        if len(self._systems) > MOST:
+        system = self.system.with_parameters(parameters)
+        cached = self._systems.setdefault(system.parameters.tobytes(), system)
+        if len(self._systems) > MAX_SYSTEMS:
             del self._systems[next(iter(self._systems))]
-        return kept
+        return cached
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Make copies, also in other processes, without a motion: two integrators cannot share the arrays of one."""
-        return _made, (self.system, self._options)
+        """Copy and pickle the system and the options only: two integrators cannot share the arrays of a motion."""
+        return _create, (self.system, self._options)
 
     def __repr__(self) -> str:
-        told = (self._options[name] for name in ("method", "rtol", "atol"))
-        return "<Integrator of {!r}: {}, rtol {}, atol {}>".format(
-            self.system.name, *(getattr(x, "name", x) for x in told)
-        )
+        method, rtol, atol = (self._options[name] for name in ("method", "rtol", "atol"))
+        return f"<Integrator of {self.system.name!r}: {method.name}, rtol {rtol}, atol {atol}>"
 
 
-def _made(system: ConstrainedSystem, options: dict[str, Any]) -> Integrator:
+def _create(system: ConstrainedSystem, options: dict[str, Any]) -> Integrator:
     return Integrator(system, **options)

@@ -1,4 +1,4 @@
-"""Runs in SIMD lanes: choose the methods, compile their code, sample short forces, check each run."""
+"""Integrate runs in SIMD lanes: choose the methods, generate code, sample short forces, check each run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from twoloop.checks.arguments import Array
 from twoloop.ensembles.starts import Starts, generic_parameters, generic_system, kit_to_write, system_of
-from twoloop.generate.elimination import Choice
+from twoloop.generate.elimination import PivotChoice
 from twoloop.generate.graph import Untraceable
 from twoloop.generate.parameter_expressions import ParameterTape
 from twoloop.generate.program import Arrays, Program
@@ -39,18 +39,18 @@ from twoloop.problem.system import ConstrainedSystem
 if TYPE_CHECKING:
     from twoloop.generate.lane_code import GeneratedLanes, LaneCode
 
-AT_ONCE = 30_000  # largest number of values that are compared together
+BLOCK_VALUES = 30_000  # largest number of sampled values that are compared together
 
 
-class ShortLooks:
-    """Sampling of the forces and drives of many runs, at times a two-thousandth of a run apart.
+class ForceSampling:
+    """Sampling of the forces and drives of many runs, to detect short forces.
 
     Parameters
     ----------
     system : ConstrainedSystem
         A system whose callbacks run on symbols, without nonholonomic rows.
     values, varying
-        As for `ParameterTape`: generic parameters, and which of them differ from run to run.
+        Arguments of `ParameterTape`: generic parameters, and the indices of those that differ between runs.
     """
 
     def __init__(self, system: ConstrainedSystem, values: Array, varying: Sequence[int]):
@@ -60,13 +60,13 @@ class ShortLooks:
         forms = np.concatenate([equations.of(kind).ravel() for kind in BY_TIME if kind in system.given])
         self._program = Program(graph, {"": [x for x in forms if any(graph.inputs_of[i] & TIME for i in x.terms)]})
 
-    def meet(self, times: Array, rtol: float, parameters: Array, q: Array, v: Array) -> NDArray[np.bool_]:
-        """Return which runs meet a change that lasts less than two samples, or a value that is not finite.
+    def has_short_forces(self, times: Array, rtol: float, parameters: Array, q: Array, v: Array) -> NDArray[np.bool_]:
+        """Return a mask of the runs with a change that lasts less than two samples, or a value that is not finite.
 
         q, v : (n_runs, n), one state of each run.
         """
-        met = np.zeros(len(q), dtype=bool)
-        size = max(1, AT_ONCE // max(1, len(times) * len(self._program.forms)))
+        short = np.zeros(len(q), dtype=bool)
+        size = max(1, BLOCK_VALUES // max(1, len(times) * len(self._program.forms)))
         for begin in range(0, len(q), size):
             rows = slice(begin, begin + size)
             algebra = Arrays(self._tape, parameters[rows])
@@ -74,12 +74,15 @@ class ShortLooks:
             values = np.empty((len(times), len(q[rows]), len(forces)))
             for k, force in enumerate(forces):
                 values[..., k] = force
-            met[rows] = _are_short(values, rtol)
-        return met
+            short[rows] = _are_short(values, rtol)
+        return short
 
 
 def _are_short(values: Array, rtol: float) -> NDArray[np.bool_]:
-    """Return in which runs a value, (n_times, n_runs, n), jumps twice within two samples or is not finite."""
+    """Return a mask of the runs in which a value jumps twice within two samples, or is not finite.
+
+    values : (n_times, n_runs, n)
+    """
     if not values.size:
         return np.zeros(values.shape[1], dtype=bool)
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=(0, 2)))
@@ -97,8 +100,9 @@ def _are_short(values: Array, rtol: float) -> NDArray[np.bool_]:
     return np.asarray(short | ~finite)
 
 
-INVOLVED = 6.0  # operations of a series per coordinate, from which on "auto" takes DOP853 (measured at 2, 11, 13) ...
-STAGES_TO = 1e-9  # ... down to this tolerance
+# operations of a series per coordinate, from which on "auto" takes DOP853 (measured at 2, 11, 13), and the smallest
+# tolerance for which it does
+COSTLY_SERIES, SMALLEST_FOR_DOP853 = 6.0, 1e-9
 STAGES = {"RadauIIA5": 3, "RadauIIA9": 5, "RadauIIA13": 7}  # number of stages of the implicit methods
 IN_LANES = ("auto", "Taylor", "DOP853", *STAGES)  # presets that can run in lanes
 
@@ -113,17 +117,17 @@ class LaneMethod:
     series : bool
         Whether it needs code for Taylor series.
     order : int
-        The order that generated code gets.
+        Argument `order` of the generated functions.
     evaluations : int
-        Evaluations of an attempt, besides those that its kernel counts and the one at its end.
+        Number of evaluations in an attempted step, without those that the kernel counts and the one at its end.
     options : ndarray
-        The numbers that its step reads.
+        Numbers that the step kernel reads.
     tableau : tuple of ndarray or None
-        For an explicit method with generated code: A, b, c and the weights of two estimates of its error.
+        For an explicit method with generated code: A, b, c and the weights of two error estimates.
     unseen : float
-        The longest part of a step within which the equations are not evaluated.
+        Largest distance between evaluations in a step, relative to the step.
     step, memory : callable
-        The kernel of its step, compiled when first needed, and the length of its memory, in vectors, for given code.
+        Functions that return the step kernel, and the size of its memory for given code, in vectors.
     """
 
     name: str
@@ -137,24 +141,25 @@ class LaneMethod:
     unseen: float = 1.0
 
 
-def is_involved(system: ConstrainedSystem) -> bool:
-    """Return whether a Taylor series takes so many operations that a dozen evaluations cost less.
+def is_series_costly(system: ConstrainedSystem) -> bool:
+    """Return whether a Taylor series takes so many operations that the stages of DOP853 cost less.
 
-    Return False if a force may be narrow: DOP853 then needs short steps, a series only samples within its steps.
+    Return False if a force may be steep: DOP853 would then need short steps, while series only check the defect more
+    often.
     """
     if may_be_steep(system, ran_on_symbols=True):
         return False
     try:
-        return series_for(system).n_operations > INVOLVED * system.n_q
+        return series_for(system).n_operations > COSTLY_SERIES * system.n_q
     except Untraceable:
         return False
 
 
 def lane_methods(name: str, stiff: bool, n: int, rtol: float, atol: float, involved: bool = False) -> list[LaneMethod]:
-    """Return the methods of a preset for runs of n coordinates; each serves if no code can be had for the one before.
+    """Return the methods of a preset for n coordinates, in the order in which they are tried.
 
-    "auto" takes Taylor series, or DOP853 if there are none or, down to STAGES_TO, if the series are `involved`. For
-    stiff motion it takes the Radau method of single runs, at loose tolerances that of order 5.
+    "auto" takes Taylor series, then DOP853; the other way round if series are `involved` and the tolerance is not below
+    SMALLEST_FOR_DOP853. For stiff motion it takes the Radau method of single runs, with order 5 at loose tolerances.
     """
     if name == "DOP853":
         return [_dop853(n, rtol, atol)]
@@ -164,8 +169,8 @@ def lane_methods(name: str, stiff: bool, n: int, rtol: float, atol: float, invol
         return [_newton(name, "all", n, rtol, atol)]
     tolerance = least_tolerance(rtol, atol)
     if not stiff:
-        made = [_taylor(rtol, atol), _dop853(n, rtol, atol)]
-        return made[::-1] if involved and tolerance >= STAGES_TO else made
+        methods = [_taylor(rtol, atol), _dop853(n, rtol, atol)]
+        return methods[::-1] if involved and tolerance >= SMALLEST_FOR_DOP853 else methods
     radau = "RadauIIA5" if tolerance >= TIGHTEST else "RadauIIA9"
     return [_newton(radau, "positions", n, rtol, atol)]
 
@@ -214,7 +219,7 @@ def _newton(name: str, tested: Literal["all", "positions"], n: int, rtol: float,
 
 
 def _options(method: Method, n: int, rtol: float, atol: float) -> Array:
-    """Return the numbers that a step reads, after those that explicit.py reads."""
+    """Return the numbers that a step kernel reads: step-size control, then the options of the plan."""
     plan = method.plan(n, rtol, atol, False)
     return np.concatenate([plan.rule, [plan.rough, cached_run().FIRST_STEP, least_tolerance(rtol, atol)], plan.options])
 
@@ -222,17 +227,17 @@ def _options(method: Method, n: int, rtol: float, atol: float) -> Array:
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-N_SAMPLES = 100  # smallest number of evaluations of the equations in a run ...
-OF_SUDDEN = 20  # ... times this if a force may act for a short time: lanes do not sample ahead
-SMALLEST, LARGEST = 128, 4096  # number of runs of a block; coefficients of all its runs are computed at once
-FOR_EACH = 3  # blocks per thread, so that all threads end at about the same time
-LOOKS = N_SAMPLES * OF_SUDDEN
-SHORT = min(layout.NO_START, layout.UNLIKE) - 1  # a status besides those of layout.py
-OUT_OF_TIME = SHORT - 1  # likewise: not at its end when the time limit ended
-AGAIN = 0.01  # s: after this time, runs that began meanwhile are stopped too
-AGREES = 1e-7  # relative to the terms of an equation: residual that rounding may leave at the end of a run
+# smallest number of evaluations of the equations in a run: usually, and if forces may be short
+N_SAMPLES, N_SHORT = 100, 2000
+SMALLEST, LARGEST = 128, 4096  # limits of the number of runs in a block, whose coefficients are computed together
+BLOCKS_PER_THREAD = 3  # so that all threads end at about the same time
+# status of runs besides those in layout.py: a short force was met; the time limit ended before the run
+SHORT = min(layout.NO_START, layout.UNLIKE) - 1
+OUT_OF_TIME = SHORT - 1
+STOP_INTERVAL = 0.01  # time after which `stop` is called again, s, for runs that began meanwhile
+AGREES = 1e-7  # largest residual at the end of a run that is attributed to rounding, relative to its terms
 
-WHY = {  # reasons for which a run is left to `solve_dae`, by its status in layout.py
+REASONS = {  # reasons for which a run is left to `solve_dae`, by its status in layout.py
     layout.NO_START: "the code made for the first run does not hold at the start",
     layout.NO_STATE: "a state at t_eval could not be put on the constraints",
     layout.NO_VALUES: "the equations have no values in a step (constraints lose rank, a root of a negative number)",
@@ -262,12 +267,12 @@ class LaneRuns:
     def __init__(self, system: ConstrainedSystem, starts: Starts, method: LaneMethod):
         self.system, self.starts, self.method, self.kit = system, starts, method, kit_to_write(system)
         generic, varying = generic_parameters(starts.parameters)
-        of_all = generic_system(system, starts)
-        sudden = may_be_short(of_all, ran_on_symbols=True)
-        unseen = 1.0 if may_be_steep(of_all, ran_on_symbols=True) else method.unseen
-        self.places = LOOKS if any(sudden) else N_SAMPLES * unseen
-        self.looks = ShortLooks(system, generic, varying) if sudden.by_time else None
-        choice = Choice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
+        with_all_terms = generic_system(system, starts)
+        short_forces = may_be_short(with_all_terms, ran_on_symbols=True)
+        unseen = 1.0 if may_be_steep(with_all_terms, ran_on_symbols=True) else method.unseen
+        self.n_gaps = N_SHORT if any(short_forces) else N_SAMPLES * unseen  # smallest number of steps in a run
+        self.sampling = ForceSampling(system, generic, varying) if short_forces.by_time else None
+        choice = PivotChoice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
         kind = ("lanes", method.series, method.tableau is None, choice, tuple(varying))  # the latest code is cached
 
         def make() -> GeneratedLanes[LaneCode]:
@@ -278,7 +283,7 @@ class LaneRuns:
 
         self.own = system.remembered_at(kind, generic.tobytes(), make)
 
-    def make(
+    def integrate(
         self,
         which: Integers,
         t1: float,
@@ -290,9 +295,9 @@ class LaneRuns:
         out_v: Array,
         deadline: float = np.inf,
     ) -> tuple[Integers, Integers, Integers, Array]:
-        """Integrate these runs; return status (see layout.py), steps and evaluations, and a and lam at the end.
+        """Integrate the runs `which`; return status (see layout.py), steps, evaluations, and rows [a, lam] at the end.
 
-        Runs stop at the deadline, a time of `time.monotonic`.
+        States at `times` are written to `out_q` and `out_v`. Runs stop at the deadline, a time of `time.monotonic`.
         """
         from twoloop.kernels.lanes.control import MOST_STEPS
 
@@ -303,18 +308,18 @@ class LaneRuns:
 
         def block(rows: slice) -> None:
             out = out_q[rows], out_v[rows], ends[rows]
-            told = status[rows], n_steps[rows], n_evaluations[rows]
-            self._make(which[rows], t1, times, rtol, atol, out, told)
+            counts = status[rows], n_steps[rows], n_evaluations[rows]
+            self._integrate(which[rows], t1, times, rtol, atol, out, counts)
 
         def stop() -> None:
-            """Let runs leave their lanes, also in the threads that integrate them, as if they had taken all steps."""
+            """End the runs in all threads, as if they had taken MOST_STEPS steps."""
             n_steps[status == layout.UNDECIDED] = MOST_STEPS
 
-        if not in_blocks(block, n_runs, threads, deadline, stop):
+        if not run_in_blocks(block, n_runs, threads, deadline, stop):
             status[(status == layout.MANY_STEPS) | (status == layout.UNDECIDED)] = OUT_OF_TIME
         return status, n_steps, n_evaluations, ends
 
-    def _make(
+    def _integrate(
         self,
         which: Integers,
         t1: float,
@@ -322,7 +327,7 @@ class LaneRuns:
         rtol: float,
         atol: Array,
         out: tuple[Array, Array, Array],
-        told: tuple[Integers, Integers, Integers],
+        counts: tuple[Integers, Integers, Integers],
     ) -> None:
         from twoloop.kernels.lanes import advance
 
@@ -334,26 +339,26 @@ class LaneRuns:
         kit = layout.LaneKit(self.own.functions, method.step())
         redundant = bool(code.equations.redundant_rows.conditions)
         settings = np.array([n, n_rows, method.order, redundant, code.n_numbers, method.evaluations], dtype=np.int64)
-        control = np.concatenate([[starts.t0, t1, (t1 - starts.t0) / self.places, rtol], atol, code.numbers.values])
+        control = np.concatenate([[starts.t0, t1, (t1 - starts.t0) / self.n_gaps, rtol], atol, code.numbers.values])
         given = np.ascontiguousarray(starts.q[which]), np.ascontiguousarray(starts.v[which])
-        arrays = times, numbers, *given, *out, *told, room
+        arrays = times, numbers, *given, *out, *counts, room
         advance.advance_lanes(kit, settings, control, method.options, *arrays)
 
-    def agree(self, which: Integers, made: Flags, t1: float, atol: float, q: Array, v: Array, ends: Array) -> Flags:
-        """Return which of these runs, of those that were made, satisfy the equations at their end, by the callbacks.
+    def agree(self, which: Integers, ended: Flags, t1: float, atol: float, q: Array, v: Array, ends: Array) -> Flags:
+        """Return a mask of the runs that satisfy the equations, evaluated by the callbacks, at their end.
 
-        q, v : (n_runs, n, n_t), the last at the end; ends : a and lam there.
+        ended : runs to be checked; q, v : (n_runs, n, n_t), the last ones at the end; ends : rows [a, lam] there.
         """
         from twoloop.kernels.lanes.starts import motion_residuals
 
         n, n_c = self.system.n_q, self.system.n_c
         room, worst = np.zeros(n * (n + 3) + n_c * (n + 3)), np.full(len(which), np.inf)
-        rows = np.where(made, which, -1)
+        rows = np.where(ended, which, -1)
         motion_residuals(*self.kit, t1, AGREES, atol, rows, self.starts.parameters, q, v, ends, room, worst)
         agreed: Flags = worst <= 1.0
         return agreed
 
-    def judge(
+    def check(
         self,
         which: Integers,
         status: Integers,
@@ -364,54 +369,56 @@ class LaneRuns:
         v: Array,
         ends: Array,
     ) -> Flags:
-        """Return which of these runs have all states and agree with callbacks; the status of others says why not."""
-        made = status == layout.ENDED
-        found = np.isfinite(q).all(axis=(1, 2))
-        fine = made & found
-        status[made & ~found] = layout.NO_STATE
+        """Return a mask of the runs that have all states and agree with callbacks; set the status of the others."""
+        ended = status == layout.ENDED
+        finite = np.isfinite(q).all(axis=(1, 2))
+        fine = ended & finite
+        status[ended & ~finite] = layout.NO_STATE
         agreed = self.agree(which, fine, t1, atol, q, v, ends)
         status[fine & ~agreed] = layout.UNLIKE
         fine &= agreed
-        if self.looks is not None:
-            times, runs = np.linspace(self.starts.t0, t1, LOOKS + 1), np.flatnonzero(fine)
+        if self.sampling is not None:
+            times, runs = np.linspace(self.starts.t0, t1, N_SHORT + 1), np.flatnonzero(fine)
             given = self.starts.parameters[which[runs]], q[runs, :, -1], v[runs, :, -1]
-            short = runs[self.looks.meet(times, rtol, *given)]
+            short = runs[self.sampling.has_short_forces(times, rtol, *given)]
             status[short], fine[short] = SHORT, False
         return fine
 
 
-def in_blocks(
-    make: Callable[[slice], None],
+def run_in_blocks(
+    work: Callable[[slice], None],
     n_runs: int,
     threads: int,
     deadline: float = np.inf,
     stop: Callable[[], None] = lambda: None,
 ) -> bool:
-    """Call `make` for blocks of runs in threads; call `stop` at the deadline, or if this thread gets an exception.
+    """Call `work` for blocks of runs in threads; return whether all blocks ended before the deadline.
 
-    Return whether all blocks ended before.
+    At the deadline, or after an exception in this thread, `stop` must make `work` end.
     """
-    n_blocks = 1 if threads == 1 else FOR_EACH * threads
+    n_blocks = 1 if threads == 1 else BLOCKS_PER_THREAD * threads
     size = int(np.clip(-(-n_runs // n_blocks), SMALLEST, LARGEST))
     blocks = [slice(begin, min(begin + size, n_runs)) for begin in range(0, n_runs, size)]
     stopped = False
     with ThreadPoolExecutor(threads) as pool:
-        futures = [pool.submit(make, rows) for rows in blocks]
+        futures = [pool.submit(work, rows) for rows in blocks]
         try:
-            while wait(futures, None if deadline == np.inf else max(AGAIN, deadline - time.monotonic())).not_done:
+            while wait(
+                futures, None if deadline == np.inf else max(STOP_INTERVAL, deadline - time.monotonic())
+            ).not_done:
                 stopped = True
                 stop()
         finally:
-            while wait(futures, 0.0).not_done:  # an exception, as by Ctrl-C
+            while wait(futures, 0.0).not_done:  # after an exception such as KeyboardInterrupt
                 stop()
-                wait(futures, AGAIN)
+                wait(futures, STOP_INTERVAL)
         for future in futures:
             future.result()
     return not stopped
 
 
 def aligned(vectors: int, lanes: int) -> Array:
-    """Return zeros at an address that a vector of all lanes may have."""
+    """Return zeros at an address that is aligned to the size of a vector of lanes."""
     size = 8 * lanes
     room = np.zeros(vectors * lanes + lanes)
     first = -room.ctypes.data % size // 8

@@ -1,4 +1,4 @@
-"""Starts and parameters of many runs: arrays given for all runs or for each, checked and expanded to one row a run."""
+"""Check the starts and parameters of many runs, and expand them to one row for each run."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from twoloop.checks.arguments import Array, check_real, shaped, shown, wrong_entries
 from twoloop.problem.system import ConstrainedSystem
 
-NEAR = 1e4  # times the rounding error of its terms: a residual of a start below this needs no closer check
-SLOW = 1e-3  # relative to the largest speed of all runs: the scale of rounding errors in velocities for a run at rest
-GENERIC = 16  # number of runs whose parameters are averaged for generic ones, besides the extreme ones
+NEAR = 1e4  # largest residual of a start that needs no closer check, in rounding errors of its terms
+SLOW = 1e-3  # scale of rounding errors in velocities for a run at rest, relative to the largest speed of all runs
+GENERIC = 16  # number of runs whose parameters are averaged for generic parameters, besides the extreme ones
 
 
 @dataclass
 class Starts:
-    """Starts of runs at t0, one row per run."""
+    """Starts of runs at t0, and their parameters, one row per run."""
 
     t0: float
     q: Array
@@ -24,7 +24,7 @@ class Starts:
     parameters: Array
 
     def some(self, which: NDArray[np.intp]) -> "Starts":
-        """Return the starts of some runs."""
+        """Return the starts of the runs with the indices `which`."""
         return Starts(self.t0, self.q[which], self.v[which], self.parameters[which])
 
 
@@ -36,7 +36,7 @@ def all_starts(
     Raises
     ------
     TypeError, ValueError
-        Naming the argument.
+        If an argument is wrong; the message names it.
     """
     given = {name: check_real(name, value) for name, value in zip(names, (q0, v0), strict=True)}
     sizes = {**dict.fromkeys(names, system.n_q), "parameters": system.parameters.size}
@@ -57,8 +57,8 @@ def all_starts(
         if array.ndim == 2:
             several[name] = len(array)
     if len(set(several.values())) > 1:
-        told = ", ".join(f"{name} {count}" for name, count in several.items())
-        raise ValueError(f"{names[0]}, {names[1]} and parameters must have a row for each run; rows given: {told}")
+        counts = ", ".join(f"{name} {count}" for name, count in several.items())
+        raise ValueError(f"{names[0]}, {names[1]} and parameters must have a row for each run; rows given: {counts}")
     n_runs = next(iter(several.values()), 1)
     q, v = (np.array(np.broadcast_to(given[name], (n_runs, system.n_q)), order="C") for name in names)
     p = given.get("parameters", np.broadcast_to(system.parameters, (n_runs, sizes["parameters"])))
@@ -72,21 +72,21 @@ def system_of(system: ConstrainedSystem, starts: Starts, run: int) -> Constraine
 
 
 def generic_system(system: ConstrainedSystem, starts: Starts) -> ConstrainedSystem:
-    """Return a system with every term that acts in any run: a factor that is zero in the first may not be in others."""
+    """Return the system with generic parameters, so that it has all terms, even those that are zero in some runs."""
     generic, _ = generic_parameters(starts.parameters)
     return system if np.array_equal(generic, system.parameters) else system.with_parameters(generic)
 
 
 def kit_to_write(system: ConstrainedSystem) -> tuple[Any, NDArray[np.int64]]:
-    """Return callbacks with their own writable parameters, and n_q, n_c and the index of the first parameter."""
+    """Return a kit with parameters that may be overwritten, and [n_q, n_c, index of the first parameter]."""
     from twoloop.kernels.data.common import Kit
 
     own = system.with_parameters(system.parameters) if system.parameters.size else system
     return Kit(own.functions), np.array([system.n_q, system.n_c, int(system.called_in_python)], dtype=np.int64)
 
 
-def far_off(kit: tuple[Any, NDArray[np.int64]], starts: Starts) -> NDArray[np.bool_]:
-    """Return for which starts C or C_q v + C_t exceeds the possible rounding error of its terms."""
+def is_inconsistent(kit: tuple[Any, NDArray[np.int64]], starts: Starts) -> NDArray[np.bool_]:
+    """Return a mask of the starts whose C or C_q v + C_t is larger than rounding of its terms explains."""
     from twoloop.kernels.lanes.starts import constraint_residuals
 
     functions, sizes = kit
@@ -97,11 +97,14 @@ def far_off(kit: tuple[Any, NDArray[np.int64]], starts: Starts) -> NDArray[np.bo
 
 
 def generic_parameters(parameters: Array) -> tuple[Array, list[int]]:
-    """Return parameters between those of the runs, in no relation but linear ones of all, and which of them vary."""
+    """Return generic parameters, and the indices of those that vary between runs.
+
+    Generic parameters are random averages over runs: relations that hold in some runs only do not hold between them.
+    """
     varies = (parameters != parameters[:1]).any(axis=0)
     if not varies.any():
         return parameters[0], []
-    ends = (parameters[:, varies].argmin(axis=0), parameters[:, varies].argmax(axis=0))  # a value of one run counts
+    ends = (parameters[:, varies].argmin(axis=0), parameters[:, varies].argmax(axis=0))  # one run alone may differ
     rows = parameters[np.concatenate([np.arange(0, len(parameters), max(1, len(parameters) // GENERIC)), *ends])]
     weights = np.random.default_rng(3).uniform(0.5, 1.5, len(rows))
     return np.where(varies, weights @ rows / weights.sum(), parameters[0]), np.flatnonzero(varies).tolist()

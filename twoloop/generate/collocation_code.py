@@ -130,7 +130,7 @@ SMALLEST = 1e-300  # replaces a divisor of zero
 FAILED = -1.0  # result of an audit that cannot evaluate the accelerations (defects are never negative)
 INFINITE = float("inf")
 # number of steps that use `mass_first`, after a step in which the conditions of `reduced` failed
-CAREFULLY = 8.0
+STEPS_BY_MASS_FIRST = 8.0
 FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the second step
 
 # the iteration
@@ -140,16 +140,16 @@ KAPPA = 0.02
 # number of sweeps that the step size aims at; one more if the prediction has degree 6, two more from degree 7 on,
 # because steps are long then
 TARGET = 6.0
-MORE = 7  # number of sweeps beyond the target after which a step is rejected
+EXTRA_SWEEPS = 7  # number of sweeps beyond the target after which a step is rejected
 SLOW = 0.8  # contraction of the iteration above which a step is rejected after the third sweep
-LEAST_RHO, MOST_RHO = 1e-3, 0.9
+MIN_RHO, MAX_RHO = 1e-3, 0.9
 SLOW_START, FAST_START = 0.3, 0.04  # if the contraction of the first step is outside these limits, its size is changed
 # ratio of two successive changes from which on the changes are rounding, if they are below NOISE relative to the values
 STAGNANT = 0.5
 # steps of fixed size: their KAPPA and NOISE (forces may have rounding errors, too), and the largest number of sweeps
 ROUNDING_OF_FIXED, NOISE_OF_FIXED, MOST_OF_FIXED = 1e-16, 1e-9, 60.0
 LEAST_CHANGE = 1e-30  # added to an error ratio, so that its logarithm exists
-SHARE = 0.5  # weight of the error estimate
+ERROR_WEIGHT = 0.5  # weight of the error estimate
 # allowed defect between nodes, relative to the tolerances: most of it oscillates and does not last to the end
 ALLOWED = 16.0
 
@@ -209,8 +209,8 @@ class CollocationCode:
         """Iterate the stages of a step; return a code for how the iteration ended, see data/collocation.py.
 
         The accelerations come from the program with the fewest operations. Its conditions are checked once, after the
-        last sweep. If they fail, another function makes this step and the next CAREFULLY steps with the elimination
-        that begins with M.
+        last sweep. If they fail, another function makes this step and the next STEPS_BY_MASS_FIRST steps with the
+        elimination that begins with M.
         """
         builder, one = emit.builder, Emitter(emit.builder)
         emit.numbers = emit.constants = numbers
@@ -242,7 +242,7 @@ class CollocationCode:
         def otherwise() -> Value:
             if not self.has_reduced:
                 return constant(DOUBLE, float(at.NOT_COMPUTED))
-            one.store(constant(DOUBLE, CAREFULLY), room, at.CAREFUL)
+            one.store(constant(DOUBLE, STEPS_BY_MASS_FIRST), room, at.CAREFUL)
             return careful()
 
         if self.has_reduced:
@@ -391,7 +391,7 @@ class CollocationCode:
             builder.select(builder.compare("fcmp oge", degree, number(7.0)), number(TARGET + 2), number(TARGET + 1)),
             number(TARGET),
         )
-        most = builder.select(estimated, one.add(target, number(MORE)), number(MOST_OF_FIXED))
+        most = builder.select(estimated, one.add(target, number(EXTRA_SWEEPS)), number(MOST_OF_FIXED))
         kappa, noise = (
             builder.select(estimated, number(usual), number(fixed))
             for usual, fixed in ((KAPPA, ROUNDING_OF_FIXED), (at.NOISE, NOISE_OF_FIXED))
@@ -422,7 +422,7 @@ class CollocationCode:
             return builder.operation("or", x, y)
 
         contraction = one.divide(change, one.larger(change_before, number(SMALLEST)))
-        contraction = one.smaller(one.larger(contraction, number(LEAST_RHO)), number(MOST_RHO))
+        contraction = one.smaller(one.larger(contraction, number(MIN_RHO)), number(MAX_RHO))
         rho_now = builder.select(holds_that("ogt", m, 1.0), contraction, rho)
         out_of_range = either(holds_that("olt", rho_now, FAST_START), holds_that("ogt", rho_now, SLOW_START))
         guessed = builder.both(
@@ -491,7 +491,7 @@ class CollocationCode:
             error = several.larger(several.multiply(several.multiply(top, weight), falls), error)
             curved = several.larger(several.multiply(before, weight), curved)
         h = one.load(room, at.H)
-        error = one.multiply(one.multiply(several.largest_lane(error), h), constant(DOUBLE, SHARE))
+        error = one.multiply(one.multiply(several.largest_lane(error), h), constant(DOUBLE, ERROR_WEIGHT))
         one.store(error, room, at.ERROR)
         one.store(one.multiply(several.largest_lane(curved), h), room, at.CURVED)
         by_error = one.multiply(builder.extract(two.logarithm(two.splat(error)), 0), constant(DOUBLE, 1.0 / at.ORDER))

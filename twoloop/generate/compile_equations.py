@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.generate import llvm_code
-from twoloop.generate.elimination import Choice, Elimination, Solution
+from twoloop.generate.elimination import Elimination, PivotChoice, Solution
 from twoloop.generate.graph import Graph, Untraceable
 from twoloop.generate.llvm_code import Emitter, Lowering, Place
 from twoloop.generate.llvm_text import BIT, DOUBLE, Module, Value, integer, width_of
@@ -47,7 +47,7 @@ def write_accelerations(
         lowering.define(quantity, value)
 
     def state() -> list[Value]:
-        place = _room(emit, 2 * n)
+        place = _stack_array(emit, 2 * n)
         for i, value in enumerate(inputs[1:]):
             emit.store(value, place, i)
         return [inputs[0], place, emit.pointer(place, n)]
@@ -79,7 +79,7 @@ def call_accelerations(
 
     `way` is an index of `equations.accelerations`: 0 has the fewest operations, -1 eliminates M.
     """
-    place = _room(emit, 2 * equations.system.n_q)
+    place = _stack_array(emit, 2 * equations.system.n_q)
     for i, value in enumerate(inputs[1:]):
         emit.store(value, place, i)
     given = [inputs[0], place, emit.pointer(place, equations.system.n_q), *_numbers(emit), filled]
@@ -104,7 +104,7 @@ def _accelerations(
     before, otherwise, after = builder.block, builder.append_block(), builder.append_block()
     builder.branch(everywhere, after, otherwise)
     builder.position_at_end(otherwise)
-    name, place = _acceleration_function(emit, equations, -1, lowering.numbers), _room(emit, len(a))
+    name, place = _acceleration_function(emit, equations, -1, lowering.numbers), _stack_array(emit, len(a))
     finite = builder.call(name, emit.bit, [*state(), *_numbers(emit), place])
     b = [builder.select(holds, value, emit.load(place, i)) for i, value in enumerate(a)]
     finite, last = builder.operation("or", holds, finite), builder.block
@@ -160,7 +160,7 @@ def _numbers(emit: Emitter) -> list[Value]:
     return [emit.numbers] if constants is None else [emit.numbers, constants]
 
 
-def _room(emit: Emitter, size: int) -> Value:
+def _stack_array(emit: Emitter, size: int) -> Value:
     return emit.builder.room(DOUBLE, size * width_of(emit.double))
 
 
@@ -276,7 +276,7 @@ class SplitFunctions:
 
     def accelerations(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, a: Value) -> Value:
         """Write the accelerations at (t, q, v) to `a`; return whether they are valid."""
-        kept, r, c, lam = self._rooms(emit)
+        kept, r, c, lam = self._stack_arrays(emit)
         at = [t, q, v, numbers, kept]
         return self._call(emit, ("factors", at), ("right", [*at, r, c]), ("solution", [r, c, kept, numbers, a, lam]))
 
@@ -284,7 +284,7 @@ class SplitFunctions:
         self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, moved: Value, out: Value
     ) -> Value:
         """Move positions towards the constraints by one Newton step; return whether the results are valid."""
-        kept, r, c, lam = self._rooms(emit)
+        kept, r, c, lam = self._stack_arrays(emit)
         at = [t, q, v, numbers, kept]
         _clear(emit, self.n, r)
         holds = self._call(emit, ("factors", at), ("off", [*at, c]), ("solution", [r, c, kept, numbers, moved, lam]))
@@ -309,8 +309,8 @@ class SplitFunctions:
 
         Return whether the results are valid.
         """
-        kept, r, c, change = self._rooms(emit)
-        u, at = self._room(emit, self.n), [t, q, v, numbers, kept]
+        kept, r, c, change = self._stack_arrays(emit)
+        u, at = self._stack_array(emit, self.n), [t, q, v, numbers, kept]
         _clear(emit, self.n, r)
         moves = self._call(
             emit,
@@ -332,12 +332,12 @@ class SplitFunctions:
         _sum(emit, self.n, v, change, new_v)
         return holds
 
-    def _rooms(self, emit: Emitter) -> list[Value]:
+    def _stack_arrays(self, emit: Emitter) -> list[Value]:
         """Allocate memory on the stack for the stored quantities, r, c, and a solution; return pointers."""
         sizes = self.solution.n_stored, self.n, self.n_rows, max(self.n, self.n_rows)
-        return [self._room(emit, size) for size in sizes]
+        return [self._stack_array(emit, size) for size in sizes]
 
-    def _room(self, emit: Emitter, size: int) -> Value:
+    def _stack_array(self, emit: Emitter, size: int) -> Value:
         return emit.builder.room(DOUBLE, size * width_of(emit.double))
 
 
@@ -465,7 +465,7 @@ class GeneratedCode(NamedTuple):
     def serves(self, system: ConstrainedSystem, t0: float, q0: Array) -> bool:
         """Return whether this is the code for a run of the same system from another start."""
         try:
-            return Choice.at(system, t0, q0) == self.shared.equations.choice
+            return PivotChoice.at(system, t0, q0) == self.shared.equations.choice
         except Untraceable:
             return False
 
@@ -479,7 +479,7 @@ def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check
         If code for its equations cannot be generated.
     """
     try:
-        choice = system.remembered_at("choice", (t0, q0.tobytes()), lambda: Choice.at(system, t0, q0))
+        choice = system.remembered_at("choice", (t0, q0.tobytes()), lambda: PivotChoice.at(system, t0, q0))
 
         def make(cache: TraceCache) -> SharedCode:
             return SharedCode(Elimination(system, choice, cache.equations(system)), cache)

@@ -38,10 +38,10 @@ Array = NDArray[np.float64]
 
 SINGULAR_MASS = 1e-10  # smallest over largest eigenvalue of M; below, rows of G are added to M
 RANK = 1e-9  # relative norm of a row of G after elimination of the rows before; below, the row depends on them
-NEAR = 0.01  # smallest allowed pivot, relative to the smallest pivot of a row of G at the start
+RELATIVE_BOUND = 0.01  # smallest allowed pivot, relative to the smallest pivot of a row of G at the start
 # possible values of the smallest allowed pivot; below the last one, rounding errors would dominate
 LEAST = 10.0 ** np.arange(-2, -9, -1)
-BOUNDS = LEAST[:-1] / NEAR
+BOUNDS = LEAST[:-1] / RELATIVE_BOUND
 # Indices in BOUNDS: from this smallest pivot on, rows are added to M. POOR: for up to SMALL coordinates.
 # POOR_SINGULAR: if M is singular, because Euler parameters lose two digits in sound models. POOREST: for more
 # coordinates, because adding rows makes their code much longer.
@@ -57,7 +57,7 @@ Blocks = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
 
 
 @dataclass(frozen=True)
-class Choice:
+class PivotChoice:
     """Decisions of the elimination that depend on the numbers of M and G at a position.
 
     Attributes
@@ -81,7 +81,7 @@ class Choice:
     blocks: Blocks = ()
 
     @classmethod
-    def at(cls, system: ConstrainedSystem, t: float, q: Array) -> "Choice":
+    def at(cls, system: ConstrainedSystem, t: float, q: Array) -> "PivotChoice":
         """Return the choice at a position.
 
         Raises
@@ -90,11 +90,11 @@ class Choice:
             If M is singular on velocities that the constraints allow.
         """
         mass, G = mass_and_rows(system, t, q)
-        choice = Chooser(system).choice(mass, G)
-        return replace(choice, blocks=Dependents(system, choice.rows).blocks(G))
+        choice = PivotChooser(system).choice(mass, G)
+        return replace(choice, blocks=DependentColumns(system, choice.rows).blocks(G))
 
 
-class Dependents:
+class DependentColumns:
     """Find the coordinates that rows of G determine; one object serves many positions of a system.
 
     Parameters
@@ -122,7 +122,7 @@ class Dependents:
             self.arguments = kinds, np.array(rows, np.int64), len(rows), room, work, blocks
 
     def blocks(self, G: Array) -> Blocks:
-        """Return `Choice.blocks` for the values of G at a position."""
+        """Return `PivotChoice.blocks` for the values of G at a position."""
         if self.find is None:
             return ()
         n = self.find(G, *self.arguments)
@@ -149,7 +149,7 @@ def _kinds(system: ConstrainedSystem) -> Any:
     return kinds
 
 
-class Chooser:
+class PivotChooser:
     """Make the choice for values of M and G at many positions of a system; equal choices are returned as one object."""
 
     def __init__(self, system: ConstrainedSystem):
@@ -158,10 +158,10 @@ class Chooser:
         n_rows = system.n_c + system.n_a
         self.system, self._choose = system, entry_point(choose_rows)
         self._room, self._chosen = np.zeros(room_size(n_rows, system.n_q)), np.zeros(2 + 3 * n_rows, dtype=np.int64)
-        self._key, self._last = (0, b"", 0.0), Choice((), (), 1.0, 0.0)
+        self._key, self._last = (0, b"", 0.0), PivotChoice((), (), 1.0, 0.0)
 
-    def choice(self, mass: Array, G: Array) -> Choice:
-        """Return the choice for an M and a G; raise like `Choice.at`."""
+    def choice(self, mass: Array, G: Array) -> PivotChoice:
+        """Return the choice for an M and a G; raise like `PivotChoice.at`."""
         system, room, chosen = self.system, self._room, self._chosen
         constant = system.constant_mass and system.derived.get("no weak mass", False)
         room[0] = 0.0
@@ -174,7 +174,7 @@ class Chooser:
             return self._stiffened(mass, G, place)
         return self._last
 
-    def _stiffened(self, mass: Array, G: Array, place: int) -> Choice:
+    def _stiffened(self, mass: Array, G: Array, place: int) -> PivotChoice:
         """Return the choice with all independent rows added to M, if that makes much larger pivots, else the last one.
 
         Some bodies have little inertia about their joints, such as a rod with its mass in its middle. Then the rows are
@@ -191,21 +191,21 @@ class Chooser:
             return last
         return replace(last, added=last.rows, scale=float(scale), least=float(LEAST[new]))
 
-    def _decode(self, place: int) -> Choice:
+    def _decode(self, place: int) -> PivotChoice:
         """Return the choice that the kernel wrote to `self._chosen`; `place`: index in LEAST, or negative."""
         from twoloop.kernels.linalg.rank import STAYS_SINGULAR
 
         system, n_rows = self.system, self.system.n_c + self.system.n_a
         n_independent, n_added, *places = self._chosen.tolist()
         if n_independent == 0:
-            return Choice((), (), 1.0, 0.0)
+            return PivotChoice((), (), 1.0, 0.0)
         if place < 0:
             stays = "stays singular with constraints added" if place == STAYS_SINGULAR else "is too nearly singular"
             raise Untraceable(f"the mass of {system.name!r} {stays}")
         if n_added == 0:
             system.derived["no weak mass"] = True
         added = tuple(places[n_rows : n_rows + n_added])
-        return Choice(tuple(places[:n_independent]), added, float(self._room[0]), float(LEAST[place]))
+        return PivotChoice(tuple(places[:n_independent]), added, float(self._room[0]), float(LEAST[place]))
 
 
 MOST_ELIMINATED = 60_000  # largest number of operations with the elimination: enough for 40 bodies on hinges in space
@@ -220,7 +220,7 @@ class Elimination:
     Parameters
     ----------
     system : ConstrainedSystem
-    choice : Choice
+    choice : PivotChoice
         The decisions that depend on numbers.
     equations : Equations, optional
         Traced equations of the system, whose graph is extended.
@@ -262,7 +262,7 @@ class Elimination:
 
     parts: Any = None
 
-    def __init__(self, system: ConstrainedSystem, choice: Choice, equations: Equations | None = None):
+    def __init__(self, system: ConstrainedSystem, choice: PivotChoice, equations: Equations | None = None):
         self.equations = Equations(system) if equations is None else equations
         self.system, self.choice, self.graph = system, choice, self.equations.graph
         self.zero, self._n_reduced = Affine(self.graph, 0.0, {}), 0  # number of operations of `reduced`

@@ -365,15 +365,15 @@ class Affine:
             return Affine(self.graph, ATAN(self.constant), {})
         return self.graph.operation(op.ARCTANGENT, self, self * self + 1.0)
 
-    def _branches(self, *_: Any) -> Any:
+    def _branching(self, *_: Any) -> Any:
         self.graph.refuse(BRANCHES)
 
     def __float__(self) -> float:
         self.graph.refuse(CONVERTS)
 
-    __bool__ = __lt__ = __le__ = __gt__ = __ge__ = __eq__ = __ne__ = __int__ = __abs__ = _branches
-    __index__ = __complex__ = __floordiv__ = __mod__ = __divmod__ = __rfloordiv__ = __rmod__ = __rdivmod__ = _branches
-    __round__ = __trunc__ = __floor__ = __ceil__ = __hash__ = __reduce_ex__ = _branches  # type: ignore[assignment]
+    __bool__ = __lt__ = __le__ = __gt__ = __ge__ = __eq__ = __ne__ = __int__ = __abs__ = _branching
+    __index__ = __complex__ = __floordiv__ = __mod__ = __divmod__ = __rfloordiv__ = __rmod__ = __rdivmod__ = _branching
+    __round__ = __trunc__ = __floor__ = __ceil__ = __hash__ = __reduce_ex__ = _branching  # type: ignore[assignment]
 
     def __repr__(self) -> str:
         if self.graph.running:
@@ -409,7 +409,7 @@ class Affine:
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, out: Any = None, **options: Any) -> Any:
         function = OPERATORS.get(ufunc.__name__) or FUNCTIONS.get(ufunc.__name__)
         if ufunc.__name__ in COMPARISONS:
-            self._branches()
+            self._branching()
         if function is None or method != "__call__" or options or (out is not None and out[0].dtype != object):
             self.graph.refuse(f"it calls numpy.{ufunc.__name__} on what depends on t, q or v")
         return elementwise(function, inputs, out)

@@ -26,7 +26,7 @@ from twoloop.generate import (
     series,
 )
 from twoloop.generate.compile_equations import write_accelerations
-from twoloop.generate.elimination import Choice, Elimination, Solution
+from twoloop.generate.elimination import Elimination, PivotChoice, Solution
 from twoloop.generate.graph import Untraceable, is_zero
 from twoloop.generate.lane_series import LaneEmitter, LaneSeries
 from twoloop.generate.llvm_code import lower
@@ -201,12 +201,12 @@ class LaneSteps:
         def size(base: Value, place: int) -> Value:
             return emit.function("fabs", emit.load(base, place))
 
-        def apart(one: Value, other: Value, place: int) -> Value:
+        def difference(one: Value, other: Value, place: int) -> Value:
             return emit.function("fabs", emit.subtract(emit.load(one, place), emit.load(other, place)))
 
         motion = off = emit.constant(0.0)
         for j in range(n):
-            distance = emit.larger(emit.multiply(h, size(at.state, n + j)), apart(at.new, at.state, j))
+            distance = emit.larger(emit.multiply(h, size(at.state, n + j)), difference(at.new, at.state, j))
             motion = emit.larger(distance, motion)
         turned, least = self.turned(emit, at), emit.multiply(emit.constant(SHARE_THROUGH_ZERO), motion)
         motion = emit.multiply(emit.constant(SHARE_OF_MOTION), motion)
@@ -217,7 +217,7 @@ class LaneSteps:
             if turned is not None:
                 allowed = emit.builder.select(turned, emit.smaller(scale, least), allowed)
             allowed = emit.larger(allowed, emit.constant(LEAST))
-            off = emit.largest_of(emit.divide(apart(at.predicted, at.new, j), allowed), off)
+            off = emit.largest_of(emit.divide(difference(at.predicted, at.new, j), allowed), off)
         emit.store(off, work, lanes.OFF)
 
     def turned(self, emit: LaneEmitter, at: Places) -> Value | None:
@@ -459,7 +459,7 @@ class LaneCode(LaneSteps):
     Parameters
     ----------
     system : ConstrainedSystem
-    choice : Choice
+    choice : PivotChoice
     parameters : array of Parameter
     series : bool
         Whether to generate code for the Taylor series, too.
@@ -473,7 +473,12 @@ class LaneCode(LaneSteps):
     """
 
     def __init__(
-        self, system: ConstrainedSystem, choice: Choice, parameters: Any, series: bool, tableau: Tableau | None = None
+        self,
+        system: ConstrainedSystem,
+        choice: PivotChoice,
+        parameters: Any,
+        series: bool,
+        tableau: Tableau | None = None,
     ):
         if system.n_a > 0:
             raise Untraceable("it has nonholonomic rows")

@@ -170,7 +170,7 @@ class Builder:
         self.position_at_end(self.append_block())
 
     def text(self) -> str:
-        """Return the definition of the function."""
+        """Return the LLVM text that defines the function."""
         arguments = ", ".join(map(str, self.arguments))
         body = "\n".join(block.text() for block in self._blocks)
         linkage = "internal " if self.internal else ""

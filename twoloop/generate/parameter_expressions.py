@@ -185,12 +185,12 @@ class Parameter(float):
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, out: Any = None, **options: Any) -> Any:
         name = NAMES.get(ufunc.__name__, ufunc.__name__)
         if method != "__call__" or name not in _OPERATIONS.keys() | FUNCTIONS.keys() or options:
-            self._decides(f"it calls numpy.{ufunc.__name__} on its parameters")
+            self._refuse_decision(f"it calls numpy.{ufunc.__name__} on its parameters")
             plain = (float(each) if type(each) is Parameter else each for each in inputs)
             return getattr(ufunc, method)(*plain, **options)
         return elementwise(lambda *given: applied(name, *given), inputs, out)
 
-    def _decides(self, reason: str = "it branches on its parameters, or rounds them") -> None:
+    def _refuse_decision(self, reason: str = "it branches on its parameters, or rounds them") -> None:
         """Refuse an operation whose result depends on the present value; the tracer itself may use it."""
         caller = sys._getframe(2).f_globals.get("__name__", "")
         if self.tape.running and not caller.startswith(__name__.rpartition(".")[0]):
@@ -319,7 +319,7 @@ def _deciding(name: str) -> Callable[..., Any]:
     plain = getattr(float, name)
 
     def decide(self: Parameter, *others: Any) -> Any:
-        self._decides()
+        self._refuse_decision()
         return plain(self, *others)
 
     return decide

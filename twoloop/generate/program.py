@@ -322,14 +322,14 @@ class Coefficients:
         name |= {i: k for k, i in enumerate(needed)}
         name |= {i: f"kept {place}" for i, place in given.items()}
 
-        def described(form: Affine) -> Any:
+        def described_form(form: Affine) -> Any:
             terms, constant = self.of_form(form)
             return [(name[i], c) for i, c in terms], constant
 
-        yield [described(form) for form in forms]
+        yield [described_form(form) for form in forms]
         for i in needed:
             kind, *arguments = graph.operations[i]  # type: ignore[misc]
-            yield kind, [described(each) for each in arguments if isinstance(each, Affine)]
+            yield kind, [described_form(each) for each in arguments if isinstance(each, Affine)]
 
     @property
     def n_varying(self) -> int:

@@ -322,7 +322,7 @@ def _grouped(operations: list[Any]) -> list[tuple[int, list[Any]]]:
     nodes = {node for node, *_ in operations}
     level: dict[int, int] = {}
     groups: dict[tuple[int, int], list[Any]] = {}
-    for node, kind, first, second in operations:  # they are in an order of computation
+    for node, kind, first, second in operations:  # arguments come before the operations that use them
         used = [i for form in (first, second) if form is not None for i in form.terms if i in nodes]
         level[node] = 1 + max((level[i] for i in used), default=0)
         if second is None:

@@ -261,7 +261,7 @@ class CheckedRegion:
         self._box = np.zeros((2, 0))  # smallest and largest value of each component of the states
         self.bounds = self._box
 
-    def is_due(self) -> bool:
+    def is_comparison_due(self) -> bool:
         """Return whether the next run must compare at all its states: this holds for the runs 1, 2, 4, 8, ..."""
         return (self._runs + 1) & self._runs == 0
 

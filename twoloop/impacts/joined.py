@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from twoloop.checks.arguments import Array, check_real
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
-from twoloop.run.record import Statistics, Status, explained
+from twoloop.run.record import Statistics, Status, failure_link
 
 CHANGES = "velocities jumped in impacts, or stops were closed or joints stuck for a while"
 
@@ -145,7 +145,7 @@ def join_arcs(
         *(t, q, v, a, lam),
         h=np.concatenate([arc.h for arc in arcs]),
         status=status,
-        message=message + (explained(status) if stagnated else ""),
+        message=message + (failure_link(status) if stagnated else ""),
         stats=_sum_statistics([arc.stats for arc in arcs]),
         rank=arcs[0].rank,
         redundant=arcs[0].redundant,

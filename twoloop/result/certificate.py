@@ -14,19 +14,19 @@ from twoloop.kernels.data.indices import APART
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.field_faults import NEAR, all_states, end_of_run, field_faults
 from twoloop.run.record import Record
-from twoloop.run.rerun import FINEST, IndependentRerun, RerunPiece, explicit, implicit, tighter
+from twoloop.run.rerun import FINEST, IndependentRerun, RerunPiece, nonstiff_method, stiff_method, tightened
 from twoloop.run.signals import SignalHandlers
 
-PIECES = 200  # the run is divided into at least this many intervals, also the bound of the step size
-LIMIT = 100.0  # tolerances: largest defect of a step, and largest error of a state, of a run that passes
-FASTEST = 10.0  # 1/s: largest rate of the motion by which errors of velocities are divided; of untested ones, always
-CLOSER = 0.1  # relative to the tolerances of the other reruns: those of the second run, whose errors grow
-STIFF = 4  # explicit steps per step of the run above which untested velocities are vibrations that it passed over
-CHAOTIC = 10.0  # errors up to this many times those that grow from a tolerance at the start are explained by growth
-ROUNDING = 1e-14  # relative to the largest coordinate or velocity: deviation attributed to rounding
+PIECES = 200  # smallest number of intervals into which the run is divided; steps of reruns are no longer than one
+LIMIT = 100.0  # largest defect of a step, and largest error of a state, of a run that passes, over the tolerance
+FASTEST = 10.0  # largest rate of the motion by which errors of velocities are divided, 1/s; untested ones always
+SECOND_RUN = 0.1  # factor on the tolerances of the second run, because its errors grow over the whole run
+STIFF = 4  # explicit steps per step of the run, above which untested velocities have vibrations that are not resolved
+CHAOTIC = 10.0  # errors up to this many times the growth of a tolerance at the start are explained by that growth
+ROUNDING = 1e-14  # deviation attributed to rounding, relative to the largest coordinate or velocity
 SPLIT = 100.0  # defect of an interval above which its steps are checked one by one
-MAX_WRONG = 3  # wrong steps after which the rest of an interval is skipped
-NEGLIGIBLE = 1e-10  # relative: smaller singular values of the rows count as zero
+MAX_WRONG = 3  # number of wrong steps after which the rest of an interval is skipped
+NEGLIGIBLE = 1e-10  # singular values of the rows below this share of the largest count as zero
 USUAL_GROWTH = 10.0  # error growth over an interval up to which the defect is not corrected for it
 MAX_ATTEMPTS, MAX_ATTEMPTS_PER_STEP = 400, 32  # attempted steps per interval, plus those per step of the run in it
 LOOSER = (10.0, 100.0)  # factors of the tolerances with which a failed reintegration is repeated
@@ -122,9 +122,9 @@ def _certify(result: Record, rtol: float | None, atol: ArrayLike | None, handler
         )
     checker = _Checker(result, result.system, *_tolerances(result, result.system.n_q, rtol, atol), handlers)
     faults = tuple(field_faults(result, result.system, checker.rtol, checker.atol, LIMIT))
-    defect, t_worst, unseen = _local(checker)
+    defect, t_worst, unseen = _local_errors(checker)
     error, t_error, t_grown = checker.errors() if defect <= LIMIT else (defect, t_worst, np.inf)
-    if t_grown < np.inf:  # errors of a tolerance at the start grow to this: the steps may be right
+    if t_grown < np.inf:  # the growth of a tolerance at the start explains the error: the steps may be right
         unseen = [*((start, end) for start, end in unseen if end <= t_grown), (t_grown, float(checker.t[-1]))]
     end = end_of_run(result)
     last = max(float(result.t[-1]), *(float(t[-1]) for t in result.t_events or () if len(t)), -np.inf)
@@ -141,7 +141,7 @@ def _certify(result: Record, rtol: float | None, atol: ArrayLike | None, handler
     return Certificate(defect, t_worst, gap, LIMIT, tuple(unseen), passed, message, error, faults)
 
 
-def _local(checker: _Checker) -> tuple[float, float, list[tuple[float, float]]]:
+def _local_errors(checker: _Checker) -> tuple[float, float, list[tuple[float, float]]]:
     """Return the largest defect, the start of its step, and the intervals that could not be verified."""
     defect, t_worst = 0.0, float(checker.t[0])
     unseen: list[tuple[float, float]] = []
@@ -174,9 +174,9 @@ class _Checker:
     Attributes
     ----------
     t, states : ndarray (n,), (n, 2 n_q)
-        All states known, as rows [q, v], at different times.
+        Times, all different, and states [q, v].
     every_state, place : ndarray (m, 2 n_q), (m,)
-        The same with states of equal times, and the index in `t` of each.
+        All states, of which several may have equal times, and the index in `t` of each.
     gap : float
         Longest time between evaluations so far, s.
     """
@@ -192,7 +192,7 @@ class _Checker:
         blocks = np.nan_to_num(np.abs(self.states), posinf=0.0).reshape(len(self.t), 2, len(atol))
         self.rounding = ROUNDING * np.repeat(blocks.max(axis=(0, 2)), len(atol))
         self.gap = 0.0
-        self.remakers: dict[tuple[str, float], IndependentRerun] = {}
+        self.reruns: dict[tuple[str, float], IndependentRerun] = {}
 
     def _steps(self, result: Record) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Return the number of steps of the run in each interval, and whether one of them did not test velocities."""
@@ -201,7 +201,7 @@ class _Checker:
         start = self.t[0] if result.sol is None else result.sol.t_min
         ends = start + np.cumsum(result.h)
         near = 1e-9 * (self.t[-1] - self.t[0])
-        if m == 0 or (result.success and abs(ends[-1] - self.t[-1]) > near):  # the positions of the steps are unknown
+        if m == 0 or (result.success and abs(ends[-1] - self.t[-1]) > near):  # it is unknown where the steps end
             return np.full(n, -(-m // n) + 1), np.full(n, untested.any())
         first = np.minimum(np.searchsorted(ends, self.t[:-1] + near), m - 1)
         last = np.minimum(np.searchsorted(ends, self.t[1:] - near), m - 1)
@@ -232,8 +232,8 @@ class _Checker:
     def errors(self) -> tuple[float, float, float]:
         """Return the largest error of a state over the tolerance, its time, and the time from which growth explains it.
 
-        The errors are the distances from a second run, which starts from the first state and never uses another one.
-        Where none exceeds the limit, or growth does not explain it, the last number is infinite.
+        Errors are distances from a second run, which starts from the first state and uses no other stored state. The
+        last number is infinite if no error exceeds the limit, or if growth does not explain the errors.
         """
         reference, tested = self._second_run(self.states[0])
         with np.errstate(invalid="ignore"):  # states that are not finite give NaN
@@ -256,16 +256,16 @@ class _Checker:
     def _second_run(self, start: Array) -> tuple[Array, Array]:
         """Return the states of a run from `start` at all times, and the weights of errors of velocities there.
 
-        Where it fails, e.g. near a singular position, it goes on from the stored state; `pieces` reports such places.
+        After a failure, e.g. near a singular position, it continues from the stored state; `pieces` reports failures.
         """
         states, weights = np.empty_like(self.states), np.full(len(self.t), 1.0 / self._rate())
         states[0] = start
         newton = bool(self.result.stats.n_jacobians)
         for i, j in self._intervals():
             stiff = "positions" if self.untested[i] else "all"
-            tries = [(method, looser) for looser in (CLOSER, 1.0, *LOOSER) for method in ("explicit", stiff)]
+            tries = [(method, looser) for looser in (SECOND_RUN, 1.0, *LOOSER) for method in ("explicit", stiff)]
             for method, looser in tries:
-                rerun = self._remake(method, looser, states[i], i, j, self.t[i + 1 : j + 1])
+                rerun = self._rerun(method, looser, states[i], i, j, self.t[i + 1 : j + 1])
                 if rerun is not None:
                     break
             states[i + 1 : j + 1] = self.states[i + 1 : j + 1] if rerun is None else rerun.states
@@ -276,12 +276,12 @@ class _Checker:
         return states, weights
 
     def _rate(self) -> float:
-        """Return the rate of the motion, 1/s: an error of positions makes one of velocities that is so much larger."""
+        """Return the rate of the motion, 1/s: an estimate of errors of velocities over errors of positions."""
         largest = [np.abs(np.nan_to_num(x, posinf=0.0, neginf=0.0)).max() for x in (self.result.a, self.result.v)]
         return float(np.clip(largest[0] / max(largest[1], np.finfo(float).tiny), 1.0, FASTEST))
 
     def _single_steps(self, i: int, j: int) -> Iterator[tuple[int, int, float]]:
-        """Yield the same for the steps of an interval with a large defect: many small errors, or a few wrong steps."""
+        """Yield first and last state and the defect of each step, in an interval with a large defect."""
         n_wrong = 0
         for k in range(i, j):
             defect = self._defect(k, k + 1)
@@ -294,7 +294,7 @@ class _Checker:
                 return
 
     def _defect(self, i: int, j: int) -> float:
-        """Return the defect from state i to state j: that of one method, or the smaller of two if it is too large."""
+        """Return the defect from state i to state j by one method; if it is too large, the smaller one of two."""
         newton = bool(self.result.stats.n_jacobians) and (self.result.untested is None or self.untested[i])
         stiff = "positions" if self.untested[i] else "all"
         order = (stiff, "explicit") if newton else ("explicit", stiff)
@@ -304,7 +304,7 @@ class _Checker:
             smallest, best = min(defects)
             if smallest <= LIMIT or (smallest < np.inf and j > i + 1):
                 return smallest
-        if smallest < np.inf:  # is the step wrong, or do errors grow this fast?
+        if smallest < np.inf:  # a large defect may be the growth of small errors
             growth = self._growth(best, i, j)
             return smallest / (growth if growth > USUAL_GROWTH else 1.0) if growth <= LIMIT else np.inf
         for looser in LOOSER:  # near a singular position rounding may prevent the full accuracy
@@ -318,7 +318,7 @@ class _Checker:
         """Return the defect from state i to state j by one method, with tolerances relaxed by a factor."""
         between, end = self._check_time(i, j), float(self.t[j])
         times = np.array([between, end] if self.t[i] < between < end else [end])
-        rerun = self._remake(method, looser, self.states[i], i, j, times)
+        rerun = self._rerun(method, looser, self.states[i], i, j, times)
         if rerun is None:
             return np.inf
         end_defect = self._distance(rerun.states[-1], self.states[j], i, j)
@@ -338,14 +338,11 @@ class _Checker:
 
     def _growth(self, method: str, i: int, j: int) -> float:
         """Return the factor by which an error of the size of the tolerance grows from state i to state j."""
-        reference, perturbed = (
-            self._remake(method, 1.0, start, i, j, self.t[j : j + 1]) for start in (self.states[i], self._perturbed(i))
-        )
-        return (
-            np.inf
-            if reference is None or perturbed is None
-            else self._distance(reference.states[-1], perturbed.states[-1], i, j)
-        )
+        starts = self.states[i], self._perturbed(i)
+        reference, perturbed = (self._rerun(method, 1.0, start, i, j, self.t[j : j + 1]) for start in starts)
+        if reference is None or perturbed is None:
+            return np.inf
+        return self._distance(reference.states[-1], perturbed.states[-1], i, j)
 
     def _perturbed(self, i: int) -> Array:
         """Return a state on the constraints that differs from state i by about the tolerances."""
@@ -362,34 +359,31 @@ class _Checker:
         return np.tile(self.atol, 2) + self.rtol * np.abs(state) + self.rounding
 
     def _distance(self, state: Array, reference: Array, i: int, j: int) -> float:
-        """Return the largest difference of two states over the tolerance, in the components that the steps tested."""
+        """Return the largest difference of two states over the tolerance; without velocities if untested."""
         with np.errstate(invalid="ignore"):  # states that are not finite give NaN
             error = np.abs(state - reference) / self._allowed(reference)
         return float((error[: len(self.atol)] if self.untested[i:j].any() else error).max())
 
-    def _remake(self, method: str, looser: float, start: Array, i: int, j: int, times: Array) -> RerunPiece | None:
+    def _rerun(self, method: str, looser: float, start: Array, i: int, j: int, times: Array) -> RerunPiece | None:
         """Integrate from `start` at the time of state i to state j, landing on `times`; None if that fails."""
         key = (method, looser)
-        if key not in self.remakers:
-            chosen = explicit() if method == "explicit" else implicit(method == "all")
+        if key not in self.reruns:
+            chosen = nonstiff_method() if method == "explicit" else stiff_method(method == "all")
             q, v = self.states[0].reshape(2, -1).copy()
-            rtol, atol = (np.maximum(looser * tighter(each), FINEST) for each in (self.rtol, self.atol))
-            self.remakers[key] = IndependentRerun(
-                self.system, float(self.t[0]), q, v, chosen, float(rtol), atol, self.longest
-            )
-        remaker = self.remakers[key]
-        t0, t1 = float(self.t[i]), float(self.t[j])
-        max_attempts = MAX_ATTEMPTS + MAX_ATTEMPTS_PER_STEP * (
-            int(self.n_steps[i:j].sum()) + int((t1 - t0) / self.longest)
-        )
-        rerun = remaker.integrate(t0, start, times, max_attempts if looser == 1.0 else MAX_ATTEMPTS)
+            rtol, atol = (np.maximum(looser * tightened(each), FINEST) for each in (self.rtol, self.atol))
+            run = self.system, float(self.t[0]), q, v, chosen, float(rtol), atol, self.longest
+            self.reruns[key] = IndependentRerun(*run)
+        rerun, t0, t1 = self.reruns[key], float(self.t[i]), float(self.t[j])
+        n_steps = int(self.n_steps[i:j].sum()) + int((t1 - t0) / self.longest)
+        max_attempts = MAX_ATTEMPTS + (MAX_ATTEMPTS_PER_STEP * n_steps if looser == 1.0 else 0)
+        piece = rerun.integrate(t0, start, times, max_attempts)
         self.handlers.check()
-        if rerun is not None:
-            self.gap = max(self.gap, rerun.longest * remaker.spacing)
-        return rerun
+        if piece is not None:
+            self.gap = max(self.gap, piece.longest * rerun.spacing)
+        return piece
 
     def _check_time(self, i: int, j: int) -> float:
-        """Return the midpoint of the longest interval between states i and j; without `sol` the time of state j."""
+        """Return the midpoint of the longest interval between states i and j; without `sol`, the time of state j."""
         if self.sol is None:
             return float(self.t[j])
         k = i + int(np.diff(self.t[i : j + 1]).argmax())
@@ -398,7 +392,7 @@ class _Checker:
 
 @dataclass(frozen=True)
 class _Outcome:
-    """Outcome of the checks, and its description."""
+    """Numbers and faults that the checks found, and the message that describes them."""
 
     defect: float
     error: float

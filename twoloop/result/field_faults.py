@@ -13,13 +13,13 @@ from twoloop.run.record import Record, Status
 
 Array = NDArray[np.float64]
 
-NEAR = 1e-9  # relative to the length of the run: times that close are equal
-ROUNDING = 1e-9  # relative to the largest acceleration or multiplier: deviation attributed to rounding
-PATTERNS = 3  # number of perturbed states by which the effect of a tolerance on accelerations is measured
+NEAR = 1e-9  # distance of times that count as equal, relative to the length of the run
+ROUNDING = 1e-9  # deviation attributed to rounding, relative to the largest acceleration or multiplier
+PATTERNS = 3  # number of sign patterns of the perturbations by which the effect of a tolerance is measured
 
 
 def all_states(result: Record) -> tuple[Array, Array]:
-    """Return times and states [q, v] of a result: those of `t`, of its events and of the steps of its solution."""
+    """Return times and states [q, v] of a result: at `t`, at events, and at the steps of `sol`."""
     times, states = [result.t], [np.vstack([result.q, result.v]).T]
     if result.sol is not None:
         table = result.sol.table
@@ -41,14 +41,14 @@ def end_of_run(result: Record) -> float:
 
 
 def field_faults(result: Record, system: ConstrainedSystem, rtol: float, atol: Array, limit: float) -> Iterator[str]:
-    """Yield the contradictions of a result, as clauses; errors up to `limit` tolerances are none."""
+    """Yield the contradictions in a result, as clauses of a message; errors up to `limit` tolerances are allowed."""
     shapes = list(_wrong_shapes(result, system))
     yield from shapes
     if shapes:
         return
     yield from _times_and_steps(result)
-    yield from _start(result, system, rtol, atol, limit)
-    yield from _accelerations(result, system, rtol, atol, limit)
+    yield from _start_faults(result, system, rtol, atol, limit)
+    yield from _acceleration_faults(result, system, rtol, atol, limit)
 
 
 def _wrong_shapes(result: Record, system: ConstrainedSystem) -> Iterator[str]:
@@ -85,8 +85,8 @@ def _times_and_steps(result: Record) -> Iterator[str]:
         yield f"the status says that the end was reached, and the steps, h, end at t = {start + h.sum():.6g}"
 
 
-def _start(result: Record, system: ConstrainedSystem, rtol: float, atol: Array, limit: float) -> Iterator[str]:
-    """Yield how the first state violates the constraints: those after it are compared with integrated states."""
+def _start_faults(result: Record, system: ConstrainedSystem, rtol: float, atol: Array, limit: float) -> Iterator[str]:
+    """Yield how the first state violates the constraints; `certify` compares later states with integrated states."""
     t, q, v = float(result.t[0]), result.q[:, 0], result.v[:, 0]
     if system.n_c + system.n_a == 0 or not np.isfinite([q, v]).all():
         return
@@ -100,10 +100,12 @@ def _start(result: Record, system: ConstrainedSystem, rtol: float, atol: Array, 
         yield f"the first velocities violate the constraints by {off.max():.2g}"
 
 
-def _accelerations(result: Record, system: ConstrainedSystem, rtol: float, atol: Array, limit: float) -> Iterator[str]:
-    """Yield how a and lam deviate from those at the stored states.
+def _acceleration_faults(
+    result: Record, system: ConstrainedSystem, rtol: float, atol: Array, limit: float
+) -> Iterator[str]:
+    """Yield how stored a and lam deviate from the solution of the equations at the stored states.
 
-    They may deviate by what `limit` tolerances of the state change: measured by states that differ by a tolerance.
+    A deviation is allowed if errors of `limit` tolerances in the state can cause it; perturbed states measure this.
     """
     n, t = system.n_q, np.ascontiguousarray(result.t)
     states, stored = np.vstack([result.q, result.v]).T.copy(), np.vstack([result.a, result.lam]).T

@@ -10,14 +10,14 @@ from twoloop.problem.description import Joint
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.record import Record
 
-NEGLIGIBLE = 1e-6  # relative: a reaction counts as unique if the null space of C_q^T changes it by less
+NEGLIGIBLE = 1e-6  # a reaction counts as unique if the null space of C_q^T changes it by less than this share
 
 
 @dataclass(frozen=True)
 class Reaction:
-    """Force and torque of a joint on its body; the other body, or the ground, gets the opposite.
+    """Force and torque of a joint on its body; on the other body, or the ground, the opposite acts.
 
-    Components along the axes of space, one column per time of `Result.t`.
+    Components are along the axes of space, with one column per time of `Result.t`.
 
     Attributes
     ----------

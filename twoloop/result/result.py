@@ -1,4 +1,4 @@
-"""Define `Result`, the return value of `solve_dae`: the record of a run with its views; read saved ones, and cite."""
+"""Define `Result`, the return value of `solve_dae`, with its views; load saved results, and cite methods."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ class Result(Record):
         the few steps beyond it. Evaluations between steps count in `cpu_time` only, and not at all if made by `sol`.
     rejected_error, rejected_convergence : ndarray of int (n_accepted,) or None
         Attempts rejected by the error test, and attempts whose iterations did not converge, since the previous
-        accepted step (or the start). Those after the last accepted step of a failed run count in `stats` only. None if
-        a foreign solver does not report them.
+        accepted step (or the start). Attempts after the last accepted step of a failed run count in `stats` only. None
+        if a foreign solver does not report them.
     partitioned : ndarray of int (n_accepted,) or None
         Number of repartitionings in the same interval, without the initial partition. None for a foreign solver.
     rank : int or None

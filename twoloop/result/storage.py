@@ -1,4 +1,4 @@
-"""Save results in NumPy's npz format, without pickle, or in folders; read them, with every field validated."""
+"""Save results in NumPy's npz format, without pickle, or in folders; read them and validate every field."""
 
 import json
 import math
@@ -81,7 +81,7 @@ def check_folder(store: Any) -> Path:
 
 
 def begin_folder(path: Path, n_q: int) -> FileStore:
-    """Create the folder of a run; until `end_folder` it counts as that of an interrupted run."""
+    """Create the folder of a run; until `end_folder`, its metadata describe an interrupted run."""
     buffers = FileStore(path)
     metadata = {"format": FORMAT, "n_q": n_q, "status": int(Status.INTERRUPTED), "message": INTERRUPTED, "stats": {}}
     (path / METADATA_FILE).write_text(json.dumps(metadata), encoding="utf-8")
@@ -89,7 +89,7 @@ def begin_folder(path: Path, n_q: int) -> FileStore:
 
 
 def end_folder(buffers: FileStore, result: Record) -> None:
-    """Write everything that was not written during the run."""
+    """Write the arrays and metadata that were not written during the run."""
     arrays, metadata = fields_of(result, inside=False)
     for name in arrays.keys() - {*STREAMED, *STATES}:
         buffers.add(name, arrays[name])
@@ -205,7 +205,7 @@ def _solution(system: ConstrainedSystem, arrays: dict[str, Any], metadata: dict[
 
 
 def _is_number(value: Any) -> bool:
-    """Return True for a number of JSON, in which integers may have any number of digits."""
+    """Return whether a JSON value is a finite number; integers, which may have any number of digits, are limited."""
     return math.isfinite(value) if type(value) is float else type(value) is int and abs(value) < INTEGER_LIMIT
 
 
@@ -261,7 +261,7 @@ class SavedFields:
             self._check_solution()
 
     def _check_solution(self) -> None:
-        """Check the table of the dense solution and its lookup data."""
+        """Check the states at steps that the dense solution interpolates, and its other fields."""
         n_q, n_rows = self.sizes
         t = self._times("sol_t", minimum=1)
         self._check("sol_t", bool((np.diff(t) > 0.0).all()), "increasing times")
@@ -283,7 +283,7 @@ class SavedFields:
             self._check_interior(t)
 
     def _check_interior(self, t: Array) -> None:
-        """Check states within intervals: one row each, first and last at its ends, NaN after the last."""
+        """Check the states within intervals: in each row the first and last at the ends of the interval, then NaN."""
         times = self._array("sol_interior_t", (None, None))
         states = self._array("sol_interior_states", (*times.shape, 3 * self.sizes[0]))
         finite = np.isfinite(times)

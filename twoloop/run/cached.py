@@ -20,7 +20,7 @@ from twoloop.checks.consistency import StartEvaluation, check_start
 from twoloop.checks.structure import has_definite_mass
 from twoloop.generate.compile_equations import GeneratedCode
 from twoloop.generate.derived_callbacks import exact_near, with_derived_callbacks
-from twoloop.generate.elimination import BOUNDS, LEAST, RANK, SINGULAR_MASS, Choice, Dependents
+from twoloop.generate.elimination import BOUNDS, LEAST, RANK, SINGULAR_MASS, DependentColumns, PivotChoice
 from twoloop.generate.trace import TraceCache, load_checked_bounds, share_checked_bounds, trace_cache_of
 from twoloop.generate.traced_values import Sample, Traced, extreme_states, states_near_start
 from twoloop.kernels.compile.linking import entry_point
@@ -34,7 +34,7 @@ from twoloop.methods.presets import code_for, identity, may_have_code, plans_for
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.dense_solution import DenseSolution, OutputInterpolation, Table, interpolator_of
 from twoloop.run.fallbacks import WITHIN, closer_sampling, may_have_missed_changes
-from twoloop.run.loop import NO_KINDS, IntegrationLoop, Interrupts, silent
+from twoloop.run.loop import NO_KINDS, IntegrationLoop, Interrupts, ignore_progress
 from twoloop.run.messages import describe_arrival
 from twoloop.run.options import Options
 from twoloop.run.parametric import ParametricRun, SharedSetup
@@ -178,7 +178,7 @@ class CachedIntegrator:
         problem. If nothing unusual happened, the fields are computed when they are read, from a copy of the arrays.
         """
         run, region, arrays, loops, parametric = self.run, self.region, self.arrays, self.loops, self.parametric
-        due = region.is_due()
+        due = region.is_comparison_due()
         if self.skips > 0:
             self.skips -= 1
             return None
@@ -217,7 +217,7 @@ class CachedIntegrator:
             (at_times,) = finished
         begin, end = self.one_state_from - n_rows - n * N_STEP_COLUMNS, self.states_from
         data = arrays.block[begin : end if at_times is not None else end + (1 + n_rows) * self.width].copy()
-        fields["later"] = partial(_field, data, at_times, self.of_run, self.cpu_time, system, t1, self.options)
+        fields["later"] = partial(_deferred_field, data, at_times, self.of_run, self.cpu_time, system, t1, self.options)
         region.count()  # runs that the loop ends are counted there
         return fields
 
@@ -249,7 +249,7 @@ class CachedIntegrator:
                 return None
         if report[loops.END_CODE] != run.a.ALL_OUTPUT_DONE or not report[loops.NO_REMARK]:
             self.moved = True
-            arguments = output.request(run), silent, output.time_limit, interrupts, False
+            arguments = output.request(run), ignore_progress, output.time_limit, interrupts, False
             loop = IntegrationLoop(run, t1, *arguments, start=rows[0], system=system)
             loop.resume(int(report[loops.END_CODE]), t[1:], rows[1:], steps, self.cpu_time)
             record = loop.to_end(self.check_derivatives)
@@ -335,7 +335,7 @@ def fields_of(
     return fields
 
 
-def _field(
+def _deferred_field(
     data: Array,
     at_times: tuple[Array, Array] | None,
     of_run: tuple[int, NDArray[np.int64], bool],
@@ -362,7 +362,7 @@ def _field(
     return OTHER_DEFAULTS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
-NEARER = 0.1  # starts whose smallest pivot is below this share of the first run's smallest pivot are checked anew
+RECHECK_PIVOT = 0.1  # starts with a smallest pivot below this share of the first run's are checked anew
 
 
 def first_chunk(run: Run) -> int:
@@ -389,16 +389,16 @@ def arrays_of(
     run.clock, run.control, run.tolerances = numbers[:i], numbers[i:j], numbers[j:]
     memory, (of_work, integers) = run.plan.memory, lasting(run.work)
     choice, nothing = None if code is None else code.shared.equations.choice, np.zeros(0, dtype=np.int64)
-    expected, scale = _expected(choice)
+    expected, scale = _choice_as_array(choice)
     blocks = [] if choice is None else [(i[0], i[-1], j[0], j[-1]) for i, j in choice.blocks]
-    dependents = Dependents(system, () if choice is None else choice.rows)
+    dependents = DependentColumns(system, () if choice is None else choice.rows)
     search = dependents.arguments if dependents.find else (nothing, nothing, 0, np.zeros(0), nothing, nothing)
     places = np.flatnonzero(memory.view(np.int64))  # by bits, as -0.0 must be restored, too
     weak = 0.0 if system.constant_mass and system.derived.get("no weak mass", False) else SINGULAR_MASS
     of_start: tuple[float, ...]
     of_start = max(run.rtol, GAMMA_ACCURACY), run.reuse, 0.0 if run.plan.watchful else 1.0
     of_start += np.array_equal(search[0] != 0, run.work.pattern.ravel() != 0.0), RANK, weak, scale, CONTRADICTS
-    of_start += of_mass, NEARER * run.work.notes[indices.PIVOT], run.kit.flags[FORM]
+    of_start += of_mass, RECHECK_PIVOT * run.work.notes[indices.PIVOT], run.kit.flags[FORM]
     step_fields = options.first_step or 0.0, run.least_atol, options.max_step, run.plan.looks_within
     columns, width = run.a.N_STEP_COLUMNS, len(run.state)
     block = np.empty(loops.N_HEAD + 1 + (1 + columns) * room + width * (1 + room))
@@ -427,7 +427,7 @@ def arrays_of(
     return arrays
 
 
-def _expected(choice: Choice | None) -> tuple[NDArray[np.int64], float]:
+def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], float]:
     """Return a choice of pivots as the array that kernels read, and the scale of the added rows."""
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
@@ -527,7 +527,7 @@ def set_up(
             options.set_sizes(run, t1)
     for each in entries:
         if run is None and each.moves:
-            run, entry, code = _moved(each, system, t0, t1, q0, v0, options), each, each.code
+            run, entry, code = _copy_for_start(each, system, t0, t1, q0, v0, options), each, each.code
     if run is None:
         (run, code), entry = _new_run(system, t0, t1, q0, v0, options), None
         if run.system is system:
@@ -578,7 +578,7 @@ def _share_setup(system: ConstrainedSystem, run: Run, code: GeneratedCode | None
         cached[call] = None
 
 
-def _moved(
+def _copy_for_start(
     entry: CacheEntry, system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
 ) -> Run | None:
     """Return a copy of a cached run for another start; None if that start needs other code or another form."""

@@ -104,7 +104,7 @@ class Interpolator:
         self.across: dict[float, Array] = {}  # memories of steps across singular positions, by beginnings of intervals
         self.accurate: set[float] = set()  # beginnings of intervals that neighbouring states interpolate well
         self.judges = True  # whether interior states may be computed; false if they were read from a file
-        self._make_room()
+        self._allocate()
 
     def _prepare(self) -> None:
         """Set up the workspace and the kits, for the current form of linear algebra."""
@@ -141,7 +141,7 @@ class Interpolator:
         self.static = None
         self._prepare()
 
-    def _make_room(self) -> None:
+    def _allocate(self) -> None:
         """Allocate scratch arrays for the coefficients of two polynomials."""
         half = 3 * max(indices.WINDOW, self.parts + 1)
         n = self.system.n_q
@@ -156,7 +156,7 @@ class Interpolator:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        self._make_room()
+        self._allocate()
 
     def states(self, table: Table, times: Array) -> Array:
         """Interpolate rows [q, v] at sorted `times` within the table."""
@@ -369,7 +369,7 @@ class Interpolator:
     def keep(self, t: Array, states: Array) -> None:
         """Restore interior states that `interiors` yielded; no other interior states are computed from now on."""
         self.parts, self.judges = t.shape[1] - 1, False
-        self._make_room()
+        self._allocate()
         sizes = np.isfinite(t).sum(axis=1).tolist()
         self.filled = {
             float(own_t[0]): (own_t[:n], own[:n]) for own_t, own, n in zip(t, states, sizes, strict=True) if n

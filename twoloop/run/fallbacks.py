@@ -95,12 +95,13 @@ LENGTHS = tuple(0.85**k for k in range(28))
 LONGER = tuple(1.4**k for k in range(1, 7))  # ... and longer ones, if too few nodes of a step are beyond the position
 # Distances from a singular position are measured by the smallest pivot of C_q, relative to its largest one so far.
 FAR = 0.2  # distance from which on a state may be the base of the polynomial
-LOOSER, WIDER = 10.0, 4.0  # factors on tolerances and on the longest time without an evaluation in the last attempts
+# factors on tolerances and on the longest time without an evaluation, in the last attempts
+TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
 # largest age of a base, relative to the longest of the last steps, and to twice the time to the position
 LONGEST_PAST, FARTHEST = 1.5, 4.0
 # an earlier state whose distance is below this share of the base's lies beyond another singular position
 BEYOND = 0.5
-SMALL = 1e-300  # avoids a division by zero
+MIN_DIVISOR = 1e-300  # avoids a division by zero
 CLEAR = 0.3  # distance from which on the run continues with steps of its own method
 
 
@@ -185,9 +186,9 @@ def _next_origin(run: Run, plan: Plan, control: Array) -> None:
     run.looser = run.tolerances
     if looser:
         run.looser = run.tolerances.copy()
-        run.looser[[indices.RTOL, indices.LEAST]] *= LOOSER
-        run.looser[indices.ATOL :] *= LOOSER
-        run.looser[indices.GAP] *= WIDER
+        run.looser[[indices.RTOL, indices.LEAST]] *= TOLERANCE_FACTOR
+        run.looser[indices.ATOL :] *= TOLERANCE_FACTOR
+        run.looser[indices.GAP] *= GAP_FACTOR
     if control[a.FIXED_STEP] == 0.0:
         control[a.MAX_STEP] = min(run.max_step, run.looser[indices.GAP] / control[a.MAX_EVALUATION_GAP])
     longest, allowed = float(clock[a.H_LONG]), float(control[a.MAX_STEP])
@@ -207,7 +208,7 @@ def _state_farther_away(run: Run, past: list[Place]) -> tuple[Place | None, floa
     """
     a, n, t = run.a, run.system.n_q, float(run.clock[run.a.T])
     here = least_singular_value(run.system, t, run.state[:n], run.rank)
-    farthest = now = run.work.notes[indices.PIVOT] / max(float(run.clock[a.LARGEST_PIVOT]), SMALL)
+    farthest = now = run.work.notes[indices.PIVOT] / max(float(run.clock[a.LARGEST_PIVOT]), MIN_DIVISOR)
     scale = now / here if here > 0.0 else np.inf
     base: Place | None = None
     length, oldest = 0.0, LONGEST_PAST * float(run.clock[a.H_LONG])

@@ -59,7 +59,7 @@ from twoloop.run.record import (
     Recorder,
     Statistics,
     Status,
-    explained,
+    failure_link,
     interval_kinds,
     of_run,
     record_of,
@@ -69,7 +69,7 @@ from twoloop.run.record import (
 from twoloop.run.rerun import compare_callbacks
 from twoloop.run.run import SMALL, Buffers, Run
 from twoloop.run.signals import SignalHandlers, within_a_users_function
-from twoloop.run.singular_positions import Place, turned_last
+from twoloop.run.singular_positions import Place, has_turned_last
 
 Array = NDArray[np.float64]
 
@@ -139,7 +139,7 @@ def interrupted_record(system: ConstrainedSystem, t0: float, events: list[Any] |
         lam=np.zeros((system.n_c + system.n_a, 0)),
         h=none.copy(),
         status=Status.INTERRUPTED,
-        message=describe_interrupt(t0, columns.T) + explained(Status.INTERRUPTED),
+        message=describe_interrupt(t0, columns.T) + failure_link(Status.INTERRUPTED),
         stats=Statistics(n_accepted=0),
         t_events=occurrences,
         q_events=states,
@@ -298,7 +298,7 @@ class IntegrationLoop:
             else:
                 self.code, self.raised = INTERRUPTED, None if self.interrupts.n_signals else error
                 if not run.system.called_in_python:
-                    error.add_note(_where(run.system.name, float(run.clock[a.T]), error))
+                    error.add_note(_error_note(run.system.name, float(run.clock[a.T]), error))
         if self.interrupts.handlers is not None:
             self.interrupts.handlers.check()
 
@@ -347,7 +347,7 @@ class IntegrationLoop:
             self.next_check = run.attempts() + self.check_interval
             if not across:
                 self.stiffness.sample_state(float(run.clock[a.T]), run.state, run.system.n_q)
-            if self.stall.stagnates(run.clock[a.T], self.t1) and run.control[a.MAX_STEPS] == np.inf:
+            if self.stall.is_stalled(run.clock[a.T], self.t1) and run.control[a.MAX_STEPS] == np.inf:
                 self.code = STAGNATED
         if spent < CHUNK_TIME:
             run.chunk = min(2 * run.chunk, self.largest_chunk)
@@ -367,7 +367,7 @@ class IntegrationLoop:
             self.plan, self.control = cross_singularity(run, self._past())
             self.kit = crossing_kit(run.kit)
             self.code = a.PAUSED
-        elif self.code == a.SWITCH_METHOD or self._stalls(across):
+        elif self.code == a.SWITCH_METHOD or self._is_stalled(across):
             switch_method(run)
             if self.code == a.STEP_TOO_SMALL:
                 run.clock[a.H_NEXT] = run.first_step(float(run.clock[a.T]), self.t1, run.state)
@@ -404,7 +404,7 @@ class IntegrationLoop:
         if self.latest and len(self.latest[-1][0]) and self.latest[-1][0][-1] == t:
             self.latest[-1][1][-1, : len(row)] = row
 
-    def _stalls(self, across: bool) -> bool:
+    def _is_stalled(self, across: bool) -> bool:
         """Return whether a method with a substitute makes no step, although no singular position is near."""
         run, a = self.run, self.run.a
         stalls = self.code == a.STEP_TOO_SMALL and run.control[a.MAY_SWITCH] == 1.0
@@ -416,7 +416,7 @@ class IntegrationLoop:
         stats, store = statistics(run.work.counters, self.cpu), self.request.store
         self._store_step_fields()
         reached = float(run.clock[run.a.T])
-        if recorder.ended is not None or recorder.broken_off is not None:
+        if recorder.ended is not None or recorder.interrupted_at is not None:
             for name in OF_STEPS:
                 store.cut(name, recorder.n_steps)
             stats = replace(stats, n_accepted=recorder.n_steps)
@@ -426,8 +426,8 @@ class IntegrationLoop:
                 store.cut("h", recorder.n_steps - 1)
                 store.add("h", np.array([recorder.last_step]))
             status, message = Status.EVENT, f"{event.name} ended the run at t = {end:.10g}."
-        if recorder.broken_off is not None:
-            reached = recorder.broken_off
+        if recorder.interrupted_at is not None:
+            reached = recorder.interrupted_at
         try:
             if recorder.ended is None:
                 status, message = outcome(run, code, self.t1, self.stall)
@@ -453,7 +453,7 @@ class IntegrationLoop:
             status, message = Status.INTERRUPTED, describe_interrupt(reached, table)
         t_events, q_events, v_events = recorder.events()
         fields = of_run(run, t, table) | {name: store.array(name) for name in OF_STEPS}
-        fields |= message_of(run, message + explained(status), self.system)
+        fields |= message_of(run, message + failure_link(status), self.system)
         fields |= {"status": status, "stats": stats, "sol": recorder.solution(), "system": self.system}
         fields |= {"t_events": t_events, "q_events": q_events, "v_events": v_events}
         return record_of(Record, DEFAULTS | fields)
@@ -465,7 +465,7 @@ class IntegrationLoop:
             return []
         if run.plan.watchful and run.work.notes[indices.NEARLY_SINGULAR] != 1.0:
             return []
-        return [(float(t[-2]), table[-2])] if turned_last(t, table, run.system.n_q) else []
+        return [(float(t[-2]), table[-2])] if has_turned_last(t, table, run.system.n_q) else []
 
     def _suspicious_outputs(self, t: Array, table: Array) -> list[Place]:
         """Return the states at which steps had to end, if one of them is near a singular position."""
@@ -504,11 +504,11 @@ class IntegrationLoop:
         return interval_kinds(run, steps)
 
 
-def silent(t: float) -> None:
+def ignore_progress(t: float) -> None:
     """Ignore the time reached: `report` of a loop without a progress bar."""
 
 
-def _where(name: str, t: float, error: Exception) -> str:
+def _error_note(name: str, t: float, error: Exception) -> str:
     """Return the note that is added to an exception of a compiled callback: the system and the time."""
     beyond = ": it asks an array for more than it has, as beyond the end of a table" * isinstance(error, IndexError)
     return f"raised by a compiled callback of system {name!r} in a step from t = {t:.10g}{beyond}"

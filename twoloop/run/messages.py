@@ -64,16 +64,16 @@ class StallDetector:
         self.longest = max(self.longest, float(h.max(initial=0.0)))
         self.window_n += len(h)
 
-    def stagnates(self, t: float, t1: float) -> bool:
+    def is_stalled(self, t: float, t1: float) -> bool:
         """Return whether the run stalls at time t."""
         if self.window_n < STAGNATION_STEPS:
             return False
         self.mean = (t - self.window_t) / self.window_n
         self.window_t, self.window_n = t, 0
-        return t1 - t > (STAGNATION_LEFT if self.slows else self.most) * self.mean
+        return t1 - t > (STAGNATION_LEFT if self.has_slowed else self.most) * self.mean
 
     @property
-    def slows(self) -> bool:
+    def has_slowed(self) -> bool:
         """Whether the steps were much longer earlier in the run."""
         return self.mean < STAGNATION_PACE * self.longest
 
@@ -161,13 +161,13 @@ def _rates(kit: Any, work: Any, sample: StiffnessSample, directions: list[Array]
 
     if kit.inner(kit, work, tasks.RENEW_PARTITION, sample.t, sample.q, sample.v, 0.0, work.x, work.lam) != indices.DONE:
         return 0.0, 0.0
-    squared, opposed_q = _largest(kit, work, sample, directions[0], work.independent, False)
-    rate, opposed_v = _largest(kit, work, sample, directions[1], work.independent_v, True)
+    squared, opposed_q = _dominant_eigenvalue(kit, work, sample, directions[0], work.independent, False)
+    rate, opposed_v = _dominant_eigenvalue(kit, work, sample, directions[1], work.independent_v, True)
     vibration = np.sqrt(squared) if opposed_q else 0.0
     return (vibration, rate) if opposed_v else (max(vibration, rate), 0.0)
 
 
-def _largest(
+def _dominant_eigenvalue(
     kit: Any, work: Any, sample: StiffnessSample, direction: Array, places: NDArray[np.int64], by_v: bool
 ) -> tuple[float, bool]:
     """Return the largest eigenvalue of dF/dq or dF/dv in size, by power iteration, and whether it is negative."""
@@ -263,7 +263,7 @@ def describe_rounding(run: "Run", places: list[Place], end: float) -> str:
         q, v = state[:n], state[n : 2 * n]
         if t >= end or surely_above(run.near, system.rows(t, q), run.rank):
             continue
-        over = _over_allowed(run, t, q, v)
+        over = _velocity_error_ratio(run, t, q, v)
         if over > LASTING:
             return (
                 f"Not to be trusted beyond t = {t:.10g}: steps went on from there, where the constraints nearly lose "
@@ -308,7 +308,7 @@ def outcome(run: "Run", code: int, t1: float, stall: StallDetector) -> tuple[Sta
             "the constraints allow beyond it. Correct the drives, or end t_span before.",
         )
     if code == a.ROWS_VIOLATED:
-        return Status.ROWS_CONTRADICT, _contradiction(run)
+        return Status.ROWS_CONTRADICT, _describe_contradiction(run)
     if failure == indices.NOT_FINITE:
         return (Status.NOT_FINITE, f"{stopped}: {describe_not_finite(run)}. The result holds what was computed before.")
     if code == a.RANK_LOST or failure == indices.SINGULAR:
@@ -317,7 +317,7 @@ def outcome(run: "Run", code: int, t1: float, stall: StallDetector) -> tuple[Sta
             Status.RANK_LOST,
             f"{stopped}: the constraint Jacobian has lost rank there ({rows}), so no choice of independent "
             f"coordinates exists at this singular position, and no step led across: {_REMEDIES}."
-            f"{_end_is_near(run, t1)}",
+            f"{_describe_near_end(run, t1)}",
         )
     if failure == indices.GAMMA_INACCURATE:
         reached, required = run.work.notes[indices.GAMMA_ACCURACY], run.work.notes[indices.GAMMA_REQUIRED]
@@ -336,8 +336,8 @@ def outcome(run: "Run", code: int, t1: float, stall: StallDetector) -> tuple[Sta
     return (
         Status.STEP_TOO_SMALL,
         f"{stopped}: the step size fell below the spacing of floating-point numbers; at the last attempt {reason}. "
-        f"{_near_singular(run, t1)}{_near_massless(run)}Look for a discontinuity near this time, loosen rtol and "
-        "atol, or use coordinates of similar scale.",
+        f"{_describe_near_singular(run, t1)}{_describe_near_massless(run)}Look for a discontinuity near this time, "
+        "loosen rtol and atol, or use coordinates of similar scale.",
     )
 
 
@@ -345,10 +345,10 @@ def _describe_stall(run: "Run", t1: float, stall: StallDetector) -> str:
     """Describe how short the steps are, how many more the run would take, and the likely reason."""
     left = (t1 - float(run.clock[run.a.T])) / stall.mean
     before, advice = "", "Shorten t_span, or look at the units of velocities, masses and forces. "
-    if stall.slows:
+    if stall.has_slowed:
         before = f", after steps of up to {stall.longest:.2g} s"
         advice = "Look for a singular position or a stiff force near this time, or take another method. "
-        advice = _near_singular(run, t1) or advice
+        advice = _describe_near_singular(run, t1) or advice
     elif run.control[run.a.FIXED_STEP] > 0.0:
         advice = "Take a larger step_size, or shorten t_span. "
     return (
@@ -357,7 +357,7 @@ def _describe_stall(run: "Run", t1: float, stall: StallDetector) -> str:
     )
 
 
-def _contradiction(run: "Run") -> str:
+def _describe_contradiction(run: "Run") -> str:
     """Describe a redundant row that is violated although the other rows hold, and the rows on which it depended."""
     t, n, row = float(run.clock[run.a.T]), run.system.n_q, int(run.work.notes[indices.CONTRADICTION])
     words = in_words(run.system.rows(t, run.state[:n]), [row])
@@ -389,7 +389,7 @@ def warn_of_singular_end(run: "Run") -> str:
             "and accelerations there. End t_span a little before, or beyond"
         )
     else:
-        over = _over_allowed(run, t, q, v)
+        over = _velocity_error_ratio(run, t, q, v)
         if over <= indices.UNTRUE:
             return ""
         text = (
@@ -425,7 +425,7 @@ def warn_user(text: str) -> str:
     return f" {text[0].upper()}{text[1:]}."
 
 
-def _over_allowed(run: "Run", t: float, q: Array, v: Array) -> float:
+def _velocity_error_ratio(run: "Run", t: float, q: Array, v: Array) -> float:
     """Estimate the errors of velocities caused by rounding of positions, over the tolerances."""
     allowed = run.tolerances[indices.ATOL :] + run.rtol * np.abs(v).max()
     return float((velocity_rounding_errors(run.system, t, q, v, run.rank) / allowed).max())
@@ -440,26 +440,26 @@ def _measured(run: "Run", t: float, q: Array) -> str:
     return f"the smallest singular value of the constraint Jacobian is {ratio:.1g} of the largest"
 
 
-def _end_is_near(run: "Run", t1: float) -> str:
-    """Return a sentence if the run stopped just before its end, beyond which steps across need nodes; else nothing."""
+def _describe_near_end(run: "Run", t1: float) -> str:
+    """Return a sentence if the run stopped just before its end, beyond which steps across need nodes; else ""."""
     left = t1 - float(run.clock[run.a.T])
     if left > max(NEXT_TO_END * (t1 - run.t0), float(run.clock[run.a.H_LONG])):
         return ""
     return f" The end of t_span is {left:.1g} s ahead: end a little before that position, or beyond."
 
 
-def _near_singular(run: "Run", t1: float) -> str:
+def _describe_near_singular(run: "Run", t1: float) -> str:
     """Return a sentence if C_q is close to losing rank at the last state, else an empty string."""
     ratio = singular_ratio(run.system, float(run.clock[run.a.T]), run.state[: run.system.n_q], run.rank)
     if ratio > NEARLY_SINGULAR:
         return ""
     return (
         f"The constraint Jacobian is close to losing rank there: its smallest singular value is "
-        f"{ratio:.1g} of the largest. No step led across: {_REMEDIES}.{_end_is_near(run, t1)} "
+        f"{ratio:.1g} of the largest. No step led across: {_REMEDIES}.{_describe_near_end(run, t1)} "
     )
 
 
-def _near_massless(run: "Run") -> str:
+def _describe_near_massless(run: "Run") -> str:
     """Return a sentence if some motion has almost no inertia at the last state, else an empty string."""
     t, q = float(run.clock[run.a.T]), run.state[: run.system.n_q]
     ratio, words = least_inertia(run.system, t, q)

@@ -297,7 +297,7 @@ def _consistent_state(
     wrong = Violation.of_velocity(system, t, position, velocity, jacobian, scales) if len(jacobian) > 0 else None
     if wrong is not None and wrong.excess > 1.0:
         why = f"max|C_q v + C_t| stays at {_largest(wrong.values)}"
-        raise ValueError(_no_freedom(system, t, scales.scaled(jacobian), free, kept, why))
+        raise ValueError(_describe_no_freedom(system, t, scales.scaled(jacobian), free, kept, why))
     state = ConsistentState((position, velocity))
     state.moved_q, state.moved_v = _move(position - guess), _move(velocity - speeds)
     state.dependent, state.determinant_sign, state.margin = _assembly(scales.scaled(jacobian), free)
@@ -338,7 +338,7 @@ def _position(
     start = Violation.of_position(system, t, guess, jacobian, scales)
     if start.excess > CONVERGED and _rank(scaled[:, free]) < _rank(scaled):
         why = f"max|C| stays at {_largest(start.values)}"
-        raise ValueError(_no_freedom(system, t, scaled, free, kept, why))
+        raise ValueError(_describe_no_freedom(system, t, scaled, free, kept, why))
     position, excess, iterations = _gauss_newton(system, t, guess, free)
     redundant = position is None or _rank(scales.scaled(system.jacobian(t, position))) < system.n_c
     cut = WEAK if redundant else NEGLIGIBLE
@@ -352,7 +352,7 @@ def _position(
             reached = f"after {iterations} iterations max|C| is {worst}"
         raise ValueError(
             f"q cannot be projected onto the constraints of {system.name!r} at t = {t!r}: {reached}. Give a guess that "
-            f"is nearer to an assembled position{_smallest(scales, jacobian, free, kept)}"
+            f"is nearer to an assembled position{_describe_rank_loss(scales, jacobian, free, kept)}"
         )
     far = float((np.abs(position - guess) / scales.columns).max())
     if check_assembly and (start.excess > 1.0 or far > CONSISTENT):  # next to a dead centre a small error moves far
@@ -361,9 +361,9 @@ def _position(
             there = system.jacobian(t, position)
             raise ValueError(
                 f"q does not say on which assembly of {system.name!r} it is at t = {t!r}: its projection moves "
-                f"{_change(guess, position, scales)}, and that of another guess as far away {other}. Give a guess that "
-                "is nearer to the assembly that is meant, or farther from a dead centre; twoloop.consistent_state(..., "
-                f"check_assembly=False) takes the one found{_smallest(scales, there, free, kept)}"
+                f"{_describe_change(guess, position, scales)}, and that of another guess as far away {other}. Give a "
+                "guess that is nearer to the assembly that is meant, or farther from a dead centre; twoloop.consistent_state(..., "
+                f"check_assembly=False) takes the one found{_describe_rank_loss(scales, there, free, kept)}"
             )
     return position
 
@@ -411,11 +411,11 @@ def _another_assembly(
         if beside is None or not excess <= 1.0:
             return "ends elsewhere, from where no way leads back to it"
         if distance(beside, position) > SAME * far or sign_at(beside) != sign:
-            return f"ends on another one, which differs by {_change(position, beside, scales)}"
+            return f"ends on another one, which differs by {_describe_change(position, beside, scales)}"
     return None
 
 
-def _change(one: Array, other: Array, scales: Scales) -> str:
+def _describe_change(one: Array, other: Array, scales: Scales) -> str:
     """Describe which coordinate changes most, with enough digits to show the change."""
     j = int(np.abs((other - one) / scales.columns).argmax())
     size, change = max(abs(float(one[j])), abs(float(other[j]))), abs(float(other[j] - one[j]))
@@ -485,7 +485,7 @@ def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
     return direction
 
 
-def _smallest(scales: Scales, jacobian: Array, free: NDArray[np.intp], kept: list[int]) -> str:
+def _describe_rank_loss(scales: Scales, jacobian: Array, free: NDArray[np.intp], kept: list[int]) -> str:
     """Describe how nearly C_q loses rank, both as given and scaled; return "" if it does not."""
     if jacobian[:, free].size == 0:
         return ""
@@ -500,7 +500,7 @@ def _smallest(scales: Scales, jacobian: Array, free: NDArray[np.intp], kept: lis
     )
 
 
-def _no_freedom(
+def _describe_no_freedom(
     system: ConstrainedSystem, t: float, scaled: Array, free: NDArray[np.intp], kept: list[int], why: str
 ) -> str:
     ranks = f"rank {_rank(scaled[:, free])} of {len(scaled)}"

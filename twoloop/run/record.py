@@ -28,7 +28,7 @@ from twoloop.run.dense_solution import DenseSolution, Interpolator, Table
 if TYPE_CHECKING:
     from twoloop.run.run import Run
 
-MAGIC, HEAD = b"\x93NUMPY\x01\x00", 128  # first bytes of a file in NumPy's npy format, and length of its header
+MAGIC, HEADER_SIZE = b"\x93NUMPY\x01\x00", 128  # first bytes of a file in NumPy's npy format, and length of its header
 OF_STEPS = ("h", "rejected_error", "rejected_convergence", "partitioned", "untested")  # fields with one row per step
 
 
@@ -84,16 +84,16 @@ class FileStore:
         """Append rows to an array."""
         dtype, (n, *width) = self._shapes.get(name, (part.dtype, (0, *part.shape[1:])))
         with self._path(name).open("r+b" if name in self._shapes else "x+b") as file:
-            file.seek(HEAD + n * self._row(dtype, width))
+            file.seek(HEADER_SIZE + n * self._row(dtype, width))
             file.write(np.ascontiguousarray(part).data)
-            self._close(file, name, dtype, (n + len(part), *width))
+            self._write_header(file, name, dtype, (n + len(part), *width))
 
     def cut(self, name: str, n: int) -> None:
         """Keep the first n rows of an array."""
         dtype, (before, *width) = self._shapes[name]
         with self._path(name).open("r+b") as file:
-            file.truncate(HEAD + min(n, before) * self._row(dtype, width))
-            self._close(file, name, dtype, (min(n, before), *width))
+            file.truncate(HEADER_SIZE + min(n, before) * self._row(dtype, width))
+            self._write_header(file, name, dtype, (min(n, before), *width))
 
     def array(self, name: str) -> NDArray[Any]:
         """Return all rows as a memory map; writing to it does not change the file."""
@@ -106,9 +106,10 @@ class FileStore:
     def _row(dtype: np.dtype[Any], width: list[int]) -> int:
         return int(dtype.itemsize * np.prod(width, dtype=np.int64))
 
-    def _close(self, file: Any, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
+    def _write_header(self, file: Any, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
         """Write the header, after the rows: if the process dies before, the file still has the previous array."""
-        head = repr({"descr": dtype.str, "fortran_order": False, "shape": shape}).ljust(HEAD - len(MAGIC) - 3) + "\n"
+        head = repr({"descr": dtype.str, "fortran_order": False, "shape": shape})
+        head = head.ljust(HEADER_SIZE - len(MAGIC) - 3) + "\n"
         file.flush()
         file.seek(0)
         file.write(MAGIC + (len(head)).to_bytes(2, "little") + head.encode())
@@ -260,7 +261,7 @@ class Recorder:
     def _store(self, t: Array, rows: Array) -> None:
         """Store rows [q, v, a, lam], or [q, v] if [a, lam] will be computed at the end."""
         self.request.store.add("t", t)
-        self.request.store.add("states", self._completed(t, rows) if self.request.store.finished else rows)
+        self.request.store.add("states", self._with_accelerations(t, rows) if self.request.store.finished else rows)
 
     def finish(self) -> None:
         """Search the remaining intervals at the end of the run."""
@@ -272,7 +273,7 @@ class Recorder:
         return None if self.search is None or self.ended is None else self.search.found[self.ended[0].number][-1]
 
     @property
-    def broken_off(self) -> float | None:
+    def interrupted_at(self) -> float | None:
         """Time at which the search for events was interrupted: the result ends there, as later events are not known."""
         behind = self.interrupted and self.search is not None and self.ended is None
         return self.search.reached if behind and self.search is not None else None
@@ -317,7 +318,7 @@ class Recorder:
 
     def output(self) -> tuple[Array, Array]:
         """Return times and rows [q, v, a, lam] of the result."""
-        store, end = self.request.store, self.broken_off if self.ended is None else self.ended[1]
+        store, end = self.request.store, self.interrupted_at if self.ended is None else self.ended[1]
         if end is not None:
             n = int(np.searchsorted(store.array("t"), end, side="right"))
             store.cut("t", n)
@@ -325,11 +326,11 @@ class Recorder:
         t = store.array("t")
         if self.request.times is None and self.last is not None and t[-1] < self.last[0]:
             last = np.array([self.last[0]])
-            self._store(last, self._completed(last, self.last[1][None, :]))
+            self._store(last, self._with_accelerations(last, self.last[1][None, :]))
             t = store.array("t")
-        return t, self._completed(t, store.array("states"))
+        return t, self._with_accelerations(t, store.array("states"))
 
-    def _completed(self, times: Array, rows: Array) -> Array:
+    def _with_accelerations(self, times: Array, rows: Array) -> Array:
         """Return rows [q, v, a, lam] for rows [q, v]."""
         if self.interpolator is None or rows.shape[1] == self._width:
             return rows
@@ -346,7 +347,7 @@ class Recorder:
         if not self.request.dense or self.interpolator is None:
             return None
         table = Table(*(self.request.store.array(f"sol_{name}") for name in ("t", "states", "kinds")))
-        end = float(table.t[-1]) if self.broken_off is None else self.broken_off
+        end = float(table.t[-1]) if self.interrupted_at is None else self.interrupted_at
         return DenseSolution(self.interpolator, table, end if self.ended is None else self.ended[1])
 
     def events(self) -> tuple[list[Array], list[Array], list[Array]] | tuple[None, None, None]:
@@ -413,7 +414,7 @@ MEANINGS: dict[Status, str] = {
 }
 
 
-def explained(status: Status) -> str:
+def failure_link(status: Status) -> str:
     """Return the sentence about docs/when_it_fails.md for the message of a failure; an empty string after success."""
     return "" if status >= 0 else f" See docs/when_it_fails.md#{status.name.lower()}."
 
@@ -577,7 +578,7 @@ class _Deferred:
     def __get__(self, record: Any, owner: Any = None) -> Any:
         known = {} if record is None else vars(record)
         if "later" not in known:
-            raise AttributeError(self.name)  # also on the class: the default is in the dataclass field
+            raise AttributeError(self.name)  # the class has no such attribute; dataclass fields hold the defaults
         known.update(known["later"](self.name) | known)
         return known[self.name]
 

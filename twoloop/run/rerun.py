@@ -42,7 +42,7 @@ def compare_callbacks(
         return Status.WRONG_TRACE, f"{changed} {message}"
     region = checked_region_of(run, check_derivatives)
     parameters = run.varied_parameters
-    everywhere = region.is_due() or run.system.called_in_python
+    everywhere = region.is_comparison_due() or run.system.called_in_python
     everywhere = everywhere or (parameters is not None and not region.contains_parameters(parameters))
     region.count()
     if not everywhere and end <= run.compared_until[0]:
@@ -200,17 +200,17 @@ FINEST = 1e-13  # ... but not below this, because of rounding
 MOST_NUMBERS = 100_000  # size of the buffer of states
 
 
-def tighter(tolerance: ArrayLike) -> Array:
+def tightened(tolerance: ArrayLike) -> Array:
     """Return the tolerances of the pieces, given those of the run."""
     return np.minimum(tolerance, np.maximum(SHARE * np.asarray(tolerance), FINEST))
 
 
-def explicit() -> tuple[Method, Array]:
+def nonstiff_method() -> tuple[Method, Array]:
     """Return the method for pieces that are not stiff, and its nodes."""
     return DOP853(), dop853.C
 
 
-def implicit(velocities: bool) -> tuple[Method, Array]:
+def stiff_method(velocities: bool) -> tuple[Method, Array]:
     """Return the method for stiff pieces, and its nodes; `velocities`: whether errors of velocities are tested, too."""
     tableau = radau_iia(7)
     return RungeKutta(tableau, outer="newton", tested="all" if velocities else "positions"), tableau.c

@@ -86,8 +86,8 @@ def describe_turn(
     """
     n = system.n_q
     for (t0, first), (t1, last), across in _passages(crossings, now):
-        size, speeds = (max(np.abs(first[part]).max(), np.abs(last[part]).max()) for part in (_q(n), _v(n)))
-        turn = np.abs(last[_v(n)] - first[_v(n)])
+        size, speeds = (max(np.abs(first[part]).max(), np.abs(last[part]).max()) for part in (_q_slice(n), _v_slice(n)))
+        turn = np.abs(last[_v_slice(n)] - first[_v_slice(n)])
         least = min(np.abs(state[2 * n : 3 * n]).max() for state in (first, last))
         if not (turn > np.maximum(APPARENT * (atol + rtol * speeds), TURNED * (t1 - t0) * least)).any():
             continue
@@ -97,7 +97,9 @@ def describe_turn(
         ratio = _least_ratio(system, here if across else there, there, rank, ratio_in_any_units)
         if ratio >= near:
             continue
-        known = max(_known_acceleration(system, t, state[_q(n)], state[_v(n)], near) for t, state in (here, there))
+        known = max(
+            _known_acceleration(system, t, state[_q_slice(n)], state[_v_slice(n)], near) for t, state in (here, there)
+        )
         turn[turn <= np.maximum(APPARENT * (atol + rtol * speeds), TURNED * (t1 - t0) * known)] = 0.0
         if turn.any():
             return (
@@ -110,7 +112,7 @@ def describe_turn(
     return ""
 
 
-def turned_last(times: Array, rows: Array, n: int) -> bool:
+def has_turned_last(times: Array, rows: Array, n: int) -> bool:
     """Return whether velocities of the last two states [q, v, a] differ by more than their accelerations explain."""
     most = np.maximum.reduce  # array.max() makes three calls, which would slow down short repeated runs
     if times.size < 2:
@@ -132,11 +134,11 @@ def _passages(crossings: list[list[Place]], now: Place) -> Iterator[tuple[Place,
         yield before, now, False
 
 
-def _q(n: int) -> slice:
+def _q_slice(n: int) -> slice:
     return slice(n)
 
 
-def _v(n: int) -> slice:
+def _v_slice(n: int) -> slice:
     return slice(n, 2 * n)
 
 
