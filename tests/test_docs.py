@@ -19,7 +19,7 @@ from twoloop import Status, ensemble, mechanisms, solve_dae
 from twoloop.bodies import PlanarModel, SpatialModel
 from twoloop.mechanisms import four_bar, pendulum
 from twoloop.methods.presets import PRESETS
-from twoloop.run.record import explained
+from twoloop.run.record import failure_link
 
 mpl = pytest.importorskip("matplotlib")  # not among the oldest versions
 ROOT = Path(__file__).parents[1]
@@ -168,7 +168,7 @@ def test_what_the_page_says_of_the_others(names):
 # --- statuses
 @pytest.mark.parametrize("status", [status for status in Status if status < 0], ids=lambda status: status.name)
 def test_every_failure_leads_to_a_section_with_cause_and_remedy(status):
-    assert explained(status) == f" See docs/when_it_fails.md#{status.name.lower()}."
+    assert failure_link(status) == f" See docs/when_it_fails.md#{status.name.lower()}."
     text = (DOCS / "when_it_fails.md").read_text(encoding="utf-8")
     section = re.search(rf"### {status.name}\n(.*?)(?=\n##)", text, re.DOTALL)
     assert section is not None and {"**Cause.**", "**Remedy.**"} <= set(section[1].split())
@@ -176,8 +176,8 @@ def test_every_failure_leads_to_a_section_with_cause_and_remedy(status):
 
 def test_only_a_failed_run_names_its_section(names):
     result = names("when_it_fails")["result"]
-    assert result.status is Status.MAX_STEPS and result.message.endswith(explained(Status.MAX_STEPS))
-    assert explained(Status.REACHED_END) == explained(Status.EVENT) == ""
+    assert result.status is Status.MAX_STEPS and result.message.endswith(failure_link(Status.MAX_STEPS))
+    assert failure_link(Status.REACHED_END) == failure_link(Status.EVENT) == ""
 
 
 # --- developer pages

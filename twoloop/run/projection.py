@@ -362,8 +362,9 @@ def _position(
             raise ValueError(
                 f"q does not say on which assembly of {system.name!r} it is at t = {t!r}: its projection moves "
                 f"{_describe_change(guess, position, scales)}, and that of another guess as far away {other}. Give a "
-                "guess that is nearer to the assembly that is meant, or farther from a dead centre; twoloop.consistent_state(..., "
-                f"check_assembly=False) takes the one found{_describe_rank_loss(scales, there, free, kept)}"
+                "guess that is nearer to the assembly that is meant, or farther from a dead centre; "
+                f"twoloop.consistent_state(..., check_assembly=False) takes the one found"
+                f"{_describe_rank_loss(scales, there, free, kept)}"
             )
     return position
 
