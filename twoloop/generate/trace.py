@@ -96,7 +96,7 @@ def as_forms(graph: Graph, values: Any) -> Any:
 class _Traced(FunctionCopier):
     """Copier of callbacks that replaces `math` and `numpy` by functions of expressions."""
 
-    def copies(self, value: Any) -> bool:
+    def is_copied(self, value: Any) -> bool:
         return isinstance(value, Dispatcher | types.FunctionType)
 
     def callback(self, function: Any) -> Any:
