@@ -216,7 +216,7 @@ class CollocationCode:
         emit.numbers = emit.constants = numbers
 
         def careful() -> Value:
-            name = self._careful(emit, [each.type for each in (room, state, tolerances, numbers)])
+            name = self._mass_first_function(emit, [each.type for each in (room, state, tolerances, numbers)])
             return builder.call(name, DOUBLE, [room, state, tolerances, numbers])
 
         def quick(inputs: list[Value]) -> Callable[[], Value]:
@@ -247,13 +247,13 @@ class CollocationCode:
 
         if self.has_reduced:
             left = one.load(room, at.CAREFUL)
-            with self._leaving(emit, builder.compare("fcmp ogt", left, llvm_code.ZERO)):
+            with self._returning_if(emit, builder.compare("fcmp ogt", left, llvm_code.ZERO)):
                 one.store(one.subtract(left, llvm_code.ONE), room, at.CAREFUL)
                 builder.ret(careful())
         self._call(emit, "begin_nodes", self._begin, [room, state, tolerances])
         return self._iterate(emit, room, state, tolerances, quick, otherwise)
 
-    def _careful(self, emit: LaneEmitter, kinds: list[str]) -> str:
+    def _mass_first_function(self, emit: LaneEmitter, kinds: list[str]) -> str:
         """Return the name of the function that iterates by eliminating M first; write it at the first call."""
         module, name = emit.builder.module, "careful_nodes"
         if not module.defines(name):
@@ -280,7 +280,7 @@ class CollocationCode:
         return [load_lanes(emit, room, self.a + LANES * i) for i in range(self.n)]
 
     @contextmanager
-    def _leaving(self, emit: LaneEmitter, condition: Value) -> Iterator[None]:
+    def _returning_if(self, emit: LaneEmitter, condition: Value) -> Iterator[None]:
         """Context of instructions that run only if a condition holds, and that must return from the function."""
         builder = emit.builder
         leave, go_on = builder.append_block(), builder.append_block()
@@ -307,7 +307,7 @@ class CollocationCode:
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
         fixed = builder.compare("fcmp oeq", one.load(tolerances, ESTIMATE), llvm_code.ZERO)
         h, rtol = one.load(room, at.H), builder.select(fixed, llvm_code.ONE, one.load(tolerances, RTOL))
-        several, starts = self._several(emit)
+        several, starts = self._vector_emitter(emit)
         zero = several.constant(0.0)
         length, half, relative = (several.splat(each) for each in (h, one.multiply(h, constant(DOUBLE, 0.5)), rtol))
         largest = [zero] * 3
@@ -359,7 +359,7 @@ class CollocationCode:
             power = emit.multiply(power, power)
         return emit.multiply(emit.multiply(*factors[:2]), emit.multiply(*factors[2:]))
 
-    def _several(self, emit: LaneEmitter) -> tuple[LaneEmitter, list[int]]:
+    def _vector_emitter(self, emit: LaneEmitter) -> tuple[LaneEmitter, list[int]]:
         """Return an emitter for vectors of coordinates, and their first coordinates; the last vector may overlap."""
         lanes = min(LANES, 1 << (self.n.bit_length() - 1))
         return LaneEmitter(emit.builder, lanes), [*range(0, self.n - lanes, lanes), self.n - lanes]
@@ -415,7 +415,7 @@ class CollocationCode:
         change = one.multiply(stricter, self._integrate(emit, room, state))
         m = one.add(sweeps, llvm_code.ONE)
 
-        def holds_that(name: str, x: Value, y: Value | float) -> Value:
+        def compare(name: str, x: Value, y: Value | float) -> Value:
             return builder.compare(f"fcmp {name}", x, y if isinstance(y, Value) else number(y))
 
         def either(x: Value, y: Value) -> Value:
@@ -423,29 +423,29 @@ class CollocationCode:
 
         contraction = one.divide(change, one.larger(change_before, number(SMALLEST)))
         contraction = one.smaller(one.larger(contraction, number(MIN_RHO)), number(MAX_RHO))
-        rho_now = builder.select(holds_that("ogt", m, 1.0), contraction, rho)
-        out_of_range = either(holds_that("olt", rho_now, FAST_START), holds_that("ogt", rho_now, SLOW_START))
+        rho_now = builder.select(compare("ogt", m, 1.0), contraction, rho)
+        out_of_range = either(compare("olt", rho_now, FAST_START), compare("ogt", rho_now, SLOW_START))
         guessed = builder.both(
-            builder.both(may_guess, holds_that("oeq", m, 2.0)),
-            builder.both(out_of_range, holds_that("ogt", change, 0.0)),
+            builder.both(may_guess, compare("oeq", m, 2.0)),
+            builder.both(out_of_range, compare("ogt", change, 0.0)),
         )
         stagnant = builder.both(
-            holds_that("ogt", m, 2.0),
+            compare("ogt", m, 2.0),
             builder.both(
-                holds_that("oge", change, one.multiply(number(STAGNANT), change_before)),
-                holds_that("ole", change, noise),
+                compare("oge", change, one.multiply(number(STAGNANT), change_before)),
+                compare("ole", change, noise),
             ),
         )
-        converged = either(holds_that("ole", one.multiply(rho_now, change), kappa), stagnant)
-        slow = builder.both(builder.both(holds_that("ogt", m, 3.0), estimated), holds_that("oge", rho_now, SLOW))
-        refused = either(either(slow, holds_that("oge", m, most)), holds_that("uge", change, INFINITE))
+        converged = either(compare("ole", one.multiply(rho_now, change), kappa), stagnant)
+        slow = builder.both(builder.both(compare("ogt", m, 3.0), estimated), compare("oge", rho_now, SLOW))
+        refused = either(either(slow, compare("oge", m, most)), compare("uge", change, INFINITE))
         ends = builder.operation("or", either(guessed, converged), refused)
         for phi, value in zip(carried, (m, change, rho_now), strict=True):
             phi.add_incoming(value, builder.block)
         builder.branch(ends, after, loop)
         builder.position_at_end(after)
         all_hold = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [finish()])
-        with self._leaving(emit, builder.operation("xor", all_hold, Value(BIT, "true"))):
+        with self._returning_if(emit, builder.operation("xor", all_hold, Value(BIT, "true"))):
             builder.ret(otherwise())
         for value, place in ((m, at.SWEEPS), (change, at.CHANGE), (target, at.TARGETED), (rho_now, at.RHO)):
             one.store(value, room, place)
@@ -474,10 +474,10 @@ class CollocationCode:
         further = one.divide(one.add(left, llvm_code.ONE), one.add(target, constant(DOUBLE, 2.0)))
         with one.loop(integer(0), integer(n), []) as (i, _, _):
             a0 = one.load(one.pointer(state, i), 2 * n)
-            values = emit.function("fabs", self._combined(emit, tables().spectrum, a0, room, i))
+            values = emit.function("fabs", self._weighted_rows(emit, tables().spectrum, a0, room, i))
             pairs = emit.larger(values, builder.shuffle(values, values, [1, 0, 3, 2, 5, 4, 7, 6]))
             store_lanes(emit, pairs, one.pointer(room, vector_index(emit, i)), self.spectra)
-        several, starts = self._several(emit)
+        several, starts = self._vector_emitter(emit)
         error = curved = several.constant(0.0)
         least = several.constant(SMALLEST)
         for start in starts:
@@ -513,8 +513,8 @@ class CollocationCode:
         q, v = [zero] * n, [zero] * n
         for i in self.iterated:
             q0, v0, a0 = (one.load(state, m * n + i) for m in range(3))
-            of_v = self._combined(emit, tables().velocities_between, a0, room, integer(i))
-            of_q = self._combined(emit, tables().positions_between, a0, room, integer(i))
+            of_v = self._weighted_rows(emit, tables().velocities_between, a0, room, integer(i))
+            of_q = self._weighted_rows(emit, tables().positions_between, a0, room, integer(i))
             v[i] = emit.fused(h, of_v, emit.splat(v0))
             q[i] = emit.fused(emit.multiply(h, h), of_q, emit.fused(length, emit.splat(v0), emit.splat(q0)))
         inputs, filled = [emit.add(t, length), *q, *v], builder.room(DOUBLE, LANES * n)
@@ -523,7 +523,7 @@ class CollocationCode:
         worst = largest = zero
         for i, value in enumerate(a):
             a0 = one.load(state, 2 * n + i)
-            off = emit.subtract(value, self._combined(emit, tables().values_between, a0, room, integer(i)))
+            off = emit.subtract(value, self._weighted_rows(emit, tables().values_between, a0, room, integer(i)))
             weight = emit.splat(one.load(room, at.WEIGHTS + i))
             worst = emit.larger(emit.multiply(emit.function("fabs", off), weight), worst)
             largest = emit.larger(emit.multiply(emit.function("fabs", value), weight), largest)
@@ -544,7 +544,7 @@ class CollocationCode:
         with loop_over(emit, self.iterated) as (k, i, _, _):
             a0 = one.load(one.pointer(state, i), 2 * self.n)
             store_lanes(
-                emit, self._combined(emit, tables().begin, a0, room, i), one.pointer(old, vector_index(emit, k))
+                emit, self._weighted_rows(emit, tables().begin, a0, room, i), one.pointer(old, vector_index(emit, k))
             )
 
     def end(self, emit: LaneEmitter, room: Value, state: Value, new_state: Value) -> None:
@@ -572,7 +572,9 @@ class CollocationCode:
             off = emit.add(sums, emit.splat(one.subtract(a0, a1)))
             weight = emit.splat(one.load(one.pointer(room, i), at.WEIGHTS))
             carried.append(emit.larger(emit.multiply(emit.function("fabs", off), weight), worst))
-            store_lanes(emit, self._combined(emit, tables().end, a0, room, i), one.pointer(new, vector_index(emit, k)))
+            store_lanes(
+                emit, self._weighted_rows(emit, tables().end, a0, room, i), one.pointer(new, vector_index(emit, k))
+            )
         self._choose_degree(emit, room, carried[0])
         if self.others:
             ends = [constants(table[1:, last]) for table in (tables().velocities, tables().positions)]
@@ -627,7 +629,7 @@ class CollocationCode:
         for name, place in self._places_of_ends().items():
             for k, value in enumerate(values.get(name, [])):
                 store_lanes(emit, value, room, place + LANES * k)
-        self._keep_moved(emit, room, values["moved"], holds)
+        self._store_largest_move(emit, room, values["moved"], holds)
 
     def _project_in_parts(
         self, emit: LaneEmitter, room: Value, numbers: Value, write: Callable[..., Value], names: tuple[str, ...]
@@ -637,12 +639,12 @@ class CollocationCode:
         places = {name: one.pointer(room, place) for name, place in self._places_of_ends().items()} | {"moved": moved}
         state = load_lanes(emit, room, self.ends), places["q"], places["v"]
         holds = write(emit, *state, numbers, *(places[name] for name in names))
-        self._keep_moved(emit, room, [load_lanes(emit, moved, LANES * k) for k in range(self.n)], holds)
+        self._store_largest_move(emit, room, [load_lanes(emit, moved, LANES * k) for k in range(self.n)], holds)
 
     def _places_of_ends(self) -> dict[str, int]:
         return {"q": self.ends + LANES, "v": self.ends + LANES * (1 + self.n), "a": self.end_a, "lam": self.lam}
 
-    def _keep_moved(self, emit: LaneEmitter, room: Value, values: Sequence[Value], holds: Value) -> None:
+    def _store_largest_move(self, emit: LaneEmitter, room: Value, values: Sequence[Value], holds: Value) -> None:
         moved = emit.constant(0.0)
         for value in values:
             moved = emit.larger(emit.function("fabs", value), moved)
@@ -683,7 +685,7 @@ class CollocationCode:
         place = one.pointer(room, vector_index(emit, i))
         return [first, *(one.load(place, self.a + node) for node in range(LANES))]
 
-    def _combined(self, emit: LaneEmitter, table: Array, first: Value, room: Value, i: Value) -> Value:
+    def _weighted_rows(self, emit: LaneEmitter, table: Array, first: Value, room: Value, i: Value) -> Value:
         """Return the sum of the rows of a table, weighted by the accelerations of coordinate i (see `_values`)."""
         return self._sums(emit, table, self._values(emit, first, room, i))
 

@@ -112,7 +112,7 @@ class DependentColumns:
     find: Any = None
 
     def __init__(self, system: ConstrainedSystem, rows: tuple[int, ...]):
-        kinds = _kinds(system) if len(rows) >= MOSTLY_ROWS * system.n_q > 0 else None
+        kinds = _kinds_of_entries(system) if len(rows) >= MOSTLY_ROWS * system.n_q > 0 else None
         if kinds is not None:
             from twoloop.kernels.linalg.dependent_columns import choose_dependent_columns, room_size
 
@@ -130,7 +130,7 @@ class DependentColumns:
         return tuple(((i,), (j,)) if i == k else ((i, k), (j, l)) for i, k, j, l in pivots)
 
 
-def _kinds(system: ConstrainedSystem) -> Any:
+def _kinds_of_entries(system: ConstrainedSystem) -> Any:
     """Return the kind of each entry of G: 0 for zero, 1 for a constant, 2 if it varies; None if unknown."""
     if system.called_in_python:  # such a function may store its arguments, so it is traced as late as possible
         return None
@@ -171,10 +171,10 @@ class PivotChooser:
             self._last, self._key = self._decode(place), decided
         singular = bool(self._last.added)
         if place >= ((POOR_SINGULAR if singular else POOR) if len(mass) <= SMALL else POOREST + singular):
-            return self._stiffened(mass, G, place)
+            return self._with_added_rows(mass, G, place)
         return self._last
 
-    def _stiffened(self, mass: Array, G: Array, place: int) -> PivotChoice:
+    def _with_added_rows(self, mass: Array, G: Array, place: int) -> PivotChoice:
         """Return the choice with all independent rows added to M, if that makes much larger pivots, else the last one.
 
         Some bodies have little inertia about their joints, such as a rod with its mass in its middle. Then the rows are
@@ -496,7 +496,7 @@ class Solution:
         forms += [form for block in factors.blocks for row in block.inverse for form in row]
         forms += [form for block in factors.blocks for _, row in block.below for form in row]
         factors_kept = sorted({i for form in forms for i in form.terms})
-        shared = _shared(equations.graph, factors_kept, more)
+        shared = _shared_quantities(equations.graph, factors_kept, more)
         self.stored = {i: k for k, i in enumerate([*factors_kept, *shared])}
         kept = [equations.graph.quantity(i) for i in self.stored]
         self.kept = Program(equations.graph, {"kept": kept}, equations.conditions)
@@ -517,7 +517,7 @@ class Solution:
         ]
         self._rows = {k: [here(x) for x in equations.all_rows[k]] for k in (*self._choice.added, *dependent)}
         self._nothing = Affine(self.graph, 0.0, {})
-        self.solved = self._solved()
+        self.solved = self._solution_program()
 
     @property
     def n_stored(self) -> int:
@@ -530,7 +530,7 @@ class Solution:
     def _independent(self) -> list[Affine]:
         return [self._c[k] for k in self._choice.rows]
 
-    def _solved(self) -> Program:
+    def _solution_program(self) -> Program:
         r, lam = self._r, [self._nothing] * len(self._c)
         for k in self._choice.added:
             r = [entry + (x * self._c[k]).times(self._choice.scale) for entry, x in zip(r, self._rows[k], strict=True)]
@@ -549,7 +549,7 @@ class Solution:
         )
 
 
-def _shared(graph: Graph, kept: Sequence[int], more: Sequence[Program]) -> list[int]:
+def _shared_quantities(graph: Graph, kept: Sequence[int], more: Sequence[Program]) -> list[int]:
     """Return the quantities, other than `kept`, that are computed for `kept` and that the programs use, too."""
     computed = set(graph.needed_by(map(graph.quantity, kept)))
     used = {i for outputs in more for form in outputs.forms for i in form.terms}

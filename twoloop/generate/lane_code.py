@@ -152,12 +152,12 @@ class LaneSteps:
             with emit.loop(integer(0), order, initial) as (m, carried, new):
                 power = builder.sub(builder.sub(order, integer(1)), m)
                 row = emit.pointer(at.series, builder.mul(power, integer(n)))
-                for j, (q, v, a) in zip(some, _threes(carried), strict=True):
+                for j, (q, v, a) in zip(some, _triples(carried), strict=True):
                     # from a to q: in this order each new number takes the register of the old one
                     a = emit.add(emit.multiply(a, x), v)
                     v = emit.add(emit.multiply(v, x), q)
                     new += [emit.add(emit.multiply(q, x), emit.load(row, j)), v, a]
-            for j, (q, v, a) in zip(some, _threes(new), strict=True):
+            for j, (q, v, a) in zip(some, _triples(new), strict=True):
                 positions.append(q)
                 emit.store(q, at.new, j)
                 emit.store(emit.multiply(v, per_unit), at.new, n + j)
@@ -281,7 +281,7 @@ class LaneSteps:
         return Places(order, work, state, new, predicted, found, a, lam, begin, scratch)
 
 
-def _threes(values: list[Value]) -> Iterator[tuple[Value, Value, Value]]:
+def _triples(values: list[Value]) -> Iterator[tuple[Value, Value, Value]]:
     return zip(values[::3], values[1::3], values[2::3], strict=True)
 
 
@@ -300,7 +300,7 @@ def store_mask(emit: LaneEmitter, work: Value, field: int, mask: Value) -> None:
     emit.store(emit.builder.select(mask, emit.constant(1.0), emit.constant(0.0)), work, field)
 
 
-def keep_fine(emit: LaneEmitter, work: Value, holds: Value) -> None:
+def clear_fine_unless(emit: LaneEmitter, work: Value, holds: Value) -> None:
     """Clear FINE in the lanes in which a condition does not hold."""
     store_mask(emit, work, lanes.FINE, emit.builder.both(is_set(emit, work, lanes.FINE), holds))
 
@@ -633,7 +633,7 @@ class LaneCode(LaneSteps):
         Return a mask of the lanes whose correction is valid, and the largest change of a position.
         """
         select, work = emit.builder.select, at.work
-        inputs = self._new(emit, work, at)
+        inputs = self._new_state(emit, work, at)
         written, arrays = lower(emit, outputs, inputs, self.numbers)
         values = dict(zip(outputs.arrays, arrays, strict=True))
         act = emit.builder.both(is_set(emit, work, which), written.holds(outputs, arrays[0]))
@@ -653,19 +653,19 @@ class LaneCode(LaneSteps):
         holds, a = self._accelerations(emit, work, at)
         for k, value in enumerate(a):
             emit.store(value, at.a, k)
-        keep_fine(emit, work, holds)
+        clear_fine_unless(emit, work, holds)
 
     def _accelerations(self, emit: LaneEmitter, work: Value, at: Places) -> tuple[Value, list[Value]]:
-        a, holds = write_accelerations(emit, self.equations, self._new(emit, work, at), self.numbers)
+        a, holds = write_accelerations(emit, self.equations, self._new_state(emit, work, at), self.numbers)
         return holds, a
 
     def turned(self, emit: LaneEmitter, at: Places) -> Value | None:
         """Return the mask of the function `turned`; None for series, whose defects show a passed singular position."""
         if self.recurrences is not None or len(self.equations.rows) == 0:
             return None
-        return turned(emit, *(self._rows(emit, at, time, base) for time, base in self._ends(at)))
+        return turned(emit, *(self._rows(emit, at, time, base) for time, base in self._ends_of_step(at)))
 
-    def _ends(self, at: Places) -> list[tuple[int, Value]]:
+    def _ends_of_step(self, at: Places) -> list[tuple[int, Value]]:
         return [(lanes.T, at.state), (lanes.AHEAD, at.new)]
 
     def _rows(self, emit: LaneEmitter, at: Places, time: int, base: Value) -> list[dict[int, Value]]:
@@ -685,10 +685,10 @@ class LaneCode(LaneSteps):
     def redundant(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Clear FINE in the lanes in which a redundant row is violated."""
         at, outputs = self.places(emit, order, control, work), self.equations.redundant_rows
-        written, (none,) = lower(emit, outputs, self._new(emit, work, at), self.numbers)
-        keep_fine(emit, work, written.holds(outputs, none))
+        written, (none,) = lower(emit, outputs, self._new_state(emit, work, at), self.numbers)
+        clear_fine_unless(emit, work, written.holds(outputs, none))
 
-    def _new(self, emit: LaneEmitter, work: Value, at: Places) -> list[Value]:
+    def _new_state(self, emit: LaneEmitter, work: Value, at: Places) -> list[Value]:
         return [emit.load(work, lanes.AHEAD), *(emit.load(at.new, i) for i in range(2 * self.n))]
 
 
@@ -737,7 +737,7 @@ class LaneConstraints(LaneSteps):
         values = [value for array in arrays for value in array]
         for k, value in enumerate(values):
             emit.store(value, at.series, k)
-        keep_fine(emit, work, written.holds(self._rows, values))
+        clear_fine_unless(emit, work, written.holds(self._rows, values))
 
 
 BUILD_SECONDS = 3e-4  # estimated time to compile one quantity, s

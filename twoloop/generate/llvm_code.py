@@ -233,16 +233,16 @@ class Quantities:
         """Return the value of a quantity; load it if it was not defined."""
         if quantity in self._values:
             return self._values[quantity]
-        loaded = self._here()
+        loaded = self._loaded_here()
         if quantity not in loaded:
             loaded[quantity] = self._load(quantity)
         return loaded[quantity]
 
     def stored(self, quantity: int) -> None:
         """Forget the value of a quantity that was stored in memory, so that later parts load it."""
-        self._here()[quantity] = self._values.pop(quantity)
+        self._loaded_here()[quantity] = self._values.pop(quantity)
 
-    def _here(self) -> dict[int, Value]:
+    def _loaded_here(self) -> dict[int, Value]:
         """Return the values loaded in this part of the function."""
         if self._part != self._emit.builder.part:
             self._part, self._loaded = self._emit.builder.part, {}

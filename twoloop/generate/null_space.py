@@ -98,18 +98,18 @@ def solve(blocks: Sequence[Block], right: Sequence[Affine]) -> list[Affine]:
     pending: list[list[tuple[Affine, Affine]]] = [[] for _ in right]
     for places, _, below in blocks:
         for i in places:
-            solution[i] = (solution[i] - _gathered(pending[i])).value()
+            solution[i] = (solution[i] - _collected_sum(pending[i])).value()
         for j, multiples in below:
             pending[j] += [(multiple, solution[i]) for multiple, i in zip(multiples, places, strict=True)]
     for places, inverse, below in reversed(blocks):
         pivots = [solution[i] for i in places]
         for place, (i, row) in enumerate(zip(places, inverse, strict=True)):
             products = [(multiples[place], solution[j]) for j, multiples in below]
-            solution[i] = (_dot(row, pivots) - _gathered(products)).value()
+            solution[i] = (_dot(row, pivots) - _collected_sum(products)).value()
     return solution
 
 
-def _gathered(products: Sequence[tuple[Affine, Affine]]) -> Any:
+def _collected_sum(products: Sequence[tuple[Affine, Affine]]) -> Any:
     """Return the sum of products a b; those whose a is a multiple of the same expression become one product."""
     total: Any = 0.0
     groups: dict[Any, tuple[Affine, Affine]] = {}
@@ -339,10 +339,10 @@ def reduced_accelerations(
     factors = Factors(matrix, len(independent), len(independent))
     solution = dict(zip(independent, factors.solve(right), strict=True))
     accelerations = [g[i] + _add_products(zero, ((entry, solution[x]) for x, entry in T[i].items())) for i in range(n)]
-    return accelerations, list(_definite(matrix, factors))
+    return accelerations, list(_pivot_conditions(matrix, factors))
 
 
-def _definite(matrix: dict[tuple[int, int], Affine], factors: Factors) -> Iterator[tuple[Affine, Affine]]:
+def _pivot_conditions(matrix: dict[tuple[int, int], Affine], factors: Factors) -> Iterator[tuple[Affine, Affine]]:
     """Yield the conditions on the pivots of the reduced mass matrix, relative to its diagonal entries."""
     pivots = iter(factors.positive)
     for places, _, _ in factors.blocks:

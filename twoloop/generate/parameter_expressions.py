@@ -1,7 +1,7 @@
-"""Numbers that record how they were computed from parameters, so that one trace serves all values of these.
+"""Compute with numbers that record how they depend on parameters, so that one trace serves all parameter values.
 
-A `Parameter` is a float with which callbacks compute as with any other; the result is a `Parameter` again. Tracing
-decides by present values (which terms cancel, which expressions are equal), so these must be generic.
+A `Parameter` is a float with which callbacks compute as with any other float; the result is a `Parameter` again.
+Tracing uses present values to decide which terms cancel and which expressions are equal, so they must be generic.
 """
 
 import math
@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-Powers = tuple[tuple[int, float], ...]  # a product of atoms: their indices and exponents; empty for 1
+Powers = tuple[tuple[int, float], ...]  # product of powers of atoms: indices of the atoms, and exponents; empty for 1
 
-MOST_TERMS = 200  # largest number of terms of a sum: its key holds all of them, and takes long to compare
+MOST_TERMS = 200  # largest number of terms of a sum, because long keys take long to compare
 _as_float = float.__pos__  # converts a Parameter to a float; float() would be refused
-CANCELLED = 8.0 * 2.0**-52  # relative: a smaller sum of two terms is rounding of zero
+CANCELLED = 8.0 * 2.0**-52  # a sum of two terms below this share of a term is a rounding error of zero
 NUMBERS = (int, float, np.number)
 _UNARY = ("sin", "cos", "tan", "sqrt", "exp", "log", "arctan", "sinh", "cosh", "tanh", "absolute")
 FUNCTIONS = {name: getattr(np, name) for name in (*_UNARY, "hypot", "power")}
@@ -45,7 +45,7 @@ class Untraceable(ValueError):
 
 
 class Refusal(BaseException):
-    """Exception that leaves a callback that does not run on symbols; its own `except Exception` cannot catch it."""
+    """Exception that ends a callback that does not run on symbols; its own `except Exception` cannot catch it."""
 
 
 class Symbolic:
@@ -54,15 +54,15 @@ class Symbolic:
     Attributes
     ----------
     running : bool
-        Whether a callback is running on it now.
+        Whether a callback is being traced with this object now.
     refused : str
-        Reason why that callback cannot run on it; the callback may have caught the exception.
+        Reason why the callback cannot be traced; the callback may have caught the exception.
     """
 
     running, refused = False, ""
 
     def refuse(self, reason: str) -> NoReturn:
-        """Leave the running callback, and store the reason."""
+        """Raise an exception that ends the running callback, and store the reason."""
         if not self.running:
             raise Untraceable(reason)
         self.refused = self.refused or reason
@@ -70,7 +70,7 @@ class Symbolic:
 
     @contextmanager
     def watched(self) -> Iterator[None]:
-        """Watch the run of a callback; raise Untraceable if it was refused something and caught the exception."""
+        """Context in which a callback runs; raise Untraceable if the callback caught a refusal."""
         self.running, self.refused = True, ""
         try:
             yield
@@ -83,13 +83,13 @@ class Symbolic:
 class ParameterTape(Symbolic):
     """Record of how numbers were computed from parameters.
 
-    Its atoms are parameters, sums of products of atoms, and functions of such products. A callback that runs on its
-    numbers must not branch on their present values.
+    Numbers are multiples of products of powers of atoms. An atom is a parameter, a sum of such numbers, or a function
+    of them. Callbacks must not branch on the present values of the numbers.
 
     Parameters
     ----------
     values : sequence of float
-        Values of all parameters, generic ones for those that vary.
+        Values of all parameters; generic values for parameters that vary.
     varying : sequence of int
         Indices of the parameters that vary.
     """
@@ -104,14 +104,14 @@ class ParameterTape(Symbolic):
             self.parameters[place] = Parameter(float(values[place]), self, 1.0, ((place, 1.0),))
 
     def atom(self, definition: Any) -> Powers:
-        """Return a sum or a function as a product of one atom; equal definitions share their atom."""
+        """Return the Powers of the atom with a definition, a sum or a function; equal definitions share an atom."""
         if definition not in self._places:
             self._places[definition] = len(self.atoms)
             self.atoms.append(definition)
         return ((self._places[definition], 1.0),)
 
     def terms(self, number: float) -> dict[Powers, float]:
-        """Return a number as a sum of products: a dict of coefficients by product."""
+        """Return the terms of a number that is a sum: a dict of coefficients by Powers."""
         if type(number) is not Parameter:
             return {(): number} if number else {}
         (place, exponent), *further = number.powers
@@ -121,14 +121,14 @@ class ParameterTape(Symbolic):
         return {powers: number.scale * c for powers, c in definition[1]}
 
     def on(self, parameters: Array) -> Callable[[float], Any]:
-        """Return a function that evaluates a number for other parameters, whose shapes are those of `products`."""
+        """Return a function that evaluates a number for other parameters, see `products`."""
         product = self.products(parameters)
         return lambda number: number.scale * product(number.powers) if type(number) is Parameter else number
 
     def products(self, parameters: Array) -> Callable[[Powers], Any]:
-        """Return a function that evaluates products of atoms for other parameters.
+        """Return a function that evaluates Powers for other parameters.
 
-        For parameters (n_runs, n_p) it returns an array (n_runs,), or one number for all runs.
+        For parameters (n_runs, n_p) the function returns an array (n_runs,), or one number for all runs.
         """
         atoms: dict[int, Any] = {}
         products: dict[Powers, Any] = {(): 1.0}
@@ -156,7 +156,7 @@ class ParameterTape(Symbolic):
         return product
 
     def evaluate(self, numbers: Sequence["Parameter"], parameters: Array) -> Array:
-        """Evaluate numbers for other parameters (n_runs, n_p): (n_runs, len(numbers))."""
+        """Evaluate numbers for other parameters (n_runs, n_p); return an array (n_runs, len(numbers))."""
         product = self.products(parameters)
         places = {powers: k for k, powers in enumerate(dict.fromkeys(each.powers for each in numbers))}
         products = np.empty((len(places), len(parameters)))
@@ -169,7 +169,7 @@ class ParameterTape(Symbolic):
 
 
 class Parameter(float):
-    """Float that is a multiple of a product of atoms."""
+    """Float that records how it depends on parameters: `scale` times the product `powers` of atoms of a tape."""
 
     __slots__ = ("powers", "scale", "tape")
     tape: ParameterTape
@@ -188,16 +188,16 @@ class Parameter(float):
             self._refuse_decision(f"it calls numpy.{ufunc.__name__} on its parameters")
             plain = (float(each) if type(each) is Parameter else each for each in inputs)
             return getattr(ufunc, method)(*plain, **options)
-        return elementwise(lambda *given: applied(name, *given), inputs, out)
+        return elementwise(lambda *given: apply_function(name, *given), inputs, out)
 
     def _refuse_decision(self, reason: str = "it branches on its parameters, or rounds them") -> None:
-        """Refuse an operation whose result depends on the present value; the tracer itself may use it."""
+        """Refuse an operation whose result depends on the present value, unless the tracer itself called it."""
         caller = sys._getframe(2).f_globals.get("__name__", "")
         if self.tape.running and not caller.startswith(__name__.rpartition(".")[0]):
             self.tape.refuse(reason)
 
     def to(self, exponent: float) -> "Parameter":
-        """Return a power with a whole exponent that is not 0."""
+        """Return the power with an exponent, a whole number except 0."""
         powers = tuple([(place, exponent * power) for place, power in self.powers])
         return Parameter(_as_float(self) ** exponent, self.tape, self.scale**exponent, powers)
 
@@ -208,7 +208,7 @@ class Parameter(float):
         return self
 
     def __abs__(self) -> Any:
-        return applied("absolute", self)
+        return apply_function("absolute", self)
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         return float, (float(self),)
@@ -258,7 +258,7 @@ def _product(a: float, b: float) -> float:
 
 
 def _power(base: float, exponent: float) -> float:
-    # the root of a square is not recorded as a product of powers: the sign of the base would be lost
+    # non-integer powers are functions, not Powers: (x^2)^0.5 would become x and lose the absolute value
     if type(exponent) is Parameter or not exponent.is_integer():
         return _function("power", base, exponent)
     assert isinstance(base, Parameter)
@@ -278,8 +278,8 @@ def _tape_of(*numbers: float) -> ParameterTape:
     return next(number.tape for number in numbers if type(number) is Parameter)
 
 
-def applied(name: str, *arguments: Any) -> Any:
-    """Apply a function of NumPy or `math` by its name; the result is a Parameter if an argument is."""
+def apply_function(name: str, *arguments: Any) -> Any:
+    """Apply a function of NumPy or `math`, given by its name; the result is a Parameter if an argument is one."""
     name = NAMES.get(name, name)
     if any(not issubclass(type(each), NUMBERS) for each in arguments):  # a symbol has its own operators
         return OPERATORS[name](*arguments)
@@ -294,7 +294,7 @@ def applied(name: str, *arguments: Any) -> Any:
 def _function(name: str, *numbers: float) -> Parameter:
     tape = _tape_of(*numbers)
     arguments = tuple((each.powers, each.scale) if isinstance(each, Parameter) else ((), each) for each in numbers)
-    with np.errstate(all="ignore"):  # a generic value may be outside the domain
+    with np.errstate(all="ignore"):  # a generic value may be outside the domain of the function
         value = float(FUNCTIONS[name](*map(float, numbers)))
     return Parameter(value, tape, 1.0, tape.atom((name, arguments)))
 
@@ -315,7 +315,7 @@ def _operator(name: str, swapped: bool) -> Callable[[Parameter, Any], Any]:
     return operate
 
 
-def _deciding(name: str) -> Callable[..., Any]:
+def _refusing_method(name: str) -> Callable[..., Any]:
     plain = getattr(float, name)
 
     def decide(self: Parameter, *others: Any) -> Any:
@@ -325,15 +325,16 @@ def _deciding(name: str) -> Callable[..., Any]:
     return decide
 
 
-_DECIDING = ("bool", "int", "float", "trunc", "floor", "ceil", "round", "lt", "le", "gt", "ge", "eq", "ne")
-for _name in (*_DECIDING, "mod", "rmod", "floordiv", "rfloordiv", "divmod", "rdivmod"):
-    setattr(Parameter, f"__{_name}__", _deciding(f"__{_name}__"))
+_REFUSED = ("bool", "int", "float", "trunc", "floor", "ceil", "round", "lt", "le", "gt", "ge", "eq", "ne")
+for _name in (*_REFUSED, "mod", "rmod", "floordiv", "rfloordiv", "divmod", "rdivmod"):
+    setattr(Parameter, f"__{_name}__", _refusing_method(f"__{_name}__"))
 Parameter.__hash__ = float.__hash__  # type: ignore[method-assign]
 for _symbol, _name in {"add": "add", "sub": "subtract", "mul": "multiply", "truediv": "divide", "pow": "power"}.items():
     setattr(Parameter, f"__{_symbol}__", _operator(_name, False))
     setattr(Parameter, f"__r{_symbol}__", _operator(_name, True))
 for _name in _UNARY:
-    setattr(Parameter, _name, lambda self, name=_name: applied(name, self))  # NumPy calls them on arrays of objects
+    # NumPy calls methods of these names on arrays of objects
+    setattr(Parameter, _name, lambda self, name=_name: apply_function(name, self))
 
 
 def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = None) -> Any:
@@ -347,7 +348,7 @@ def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = 
 
 
 def _operand(value: Any) -> Any:
-    """Return an array of objects; also for a single number, or for a symbol, which refuses isinstance."""
+    """Convert an array, a number or a symbol to an array of objects; isinstance() would be refused by symbols."""
     if issubclass(type(value), np.ndarray):
         return value.astype(object)
     array = np.empty((), dtype=object)
@@ -356,17 +357,17 @@ def _operand(value: Any) -> Any:
 
 
 def array_of(values: Iterable[float]) -> Any:
-    """Return an array of floats, or of objects if some are Parameters."""
+    """Return an array of floats, or of objects if some values are Parameters."""
     values = list(values)
     return np.array(values, dtype=object if any(type(each) is Parameter for each in values) else float)
 
 
 def number(value: Any) -> float:
-    """Return a coefficient: a Parameter as it is, any other number as a float."""
+    """Convert a number to a float, unless it is a Parameter."""
     return value if type(value) is Parameter else float(value)
 
 
 def function_of_number(name: str) -> Callable[[float], float]:
-    """Return a function of `math` that records its result for a Parameter."""
+    """Return a function of `math` that returns a Parameter if its argument is one."""
     plain = getattr(math, name)
-    return lambda x: applied(name, x) if type(x) is Parameter else plain(x)
+    return lambda x: apply_function(name, x) if type(x) is Parameter else plain(x)

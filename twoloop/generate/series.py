@@ -224,7 +224,7 @@ def _sum_of_products(
         for i, c in factor.terms.items():
             _collect(by_quantity, graph.quantity(i), multiplier.times(c))
     groups = (by_quantity, by_factor) if of_rates else (by_factor, by_quantity)
-    candidates = [[_unit_product(*each) for each in candidate.values() if each[1].terms] for candidate in groups]
+    candidates = [[_normalized_product(*each) for each in candidate.values() if each[1].terms] for candidate in groups]
     for key, scale, factor, multiplier in min(
         candidates, key=lambda candidate: len({key for key, *_ in candidate} - products.keys())
     ):
@@ -234,7 +234,7 @@ def _sum_of_products(
     return total
 
 
-def _unit_product(factor: Affine, multiplier: Affine) -> tuple[Any, float, Affine, Affine]:
+def _normalized_product(factor: Affine, multiplier: Affine) -> tuple[Any, float, Affine, Affine]:
     """Normalize a product; return its key, its scale, and both factors."""
     scale, multiplier = multiplier.normalised()
     return (factor.key, multiplier.key), scale, factor, multiplier
@@ -259,7 +259,7 @@ def _assemble(
     early: list[Any] = []
     late: list[Any] = []
     factors = [form for each in (row_products, reaction_products) for _, *forms in each.values() for form in forms]
-    for i, operation in _used(graph, [*rows, *balance, *factors]):
+    for i, operation in _needed_operations(graph, [*rows, *balance, *factors]):
         if i not in sums:
             kind, first, second = operation
             arguments = (_without_sums(sums, first), None if second is None else _without_sums(sums, second))
@@ -268,7 +268,7 @@ def _assemble(
         raise Untraceable(f"its equations are more than {MOST_OPERATIONS} operations")
     tables = [
         [
-            *_grouped(operations),
+            *_groups(operations),
             (
                 PENDING,
                 sorted([(only_quantity(form), *factors) for form, *factors in products.values()], key=_term_counts),
@@ -287,12 +287,12 @@ def _assemble(
         n_rows,
         _table(tables[0], place),
         _table(tables[1], place),
-        *_nonzero([_without(form, v_and_a) for form in rows], place),
-        *_nonzero([_without(form, lam_and_a) for form in balance], place),
+        *_nonzero_sums([_without(form, v_and_a) for form in rows], place),
+        *_nonzero_sums([_without(form, lam_and_a) for form in balance], place),
     )
 
 
-def _used(graph: Graph, forms: list[Affine]) -> list[tuple[int, Any]]:
+def _needed_operations(graph: Graph, forms: list[Affine]) -> list[tuple[int, Any]]:
     """Return the operations that expressions need; if the sine of an angle is needed, so is the cosine."""
     needed = set(graph.needed_by(forms))
     pairs = (SINE, COSINE)
@@ -304,7 +304,7 @@ def _used(graph: Graph, forms: list[Affine]) -> list[tuple[int, Any]]:
     ]
 
 
-def _nonzero(forms: list[Affine], place: dict[int, int]) -> tuple[Sums, Integers]:
+def _nonzero_sums(forms: list[Affine], place: dict[int, int]) -> tuple[Sums, Integers]:
     """Return the nonzero expressions and their indices."""
     kept = [k for k, form in enumerate(forms) if form.terms or form.constant]
     sums = _sums([forms[k] for k in kept], place)
@@ -317,7 +317,7 @@ def _without(form: Affine, inputs: Container[int]) -> Affine:
     return Affine(form.graph, form.constant, {i: c for i, c in form.terms.items() if i not in inputs})
 
 
-def _grouped(operations: list[Any]) -> list[tuple[int, list[Any]]]:
+def _groups(operations: list[Any]) -> list[tuple[int, list[Any]]]:
     """Group operations by kind, so that a group depends only on the groups before it; return kinds and groups."""
     nodes = {node for node, *_ in operations}
     level: dict[int, int] = {}

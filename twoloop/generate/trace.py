@@ -35,7 +35,7 @@ from twoloop.generate.parameter_expressions import (
     ParameterTape,
     Powers,
     Refusal,
-    applied,
+    apply_function,
     elementwise,
     number,
 )
@@ -156,7 +156,7 @@ def _refuse(value: Any, does: str) -> None:
         symbol.graph.refuse(f"it {does} what depends on t, q or v")
 
 
-def _of_numbers(function_of_numbers: Any, name: str) -> Callable[..., Any]:
+def _for_numbers_only(function_of_numbers: Any, name: str) -> Callable[..., Any]:
     """Wrap a function that may treat expressions differently from numbers: the wrapper refuses expressions."""
 
     @functools.wraps(function_of_numbers)
@@ -167,13 +167,13 @@ def _of_numbers(function_of_numbers: Any, name: str) -> Callable[..., Any]:
     return function
 
 
-def _either(of_numbers: Any, of_symbols: Callable[..., Any]) -> Callable[..., Any]:
+def _number_or_symbol(of_numbers: Any, of_symbols: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function that calls `of_symbols` if an argument holds symbols, else `of_numbers`."""
 
     def function(*arguments: Any) -> Any:
         if _symbol_in(arguments) is None:
             has_parameters = any(type(x) is Parameter for x in arguments)
-            return applied(of_numbers.__name__, *arguments) if has_parameters else of_numbers(*arguments)
+            return apply_function(of_numbers.__name__, *arguments) if has_parameters else of_numbers(*arguments)
         if any(isinstance(x, np.ndarray) for x in arguments if type(x) is not Affine):
             return elementwise(function, arguments)
         return of_symbols(*arguments)
@@ -243,7 +243,7 @@ class _Mathematics:
         if isinstance(original, type) or not callable(original):
             return original
         if name in FUNCTIONS or name == "hypot":
-            return _either(original, FUNCTIONS.get(name) or OPERATORS[name])
+            return _number_or_symbol(original, FUNCTIONS.get(name) or OPERATORS[name])
         if name in ("pow", "power"):
             return lambda x, y: x**y
         if self._module is np and name in CONSTRUCTORS:
@@ -256,7 +256,7 @@ class _Mathematics:
             return _norm
         if self._module is np and name in NUMPY_FUNCTIONS:
             return original
-        return _of_numbers(original, f"{self._module.__name__}.{name}")
+        return _for_numbers_only(original, f"{self._module.__name__}.{name}")
 
 
 # order in which callbacks are traced
@@ -539,7 +539,7 @@ def derive_cached(
     """
     for find in (_own_cache,) if system.called_in_python else (trace_cache_of, _own_cache):
         cache = system.remembered(("family", find), partial(find, system))
-        derived = system.remembered((what, find), partial(_derived_for, system, cache, what, make))
+        derived = system.remembered((what, find), partial(_derive, system, cache, what, make))
         try:
             if isinstance(derived, Untraceable):
                 raise derived
@@ -551,7 +551,7 @@ def derive_cached(
     raise reason
 
 
-def _derived_for(system: ConstrainedSystem, cache: TraceCache, what: Any, make: Callable[[TraceCache], Any]) -> Any:
+def _derive(system: ConstrainedSystem, cache: TraceCache, what: Any, make: Callable[[TraceCache], Any]) -> Any:
     """Return the derived object for a system, or the exception that says why there is none."""
     try:
         shared = cache.remembered(what, partial(make, cache))

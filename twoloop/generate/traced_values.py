@@ -171,7 +171,7 @@ class Sample:
     """Sample of the states [t, q, v] of a run, from its start to its present time."""
 
     def __init__(self, t: float, state: Array, n: int) -> None:
-        self._n, self._parts = n, list[Array]()
+        self._n, self._random_parts = n, list[Array]()
         self.add(state[:0], state[None, :][:0], t, state)
 
     def add(self, t: Array, rows: Array, end: float, state: Array) -> None:
@@ -181,19 +181,19 @@ class Sample:
         part = np.empty((len(some) + 1, 1 + self._n))
         part[0, 0], part[0, 1:] = end, state[: self._n]
         part[:0:-1, 0], part[:0:-1, 1:] = some, rows[::stride, : self._n]
-        self._parts.insert(0, part)
-        if len(self._parts) > MAX_STATES:
-            self._parts = self._parts[::2]
+        self._random_parts.insert(0, part)
+        if len(self._random_parts) > MAX_STATES:
+            self._random_parts = self._random_parts[::2]
 
     def end(self, t: float, state: Array) -> None:
         """Drop the states after the time at which a run ended, and add the state at that time."""
         states = self.states()
-        self._parts = [states[states[:, 0] <= t]]
+        self._random_parts = [states[states[:, 0] <= t]]
         self.add(states[:0, 0], states[:0], t, state)
 
     def states(self) -> Array:
         """Return all states, the latest first."""
-        return np.concatenate(self._parts)
+        return np.concatenate(self._random_parts)
 
 
 def refuse_wrong(traced: Sequence[Traced], system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:
@@ -225,7 +225,7 @@ def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:
     """Return the start [t, q, v], and random states near it at times spread over the run."""
     size = sizes(q)
     speed = np.maximum(size, np.abs(v))
-    n, parts = len(q), _parts(len(q))
+    n, parts = len(q), _random_parts(len(q))
     states = np.empty((1 + N_NEARBY, 1 + 2 * n))
     states[0, 0], states[0, 1 : 1 + n], states[0, 1 + n :] = t0, q, v
     states[1:, 0] = t0 + (t1 - t0) * TIMES
@@ -235,7 +235,7 @@ def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:
 
 
 @cache
-def _parts(n_q: int) -> Array:
+def _random_parts(n_q: int) -> Array:
     """Return fixed random numbers between -1 and 1, (2, N_NEARBY, n_q)."""
     return np.random.default_rng(6).uniform(-1.0, 1.0, (2, N_NEARBY, n_q))
 

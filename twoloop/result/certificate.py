@@ -20,7 +20,7 @@ from twoloop.run.signals import SignalHandlers
 PIECES = 200  # smallest number of intervals into which the run is divided; steps of reruns are no longer than one
 LIMIT = 100.0  # largest defect of a step, and largest error of a state, of a run that passes, over the tolerance
 FASTEST = 10.0  # largest rate of the motion by which errors of velocities are divided, 1/s; untested ones always
-SECOND_RUN = 0.1  # factor on the tolerances of the second run, because its errors grow over the whole run
+SECOND_RUN_FACTOR = 0.1  # factor on the tolerances of the second run, because its errors grow over the whole run
 STIFF = 4  # explicit steps per step of the run, above which untested velocities have vibrations that are not resolved
 CHAOTIC = 10.0  # errors up to this many times the growth of a tolerance at the start are explained by that growth
 ROUNDING = 1e-14  # deviation attributed to rounding, relative to the largest coordinate or velocity
@@ -263,7 +263,7 @@ class _Checker:
         newton = bool(self.result.stats.n_jacobians)
         for i, j in self._intervals():
             stiff = "positions" if self.untested[i] else "all"
-            tries = [(method, looser) for looser in (SECOND_RUN, 1.0, *LOOSER) for method in ("explicit", stiff)]
+            tries = [(method, looser) for looser in (SECOND_RUN_FACTOR, 1.0, *LOOSER) for method in ("explicit", stiff)]
             for method, looser in tries:
                 rerun = self._rerun(method, looser, states[i], i, j, self.t[i + 1 : j + 1])
                 if rerun is not None:

@@ -222,7 +222,7 @@ class SavedFields:
         self.path, self.arrays, self.metadata = path, arrays, metadata
         for name, expected in self._value("check_sums", dict, {}).items():  # absent in older files
             if name not in arrays or checksum(arrays[name]) != expected:
-                raise self._wrong(name, "what was saved under this name", "something else" if name in arrays else None)
+                raise self._error(name, "what was saved under this name", "something else" if name in arrays else None)
         n_t = len(self._times("t"))
         n_q = len(self._array("q", (None, n_t)))
         for name in ("v", "a"):
@@ -278,7 +278,7 @@ class SavedFields:
             "sol_ranks", valid, f"two ranks, the second {min(n_q, n_rows) if self.rank is None else self.rank}"
         )
         if ("sol_interior_t" in self.arrays) != ("sol_interior_states" in self.arrays):
-            raise self._wrong("sol_interior_t and sol_interior_states", "given together", None)
+            raise self._error("sol_interior_t and sol_interior_states", "given together", None)
         if "sol_interior_t" in self.arrays:
             self._check_interior(t)
 
@@ -309,7 +309,7 @@ class SavedFields:
             count = value is None or (type(value) is int and 0 <= value < INTEGER_LIMIT)
             time = name == "cpu_time" and _is_number(value) and value >= 0.0
             if name not in names or not (time or (count and name != "cpu_time")):
-                raise self._wrong(
+                raise self._error(
                     f"stats[{shown(name)}]", f"a count or a time of {', '.join(sorted(names))}", shown(value)
                 )
         return Statistics(**stats)
@@ -320,12 +320,12 @@ class SavedFields:
         sizes = ", ".join("n" if size is None else str(size) for size in shape) + ("," if len(shape) == 1 else "")
         expected = f"an array of {np.dtype(dtype).name} of shape ({sizes})"
         if array is None:
-            raise self._wrong(name, expected, None)
+            raise self._error(name, expected, None)
         fits = array.ndim == len(shape) and all(
             expected_n in (None, n) for expected_n, n in zip(shape, array.shape, strict=True)
         )
         if array.dtype != dtype or not fits:
-            raise self._wrong(name, expected, f"one of {array.dtype.name} of shape {array.shape}")
+            raise self._error(name, expected, f"one of {array.dtype.name} of shape {array.shape}")
         return array
 
     def _finite(self, name: str, shape: tuple[int | None, ...]) -> Array:
@@ -343,36 +343,36 @@ class SavedFields:
 
     def _check(self, name: str, valid: bool, expected: str) -> None:
         if not valid:
-            raise self._wrong(name, expected, shown(self.arrays[name]))
+            raise self._error(name, expected, shown(self.arrays[name]))
 
     def _check_value(self, name: str, valid: bool, expected: str) -> None:
         if not valid:
-            raise self._wrong(name, expected, shown(self.metadata[name]))
+            raise self._error(name, expected, shown(self.metadata[name]))
 
     def _value(self, name: str, kind: type, default: Any = None) -> Any:
         value = self.metadata.get(name, default)
         if type(value) is not kind:
-            raise self._wrong(name, f"of type {kind.__name__}", shown(value) if name in self.metadata else None)
+            raise self._error(name, f"of type {kind.__name__}", shown(value) if name in self.metadata else None)
         return value
 
     def _number(self, name: str) -> float:
         value: Any = self.metadata.get(name)
         if not _is_number(value):
-            raise self._wrong(name, "a finite number", shown(value))
+            raise self._error(name, "a finite number", shown(value))
         return float(value)
 
     def _whole(self, name: str, minimum: int, maximum: int, or_none: bool) -> int | None:
         value = self.metadata.get(name)
         if (value is None and or_none) or (type(value) is int and minimum <= value <= maximum):
             return value
-        raise self._wrong(name, f"a whole number from {minimum} to {maximum}", shown(value))
+        raise self._error(name, f"a whole number from {minimum} to {maximum}", shown(value))
 
     def _choice(self, name: str, choices: list[int]) -> int:
         value = self._value(name, int)
         self._check_value(name, value in choices, f"one of {choices}")
         return int(value)
 
-    def _wrong(self, name: str, expected: str, actual: str | None) -> ValueError:
+    def _error(self, name: str, expected: str, actual: str | None) -> ValueError:
         return ValueError(
             f"path leads to a damaged file: {name} in {self.path!r} must be {expected}; "
             f"{'it is missing' if actual is None else f'found {actual}'}. Take another copy of the file"

@@ -101,7 +101,8 @@ class Interpolator:
         self._prepare()
         self.failures, self.warns = 0, True  # number of failures of the last call; whether to warn of them
         self.filled: dict[float, tuple[Array, Array]] = {}  # interior states, by the times at which intervals begin
-        self.across: dict[float, Array] = {}  # memories of steps across singular positions, by beginnings of intervals
+        # polynomials (memory arrays of the steps) across singular positions, by the times at which intervals begin
+        self.across: dict[float, Array] = {}
         self.accurate: set[float] = set()  # beginnings of intervals that neighbouring states interpolate well
         self.judges = True  # whether interior states may be computed; false if they were read from a file
         self._allocate()

@@ -99,8 +99,7 @@ FAR = 0.2  # distance from which on a state may be the base of the polynomial
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
 # largest age of a base, relative to the longest of the last steps, and to twice the time to the position
 LONGEST_PAST, FARTHEST = 1.5, 4.0
-# an earlier state whose distance is below this share of the base's lies beyond another singular position
-BEYOND = 0.5
+BEYOND = 0.5  # if an earlier state is nearer than this share of the base's distance, a singular position lies between
 MIN_DIVISOR = 1e-300  # avoids a division by zero
 CLEAR = 0.3  # distance from which on the run continues with steps of its own method
 

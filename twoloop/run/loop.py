@@ -69,7 +69,7 @@ from twoloop.run.record import (
 from twoloop.run.rerun import compare_callbacks
 from twoloop.run.run import SMALL, Buffers, Run
 from twoloop.run.signals import SignalHandlers, within_a_users_function
-from twoloop.run.singular_positions import Place, has_turned_last
+from twoloop.run.singular_positions import Place, velocities_turned_last
 
 Array = NDArray[np.float64]
 
@@ -465,7 +465,7 @@ class IntegrationLoop:
             return []
         if run.plan.watchful and run.work.notes[indices.NEARLY_SINGULAR] != 1.0:
             return []
-        return [(float(t[-2]), table[-2])] if has_turned_last(t, table, run.system.n_q) else []
+        return [(float(t[-2]), table[-2])] if velocities_turned_last(t, table, run.system.n_q) else []
 
     def _suspicious_outputs(self, t: Array, table: Array) -> list[Place]:
         """Return the states at which steps had to end, if one of them is near a singular position."""

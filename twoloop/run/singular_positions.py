@@ -112,7 +112,7 @@ def describe_turn(
     return ""
 
 
-def has_turned_last(times: Array, rows: Array, n: int) -> bool:
+def velocities_turned_last(times: Array, rows: Array, n: int) -> bool:
     """Return whether velocities of the last two states [q, v, a] differ by more than their accelerations explain."""
     most = np.maximum.reduce  # array.max() makes three calls, which would slow down short repeated runs
     if times.size < 2:

@@ -106,7 +106,7 @@ def _entries(system: ConstrainedSystem, t: float, q: Array, v: Array, lam: Array
 
 SINGULAR = 1e-10  # smallest over largest eigenvalue of a body's M, below which it counts as singular
 ALONG = 1e-3  # a row whose part along a direction without mass is a larger share of its length makes M definite there
-NEWTON = 1.6  # number of coordinates, in units of LARGE, from which on Newton's matrices are sparse
+MIN_SIZE_NEWTON = 1.6  # number of coordinates, in units of LARGE, from which on Newton's matrices are sparse
 SPARSE = 0.05  # share of the entries and operations of dense factors above which the static form does not pay
 
 
@@ -153,7 +153,7 @@ def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -
 
 def with_newton(system: ConstrainedSystem, t0: float, q0: Array, form: StaticForm) -> StaticForm | None:
     """Return the static form with the program of Newton's matrix; None if there is none, or it does not pay."""
-    if system.n_q < NEWTON * LARGE:
+    if system.n_q < MIN_SIZE_NEWTON * LARGE:
         return None
     cached = system.remembered("newton form", lambda: newton_form(system, t0, q0, *form.newton_arguments))
     return None if cached is None else form._replace(newton=cached[0], n_groups=cached[1])
