@@ -14,7 +14,7 @@ from twoloop.kernels.data.indices import APART
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.field_faults import NEAR, all_states, end_of_run, field_faults
 from twoloop.run.record import Record
-from twoloop.run.rerun import FINEST, IndependentRerun, RerunPiece, nonstiff_method, stiff_method, tightened
+from twoloop.run.rerun import FINEST, IndependentRerun, RerunPiece, nonstiff_method, stiff_method, tighter_tolerances
 from twoloop.run.signals import SignalHandlers
 
 PIECES = 200  # smallest number of intervals into which the run is divided; steps of reruns are no longer than one
@@ -370,7 +370,7 @@ class _Checker:
         if key not in self.reruns:
             chosen = nonstiff_method() if method == "explicit" else stiff_method(method == "all")
             q, v = self.states[0].reshape(2, -1).copy()
-            rtol, atol = (np.maximum(looser * tightened(each), FINEST) for each in (self.rtol, self.atol))
+            rtol, atol = (np.maximum(looser * tighter_tolerances(each), FINEST) for each in (self.rtol, self.atol))
             run = self.system, float(self.t[0]), q, v, chosen, float(rtol), atol, self.longest
             self.reruns[key] = IndependentRerun(*run)
         rerun, t0, t1 = self.reruns[key], float(self.t[i]), float(self.t[j])

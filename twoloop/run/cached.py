@@ -39,8 +39,8 @@ from twoloop.run.messages import describe_arrival
 from twoloop.run.options import Options
 from twoloop.run.parametric import ParametricRun, SharedSetup
 from twoloop.run.record import (
-    BEFORE,
     DEFAULTS,
+    INITIAL_COUNTS,
     OF_STEPS,
     MemoryStore,
     OutputRequest,
@@ -352,7 +352,7 @@ def _deferred_field(
     begin, end = (places := loops.N_HEAD + n_states), places + n_steps * N_STEP_COLUMNS
     if name in STEP_FIELDS:
         counts = data[loops.N_REPORT : loops.N_HEAD].astype(np.int64)
-        by_step = step_fields(data[begin:end].reshape(n_steps, N_STEP_COLUMNS), BEFORE.copy())
+        by_step = step_fields(data[begin:end].reshape(n_steps, N_STEP_COLUMNS), INITIAL_COUNTS.copy())
         return by_step | {"stats": statistics(counts, cpu_time)} | options.metadata
     rank, redundant, own = of_run
     defect = float(data[loops.DEFECT]) if data[loops.HAS_DEFECTS] else None

@@ -51,8 +51,8 @@ from twoloop.run.messages import (
     warn_user,
 )
 from twoloop.run.record import (
-    BEFORE,
     DEFAULTS,
+    INITIAL_COUNTS,
     OF_STEPS,
     OutputRequest,
     Record,
@@ -212,7 +212,7 @@ class IntegrationLoop:
         # numbers of attempts after which progress is checked, whatever chunks CHUNK_TIME allows
         self.check_interval = self.next_check = run.chunk
         self.plan, self.control, self.kit = run.plan, run.control, run.kit  # replaced in steps across a singularity
-        self.counts = BEFORE.copy()
+        self.counts = INITIAL_COUNTS.copy()
         self.latest: list[tuple[Array, Array]] = []  # times and rows of the last two chunks
         self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # steps that were not stored yet, after an empty array
         if self.request.store.finished:

@@ -590,13 +590,15 @@ for _field in fields(Record):  # after the decorator, which would treat a descri
 
 Integers = NDArray[np.int64]
 
-COUNTED = [each.name for each in fields(Statistics) if each.name != "cpu_time"]
-COUNTERS = itemgetter(*(getattr(indices, name.upper()) for name in COUNTED))
-BEFORE = np.array([0, 0, 1])  # counts of rejections and partitions at the start: the first partition is no renewal
+COUNT_NAMES = [each.name for each in fields(Statistics) if each.name != "cpu_time"]
+COUNTERS = itemgetter(*(getattr(indices, name.upper()) for name in COUNT_NAMES))
+INITIAL_COUNTS = np.array(
+    [0, 0, 1]
+)  # counts of rejections and partitions at the start: the first partition is no renewal
 
 
 def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
-    """Return the fields of a record with one row per step; `counts` are updated from before to after the steps."""
+    """Return the fields of a record with one row per step; add rejections and partitions of the steps to `counts`."""
     n = len(steps)
     h, changes, untested = np.empty(n), np.empty((3, n), dtype=np.int64), np.empty(n, dtype=np.bool_)
     entry_point(cached_run().split_steps)(steps, counts, h, changes, untested)
@@ -605,7 +607,7 @@ def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
 
 def statistics(counted: Integers, cpu: float) -> Statistics:
     """Return the statistics of a run, from the counts of its workspace and its CPU time, s."""
-    return Statistics(**dict(zip(COUNTED, COUNTERS(counted.tolist()), strict=True)), cpu_time=cpu)
+    return Statistics(**dict(zip(COUNT_NAMES, COUNTERS(counted.tolist()), strict=True)), cpu_time=cpu)
 
 
 def of_run(run: "Run", t: Array, table: Array) -> dict[str, Any]:

@@ -200,7 +200,7 @@ FINEST = 1e-13  # ... but not below this, because of rounding
 MOST_NUMBERS = 100_000  # size of the buffer of states
 
 
-def tightened(tolerance: ArrayLike) -> Array:
+def tighter_tolerances(tolerance: ArrayLike) -> Array:
     """Return the tolerances of the pieces, given those of the run."""
     return np.minimum(tolerance, np.maximum(SHARE * np.asarray(tolerance), FINEST))
 

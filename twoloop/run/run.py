@@ -341,7 +341,7 @@ class Run:
         counted = set(self.work.rows_v.tolist())
         redundant = [i for i in range(n_rows) if i not in counted]
         rows = self._rows() if rows is None else rows
-        wrong = self.contradicting(rows).tolist()
+        wrong = self.violated_rows(rows).tolist()
         if wrong:
             raise ValueError(
                 f"the constraints of {self.system.name!r} contradict one another at t = {self.t0:g}: "
@@ -362,7 +362,7 @@ class Run:
         atol, q = self.tolerances[indices.ATOL :], self.state[: self.system.n_q]
         return describe_singular_start(self.system, self.t0, q, self.rank, self.rtol, atol)
 
-    def contradicting(self, rows: Rows) -> NDArray[np.int64]:
+    def violated_rows(self, rows: Rows) -> NDArray[np.int64]:
         """Return the rows of [C_q; A] that the accelerations at the start violate."""
         n = self.system.n_q
         a, gamma = self.state[2 * n : 3 * n], self.work.Gamma

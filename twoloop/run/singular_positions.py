@@ -164,7 +164,7 @@ def ratio_in_any_units(system: ConstrainedSystem, t: float, q: Array, rank: int)
 def _in_any_units(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
     """Return M and the rows, scaled to unit masses and unit lengths of rows, the lengths, and the units of coordinates.
 
-    Rows that are short at this position only are scaled by their lengths some distance away.
+    A row that is short at this position only is divided by its length at a displaced position.
     """
     mass, rows = system.mass(t, q), system.rows(t, q)
     inertia = np.abs(np.diagonal(mass))

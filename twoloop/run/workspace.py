@@ -67,7 +67,7 @@ def newton_form(
     for share in NEARBY[:2]:
         q = q0 + share * size * rng.uniform(-1.0, 1.0, system.n_q)
         try:
-            entries |= _entries(system, t0, q, rng.uniform(-1.0, 1.0, system.n_q), lam, most)
+            entries |= _derivative_entries(system, t0, q, rng.uniform(-1.0, 1.0, system.n_q), lam, most)
         except Exception:  # outside the domain of the callbacks; missed entries are found during the run
             continue
         if len(entries) > most:
@@ -80,7 +80,9 @@ def newton_form(
     return program, int(column_groups(tangents, system.n_q).max(initial=-1)) + 1
 
 
-def _entries(system: ConstrainedSystem, t: float, q: Array, v: Array, lam: Array, most: float) -> set[tuple[int, int]]:
+def _derivative_entries(
+    system: ConstrainedSystem, t: float, q: Array, v: Array, lam: Array, most: float
+) -> set[tuple[int, int]]:
     """Find the nonzero entries of d(Q - C_q^T lam)/dq and dQ/dv, and make the pattern symmetric."""
 
     def reaction(q: Array) -> Array:
@@ -331,7 +333,7 @@ def _flags_at(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
 
 
 def _flags(system: ConstrainedSystem, t0: float, q0: Array, definite: bool) -> tuple[Array, bool]:
-    """Choose dense or banded algebra, and say whether sparse factors would pay."""
+    """Choose dense or banded algebra; return the flags, and whether sparse factors would be faster."""
     flags: Array = system.functions.flags.copy()
     if system.constant_mass:
         flags[DIAGONAL_MASS] = is_diagonal(system.mass(t0, q0))
