@@ -19,7 +19,7 @@ from references.minimal.solvers import has_minimal
 from references.paper.four_bar_minimal import MinimalFourBar
 from studies.bench import adaptive, headline
 from studies.bench.cli import Call, StudyError
-from studies.bench.collector import Run, Warm, warm_up
+from studies.bench.collector import REPEATS, Run, Warm, warm_up
 from studies.bench.end_states import case_of, row_of
 from studies.bench.four_bar import SECOND
 from studies.bench.solvers import CATALOGUE, HEYOKA, MINIMAL, OTHER_SOLVERS, OWN, TAYLOR
@@ -49,7 +49,6 @@ QUICK_TOLERANCES = (1e-3, 1e-5)
 TIMED = 0.1  # s; a shorter run is called several times more
 TIME_LIMIT = 1.0  # s of CPU of a run
 COMPILING = 30.0  # s of what is built before
-REPEATS = 2  # half an hour each; a short run is the median of nine calls in each
 TIGHT = 1e-12  # tolerance of the reference of the second geometry, well above rounding, which a third way holds ...
 FAR = 1e-11  # ... to so much
 MINIMAL_GROUP = "minimal coordinates"
