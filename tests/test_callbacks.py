@@ -5,7 +5,6 @@ import inspect
 import itertools
 import multiprocessing
 import pickle
-import time
 
 import numba
 import numpy as np
@@ -288,8 +287,8 @@ def tired(n):
 
 
 def timed():
-    began = time.monotonic()
-    return lambda t, q, v: -2.0 * v[0] if v[0] > 1e9 else 1e3 + time.monotonic() - began
+    clock = itertools.count(0.0, 10e-6)  # s, as long as a call takes
+    return lambda t, q, v: -2.0 * v[0] if v[0] > 1e9 else 1e3 + next(clock)
 
 
 @pytest.mark.parametrize("make", [lambda: tired(60), lambda: tired(250), timed])
