@@ -11,7 +11,7 @@ from references.scipy.index1 import solve_index1
 from references.sundials.cvode_c import solve_cvode_c
 from references.sundials.ida import solve_ida, solve_ida_c
 from studies.bench.solvers import GIVEN
-from studies.honesty.traps import FOLD, FORCE, INPUT, LINKAGE, MISTAKE, SHORT, SINGULAR, Trap
+from studies.honesty.traps import FORCE, INPUT, LINKAGE, MISTAKE, SHORT, SINGULAR, Trap
 from twoloop import Result, solve_dae
 from twoloop.kernels.control.discontinuities import N_SAMPLES
 from twoloop.kernels.data.indices import LONGEST_UNSEEN
@@ -38,7 +38,7 @@ WITH_CODE: dict[str, dict[str, Any]] = {"": {}, "compiled": {"compiled": True}, 
 QUICK_OWN, QUICK_SCIPY = (GIVEN, "DOP853", "BDF"), ("DOP853",)
 OWN_OF = {  # groups of many runs, which fewer methods make
     SHORT: (GIVEN, "DOP853", "RadauIIA5"),
-    **dict.fromkeys((SINGULAR, FOLD), (GIVEN, "auto, not compiled", "DOP853")),
+    SINGULAR: (GIVEN, "auto, not compiled", "DOP853"),
     LINKAGE: (GIVEN, "DOP853"),
     FORCE: (*OWN, *OF_FORCES),
 }
@@ -94,12 +94,12 @@ def solvers(quick: bool, group: str = MISTAKE) -> dict[str, Call]:
     others = {name: solve for name, solve in OTHERS.items() if name not in left_out}
     scipy = QUICK_SCIPY if quick or group in (SHORT, LINKAGE) else SCIPY
     others |= {f"{name}, index 1": partial(solve_index1, method=name) for name in scipy}
-    if group in (SINGULAR, FOLD):  # where accelerations are undefined
-        others = {name: solve for name, solve in others.items() if group == SINGULAR and name in (IDA, IDA_C)}
+    if group == SINGULAR:  # where accelerations are undefined
+        others = {name: solve for name, solve in others.items() if name in (IDA, IDA_C)}
     methods = QUICK_OWN if quick else OWN_OF.get(group, OWN)
     made: dict[str, Call] = {f"{name}{OWN_SUFFIX}": partial(own, name) for name in methods}
     made |= {name: partial(other, solve, False) for name, solve in others.items()}
-    if group not in (INPUT, LINKAGE, SINGULAR, FOLD):  # which a largest step does not help
+    if group not in (INPUT, LINKAGE, SINGULAR):  # which a largest step does not help
         made |= {name + LIMITED: partial(other, solve, True) for name, solve in others.items()}
     return made
 

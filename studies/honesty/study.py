@@ -59,7 +59,6 @@ TABLE: dict[str, tuple[str, Callable[[pd.DataFrame], pd.Series]]] = {  # kinds o
     "pulse_long": ("pulses of 3 and 10 ms", _brief("pulse", False)),
     "pulse_short": ("pulses of 0.1 to 1 ms", _brief("pulse", True)),
     "singular": ("singular positions", _of(traps.SINGULAR)),
-    "folds": ("linkages that fold", _of(traps.FOLD)),
     "linkages": ("random four-bar linkages", _of(traps.LINKAGE)),
     "mistakes": ("mistakes and hard motions", _of(traps.MISTAKE)),
     "input": ("inconsistent start, wrong derivative", _of(traps.INPUT)),
@@ -158,7 +157,7 @@ def answer_of(table: Mapping[str, Any]) -> str:
 
     brief = f"forces shorter than 1/{number(round(1.0 / LOOK))} of the run"
     words = {("sharp",): "runs under sharp forces", ("gust_short", "pulse_short"): f"under {brief}"}
-    words |= {("singular", "folds"): "at singular positions"}
+    words |= {("singular",): "at singular positions"}
     places = [f"{counts(*keys)} {where}" for keys, where in words.items() if keys[0] in table]
     return f"{GIVEN[0].upper()}{GIVEN[1:]} is silently wrong in {', '.join(places)}."
 

@@ -21,7 +21,6 @@ from studies.bench.sharp_mechanisms import Mechanism, bars, row, slider_in_space
 from studies.bench.sharp_mechanisms import chain as chain_of
 from studies.bench.sharp_motion import Motion, motion
 from studies.bench.store import Array
-from studies.honesty.folds import FOLDS, folding
 from studies.planted_errors.faults import python_copy
 from twoloop import ConstrainedSystem
 from twoloop.kernels.compile.callbacks import callback
@@ -29,10 +28,9 @@ from twoloop.mechanisms import Problem, four_bar, n_four_bar
 
 NEVER = 1e30  # s
 # groups of traps: a start or a derivative that checks of the input find; a mistake in a model or a setting, or a hard
-# motion; a sharp force; a force so short that a solver may step over it; a random linkage; singular positions of A02,
-# and of other mechanisms
-GROUPS = ("input", "mistake", "force", "short", "linkage", "singular", "fold")
-INPUT, MISTAKE, FORCE, SHORT, LINKAGE, SINGULAR, FOLD = GROUPS
+# motion; a sharp force; a force so short that a solver may step over it; a random linkage; singular positions
+GROUPS = ("input", "mistake", "force", "short", "linkage", "singular")
+INPUT, MISTAKE, FORCE, SHORT, LINKAGE, SINGULAR = GROUPS
 AGREE = 1e-8  # m or rad: how far two methods may differ in the motion under a force
 SEED = 20261126  # of all draws: the day. Draw by a new seed when the methods have been changed to pass these
 GROWN = 100.0  # how much errors may grow in a motion under a force, up to which two methods can agree on it
@@ -51,7 +49,6 @@ N_DRAWS, N_QUICK, QUICK_WIDTHS = 8, 2, (1e-3,)  # of each width on each mechanis
 N_LINKAGES, LINKAGE_END = 100, 5.0  # of each kind; s
 SIZES, ENDS = tuple(range(1, 7)), (5.0, 10.0, 20.0)  # of A02 in both sets of coordinates; s
 TOLERANCES = tuple(10.0 ** (-0.5 * k) for k in range(12, 23))  # of A02: 1e-6 to 1e-11
-N_FOLDS, FOLD_TOLERANCES = 2, (1e-4, 1e-6, 1e-8, 1e-10)  # starts of each linkage that folds
 # places in the parameters behind lengths and masses: a spring that holds the last point, and where it is at rest;
 # begin, end and size of a force along x; when the force becomes NaN, when it raises; a wrong entry of C_q
 SPRING, REST, BEGIN, END, PUSH, NAN, RAISES, WRONG = range(8)
@@ -130,7 +127,6 @@ def traps(quick: bool, groups: Sequence[str] | None = None) -> Iterator[Trap]:
         MISTAKE: lambda: chain((trap for n in sizes for trap in of_chain(n)), () if quick else of_linkages()),
         LINKAGE: lambda: random_linkages(0 if quick else N_LINKAGES),
         SINGULAR: lambda: iter(()) if quick else singular_positions(),
-        FOLD: lambda: iter(()) if quick else folds(),
         FORCE: lambda: under_forces(quick),
         SHORT: lambda: short_forces(quick),
     }
@@ -167,14 +163,6 @@ def singular_positions() -> Iterator[Trap]:
         trap = of_motion(SINGULAR, problem, lambda t, known=problem.motion: known(t)[0])  # type: ignore[misc]
         name = f"{problem.name}, {t_end:g} s, {tolerance:.2g}"
         yield replace(trap, t_end=t_end, tolerance=tolerance, mechanism=name, singular=True, group=SINGULAR)
-
-
-def folds() -> Iterator[Trap]:
-    """Yield linkages that fold on the way, from random starts, at all FOLD_TOLERANCES."""
-    for (place, name), k, tolerance in product(enumerate(FOLDS), range(N_FOLDS), FOLD_TOLERANCES):
-        about: dict[str, Any] = {"tolerance": tolerance, "singular": True, "group": FOLD}
-        about |= folding(name, (SEED, place, k))
-        yield Trap("linkage that folds", f"{name}, start {k}, {tolerance:g}", **about)
 
 
 def of_motion(name: str, problem: Problem, positions: Callable[[float], Array]) -> Trap:
