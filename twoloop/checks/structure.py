@@ -26,6 +26,7 @@ from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.kernels.compile.linking import entry_point
 
 if TYPE_CHECKING:
+    from twoloop.kernels.data.common import Kit
     from twoloop.problem.system import ConstrainedSystem
 
 
@@ -231,7 +232,7 @@ def run_inconsistency(
     Mostly all values are equal to the bit, which is fast to check.
     """
     before = _mass_at(system, t0, q0).tobytes() if system.constant_mass else b""
-    fused = "kinematics" in system.given
+    kit = system.kit if "kinematics" in system.given else None
     for t, q, v in states:
         if not system.constant_mass:
             wrong = unsymmetric_mass(system, t, q)
@@ -239,7 +240,7 @@ def run_inconsistency(
             there = defined(lambda t=t, q=q: _mass_at(system, t, q))  # type: ignore[misc]
             same = there is None or there.tobytes() == before
             wrong = None if same else changed_mass(system, t0, q0, t, q)
-        if wrong is None and fused and not _compared(system, t, q, v)[0]:
+        if wrong is None and kit is not None and not _compared(system, kit, t, q, v)[0]:
             wrong = wrong_kinematics(system, t, q)
         if wrong is None and system.entries:
             wrong = wrong_values(system, t, q)
@@ -252,11 +253,11 @@ def wrong_kinematics(system: ConstrainedSystem, t: float, q: Array) -> str | Non
     """Describe where the fused callback differs from the separate ones, which other checks compare with differences."""
     if "kinematics" not in system.given:
         return None
-    _, rate, rows = _compared(system, t, q, 0.0 * q)
+    _, rate, rows = _compared(system, system.kit, t, q, 0.0 * q)
     entries = system.sparse_rows(t, q)  # because for large systems units of full matrices take seconds
     v = generic_velocities(system, t, q, entries if isinstance(entries, SparseRows) else rows, rate)[-1]
     for place in (q, q + NEAR * v):
-        if _compared(system, t, place, v)[0]:
+        if _compared(system, system.kit, t, place, v)[0]:
             continue
         separate = {
             "constraint": system.constraint(t, place),
@@ -279,14 +280,14 @@ def wrong_kinematics(system: ConstrainedSystem, t: float, q: Array) -> str | Non
     return None
 
 
-def _compared(system: ConstrainedSystem, t: float, q: Array, v: Array) -> tuple[bool, Array, Array]:
+def _compared(system: ConstrainedSystem, kit: Kit, t: float, q: Array, v: Array) -> tuple[bool, Array, Array]:
     """Return whether kinematics agrees with the separate callbacks, and C_t and C_q of the latter."""
     from twoloop.kernels.evaluation.checks import kinematics_agree
 
     n, n_c = system.n_q, system.n_c
     fused, given = np.zeros((2, 3 + n, n_c))
     state = np.ascontiguousarray(q), np.ascontiguousarray(v)
-    agree = entry_point(kinematics_agree)(system.kit, t, *state, fused, given, np.zeros(n_c), SAME, ROUNDED * EPS)
+    agree = entry_point(kinematics_agree)(kit, t, *state, fused, given, np.zeros(n_c), SAME, ROUNDED * EPS)
     return bool(agree), given[1], given[3:].reshape((n_c, n))
 
 
