@@ -19,6 +19,7 @@ from twoloop.generate.graph import Graph, Untraceable
 from twoloop.generate.program import OperationTable
 from twoloop.generate.trace import Evaluator
 from twoloop.kernels.compile.linking import entry_point
+from twoloop.kernels.data.common import Kit
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -110,9 +111,9 @@ class Traced:
         """
         from twoloop.kernels.evaluation import checks as kernels
 
-        most = MAX_IN_PYTHON if system.called_in_python else MAX_STATES
+        kit, most = system.kit, MAX_IN_PYTHON if system.called_in_python else MAX_STATES
         states = states[:: 1 + max(len(states) // most, len(states) * len(self.places) // MAX_ENTRIES)]
-        n_different, called, traced, bounds = self._evaluate(system, states)
+        n_different, called, traced, bounds = self._evaluate(kit, states)
         if n_different == 0:
             return None
         finite = np.isfinite(called)
@@ -132,12 +133,12 @@ class Traced:
                 return self._message(states[k], int(entry), called[k, entry], traced[k, entry])
         return None
 
-    def _evaluate(self, system: ConstrainedSystem, states: Array) -> tuple[int, Array, Array, Array]:
+    def _evaluate(self, kit: Kit, states: Array) -> tuple[int, Array, Array, Array]:
         from twoloop.kernels.evaluation import checks as kernels
 
         called, traced, bounds = np.zeros((3, len(states), len(self.places)))
         n_different = entry_point(kernels.compare_traces)(
-            system.kit,
+            kit,
             self.sizes,
             self.is_compared,
             np.ascontiguousarray(states),
@@ -152,7 +153,7 @@ class Traced:
     def _is_systematic(self, system: ConstrainedSystem, state: Array, entry: int) -> bool:
         """Return whether a difference is about the same at neighbouring states, as rounding errors would not be."""
         parts = np.random.default_rng(5).uniform(-1.0, 1.0, (N_NEIGHBOURS, len(state)))
-        _, called, traced, _ = self._evaluate(system, state * (1.0 + PERTURBATION * parts))
+        _, called, traced, _ = self._evaluate(system.kit, state * (1.0 + PERTURBATION * parts))
         off = (called - traced)[:, entry]
         return bool(np.abs(off).min() > 0.5 * np.abs(off).max() and np.abs(off.sum()) == np.abs(off).sum())
 
