@@ -46,14 +46,14 @@ from twoloop.kernels.lanes.layout import (
 )
 from twoloop.kernels.steps.newton_systems import DIFFERENCE, MAX_ITERATIONS, STAGNATION
 from twoloop.kernels.steps.stages import (
-    FARTHEST,
     GAMMA0,
+    MAX_STEP_RATIO,
     N_EIGEN_SCALARS,
     N_REAL,
     OUTER_TOL,
     VELOCITIES,
     count_eigenvalues,
-    eigen_place,
+    eigen_offset,
     middle_node,
     tableau_of,
 )
@@ -182,7 +182,7 @@ def factor_systems_of_lanes(settings, own, s, work):
     """Factor I - (X l)^2 J_q - X l J_v for each eigenvalue l."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
-    n_systems, place = count_eigenvalues(own, s), eigen_place(s)
+    n_systems, place = count_eigenvalues(own, s), eigen_offset(s)
     n_real = int(own[place + N_REAL])
     place += N_EIGEN_SCALARS + s
     by_q, by_v = matrix_at(memory, n, s, BY_Q), matrix_at(memory, n, s, BY_V)
@@ -212,7 +212,7 @@ def predict_stages(settings, c, work, begins):
     for k in range(LANES):
         before = work[(memory + H_PREVIOUS) * LANES + k]
         ratio = work[X * LANES + k] / before if before > 0.0 else np.inf
-        known = 1.0 if ratio <= FARTHEST else 0.0
+        known = 1.0 if ratio <= MAX_STEP_RATIO else 0.0
         work[(memory + CONSTANT) * LANES + k] = 1.0 - known
         for j in range(s):
             theta = begins + ratio * c[j] if known == 1.0 else 0.0
@@ -270,7 +270,7 @@ def _correct(settings, own, s, work):
     """Compute corrections of the stages into CHANGES; add them in lanes that still iterate."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
-    n_systems, place = count_eigenvalues(own, s), eigen_place(s)
+    n_systems, place = count_eigenvalues(own, s), eigen_offset(s)
     n_real = int(own[place + N_REAL])
     place += N_EIGEN_SCALARS + s
     one, changes = vector_at(memory, n, COMPLEX), block_at(memory, n, s, CHANGES)
@@ -405,7 +405,7 @@ def _allowed(control, work, state, new, j, place, k):
 def _embedded_estimate(settings, own, A, work, memory):
     """Compute the embedded estimate of the error, unfiltered, into E_Q and E_V."""
     n, s = settings[N], A.shape[0]
-    place = eigen_place(s)
+    place = eigen_offset(s)
     gamma0, e = own[place + GAMMA0], own[place + N_EIGEN_SCALARS : place + N_EIGEN_SCALARS + s]
     known, begin = table(work, block_at(memory, n, s, STAGES), s, n), vector_at(memory, n, BEGIN_V)
     e_q, e_v, sums = vector_at(memory, n, E_Q), vector_at(memory, n, E_V), vector_at(memory, n, SUMS)
@@ -429,7 +429,7 @@ def _embedded_estimate(settings, own, A, work, memory):
 def _filter(settings, own, s, work, memory):
     """Apply (I - z J)^-1 to (E_Q, E_V), z = gamma0 H, J being the Jacobian of (v, F)."""
     n = settings[N]
-    gamma0 = own[eigen_place(s) + GAMMA0]
+    gamma0 = own[eigen_offset(s) + GAMMA0]
     e_q, e_v, one = vector_at(memory, n, E_Q), vector_at(memory, n, E_V), vector_at(memory, n, COMPLEX)
     by_q = matrix_at(memory, n, s, BY_Q)
     for i in range(n):
@@ -529,7 +529,7 @@ def _estimate(settings, control, own, A, work):
     """Compute ERROR: the embedded estimate, filtered for stiff components, over the tolerances."""
     n, s = settings[N], A.shape[0]
     state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
-    place = eigen_place(s)
+    place = eigen_offset(s)
     e_q, e_v = vector_at(memory, n, E_Q), vector_at(memory, n, E_V)
     _embedded_estimate(settings, own, A, work, memory)
     copy_vectors(work, e_v, vector_at(memory, n, UNFILTERED), n)

@@ -20,8 +20,8 @@ from twoloop.kernels.paper.iterations import (
 from twoloop.kernels.steps.stages import (
     END_ERROR_WEIGHT,
     EXTRAPOLATION,
-    FARTHEST,
     INNER_TOL,
+    MAX_STEP_RATIO,
     STAGES,
     end_error,
     interpolate,
@@ -66,7 +66,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     rest = rests_of(memory, s, n, tolerances)
     ratio = h / memory[at.H_PREVIOUS] if memory[at.HAS_PREVIOUS] == 1.0 else np.inf
     for j in range(s):
-        if ratio <= FARTHEST:
+        if ratio <= MAX_STEP_RATIO:
             interpolate(c, 1.0 + ratio * c[j], previous, weights, trial[j])
         else:
             copy(a, trial[j])

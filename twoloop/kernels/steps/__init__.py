@@ -1,1 +1,1 @@
-"""Steps of the integration methods: one file for each outer loop, and files for common parts."""
+"""Steps of the integration methods: one module for each outer loop, and modules that several steps share."""

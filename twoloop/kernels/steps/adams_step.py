@@ -1,14 +1,16 @@
 """Step of the Adams methods, orders 1 to 12, for all coordinates: predict, evaluate, correct, evaluate.
 
-Variable order and step in modified divided differences of a, as in Krogh's DVDQ and Shampine and Gordon's STEP, for
-second-order equations: positions are the double integral of the polynomial through the accelerations, velocities the
-single one. The first evaluation is at the prediction, off the constraints by its error; the second is at the corrected
-state, projected onto them. Differences are of all coordinates, so that a new partition needs no conversion.
+Order and step size are variable. The history consists of modified divided differences phi_i of the accelerations, as in
+Krogh's DVDQ and Shampine and Gordon's STEP, here for second-order equations: velocities are the integral of the
+polynomial through the accelerations, positions its double integral. The first evaluation is at the prediction, which
+violates the constraints by its error; the second is at the corrected state, projected onto the constraints. Differences
+of all coordinates are stored, so that a new partition needs no conversion.
 
-With t_n the times of the accepted steps, psi_i(n) = t_n - t_{n-i}, and i counted from 1 as in the literature:
-beta_i = prod_{j<i} psi_j(n+1) / psi_j(n), and on the step, s from 0 to 1, the polynomial through the last k
-accelerations is sum_i c_i(s) beta_i phi_i(n), c_i(s) = prod_{j=0}^{i-2} (s h + psi_j(n)) / psi_{j+1}(n+1), psi_0 = 0.
-g_i = int c_i ds and G_i = int (1 - s) c_i ds give velocities and positions; all terms of these are positive.
+Notation: t_n are the times of accepted steps, psi_i(n) = t_n - t_{n-i}, psi_0 = 0, and i counts from 1 as in the
+literature; beta_i = prod_{j<i} psi_j(n+1) / psi_j(n). In the step, for s from 0 to 1, the polynomial through the last k
+accelerations is sum_i c_i(s) beta_i phi_i(n), with c_i(s) = prod_{j=0}^{i-2} (s h + psi_j(n)) / psi_{j+1}(n+1).
+g_i = int c_i ds is the coefficient for velocities, G_i = int (1 - s) c_i ds that for positions. All factors in these
+integrals are positive.
 """
 
 import numpy as np
@@ -18,45 +20,52 @@ from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, inlined,
 from twoloop.kernels.data.indices import ATOL, DONE, N_OUTER, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate_as_given, project
 
-HIGHEST = 12  # largest order; above 13 the nodes below would not be exact
-N_TERMS = HIGHEST + 2  # number of differences of a step, and of coefficients g and G
+HIGHEST = 12  # largest order; above 13 the quadrature with NODES would not be exact
+N_TERMS = HIGHEST + 2  # number of differences of a step, of coefficients g and of coefficients G
 STRICT = 5.0  # factor on the error estimate: errors of many short steps add up, and then come close to the tolerance
-SAFETY = 0.8  # safety factor of the step factor
-GROWTH, SHRINKAGE = 1.2, 0.5  # limits of the step factor ...
-START_GROWTH = 2.0  # ... and its upper limit while the order still rises with every step
-LEAST_FACTOR = 0.1  # smallest step factor after a step whose dependents are far from the prediction
-RESTART_AFTER = 3  # number of failures in a row after which the method restarts with order 1
+SAFETY = 0.8  # factor on the step size for which the estimated error would be 1
+GROWTH, SHRINKAGE = 1.2, 0.5  # largest and smallest ratio of successive step sizes
+START_GROWTH = 2.0  # largest ratio of successive step sizes while the order still rises with every step
+LEAST_FACTOR = (
+    0.1  # smallest ratio of step sizes after a step whose dependent positions differ much from the prediction
+)
+RESTART_AFTER = 3  # number of successive failures after which the method restarts with order 1
 
-# eight Gauss nodes on [0, 1]: exact for c_i and (1 - s) c_i up to i = 15
+# eight Gauss nodes on [0, 1] and their weights: exact for c_i and (1 - s) c_i up to i = 15
 NODES, WEIGHTS = (0.5 * (1.0 + x) if k == 0 else 0.5 * x for k, x in enumerate(np.polynomial.legendre.leggauss(8)))
-REST = WEIGHTS * (1.0 - NODES)
+REST = WEIGHTS * (1.0 - NODES)  # weights of c_i in the integral of (1 - s) c_i
 
 
 def _error_constants():
-    """Return |g_k - g_k+1| of equal steps for each order k: the error of velocities over h times a difference."""
+    """Return |g_k - g_{k+1}| at equal steps for each order k.
+
+    It is the factor of h times the difference, in the estimated error of the velocities.
+    """
     coefficients = np.ones(HIGHEST + 1)
     for k in range(1, HIGHEST + 1):
         coefficients[k] = -np.sum(coefficients[:k] / np.arange(k + 1.0, 1.0, -1.0))
     return np.abs(coefficients)
 
 
-# error constants; those of the present steps are smaller after a decrease of h, but not correct if the force jumps
+# lower bounds of the error constants: after a decrease of h those of the actual steps are smaller, and too small if the
+# force jumps
 EQUAL_STEPS = _error_constants()
 
-# places in `options`
-THETA, N_OPTIONS = range(2)  # THETA: a second evaluation that moves a position by more is repeated
-# places in `memory`: scalars, rows of coefficients (N_TERMS + 1 each), then tables; see _table
+# indices in `options`. THETA: limit of the last correction of a projection, see `project` in inner_loop.py
+THETA, N_OPTIONS = range(2)
+# indices of the scalars in `memory`; then follow rows of N_TERMS + 2 coefficients, and tables, see _table
 (
     WHICH,  # index of the table of the last accepted step
     ORDER,
-    DEPTH,  # number of accelerations in the history
-    AGE,  # number of steps accepted at this order
+    DEPTH,  # number of accelerations in the history, at most N_TERMS
+    AGE,  # number of steps accepted since the order changed or a step was rejected
     STARTING,  # 1: the order rises with every step
-    FAILED,  # number of rejected attempts in a row
+    FAILED,  # number of successive rejected attempts
     NEXT_ORDER,
     N_SCALARS,
 ) = range(8)
-PSI, NEW_PSI, BETA, SPEED, PLACE, NODE, N_ROWS = range(7)  # SPEED holds g, PLACE holds G
+# numbers of the rows of coefficients: psi(n), psi(n+1), beta, g, G, and c_i at NODES
+PSI, NEW_PSI, BETA, SPEED, PLACE, NODE, N_ROWS = range(7)
 
 
 def memory_size(n_q: int) -> int:
@@ -65,18 +74,20 @@ def memory_size(n_q: int) -> int:
 
 
 def _padded(n_q: int) -> int:
+    """Return the next multiple of 4."""
     return (n_q + 3) // 4 * 4
 
 
 @inlined
 def _row(memory, which):
+    """Return a view (N_TERMS + 2) of row number `which`, such as PSI, of the coefficients."""
     start = N_SCALARS + which * (N_TERMS + 2)
     return memory[start : start + N_TERMS + 2]
 
 
 @inlined
 def _table(memory, n, which):
-    """Return one of the two tables (N_TERMS + 1, n padded): rows of differences phi_i less d, and d in the last row."""
+    """Return table 0 or 1 (N_TERMS + 1, n padded). The differences are phi_i = row i - 1 + d; d is the last row."""
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + int(which) * (N_TERMS + 1) * width
     return memory[start : start + (N_TERMS + 1) * width].reshape((N_TERMS + 1, width))
@@ -84,7 +95,7 @@ def _table(memory, n, which):
 
 @inlined
 def _scratch(memory, n):
-    """Return two rows, for velocities and for positions: means over the step, later reciprocals of the tolerances."""
+    """Return two rows (n padded), for velocities and positions: mean accelerations, later reciprocal tolerances."""
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + 2 * (N_TERMS + 1) * width
     return memory[start : start + width], memory[start + width : start + 2 * width]
@@ -92,7 +103,7 @@ def _scratch(memory, n):
 
 @kernel(SETTLE)
 def settle_adams(f, w, options, memory, tolerances, accepted):
-    """Make an accepted attempt part of the history; count a rejected one."""
+    """Add an accepted attempt to the history, or count a rejected one."""
     if not accepted:
         memory[FAILED] += 1.0
         memory[AGE] = 0.0
@@ -114,7 +125,7 @@ def settle_adams(f, w, options, memory, tolerances, accepted):
 
 @merged
 def _begin(memory, n, state):
-    """Start a history with one acceleration."""
+    """Start a history that contains only the accelerations of `state`."""
     table = _table(memory, n, memory[WHICH])
     table[:, :] = 0.0
     for m in range(n):
@@ -127,14 +138,14 @@ def _begin(memory, n, state):
 
 @merged
 def _coefficients(memory, h, k):
-    """Compute beta_1 ... beta_k+1, and g and G up to the term k + 2, for a step of h."""
+    """Compute psi(n+1), beta_1 to beta_{k+1}, g_1 to g_{k+2} and G_1 to G_{k+2} for a step of h, in `memory`."""
     psi, new_psi, beta = _row(memory, PSI), _row(memory, NEW_PSI), _row(memory, BETA)
     g, G, c = _row(memory, SPEED), _row(memory, PLACE), _row(memory, NODE)
     new_psi[0] = h
     for i in range(N_TERMS):
         new_psi[i + 1] = psi[i] + h
     beta[0] = 1.0
-    for i in range(k):  # compute all quotients first, so that divisions do not wait for one another
+    for i in range(k):  # all quotients before their products, so that the divisions can overlap
         beta[i + 1] = new_psi[i] / psi[i] if psi[i] > 0.0 else 0.0
     for i in range(k):
         beta[i + 1] *= beta[i]
@@ -156,12 +167,12 @@ def _coefficients(memory, h, k):
 
 @merged
 def _predict(memory, h, k, old, new, state, q1, v1, n):
-    """Compute the prediction (q1, v1), and into `new` the differences for an exact prediction."""
+    """Compute the prediction (q1, v1), and the differences that an exact prediction would have into the table `new`."""
     beta, g, G = _row(memory, BETA), _row(memory, SPEED), _row(memory, PLACE)
     in_v, in_q = _scratch(memory, n)
     for m in range(0, old.shape[1], 4):
         d0, d1, d2, d3 = old[N_TERMS, m], old[N_TERMS, m + 1], old[N_TERMS, m + 2], old[N_TERMS, m + 3]
-        # if the step is accepted, d is added to this: phi_k+2 = d - beta_k+1 phi_k+1
+        # the row holds phi_{k+2} - d: phi_{k+2} = d - beta_{k+1} phi_{k+1}
         b = beta[k]
         new[k + 1, m] = -b * (old[k, m] + d0)
         new[k + 1, m + 1] = -b * (old[k, m + 1] + d1)
@@ -212,16 +223,19 @@ def _predict(memory, h, k, old, new, state, q1, v1, n):
 
 @merged
 def _error(g, G, h, order, largest_v, largest_q):
-    """Return the local error of an order from its largest difference over the tolerances."""
+    """Return the local error at `order`, over the tolerances.
+
+    `largest_v`, `largest_q`: the largest difference over the tolerances of velocities and of positions.
+    """
     return max(h * abs(g[order - 1] - g[order]) * largest_v, h * h * abs(G[order - 1] - G[order]) * largest_q)
 
 
 @merged
 def _choose_order(memory, h, k, table, d, n):
-    """Return the largest error of the attempt over the tolerances and the step factor; choose the next order.
+    """Return the error of the attempt over the tolerances, and the ratio of the next step size to h; set NEXT_ORDER.
 
-    Order rules are those of STEP: lower if the error would not be larger; higher if it would be smaller, after k + 1
-    steps at order k; while the method starts, higher with every step.
+    The rules are those of STEP. The order decreases if this does not increase the error. It increases after k + 1 steps
+    at order k if this decreases the error, and while the method starts, with every step.
     """
     g, G = _row(memory, SPEED), _row(memory, PLACE)
     per_v, per_q = _scratch(memory, n)
@@ -266,7 +280,7 @@ def _choose_order(memory, h, k, table, d, n):
 
 @kernel(ATTEMPT, vectorized=True)
 def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step, and choose the order and size of the next one."""
+    """Attempt a step, and choose the order and the size of the next step."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
@@ -277,7 +291,7 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
     old, new = _table(memory, n, memory[WHICH]), _table(memory, n, 1.0 - memory[WHICH])
     _coefficients(memory, h, k)
     _predict(memory, h, k, old, new, state, q1, v1, n)
-    memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # used if the attempt fails
+    memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # remains if an evaluation fails
     code = evaluate_as_given(f, w, t + h, q1, v1, a1)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)

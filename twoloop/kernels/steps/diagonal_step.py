@@ -1,23 +1,23 @@
 """Diagonally implicit Runge-Kutta steps with an explicit first stage (ESDIRK), for stiff problems and few digits.
 
-The stages are found one after another. Newton's method finds the accelerations a of the independent coordinates at
-stage j, z = gamma h:
+The stages are solved one after another. For stage j, Newton's method finds the accelerations a of the independent
+coordinates, with z = gamma h and sums over the stages k < j:
 
     F(t_j, Q, V) - a = 0,  V = v_j + z a,  Q = q_j + z V,
-    v_j = v + h sum_k a_jk a_k,  q_j = q + h sum_k a_jk V_k over the stages before.
+    v_j = v + h sum_k a_jk a_k,  q_j = q + h sum_k a_jk V_k.
 
-The corrections d solve (I - z^2 J_q - z J_v) d = F - a with the derivatives of the right-hand side F. If the system
-gives tangents, each iterate has its own derivatives: stiff directions turn as the body moves, and after the turn of a
-large step an older matrix no longer contracts. Methods whose stages are solved together, as in newton_step.py, share
-one matrix.
+The corrections d solve (I - z^2 J_q - z J_v) d = F - a, where J_q and J_v are the derivatives of F. If the system
+provides tangents, the derivatives are computed in every iteration: stiff directions turn with the bodies, and if they
+turn much in a step, the iteration with older derivatives does not converge. Methods whose stages are solved together,
+as in newton_step.py, use one set of derivatives for all stages.
 
-The dense matrix of one iteration from tangents is factored as it stands, T^T (M - z^2 K - z D) T, whereas
-newton_systems.py first applies the inverse of T^T M T to the derivatives, for many systems. This is half the work
-where a matrix serves one iteration only.
+From tangents, the dense matrix T^T (M - z^2 K - z D) T of an iteration is factored directly. newton_systems.py first
+multiplies the derivatives by the inverse of T^T M T, to use them in several systems. The direct way takes half the work
+if a matrix is used in one iteration only.
 
-With step-size control TR-BDF2 continues from the embedded formula of order 3, with the difference filtered three times,
-which keeps the method L-stable: then the errors of many short steps add up to the tolerance, and not to the tolerance
-times their number.
+Under step-size control, TR-BDF2 continues from the embedded formula of order 3; the difference of the two formulas is
+filtered three times, which keeps the method L-stable. Then the errors of many short steps add up to the tolerance, not
+to the tolerance times the number of steps.
 """
 
 import numpy as np
@@ -54,15 +54,15 @@ from twoloop.kernels.steps.newton_systems import (
     tangent_by_v,
 )
 from twoloop.kernels.steps.stages import (
+    DIAGONAL_OFFSET,
     INNER_TOL,
+    NEWTON_OFFSET,
     OUTER_TOL,
-    PLACE,
     STAGES,
-    TAIL,
+    as_matrix,
     block,
+    matrix_storage,
     pivots_of,
-    space,
-    square,
     vector,
 )
 from twoloop.kernels.steps.velocity_errors import (
@@ -73,11 +73,13 @@ from twoloop.kernels.steps.velocity_errors import (
     velocity_error,
 )
 
-ASYMMETRY = 1e-12  # relative to the largest entry: a smaller asymmetry is rounding
+# largest difference of entries (i, j) and (j, i) of a matrix that counts as symmetric, over its largest diagonal entry
+ASYMMETRY = 1e-12
 
 
 @compiled
 def _symmetric(A):
+    """Return whether A is symmetric but for rounding errors."""
     largest, off = 0.0, 0.0
     for i in range(A.shape[0]):
         largest = max(largest, abs(A[i, i]))
@@ -87,64 +89,68 @@ def _symmetric(A):
 
 
 @compiled
-def _fill(w, memory, n, m, z, H):
-    """Compute the matrix T^T M T - z^2 T^T K T - z T^T D T into H."""
-    N, Kr, Dr = space(w, n, at.SYSTEMS), space(w, n, at.BY_Q), space(w, n, at.BY_V)
-    square = z * z
+def _fill_matrix(w, memory, n, m, z, H):
+    """Compute T^T M T - z^2 T^T K T - z T^T D T into H (m^2), m being the number of independent coordinates."""
+    N, Kr, Dr = matrix_storage(w, n, at.SYSTEMS), matrix_storage(w, n, at.BY_Q), matrix_storage(w, n, at.BY_V)
+    z2 = z * z
     if memory[at.DAMPED] == 1.0:
         for i in range(m * m):
-            H[i] = N[i] - square * Kr[i] - z * Dr[i]
+            H[i] = N[i] - z2 * Kr[i] - z * Dr[i]
     else:
         for i in range(m * m):
-            H[i] = N[i] - square * Kr[i]
+            H[i] = N[i] - z2 * Kr[i]
 
 
 @compiled
-def refactor(w, memory, z):
-    """Factor the matrix for another z, with the tangents of the last state."""
+def factor_for(w, memory, z):
+    """Factor the matrix of an iteration for z, with the tangents computed last; return a code."""
     n, m = w.Q.size, w.independent.size
-    numbers = space(w, n, at.FILTER)
-    H = square(numbers, m)
+    numbers = matrix_storage(w, n, at.FILTER)
+    H = as_matrix(numbers, m)
     w.counters[N_FACTORIZATIONS] += 1
-    _fill(w, memory, n, m, z, numbers)
+    _fill_matrix(w, memory, n, m, z, numbers)
     memory[at.SYMMETRIC] = 0.0
     if _symmetric(H):
         if ldl_factor(H):
             memory[at.SYMMETRIC] = 1.0
             return DONE
-        _fill(w, memory, n, m, z, numbers)  # not definite, such as for a compressed beam
+        _fill_matrix(w, memory, n, m, z, numbers)  # the matrix is indefinite, for example if a beam is compressed
     return DONE if lu_factor(H, pivots_of(memory, 1, n, 0)) > 0.0 else SINGULAR
 
 
 @compiled
 def factor_iteration(f, w, memory, t, q, v, z):
-    """Factor the matrix at a state that was just evaluated, with its multipliers in w.lam."""
+    """Compute the tangents at (t, q, v), the state evaluated last, and factor the matrix for z; return a code.
+
+    w.lam are the multipliers of this state.
+    """
     n = q.size
     m = w.independent.size
     w.counters[N_JACOBIANS] += 1
-    numbers = space(w, n, at.FILTER)
-    K, R = numbers.reshape((n, n)), space(w, n, at.SYSTEMS).reshape((n, n))
-    AT = space(w, n, at.SYSTEMS + 1)[: n * m].reshape((n, m))
+    numbers = matrix_storage(w, n, at.FILTER)
+    K, R = numbers.reshape((n, n)), matrix_storage(w, n, at.SYSTEMS).reshape((n, n))
+    AT = matrix_storage(w, n, at.SYSTEMS + 1)[: n * m].reshape((n, m))
     code = tangent_by_q(f, w, t, q, v, n - 1, vector(memory, 1, n, at.Q_MOVED), K, R)
     if code == DONE:
         code = find_tangents(f, w, t, q)
     if code != DONE:
         return code
-    reduce(w, K, AT, square(space(w, n, at.BY_Q), m))
+    reduce(w, K, AT, as_matrix(matrix_storage(w, n, at.BY_Q), m))
     memory[at.DAMPED] = f.flags[FORCE_BY_V_GIVEN]
     code = tangent_by_v(f, t, q, v, n - 1, K)
     if code != DONE:
         return code
     if memory[at.DAMPED] == 1.0:
-        reduce(w, K, AT, square(space(w, n, at.BY_V), m))
-    reduce(w, w.M, AT, square(space(w, n, at.SYSTEMS), m))
-    return refactor(w, memory, z)
+        reduce(w, K, AT, as_matrix(matrix_storage(w, n, at.BY_V), m))
+    reduce(w, w.M, AT, as_matrix(matrix_storage(w, n, at.SYSTEMS), m))
+    return factor_for(w, memory, z)
 
 
 @compiled
 def _solve_iteration(w, memory, x):
+    """Solve the factored system for the right-hand side x (n_dof), which becomes the solution."""
     m = x.size
-    H = square(space(w, w.Q.size, at.FILTER), m)
+    H = as_matrix(matrix_storage(w, w.Q.size, at.FILTER), m)
     if memory[at.SYMMETRIC] == 1.0:
         ldl_solve(H, x)
     else:
@@ -153,10 +159,10 @@ def _solve_iteration(w, memory, x):
 
 @compiled
 def solve_iteration(w, memory, residual, a):
-    """Add the correction to the independent coordinates of a; the residual (n_q) becomes the correction."""
+    """Add the correction to the independent accelerations in a (n_q); it also replaces the `residual` (n_q) there."""
     n = w.Q.size
     m = w.independent.size
-    N, x = square(space(w, n, at.SYSTEMS), m), vector(memory, 1, n, at.V_MOVED)[:m]
+    N, x = as_matrix(matrix_storage(w, n, at.SYSTEMS), m), vector(memory, 1, n, at.V_MOVED)[:m]
     for i in range(m):
         total = 0.0
         for j in range(m):
@@ -170,10 +176,10 @@ def solve_iteration(w, memory, residual, a):
 
 @compiled
 def filter_by_iteration(w, memory, z, e_q, e_v):
-    """Replace e_v (n_dof) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q)."""
+    """Replace e_v (n_dof) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with the factors computed last."""
     n = w.Q.size
     m = e_q.size
-    N, Kr = square(space(w, n, at.SYSTEMS), m), square(space(w, n, at.BY_Q), m)
+    N, Kr = as_matrix(matrix_storage(w, n, at.SYSTEMS), m), as_matrix(matrix_storage(w, n, at.BY_Q), m)
     x = vector(memory, 1, n, at.V_MOVED)[:m]
     for i in range(m):
         total = 0.0
@@ -184,16 +190,19 @@ def filter_by_iteration(w, memory, z, e_q, e_v):
     copy(x, e_v)
 
 
-MAX_ITERATIONS = 8
-GROWTH = 2.0  # growth of a correction above which the iteration fails
-SHARE_IF_LINEAR = 0.01  # relative to the tolerance of the outer loop, if the iteration does not converge quadratically
-KEEP_CONTRACTION = 0.1  # contraction up to which differenced derivatives are reused
-SHARE_OF_VELOCITY = 0.1  # weight of a correction measured by the position error that its velocity causes
+MAX_ITERATIONS = 8  # number of Newton iterations after which a stage has failed
+GROWTH = 2.0  # ratio of successive corrections above which the iteration fails
+LINEAR_FACTOR = 0.01  # factor on the tolerance of the outer loop for iterations that do not converge quadratically
+MAX_CONTRACTION = 0.1  # ratio of successive corrections up to which derivatives computed by differences are reused
+VELOCITY_WEIGHT = 0.1  # weight, in the convergence test, of the position error that the correction of a velocity causes
 
 
 @inlined
 def stages_of(memory, s, n):
-    """Return views: velocities and accelerations of the stages, accelerations at the end of the last step."""
+    """Return views of `memory`: velocities and accelerations of the stages (s, n), accelerations (n) of the last one.
+
+    The last one is the last stage of the last accepted step.
+    """
     last = memory.size - n
     return (
         memory[last - 2 * s * n : last - s * n].reshape((s, n)),
@@ -205,13 +214,16 @@ def stages_of(memory, s, n):
 @merged
 def gamma_of(options):
     """Return gamma, the diagonal entry of A."""
-    s = int(options[TAIL])
-    return options[TAIL + s * s]
+    s = int(options[DIAGONAL_OFFSET])
+    return options[DIAGONAL_OFFSET + s * s]
 
 
 @merged
 def _set_stage_state(z, q_bar, v_bar, a, Q, V):
-    """Set the independent Q and V from the acceleration a of the stage, and start values of the dependent ones."""
+    """Compute the positions Q and velocities V of a stage from its accelerations a, all (n_q).
+
+    For dependent coordinates these are start values of Newton's method.
+    """
     for m in range(Q.size):
         V[m] = v_bar[m] + z * a[m]
         Q[m] = q_bar[m] + z * V[m]
@@ -219,7 +231,7 @@ def _set_stage_state(z, q_bar, v_bar, a, Q, V):
 
 @merged
 def has_dense_tangents(f, w):
-    """Return whether each iteration factors a matrix of its own, T^T (M - z^2 K - z D) T."""
+    """Return whether every iteration computes and factors its own matrix T^T (M - z^2 K - z D) T, from tangents."""
     return (
         f.flags[FORCE_BY_Q_GIVEN] == 1
         and f.flags[BANDWIDTH] < 0
@@ -230,13 +242,16 @@ def has_dense_tangents(f, w):
 
 @merged
 def one_stage_of(options):
-    """Return the number of stages, 1; a literal 1 would make the compiler specialize newton_systems.py for it."""
+    """Return 1, the number of stages solved at once; for a literal 1, newton_systems.py would be compiled again."""
     return int(options[STAGES])
 
 
 @compiled
 def _prepare(f, w, options, memory, t, h, Q, V, F):
-    """Prepare factors for an iteration at (Q, V), just evaluated, with accelerations F; return the code."""
+    """Compute or reuse the derivatives and factors for an iteration; return a code.
+
+    (Q, V) is the state evaluated last, with accelerations F.
+    """
     if f.flags[FORCE_BY_Q_GIVEN] == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
         memory[at.HAS_JACOBIAN] = 1.0
@@ -254,7 +269,10 @@ def _prepare(f, w, options, memory, t, h, Q, V, F):
 
 @compiled
 def solve_stage(f, w, options, memory, t, h, A_stage):
-    """Solve one stage by Newton's method from A_stage (1, n_q), with (Q, V) in Q_MID, V_MID; return the code."""
+    """Solve for the accelerations A_stage (1, n_q) of a stage at t by Newton's method; return a code.
+
+    A_stage is their prediction on entry. The vectors Q_MID and V_MID of `memory` become positions and velocities.
+    """
     n = w.Q.size
     z = h * gamma_of(options)
     q_bar, v_bar = block(memory, 1, n, at.PREVIOUS)[0], block(memory, 1, n, at.TRIAL)[0]
@@ -275,7 +293,7 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
         for m in w.independent:
             scale_q = max(scale_q, abs(Q[m]))
             scale_v = max(scale_v, abs(V[m]))
-        if f.flags[FORM] != STATIC:  # with the static form no coordinate is dependent
+        if f.flags[FORM] != STATIC:  # in the static form no coordinate is dependent
             for m in w.dependent:
                 a[m] = F[m]
         code = _prepare(f, w, options, memory, t, h, Q, V, F)
@@ -287,7 +305,7 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
         else:
             correct(f, w, options, memory, one_stage_of(options), residual, A_stage)
         change = 0.0
-        share = max(z / scale_q, SHARE_OF_VELOCITY * min(memory[at.DURATION] / scale_q, 1.0 / scale_v))
+        share = max(z / scale_q, VELOCITY_WEIGHT * min(memory[at.DURATION] / scale_q, 1.0 / scale_v))
         for m in w.independent:
             change = max(change, z * abs(residual[0, m]) * share)
         if not np.isfinite(change):
@@ -301,10 +319,10 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
         if iteration > 0:
             if contraction > GROWTH:
                 return OUTER_DIVERGED
-            share = 1.0 if tangents_given else SHARE_IF_LINEAR
+            share = 1.0 if tangents_given else LINEAR_FACTOR
             if contraction < 1.0 and contraction / (1.0 - contraction) * change <= share * options[OUTER_TOL]:
                 break
-            if contraction > KEEP_CONTRACTION and memory[at.FRESH] == 0.0:
+            if contraction > MAX_CONTRACTION and memory[at.FRESH] == 0.0:
                 memory[at.HAS_JACOBIAN] = 0.0
         if iteration == MAX_ITERATIONS - 1:
             return OUTER_DIVERGED
@@ -315,16 +333,21 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
     return DONE
 
 
-# number of filters: with fewer, extrapolation is unstable for vibrations, see tests/kernels/test_diagonal.py
+# number of filters of the difference of the two formulas before it is subtracted: with fewer, the method is unstable
+# for vibrations, see tests/kernels/test_diagonal.py
 N_FILTERS = 3
 
-# largest error of `lower` at a jump, relative to the width of the accelerations: its difference then counts in full
-JUMP_SHARE = 0.174
+# largest sum of `lower` times the stage accelerations at a jump, relative to their range: `_error_at_jumps` then does
+# not reduce its estimate
+MAX_JUMP_RATIO = 0.174
 
 
 @compiled
 def _filter(f, w, options, memory, h, e_q, e_v):
-    """Apply (I - z J)^-1 to (e_q, e_v) by the last factors, J being the Jacobian of (v, F); n_dof numbers each."""
+    """Replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), z = h gamma, with the last factors.
+
+    J is the Jacobian of (v, F); the vectors are the first n_dof numbers of the arrays.
+    """
     z = h * gamma_of(options)
     count = w.independent.size
     if has_dense_tangents(f, w):
@@ -337,15 +360,18 @@ def _filter(f, w, options, memory, h, e_q, e_v):
 
 @compiled
 def _factor_filter(f, w, options, memory, h):
-    """Compute the factors that `_filter` uses for steps of h; return the code."""
+    """Factor the matrix that `_filter` uses for steps of size h; return a code."""
     if has_dense_tangents(f, w):
-        return refactor(w, memory, h * gamma_of(options))
+        return factor_for(w, memory, h * gamma_of(options))
     return factor_filter(f, w, options, memory, one_stage_of(options), h)
 
 
 @compiled
 def _difference(w, h, V_stage, A_stage, weights, share, e_q, e_v):
-    """Compute `share` times h times the weighted sum of the stages, for the independent coordinates (n_dof)."""
+    """Compute `share` times h times the weighted sum of the stage velocities into e_q, of accelerations into e_v.
+
+    The first n_dof numbers of e_q and e_v are for the independent coordinates.
+    """
     for i in range(w.independent.size):
         j = w.independent[i]
         in_q, in_v = 0.0, 0.0
@@ -358,7 +384,7 @@ def _difference(w, h, V_stage, A_stage, weights, share, e_q, e_v):
 
 @compiled
 def _renew_derivatives(f, w, options, memory, t, h, new_state):
-    """Compute derivatives at the end of the step, and their factors; return the code."""
+    """Compute the derivatives at the end of the step, and factor the systems for steps of size h; return a code."""
     n = w.Q.size
     Q, V, F = vector(memory, 1, n, at.Q_MID), vector(memory, 1, n, at.V_MID), vector(memory, 1, n, at.A_MID)
     copy(new_state[:n], Q)
@@ -379,9 +405,10 @@ def _renew_derivatives(f, w, options, memory, t, h, new_state):
 
 @compiled
 def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, weights, share):
-    """Return the largest component of `share` times the weighted sum of stages, over atol + rtol |value|.
+    """Return the largest component of an error estimate over the tolerances, `share` times the weighted sum of stages.
 
-    The sum is filtered by the last factors (Hosea and Shampine 1996), so that stiff components do not count.
+    The sum is filtered with the factors computed last (Hosea and Shampine 1996), so that stiff components do not count.
+    Outdated derivatives are first computed anew, if they matter. E_Q and E_V become the sum, E_V filtered twice.
     """
     n = w.Q.size
     q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
@@ -406,7 +433,7 @@ def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A
         j = w.independent[i]
         scale = allowed(tolerances, j, q[j], q1[j])
         error = max(error, abs(e_q[i]) / scale)
-        if options[PLACE + at.VELOCITIES] == 1.0:
+        if options[NEWTON_OFFSET + at.VELOCITIES] == 1.0:
             scale = allowed(tolerances, j, v[j], v1[j])
             error = max(error, abs(e_v[i]) / scale)
     copy(e_v, once)
@@ -416,7 +443,10 @@ def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A
 
 @compiled
 def _extrapolate(f, w, options, memory, h, q1, v1):
-    """Replace the end of the step by that of the embedded formula; the difference has been filtered twice before."""
+    """Replace (q1, v1), the end of the step, by that of the embedded formula.
+
+    (E_Q, E_V) is the difference of the two formulas, which `_error` has filtered twice.
+    """
     e_q, e_v = vector(memory, 1, w.Q.size, at.E_Q), vector(memory, 1, w.Q.size, at.E_V)
     for _ in range(2, N_FILTERS):
         _filter(f, w, options, memory, h, e_q, e_v)
@@ -427,7 +457,10 @@ def _extrapolate(f, w, options, memory, h, q1, v1):
 
 @compiled
 def _slow_error(f, w, options, memory, h, tolerances, state, new_state, A_stage):
-    """Return the error that velocity errors (E_V) leave in slow directions, as in newton_step.py."""
+    """Return the position error over the tolerances that E_V causes in slow directions, as in newton_step.py.
+
+    It is 0 where E_V is too small to matter. Overwrites E_Q, E_V and the factors.
+    """
     n = w.Q.size
     e_q, e_v = vector(memory, 1, n, at.E_Q), vector(memory, 1, n, at.E_V)
     longest = motion_time(w, tolerances, state, state[2 * n :])
@@ -441,7 +474,7 @@ def _slow_error(f, w, options, memory, h, tolerances, state, new_state, A_stage)
     longer = STEPS_TO_DECAY * h / gamma_of(options)
     if _factor_filter(f, w, options, memory, longer) == DONE:
         _filter(f, w, options, memory, longer, e_q, e_v)
-        # where the motion is unstable the system may be nearly singular, and the solution too large
+        # if the motion is unstable, the system may be nearly singular, and its solution too large
         error = min(error, velocity_error(w, tolerances, e_v, longest, state, new_state))
     memory[at.H_FACTORED] = 0.0
     return error
@@ -449,11 +482,12 @@ def _slow_error(f, w, options, memory, h, tolerances, state, new_state, A_stage)
 
 @compiled
 def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, lower):
-    """Return the error that `lower`, the weights of another embedded formula, shows where accelerations jump.
+    """Return a second error estimate over the tolerances, for accelerations that jump within the step.
 
-    The weights of the first formula are so small at the stages of the first half that a jump there hardly shows.
-    `lower` is exact for accelerations quadratic in time. The error of smooth ones is a small share of their width: its
-    difference is multiplied by this share, which makes it of a higher order than the first estimate.
+    A jump in the first half of the step hardly changes the first estimate, which has small weights there. `lower`
+    (s) are weights of another embedded formula. The sum of `lower` times the accelerations of the stages is zero if the
+    accelerations are quadratic in time, small relative to their range if they are smooth, and large if they jump. The
+    ratio of this sum to the range is a factor of the estimate, which raises its order above that of the first estimate.
     """
     n = w.Q.size
     missed, widest = 0.0, 0.0
@@ -468,7 +502,7 @@ def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V
         return 0.0
     if memory[at.H_FACTORED] == 0.0 and _factor_filter(f, w, options, memory, h) != DONE:
         return np.inf
-    share = min(1.0, missed / (JUMP_SHARE * widest))
+    share = min(1.0, missed / (MAX_JUMP_RATIO * widest))
     error = _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, lower, share)
     if error <= 1.0:
         error = max(error, _slow_error(f, w, options, memory, h, tolerances, state, new_state, A_stage))
@@ -477,19 +511,19 @@ def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V
 
 @kernel(SETTLE)
 def settle_diagonal(f, w, options, memory, tolerances, accepted):
-    """Store the last stage of an accepted step, which is the first of the next one."""
+    """Store the last stage of an accepted step, which is the first stage of the next step."""
     if accepted:
-        s = int(options[TAIL])
+        s = int(options[DIAGONAL_OFFSET])
         _, A_stage, a_end = stages_of(memory, s, w.Q.size)
-        copy(A_stage[s - 1], a_end)  # F at the state would be the residual of Newton's method times the stiffness
+        copy(A_stage[s - 1], a_end)  # F there would contain Newton's residual times the stiffness
         memory[at.FRESH] = 0.0
 
 
 @kernel(ATTEMPT, vectorized=True)
 def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step: solve the stages one after another; the last one is the end of the step."""
-    s = int(options[TAIL])
-    o = TAIL + 1
+    """Attempt a step: solve the stages one after another, the last of which is the end of the step."""
+    s = int(options[DIAGONAL_OFFSET])
+    o = DIAGONAL_OFFSET + 1
     A = options[o : o + s * s].reshape((s, s))
     c, weights = options[o + s * s : o + s * s + s], options[o + s * s + s : o + s * s + 2 * s]
     lower = options[o + s * s + 2 * s : o + s * s + 3 * s]
@@ -502,7 +536,7 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
         memory[at.PARTITION_NUMBER] = w.notes[GENERATION]
         memory[at.HAS_JACOBIAN] = 0.0
         copy(a, a_end)
-    if memory[at.FRESH] == 0.0 and memory[at.CONTRACTION] > KEEP_CONTRACTION:
+    if memory[at.FRESH] == 0.0 and memory[at.CONTRACTION] > MAX_CONTRACTION:
         memory[at.HAS_JACOBIAN] = 0.0
     copy(v, V_stage[0])
     copy(a_end, A_stage[0])
@@ -527,7 +561,7 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
             return Attempt(code, np.inf, 0.0)
         copy(V, V_stage[j])
     copy(V, v1)
-    for m in w.dependent:  # prediction by the formula, to be compared with the values that the constraints give
+    for m in w.dependent:  # predicted by the formula; compared below with the positions that the constraints determine
         q1[m] = q_bar[m] + h * A[s - 1, s - 1] * V[m]
     for m in w.independent:
         q1[m] = Q[m]

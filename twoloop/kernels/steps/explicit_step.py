@@ -1,9 +1,9 @@
-"""Step of an explicit Runge-Kutta method for (q_i, v_i): every stage is one evaluation, without an outer loop.
+"""Step of an explicit Runge-Kutta method for (q_i, v_i): each stage is one evaluation, and there is no outer loop.
 
-The tableau is any whose first stage is the state itself and that estimates its error by two embedded formulas. The
-inner loop restores the dependents of every stage, so that the step never leaves the constraints. With FREE all
-coordinates are integrated alike, unlike in the paper: stages are off the constraints by the error of the formula, and
-only the end of the step is projected.
+The first stage is the state at the beginning of the step, and two embedded formulas estimate the error. By default, the
+inner loop computes the dependent coordinates of every stage, so that all stages satisfy the constraints. With FREE,
+unlike in the paper, the method integrates dependent coordinates, too: stages violate the constraints by the error of
+the formula, and only the end of the step is projected.
 """
 
 import numpy as np
@@ -15,13 +15,15 @@ from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, LEAST, N_OUTER, N
 from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_as_given, evaluate_state, project
 from twoloop.kernels.linalg.dense import copy
 
-# places in `options`: scalars, then A (s, s), b (s), c (s) and the weights of the two estimates (s each)
-STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)  # FREE: stages are not projected
-# vectors in `memory`, then the slopes of the stages. Each has 2 n_q numbers, and zeros up to a multiple of BLOCK
+# indices of the scalars in `options`; then follow A (s, s), b (s), c (s) and the weights of the two error estimates (s
+# each). FREE: 1 if stages are not projected
+STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)
+# numbers of the vectors in `memory`; then follow the slopes of the stages. Vectors and slopes have 2 n_q numbers each,
+# padded to a multiple of BLOCK
 STAGE, FINE, COARSE, N_VECTORS = range(4)
-BLOCK = 8
-# factor on errors once a singular position was near, because errors of the phase grow from one passage to the next; it
-# makes no tolerance smaller than LEAST_STRICT
+BLOCK = 8  # number of sums that `_weighted` accumulates in registers
+# factor on errors once the run has come near a singular position, because errors in time grow with each singular
+# position passed; the factor makes no tolerance smaller than LEAST_STRICT
 STRICT, LEAST_STRICT = 10.0, 1e-11
 
 
@@ -35,7 +37,10 @@ def options_array(
     free: bool = False,
     theta: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Return the parameter block that the step reads; see `_error` for `fine` and `coarse`, `project` for theta."""
+    """Return the array `options` that the step reads.
+
+    `fine`, `coarse`: weights (s) of the two error estimates; `free`: stages are not projected; `theta`: see `project`.
+    """
     A, b, c, fine, coarse = (np.asarray(x, dtype=float) for x in (A, b, c, fine, coarse))
     s = b.size
     if A.shape != (s, s) or not c.size == fine.size == coarse.size == s:
@@ -53,12 +58,13 @@ def memory_size(s: int, n_q: int) -> int:
 
 @inlined
 def _width(n):
+    """Return the padded length of a vector of 2 n numbers."""
     return (2 * n + BLOCK - 1) // BLOCK * BLOCK
 
 
 @inlined
 def tableau_of(options):
-    """Return views of the parameter block: s, A, b, c, and the weights of the two estimates."""
+    """Return the number of stages s, and views of `options`: A, b, c, and the weights of the two error estimates."""
     s = int(options[STAGES])
     o = N_SCALARS
     A = options[o : o + s * s].reshape((s, s))
@@ -68,19 +74,20 @@ def tableau_of(options):
 
 @inlined
 def _vector(memory, n, which):
+    """Return a view of vector number `which`, such as STAGE, of `memory`."""
     return memory[which * _width(n) : (which + 1) * _width(n)]
 
 
 @inlined
 def _slopes(memory, s, n):
-    """Return velocities and accelerations of the stages, side by side."""
+    """Return a view (s, 2 n padded) of the slopes: velocities, then accelerations, of each stage."""
     begin = N_VECTORS * _width(n)
     return memory[begin : begin + s * _width(n)].reshape((s, _width(n)))
 
 
 @compiled
 def _weighted(weights, slopes, total):
-    """Compute the sum of weights[k] slopes[k], block by block, each block in registers."""
+    """Compute the sum of weights[k] slopes[k] over k into `total`, BLOCK entries at a time."""
     for m in range(0, total.size, BLOCK):
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
         for k in range(weights.size):
@@ -105,7 +112,7 @@ def _weighted(weights, slopes, total):
 
 @compiled
 def _move(y, h, weights, slopes, total, y1):
-    """Compute y1 = y + h times the weighted sum; y is added last, so that not every stage rounds it."""
+    """Compute y1 = y + h sum_k weights[k] slopes[k]; `total` is scratch. Adding y last rounds it only once."""
     _weighted(weights, slopes, total)
     for m in range(y.size):
         y1[m] = y[m] + h * total[m]
@@ -113,11 +120,12 @@ def _move(y, h, weights, slopes, total, y1):
 
 @compiled
 def largest_error(tolerances, y, y1, one, other, strict):
-    """Return e^2 / sqrt(e^2 + d^2) of the largest components e and d of both estimates, of q and v, dependents too.
+    """Return the error e^2 / sqrt(e^2 + d^2), where e and d are the largest components of the two estimates.
 
-    Estimates are relative to atol + rtol |y|. Component by component e^2 / sqrt(e^2 + d^2) would be e, of low order,
-    where d passes through zero: up to 30 % more evaluations. If `strict`, e^(3/2) / (e^2 + d^2)^(1/4): near a singular
-    position terms of high order are not small (an error of 47 tolerances was estimated as 1.4).
+    The estimates `one` and `other` (2 n) are for all positions and velocities, and relative to atol + rtol |y|. Formed
+    for each component, the expression would be e, of low order, where d passes through zero: up to 30 % more
+    evaluations. If `strict`, return e^(3/2) / (e^2 + d^2)^(1/4): near a singular position terms of high order are not
+    small (an error of 47 tolerances was estimated as 1.4).
     """
     n = one.size // 2
     rtol = tolerances[RTOL]
@@ -137,7 +145,7 @@ def largest_error(tolerances, y, y1, one, other, strict):
 
 @compiled
 def _error(tolerances, h, fine, coarse, y, y1, slopes, one, other, strict):
-    """Return the error of a finished step; `one` and `other` are scratch for the two estimates."""
+    """Return the error of a step from y to y1 over the tolerances; `one` and `other` are scratch."""
     _weighted(fine, slopes, one)
     _weighted(coarse, slopes, other)
     for m in range(y.size):
@@ -148,14 +156,15 @@ def _error(tolerances, h, fine, coarse, y, y1, slopes, one, other, strict):
 
 @kernel(ATTEMPT, vectorized=True)
 def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step; if the estimate rejects it, the accelerations at its end are not computed."""
+    """Attempt a step; if its error is above 1, return without the accelerations at the end of the step."""
     s, A, b, c, fine, coarse = tableau_of(options)
     n = w.Q.size
     q, v, y, y1 = state[:n], state[n : 2 * n], state[: 2 * n], new_state[: 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
     stage, one, other = _vector(memory, n, STAGE), _vector(memory, n, FINE), _vector(memory, n, COARSE)
     slopes = _slopes(memory, s, n)
-    # near a singular position, the side of it on which a stage is and the exact velocities matter
+    # near a singular position stages are projected: it matters on which side of this position a stage is, and how
+    # accurate its velocities are
     near = options[FREE] == 1.0 and w.notes[NEARLY_SINGULAR] != 0.0
     free = options[FREE] == 1.0 and not near
     longer = gap_ratio(tolerances, h)
@@ -164,7 +173,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.counters[N_OUTER] += 1
     copy(state[n : 3 * n], slopes[0])
     for j in range(1, s):
-        _move(y, h, A[j, :j], slopes, stage, stage)  # dependents too, as start values of Newton's method
+        _move(y, h, A[j, :j], slopes, stage, stage)  # entries of dependent coordinates: start values of Newton's method
         v_stage, a_stage = slopes[j, :n], slopes[j, n : 2 * n]
         copy(stage[n : 2 * n], v_stage)
         if free:

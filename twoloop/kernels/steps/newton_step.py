@@ -4,11 +4,11 @@ The unknowns are the stage accelerations a_j of the independent coordinates, as 
 
     r_j = F(t_j, Q_j, V_j) - a_j = 0,  Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k,  V_j = v + h sum_k A_jk a_k,
 
-F being the two-loop right-hand side. With J_q, J_v, its derivatives by q_i and v_i at one state (simplified Newton),
-the corrections solve (I - h^2 A A x J_q - h A x J_v) d = r. In the eigenvectors of A this falls apart into one real
-(n_dof, n_dof) system I - (h l)^2 J_q - h l J_v for each real eigenvalue l and one complex for each pair, half the size
-of those of a first-order form (Hairer & Wanner, Solving ODEs II, IV.8, for Radau IIA). A fixed-point iteration would
-need tiny steps there.
+where F is the two-loop right-hand side. J_q and J_v are its derivatives by q_i and v_i at a single state (simplified
+Newton's method). The corrections d solve (I - h^2 A A x J_q - h A x J_v) d = r, x being the Kronecker product. In the
+eigenvectors of A this splits into systems (n_dof, n_dof) I - (h l)^2 J_q - h l J_v: a real one for each real eigenvalue
+l of A, and a complex one for each pair. These have half the size of the systems of a first-order form (Hairer & Wanner,
+Solving ODEs II, IV.8, for Radau IIA). In stiff problems, a fixed-point iteration would need tiny steps.
 """
 
 import numpy as np
@@ -30,12 +30,12 @@ from twoloop.kernels.steps.newton_systems import (
     filter_error,
 )
 from twoloop.kernels.steps.stages import (
-    FARTHEST,
     INNER_TOL,
+    MAX_STEP_RATIO,
     OUTER_TOL,
     STAGES,
     block,
-    eigen_place,
+    eigen_offset,
     interpolate,
     middle_node,
     tableau_of,
@@ -43,13 +43,17 @@ from twoloop.kernels.steps.stages import (
 )
 from twoloop.kernels.steps.velocity_errors import STEPS_TO_DECAY, filtered_velocity_error, motion_time, velocity_error
 
-SLOW = 0.05  # contraction above which the derivatives are renewed before the next step
-STAGNATION_FIXED = 1e-9  # STAGNATION of fixed steps, relative to max(1, |value|)
+SLOW = 0.05  # ratio of the last two corrections above which the derivatives are computed anew for the next step
+# largest correction taken for a rounding error in fixed steps, relative to max(1, |value|)
+STAGNATION_FIXED = 1e-9
 
 
 @compiled
 def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
-    """Solve for the stage accelerations by Newton's method from their prediction in A_stage; return the code."""
+    """Solve for the stage accelerations A_stage (s, n) by Newton's method; return a code.
+
+    A_stage is their prediction on entry. Stores the last contraction in `memory`.
+    """
     s, A, A2, _, _, c = tableau_of(options)
     n = q.size
     residual = block(memory, s, n, at.RESIDUAL)
@@ -76,7 +80,7 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
                 return code
             for m in range(n):
                 residual[j, m] = a_new[m] - A_stage[j, m]
-            if f.flags[FORM] != STATIC:  # with the static form no coordinate is dependent
+            if f.flags[FORM] != STATIC:  # in the static form no coordinate is dependent
                 for m in w.dependent:
                     A_stage[j, m] = a_new[m]
         scale_q, scale_v = 1.0, 1.0
@@ -120,23 +124,26 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
 
 @compiled
 def _filter(f, w, options, memory, h, e_q, e_v):
-    """Apply (I - z J)^-1 to (e_q, e_v), z = h gamma0, J being the Jacobian of (v, F); n_dof numbers each."""
+    """Replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), z = h gamma0, where J is the Jacobian of (v, F).
+
+    The vectors are the first n_dof numbers of the arrays.
+    """
     s = int(options[STAGES])
     m = w.independent.size
     filter_error(f, w, options, memory, s, h, e_q, e_v)
     for i in range(m):
-        e_q[i] += h * options[eigen_place(s) + at.GAMMA0] * e_v[i]
+        e_q[i] += h * options[eigen_offset(s) + at.GAMMA0] * e_v[i]
 
 
 @compiled
 def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
-    """Return the largest component of the filtered embedded error estimate over atol + rtol |value|."""
+    """Return the largest component of the embedded error estimate, filtered, over the tolerances."""
     s, A, _, _, _, _ = tableau_of(options)
     n = w.Q.size
     q, v, a, q1, v1 = state[:n], state[n : 2 * n], state[2 * n : 3 * n], new_state[:n], new_state[n : 2 * n]
-    place = eigen_place(s)
-    gamma0 = options[place + at.GAMMA0]
-    e = options[place + at.N_EIGEN_SCALARS : place + at.N_EIGEN_SCALARS + s]
+    offset = eigen_offset(s)
+    gamma0 = options[offset + at.GAMMA0]
+    e = options[offset + at.N_EIGEN_SCALARS : offset + at.N_EIGEN_SCALARS + s]
     e_q, e_v = vector(memory, s, n, at.E_Q), vector(memory, s, n, at.E_V)
     raw, once = vector(memory, s, n, at.A_NEW), vector(memory, s, n, at.A_MID)
     for i in range(w.independent.size):
@@ -157,9 +164,9 @@ def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
     for i in range(w.independent.size):
         j = w.independent[i]
         error = max(error, abs(e_q[i]) / allowed(tolerances, j, q[j], q1[j]))
-        if options[place + at.VELOCITIES] == 1.0:
+        if options[offset + at.VELOCITIES] == 1.0:
             error = max(error, abs(e_v[i]) / allowed(tolerances, j, v[j], v1[j]))
-    if options[place + at.VELOCITIES] == 1.0:
+    if options[offset + at.VELOCITIES] == 1.0:
         return error
     copy(e_v, once)
     _filter(f, w, options, memory, h, e_q, e_v)
@@ -171,13 +178,14 @@ def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
 
 @compiled
 def _slow_error(f, w, options, memory, h, tolerances, state, new_state):
-    """Return the error that velocity errors (E_V) leave in directions that are slow relative to the step.
+    """Return the position error over the tolerances that the velocity error E_V causes in slow directions.
 
-    The rate of change of an error is that of its fastest component. So the component that is left after a few steps is
-    taken to last as long as the motion itself.
+    The duration in `filtered_velocity_error` is that of the fastest component. The component that remains after
+    STEPS_TO_DECAY steps is assumed to last as long as the motion. Returns 0 if E_V is too small to matter. Overwrites
+    E_Q, E_V and the factors of the filter.
     """
     s, n = int(options[STAGES]), w.Q.size
-    z = STEPS_TO_DECAY * h / options[eigen_place(s) + at.GAMMA0]
+    z = STEPS_TO_DECAY * h / options[eigen_offset(s) + at.GAMMA0]
     e_q, e_v = vector(memory, s, n, at.E_Q), vector(memory, s, n, at.E_V)
     longest = motion_time(w, tolerances, state, state[2 * n :])
     error = velocity_error(w, tolerances, e_v, longest, state, new_state)
@@ -187,7 +195,7 @@ def _slow_error(f, w, options, memory, h, tolerances, state, new_state):
         e_q[i] = 0.0
     if factor_filter(f, w, options, memory, s, z) == DONE:
         filter_error(f, w, options, memory, s, z, e_q, e_v)
-        # where the motion is unstable the system may be nearly singular, and the solution too large
+        # if the motion is unstable, the system may be nearly singular, and its solution too large
         error = min(error, velocity_error(w, tolerances, e_v, longest, state, new_state))
     if factor_filter(f, w, options, memory, s, h) != DONE:
         memory[at.H_FACTORED] = 0.0
@@ -196,7 +204,7 @@ def _slow_error(f, w, options, memory, h, tolerances, state, new_state):
 
 @kernel(SETTLE)
 def settle_newton(f, w, options, memory, tolerances, accepted):
-    """Store the stages of an accepted step, which predict the next ones."""
+    """Store the stages of an accepted step, which predict those of the next step."""
     s, n = int(options[STAGES]), w.Q.size
     if accepted:
         memory[at.FRESH] = 0.0
@@ -226,8 +234,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     node = middle_node(c)
     while True:
         if memory[at.HAS_JACOBIAN] == 0.0:
-            # stiff directions turn as the body moves: those in the middle differ least from those of all stages. The
-            # time is that of a stage, so that the derivatives see no force that the stages do not see
+            # stiff directions turn as the bodies move: at a stage in the middle of the step they differ least from
+            # those of the other stages. At the time of a stage, the derivatives contain no force that no stage has
             x = node * h
             for m in range(n):
                 q_mid[m] = q[m] + x * (v[m] + 0.5 * x * a[m])
@@ -249,7 +257,7 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
                 return Attempt(code, np.inf, 0.0)
         ratio = h / memory[at.H_PREVIOUS] if memory[at.HAS_PREVIOUS] == 1.0 else np.inf
         for j in range(s):
-            if ratio <= FARTHEST:
+            if ratio <= MAX_STEP_RATIO:
                 interpolate(c, 1.0 + ratio * c[j], previous, weights, trial[j])
             else:
                 copy(a, trial[j])
@@ -258,7 +266,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             break
         if memory[at.FRESH] == 1.0 and (node == 0.0 or code != OUTER_DIVERGED):
             return Attempt(code, np.inf, 0.0)
-        # extrapolation by the accelerations may miss the middle, for example where friction is no longer stiff
+        # the extrapolated state in the middle may be wrong, for example where friction is no longer stiff: next, use
+        # the beginning of the step
         if memory[at.FRESH] == 1.0:
             node = 0.0
         memory[at.HAS_JACOBIAN] = 0.0

@@ -1,29 +1,31 @@
-"""Linear algebra of Newton's method for implicit steps: the systems I - z^2 J_q - z J_v, z = h l, of each eigenvalue l.
+"""Linear algebra of Newton's method in implicit steps: one system, I - z^2 J_q - z J_v with z = h l, per eigenvalue l.
 
 J_q and J_v are the derivatives of the two-loop right-hand side by the independent positions and velocities. The
-corrections x of the independent accelerations solve (I - z^2 J_q - z J_v) x = r. Multiplied by T^T M T, where
-v = T v_i are the velocities that the constraints allow, T = [I; -Cqd^-1 Cqi], this is
+corrections x of the independent accelerations solve (I - z^2 J_q - z J_v) x = r. The velocities that the constraints
+allow are v = T v_i, T = [I; -Cqd^-1 Cqi]. Multiplied by T^T M T, the system becomes
 
-    T^T (M - z^2 K - z D) T x = T^T M T r,    K, D = derivatives by q, v of Q - Cq^T lam, lam held
+    T^T (M - z^2 K - z D) T x = T^T M T r.
 
-except for the changes of T and M with the position, and of Q_d with the velocity. These terms, zero for linear
-constraints, have no stiffness, and a simplified Newton may leave them out: at a tolerance the steps are the same, but
-fixed steps in which a body turns by some 0.4 rad may fail where differences of the right-hand side converge. X = T x is
-also the solution of a matrix with a border,
+K and D are the derivatives of Q - Cq^T lam by q and v, at constant lam. This omits the dependence of T and M on q, and
+of Q_d on v. The omitted terms are not stiff, and are zero for linear constraints, so that a simplified Newton's method
+does not need them. Under step-size control the steps are the same without them. Fixed steps in which a body turns by
+some 0.4 rad may fail without them, and converge with differences of the right-hand side.
+
+X = T x also solves a system with a bordered matrix,
 
     [[M - z^2 K - z D, Cq^T], [Cq, 0]] [X; mu] = [M T r; 0].
 
 There are three kinds of storage:
 
-- dense: J_q and J_v, (n_dof, n_dof), from the tangents K and D that the system gives, else by differences of the
-  right-hand side;
-- banded, where the system has a bandwidth b: K and D with the border, at a cost in proportion to n_q. Without tangents,
-  K and D are differenced in groups of columns that share no row, 2 b + 1 of them for every n_q (Curtis, Powell and Reid
-  1974, doi 10.1093/imamat/13.1.117). On the beam of 32 elements, sparse factors take 2.5 to 7 times as long;
-- sparse, for large systems, of which all coordinates count as independent: static factors of the matrix with the
-  border, its right-hand side [M r; G r]. K and D are differenced in groups of columns. Each time, the change that they
-  predict is compared with the effect of displacing all coordinates at once: if entries are missing, which were zero
-  when the pattern was recorded, another storage has to take over.
+- dense: J_q and J_v (n_dof, n_dof), from the tangents K and D if the system provides them, otherwise by differences of
+  the right-hand side;
+- banded, if the system has a bandwidth b: K, D and the border, at a cost proportional to n_q. Without tangents, K and D
+  are computed by differences in 2 b + 1 groups of columns that share no row (Curtis, Powell and Reid 1974, doi
+  10.1093/imamat/13.1.117). On the beam of 32 elements, sparse factors take 2.5 to 7 times as long;
+- sparse, for large systems: all coordinates are treated as independent, and the bordered matrix, with the right-hand
+  side [M r; G r], has a fixed sparsity pattern. K and D are computed by differences in groups of columns. Each time,
+  the change of the residual that they predict is compared with the effect of displacing all coordinates at once. A
+  deviation shows that entries are missing, which were zero when the pattern was recorded: other storage is then needed.
 """
 
 import numpy as np
@@ -79,36 +81,40 @@ from twoloop.kernels.steps.stages import (
     Q_STAGE,
     SYSTEMS,
     V_MOVED,
+    as_matrix,
     block,
     complex_vector,
     count_eigenvalues,
-    eigen_place,
+    eigen_offset,
+    matrix_storage,
     pivots_of,
-    space,
-    square,
-    system_space,
+    system_storage,
     vector,
 )
 
-MAX_ITERATIONS = 15
-SAME_STEP = 1e-9  # relative: steps are differences of times, so that equal steps are rounded differently at other times
-STAGNATION = 0.1  # relative to the step tolerance: corrections of this size that no longer shrink are rounding
+MAX_ITERATIONS = 15  # number of Newton iterations after which a step has failed
+# relative difference up to which step sizes count as equal: they are differences of times, with rounding errors
+SAME_STEP = 1e-9
+# over the step tolerance: up to this size, corrections that no longer decrease are taken for rounding errors
+STAGNATION = 0.1
 
-DIFFERENCE = 1e-7  # displacement for derivatives, relative to max(1, |value|)
-# factors between displacements made at once, so that their effects do not cancel: UNEQUAL^k, k below N_UNEQUAL
+DIFFERENCE = 1e-7  # displacement for differences, relative to max(1, |value|)
+# where all coordinates are displaced at once, that of index i is displaced by 1 + UNEQUAL (i mod N_UNEQUAL) times
+# DIFFERENCE: effects of equal displacements might cancel
 UNEQUAL, N_UNEQUAL = 0.37, 7
 
-# --- tangents: K and D, of which only the band |i - j| <= b is used
+# --- tangents K and D, of which only the band |i - j| <= b is computed and read
 
 
 @inlined
-def displace_unequally(value, place):
-    """Displace a coordinate or velocity along with all others, by unequal amounts, so that nothing cancels."""
-    return value + DIFFERENCE * max(1.0, abs(value)) * (1.0 + UNEQUAL * (place % N_UNEQUAL))
+def displace_unequally(value, index):
+    """Return a coordinate or velocity, displaced by an amount that depends on its index, see UNEQUAL."""
+    return value + DIFFERENCE * max(1.0, abs(value)) * (1.0 + UNEQUAL * (index % N_UNEQUAL))
 
 
 @compiled
 def _clear(A, b):
+    """Set the band |i - j| <= b of A to zero."""
     for i in range(A.shape[0]):
         for j in range(max(0, i - b), min(A.shape[0], i + b + 1)):
             A[i, j] = 0.0
@@ -116,6 +122,7 @@ def _clear(A, b):
 
 @compiled
 def _finite(A, b):
+    """Return DONE, or NOT_FINITE if an entry in the band |i - j| <= b of A is not finite."""
     for i in range(A.shape[0]):
         for j in range(max(0, i - b), min(A.shape[0], i + b + 1)):
             if not np.isfinite(A[i, j]):
@@ -125,7 +132,7 @@ def _finite(A, b):
 
 @compiled
 def _constraints_bend(f, w, t, q):
-    """Return whether C_q at q differs from w.G; w.Gx becomes C_q at q."""
+    """Return whether C_q at q differs from w.G. Overwrites w.Gx with C_q at q."""
     w.Gx[:, :] = 0.0
     constraint_rows(f, w, t, q, w.Gx)
     for i in range(w.C.size):
@@ -137,7 +144,10 @@ def _constraints_bend(f, w, t, q):
 
 @compiled
 def _subtract_reaction_differences(f, w, t, q, moved, b, K):
-    """Subtract d(Cq^T lam)/dq from K, by displacing coordinates j, j + 2 b + 1, ... at once."""
+    """Subtract d(Cq^T lam)/dq from the band of K, by differences; w.G is C_q at q.
+
+    Coordinates j, j + 2 b + 1, j + 2 (2 b + 1), ... are displaced at once. `moved` (n_q) is scratch.
+    """
     n = q.size
     for j in range(n):
         moved[j] = displace_unequally(q[j], j)
@@ -159,7 +169,10 @@ def _subtract_reaction_differences(f, w, t, q, moved, b, K):
 
 @compiled
 def tangent_by_q(f, w, t, q, v, b, moved, K, R):
-    """Compute the band |i - j| <= b of K (n_q, n_q), at a state that was just evaluated."""
+    """Compute the band |i - j| <= b of K (n_q, n_q) at the state evaluated last; return a code.
+
+    `moved` (n_q) and R (n_q, n_q) are scratch.
+    """
     _clear(K, b)
     f.force_by_q(t, q, v, f.p, K)
     if f.flags[REACTION_BY_Q_GIVEN] == 1:
@@ -175,7 +188,7 @@ def tangent_by_q(f, w, t, q, v, b, moved, K, R):
 
 @compiled
 def tangent_by_v(f, t, q, v, b, D):
-    """Compute the band of D (n_q, n_q); leave it unchanged if the force does not depend on v."""
+    """Compute the band |i - j| <= b of D (n_q, n_q) if the system provides it; return a code."""
     if f.flags[FORCE_BY_V_GIVEN] == 0:
         return DONE
     _clear(D, b)
@@ -188,7 +201,7 @@ def tangent_by_v(f, t, q, v, b, D):
 
 @compiled
 def reduce(w, A, AT, B):
-    """Compute B = T^T A T with T = [I; w.D^T]; AT (n_q, n_dof) is scratch."""
+    """Compute B (n_dof, n_dof) = T^T A T with T = [I; w.D^T], and AT (n_q, n_dof) = A T."""
     n, m = AT.shape
     columns = columns_of(w.index)
     for i in range(n):
@@ -211,21 +224,21 @@ def reduce(w, A, AT, B):
 
 @compiled
 def _dense_from_tangents(f, w, memory, s, t, q, v):
-    """Compute J_q and J_v from the tangents of the system, at a state that was just evaluated."""
+    """Compute J_q and J_v from the tangents of the system at the state evaluated last; return a code."""
     n = q.size
     m = w.independent.size
     w.counters[N_JACOBIANS] += 1
-    # factors are no longer needed: K or D use their memory, then T^T M T and T^T A
-    K, R = square(space(w, n, FILTER), n), square(space(w, n, SYSTEMS), n)
+    # K (then D), T^T M T and A T overwrite the factors, which are no longer needed
+    K, R = as_matrix(matrix_storage(w, n, FILTER), n), as_matrix(matrix_storage(w, n, SYSTEMS), n)
     code = tangent_by_q(f, w, t, q, v, n - 1, vector(memory, s, n, Q_MOVED), K, R)
     if code != DONE:
         return code
-    AT = space(w, n, SYSTEMS + 1)[: n * m].reshape((n, m))
+    AT = matrix_storage(w, n, SYSTEMS + 1)[: n * m].reshape((n, m))
     code = find_tangents(f, w, t, q)
     if code != DONE:
         return code
-    Jq, Jv = square(space(w, n, BY_Q), m), square(space(w, n, BY_V), m)
-    N = square(space(w, n, SYSTEMS), m)
+    Jq, Jv = as_matrix(matrix_storage(w, n, BY_Q), m), as_matrix(matrix_storage(w, n, BY_V), m)
+    N = as_matrix(matrix_storage(w, n, SYSTEMS), m)
     reduce(w, w.M, AT, N)
     if not ldl_factor(N):
         return SINGULAR
@@ -241,12 +254,12 @@ def _dense_from_tangents(f, w, memory, s, t, q, v):
 
 @compiled
 def _dense_derivatives(f, w, options, memory, s, t, q, v, a):
-    """Compute J_q and J_v at (t, q, v), whose accelerations a were just evaluated."""
+    """Compute J_q and J_v at (t, q, v), the state evaluated last, with accelerations a; return a code."""
     if f.flags[FORCE_BY_Q_GIVEN] == 1 and w.Rate.size == w.C.size:
         return _dense_from_tangents(f, w, memory, s, t, q, v)
     n = q.size
     m = w.independent.size
-    Jq, Jv = square(space(w, n, BY_Q), m), square(space(w, n, BY_V), m)
+    Jq, Jv = as_matrix(matrix_storage(w, n, BY_Q), m), as_matrix(matrix_storage(w, n, BY_V), m)
     q_moved, v_moved = vector(memory, s, n, Q_MOVED), vector(memory, s, n, V_MOVED)
     a_new = vector(memory, s, n, A_NEW)
     w.counters[N_JACOBIANS] += 1
@@ -293,9 +306,9 @@ def _dense_derivatives(f, w, options, memory, s, t, q, v, a):
 
 @compiled
 def _factor_dense(w, memory, s, which, z, matrix):
-    """Factor I - z^2 J_q - z J_v; `which`: the pivots, see `pivots_of`."""
+    """Factor I - z^2 J_q - z J_v into `matrix`; return a code. `which`: number of the pivots, see `pivots_of`."""
     n, m = w.Q.size, w.independent.size
-    Jq, Jv = square(space(w, n, BY_Q), m), square(space(w, n, BY_V), m)
+    Jq, Jv = as_matrix(matrix_storage(w, n, BY_Q), m), as_matrix(matrix_storage(w, n, BY_V), m)
     damped = memory[DAMPED] == 1.0
     for i in range(m):
         for j in range(m):
@@ -308,16 +321,17 @@ def _factor_dense(w, memory, s, which, z, matrix):
 
 @compiled
 def _filter_dense(w, options, memory, s, h, e_q, e_v):
+    """Replace e_v by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0; e_q and e_v have n_dof numbers."""
     n = w.Q.size
     m = e_q.size
-    gamma0 = options[eigen_place(s) + GAMMA0]
-    Jq = square(space(w, n, BY_Q), m)
+    gamma0 = options[eigen_offset(s) + GAMMA0]
+    Jq = as_matrix(matrix_storage(w, n, BY_Q), m)
     for i in range(m):
         total = 0.0
         for j in range(m):
             total += Jq[i, j] * e_q[j]
         e_v[i] += h * gamma0 * total
-    lu_solve(square(space(w, n, FILTER), m), pivots_of(memory, s, n, 0), e_v)
+    lu_solve(as_matrix(matrix_storage(w, n, FILTER), m), pivots_of(memory, s, n, 0), e_v)
 
 
 # --- banded storage
@@ -325,14 +339,18 @@ def _filter_dense(w, options, memory, s, h, e_q, e_v):
 
 @inlined
 def _band(numbers, n, b):
-    """Return the space of K or D as a band: entry (i, j) at [i, b + j - i]."""
+    """Return a view (n, 2 b + 1) of the storage of K or D, as a band: entry (i, j) is at [i, b + j - i]."""
     return numbers[: n * (2 * b + 1)].reshape((n, 2 * b + 1))
 
 
 @inlined
 def _border(w, n, r, b):
-    """Return the arrays behind K: independent rows of C_q, w.D, and the columns of its entries, at the same state."""
-    numbers = space(w, n, BY_Q)
+    """Return views of the arrays stored after K, for the state of K.
+
+    They are the r independent rows of C_q (r, n), a copy of w.D (n - r + 1, r), and the dependent coordinates (r) to
+    which its columns belong.
+    """
+    numbers = matrix_storage(w, n, BY_Q)
     start = n * (2 * b + 1)
     Cq = numbers[start : start + r * n].reshape((r, n))
     start += r * n
@@ -343,7 +361,7 @@ def _border(w, n, r, b):
 
 @compiled
 def _banded_residual(f, w, t, q, v):
-    """Compute Q - C_q^T lam into w.Q, with the multipliers in w.lam."""
+    """Compute Q - C_q^T lam at (t, q, v) into w.Q, with the multipliers of w.lam. Overwrites w.Gx with C_q."""
     w.counters[N_EVALUATIONS] += 1
     w.Q[:] = 0.0
     f.force(t, q, v, f.p, w.Q)
@@ -356,7 +374,11 @@ def _banded_residual(f, w, t, q, v):
 
 @compiled
 def _difference_groups(f, w, t, q, v, by_v, base, moved, b, band):
-    """Difference columns j, j + 2 b + 1, ... at once; return DONE, or NOT_FINITE."""
+    """Compute K, or D if `by_v`, into `band` by differences; return DONE, or NOT_FINITE.
+
+    Columns j, j + 2 b + 1, j + 2 (2 b + 1), ... are computed at once. `base` (n_q) is the residual at (q, v); `moved`
+    (n_q) is scratch.
+    """
     n = q.size
     given = v if by_v else q
     for group in range(2 * b + 1):
@@ -378,6 +400,7 @@ def _difference_groups(f, w, t, q, v, by_v, base, moved, b, band):
 
 @compiled
 def _copy_band(A, b, band):
+    """Copy the band of A (n, n) to `band` (n, 2 b + 1), see `_band`."""
     n = A.shape[0]
     for i in range(n):
         for j in range(max(0, i - b), min(n, i + b + 1)):
@@ -386,22 +409,23 @@ def _copy_band(A, b, band):
 
 @compiled
 def _band_from_tangents(f, w, memory, s, t, q, v, b):
+    """Store K and D, which the system provides, as bands, at the state evaluated last; return a code."""
     n = q.size
-    K, R = space(w, n, FILTER).reshape((n, n)), space(w, n, SYSTEMS).reshape((n, n))
+    K, R = matrix_storage(w, n, FILTER).reshape((n, n)), matrix_storage(w, n, SYSTEMS).reshape((n, n))
     code = tangent_by_q(f, w, t, q, v, b, vector(memory, s, n, Q_MOVED), K, R)
     if code != DONE:
         return code
-    _copy_band(K, b, _band(space(w, n, BY_Q), n, b))
+    _copy_band(K, b, _band(matrix_storage(w, n, BY_Q), n, b))
     memory[DAMPED] = f.flags[FORCE_BY_V_GIVEN]
     code = tangent_by_v(f, t, q, v, b, K)
     if memory[DAMPED] == 1.0:
-        _copy_band(K, b, _band(space(w, n, BY_V), n, b))
+        _copy_band(K, b, _band(matrix_storage(w, n, BY_V), n, b))
     return code
 
 
 @compiled
 def _banded_derivatives(f, w, memory, s, t, q, v):
-    """Compute K and D at a state that was just evaluated."""
+    """Compute K and D as bands, and the border, at the state (t, q, v) evaluated last; return a code."""
     n = q.size
     b = f.flags[BANDWIDTH]
     w.counters[N_JACOBIANS] += 1
@@ -418,7 +442,7 @@ def _banded_derivatives(f, w, memory, s, t, q, v):
     base, moved = vector(memory, s, n, A_NEW), vector(memory, s, n, Q_MOVED)
     _banded_residual(f, w, t, q, v)
     copy(w.Q, base)
-    code = _difference_groups(f, w, t, q, v, False, base, moved, b, _band(space(w, n, BY_Q), n, b))
+    code = _difference_groups(f, w, t, q, v, False, base, moved, b, _band(matrix_storage(w, n, BY_Q), n, b))
     if code != DONE:
         return code
     # displace all velocities at once: if nothing changes, no differences are needed
@@ -431,14 +455,17 @@ def _banded_derivatives(f, w, memory, s, t, q, v):
             memory[DAMPED] = 1.0
     if memory[DAMPED] == 0.0:
         return DONE
-    return _difference_groups(f, w, t, q, v, True, base, moved, b, _band(space(w, n, BY_V), n, b))
+    return _difference_groups(f, w, t, q, v, True, base, moved, b, _band(matrix_storage(w, n, BY_V), n, b))
 
 
 @compiled
 def _factor_banded(w, memory, s, b, which, z, numbers, factorize, substitute):
-    """Factor M - z^2 K - z D with its border; `which`: the pivots, see `pivots_of`."""
+    """Factor M - z^2 K - z D with its border into `numbers`; return a code.
+
+    `which`: number of the pivots, see `pivots_of`; `factorize`, `substitute`: LAPACK routines, real or complex.
+    """
     n = w.Q.size
-    K, D = _band(space(w, n, BY_Q), n, b), _band(space(w, n, BY_V), n, b)
+    K, D = _band(matrix_storage(w, n, BY_Q), n, b), _band(matrix_storage(w, n, BY_V), n, b)
     damped = memory[DAMPED] == 1.0
     target = lu_band(numbers, n, b)
     for i in range(n):
@@ -453,7 +480,7 @@ def _factor_banded(w, memory, s, b, which, z, numbers, factorize, substitute):
 
 @compiled
 def _all_coordinates(w, b, x, X):
-    """Compute X = T x; only the first n_dof numbers of x (n_q) are used, the others are scratch."""
+    """Compute X (n_q) = T x from the first n_dof numbers of x (n_q)."""
     n_dof = w.independent.size
     _, D, columns = _border(w, w.Q.size, w.rows.size, b)
     for i in columns:
@@ -466,7 +493,10 @@ def _all_coordinates(w, b, x, X):
 
 @compiled
 def _solve_for_independents(w, b, numbers, pivots, substitute, x):
-    """Solve with the full right-hand side x (n_q); its first n_dof numbers become the independent coordinates."""
+    """Solve the bordered system with the right-hand side x (n_q) for all coordinates.
+
+    Overwrites the first n_dof numbers of x with the independent coordinates of the solution.
+    """
     Cq, _, _ = _border(w, x.size, w.rows.size, b)
     solve_bordered(w, b, Cq, numbers, pivots, substitute, x)
     for k in range(w.independent.size):  # ascending, so that no number is overwritten before it is read
@@ -475,7 +505,10 @@ def _solve_for_independents(w, b, numbers, pivots, substitute, x):
 
 @compiled
 def _solve_banded(f, w, b, numbers, pivots, substitute, X, x):
-    """Solve for the independent part; only the first n_dof numbers of x (n_q) are used, the rest and X are scratch."""
+    """Solve (I - z^2 J_q - z J_v) y = x, and overwrite x with y, by the bordered matrix.
+
+    x and y are the first n_dof numbers of the array x (n_q); its other numbers and X (n_q) are scratch.
+    """
     _all_coordinates(w, b, x, X)
     x[:] = 0.0
     add_banded_mass_times(f, w, X, x)
@@ -484,11 +517,14 @@ def _solve_banded(f, w, b, numbers, pivots, substitute, X, x):
 
 @compiled
 def _filter_banded(f, w, options, memory, s, h, e_q, e_v):
-    """Replace e_v by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0: n_dof numbers of each (n_q)."""
+    """Replace e_v by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0.
+
+    The vectors are the first n_dof numbers of the arrays e_q and e_v (n_q).
+    """
     n = w.Q.size
     b = f.flags[BANDWIDTH]
-    z = h * options[eigen_place(s) + GAMMA0]
-    K, X = _band(space(w, n, BY_Q), n, b), vector(memory, s, n, Q_MOVED)
+    z = h * options[eigen_offset(s) + GAMMA0]
+    K, X = _band(matrix_storage(w, n, BY_Q), n, b), vector(memory, s, n, Q_MOVED)
     _all_coordinates(w, b, e_v, X)
     e_v[:] = 0.0
     add_banded_mass_times(f, w, X, e_v)
@@ -497,18 +533,20 @@ def _filter_banded(f, w, options, memory, s, h, e_q, e_v):
         for j in range(max(0, i - b), min(n, i + b + 1)):
             e_v[i] += z * K[i, b + j - i] * X[j]
     pivots = pivots_of(memory, s, n, 0)
-    _solve_for_independents(w, b, space(w, n, FILTER), pivots, DGBTRS, e_v)
+    _solve_for_independents(w, b, matrix_storage(w, n, FILTER), pivots, DGBTRS, e_v)
 
 
-# --- sparse storage, of all coordinates
-# relative to the change that the entries of a row predict: a larger deviation shows that entries are missing
+# --- sparse storage, for all coordinates
+
+# largest difference of the predicted and the actual change of a residual, relative to the sum of the absolute terms of
+# the prediction: a larger difference shows that entries are missing
 MAX_DEVIATION = 0.2
-NOISE = 1e-13  # relative to the largest force: rounding errors of a difference
-N_SPARSE_VECTORS = 3  # number of vectors of all coordinates: the force, the displaced force, and the displaced state
+NOISE = 1e-13  # rounding errors of a difference of residuals, relative to the largest force
+N_SPARSE_VECTORS = 3  # number of real vectors that _sparse_vectors returns first: `base`, `other` and `moved`
 
 
 def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_eigenvalues: int) -> int:
-    """Return the length of w.matrices: see _sparse_state, _sparse_vectors and _sparse_factors."""
+    """Return the length of w.matrices for sparse storage: see _sparse_state, _sparse_vectors and _sparse_factors."""
     n = int(program[N_PIVOTS])
     n_tangents = int(program[N_OF_MASS]) - n_mass
     one = n + 2 * int(program[N_OFF])
@@ -517,7 +555,7 @@ def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_eigenvalu
 
 @inlined
 def _sparse_state(f, w):
-    """Return the numbers of M, G, K and D, and for each row whether it is independent and how much it stiffens M."""
+    """Return views of the entries of M, G, K and D, and of w.counts and the stiffening of M for each row of G."""
     n_mass, n_jacobian, n_rows = w.mass_values.size, w.jacobian_values.size, w.counts.size
     a = n_mass + n_jacobian
     b = a + mass_of(f.newton_program)[0].size - n_mass
@@ -535,7 +573,7 @@ def _sparse_state(f, w):
 
 @inlined
 def _sparse_vectors(f, w):
-    """Return N_SPARSE_VECTORS vectors (n_q), sizes of pivots (N), and two complex vectors (N)."""
+    """Return views of scratch: three vectors (n_q), the sizes of pivots (N), and two complex vectors (N)."""
     n, begin = f.newton_program[N_PIVOTS], w.mass_values.size + w.jacobian_values.size
     begin += 2 * (mass_of(f.newton_program)[0].size - w.mass_values.size) + 2 * n
     n_q, numbers = w.Q.size, w.matrices
@@ -552,7 +590,7 @@ def _sparse_vectors(f, w):
 
 @inlined
 def _sparse_factors(f, w, k):
-    """Return the factors for gamma0 (k = 0), or for eigenvalue k - 1: complex numbers as pairs of real numbers."""
+    """Return a real view of the factors for gamma0 (k = 0), or of the complex ones for eigenvalue k - 1."""
     n = f.newton_program[N_PIVOTS]
     one = n + 2 * f.newton_program[N_OFF]
     begin = w.mass_values.size + w.jacobian_values.size + (N_SPARSE_VECTORS + 7) * n
@@ -564,7 +602,10 @@ def _sparse_factors(f, w, k):
 
 @compiled
 def _sparse_residual(f, w, t, q, v, moved, out):
-    """Compute Q - G^T lam into `out`; with `moved`, evaluate G again. Return the largest number added."""
+    """Compute Q - G^T lam at (t, q, v) into `out`; return the largest term of this sum.
+
+    If `moved`, q has changed, and G is evaluated first, into w.jacobian_values.
+    """
     w.counters[N_EVALUATIONS] += 1
     out[:] = 0.0
     f.force(t, q, v, f.p, out)
@@ -583,7 +624,10 @@ def _sparse_residual(f, w, t, q, v, moved, out):
 
 @compiled
 def _sparse_differences(f, w, t, q, v, by_v, base, other, moved, entries):
-    """Difference the entries of K, or of D, group by group; return DONE, or NOT_FINITE."""
+    """Compute the entries of K, or of D if `by_v`, by differences; return DONE, or NOT_FINITE.
+
+    All columns of a group are displaced at once. `base` is the residual at (q, v); overwrites `other` and `moved`.
+    """
     rows, columns, begins = tangents_of(f.newton_program)
     given = v if by_v else q
     for group in range(begins.size - 1):
@@ -603,8 +647,11 @@ def _sparse_differences(f, w, t, q, v, by_v, base, other, moved, entries):
 
 
 @compiled
-def _entries_explain(f, base, other, given, moved, largest, entries, predicted):
-    """Return whether these entries explain the change from base to other; `predicted` is scratch."""
+def _entries_are_complete(f, base, other, given, moved, largest, entries, predicted):
+    """Return whether the entries (of K or D) account for the change of the residual.
+
+    The residual changes from `base` to `other` as `given` changes to `moved`. Overwrites `other` and `predicted`.
+    """
     rows, columns, _ = tangents_of(f.newton_program)
     predicted[:] = 0.0
     for k in range(rows.size):
@@ -620,7 +667,10 @@ def _entries_explain(f, base, other, given, moved, largest, entries, predicted):
 
 @compiled
 def _sparse_derivatives(f, w, memory, t, q, v):
-    """Compute K and D at a state that was just evaluated; return NEEDS_DENSE if entries are missing."""
+    """Compute the entries of K and D at the state evaluated last; return a code.
+
+    The code is NEEDS_DENSE if there is no program for sparse storage, or if entries are missing in its pattern.
+    """
     if f.newton_program.size == 0:
         return NEEDS_DENSE
     w.counters[N_JACOBIANS] += 1
@@ -637,7 +687,7 @@ def _sparse_derivatives(f, w, memory, t, q, v):
     for j in range(q.size):
         moved[j] = displace_unequally(q[j], j)
     _sparse_residual(f, w, t, moved, v, True, other)
-    complete = _entries_explain(f, base, other, q, moved, largest, K, sizes[: q.size])
+    complete = _entries_are_complete(f, base, other, q, moved, largest, K, sizes[: q.size])
     copy(jacobian, w.jacobian_values)
     for j in range(q.size):
         moved[j] = displace_unequally(v[j], j)
@@ -655,12 +705,13 @@ def _sparse_derivatives(f, w, memory, t, q, v):
     for j in range(q.size):
         moved[j] = displace_unequally(v[j], j)
     _sparse_residual(f, w, t, q, moved, False, other)
-    complete = _entries_explain(f, base, other, v, moved, largest, D, sizes[: q.size]) and complete
+    complete = _entries_are_complete(f, base, other, v, moved, largest, D, sizes[: q.size]) and complete
     return DONE if complete else NEEDS_DENSE
 
 
 @compiled
 def _factor_sparse(f, w, z, values):
+    """Factor the bordered matrix for z into `values`, real or complex; return a code."""
     mass, jacobian, K, D, counts, stiffness = _sparse_state(f, w)
     _, _, _, sizes, _, _ = _sparse_vectors(f, w)
     load(f.newton_program, mass, jacobian, K, D, z, stiffness, values)
@@ -669,7 +720,7 @@ def _factor_sparse(f, w, z, values):
 
 @compiled
 def _sparse_right_side(f, w, r, right):
-    """Compute the right-hand side [M r; G r]; M includes the stiffening by redundant rows."""
+    """Compute the right-hand side [M r; G r] into `right`; M includes the stiffening by redundant rows."""
     mass, jacobian, _, _, counts, stiffness = _sparse_state(f, w)
     right[:] = 0.0
     rows, columns, _ = mass_of(f.newton_program)
@@ -683,10 +734,10 @@ def _sparse_right_side(f, w, r, right):
 
 @compiled
 def _filter_sparse(f, w, options, s, h, e_q, e_v):
-    """Replace e_v by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0."""
+    """Replace e_v (n_q) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0."""
     _, _, K, _, _, _ = _sparse_state(f, w)
     _, _, _, _, right, y = _sparse_vectors(f, w)
-    z, n = h * options[eigen_place(s) + GAMMA0], y.size
+    z, n = h * options[eigen_offset(s) + GAMMA0], y.size
     x = right.view(np.float64)[:n]
     _sparse_right_side(f, w, e_v, x)
     rows, columns, _ = tangents_of(f.newton_program)
@@ -696,12 +747,12 @@ def _filter_sparse(f, w, options, s, h, e_q, e_v):
     copy(x[: e_v.size], e_v)
 
 
-# --- functions that steps call, for any storage
+# --- functions for any storage, which steps call
 
 
 @compiled
 def derivatives_at(f, w, options, memory, s, t, q, v, a):
-    """Compute derivatives at a state (q, v) that was just evaluated, with accelerations a."""
+    """Compute the derivatives at (t, q, v), the state evaluated last, with accelerations a; return a code."""
     if f.flags[FORM] == STATIC:
         return _sparse_derivatives(f, w, memory, t, q, v)
     if f.flags[BANDWIDTH] >= 0:
@@ -711,46 +762,46 @@ def derivatives_at(f, w, options, memory, s, t, q, v, a):
 
 @compiled
 def factor_filter(f, w, options, memory, s, h):
-    """Factor the system of z = h gamma0, which is real."""
-    n, z = w.Q.size, h * options[eigen_place(s) + GAMMA0]
+    """Factor the system for z = h gamma0, which is real; return a code."""
+    n, z = w.Q.size, h * options[eigen_offset(s) + GAMMA0]
     w.counters[N_FACTORIZATIONS] += 1
     if f.flags[FORM] == STATIC:
         return _factor_sparse(f, w, z, _sparse_factors(f, w, 0))
     if f.flags[BANDWIDTH] >= 0:
-        return _factor_banded(w, memory, s, f.flags[BANDWIDTH], 0, z, space(w, n, FILTER), DGBTRF, DGBTRS)
-    return _factor_dense(w, memory, s, 0, z, square(space(w, n, FILTER), w.independent.size))
+        return _factor_banded(w, memory, s, f.flags[BANDWIDTH], 0, z, matrix_storage(w, n, FILTER), DGBTRF, DGBTRS)
+    return _factor_dense(w, memory, s, 0, z, as_matrix(matrix_storage(w, n, FILTER), w.independent.size))
 
 
 @compiled
 def _factor_system(f, w, memory, s, k, z):
-    """Factor the system of the k-th eigenvalue, which is complex."""
+    """Factor the complex system of eigenvalue k for z = h l; return a code."""
     n = w.Q.size
     w.counters[N_FACTORIZATIONS] += 1
     if f.flags[FORM] == STATIC:
         return _factor_sparse(f, w, z, _sparse_factors(f, w, 1 + k).view(np.complex128))
     if f.flags[BANDWIDTH] >= 0:
-        return _factor_banded(w, memory, s, f.flags[BANDWIDTH], 1 + k, z, system_space(w, n, k), ZGBTRF, ZGBTRS)
-    return _factor_dense(w, memory, s, 1 + k, z, square(system_space(w, n, k), w.independent.size))
+        return _factor_banded(w, memory, s, f.flags[BANDWIDTH], 1 + k, z, system_storage(w, n, k), ZGBTRF, ZGBTRS)
+    return _factor_dense(w, memory, s, 1 + k, z, as_matrix(system_storage(w, n, k), w.independent.size))
 
 
 @compiled
 def factor_systems(f, w, options, memory, s, h):
-    """Factor the systems of gamma0 and of every eigenvalue for steps of h; return the code."""
-    place = eigen_place(s)
-    n_eigen, n_real = count_eigenvalues(options, s), int(options[place + N_REAL])
+    """Factor the systems of gamma0 and of every eigenvalue for steps of size h; return a code."""
+    offset = eigen_offset(s)
+    n_eigen, n_real = count_eigenvalues(options, s), int(options[offset + N_REAL])
     code = factor_filter(f, w, options, memory, s, h)
-    place += N_EIGEN_SCALARS + s
+    offset += N_EIGEN_SCALARS + s
     for k in range(n_eigen):
-        if code == DONE and (k > 0 or n_real == 0):  # a real eigenvalue is gamma0
-            code = _factor_system(f, w, memory, s, k, h * complex(options[place], options[place + 1]))
-        place += 2 + 4 * s
+        if code == DONE and (k > 0 or n_real == 0):  # a real eigenvalue equals gamma0
+            code = _factor_system(f, w, memory, s, k, h * complex(options[offset], options[offset + 1]))
+        offset += 2 + 4 * s
     memory[H_FACTORED] = h
     return code
 
 
 @compiled
 def _solve_real(f, w, memory, s, x):
-    """Solve the system of gamma0; the first n_dof numbers of x (n_q) are overwritten."""
+    """Solve the system of gamma0; overwrite the first n_dof numbers of x (n_q) by the solution."""
     n, m = w.Q.size, w.independent.size
     if f.flags[FORM] == STATIC:
         _, _, _, _, right, y = _sparse_vectors(f, w)
@@ -760,14 +811,14 @@ def _solve_real(f, w, memory, s, x):
         copy(right.view(np.float64)[:n], x)
     elif f.flags[BANDWIDTH] >= 0:
         X, pivots = vector(memory, s, n, Q_MOVED), pivots_of(memory, s, n, 0)
-        _solve_banded(f, w, f.flags[BANDWIDTH], space(w, n, FILTER), pivots, DGBTRS, X, x)
+        _solve_banded(f, w, f.flags[BANDWIDTH], matrix_storage(w, n, FILTER), pivots, DGBTRS, X, x)
     else:
-        lu_solve(square(space(w, n, FILTER), m), pivots_of(memory, s, n, 0), x[:m])
+        lu_solve(as_matrix(matrix_storage(w, n, FILTER), m), pivots_of(memory, s, n, 0), x[:m])
 
 
 @compiled
 def _solve_complex(f, w, options, memory, s, k, x):
-    """Solve the k-th eigenvalue's system; the first n_dof numbers of x (n_q) are overwritten."""
+    """Solve the complex system of eigenvalue k; overwrite the first n_dof numbers of x (n_q) by the solution."""
     n, m = w.Q.size, w.independent.size
     if f.flags[FORM] == STATIC:
         _, _, _, _, right, y = _sparse_vectors(f, w)
@@ -776,15 +827,15 @@ def _solve_complex(f, w, options, memory, s, k, x):
         copy(right[:n], x)
     elif f.flags[BANDWIDTH] >= 0:
         X, pivots = complex_vector(memory, s, n, count_eigenvalues(options, s), 1), pivots_of(memory, s, n, 1 + k)
-        _solve_banded(f, w, f.flags[BANDWIDTH], system_space(w, n, k), pivots, ZGBTRS, X, x)
+        _solve_banded(f, w, f.flags[BANDWIDTH], system_storage(w, n, k), pivots, ZGBTRS, X, x)
     else:
-        lu_solve(square(system_space(w, n, k), m), pivots_of(memory, s, n, 1 + k), x[:m])
+        lu_solve(as_matrix(system_storage(w, n, k), m), pivots_of(memory, s, n, 1 + k), x[:m])
 
 
 @compiled
 def solve_system(f, w, options, memory, s, k, x):
-    """Solve the k-th eigenvalue's system; the first n_dof numbers of x (n_q) are overwritten."""
-    if k == 0 and options[eigen_place(s) + N_REAL] > 0.0:  # a real eigenvalue is gamma0
+    """Solve the system of eigenvalue k; overwrite the first n_dof numbers of x (n_q, complex) by the solution."""
+    if k == 0 and options[eigen_offset(s) + N_REAL] > 0.0:  # a real eigenvalue equals gamma0
         real = vector(memory, s, w.Q.size, V_MOVED)
         for i in range(x.size):
             real[i] = x[i].real
@@ -797,7 +848,10 @@ def solve_system(f, w, options, memory, s, k, x):
 
 @compiled
 def filter_error(f, w, options, memory, s, h, e_q, e_v):
-    """Replace e_v by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0: n_dof numbers of each (n_q)."""
+    """Replace e_v by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0.
+
+    The vectors are the first n_dof numbers of the arrays e_q and e_v (n_q).
+    """
     m = w.independent.size
     if f.flags[FORM] == STATIC:
         _filter_sparse(f, w, options, s, h, e_q, e_v)
@@ -809,20 +863,23 @@ def filter_error(f, w, options, memory, s, h, e_q, e_v):
 
 @compiled
 def correct(f, w, options, memory, s, residual, A_stage):
-    """Solve for the corrections of the stage accelerations and add them; `residual` becomes the corrections."""
+    """Solve for the corrections of the stage accelerations, add them to A_stage, and store them in `residual`.
+
+    Only the entries of independent coordinates in these arrays (s, n_q) are read and changed.
+    """
     n = w.Q.size
     m = w.independent.size
-    place = eigen_place(s)
-    n_real = int(options[place + N_REAL])
+    offset = eigen_offset(s)
+    n_real = int(options[offset + N_REAL])
     n_eigen = count_eigenvalues(options, s)
     x = complex_vector(memory, s, n, n_eigen, 0)
-    place += N_EIGEN_SCALARS + s
-    d = block(memory, s, n, Q_STAGE)  # not used between two evaluations
+    offset += N_EIGEN_SCALARS + s
+    d = block(memory, s, n, Q_STAGE)  # a scratch array, overwritten before the next evaluation
     d[:, :] = 0.0
     for k in range(n_eigen):
-        row = place + 2
+        row = offset + 2
         column = row + 2 * s
-        place += 2 + 4 * s
+        offset += 2 + 4 * s
         for i in range(m):
             total = complex(0.0, 0.0)
             for j in range(s):

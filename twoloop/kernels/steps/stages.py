@@ -1,6 +1,6 @@
-"""Common parts of implicit Runge-Kutta steps: parameters, prediction of stages, error at jumps, memory.
+"""Common parts of implicit Runge-Kutta steps: `options`, prediction of stages, error at jumps, layout of `memory`.
 
-To compile implicit steps takes a third of the time of the first run, so they are loaded when needed (`LazyStep`).
+Compiling the implicit steps takes a third of the time of the first run, so each is loaded when needed (`LazyStep`).
 """
 
 from importlib import import_module
@@ -13,12 +13,14 @@ from twoloop.kernels.control.step_size import commit_nothing
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed, compiled, inlined, kernel, merged
 from twoloop.kernels.data.indices import NOT_LOADED
 
-FARTHEST = 3.0  # largest step ratio over which the old stage polynomial is extrapolated
-# weight of `end_error` beside Richardson's estimate, because it is meant for jumps between ends and stages only
+# largest ratio of a step to the previous one at which the stage polynomial of the previous step predicts the stages
+MAX_STEP_RATIO = 3.0
+# factor on `end_error` where Richardson's estimate is used, too: `end_error` then serves for jumps only, between an end
+# of the step and the nearest stage
 END_ERROR_WEIGHT = 0.01
 
-# indices in `options`: scalars, then A (s, s), A A (s, s), b (s), b A (s), c (s) and two rows (s) for `end_error`.
-# EXTRAPOLATION: 1 / (2^order - 1), or 0: no extrapolation; POWER: order - 1
+# indices of the scalars in `options`; then follow A (s, s), A A (s, s), b (s), b A (s), c (s) and two rows (s) for
+# `end_error`. EXTRAPOLATION: 1 / (2^order - 1), or 0 for no extrapolation; POWER: order - 1
 STAGES, INNER_TOL, OUTER_TOL, EXTRAPOLATION, OUTER_TEST, POWER, N_SCALARS = range(7)
 
 
@@ -32,7 +34,10 @@ def options_array(
     outer_test: float = 1.0,
     power: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Return the parameter block that `tableau_of` reads; `outer_test` = 1: test (32) covers dependents, too."""
+    """Return the array `options` that `tableau_of` reads.
+
+    `outer_test`: 1 if test (32) of the paper also covers the dependent coordinates; `power`: order - 1.
+    """
     A, b, c = np.asarray(A), np.asarray(b), np.asarray(c)
     scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation, outer_test, power])
     rows = (b, b @ A, c, _lagrange(c, 0.0), _lagrange(c, 1.0))
@@ -40,7 +45,7 @@ def options_array(
 
 
 def _lagrange(nodes: NDArray[np.float64], x: float) -> NDArray[np.float64]:
-    """Return the weights of values at distinct nodes in their interpolating polynomial at x."""
+    """Return the values at x of the Lagrange polynomials of distinct nodes, (s)."""
     factors = (x - nodes[None, :]) / (nodes[:, None] - nodes[None, :] + np.eye(len(nodes)))
     np.fill_diagonal(factors, 1.0)
     return np.asarray(factors.prod(axis=1))
@@ -48,7 +53,7 @@ def _lagrange(nodes: NDArray[np.float64], x: float) -> NDArray[np.float64]:
 
 @inlined
 def tableau_of(options):
-    """Return views of the parameter block: s, A, A A, b, b A, c."""
+    """Return the number of stages s, and views of `options`: A, A A, b, b A, c."""
     s = int(options[STAGES])
     o = N_SCALARS
     A = options[o : o + s * s].reshape((s, s))
@@ -59,7 +64,7 @@ def tableau_of(options):
 
 @merged
 def middle_node(c):
-    """Return the node nearest to the middle."""
+    """Return the entry of c (s) that is nearest to 1/2."""
     nearest = 0
     for j in range(c.size):
         if abs(c[j] - 0.5) < abs(c[nearest] - 0.5):
@@ -69,7 +74,7 @@ def middle_node(c):
 
 @compiled
 def interpolate(c, theta, A_stage, weights, a):
-    """Evaluate the polynomial through (c_j, A_stage_j) at theta."""
+    """Evaluate the polynomial through the points (c_j, A_stage[j]) at theta into a (n); `weights` (s) is scratch."""
     s = c.size
     for j in range(s):
         product = 1.0
@@ -86,16 +91,16 @@ def interpolate(c, theta, A_stage, weights, a):
 
 @compiled
 def end_error(tolerances, options, h, state, new_state, A_stage):
-    """Estimate the error of a step from the polynomial through the stage accelerations, over (26).
+    """Return an estimate of the error of a step over the tolerances (26), from the stage accelerations (s, n).
 
-    The accelerations of the stages differ by w, a term of order h. At an end of the step the polynomial through them is
-    off by a term of order h^s. If each order is smaller by the same factor f, the term of the method's own order is h w
-    f^(order - 1). At a jump of the force terms do not become smaller, and the error is h w: steps shrink until the jump
-    does not matter. This includes jumps between an end and its nearest stage. The estimate must not be used alone: the
-    one term may pass through zero, and on pendulums errors of single steps then were 100 tolerances.
+    The stage accelerations have a range w of order h. At the ends of the step, the polynomial through them differs from
+    the accelerations there by e, of order h^s. If successive orders decrease by a constant factor f, then e = w
+    f^(s - 1), and the error of the method is h w f^(order - 1). If the force jumps, also between an end and the nearest
+    stage, orders do not decrease: the estimate is h w, and steps shrink until the jump does not matter. The estimate
+    must not be used alone: e may pass through zero, and errors of single steps of pendulums then were 100 tolerances.
     """
     s, n = A_stage.shape
-    place = N_SCALARS + 2 * s * s + 3 * s
+    offset = N_SCALARS + 2 * s * s + 3 * s
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
     top = 0.0
@@ -105,8 +110,8 @@ def end_error(tolerances, options, h, state, new_state, A_stage):
         for j in range(s):
             value = A_stage[j, m]
             low, high = min(low, value), max(high, value)
-            start += options[place + j] * value
-            end += options[place + s + j] * value
+            start += options[offset + j] * value
+            end += options[offset + s + j] * value
         width, missed = high - low, max(abs(start), abs(end))
         error = h * max(width, missed)
         if missed < width:
@@ -118,40 +123,42 @@ def end_error(tolerances, options, h, state, new_state, A_stage):
     return top
 
 
-# `options` of Newton's method: the parameter block above, then these scalars, the weights e (s) of the estimate, and
-# for each eigenvalue its real and imaginary part, its row of T^-1 and its column of T (s real, s imaginary parts each).
-# VELOCITIES: 1 if the error of velocities is tested, too
+# indices of further scalars in `options` of Newton's method, after the entries above. Then follow the weights e (s) of
+# the error estimate, and for each eigenvalue of A: its real and imaginary part, its row of T^-1 and its column of T (s
+# real, then s imaginary parts each). VELOCITIES: 1 if the error of velocities is tested, too
 N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
 
-# indices in `memory`
+# indices of the scalars in `memory`
 (
     HAS_TRIAL,
     H_TRIAL,
     HAS_PREVIOUS,
     H_PREVIOUS,
     HAS_JACOBIAN,
-    FRESH,  # 1: the derivatives are those of the present state
+    FRESH,  # 1: the derivatives were computed for this step; 0: before it, or at its end
     PARTITION_NUMBER,
     H_FACTORED,
-    CONTRACTION,  # contraction of the last iteration
+    CONTRACTION,  # ratio of the last two corrections of Newton's method
     DAMPED,  # 0: forces do not depend on v
-    SYMMETRIC,  # 1: the matrix of diagonal_step.py was factored as a symmetric one
-    DURATION,  # s: how long an error of velocity lasts, see velocity_errors.py; 0: not known
+    SYMMETRIC,  # 1: the factors of the matrix of diagonal_step.py are L D L^T, 0: L U
+    DURATION,  # s, duration of an error of the velocities, see velocity_errors.py; 0: not known
     CHANGED,  # 1: diagonal_step.py has computed new derivatives at the end of the step
     N_MEMORY_SCALARS,
 ) = range(14)
+# numbers of the blocks (s, n_q) in `memory`, and of the vectors (n_q) after them
 PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
-# parts of w.matrices, of n_q^2 numbers each; from SYSTEMS on a complex pair for each eigenvalue
+# numbers of the parts of w.matrices, of n_q^2 entries each; from SYSTEMS on, two parts for each eigenvalue hold a
+# complex matrix
 BY_Q, BY_V, FILTER, SYSTEMS = range(4)
 
 
 def newton_options(
     A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], velocities: bool
 ) -> NDArray[np.float64]:
-    """Return the part of `options` that follows that of stages.py; A has a basis of eigenvectors.
+    """Return the options of Newton's method, which follow those of `options_array` in `options`.
 
-    velocities : whether the error of velocities is tested.
+    A must be diagonalizable. `velocities`: whether the error of velocities is tested.
     """
     values, T = np.linalg.eig(A)
     inverse = np.linalg.inv(T)
@@ -166,9 +173,10 @@ def newton_options(
 
 
 def _estimate_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: float) -> NDArray[np.float64]:
-    """Return weights e: gamma0 f(y_n) + sum_j e_j f(Y_j) is a quadrature of order s less that of the method.
+    """Return the weights e (s) of the error estimate h (gamma0 f(y_n) + sum_j e_j f(Y_j)).
 
-    Hairer & Wanner II, (IV.8.16). With c_1 = 0 the stages already contain f(y_n): then the last stage is left out.
+    The estimate is the difference of an embedded quadrature of order s and the method (Hairer & Wanner II, (IV.8.16)).
+    If c_1 = 0, stage 1 already is f(y_n), and the embedded quadrature omits the last stage.
     """
     s = len(b)
     moments = 1.0 / np.arange(1.0, s + 1.0)
@@ -183,19 +191,20 @@ def _estimate_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: fl
 
 
 def memory_size(n_eigenvalues: int, s: int, n_q: int) -> int:
-    """Return the length of `memory`: scalars, blocks, vectors, pivots, two complex vectors, weights."""
+    """Return the length of `memory`: scalars, blocks, vectors, pivots, two complex scratch vectors, s weights."""
     return N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + 5 + n_eigenvalues) * n_q + s
 
 
 def n_matrices(n_eigenvalues: int) -> int:
-    """Return the number of spaces of n_q^2 numbers that w.matrices needs."""
+    """Return the number of parts of n_q^2 entries that w.matrices needs."""
     return SYSTEMS + 2 * n_eigenvalues
 
 
-# `options` are those of a Newton method of one stage, A = [[gamma]]; then the number of stages, A, c, b - b^ and
-# `lower` of this method, and 1 if steps with an error estimate continue from the embedded formula
-PLACE = N_SCALARS + 2 + 5
-TAIL = PLACE + N_EIGEN_SCALARS + 1 + 2 + 4
+# `options` of a diagonally implicit method begin with those of a Newton method of one stage, A = [[gamma]], whose
+# eigenvalue scalars are at NEWTON_OFFSET. From DIAGONAL_OFFSET on follow the number of stages, A, c, b - b^, `lower`,
+# and 1 if steps with an error estimate continue from the embedded formula
+NEWTON_OFFSET = N_SCALARS + 2 + 5
+DIAGONAL_OFFSET = NEWTON_OFFSET + N_EIGEN_SCALARS + 1 + 2 + 4
 
 
 def diagonal_options(
@@ -208,10 +217,11 @@ def diagonal_options(
     velocities: bool,
     embedded: bool,
 ) -> NDArray[np.float64]:
-    """Return the parameter block: A (s, s) has zeros in its first row, then gamma on the diagonal; b is its last row.
+    """Return the array `options` of a diagonally implicit method.
 
-    `lower`: weights of the estimate for accelerations that jump. `embedded`: the embedded formula has the higher order,
-    and steps continue from it.
+    The first row of A (s, s) is zero, the other diagonal entries are gamma, and the last row is b. `weights`: b - b^ of
+    the embedded formula. `lower`: weights of the error estimate where accelerations jump. `embedded`: whether steps
+    continue from the embedded formula, which then has the higher order.
     """
     A, c, weights, lower = (np.asarray(x, dtype=np.float64) for x in (A, c, weights, lower))
     gamma = A[-1, -1]
@@ -221,80 +231,82 @@ def diagonal_options(
 
 
 def diagonal_memory(s: int, n_q: int) -> NDArray[np.float64]:
-    """Allocate `memory`: that of a Newton method of one stage, then velocities and accelerations (s, n_q).
+    """Allocate `memory` of a diagonally implicit method.
 
-    Last come the accelerations (n_q) of the last stage of the last accepted step.
+    It begins with the memory of a Newton method of one stage. Then follow the velocities and the accelerations of the
+    stages (s, n_q each), and the accelerations (n_q) of the last stage of the last accepted step.
     """
     return np.zeros(memory_size(1, 1, n_q) + (2 * s + 1) * n_q)
 
 
 @merged
-def eigen_place(s):
-    """Return the first place of the eigenvalue scalars."""
+def eigen_offset(s):
+    """Return the offset of the scalars N_REAL, ... of Newton's method in `options`."""
     return N_SCALARS + 2 * s * s + 5 * s
 
 
 @merged
 def count_eigenvalues(options, s):
-    """Return the number of systems: one for each real eigenvalue and one for each pair."""
-    place = eigen_place(s)
-    return int(options[place + N_REAL] + options[place + N_PAIRS])
+    """Return the number of linear systems: one for each real eigenvalue of A and one for each complex pair."""
+    offset = eigen_offset(s)
+    return int(options[offset + N_REAL] + options[offset + N_PAIRS])
 
 
 @inlined
 def block(memory, s, n, which):
-    """Return a view of a stage block, (s, n)."""
+    """Return a view (s, n) of block number `which`, such as PREVIOUS, of `memory`."""
     start = N_MEMORY_SCALARS + which * s * n
     return memory[start : start + s * n].reshape((s, n))
 
 
 @inlined
 def vector(memory, s, n, which):
-    """Return a view of a vector, (n)."""
+    """Return a view (n) of vector number `which`, such as A_NEW, of `memory`."""
     start = N_MEMORY_SCALARS + (N_BLOCKS * s + which) * n
     return memory[start : start + n]
 
 
 @inlined
-def space(w, n, which):
-    """Return the space of one matrix, (n^2)."""
+def matrix_storage(w, n, which):
+    """Return a view (n^2) of part number `which`, such as BY_Q, of w.matrices."""
     return w.matrices[which * n * n : (which + 1) * n * n]
 
 
 @inlined
-def square(numbers, m):
-    """Return the first m^2 numbers of a space as a matrix."""
+def as_matrix(numbers, m):
+    """Return a view (m, m) of the first m^2 numbers."""
     return numbers[: m * m].reshape((m, m))
 
 
 @inlined
-def system_space(w, n, k):
-    """Return the space of the k-th eigenvalue's system, complex (n^2)."""
+def system_storage(w, n, k):
+    """Return a complex view (n^2) of the part of w.matrices for the system of eigenvalue k."""
     start = (SYSTEMS + 2 * k) * n * n
     return w.matrices[start : start + 2 * n * n].view(np.complex128)
 
 
 @inlined
 def _tail(memory, s, n, k):
+    """Return a view (2 n) of `memory` from k n numbers behind its vectors on."""
     start = N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + k) * n
     return memory[start : start + 2 * n]
 
 
 @inlined
 def pivots_of(memory, s, n, k):
-    """Return the row exchanges (n integers) of the filter (k = 0), or of the system of eigenvalue k - 1."""
+    """Return a view of the pivots (n integers) of the filter's matrix (k = 0), or of the system of eigenvalue k - 1."""
     return _tail(memory, s, n, k)[:n].view(np.int64)
 
 
 @inlined
 def complex_vector(memory, s, n, n_eigen, which):
-    """Return a complex scratch vector (n); `which` is 0 or 1."""
+    """Return a complex scratch vector (n), number 0 or 1."""
     return _tail(memory, s, n, 1 + n_eigen + 2 * which).view(np.complex128)
 
 
 @kernel(ATTEMPT)
 def stop_to_load(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Return NOT_LOADED, which stops the run, so that its caller loads the step."""
+    """Return an attempt with the code NOT_LOADED: the run pauses until its caller has loaded the real step."""
     return Attempt(NOT_LOADED, np.inf, 0.0)
 
 
@@ -302,22 +314,22 @@ PLACEHOLDER = Step(stop_to_load, commit_nothing)
 
 
 class LazyStep(NamedTuple):
-    """Reference to a step that is not imported yet: its module, such as "steps.newton_step", and its name there."""
+    """Reference to a step that need not be imported yet: its module, such as "steps.newton_step", and name there."""
 
     module: str
     name: str
 
 
-LOADED: dict[LazyStep, Step] = {}
+LOADED: dict[LazyStep, Step] = {}  # steps imported so far
 
 
 def loaded(step: Any) -> Any:
-    """Return a step; import its module first if it is a LazyStep."""
+    """Return the step itself; for a LazyStep, import its module if it is not imported yet."""
     if isinstance(step, LazyStep) and step not in LOADED:
         LOADED[step] = getattr(import_module(f"twoloop.kernels.{step.module}"), step.name)
     return without_loading(step)
 
 
 def without_loading(step: Any) -> Any:
-    """Return a step, or the placeholder if it is a LazyStep that nothing has loaded yet."""
+    """Return the step itself; for a LazyStep that is not imported yet, return PLACEHOLDER."""
     return LOADED.get(step, PLACEHOLDER) if isinstance(step, LazyStep) else step

@@ -1,12 +1,13 @@
-"""Estimate the position errors that errors of the velocities cause, for methods that step over vibrations.
+"""Estimate the position errors that velocity errors cause, for methods whose steps are longer than vibrations.
 
-An error e of the velocities moves the positions until it changes its sign or decays. J J e, J being the Jacobian of
-(v, F), shows the square of the rate at which it does. So the error due to a force that jumps within a step counts, and
-the error of vibrations that do not matter does not.
+A velocity error e changes the positions until e changes its sign or decays. It lasts for sqrt(|e| / |J J e|), where J
+is the Jacobian of (v, F). So the error due to a force that jumps within a step has an effect, and the error of fast
+vibrations has none. There are two exceptions:
 
-- This is the rate of the fastest component of the error. If a stiff damper acts beside a contact, the component in slow
-  directions lasts much longer: a filter for several steps at once leaves just this component.
-- If J was differenced before a contact began or ended, it has another rate, though Newton's method still contracts.
+- The duration is that of the fastest component of e. If a stiff damper acts beside a contact, the component in slow
+  directions lasts much longer. A filter with the length of several steps leaves only this component.
+- If J was computed by differences before a contact began or ended, it shows a wrong duration, though Newton's method
+  still converges. `derivatives_agree` detects this.
 """
 
 import numpy as np
@@ -19,22 +20,23 @@ from twoloop.kernels.steps import stages as at
 from twoloop.kernels.steps.newton_systems import DIFFERENCE
 from twoloop.kernels.steps.stages import INNER_TOL, block, vector
 
-# factor on the duration of an error that changes its sign as slowly as the motion: it is no vibration, and the errors
+# factor on the duration of an error that changes as slowly as the motion: such an error is no vibration, and the errors
 # of the next steps have the same sign
 SLOW_FACTOR = 10.0
-LONGEST_GAPS = 10.0  # times GAP: longest duration of an error
+LONGEST_GAPS = 10.0  # longest duration of an error, in units of GAP
 STEPS_TO_DECAY = 10.0  # number of steps after which a fast error has decayed
-FAST = 20.0  # duration, in steps, below which an error of the velocities counts as fast
-UNLIKE = 0.3  # relative difference of accelerations above which derivatives do not belong to a state
+FAST = 20.0  # duration over z = h gamma below which a velocity error counts as fast
+# relative change of J above which it counts as outdated
+UNLIKE = 0.3
 
 
 @compiled
 def filtered_velocity_error(w, memory, tolerances, z, raw, once, twice, state, new_state, a_end):
-    """Return the largest component of an error, filtered by (I - z J)^-1 `once` and `twice`, over the tolerances.
+    """Return the error over the tolerances that a velocity error (n_dof) causes, see `velocity_error`.
 
-    A velocity error counts as the smaller of two ratios: its ratio to the tolerance of the velocity, and the ratio of
-    the position error that it causes, until it changes its sign or decays, to that of the position. `a_end`: the
-    accelerations at the end, where a contact that begins in the step shows how fast the motion changes.
+    `raw` is the velocity error, `once` and `twice` are its results after one and two filters (I - z J)^-1. `a_end`
+    are the accelerations at the end of the step, which show how fast the motion changes if a contact began. Stores the
+    duration of the error in `memory`.
     """
     n = w.Q.size
     v, a = state[n : 2 * n], state[2 * n : 3 * n]
@@ -55,7 +57,11 @@ def filtered_velocity_error(w, memory, tolerances, z, raw, once, twice, state, n
 
 @compiled
 def velocity_error(w, tolerances, e_v, duration, state, new_state):
-    """Return the largest component of a velocity error of the given duration, over the tolerances."""
+    """Return the largest component of a velocity error e_v (n_dof) that lasts for `duration`, s, over the tolerances.
+
+    The component is the smaller of two ratios: of the velocity error to the tolerance of the velocity, and of the
+    position error that it causes in that time to the tolerance of the position.
+    """
     n = w.Q.size
     error = 0.0
     for i in range(w.independent.size):
@@ -68,7 +74,7 @@ def velocity_error(w, tolerances, e_v, duration, state, new_state):
 
 @compiled
 def motion_time(w, tolerances, state, a):
-    """Return the time in which accelerations a change the velocities of the motion, s."""
+    """Return the time, s, in which accelerations a (n_q) change velocities by their size; at most LONGEST_GAPS GAP."""
     n = w.Q.size
     fastest = change = 0.0
     for j in w.independent:
@@ -80,10 +86,10 @@ def motion_time(w, tolerances, state, a):
 
 @compiled
 def _derivatives_matter(w, memory, tolerances, z, raw, longest, state, new_state):
-    """Return whether an outdated J, not that of the end of the step, would change the estimate.
+    """Return whether the error estimate might be wrong if J is outdated.
 
-    It would if the velocity error `raw` mattered when it lasted longer than J shows, or if J has directions that are
-    fast relative to the step while Newton's method, which uses J, contracts as if they were slow.
+    This is so if the velocity error `raw` would exceed the tolerances if it lasted for `longest`, s. It is also so if J
+    shows a short duration, and Newton's method converges so slowly that J must have changed by more than UNLIKE.
     """
     duration = memory[at.DURATION]
     if duration < min(longest, FAST * z) and memory[at.CONTRACTION] * duration * duration > UNLIKE * z * z:
@@ -93,10 +99,11 @@ def _derivatives_matter(w, memory, tolerances, z, raw, longest, state, new_state
 
 @compiled
 def derivatives_agree(f, w, options, memory, s, t, z, tolerances, raw, e_q, e_v, state, new_state, a_end):
-    """Return whether J is that of the end of the step, at time t, or does not matter.
+    """Return whether J agrees with the equations at the end of the step, at time t, or does not change the estimate.
 
-    (e_q, e_v) is (I - z J)^-1 of the error, and `raw` its velocities; the product with J is compared with a difference
-    of accelerations.
+    (e_q, e_v) is (I - z J)^-1 times an error whose velocities are `raw`, so that (e_v - raw) / z is a product with J.
+    This product is compared with a difference of accelerations for a displacement by (e_q, e_v). `longest`: see
+    `motion_time`.
     """
     n = w.Q.size
     longest = max(motion_time(w, tolerances, state, state[2 * n :]), motion_time(w, tolerances, state, a_end))
@@ -104,10 +111,10 @@ def derivatives_agree(f, w, options, memory, s, t, z, tolerances, raw, e_q, e_v,
         return True
     q1, v1 = new_state[:n], new_state[n : 2 * n]
     Q, V = vector(memory, s, n, at.Q_MOVED), vector(memory, s, n, at.V_MOVED)
-    there, moved = block(memory, s, n, at.RESIDUAL)[0], block(memory, s, n, at.Q_STAGE)[0]
+    a_base, a_moved = block(memory, s, n, at.RESIDUAL)[0], block(memory, s, n, at.Q_STAGE)[0]
     copy(q1, Q)
     copy(v1, V)
-    if evaluate(f, w, t, Q, V, options[INNER_TOL], there) != DONE:
+    if evaluate(f, w, t, Q, V, options[INNER_TOL], a_base) != DONE:
         return False
     largest, size = 0.0, 1.0
     for i in range(w.independent.size):
@@ -121,14 +128,14 @@ def derivatives_agree(f, w, options, memory, s, t, z, tolerances, raw, e_q, e_v,
     for i in range(w.independent.size):
         Q[w.independent[i]] += factor * e_q[i]
         V[w.independent[i]] += factor * e_v[i]
-    if evaluate(f, w, t, Q, V, options[INNER_TOL], moved) != DONE:
+    if evaluate(f, w, t, Q, V, options[INNER_TOL], a_moved) != DONE:
         return False
     apart, widest, fastest = 0.0, 0.0, 0.0
     for i in range(w.independent.size):
         j = w.independent[i]
         scale = allowed(tolerances, j, state[n + j], new_state[n + j])
-        by_j, found = (e_v[i] - raw[i]) / z, (moved[j] - there[j]) / factor
-        apart = max(apart, abs(by_j - found) / scale)
-        widest = max(widest, abs(by_j) / scale, abs(found) / scale)
+        product, difference = (e_v[i] - raw[i]) / z, (a_moved[j] - a_base[j]) / factor
+        apart = max(apart, abs(product - difference) / scale)
+        widest = max(widest, abs(product) / scale, abs(difference) / scale)
         fastest = max(fastest, abs(e_v[i]) / scale)
     return apart <= UNLIKE * widest or widest * longest <= fastest
