@@ -1,8 +1,8 @@
-"""Step of the backward differentiation formulas, orders 1 to 5, for (q_i, v_i), its outer loop by fixed point.
+"""Step of the backward differentiation formulas, orders 1 to 5, for (q_i, v_i), with a fixed-point outer loop.
 
-The history consists of modified divided differences (Krogh), scaled to the step as in DASSL and IDA (fixed leading
-coefficient): any step size may follow any other, and with equal steps they are backward differences. They are
-differences of the full (q, v), dependents with their restored values, so that a new partition needs no conversion.
+The history consists of modified divided differences (Krogh), scaled to the step size as in DASSL and IDA (fixed leading
+coefficient), so that the step size can change in every step. At equal steps they are backward differences. Differences
+of all coordinates (q, v) are stored, including the dependent ones, so that a new partition needs no conversion.
 """
 
 from typing import Any
@@ -21,34 +21,34 @@ from twoloop.kernels.steps.stages import options_array as gauss_options
 MAX_ORDER = 5
 N_DIFFERENCES = MAX_ORDER + 2  # differences of orders 0 to MAX_ORDER + 1
 STARTER_STAGES = 3  # number of stages of the Gauss steps that begin a run of fixed steps
-MAX_ITERATIONS = 60
-SAFETY = 0.9  # safety factor of the step factor
-LEAST_FACTOR = 0.2
+MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
+SAFETY = 0.9  # factor on the step size for which the estimated error would be 1, after a rejected step
+LEAST_FACTOR = 0.2  # smallest ratio of successive step sizes after a rejected step
 STRICT = 10.0  # factor on the error estimate: errors of many short steps add up, and then come close to the tolerance
-BIAS = 6.0  # factor on the estimate that chooses the step size, as in VODE; with less, more steps are rejected
-OTHER_ORDER = 1.4  # ... and a further factor for another order, so that the order rarely changes back and forth
-KEEP_BELOW = 1.2  # a step that could grow by less than this keeps its size
-GROWTH = 2.0  # largest growth of a step
+BIAS = 6.0  # factor on the error estimate in the choice of the step size, as in VODE; a smaller one causes rejections
+OTHER_ORDER = 1.4  # factor on the error estimates of other orders, so that the order rarely changes back and forth
+KEEP_BELOW = 1.2  # ratio of step sizes from 1 to this at which the step size remains unchanged
+GROWTH = 2.0  # largest ratio of successive step sizes
 
-# places in `options`: scalars, then the parameter block of the Gauss steps
+# indices of the scalars in `options`; then follow the options of the Gauss steps
 HIGHEST, INNER_TOL, OUTER_TOL, N_SCALARS = range(4)
-# places in `memory`: scalars, rows of coefficients, then vectors; see _coefficients and _blocks
+# indices of the scalars in `memory`; then follow rows of coefficients and vectors, see _coefficients and _blocks
 (
-    HAS_TRIAL,  # 1: the last attempt stored the differences at its end
+    HAS_TRIAL,  # 1: the last attempt has stored the differences at the end of its step
     ORDER,
-    DEPTH,  # highest difference in the history
+    DEPTH,  # order of the highest difference in the history
     AGE,  # number of accepted steps since the order changed or the error test failed
     NEXT_ORDER,
     NEXT_DEPTH,
     N_MEMORY_SCALARS,
 ) = range(7)
-# rows of coefficients: times since the points of the history, from its last point and from the end of the step; error
-# constants of orders 0, 1, ...
+# numbers of the rows of coefficients. SPANS, NEW_SPANS: times, s, since the points of the history, measured from its
+# last point and from the end of the step; ERROR_CONSTANTS: of the orders 0, 1, ...
 SPANS, NEW_SPANS, ERROR_CONSTANTS, N_ROWS = range(4)
 
 
 def options_array(max_order: int, inner_tol: float, outer_tol: float, starter: Any) -> NDArray[np.float64]:
-    """Return the parameter block that the step reads; `starter`: the Gauss tableau of STARTER_STAGES stages."""
+    """Return the array `options` that the step reads; `starter`: the Gauss tableau of STARTER_STAGES stages."""
     gauss = gauss_options(starter.A, starter.b, starter.c, inner_tol, outer_tol, 0.0)
     return np.concatenate([[float(max_order), inner_tol, outer_tol], gauss])
 
@@ -60,13 +60,17 @@ def memory_size(n_q: int) -> int:
 
 @inlined
 def _coefficients(memory, row):
+    """Return a view (N_DIFFERENCES) of row number `row`, such as SPANS, of the coefficients."""
     start = N_MEMORY_SCALARS + row * N_DIFFERENCES
     return memory[start : start + N_DIFFERENCES]
 
 
 @inlined
 def _blocks(memory, n):
-    """Return differences and trial differences (N_DIFFERENCES, 2 n), prediction and its derivative (2 n), scratch."""
+    """Return views of `memory`: differences and trial differences (N_DIFFERENCES, 2 n each), and further vectors.
+
+    These are the prediction of (q, v) and its derivative (2 n each), and scratch.
+    """
     o = N_MEMORY_SCALARS + N_ROWS * N_DIFFERENCES
     size = N_DIFFERENCES * 2 * n
     differences = memory[o : o + size].reshape((N_DIFFERENCES, 2 * n))
@@ -77,7 +81,7 @@ def _blocks(memory, n):
 
 @kernel(SETTLE)
 def settle_bdf(f, w, options, memory, tolerances, accepted):
-    """Make the trial differences the history if the attempt was accepted; otherwise choose the next order."""
+    """After an accepted attempt, make the trial differences the history; after either, adopt the order chosen."""
     differences, trial, _, _, _ = _blocks(memory, w.Q.size)
     left = memory[HAS_TRIAL]
     memory[HAS_TRIAL] = 0.0
@@ -97,7 +101,7 @@ def settle_bdf(f, w, options, memory, tolerances, accepted):
 
 @compiled
 def _begin(memory, differences, state, h, order):
-    """Start a history: with order 1 from the state and its derivative, with order 0 from the state alone."""
+    """Start the history from the state and, if `order` is 1, its derivative."""
     size = differences.shape[1]
     for m in range(size):
         differences[0, m] = state[m]
@@ -109,7 +113,10 @@ def _begin(memory, differences, state, h, order):
 
 @compiled
 def _predict(memory, differences, trial, h, prediction, rate):
-    """Scale the differences to a step of h into `trial`; extrapolate the polynomial of degree ORDER and its rate."""
+    """Scale the differences to a step of h into `trial`; compute the error constants, the prediction and its rate.
+
+    The prediction extrapolates the polynomial of degree ORDER to the end of the step; `rate` is its derivative there.
+    """
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, new_spans = _coefficients(memory, SPANS), _coefficients(memory, NEW_SPANS)
     constants = _coefficients(memory, ERROR_CONSTANTS)
@@ -137,7 +144,7 @@ def _predict(memory, differences, trial, h, prediction, rate):
 
 @merged
 def _corrector_length(h, k):
-    """Return the length c of the corrector, h / (1 + 1/2 + ... + 1/k)."""
+    """Return the coefficient c of the corrector, h / (1 + 1/2 + ... + 1/k), s."""
     leading = 0.0
     for j in range(k):
         leading += 1.0 / (j + 1.0)
@@ -146,13 +153,13 @@ def _corrector_length(h, k):
 
 @compiled
 def _correct(f, w, options, t, c, prediction, rate, new_state, a_new):
-    """Solve y = prediction + c (y' - rate) at t for the independents, by fixed-point iteration on their accelerations.
+    """Solve y = prediction + c (y' - rate) at time t for y = (q_i, v_i); return a code.
 
-    On return the whole new state is consistent.
+    The fixed-point iteration is on the independent accelerations. `new_state` becomes consistent as a whole.
     """
     n = w.Q.size
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    copy(prediction, new_state[: 2 * n])  # dependent coordinates: start values of Newton's method
+    copy(prediction, new_state[: 2 * n])  # entries of dependent coordinates: start values of Newton's method
     copy(rate[n:], a1)
     before = np.inf
     for iteration in range(MAX_ITERATIONS):
@@ -169,7 +176,7 @@ def _correct(f, w, options, t, c, prediction, rate, new_state, a_new):
             change = max(change, difference / max(abs(v1[m]), 1.0))
             change = max(change, c * difference / max(abs(q1[m]), 1.0))
         copy(a_new, a1)
-        # the first iteration evaluates the prediction, which is never accepted: extrapolation alone is unstable
+        # the first iteration evaluates the prediction, which is never the result: extrapolation alone is unstable
         if iteration > 0 and (change <= options[OUTER_TOL] or (change >= before and change <= rounding_floor(q1))):
             for k in range(w.dependent.size):
                 m = w.dependent[k]
@@ -194,11 +201,11 @@ def _norm(tolerances, y, y1, d, sign, difference):
 
 @compiled
 def _judge(options, memory, tolerances, trial, y, y1, d):
-    """Estimate the error from d = y1 - prediction; store the next order in `memory`; return error and step factor."""
+    """Return the error, from d = y1 - prediction, and the ratio of the next step size to h; set NEXT_ORDER."""
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, constants = _coefficients(memory, NEW_SPANS), _coefficients(memory, ERROR_CONSTANTS)
     norm = STRICT * _norm(tolerances, y, y1, d, 0.0, d)
-    # with unequal steps the interpolation of the history has an error, too; as in DASSL the larger one counts
+    # at unequal steps the interpolation of the history has an error, too; as in DASSL, the larger error counts
     interpolation = spans[0] / spans[k]
     for j in range(k):
         interpolation += spans[0] / spans[j] - 1.0 / (j + 1.0)
@@ -215,7 +222,7 @@ def _judge(options, memory, tolerances, trial, y, y1, d):
             memory[NEXT_ORDER] = k - 1
         return error, max(SAFETY * error ** (-1.0 / (k + 1)), LEAST_FACTOR)
     factor = (BIAS * here) ** (-1.0 / (k + 1))
-    if memory[AGE] >= k:  # the estimates require k + 1 steps of this order
+    if memory[AGE] >= k:  # estimates for other orders require k + 1 steps at this order
         lower, higher = (BIAS * below) ** (-1.0 / k), (BIAS * above) ** (-1.0 / (k + 2))
         if lower > max(factor, higher):
             memory[NEXT_ORDER] = k - 1
@@ -231,7 +238,7 @@ def _judge(options, memory, tolerances, trial, y, y1, d):
 
 @compiled
 def _extend(memory, trial, y1, d):
-    """Update the scaled differences to those at the end of the step."""
+    """Replace the scaled differences in `trial` by those at the end of the step, (t + h, y1)."""
     k = int(memory[ORDER])
     memory[NEXT_DEPTH] = k + 1
     if memory[DEPTH] > k and k < MAX_ORDER:
@@ -247,7 +254,7 @@ def _extend(memory, trial, y1, d):
 
 @compiled
 def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
-    """Take a step of the starter, of order 6."""
+    """Take a step of the Gauss method of order 6, which starts the history of fixed steps; return a code."""
     s, n = STARTER_STAGES, w.Q.size
     q1, v1 = new_state[:n], new_state[n : 2 * n]
     A_stage = scratch[: s * n].reshape((s, n))
@@ -280,7 +287,7 @@ def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
 def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt a step: predict from the history, correct, and choose the order and the size of the next step.
 
-    Fixed steps use the highest order; the history that it needs comes from as many Gauss steps.
+    Fixed steps have the order HIGHEST. As many Gauss steps precede them, to start the history.
     """
     n = w.Q.size
     differences, trial, prediction, rate, scratch = _blocks(memory, n)

@@ -1,10 +1,10 @@
-"""Iterate implicit Runge-Kutta steps by fixed point: two outer loops, and the layout of their `memory`.
+"""Solve for the stages of implicit Runge-Kutta steps by fixed-point iteration: two outer loops, and their `memory`.
 
-`iterate_accelerations` iterates on the stage accelerations alone (the tableau applied twice to q'' = a),
-`iterate_first_order` is the paper's loop on y_i = [v_i, q_i]. They are compiled in the steps that call them,
-fixed_point_step.py. Equation numbers are the paper's.
+`iterate_accelerations` iterates on the stage accelerations (the tableau applied twice to q'' = a).
+`iterate_first_order` is the loop of the paper on y_i = [v_i, q_i]. Both are compiled as parts of the steps in
+fixed_point_step.py. Equation numbers refer to the paper.
 
-Richardson's estimate: the difference of one step and two half steps is the error, and may be used to extrapolate.
+Richardson's estimate of the error is the difference between a step and two half steps. It also serves to extrapolate.
 """
 
 import numpy as np
@@ -16,11 +16,12 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, restore, rounding_fl
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TEST, OUTER_TOL, tableau_of
 
-# rows of REST, for the compensated sums of fixed steps: rounding errors of q and of v, at the last accepted step and in
-# this attempt. Without them the energy of a symmetric method drifts with the number of steps
+# number of rows of REST, the rounding errors in the compensated sums of fixed steps: of q and v at the last accepted
+# step, then of q and v in this attempt. Without compensation, the energy of a symmetric method drifts with the number
+# of steps
 N_RESTS = 4
 
-# scalars, then stage blocks (s, n_q) and vectors (n_q)
+# indices in `memory` of scalars, of the stage blocks (s, n_q) after them, and of the vectors (n_q) after these
 HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(5)
 PREVIOUS, TRIAL, HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, REST, N_VECTORS = (*range(8), 7 + N_RESTS)
@@ -33,42 +34,45 @@ def memory_size(s: int, n_q: int) -> int:
 
 @inlined
 def block(memory, s, n, which):
-    """Return a view of a block of the stages, (s, n)."""
+    """Return a view (s, n) of block number `which`, such as PREVIOUS, of `memory`."""
     start = N_MEMORY_SCALARS + which * s * n
     return memory[start : start + s * n].reshape((s, n))
 
 
 @inlined
 def vector(memory, s, n, which):
-    """Return a view of a vector of the coordinates, (n)."""
+    """Return a view (n) of vector number `which`, such as Q_FULL, of `memory`."""
     start = N_MEMORY_SCALARS + N_BLOCKS * s * n + which * n
     return memory[start : start + n]
 
 
 @inlined
 def rests_of(memory, s, n, tolerances):
-    """Return the rows of REST; no rows with step-size control, whose errors exceed rounding."""
+    """Return a view (N_RESTS, n) of REST, or (0, n) under step-size control, where rounding errors do not matter."""
     start, count = N_MEMORY_SCALARS + (N_BLOCKS * s + REST) * n, N_RESTS if tolerances[ESTIMATE] == 0.0 else 0
     return memory[start : start + count * n].reshape((count, n))
 
 
 @merged
 def store_rest(rest):
-    """Store the rounding errors of an accepted attempt for the next step."""
+    """Copy the rounding errors of an accepted attempt to the rows of the last accepted step."""
     for i in range(rest.shape[0] // 2):
         copy(rest[rest.shape[0] // 2 + i], rest[i])
 
 
-MAX_ITERATIONS = 60
-MAX_ITERATIONS_PAPER = 200  # the paper gives no limit; (33) ends a divergent loop long before this
-GROWTH = 1e3  # largest growth of the changes: at first they may grow, because the iteration matrix is not normal
-PATIENCE = 8  # number of iterations after which a growing change means divergence
+MAX_ITERATIONS = 60  # number of iterations after which `iterate_accelerations` has failed
+MAX_ITERATIONS_PAPER = 200  # that of `iterate_first_order`; in the paper there is none, but (33) ends divergent loops
+GROWTH = 1e3  # ratio of a change to the first one that means divergence: as the matrix is not normal, changes may grow
+PATIENCE = 8  # number of iterations after which a change larger than the previous one means divergence
 UNDECIDED, CONVERGED, DIVERGED = range(3)
 
 
 @merged
 def _judge(change, before, first, iteration, tolerance, q):
-    """Return UNDECIDED, CONVERGED or DIVERGED, from the last, previous and first change and the rounding of q."""
+    """Return UNDECIDED, CONVERGED or DIVERGED, from the last, the previous and the first change in the iteration.
+
+    A change that does not decrease, and is not larger than rounding errors of q, means convergence.
+    """
     if change <= tolerance:
         return CONVERGED
     if not change <= GROWTH * first:
@@ -83,7 +87,7 @@ def _judge(change, before, first, iteration, tolerance, q):
 
 @exact
 def _compensated(x, rest, increment):
-    """Return the sum of the arguments, and its rounding error (W. Kahan, Commun. ACM 8 (1965), 40)."""
+    """Return x + rest + increment, and the rounding error of this sum (W. Kahan, Commun. ACM 8 (1965), 40)."""
     increment += rest
     total = x + increment
     return total, increment - (total - x)
@@ -91,7 +95,7 @@ def _compensated(x, rest, increment):
 
 @merged
 def _clear_rests(coordinates, rest):
-    """Clear the rounding errors of coordinates that the constraints determine."""
+    """Set the rounding errors of this attempt to zero for the given coordinates, which the constraints determine."""
     for i in range(N_RESTS // 2, rest.shape[0]):
         for m in coordinates:
             rest[i, m] = 0.0
@@ -99,12 +103,12 @@ def _clear_rests(coordinates, rest):
 
 @compiled
 def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1, rest):
-    """Take a step of size h from (q, v) by a fixed-point iteration on the stage accelerations.
+    """Take a step of size h from (q, v) by a fixed-point iteration on the stage accelerations; return code, departure.
 
-    A_stage is their prediction on entry; on return it has converged, and (q1, v1) is the end of the step, on the
-    constraints. Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k have the same solution as
-    (17); for undamped systems the iteration's rate is the square of the first-order one. The sums are compensated
-    where `rest` has rows. Returns the code, and the departure of the predicted dependents.
+    A_stage (s, n) is the prediction of the accelerations on entry, and the result on return; (q1, v1) becomes the end
+    of the step, on the constraints. The stages Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk
+    a_k are the solution of (17). For undamped systems the rate of convergence is the square of that of the first-order
+    iteration. Sums are compensated if `rest` has rows. `departure` is explained in step_size.py.
     """
     s, A, A2, b, bA, c = tableau_of(options)
     n = q.size
@@ -120,7 +124,7 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
     verdict = UNDECIDED
     for iteration in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1
-        # compute all stages before evaluating any: in Gauss-Seidel order the iteration converges for smaller h only
+        # all stages are computed before any is evaluated: in Gauss-Seidel order, convergence requires a smaller h
         for j in range(s):
             for m in w.independent:
                 in_q = 0.0
@@ -166,6 +170,7 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
 
 @merged
 def _largest_change(coordinates, q, v, q_old, v_old):
+    """Return the largest change of the coordinates and their velocities, relative to max(1, |value|)."""
     change = 0.0
     for m in coordinates:
         change = max(change, abs(q[m] - q_old[m]) / max(abs(q[m]), 1.0))
@@ -175,10 +180,11 @@ def _largest_change(coordinates, q, v, q_old, v_old):
 
 @compiled
 def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1):
-    """Take a step of size h by the paper's outer loop on y_i = [v_i, q_i]: Euler start, tests (32) and (33).
+    """Take a step of size h by the paper's outer loop on y_i = [v_i, q_i]; return a code.
 
-    `a` is the acceleration at (t, q, v); K_j = [a_j; v_j] are the rows of A_stage and V_stage. An iteration updates one
-    stage after another with the latest K (Gauss-Seidel). On return (q1, v1) is the end of the step, on the constraints.
+    The loop starts from an Euler step, and ends by the tests (32) and (33). `a` are the accelerations at (t, q, v). Row
+    j of A_stage and of V_stage is K_j = [a_j; v_j]. An iteration updates one stage after another with the latest K
+    (Gauss-Seidel). (q1, v1) becomes the end of the step, on the constraints.
     """
     s, A, _, b, _, c = tableau_of(options)
     n = q.size
@@ -238,9 +244,9 @@ def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage,
 
 @compiled
 def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
-    """Return the difference of one step and two half steps over (26), for all positions and velocities.
+    """Return the difference between a step and two half steps over the tolerances (26), in positions and velocities.
 
-    It is the largest component, or the root mean square (27).
+    If `largest`, return its largest component, otherwise the root mean square (27).
     """
     rtol = tolerances[RTOL]
     total = 0.0
@@ -256,7 +262,10 @@ def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
 
 @compiled
 def estimate_and_extrapolate(f, w, share, inner_tol, t, tolerances, q, v, q_full, v_full, q1, v1):
-    """Return the error of two half steps; if a share is given, extrapolate these with the whole step."""
+    """Return a code and the error; if `share` > 0, also extrapolate (q1, v1).
+
+    (q1, v1) is the end of two half steps, (q_full, v_full) that of a step; `share` is 1 / (2^order - 1).
+    """
     error = _richardson_error(tolerances, share > 0.0, q, v, q_full, v_full, q1, v1)
     if not (share > 0.0 and error <= 1.0):
         return DONE, error

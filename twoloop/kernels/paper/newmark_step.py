@@ -1,4 +1,4 @@
-"""Newmark step, with an outer loop by fixed point on independent accelerations. Equation numbers are the paper's."""
+"""Newmark step: the outer loop is a fixed-point iteration on independent accelerations. Equation numbers: the paper."""
 
 import numpy as np
 
@@ -8,31 +8,33 @@ from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, GAP, N_OUTER, OUT
 from twoloop.kernels.evaluation.inner_loop import evaluate_state, rounding_floor
 from twoloop.kernels.linalg.dense import copy
 
-MAX_ITERATIONS = 60
-GROWN = 2.0  # ratio of the size to that before the step above which most of it is due to this step
-TINY = 1e-300  # replaces size and rate of a mechanism at rest at the origin
+MAX_ITERATIONS = 60  # number of iterations after which a step has failed
+# ratio of the largest coordinate after the step to that before the step, above which it is mainly due to this step
+GROWN = 2.0
+TINY = 1e-300  # added to a tolerance that is zero for a mechanism at rest at the origin
 
-# places in `memory` before the new accelerations
+# indices in `memory`, before the new accelerations (n_q): largest coordinate, velocity and acceleration so far
 SIZE, SPEED, ACCELERATION, N_MEMORY_SCALARS = range(4)
 
-# places in `options`
+# indices in `options`
 BETA, GAMMA, INNER_TOL, OUTER_TOL, ERROR_TOL, N_OPTIONS = range(6)
 
 
 @merged
-def _largest(x, least):
+def _largest(x, at_least):
+    """Return the largest absolute value in x, or `at_least` if this is larger."""
     for m in range(x.size):
-        least = max(least, abs(x[m]))
-    return least
+        at_least = max(at_least, abs(x[m]))
+    return at_least
 
 
 @compiled
 def _rate(memory, gap, q, v, a, q1, v1, a1):
-    """Return the reciprocal of the time in which velocities and accelerations change the coordinates as a whole.
+    """Return the reciprocal, 1/s, of the time in which velocities and accelerations change coordinates by their size.
 
-    It uses the largest values so far, because at a single time coordinates may be near zero, wherever the origin is. If
-    most of their size is due to this step, as after rest at the origin, they do not determine that time: it is then at
-    least `gap`.
+    Sizes are the largest absolute values so far, because all coordinates may be near zero at a single time, depending
+    on the origin. If the size of the coordinates is mainly due to this step, as after rest at the origin, the time is
+    at least `gap`, s.
     """
     memory[SIZE] = _largest(q, memory[SIZE])
     memory[SPEED] = _largest(v, memory[SPEED])
@@ -46,10 +48,10 @@ def _rate(memory, gap, q, v, a, q1, v1, a1):
 
 @compiled
 def _error(options, tolerances, rate, h, q, v, a, a1):
-    """Return e = |beta - 1/6| h^2 |a1 - a|, the leading local error of q for gamma = 1/2, over the tolerances.
+    """Return the error from e = |beta - 1/6| h^2 |a1 - a|, the leading local error of q for gamma = 1/2.
 
-    It is the largest component of e / h over rate * atol + rtol |v|: the error per unit step, of order h^2 like the
-    error of the run. With ERROR_TOL > 0 it is the 2-norm of e over ERROR_TOL (the paper's err_out).
+    It is the largest component of e / h over rate * atol + rtol |v|. This error per unit step is of order h^2, as is
+    the error of the run. If ERROR_TOL > 0, it is the 2-norm of e over ERROR_TOL (err_out in the paper).
     """
     factor = abs(options[BETA] - 1.0 / 6.0) * h
     total = 0.0
@@ -63,7 +65,7 @@ def _error(options, tolerances, rate, h, q, v, a, a1):
 
 @kernel(ATTEMPT)
 def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step: (12) for the independents, inner loop, accelerations, repeated until the latter converge."""
+    """Attempt a step: repeat (12) for independent coordinates, inner loop and accelerations until these converge."""
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
@@ -71,7 +73,7 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
     a_new = memory[N_MEMORY_SCALARS : N_MEMORY_SCALARS + n]
     for m in range(n):
         a1[m] = a[m]
-        q1[m] = q[m] + h * v[m] + 0.5 * h * h * a[m]  # for the dependents these are start values of Newton's method
+        q1[m] = q[m] + h * v[m] + 0.5 * h * h * a[m]  # start values of Newton's method for dependent coordinates
     before = np.inf
     for _ in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1

@@ -26,9 +26,7 @@ STRICT = 5.0  # factor on the error estimate: errors of many short steps add up,
 SAFETY = 0.8  # factor on the step size for which the estimated error would be 1
 GROWTH, SHRINKAGE = 1.2, 0.5  # largest and smallest ratio of successive step sizes
 START_GROWTH = 2.0  # largest ratio of successive step sizes while the order still rises with every step
-LEAST_FACTOR = (
-    0.1  # smallest ratio of step sizes after a step whose dependent positions differ much from the prediction
-)
+LEAST_FACTOR = 0.1  # smallest ratio of step sizes after a step whose dependent positions differ from the prediction
 RESTART_AFTER = 3  # number of successive failures after which the method restarts with order 1
 
 # eight Gauss nodes on [0, 1] and their weights: exact for c_i and (1 - s) c_i up to i = 15

@@ -1,19 +1,19 @@
 """Step across a singular position, where C_q loses rank, such as a parallelogram with its bars in line.
 
-Near such a position no partition determines the dependent coordinates well. Loops on independent coordinates do not
-converge there, nor does iteration with stages off the constraints, though the motion is smooth. This step is a
-collocation at Gauss nodes whose stages are projected onto the constraints: there the accelerations are those of the
+Near such a position no partition determines the dependent coordinates well. Although the motion is smooth, outer loops
+on independent coordinates do not converge there, nor do iterations whose stages violate the constraints. This step is a
+collocation at Gauss nodes whose stages are projected onto the constraints. Then the accelerations are those of the
 motion, and the fixed-point iteration converges as it does elsewhere.
 
-- At a distance s from the position (relative, as pivots measure it) rounding changes positions by eps/s, velocities by
-  eps/s^2 and accelerations by eps/s^3. Nodes at which this would show are left out: the accelerations there are those
-  of the polynomial through the other nodes on both sides, because the motion through the position is analytic.
-- Only q and v at the beginning enter the result: the accelerations there may be rounding.
-- The end is put on the constraints with a partition of its own.
-- Stages are projected by the generated code of the mechanism. A partition is chosen at a stage only where there is no
-  such code, or where its pivots are too small.
-- A stage that its projection moves by more than the tolerances is on another branch of the motion, or the polynomial
-  is not accurate: the step is rejected.
+- At a relative distance s from the position (a ratio of pivots), rounding errors are eps/s in positions, eps/s^2 in
+  velocities and eps/s^3 in accelerations. Nodes with too large rounding errors are left out. Their accelerations are
+  those of the polynomial through the other nodes on both sides, because the motion through the position is analytic.
+- The result depends on q and v at the beginning only: the accelerations there may consist of rounding errors.
+- The end of the step is projected onto the constraints with a partition chosen there.
+- The generated code of the mechanism projects the stages. If there is no generated code, or if its pivots are too
+  small, the general code does so, with a partition chosen at the stage.
+- The step is rejected if the projection changes a stage by more than the tolerances: the stage is on another branch of
+  the motion, or the polynomial is inaccurate.
 """
 
 import numpy as np
@@ -39,44 +39,47 @@ from twoloop.kernels.data.indices import (
 from twoloop.kernels.evaluation.inner_loop import evaluate_state, project, renew_partition
 from twoloop.kernels.linalg.dense import copy
 
-# places in `options`, then A, A A, Legendre coefficients (S, S each); b, b A, c
+# indices of the scalars in `options`; then follow A, A A, Legendre coefficients (S, S each), and b, b A, c (S each)
 INNER_TOL, THETA, N_SCALARS = range(3)
 S = 20  # number of nodes
-LEFT = 0.01  # relative to the tolerances: change at which the iteration ends ...
-STAGNANT, NOISE = 0.5, 0.3  # ... or NOISE of them, if a change is at least STAGNANT times the one before
-MOST, FEW = 40, 12  # largest number of sweeps; and number of sweeps after which more nodes are left out ...
-FARTHER = 2.0  # ... up to this times the distance
+LEFT = 0.01  # over the tolerances: change of the accelerations by a sweep at which the iteration has converged
+# over the tolerances: the iteration has also converged if the change is at most NOISE, and at least STAGNANT times the
+# previous change
+STAGNANT, NOISE = 0.5, 0.3
+MOST, FEW = 40, 12  # largest number of sweeps, and number of sweeps after which more nodes are left out
+FARTHER = 2.0  # factor by which the distance from the position in which nodes are left out grows after FEW sweeps
 MOST_LEFT_OUT = 9  # largest number of nodes that may be left out
-# numbers at the end of `memory`: two that `begin` stores, the time of its base, and first time, length and end of the
-# polynomial that was found (-inf: none)
+# indices of the scalars at the end of `memory`: the arguments of `begin`, with the time of `base`; then first time,
+# length and end, s, of the polynomial of the last converged attempt (END = -inf: none)
 LARGEST_PIVOT, EARLIEST, BASE, BEGIN, WHOLE, END, N_STORED = range(7)
-SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2  # of a polynomial, relative to its length
-# longest part of a step without a node, relative to the step, if all nodes are evaluated
+# limits of the length of a piece of the polynomial, which is accepted as a step, relative to the whole polynomial
+SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2
+# longest time between evaluations if all nodes are evaluated, relative to the step
 UNSEEN = 0.0767
-BACK = 0.4  # part of the polynomial before the state from which the step begins
+BACK = 0.4  # fraction of the polynomial that lies before the beginning of the step
 ORDER, SHARE = 12.0, 0.5  # order of the estimated error; factor on the estimate
-MOVED = 0.5  # weight of the correction of a stage by its projection, as an error
-ROUNDING = 1e-13  # relative: accuracy of the iteration in steps without an estimate, and of times
-NEARER = 0.5  # smallest ratio of the pivots at the end and at the start of a step ...
-ENDS = 4.0  # ... unless the pivot at the end is this many times the one below which nodes are left out
-FOUND = 2.0  # error and factor returned with a polynomial that was found, so that its pieces follow
+MOVED = 0.5  # weight in the error of the step of the largest correction of a stage by its projection
+ROUNDING = 1e-13  # relative tolerance of the iteration in fixed steps, and of comparisons of times
+NEARER = 0.5  # smallest allowed ratio of the pivot at the end of a step to that at the beginning; see also ENDS
+ENDS = 4.0  # the pivot at the end is also allowed if it is this many times the pivot below which nodes are left out
+FOUND = 2.0  # error and factor returned with a new polynomial: the step is repeated, and takes a piece of it
 SMALL = 1e-300  # replaces a coefficient of zero
 
 
 def options_array(A, b, c, inner_tol, theta):
-    """Return the parameter block for a Gauss tableau."""
+    """Return the array `options` for a Gauss tableau of S stages."""
     degrees = np.arange(S)
     legendre = np.polynomial.legendre.legvander(2.0 * c - 1.0, S - 1).T * b * (2 * degrees + 1)[:, None]
     return np.concatenate([[inner_tol, theta], *map(np.ravel, [A, A @ A, legendre, b, b @ A, c])])
 
 
 def memory_size(n):
-    """Return the length of `memory`, which ends with the numbers that `begin` stores, N_STORED of them."""
+    """Return the length of `memory` for n coordinates."""
     return (S + 7) * n + 3 * S + N_STORED
 
 
 def begin(memory, largest_pivot, earliest, base=None):
-    """Store where the polynomial begins in `memory`.
+    """Store the conditions for the next polynomial in `memory`, and discard the last polynomial.
 
     Parameters
     ----------
@@ -87,8 +90,8 @@ def begin(memory, largest_pivot, earliest, base=None):
     earliest : float
         Earliest time at which nodes may lie, s.
     base : (float, ndarray), optional
-        Time and state of an earlier step, farther from the singular position than the state from which the step
-        begins: q and v are then those of the polynomial through this earlier state. None: of the one at the beginning.
+        Time, s, and state [q, v, ...] of an earlier step, farther from the singular position. The polynomial then goes
+        through q and v of this state. None: through those at the beginning of the step.
     """
     stored = memory[-N_STORED:]
     stored[:] = np.nan
@@ -99,9 +102,10 @@ def begin(memory, largest_pivot, earliest, base=None):
 
 
 def piece_ends(memory, c, t):
-    """Return the times after t at which the pieces of the polynomial end that `memory` holds.
+    """Return the times after t, s, at which the pieces of the polynomial in `memory` end.
 
-    They are times of nodes that are not left out: the first ones beside those, and some others between.
+    They are END and the times of evaluated nodes, if the node is next to one that is left out, or if the piece would
+    otherwise be longer than LONGEST_PIECE.
     """
     stored = memory[-N_STORED:]
     left_out = memory[-N_STORED - 3 * S : -N_STORED - 2 * S] == 1.0
@@ -116,7 +120,7 @@ def piece_ends(memory, c, t):
 
 @compiled
 def _combined(weights, a, total):
-    """Sum the accelerations at the nodes with these weights."""
+    """Compute the weighted sum of the accelerations a (S, n) at the nodes into `total` (n)."""
     total[:] = 0.0
     for k in range(S):
         for m in range(total.size):
@@ -125,7 +129,7 @@ def _combined(weights, a, total):
 
 @compiled
 def _weight(tolerances, m, n, h, state):
-    """Return the reciprocal of the allowed error of velocity m."""
+    """Return the reciprocal of the allowed error of velocity m in a step of h."""
     q, v = abs(state[m]), abs(state[n + m])
     if tolerances[ESTIMATE] == 0.0:
         return 1.0 / (ROUNDING * (1.0 + v))
@@ -136,9 +140,10 @@ def _weight(tolerances, m, n, h, state):
 
 @compiled
 def _error(tolerances, h, state, legendre, a, n_kept):
-    """Estimate the error as collocation_code.py does, from the decay of the Legendre coefficients of a.
+    """Return the error over the tolerances, from the decay of the Legendre coefficients of a.
 
-    `n_kept`: number of nodes that are not left out; coefficients of higher degrees are rounding.
+    The estimate is that of collocation_code.py. `n_kept`: number of nodes that are not left out; coefficients of
+    degrees from `n_kept` on are rounding errors.
     """
     n, largest = a.shape[1], 0.0
     for m in range(n):
@@ -163,7 +168,10 @@ def _error(tolerances, h, state, legendre, a, n_kept):
 
 @merged
 def _integrate(h, c, A, AA, a, q, v, q_end, v_end):
-    """Set q_end and v_end to positions and velocities a time c h later, from integrals of the accelerations."""
+    """Set q_end and v_end to the state at the time c h after (q, v), where the polynomial begins.
+
+    A and AA (S) are the weights of the accelerations in their integral and double integral.
+    """
     _combined(A, a, v_end)
     _combined(AA, a, q_end)
     for m in range(q.size):
@@ -187,7 +195,7 @@ def _interpolate(j, c, left_out, a):
 
 @compiled
 def _widest_gap(c, c0, left_out):
-    """Return the longest part after c0 without a node that is evaluated, relative to the whole."""
+    """Return the longest part of [c0, 1] without an evaluated node; the polynomial extends over [0, 1]."""
     widest, before = 0.0, c0
     for k in range(S):
         if left_out[k] == 0.0 and c[k] > c0:
@@ -197,9 +205,9 @@ def _widest_gap(c, c0, left_out):
 
 @merged
 def _choose_partition_at_end(f, w, t, q, pivot, near):
-    """Choose the partition at the end of a step; return SINGULAR if the next step would begin nearer to the position.
+    """Choose the partition at the end of a step; return a code, SINGULAR if the end is too close to the position.
 
-    `pivot` is the smallest pivot at the beginning, `near` the one below which nodes are left out.
+    `pivot` is the smallest pivot at the beginning; `near` is the pivot below which nodes are left out.
     """
     code = renew_partition(f, w, t, q)
     if code == DONE and w.notes[PIVOT] < max(NEARER * pivot, min(ENDS * near, pivot)):
@@ -209,7 +217,7 @@ def _choose_partition_at_end(f, w, t, q, pivot, near):
 
 @compiled
 def _weights_to_start(b, c, c0, to_v, to_q):
-    """Compute the weights of the integrals of the accelerations, once and twice, from the first end up to c0."""
+    """Compute the weights (S) of the accelerations in their integral, to_v, and double integral, to_q, from 0 to c0."""
     to_v[:] = 0.0
     to_q[:] = 0.0
     for i in range(S):
@@ -224,7 +232,7 @@ def _weights_to_start(b, c, c0, to_v, to_q):
 
 @merged
 def _set_base(h, c0, to_v, to_q, a, q, v, q_0, v_0):
-    """Set q_0 and v_0 to the state at the first node's side of the polynomial, which has the state q, v at c0."""
+    """Set q_0 and v_0 to the state at the beginning of the polynomial, whose state at c0 is q, v."""
     _combined(to_v, a, v_0)
     _combined(to_q, a, q_0)
     for m in range(q.size):
@@ -234,7 +242,7 @@ def _set_base(h, c0, to_v, to_q, a, q, v, q_0, v_0):
 
 @compiled
 def _extrapolate(j, c, last, a):
-    """Set the accelerations at node j to those of the polynomial through the nodes `last` (-1: none)."""
+    """Set the accelerations at node j by extrapolation of the polynomial through the nodes `last` (-1: no node)."""
     a[j, :] = 0.0
     for k in last:
         if k >= 0:
@@ -248,7 +256,7 @@ def _extrapolate(j, c, last, a):
 
 @compiled
 def _evaluate(time, whole, b, c, a, q_0, v_0, to_v, to_q, q, v, acceleration):
-    """Set q, v and the accelerations to those of the polynomial, so much time after its first end."""
+    """Set q, v and `acceleration` to those of the polynomial at `time`, s, after its beginning."""
     place = time / whole
     _weights_to_start(b, c, place, to_v, to_q)
     _combined(to_v, a, v)
@@ -268,7 +276,10 @@ def _evaluate(time, whole, b, c, a, q_0, v_0, to_v, to_q, q, v, acceleration):
 
 @merged
 def _end_of_piece(f, w, t, near, options, tolerances, stage, state, new_state):
-    """Complete the state [q, v, a] in `stage`; where pivots are below `near`, it is not put on the constraints."""
+    """Return the attempt that ends with the state [q, v, a] of `stage`, and compute `new_state`.
+
+    The state is projected onto the constraints, unless pivots there are below `near`.
+    """
     n = w.Q.size
     q, q1, v1 = state[:n], new_state[:n], new_state[n : 2 * n]
     a1, lam1 = new_state[2 * n : 3 * n], new_state[3 * n :]
@@ -296,7 +307,7 @@ def _end_of_piece(f, w, t, near, options, tolerances, stage, state, new_state):
 
 
 def state_at(memory, options, t):
-    """Return the state [q, v, a] of the polynomial that `memory` holds, at t."""
+    """Return the state [q, v, a] of the polynomial in `memory` at time t, s."""
     stored, n = memory[-N_STORED:], (memory.size - 3 * S - N_STORED) // (S + 7)
     b, _, c = options[N_SCALARS + 3 * S * S :].reshape((3, S))
     a, stage = memory[: S * n].reshape((S, n)), memory[S * n : (S + 5) * n].reshape((5, n))
@@ -311,7 +322,7 @@ def state_at(memory, options, t):
 
 
 def _lagrange(c, x):
-    """Return the weights of values at the nodes in their interpolating polynomial at x."""
+    """Return the values at x of the Lagrange polynomials of the nodes, (S)."""
     factors = (x - c) / (c[:, None] - c + np.eye(S))
     np.fill_diagonal(factors, 1.0)
     return factors.prod(axis=1)
@@ -319,7 +330,7 @@ def _lagrange(c, x):
 
 @kernel(ATTEMPT)
 def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt one step."""
+    """Attempt a step: take a piece of the polynomial in `memory`, or if there is none, compute a polynomial."""
     n = w.Q.size
     q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
     A, AA, legendre = options[N_SCALARS : N_SCALARS + 3 * S * S].reshape((3, S, S))
@@ -366,7 +377,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if estimated and chooses and sweep == FEW:
             near = min(FARTHER * near, NEAR_MOST)
         for i in range(S):
-            # away from the state in both directions, first to where the motion comes from
+            # in both directions from the beginning of the step, first backwards in time
             j = n_back - 1 - i if i < n_back else i
             if sweep == 0:
                 if i == n_back:
@@ -386,7 +397,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if chooses:
                 code = renew_partition(f, w, time, q_stage)
                 left_out[j] = 0.0
-                if code == DONE:  # a run that begins near the position has only seen small pivots
+                if code == DONE:  # in a run that begins near the position, earlier pivots may all be small
                     largest_pivot = max(largest_pivot, w.notes[PIVOT])
                 if estimated and (code != DONE or w.notes[PIVOT] < near * largest_pivot):
                     left_out[j], code = 1.0, DONE
@@ -401,8 +412,8 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
                     code = project(f, w, time, q_stage, v_stage, options[THETA], a_stage, w.lam)
                 if renews or w.notes[BY_GENERAL] == 0.0:
                     break
-                # pivots of the generated code are too small: the general code took over, with the partition of
-                # another stage
+                # pivots of the generated code were too small, and the general code used the partition of another
+                # stage: repeat the projection with a partition chosen here
                 renews, generated = True, False
                 _integrate(whole, c[j], A[j], AA[j], a, q_0, v_0, q_stage, v_stage)
                 code = renew_partition(f, w, time, q_stage)
@@ -430,7 +441,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             converged = True
             break
         _set_base(whole, c_base, to_v, to_q, a, q_base, v_base, q_0, v_0)
-        # most rejections are due to the end of the step, which is accurate enough for that test by now
+        # most rejections are due to this test of the end of the step, which is accurate enough after two sweeps
         if sweep == 1 and estimated:
             _integrate(whole, 1.0, b, bA, a, q_0, v_0, q1, v1)
             code = _choose_partition_at_end(f, w, t + h, q1, pivot, near * largest_pivot)
@@ -449,7 +460,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     code = _choose_partition_at_end(f, w, t + h, q1, pivot, near * largest_pivot)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
-    if estimated:  # the steps that are accepted are pieces of the polynomial
+    if estimated:  # pieces of the polynomial are the steps that follow
         stored[BEGIN], stored[WHOLE], stored[END] = begin, whole, t + h
         return Attempt(DONE, FOUND, FOUND)
     copy(q1, q_stage)

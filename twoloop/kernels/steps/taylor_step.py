@@ -1,20 +1,20 @@
 """Step by the Taylor series of the motion, computed from the index-3 equations themselves.
 
-With G = [C_q; A] the motion satisfies G v + G_t = 0 and M a + G^T lam = Q. In the coefficients of the series, of order
-k in a and lam and of order k + 1 in v, all but the last coefficients of a, lam and v are known, and these solve
+With G = [C_q; A] the motion satisfies G v + G_t = 0 and M a + G^T lam = Q. The coefficients of order k of a and lam,
+and of order k + 1 of v, follow from all lower ones: they solve
 
     M_0 a_k + G_0^T lam_k = r_k,    G_0 a_k = c_k,
 
-with the matrix of the accelerations at the beginning of the step. Its factors exist already: each order takes one
-solution with them, and no derivative of the constraints beyond G (J. D. Pryce's structural analysis, BIT 41 (2001),
-364-394, finds these offsets for any equations). What r and c need of G, M and Q follows from a program, see
-`twoloop.generate.series`, and the recurrences for their coefficients (R. E. Moore, Interval Analysis (1966), ch. 11).
+with the matrix of the accelerations at the beginning of the step. This matrix is factored already: each order takes one
+solution, and no derivatives of the constraints beyond G (J. D. Pryce's structural analysis, BIT 41 (2001), 364-394,
+finds these orders for any equations). The parts of r and c that depend on G, M and Q are computed by a program, see
+`twoloop.generate.series`, with recurrences for Taylor coefficients (R. E. Moore, Interval Analysis (1966), ch. 11).
 
-The order of the series depends on the tolerance. The step is so long that the last terms of the series are as large as
-the tolerance (A. Jorba and M. Zou, Experimental Mathematics 14 (2005), 99-117). Time is counted in units of the step
-before, so that no power of a short time underflows. The end of the step is projected onto the constraints.
+The order of the series depends on the tolerance. The step size is such that the last terms of the series equal the
+tolerance (A. Jorba and M. Zou, Experimental Mathematics 14 (2005), 99-117). The unit of time is the previous step size,
+so that no power of a short time underflows. The end of the step is projected onto the constraints.
 
-Where no code is generated, the program of the series is interpreted, order by order.
+If there is no generated code, the program of the series is interpreted, order by order.
 """
 
 import numpy as np
@@ -55,9 +55,9 @@ from twoloop.kernels.evaluation.tasks import EVALUATE_AS_GIVEN, SOLVE
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.linalg.saddle_point import solve_both
 
-# indices in `options`: scalars (ORDER is that of the series of q); where each array of the program begins and the last
-# one ends; then the arrays, integers by their bits. KEEP: consecutive steps evaluate one series about the first state,
-# to interpolate within a step
+# indices of the scalars in `options`; then follow the offsets of the arrays of the program, and these arrays, integers
+# as bit patterns. ORDER: order of the series of q; KEEP: 1 if consecutive steps evaluate the series about the first
+# state, to interpolate within a step
 ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, N_SCALARS = range(7)
 # arrays of a table; arrays of sums as twoloop.generate.series.Sums has them
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
@@ -67,9 +67,9 @@ EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
 BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
 KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns of GROUPS
 
-# places in `memory`: scalars, two series of q (ORDER + 1, n_q), then scratch, see arrays_of
+# indices of the scalars in `memory`; then follow two series of q (ORDER + 1, n_q), and scratch, see arrays_of
 (
-    KNOWN,  # 1: there is a series about the state
+    KNOWN,  # 1: series number WHICH has been computed
     WHICH,  # index of the series about the state
     UNIT,  # unit of time of each series, s
     NEXT_UNIT,
@@ -78,10 +78,10 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns o
     TRIED,  # 1: the last attempt stored a series, which replaces the other one if the attempt was accepted
     PASSED,  # with KEEP: time since the state of the series, s
     TARGET,  # index of the series that is computed
-    # ratio of the step to LENGTH that the distance of its end from the constraints allowed last; 0: not known
+    # last ratio of a step size to LENGTH that the distance of its end from the constraints allowed; 0: not known
     SHORTER,
     ATTEMPTS,  # number of attempts: each one evaluates the defect at other times
-    SUSPECTED,  # 1: a step was rejected for its defect at time SUSPECT, and no accepted step has reached that time
+    SUSPECTED,  # 1: a step was rejected because of its defect at the time SUSPECT, s, which the run has not passed yet
     SUSPECT,
     N_MEMORY_SCALARS,
 ) = range(14)
@@ -96,7 +96,7 @@ def memory_size(order: int, n_q: int, n_rows: int, n_nodes: int, early: int, lat
 
 @inlined
 def accelerations_found(memory, n):
-    """Return the last numbers of `memory`: the accelerations that the series gives at one time."""
+    """Return a view (n) of the last numbers of `memory`: accelerations according to the series."""
     return memory[memory.size - n :]
 
 
@@ -113,7 +113,7 @@ def _numbers(options, which):
 
 @inlined
 def series_of(memory, order, n, which):
-    """Return one of the two series of q as a vector, row by row: numba calls a function for a two-dimensional array."""
+    """Return series 0 or 1 of q as a vector, row by row; views of two dimensions would cost a function call each."""
     begin = N_MEMORY_SCALARS + int(which) * (order + 1) * n
     return memory[begin : begin + (order + 1) * n]
 
@@ -145,7 +145,7 @@ def interior(X, Y, K, total):
 
 @merged
 def _gather(options, sums, groups, g, more, values, out):
-    """Compute the arguments of a group of operations, without their constants."""
+    """Compute the arguments of group g of operations, without their constants, from `values` into `out`."""
     column, coefficient = _integers(options, sums + COLUMN), _numbers(options, sums + COEFFICIENT)
     for o in range(groups[g + BEGIN], groups[g + END]):
         out[o] = coefficient[o] * values[column[o]]
@@ -157,7 +157,7 @@ def _gather(options, sums, groups, g, more, values, out):
 
 @merged
 def _sum(options, sums, scale, values, out):
-    """Compute all sums of a list without their constants, times a factor; other entries of `out` are unchanged."""
+    """Compute `scale` times all sums of a list, without their constants, into the entries of `out` listed for them."""
     column, coefficient = _integers(options, sums + COLUMN), _numbers(options, sums + COEFFICIENT)
     places = _integers(options, sums + PLACES)
     for o in range(column.size):
@@ -170,7 +170,10 @@ def _sum(options, sums, scale, values, out):
 
 @compiled
 def begin_operations(options, table, values, z, x, y):
-    """Compute order zero of the operations of a table; pending products remain zero."""
+    """Compute order 0 of the results z and of the arguments x and y of the operations of a table.
+
+    Pending products, whose second factor depends on the accelerations, are set to zero.
+    """
     groups = _integers(options, table + GROUPS)
     constant, constant_2 = _numbers(options, table + FIRST + CONSTANT), _numbers(options, table + SECOND + CONSTANT)
     for g in range(0, groups.size, N_GROUP):
@@ -205,7 +208,7 @@ def begin_operations(options, table, values, z, x, y):
 
 @merged
 def _operate(options, table, K, values, z, x, y, x0, y0, total):
-    """Compute order K > 0 of the operations of a table; of pending products only the part known before the solution."""
+    """Compute order K > 0 of the operations of a table; for pending products, only the part that is known already."""
     groups = _integers(options, table + GROUPS)
     inverse = 1.0 / K
     for g in range(0, groups.size, N_GROUP):
@@ -253,7 +256,7 @@ def _complete(options, table, values, y):
 
 @inlined
 def arrays_of(options, memory, n, n_rows):
-    """Return arrays for coefficients of quantities and of arguments of operations, sums of products, r and c."""
+    """Return views of `memory`: coefficients of quantities and of arguments of operations, sums of products, r, c."""
     n_nodes, early, late = int(options[N_NODES]), int(options[EARLY_WIDTH]), int(options[LATE_WIDTH])
     order = int(options[ORDER])
     depth = order + 2
@@ -277,7 +280,7 @@ def arrays_of(options, memory, n, n_rows):
 
 @merged
 def begin_series(options, t, unit, state, N, series, first, x, y, r, c):
-    """Set orders 0 and 1 of the state, and compute early operations of order 0; r and c become zero."""
+    """Set orders 0 and 1 of t, q and v, compute order 0 of the early operations, and set r and c to zero."""
     n = r.size
     r[:], c[:] = 0.0, 0.0
     N[0, 0], N[1, 0] = t, unit
@@ -301,7 +304,7 @@ def take_order(K, unit, N, series, a):
 
 @merged
 def end_series(w, order, series):
-    """Count evaluations, and return whether the last order is finite, as a code."""
+    """Count the evaluations; return DONE, or NOT_FINITE if the last order of `series` is not finite."""
     w.counters[N_EVALUATIONS] += order - 1
     n = series.size // (order + 1)
     for j in range(n):
@@ -312,7 +315,7 @@ def end_series(w, order, series):
 
 @compiled
 def expand(f, w, options, memory, t, state, unit):
-    """Compute the series, in a unit of time, about a state whose factors are in w; return DONE or a reason."""
+    """Compute the series about `state` at t in units of `unit`, s; return a code. w has the factors for this state."""
     n, n_rows, order = w.Q.size, w.Rate.size, int(options[ORDER])
     N, X1, Y1, X2, Y2, total1, total2, r, c = arrays_of(options, memory, n, n_rows)
     series = series_of(memory, order, n, memory[TARGET])
@@ -351,22 +354,23 @@ def expand(f, w, options, memory, t, state, unit):
     return end_series(w, order, series)
 
 
-# target of the distance of the unprojected end of a step from the constraints, over the tolerances
+# target of the distance of the end of a step from the constraints before its projection, over the tolerances
 ALLOWED = 0.3
-# a defect up to MAX_NOISE is rounding if the one near the beginning is at least a NOISE_RATIO-th of it
+# a defect up to MAX_NOISE, over the tolerances, counts as a rounding error if it is at most NOISE_RATIO times the
+# defect near the beginning of the step, where the series is exact
 MAX_NOISE, NOISE_RATIO = 1e4, 10.0
-NEAR_BEGIN = 1e-5  # relative to the step: distance from its start within which no force is assumed to change
+NEAR_BEGIN = 1e-5  # time after the beginning of a step, relative to the step, within which no force changes
 GOLDEN = 0.6180339887498949  # fractional parts of its multiples are evenly distributed between 0 and 1
 MAX_DEFECT = 1e300  # replaces an infinite defect, if a function has no value within the step
-MIN_FACTOR = 0.1  # smallest factor of a step that is rejected for its defect
-GROWTH = 5.0  # largest ratio of successive steps, because coefficients are scaled by the unit of the step before
-MAX_FIRST_FACTOR = 1e6  # relative to the guess of the first step: largest factor, so that no power of it overflows
+MIN_FACTOR = 0.1  # smallest ratio of the next step size to that of a step rejected because of its defect
+GROWTH = 5.0  # largest ratio of successive step sizes: the unit of the coefficients is the previous step size
+MAX_FIRST_FACTOR = 1e6  # largest ratio of the first step size to its guess, so that no power of it overflows
 TOO_SHORT = 2.0  # error that rejects a first step because the series allows a longer one
 
 
 @merged
 def _find_series(f, w, options, memory, t, state, unit, which):
-    """Compute the series about a state that was projected just before, into one of the two places."""
+    """Compute the series about `state` at t, which was projected last, as series number `which`; return a code."""
     n = w.Q.size
     memory[TARGET] = which
     if f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0:  # generated code leaves no factors in w
@@ -379,7 +383,7 @@ def _find_series(f, w, options, memory, t, state, unit, which):
 
 @merged
 def _length(tolerances, series, unit, order, n):
-    """Return the step, in units, at which the last two terms of positions and velocities equal the tolerances."""
+    """Return the step size, in units of `unit`, at which the last two terms of the series equal the tolerances."""
     rtol, last, before = tolerances[RTOL], 0.0, 0.0
     row, row_before = order * n, (order - 1) * n
     for j in range(n):
@@ -398,9 +402,9 @@ def _length(tolerances, series, unit, order, n):
 
 @merged
 def _evaluate(series, unit, order, x, q, v, a):
-    """Evaluate q, v and a at x units of time by Horner's scheme, four or two coordinates at a time.
+    """Evaluate q, v and a (n each) at x units of time by Horner's scheme, four or two coordinates at a time.
 
-    Horner's recurrence of the second derivative gives half of it.
+    The recurrence for the second derivative yields half of this derivative.
     """
     n, per_unit = q.size, 1.0 / unit
     twice = 2.0 * per_unit * per_unit
@@ -433,7 +437,7 @@ def _evaluate(series, unit, order, x, q, v, a):
 
 @compiled
 def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
-    """Return the defect after the share s of the step, over the allowed defect; infinite if it cannot be evaluated."""
+    """Return the defect at t + s h over the allowed defect, or infinity if it cannot be evaluated."""
     found = accelerations_found(memory, q.size)
     _evaluate(series, memory[UNIT], order, s * h / memory[UNIT], q, v, found)
     if evaluate_as_given(f, w, t + s * h, q, v, a) != DONE:
@@ -443,7 +447,7 @@ def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
 
 @compiled
 def _is_noise(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
-    """Return whether a defect is rounding, i.e. as large near the beginning, where the series is exact."""
+    """Return whether a defect is a rounding error: it is as large near the beginning, where the series is exact."""
     if defect > MAX_NOISE:
         return False
     noise = 0.0
@@ -454,9 +458,9 @@ def _is_noise(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
 
 @compiled
 def _defect_within(f, w, memory, t, h, tolerances, series, order, q, v, a):
-    """Return the defect for which the step is rejected before its end is evaluated, or 0; record the largest one.
+    """Return a defect within the step for which it has to be rejected, or 0; record the largest defect.
 
-    Each attempt evaluates it at other times, and at the time for which a step was last rejected.
+    The defect is evaluated at times that differ from attempt to attempt, and at the time SUSPECT.
     """
     look, shift = tolerances[LOOK], memory[ATTEMPTS] * GOLDEN % 1.0
     n_places = 0
@@ -478,13 +482,13 @@ def _defect_within(f, w, memory, t, h, tolerances, series, order, q, v, a):
 
 @merged
 def _shrink_factor(defect, order):
-    """Return the factor for a step that was rejected for its defect."""
+    """Return the ratio of the next step size to that of a step rejected because of its defect."""
     return max(MIN_FACTOR, 0.9 * defect ** (-1.0 / order))
 
 
 @kernel(SETTLE)
 def settle_taylor(f, w, options, memory, tolerances, accepted):
-    """Store the series about the end of an accepted step for the next one."""
+    """Make the series about the end of an accepted step that of the next step."""
     if accepted and memory[TRIED] == 1.0:
         memory[WHICH] = 1.0 - memory[WHICH]
         memory[UNIT], memory[LENGTH] = memory[NEXT_UNIT], memory[NEXT_LENGTH]
@@ -493,7 +497,7 @@ def settle_taylor(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step by the series about its beginning; the series about its end then sets the next step."""
+    """Attempt a step by the series about its beginning; the series about its end determines the next step size."""
     n, order, estimated = w.Q.size, int(options[ORDER]), tolerances[ESTIMATE] == 1.0
     q, v = state[:n], state[n : 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
@@ -514,12 +518,12 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     x = (memory[PASSED] + h) / unit
     error, checked, found = 0.0, False, accelerations_found(memory, n)
     if estimated:
-        error = x / memory[LENGTH]  # the estimated error is a power of this, and smaller
+        error = x / memory[LENGTH]  # an upper limit: the estimated error is a power of this ratio
         if error > 1.0 + SLACK:
             return Attempt(DONE, error, 1.0 / error)
         error = min(error, 1.0)
-        singular = w.notes[NEARLY_SINGULAR] != 0.0  # from the first such position on
-        checked = w.notes[NEAR_NOW] == 0.0  # near such a position accelerations off the constraints are meaningless
+        singular = w.notes[NEARLY_SINGULAR] != 0.0  # True from the first singular position on
+        checked = w.notes[NEAR_NOW] == 0.0  # near a singular position, accelerations off the constraints are useless
         w.notes[NEAR_NOW] = 0.0 if checked else 2.0
         longer = gap_ratio(tolerances, h)
         if longer > 0.0 and singular:
