@@ -23,7 +23,7 @@ from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.result.storage import begin_folder, check_folder, end_folder
 from twoloop.run.cached import STEPS, MissedChanges, Output, cached_result, fields_of, set_up
-from twoloop.run.fallbacks import MOST, closer_sampling, may_have_missed_changes
+from twoloop.run.fallbacks import MAX_REPETITIONS, closer_sampling, may_have_missed_changes
 from twoloop.run.loop import IntegrationLoop, Interrupts, interrupted_record
 from twoloop.run.options import options_of
 from twoloop.run.record import FileStore, MemoryStore, OutputRequest, Status, record_of
@@ -201,7 +201,7 @@ def solve_dae(
     interrupts = Interrupts()
     try:
         at_ends = times is not None and times.size <= 2 and set(times.tolist()) <= {t0, t1}
-        run, every, spent, repeats = None, np.inf, 0.0, MOST
+        run, every, spent, repeats = None, np.inf, 0.0, MAX_REPETITIONS
         in_time = time_limit is None or (time_limit >= LONGEST and system.n_q <= SMALL)
         if folder is event_functions is options.own_tolerance is None and in_time and not progress:
             is_default = times is time_limit is None and not dense_output
@@ -213,7 +213,7 @@ def solve_dae(
                     warnings.warn(rows_warning, ConstraintWarning, stacklevel=2)
                 return record_of(Result, fields)
             if isinstance(outcome, MissedChanges):
-                every, spent, repeats = outcome.every, outcome.cpu_time, MOST - 1
+                every, spent, repeats = outcome.every, outcome.cpu_time, MAX_REPETITIONS - 1
             elif isinstance(outcome, Run):
                 run = outcome
         interrupts.listen()

@@ -33,7 +33,7 @@ from twoloop.kernels.linalg.band import lapack_addresses
 from twoloop.methods.presets import code_for, identity, may_have_code, plans_for
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.dense_solution import DenseSolution, OutputInterpolation, Table, interpolator_of
-from twoloop.run.fallbacks import WITHIN, closer_sampling, may_have_missed_changes
+from twoloop.run.fallbacks import REPEAT_BELOW, closer_sampling, may_have_missed_changes
 from twoloop.run.loop import NO_KINDS, IntegrationLoop, Interrupts, ignore_progress
 from twoloop.run.messages import describe_arrival
 from twoloop.run.options import Options
@@ -66,21 +66,23 @@ from twoloop.run.workspace import GAMMA_ACCURACY, sparse_factors_pay
 Array = NDArray[np.float64]
 
 MAX_IDLE = 4  # largest number of idle integrators with equal options; each thread takes one
-FIRST_CHUNKS = 4  # length of the first call in chunks, if no states are sampled: Ctrl-C is answered within 0.1 s
-AFTER_ERROR = 16  # number of calls that skip an integrator after a callback raised in it
-STEP_FIELDS = (*OF_STEPS, "stats")  # fields that are computed separately from the others
+# length of the first call of compiled code, in chunks, if no states are sampled for `StiffnessMonitor`: a longer call
+# would delay the answer to Ctrl-C by more than 0.1 s
+FIRST_CHUNKS = 4
+AFTER_ERROR = 16  # number of calls that do not use an integrator after a callback raised in it
+STEP_FIELDS = (*OF_STEPS, "stats")  # fields of a result that are computed from the array of steps
 OTHER_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
 SHORT_RUN = 1e-3  # CPU time of a run, s, below which elapsed time is measured instead: that clock is faster to read
 REACHED_END = Status.REACHED_END  # a global name, because looking it up in the enumeration takes longer
 
 
 class Output(NamedTuple):
-    """Requested output: states at all steps (`times` is None), at times, or at the ends alone; `dense`: also `sol`."""
+    """Requested output: states at `times` (the two ends of the run if `at_ends`); None: at all steps."""
 
     times: Array | None
     at_ends: bool
-    dense: bool
-    time_limit: float | None
+    dense: bool  # whether `sol` is requested, too
+    time_limit: float | None  # limit of elapsed time, s
 
     @property
     def between(self) -> Array | None:
@@ -100,7 +102,7 @@ class MissedChanges:
     """Request to repeat a run that may have missed short changes, with evaluations at most `every` seconds apart."""
 
     every: float
-    cpu_time: float
+    cpu_time: float  # CPU time of the run to be repeated, s
 
 
 class CachedIntegrator:
@@ -118,7 +120,7 @@ class CachedIntegrator:
         Whether M has an inverse at the start.
     options : Options
     shared : SharedSetup or None
-        Setup for systems with other parameters, if the integrator is to serve these, too.
+        Setup for systems with other parameters, if the integrator is used for these, too.
     """
 
     def __init__(
@@ -133,31 +135,32 @@ class CachedIntegrator:
         self.parametric = None if shared is None else ParametricRun(shared, run)
         self.run, self.options, self.check_derivatives = run, options, (checks := options.check_derivatives)
         self.region = run.region = checked_region_of(run, checks) if shared is None else shared.region(checks)
-        run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, (room := first_chunk(run))
+        run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, (n_attempts := first_chunk(run))
         checked = system if self.parametric is None else self.parametric.system
+        # skips: number of the next calls that do not use the integrator, because a callback raised
         self.evaluation, self.loops, self.skips = StartEvaluation(checked), cached_run(), 0
-        self.arrays, self.given = arrays_of(run, self.evaluation, code, definite, options, room), checked.kit
+        self.arrays, self.callbacks = arrays_of(run, self.evaluation, code, definite, options, n_attempts), checked.kit
         self._start_and_advance = entry_point(self.loops.start_and_advance)
-        # indices in `arrays.block`: the beginning of the states, and of the report of a run with a single state
+        # indices in `arrays.block` at which the states begin, and the report of a run with a single state
         self.states_from, self.width = self.arrays.report.size, len(run.state)
         self.one_state_from = self.states_from - self.loops.N_HEAD - 1
-        self.moved = False  # whether `IntegrationLoop` may have changed attributes of `run` that are not arrays
+        self.loop_used = False  # whether `IntegrationLoop` may have changed attributes of `run` that are not arrays
         self.at_start = {name: getattr(run, name) for name in ("plan", "memory", "chunk", "kit", "functions")}
         self.form, self.cpu_time = run.kit.flags[FORM], np.inf  # CPU time of the last run, s
         self.between = OutputInterpolation(run)
-        self.of_run = run.rank, run.redundant, bool(run.plan.own)
-        self.independent = self.arrays.start_rows.tobytes()  # the independent rows for which `of_run` was computed
+        self.run_fields = run.rank, run.redundant, bool(run.plan.own)  # the last: whether generated code is called
+        self.independent = self.arrays.start_rows.tobytes()  # the independent rows of `run_fields`
         self.redundancy = {self.independent: (run.redundant, run.rows_warning)}
 
     @staticmethod
     def can_start(run: Run) -> bool:
-        """Return whether the compiled loop can start this run: in the dense form, at a start without warnings."""
+        """Return whether compiled code can start this run: callbacks compiled, dense algebra, no warning."""
         return run.static is None and not run.start_warning and not run.system.called_in_python
 
     @staticmethod
     def can_provide(run: Run, output: Output, shared: SharedSetup | None) -> bool:
         """Return whether an integrator that reuses its arrays can provide an output."""
-        # sol and output must have the same states within steps; a shared setup will get other parameters
+        # `sol` and interpolated output must agree; and `sol` would read arrays that a shared setup fills anew
         if output.dense and (output.between is not None or shared is not None):
             return False
         return output.between is None or not (run.lands or run.kit.flags[FORM] == indices.AUGMENTED)
@@ -187,11 +190,11 @@ class CachedIntegrator:
                 self.evaluation.system, arrays.last_start[loops.N_EQUAL] = parametric.system, loops.NEVER
         elif self.check_derivatives and not system.checked:
             return None
-        if self.moved:
+        if self.loop_used:
             self._return_to_start()
         run.t0 = t0
-        kit, work, sizes, box = run.kit.address, run.work.address, self.evaluation.sizes(), region.bounds
-        start = kit, self.given.address, work, arrays.address, t0, t1, q0, v0, sizes, box
+        kit, work, sizes, bounds = run.kit.address, run.work.address, self.evaluation.sizes(), region.bounds
+        start = kit, self.callbacks.address, work, arrays.address, t0, t1, q0, v0, sizes, bounds
         clock = time.perf_counter if self.cpu_time < SHORT_RUN else time.process_time
         began = clock()
         try:
@@ -203,10 +206,10 @@ class CachedIntegrator:
             return None
         self.cpu_time = clock() - began
         fields: dict[str, Any] = {"status": REACHED_END}
-        n_rows, at_times = n, None  # one row for each step, unless `_finish` counts them
-        other_rows = run.rows_warning != "" and arrays.start_rows.tobytes() != self.independent
+        n_rows, timed_states = n, None  # one row for each step, unless `_finish` counts them
+        rows_differ = run.rows_warning != "" and arrays.start_rows.tobytes() != self.independent
         all_steps = output.times is None and not output.dense
-        if n < 0 or other_rows or due or not all_steps or parametric is not None:
+        if n < 0 or rows_differ or due or not all_steps or parametric is not None:
             if n in (loops.IN_DOUBT, loops.REFUSED):
                 return None
             interrupts.listen()
@@ -214,10 +217,12 @@ class CachedIntegrator:
             finished = self._finish(system, t1, q0, v0, output, interrupts, due, fields)
             if not isinstance(finished, tuple):
                 return finished
-            (at_times,) = finished
+            (timed_states,) = finished
         begin, end = self.one_state_from - n_rows - n * N_STEP_COLUMNS, self.states_from
-        data = arrays.block[begin : end if at_times is not None else end + (1 + n_rows) * self.width].copy()
-        fields["later"] = partial(_deferred_field, data, at_times, self.of_run, self.cpu_time, system, t1, self.options)
+        data = arrays.block[begin : end if timed_states is not None else end + (1 + n_rows) * self.width].copy()
+        fields["later"] = partial(
+            _deferred_field, data, timed_states, self.run_fields, self.cpu_time, system, t1, self.options
+        )
         region.count()  # runs that the loop ends are counted there
         return fields
 
@@ -234,8 +239,9 @@ class CachedIntegrator:
     ) -> dict[str, Any] | MissedChanges | tuple[tuple[Array, Array] | None] | None:
         """Check the first chunk of a run, and integrate to the end if the run has further chunks.
 
-        Return all fields of an unusual run. Of other runs return a tuple for the deferred fields, whose only element
-        is (output times, rows), or None for all steps; `sol` is added to `fields`. Return None like `integrate`.
+        Return all fields of an unusual run, or None if the start must be checked more closely, as in `integrate`. For
+        any other run, return a tuple of one element: (output times, states), or None for output at all steps. Write
+        `sol` to `fields` if it is requested.
         """
         run, arrays, loops = self.run, self.arrays, self.loops
         n_rows, n_steps = arrays.filled.tolist()
@@ -248,19 +254,19 @@ class CachedIntegrator:
                 arrays.last_start[loops.N_EQUAL] = loops.NEVER
                 return None
         if report[loops.END_CODE] != run.a.ALL_OUTPUT_DONE or not report[loops.NO_REMARK]:
-            self.moved = True
+            self.loop_used = True
             arguments = output.request(run), ignore_progress, output.time_limit, interrupts, False
             loop = IntegrationLoop(run, t1, *arguments, start=rows[0], system=system)
             loop.resume(int(report[loops.END_CODE]), t[1:], rows[1:], steps, self.cpu_time)
             record = loop.to_end(self.check_derivatives)
             if record.status >= 0 and may_have_missed_changes(run):
                 return MissedChanges(closer_sampling(run), record.stats.cpu_time)
-            return fields_of(record, self.options, system, self.of_run[-1], t1)
-        at_times = None
+            return fields_of(record, self.options, system, self.run_fields[-1], t1)
+        timed_states = None
         kinds = interval_kinds(run, steps) if output.dense or output.between is not None else NO_KINDS
         if output.between is not None:
             began = time.process_time()
-            self.between.find(output.between, t, rows, kinds, self.evaluation.pattern)
+            self.between.interpolate(output.between, t, rows, kinds, self.evaluation.pattern)
             self.cpu_time += time.process_time() - began
         if not self._compare_callbacks(t, rows, t1, bool(report[loops.IN_CHECKED_REGION]), due):
             arrays.last_start[loops.N_EQUAL] = loops.NEVER
@@ -273,11 +279,11 @@ class CachedIntegrator:
             states = rows[ends] if output.at_ends else self.between.completed(output.times)
             if states is None:
                 return None
-            at_times = output.times.copy(), states
-        return (at_times,)
+            timed_states = output.times.copy(), states
+        return (timed_states,)
 
     def _check_new_start(self, t1: float, q0: Array, v0: Array) -> bool:
-        """Update the redundant rows at a new start, and return whether callbacks with new parameters are consistent."""
+        """Update the redundant rows at a new start. Return False if the start or new parameters need more checks."""
         run = self.run
         if run.rows_warning:  # rounding may decide which of several dependent rows is left out
             independent = self.arrays.start_rows.tobytes()
@@ -287,15 +293,16 @@ class CachedIntegrator:
                     return False
                 self.redundancy[independent] = new_run.redundant, new_run.rows_warning
             run.redundant, run.rows_warning = self.redundancy[independent]
-            self.of_run, self.independent = (run.rank, run.redundant, self.of_run[-1]), independent
+            self.run_fields, self.independent = (run.rank, run.redundant, self.run_fields[-1]), independent
         mass, derivatives = self.evaluation.mass, self.check_derivatives
         return self.parametric is None or self.parametric.agrees(run.t0, q0, v0, t1, mass, derivatives)
 
     def _return_to_start(self) -> None:
         """Restore the attributes of the run, besides arrays, that the loop may have changed."""
-        run, self.moved = self.run, False
+        run, self.loop_used = self.run, False
         if run.plan is self.at_start["plan"] and not run.substituted and run.kit.flags[FORM] == self.form:
-            self.at_start |= {"kit": run.kit, "functions": run.functions}  # the kit may have loaded a step meanwhile
+            # the loop may have loaded a step into the kit
+            self.at_start |= {"kit": run.kit, "functions": run.functions}
         vars(run).update(self.at_start, crossings=[], jumps=[], lengths=[], substituted=False)
 
     def _compare_callbacks(self, t: Array, rows: Array, t1: float, inside: bool, due: bool) -> bool:
@@ -314,7 +321,7 @@ class CachedIntegrator:
             sample = Sample(float(t[0]), rows[0], n)
             sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
             states = sample.states()
-            if not everywhere:  # the region must reach the extreme states, or equal runs would be compared again
+            if not everywhere:  # with the extreme states, the region contains all states of an equal run
                 states = np.concatenate([extreme_states(t, rows[:, :n]), states])
             if compare_callbacks_at(run, region, states, self.check_derivatives, status, "", everywhere)[0] != status:
                 return False
@@ -337,87 +344,91 @@ def fields_of(
 
 def _deferred_field(
     data: Array,
-    at_times: tuple[Array, Array] | None,
-    of_run: tuple[int, NDArray[np.int64], bool],
+    timed_states: tuple[Array, Array] | None,
+    run_fields: tuple[int, NDArray[np.int64], bool],
     cpu_time: float,
     system: ConstrainedSystem,
     t1: float,
     options: Options,
     name: str,
 ) -> dict[str, Any]:
-    """Compute a deferred field of a result; return it with others by name. `data` is the report of the run."""
+    """Compute the deferred field `name` of a result; return a dict of this and related fields.
+
+    `data`: copy of the run's report, steps and states. `timed_states`: the output; None for output at all steps.
+    """
     if name == "message":
         return {name: describe_arrival(t1, options.step_size is not None)}
     loops, n_states, n_steps = cached_run(), int(data[0]), int(data[1])
-    begin, end = (places := loops.N_HEAD + n_states), places + n_steps * N_STEP_COLUMNS
+    begin, end = (after_times := loops.N_HEAD + n_states), after_times + n_steps * N_STEP_COLUMNS
     if name in STEP_FIELDS:
         counts = data[loops.N_REPORT : loops.N_HEAD].astype(np.int64)
         by_step = step_fields(data[begin:end].reshape(n_steps, N_STEP_COLUMNS), INITIAL_COUNTS.copy())
         return by_step | {"stats": statistics(counts, cpu_time)} | options.metadata
-    rank, redundant, own = of_run
+    rank, redundant, own = run_fields
     defect = float(data[loops.DEFECT]) if data[loops.HAS_DEFECTS] else None
     fields = {"rank": rank, "redundant": redundant.copy(), "defect": defect, "compiled": own}
     fields |= {"widest_gap": float(data[loops.LONGEST_GAP]), "system": system, "atol": options.atol.copy(), "t_end": t1}
-    t, rows = (data[loops.N_HEAD : begin], data[end:].reshape(n_states, -1)) if at_times is None else at_times
+    t, rows = (data[loops.N_HEAD : begin], data[end:].reshape(n_states, -1)) if timed_states is None else timed_states
     return OTHER_DEFAULTS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
-RECHECK_PIVOT = 0.1  # starts with a smallest pivot below this share of the first run's are checked anew
+# ratio of the smallest pivot at a start to that at the first start, below which the start is checked anew
+RECHECK_PIVOT = 0.1
 
 
 def first_chunk(run: Run) -> int:
-    """Return the number of attempts of the first chunk, which fills at most as many rows."""
+    """Return the number of attempted steps of the first chunk, which is also its largest number of rows."""
     return max(LANES, run.chunk * (FIRST_CHUNKS if run.plan.stable_to is None else 1))
 
 
 def arrays_of(
-    run: Run, evaluation: StartEvaluation, code: GeneratedCode | None, definite: bool, options: Options, room: int
+    run: Run, evaluation: StartEvaluation, code: GeneratedCode | None, definite: bool, options: Options, n_attempts: int
 ) -> SimpleNamespace:
-    """Create the arrays that `start_and_advance` of kernels/cached_run.py reads and writes, for at most `room` steps.
+    """Create the arrays that `start_and_advance` of kernels/cached_run.py reads and writes, for `n_attempts` steps.
 
-    `run` is at its start: its clock, control and tolerances become one array. `evaluation` is for the system of
-    the call. The other arguments are those of `CachedIntegrator`.
+    `run` must be at its start; its clock, control and tolerances are replaced by views of one array. `evaluation` is
+    for the system of the call. The other arguments are those of `CachedIntegrator`.
     """
     from twoloop.kernels.evaluation import checks as start_checks
     from twoloop.kernels.linalg import rank as pivots
     from twoloop.kernels.linalg.dependent_columns import choose_dependent_columns as find
 
     loops, system = cached_run(), evaluation.system
-    of_mass = 0 if system.constant_mass else start_checks.DEFINITE if definite else start_checks.INDEFINITE
+    mass_kind = 0 if system.constant_mass else start_checks.DEFINITE if definite else start_checks.INDEFINITE
     numbers, n_rows = np.concatenate([run.clock, run.control, run.tolerances]), system.n_c + system.n_a
     i, j = run.clock.size, run.clock.size + run.control.size
     run.clock, run.control, run.tolerances = numbers[:i], numbers[i:j], numbers[j:]
-    memory, (of_work, integers) = run.plan.memory, lasting(run.work)
-    choice, nothing = None if code is None else code.shared.equations.choice, np.zeros(0, dtype=np.int64)
+    memory, (lasting_floats, integers) = run.plan.memory, lasting(run.work)
+    choice, none = None if code is None else code.shared.equations.choice, np.zeros(0, dtype=np.int64)
     expected, scale = _choice_as_array(choice)
     blocks = [] if choice is None else [(i[0], i[-1], j[0], j[-1]) for i, j in choice.blocks]
     dependents = DependentColumns(system, () if choice is None else choice.rows)
-    search = dependents.arguments if dependents.find else (nothing, nothing, 0, np.zeros(0), nothing, nothing)
-    places = np.flatnonzero(memory.view(np.int64))  # by bits, as -0.0 must be restored, too
+    search = dependents.arguments if dependents.find else (none, none, 0, np.zeros(0), none, none)
+    places = np.flatnonzero(memory.view(np.int64))  # compared as bits, because -0.0 must be restored, too
     weak = 0.0 if system.constant_mass and system.derived.get("no weak mass", False) else SINGULAR_MASS
-    of_start: tuple[float, ...]
-    of_start = max(run.rtol, GAMMA_ACCURACY), run.reuse, 0.0 if run.plan.watchful else 1.0
-    of_start += np.array_equal(search[0] != 0, run.work.pattern.ravel() != 0.0), RANK, weak, scale, CONTRADICTS
-    of_start += of_mass, RECHECK_PIVOT * run.work.notes[indices.PIVOT], run.kit.flags[FORM]
+    start_constants: tuple[float, ...]
+    start_constants = max(run.rtol, GAMMA_ACCURACY), run.reuse, 0.0 if run.plan.watchful else 1.0
+    start_constants += np.array_equal(search[0] != 0, run.work.pattern.ravel() != 0.0), RANK, weak, scale, CONTRADICTS
+    start_constants += mass_kind, RECHECK_PIVOT * run.work.notes[indices.PIVOT], run.kit.flags[FORM]
     step_fields = options.first_step or 0.0, run.least_atol, options.max_step, run.plan.looks_within
     columns, width = run.a.N_STEP_COLUMNS, len(run.state)
-    block = np.empty(loops.N_HEAD + 1 + (1 + columns) * room + width * (1 + room))
-    report_part, states = np.split(block, [len(block) - width * (1 + room)])
+    block = np.empty(loops.N_HEAD + 1 + (1 + columns) * n_attempts + width * (1 + n_attempts))
+    report_part, states = np.split(block, [len(block) - width * (1 + n_attempts)])
     arrays = SimpleNamespace(
         **evaluation.arrays,
         **{"numbers": numbers, "start_numbers": numbers.copy()},
         **{"memory": memory, "memory_places": places, "start_memory": memory[places]},
         **{"clock": run.clock, "control": run.control, "tolerances": run.tolerances, "options": run.plan.options},
-        **{"state": run.state, "new_state": run.new_state, "lasting": of_work, "lasting_integers": integers},
-        **{"saved": np.empty(numbers.size + of_work.size + run.state.size), "saved_integers": integers.copy()},
-        **{"constants": np.array([*of_start, *step_fields, run.near, TURNED, WITHIN])},
+        **{"state": run.state, "new_state": run.new_state, "lasting": lasting_floats, "lasting_integers": integers},
+        **{"saved": np.empty(numbers.size + lasting_floats.size + run.state.size), "saved_integers": integers.copy()},
+        **{"constants": np.array([*start_constants, *step_fields, run.near, TURNED, REPEAT_BELOW])},
         lapack=np.array(lapack_addresses() if run.kit.flags[BANDWIDTH] >= 0 else [], dtype=np.int64),
         **{"bounds": BOUNDS, "scratch": np.zeros(pivots.room_size(n_rows, system.n_q)), "expected": expected},
         **{"chosen": np.zeros(2 + 3 * n_rows, dtype=np.int64), "blocks": np.array(blocks, dtype=np.int64).ravel()},
         **dict(zip(("kinds", "counted", "_", "search", "search_places", "found"), search, strict=True)),
         **{"last_start": np.zeros(loops.START + 2 + 2 * system.n_q), "start_rows": run.work.rows_v.copy()},
-        **{"end": np.zeros(1), "t": np.empty(room + 1), "states": states.reshape(room + 1, width)},
-        **{"steps": np.empty((room, columns)), "filled": np.zeros(2, dtype=np.int64)},
+        **{"end": np.zeros(1), "t": np.empty(n_attempts + 1), "states": states.reshape(n_attempts + 1, width)},
+        **{"steps": np.empty((n_attempts, columns)), "filled": np.zeros(2, dtype=np.int64)},
         **{"report": report_part, "block": block},
         **{"evaluate_start": start_checks.evaluate_start, "choose": pivots.choose_rows, "dependents": find},
         **{"start": run.kernels.start, "advance": run.kernels.advance},
@@ -431,13 +442,13 @@ def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], flo
     """Return a choice of pivots as the array that kernels read, and the scale of the added rows."""
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
-    place = int(np.searchsorted(-LEAST, -choice.least))
-    numbers = place, len(choice.rows), len(choice.added), *choice.rows, *choice.added
+    index = int(np.searchsorted(-LEAST, -choice.least))
+    numbers = index, len(choice.rows), len(choice.added), *choice.rows, *choice.added
     return np.array(numbers, dtype=np.int64), choice.scale
 
 
-# limits of the cache: sets of options for each system, numbers in the workspace of a run, and entries with equal
-# options (another start may need other code)
+# limits of the cache: sets of options of a system; floats in the workspace of a run; entries with equal options, which
+# differ in the start, as another start may need other code
 MAX_OPTIONS, MAX_WORKSPACE, MAX_ENTRIES = 16, 150_000, 3
 
 
@@ -449,12 +460,12 @@ class CacheEntry(NamedTuple):
     t1: float
     code: GeneratedCode | None
     definite: bool  # whether M was definite at the start
-    moves: bool  # whether a run from another start differs only by that start
+    for_other_starts: bool  # whether copies of the run can begin at other starts
     idle: list[CachedIntegrator] | None  # None: the compiled loop cannot start this run
     shared: SharedSetup | None = None  # setup shared with systems of other parameters
 
 
-# the last start, the entries by options, and the id of the last run's code if no entry has it
+# the last start; the entries by options; the id of the last run's code, if that run was created anew
 NO_RUNS: tuple[Any, dict[Any, tuple[CacheEntry, ...]], int | None] = (None, {}, None)
 
 
@@ -468,10 +479,10 @@ def cached_result(
     output: Output,
     interrupts: Interrupts,
 ) -> tuple[dict[str, Any], str] | MissedChanges | Run | None:
-    """Integrate by the cached integrator for a system and options, which the first call creates.
+    """Integrate with a cached integrator for a system and options; the first call creates it.
 
-    Return the fields of the result and a warning of redundant rows; or a request to repeat the run; or a `Run` at its
-    start, if it cannot be cached; or None, if `set_up` has to check the start.
+    Return the fields of the result and a warning of redundant rows; or a request to repeat the run; or, if the run
+    cannot be cached, a `Run` at its start; or, if the start must be checked more closely by `set_up`, None.
     """
     entries = system.derived.get("runs", NO_RUNS)[1].get(options.key, ())
     if not entries and (shared := system.shared.get("runs")):
@@ -506,7 +517,7 @@ def cached_result(
 def set_up(
     system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
 ) -> tuple[Run, CacheEntry | None]:
-    """Create a run at its start, or copy a cached run; return it, and the cache entry that was added for it, if any.
+    """Create a run at its start, or copy a cached run; return it, and the cache entry if one was added for it.
 
     Runs are cached if the method is twoloop's own, callbacks are compiled, and traces are trusted.
 
@@ -515,7 +526,7 @@ def set_up(
     TypeError, ValueError
         If the start is refused, the method cannot run the system, or requested code cannot be generated.
     """
-    if system.called_in_python:  # such functions may depend on variables that change
+    if system.called_in_python:  # functions called in Python may depend on variables that change
         return _new_run(system, t0, t1, q0, v0, options)[0], None
     start, call = (t0, q0.tobytes(), v0.tobytes()), options.key
     came_from, runs, before = system.derived.get("runs", NO_RUNS)
@@ -526,7 +537,7 @@ def set_up(
         if entry.t1 != t1:
             options.set_sizes(run, t1)
     for each in entries:
-        if run is None and each.moves:
+        if run is None and each.for_other_starts:
             run, entry, code = _copy_for_start(each, system, t0, t1, q0, v0, options), each, each.code
     if run is None:
         (run, code), entry = _new_run(system, t0, t1, q0, v0, options), None
@@ -551,10 +562,10 @@ def _entry_of(run: Run, code: GeneratedCode | None, t1: float, options: Options)
         system, options.method, options.step_size is not None, options.compiled
     )
     definite = has_definite_mass(system, t0, q0)
-    moves = run.static is None and settled and (definite or not sparse_factors_pay(system, run.kit.flags))
+    for_other_starts = run.static is None and settled and (definite or not sparse_factors_pay(system, run.kit.flags))
     start = t0, q0.tobytes(), v0.tobytes()
-    idle: list[CachedIntegrator] | None = [] if moves and CachedIntegrator.can_start(run) else None
-    return CacheEntry(run.copy(), start, t1, code, definite, moves, idle)
+    idle: list[CachedIntegrator] | None = [] if for_other_starts and CachedIntegrator.can_start(run) else None
+    return CacheEntry(run.copy(), start, t1, code, definite, for_other_starts, idle)
 
 
 def _trace_cache(system: ConstrainedSystem) -> TraceCache:
@@ -594,7 +605,8 @@ def _copy_for_start(
 def _new_run(
     system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
 ) -> tuple[Run, GeneratedCode | None]:
-    fixed, given, new = options.step_size is not None, system, not system.checked
+    """Create a run at its start: check the start, derive callbacks, generate code and choose a plan."""
+    fixed, original, new = options.step_size is not None, system, not system.checked
     if new:
         load_checked_bounds(system)
     first = first_force(system, t0, q0, v0)
@@ -609,11 +621,11 @@ def _new_run(
     if derived:
         plan = plan.changed(traced=(*plan.traced, *derived))
     if new:
-        share_checked_bounds(given)
+        share_checked_bounds(original)
     if system.called_in_python and not fixed:
-        unlike = find_nondeterminism(system, states_near_start(t0, t1, q0, v0))
-        if unlike is not None:
-            raise ValueError(unlike)
+        difference = find_nondeterminism(system, states_near_start(t0, t1, q0, v0))
+        if difference is not None:
+            raise ValueError(difference)
     if first is not None and not any("force" in each.kinds for each in plan.traced):
         system.derived.setdefault(FIRST_FORCE, [first])
     run = Run(system, plan, t0, q0, v0, options.rtol, options.atol, options.step_size, interiors)

@@ -31,10 +31,10 @@ Groups = NDArray[np.int64]
 
 MAX_DIVIDED = 512  # largest number of intervals whose interior states are cached
 MAX_ACCURATE = 65536  # largest number of intervals that are remembered to have accurate polynomials
-# largest accepted error of polynomials in the constraints and the equations, over the tolerances; and near singular
-# positions, where it was measured to be a tenth of the error of velocities
+# largest accepted residual of a polynomial in the constraints and the equations of motion, relative to the tolerances.
+# ACROSS: in steps across singular positions, where the residual was measured to be a tenth of the error of velocities
 MAX_ERROR, MAX_ERROR_ACROSS = 10.0, 1.0
-N_REPAIR = 4  # number of steps that divide an interval whose polynomials have a larger error
+N_REPAIR = 4  # number of steps that divide an interval whose polynomial has a larger residual
 
 
 class Table(NamedTuple):
@@ -46,7 +46,7 @@ class Table(NamedTuple):
 
 
 def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: float) -> tuple[int, int]:
-    """Return the ranks of C_q, and of C_q and A, which the kernels need to create workspaces."""
+    """Return the rank of C_q and the rank of [C_q; A], from which `workspace` computes the sizes of arrays."""
     from twoloop.kernels import advance
 
     kit = kit_of(system, t, q)
@@ -65,13 +65,13 @@ class Interpolator:
     system : ConstrainedSystem
         The problem.
     t0, row : float, ndarray (3 n_q,)
-        A state [q, v, a] of the run.
+        Time and row [q, v, a] of a state of the run.
     rtol : float
         Relative tolerance of the run.
     atol : ndarray (n_q,)
         Absolute tolerances.
     ranks : (int, int)
-        Ranks of C_q, and of C_q and A.
+        Rank of C_q, and rank of [C_q; A].
     plans : dict, optional
         For each kind of interval the plan that divides it into `plan.parts` fixed steps; other kinds are not divided.
     """
@@ -99,7 +99,7 @@ class Interpolator:
         self.static = static_form(system, t0, row[: system.n_q], *self.plans.values())
         self.matrices = max((plan.matrices for plan in self.plans.values()), default=0)
         self._prepare()
-        self.failures, self.warns = 0, True  # number of failures of the last call; whether to warn of them
+        self.failures, self.warns = 0, True  # number of times at which the last call failed; whether to warn of them
         self.filled: dict[float, tuple[Array, Array]] = {}  # interior states, by the times at which intervals begin
         # polynomials (memory arrays of the steps) across singular positions, by the times at which intervals begin
         self.across: dict[float, Array] = {}
@@ -120,6 +120,7 @@ class Interpolator:
         self._start()
 
     def _start(self) -> None:
+        """Compute the accelerations at the start, which initializes the workspace."""
         from twoloop.kernels import advance
 
         system, t0, row = self.arguments[:3]
@@ -177,7 +178,7 @@ class Interpolator:
             failures += self._interpolate(divided, own, times, out)
             others.append(rest)
         failures += self._interpolate(table, np.concatenate(others), times, out)
-        self._count(failures, len(times))
+        self._warn_of_failures(failures, len(times))
         return out
 
     def within(self, table: Table, t: float) -> Callable[[float], Array]:
@@ -191,12 +192,12 @@ class Interpolator:
 
         def row(t: float) -> Array:
             time[0] = t
-            self._count(self._interpolate(source, group, time, out), 1)
+            self._warn_of_failures(self._interpolate(source, group, time, out), 1)
             return out[0].copy()
 
         return row
 
-    def _count(self, failures: int, n_times: int) -> None:
+    def _warn_of_failures(self, failures: int, n_times: int) -> None:
         self.failures = failures
         if failures > 0 and self.warns:
             _warn(f"at {failures} of {n_times} times the state is interpolated and off the constraints", 5)
@@ -233,7 +234,7 @@ class Interpolator:
         divided, own, rest = self._divided(table, groups)
         off = np.zeros(len(groups))
         off[inner], off[~inner] = self._errors(divided, own), self._errors(table, rest)
-        # the steps of these kinds are too long for polynomials through their ends
+        # where a plan was to divide the interval, and failed, the step is too long for a polynomial through its ends
         off[~inner & np.isin(groups[:, indices.KIND], list(self.plans))] = np.inf
         fits = off <= np.where(groups[:, indices.KIND] == indices.ACROSS, MAX_ERROR_ACROSS, MAX_ERROR)
         self.accurate.update(table.t[groups[~inner & fits, indices.FIRST_OWN]].tolist())
@@ -241,14 +242,17 @@ class Interpolator:
             self._repair(table, groups[k], float(off[k]))
 
     def _errors(self, table: Table, groups: Groups) -> Array:
-        """Estimate the errors of the polynomials of intervals, over the tolerances."""
+        """Estimate the residuals of the polynomials of intervals, relative to the tolerances."""
         out, groups = np.zeros(len(groups)), np.ascontiguousarray(groups)
         arrays = self.tolerances, table.t, table.states, groups, self.nodes, self.room, self.rows, out
         entry_point(self.kernels.judge)(self.kit, self.work, INNER_TOL, *arrays)
         return out
 
-    def _repair(self, table: Table, group: Groups, worst: float) -> None:
-        """Choose the most accurate states for an interval: neighbouring states, states of steps in it, or its ends."""
+    def _repair(self, table: Table, group: Groups, smallest: float) -> None:
+        """Interpolate an interval through other states if that reduces its residual, at first `smallest`; cache them.
+
+        These are, in this order, states of one step across a singular position, of N_REPAIR steps, and the ends alone.
+        """
         i, kind = int(group[indices.FIRST_OWN]), int(group[indices.KIND])
         begin = float(table.t[i])
         candidates = (
@@ -257,20 +261,20 @@ class Interpolator:
             lambda: (table.t[i : i + 2], table.states[i : i + 2]),
         )
         for candidate in candidates:
-            if worst <= MAX_ERROR_ACROSS or (interior := candidate()) is None:
+            if smallest <= MAX_ERROR_ACROSS or (interior := candidate()) is None:
                 continue
             own = Table(np.ascontiguousarray(interior[0]), np.ascontiguousarray(interior[1]), table.kinds)
             single, last = group[None, :].copy(), len(own.t) - 1
             single[0, [indices.FIRST_OWN, indices.LAST_OWN, indices.LOW, indices.HIGH]] = 0, last, 0, last
-            off = float(self._errors(own, single)[0])
-            if off < worst or not np.isfinite(worst):
-                worst = off
+            error = float(self._errors(own, single)[0])
+            if error < smallest or not np.isfinite(smallest):
+                smallest = error
                 self.filled[begin] = own.t, own.states
         if begin not in self.filled:
             self.accurate.add(begin)
 
     def _crossing(self, table: Table, i: int) -> tuple[Array, Array] | None:
-        """Compute interior states by a step across a singular position that begins and ends with the interval."""
+        """Compute interior states by a step across a singular position, as long as the interval; None if it fails."""
         from twoloop.kernels.steps import crossing_step as kernels
 
         if self.static is not None:
@@ -283,21 +287,21 @@ class Interpolator:
         state = np.concatenate([table.states[i], np.zeros(self.system.n_c + self.system.n_a)])
         attempt = entry_point(kernels.crossing_step)
         attempt(self.kit, self.work, plan.options, plan.memory, begin, end - begin, tolerances, state, state.copy())
-        found = plan.memory[-kernels.N_STORED :][kernels.END] > begin
-        return self._of_crossing(table, i, plan.memory) if found else None
+        succeeded = plan.memory[-kernels.N_STORED :][kernels.END] > begin
+        return self._of_crossing(table, i, plan.memory) if succeeded else None
 
     def _of_crossing(self, table: Table, i: int, memory: Array) -> tuple[Array, Array]:
-        """Return states of the polynomial of a step across a singular position, which `memory` holds."""
+        """Return times and states in interval i, by the polynomial of a step across a singular position in `memory`."""
         from twoloop.kernels.steps.crossing_step import state_at
 
         n, options = self.system.n_q, crossing_plan(self.system.n_q).options
         times = np.linspace(table.t[i], table.t[i + 1], self.parts + 1)
         states = np.array([state_at(memory, options, t) for t in times])
-        states[[0, -1], : 2 * n] = table.states[i : i + 2, : 2 * n]  # their accelerations may be rounding
+        states[[0, -1], : 2 * n] = table.states[i : i + 2, : 2 * n]  # but not a, which may be a rounding error
         return times, states
 
     def _repair_plan(self, kind: int) -> tuple[Plan, Any]:
-        """Return plan and kit of the steps that divide an interval whose polynomials are not accurate."""
+        """Return plan and kit of the steps that divide an interval of this kind whose polynomial is not accurate."""
         stiff = kind == indices.VELOCITIES
         if stiff not in self.repairs:
             from twoloop.methods.dop853 import DOP853
@@ -317,7 +321,7 @@ class Interpolator:
         return self.repairs[stiff]
 
     def _divided(self, table: Table, groups: Groups) -> tuple[Table, Groups, Groups]:
-        """Return a table of interior states, the groups of the intervals with such states, and the other groups."""
+        """Return a table of cached interior states, the groups of intervals with such states, and the other groups."""
         begins = table.t[groups[:, indices.FIRST_OWN]].tolist()
         filled = np.array([t in self.filled for t in begins], dtype=bool)
         pairs = [self.filled[t] for t in begins if t in self.filled]
@@ -331,7 +335,7 @@ class Interpolator:
         return Table(np.concatenate(t), np.concatenate(states), table.kinds), own, groups[~filled]
 
     def _fill(self, table: Table, plan: Plan, kit: Any, intervals: Groups) -> dict[float, tuple[Array, Array]]:
-        """Compute interior states; return them by the beginnings of intervals. Take fewer parts if steps fail."""
+        """Compute (times, states) in intervals by fixed steps, fewer if steps fail; return them by the first time."""
         n = self.system.n_q
         tolerances = np.zeros(ATOL + n)  # zeros: no error estimate
         state = np.zeros(3 * n + self.system.n_c + self.system.n_a)
@@ -351,7 +355,7 @@ class Interpolator:
         return filled
 
     def interiors(self, table: Table) -> Iterator[tuple[Array, Array]]:
-        """Yield interior states of divided intervals in blocks, to be stored in a file and given to `keep`.
+        """Yield interior states of divided intervals in blocks, to be stored in a file and restored by `keep`.
 
         A block has times (m, parts + 1) and rows (m, parts + 1, 3 n_q); the last ones are NaN if an interval has fewer
         states.
@@ -394,12 +398,12 @@ def _blocks(groups: Groups) -> list[Groups]:
 
 
 def _groups(table: Table, which: Groups) -> Groups:
-    """Return the groups that kernels read: a row for each interval in `which`, without the output times in it."""
+    """Return a group (row of indices for kernels) for each interval in `which`; those of output times are not set."""
     groups = np.zeros((len(which), indices.N_COLUMNS), dtype=np.int64)
     groups[:, indices.FIRST_OWN], groups[:, indices.LAST_OWN] = which, which + 1
     groups[:, indices.KIND] = table.kinds[which]
     groups[:, indices.HIGH] = len(table.t) - 1
-    # the polynomials of steps across a singular position leave out the states before, which may have rounding errors
+    # polynomials across a singular position do not use the states before it, which may have rounding errors
     across = np.append(False, table.kinds == indices.ACROSS)
     (begins,) = (across[1:] & ~across[:-1]).nonzero()
     if begins.size:
@@ -424,17 +428,18 @@ class OutputInterpolation:
     Parameters
     ----------
     run : Run
-        The run that holds the arrays.
+        The run whose arrays are used.
     """
 
     def __init__(self, run: Run):
         self.run, self._rows = run, np.zeros((0, 0))
         self._interpolator: Interpolator | None = None
 
-    def find(self, times: Array, t: Array, rows: Array, kinds: NDArray[np.int64], pattern: Array) -> None:
-        """Interpolate and store [q, v] at `times`, from rows [q, v, a, lam] at the ends of steps and interval kinds.
+    def interpolate(self, times: Array, t: Array, rows: Array, kinds: NDArray[np.int64], pattern: Array) -> None:
+        """Interpolate [q, v] at `times`, and store these rows.
 
-        `pattern`: 1 where the rows of the constraints have entries at the start.
+        `t`, `rows`: times and rows [q, v, a, lam] of accepted steps. `kinds`: kinds of the intervals between them.
+        `pattern`: 1 at the entries of the constraint rows at the start.
         """
         run = self.run
         table = Table(t, rows[:, : 3 * run.system.n_q].copy(), kinds)
@@ -447,13 +452,13 @@ class OutputInterpolation:
         self._interpolator, self._rows = interpolator, interpolator.states(table, times)
 
     def completed(self, times: Array) -> Array | None:
-        """Return rows [q, v, a, lam] at the times of `find`; None if projection or accelerations fail at a time."""
+        """Return rows [q, v, a, lam] at the times of `interpolate`; None if one of them fails."""
         interpolator, rows = self._interpolator, self._rows
         if interpolator is None or interpolator.failures > 0:
             return None
         added = np.full((len(times), len(self.run.state) - rows.shape[1]), np.nan)
         interpolator.complete(times, rows, added)
-        if interpolator.static is not None or interpolator.repairs:  # it has changed: the next run needs a new one
+        if interpolator.static is not None or interpolator.repairs:  # its workspace may have changed
             self._interpolator = None
         return np.concatenate([rows, added], axis=1) if interpolator.failures == 0 else None
 

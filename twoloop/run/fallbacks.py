@@ -1,7 +1,8 @@
 """Continue a run where its own steps cannot: with another method, across a singular position, or over a jump.
 
-A run that met a short change of forces is repeated with more evaluations, at most MOST times: noise, whose changes
-have no shortest duration, would need ever more. After the last repetition a warning is given.
+A run that met a short change of forces is repeated with more evaluations, at most MAX_REPETITIONS times: the changes of
+noise have no shortest duration, so that every repetition would meet shorter ones. After the last repetition a warning
+is given.
 """
 
 import numpy as np
@@ -16,32 +17,32 @@ from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.messages import warn_user
 from twoloop.run.run import Run
 from twoloop.run.singular_positions import Place, least_singular_value
-from twoloop.run.workspace import kit_of, kit_with
+from twoloop.run.workspace import kit_for_plan, kit_of
 
-# durations of changes, relative to the longest time between two evaluations: a run that met a change shorter than
-# WITHIN is repeated, as other changes may be shorter still; a warning is given for changes shorter than SEEN, which may
-# fall between two evaluations
-WITHIN, SEEN = 2.0, 1.25
-PER_CHANGE = 4.0  # number of evaluations of a repeated run within the shortest change that was met ...
-MAX_REFINEMENT = 8.0  # ... but it has at most this many times as many evaluations as before
-MOST = 2  # largest number of repetitions of a run
+# durations of a change of forces or drives, relative to the longest time between two evaluations: a run that met a
+# shorter change than REPEAT_BELOW is repeated, as other changes may be shorter still; one that is not repeated warns
+# below WARN_BELOW, as such a change may fall between two evaluations
+REPEAT_BELOW, WARN_BELOW = 2.0, 1.25
+EVALUATIONS_PER_CHANGE = 4.0  # number of evaluations of a repeated run within the shortest change that the run met
+MAX_REFINEMENT = 8.0  # largest ratio of the times between evaluations before and after a repetition
+MAX_REPETITIONS = 2  # largest number of repetitions of a run
 
 
-def may_have_missed_changes(run: Run, limit: float = WITHIN) -> bool:
+def may_have_missed_changes(run: Run, limit: float = REPEAT_BELOW) -> bool:
     """Return whether forces or drives changed for so short a time that another such change may have been missed."""
     a, clock = run.a, run.clock
     return bool(clock[a.SHORTEST_CHANGE] < limit * clock[a.WIDEST_SAMPLING])
 
 
 def closer_sampling(run: Run) -> float:
-    """Return the time between evaluations, s, for a repetition that meets changes that this run may have missed."""
+    """Return the largest time between evaluations, s, for a repetition that meets changes this run may have missed."""
     a, clock = run.a, run.clock
-    return float(max(clock[a.SHORTEST_CHANGE] / PER_CHANGE, clock[a.WIDEST_SAMPLING] / MAX_REFINEMENT))
+    return float(max(clock[a.SHORTEST_CHANGE] / EVALUATIONS_PER_CHANGE, clock[a.WIDEST_SAMPLING] / MAX_REFINEMENT))
 
 
 def warn_of_missed_changes(run: Run) -> str:
     """Warn if a run that is not repeated may have missed short changes; return the sentence, or an empty one."""
-    if not may_have_missed_changes(run, SEEN):
+    if not may_have_missed_changes(run, WARN_BELOW):
         return ""
     a, clock = run.a, run.clock
     text = (
@@ -56,7 +57,7 @@ Array = NDArray[np.float64]
 
 CORRECTIONS = 3  # number of Newton corrections of positions whose error is below the tolerances
 NEGLIGIBLE = 1e-12  # singular values below this share of the largest count as zero (redundant rows)
-HOLDS = 1e-8  # relative residual of the equations below which they count as solved
+MAX_RESIDUAL = 1e-8  # relative residual of the equations below which they count as solved
 
 
 def state_behind_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Array | None:
@@ -69,7 +70,7 @@ def state_behind_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -
     equations, lengths, size = scaled_equations(system, t, q)
     right = np.concatenate([np.zeros(system.n_q), -system.velocity_constraint(t, q, v) / lengths * size])
     change = np.linalg.lstsq(equations, right, rcond=NEGLIGIBLE)[0]
-    if not np.abs(equations @ change - right).max() <= HOLDS * np.abs(right).max():
+    if not np.abs(equations @ change - right).max() <= MAX_RESIDUAL * np.abs(right).max():
         return None
     return np.concatenate([q, v + change[: system.n_q]])
 
@@ -90,22 +91,24 @@ def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Arr
     return np.block([[mass, scaled.T], [scaled, np.zeros((len(rows), len(rows)))]]), lengths, size
 
 
-# step lengths to try across a singular position (no stage should fall on it), relative to the longest of the last steps
+# step lengths to try across a singular position, relative to the longest of the last steps: several, as no node of the
+# step should fall on the position
 LENGTHS = tuple(0.85**k for k in range(28))
-LONGER = tuple(1.4**k for k in range(1, 7))  # ... and longer ones, if too few nodes of a step are beyond the position
+# longer lengths to try, in the same unit, if too few nodes of a step are beyond the position
+LONGER = tuple(1.4**k for k in range(1, 7))
 # Distances from a singular position are measured by the smallest pivot of C_q, relative to its largest one so far.
 FAR = 0.2  # distance from which on a state may be the base of the polynomial
-# factors on tolerances and on the longest time without an evaluation, in the last attempts
+# factors of the tolerances and of the longest time without an evaluation, in the last attempts
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
-# largest age of a base, relative to the longest of the last steps, and to twice the time to the position
+# largest age of a base: LONGEST_PAST longest last steps, or FARTHEST times twice the time to the position, if longer
 LONGEST_PAST, FARTHEST = 1.5, 4.0
-BEYOND = 0.5  # if an earlier state is nearer than this share of the base's distance, a singular position lies between
+BEYOND = 0.5  # an earlier state nearer than this share of the base's distance is beyond another singular position
 MIN_DIVISOR = 1e-300  # avoids a division by zero
 CLEAR = 0.3  # distance from which on the run continues with steps of its own method
 
 
 def may_cross(run: Run, code: int) -> bool:
-    """Return whether steps across a singular position follow, given the code with which `advance` returned."""
+    """Return whether steps across a singular position come next, given the code that `advance` returned."""
     a, notes = run.a, run.work.notes
     if code == a.SWITCH_METHOD:
         from twoloop.kernels.steps.lobatto_step import TIGHT_TOLERANCE
@@ -138,14 +141,14 @@ def load(run: Run) -> None:
 def _renew_kit(run: Run) -> None:
     """Create the kit that calls the steps of the run's plan."""
     if run.static is None:
-        run.kit = kit_with(run.system, run.functions.flags, run.plan)
+        run.kit = kit_for_plan(run.system, run.functions.flags, run.plan)
     else:
         run.kit = kit_of(run.system, run.t0, run.state[: run.system.n_q], run.plan, run.static)
     run.functions = run.kit.functions
 
 
 def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
-    """Return the plan and the controls for steps across a singular position, see kernels/steps/crossing_step.py.
+    """Prepare steps across a singular position, see kernels/steps/crossing_step.py; return their plan and controls.
 
     `past`: states of the last accepted steps, oldest first; may be empty.
     """
@@ -157,7 +160,7 @@ def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
     base, run.mirrored = None, 0.0
     if not fixed:
         base, run.mirrored = _state_farther_away(run, [place for place in past if place[0] >= earliest])
-    # nodes in the past are wrong if a force jumped meanwhile, and too few near the start of the run: try other origins
+    # nodes at earlier times are wrong if a force jumped since, and too few near the start of the run: try other origins
     run.origins = [(earliest, base, False), (np.inf, None, False)]
     if float(clock[a.T] - clock[a.T_START]) < clock[a.H_LONG] and not run.system.called_in_python:
         run.origins.append((-np.inf, None, False))
@@ -201,9 +204,9 @@ def _next_origin(run: Run, plan: Plan, control: Array) -> None:
 def _state_farther_away(run: Run, past: list[Place]) -> tuple[Place | None, float]:
     """Return the base of the polynomial: the latest state in `past` that is far from the singular position.
 
-    If none is far, return the farthest one; None if the present state is farther. (Rounding changes velocities by
-    eps/s^2 at a distance s, measured by the smallest singular value.) Also return a step length, s: if the distance
-    changes linearly, the step ends as far beyond the position as the base is before it; 0 without an approach.
+    If none is far, the base is the farthest one, or None if the present state is farther. (At a distance s, measured by
+    the smallest singular value, rounding changes velocities by eps/s^2.) Also return a step length, s, with which the
+    step ends as far beyond the position as the base is before it, if the distance changes linearly; 0 if it grows.
     """
     a, n, t = run.a, run.system.n_q, float(run.clock[run.a.T])
     here = least_singular_value(run.system, t, run.state[:n], run.rank)
@@ -224,7 +227,7 @@ def _state_farther_away(run: Run, past: list[Place]) -> tuple[Place | None, floa
 
 
 def lengths_across(longest: float, allowed: float) -> list[float]:
-    """Return the step lengths to try across a singular position, s: shares of `longest`, cut to the allowed length."""
+    """Return the step lengths to try across a singular position, s: `longest` and shares of it, at most `allowed`."""
     first = min(longest, allowed)
     return [first, *(longest * part for part in LENGTHS if longest * part < first)]
 
@@ -242,7 +245,7 @@ def crossing_kit(kit: Kit) -> Kit:
 def after_crossing(run: Run, plan: Plan, control: Array, code: int, accepted: int) -> tuple[Plan, Array, int]:
     """Return plan, controls and code for what follows an attempt to step across a singular position.
 
-    This is the next piece of the polynomial that was found, an attempt with another length, or the run's own method.
+    What follows is the next piece of the polynomial, an attempt with another length, or the run's own method.
     """
     from twoloop.kernels.steps import crossing_step as kernels
 

@@ -6,7 +6,8 @@ raises `KeyboardInterrupt` only within functions of the user, which may take lon
 Elsewhere it is stored until the loop checks for it.
 """
 
-import _signal  # type: ignore[import-not-found]  # `signal` makes enumerations of handlers, which takes 8 microseconds
+# `signal` tries to convert each handler to an enum member, which takes 8 microseconds: `_signal` does not
+import _signal  # type: ignore[import-not-found]
 import signal
 import threading
 import time
@@ -47,7 +48,7 @@ from twoloop.run.messages import (
     message_of,
     outcome,
     reject_turned_velocities,
-    warn_of_own_passages,
+    warn_of_passage_by_ordinary_steps,
     warn_user,
 )
 from twoloop.run.record import (
@@ -60,8 +61,8 @@ from twoloop.run.record import (
     Statistics,
     Status,
     failure_link,
+    fields_of_run,
     interval_kinds,
-    of_run,
     record_of,
     statistics,
     step_fields,
@@ -101,8 +102,8 @@ class Interrupts:
         return self
 
     def gives_result(self) -> bool:
-        """Return whether a run that Ctrl-C ended returns a result: the fourth signal and handlers of the user raise."""
-        self.listen()  # replaces the handler only if it is Python's own
+        """Return whether a run that Ctrl-C ended returns its result; else a handler raised KeyboardInterrupt."""
+        self.listen()  # a handler of the user stays, and raises; so does `_on_signal` after PATIENCE signals
         return self._installed and self.n_signals <= PATIENCE
 
     def leave(self) -> None:
@@ -149,15 +150,15 @@ def interrupted_record(system: ConstrainedSystem, t0: float, events: list[Any] |
     )
 
 
-BUFFER_ROWS = 1024  # largest number of states in the buffers of a chunk ...
-BUFFER_STEPS = 4096  # ... and of steps
-CHUNK_TO_EVENT = 16  # attempts per chunk if an event may end the run: steps beyond the event are wasted
+BUFFER_ROWS = 1024  # largest number of states in the buffers of a chunk
+BUFFER_STEPS = 4096  # largest number of steps in the buffers of a chunk
+CHUNK_TO_EVENT = 16  # number of attempts in a chunk if an event may end the run: steps beyond the event are wasted
 CHUNK_TIME = 0.05  # CPU time, s; chunks that take longer do not grow, so that the loop notices Ctrl-C
 # statuses whose message may say that stability limited the steps
 EXPLAINED_BY_STIFFNESS = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
 MOST_PAST = 16  # largest number of accepted states that are candidates for the base of a step across a singularity
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
-MOST_SPARE, LARGEST_SPARE = 16, 250_000  # largest number of buffers kept for later runs, and of numbers in each
+MOST_SPARE, LARGEST_SPARE = 16, 250_000  # largest number of buffers kept for later runs; of floats in each
 _spare: dict[tuple[int, int, int], Buffers] = {}  # buffers for the next run, by their sizes
 
 
@@ -209,7 +210,7 @@ class IntegrationLoop:
         to_event = request.events is not None and any(event.terminal < np.inf for event in request.events)
         if to_event:
             self.largest_chunk = run.chunk = CHUNK_TO_EVENT
-        # numbers of attempts after which progress is checked, whatever chunks CHUNK_TIME allows
+        # number of attempts from one check of progress to the next, and in total at the next check; see CHUNK_TIME
         self.check_interval = self.next_check = run.chunk
         self.plan, self.control, self.kit = run.plan, run.control, run.kit  # replaced in steps across a singularity
         self.counts = INITIAL_COUNTS.copy()
@@ -218,8 +219,8 @@ class IntegrationLoop:
         if self.request.store.finished:
             self._store_step_fields()
         self.filled = np.zeros(2, dtype=np.int64)
-        ends_before = to_event or time_limit is not None  # t1 may then be an arbitrary late time
-        self.stall = StallDetector(run.t0, np.inf if ends_before else OUT_OF_REACH)
+        may_end_before_t1 = to_event or time_limit is not None  # such runs may have any late time as t1
+        self.stall = StallDetector(run.t0, np.inf if may_end_before_t1 else OUT_OF_REACH)
         self.stiffness = StiffnessMonitor(run.plan)
         self.sample = Sample(run.t0, self.start, 2 * run.system.n_q)
         self.cpu = 0.0
@@ -227,7 +228,7 @@ class IntegrationLoop:
         self.code = INTERRUPTED if interrupts.n_signals else run.a.PAUSED
 
     def resume(self, code: int, t: Array, rows: Array, steps: Array, cpu_time: float) -> None:
-        """Record a copy of the first chunk (times, rows and steps of `advance`), and handle its code."""
+        """Record a copy of the first chunk (times, rows and steps of `advance`), and handle the code of `advance`."""
         self.code, self.cpu = code, cpu_time
         self._store_chunk(t.copy(), rows.copy(), steps.copy(), self._kinds(steps, False, False))
         self._handle(steps, False, cpu_time)
@@ -304,7 +305,7 @@ class IntegrationLoop:
 
     @contextmanager
     def _stopped_in_time(self) -> Iterator[None]:
-        """End the steps of a chunk at the deadline, where one attempt may take long: machine code reads no clock."""
+        """Stop machine code, which reads no clock, by a timer at the deadline; only where one attempt may take long."""
         run, notes = self.run, self.run.work.notes
         if self.deadline == np.inf or (run.system.n_q <= SMALL and not run.system.called_in_python):
             yield
@@ -388,7 +389,7 @@ class IntegrationLoop:
                 self.kit = run.kit
 
     def _past(self) -> list[Place]:
-        """Return the states of the last accepted steps, oldest first, as far as they are stored."""
+        """Return the states of the last accepted steps, oldest first; an empty list if not all are stored."""
         if not self.request.every_step:
             return []
         places = [(self.run.t0, self.start)] if len(self.latest) < 2 else []
@@ -397,7 +398,7 @@ class IntegrationLoop:
         return places[-MOST_PAST:]
 
     def _correct_last(self) -> None:
-        """Replace the last stored state by the more accurate one of the polynomial across a singular position."""
+        """Replace the last stored state by that of the polynomial across a singular position: it is more accurate."""
         run = self.run
         t, row = float(run.clock[run.a.T]), run.state[: 3 * run.system.n_q]
         self.recorder.correct_last(t, row)
@@ -442,7 +443,7 @@ class IntegrationLoop:
                     end = recorder.last[0]
                 status, message = compare_callbacks(run, self.sample, end, check_derivatives, status, message)
             if self.last and status >= 0:
-                message += warn_of_missed_changes(run) + warn_of_own_passages(run)
+                message += warn_of_missed_changes(run) + warn_of_passage_by_ordinary_steps(run)
             if status >= 0 and run.start_warning:
                 message += warn_user(run.start_warning)
             if status in EXPLAINED_BY_STIFFNESS:
@@ -452,14 +453,14 @@ class IntegrationLoop:
         if self.interrupts.n_signals or recorder.interrupted or (code == INTERRUPTED and recorder.ended is None):
             status, message = Status.INTERRUPTED, describe_interrupt(reached, table)
         t_events, q_events, v_events = recorder.events()
-        fields = of_run(run, t, table) | {name: store.array(name) for name in OF_STEPS}
+        fields = fields_of_run(run, t, table) | {name: store.array(name) for name in OF_STEPS}
         fields |= message_of(run, message + failure_link(status), self.system)
         fields |= {"status": status, "stats": stats, "sol": recorder.solution(), "system": self.system}
         fields |= {"t_events": t_events, "q_events": q_events, "v_events": v_events}
         return record_of(Record, DEFAULTS | fields)
 
     def _suspicious_last_step(self, t: Array, table: Array) -> list[Place]:
-        """Return the beginning of the last step if velocities turned in it, as they do near a singular position."""
+        """Return the state before the last step if velocities turned in it, as near a singular position; else []."""
         run = self.run
         if self.request.times is not None or self.recorder.ended is not None:
             return []
@@ -468,7 +469,7 @@ class IntegrationLoop:
         return [(float(t[-2]), table[-2])] if velocities_turned_last(t, table, run.system.n_q) else []
 
     def _suspicious_outputs(self, t: Array, table: Array) -> list[Place]:
-        """Return the states at which steps had to end, if one of them is near a singular position."""
+        """Return the states at which steps had to end, if one of them is near a singular position; else []."""
         run, request = self.run, self.request
         grid = run.control[run.a.FIXED_STEP] > 0.0 and request.times is None
         if not run.passed_near_singular() or not (grid or (request.times is not None and request.lands)):
@@ -510,5 +511,5 @@ def ignore_progress(t: float) -> None:
 
 def _error_note(name: str, t: float, error: Exception) -> str:
     """Return the note that is added to an exception of a compiled callback: the system and the time."""
-    beyond = ": it asks an array for more than it has, as beyond the end of a table" * isinstance(error, IndexError)
+    beyond = ": it reads beyond the end of an array, such as a table" * isinstance(error, IndexError)
     return f"raised by a compiled callback of system {name!r} in a step from t = {t:.10g}{beyond}"

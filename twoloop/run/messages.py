@@ -51,7 +51,7 @@ class StallDetector:
     t0 : float
         Start of the run, s.
     most : float
-        Largest number of remaining steps, at the mean length of the last ones.
+        Largest number of steps that the rest of the run may take, at the mean length of the last ones.
     """
 
     def __init__(self, t0: float, most: float = OUT_OF_REACH):
@@ -65,7 +65,7 @@ class StallDetector:
         self.window_n += len(h)
 
     def is_stalled(self, t: float, t1: float) -> bool:
-        """Return whether the run stalls at time t."""
+        """Return whether the run stalls at time t: compare the mean of the last STAGNATION_STEPS steps or more."""
         if self.window_n < STAGNATION_STEPS:
             return False
         self.mean = (t - self.window_t) / self.window_n
@@ -81,7 +81,8 @@ class StallDetector:
 MAX_SAMPLES = 8  # largest number of sampled states, spread about evenly over the run
 LAST_STEPS = 8  # the step at a state is the median of this number of steps before it
 ITERATIONS = 6  # number of power iterations at each state
-START = 0.1  # share of a vector with all coordinates that is added to the direction before each estimate
+# a vector with all coordinates, times this share, is added to the directions before each estimate (see below)
+INITIAL_SHARE = 0.1
 ALIGNED = 0.9  # absolute cosine above which the image counts as parallel to the direction
 MIN_STEPS = 200  # number of accepted steps below which stiffness is not mentioned
 # share of the stability limit that half of the sampled states must reach; smooth motion stays below 0.4
@@ -137,8 +138,8 @@ def describe_stiffness(monitor: StiffnessMonitor, kit: Any, work: Any) -> str:
     directions = [np.zeros_like(start), np.zeros_like(start)]
     samples = []
     for sample in monitor.samples:
-        for direction in directions:  # continue from the previous state; START restores coordinates that became zero
-            direction += START * start
+        for direction in directions:  # of the previous sample; INITIAL_SHARE restores coordinates that became zero
+            direction += INITIAL_SHARE * start
         try:
             vibration, decay = _rates(kit, work, sample, directions)
         except Exception:  # raised by a callback at a displaced state, which the run did not visit
@@ -170,7 +171,10 @@ def _rates(kit: Any, work: Any, sample: StiffnessSample, directions: list[Array]
 def _dominant_eigenvalue(
     kit: Any, work: Any, sample: StiffnessSample, direction: Array, places: NDArray[np.int64], by_v: bool
 ) -> tuple[float, bool]:
-    """Return the largest eigenvalue of dF/dq or dF/dv in size, by power iteration, and whether it is negative."""
+    """Return |x| of the largest eigenvalue x of dF/dq or (`by_v`) dF/dv, and whether x < 0.
+
+    Power iteration in the independent coordinates `places`, from `direction`, which becomes the eigenvector.
+    """
     from twoloop.kernels.evaluation import tasks
 
     size = DISPLACEMENT * max(1.0, float(np.abs(sample.v if by_v else sample.q).max()))
@@ -193,14 +197,16 @@ def _dominant_eigenvalue(
 
 
 NEARLY_SINGULAR = 1e-3  # smallest over largest singular value of C_q, below which a message mentions it
-LASTING = 100.0  # times the tolerances: larger errors of velocities within the run make its result untrustworthy
+# error of velocities (or accelerations) within a run, relative to the tolerances, above which the rest is not trusted
+MAX_LASTING_ERROR = 100.0
 LOST_AT_END = 1e-6  # ratio of singular values below which velocities at the end count as not determined
 # advice if no step leads across a singular position; loose tolerances help, as rounding errors are large there
 _REMEDIES = (
     "loosen rtol and atol, take another method or compiled=False, end t_span before, or change the geometry slightly"
 )
 CROSSINGS = "\0"  # placeholder in a message, replaced by the description of singular positions that were crossed
-AFTER, NEGLIGIBLE_SLOPE = 1e-3, 1e-9  # s after a start at which its rank is compared; relative singular value of zero
+# time after a start, s, at which the rank is compared with that at the start; singular value that counts as zero there
+AFTER, NEGLIGIBLE_SLOPE = 1e-3, 1e-9
 # if a run stops closer to its end than this share of its length, or than a step, the message mentions it
 NEXT_TO_END = 1e-3
 
@@ -214,7 +220,7 @@ _REASONS = {
 }
 
 
-def _describe_passages(run: "Run") -> str:
+def _describe_jumps_and_crossings(run: "Run") -> str:
     """Describe jumps and singular positions in a run that succeeded; return an empty string if there were none."""
     text = f" At t = {_times(run.jumps)} C_t or b jumps: velocities changed there as by an impulse." * bool(run.jumps)
     return text + (CROSSINGS if run.crossings else "")
@@ -242,9 +248,9 @@ def message_of(run: "Run", words: str, system: "ConstrainedSystem", later: Later
 def reject_turned_velocities(
     run: "Run", last_step: list[Place], landed: list[Place], end: float, status: Status, message: str
 ) -> tuple[Status, str]:
-    """Return status and message, changed if velocities turned unaccountably near a singular position.
+    """Return status and message, or RANK_LOST if rounding or another branch of the motion changed velocities.
 
-    `last_step`: the beginning of the last step, if velocities turned in it. `landed`: states at which steps had to end.
+    `last_step`: state before the last step, if velocities turned in it. `landed`: states at which steps had to end.
     """
     now, crossings = (float(run.clock[run.a.T]), run.state), [each for each in run.crossings if each[0][0] < end]
     turned = describe_rounding(run, [*(place for each in crossings for place in each), *landed], end)
@@ -257,14 +263,14 @@ def reject_turned_velocities(
 
 
 def describe_rounding(run: "Run", places: list[Place], end: float) -> str:
-    """Describe where steps continued from velocities that rounding had changed; return "" if they did nowhere."""
+    """Describe the first state whose velocities rounding had changed too much; return "" if there is none."""
     system, n = run.system, run.system.n_q
     for t, state in sorted({place[0]: place for place in places}.values(), key=itemgetter(0)):
         q, v = state[:n], state[n : 2 * n]
         if t >= end or surely_above(run.near, system.rows(t, q), run.rank):
             continue
         over = _velocity_error_ratio(run, t, q, v)
-        if over > LASTING:
+        if over > MAX_LASTING_ERROR:
             return (
                 f"Not to be trusted beyond t = {t:.10g}: steps went on from there, where the constraints nearly lose "
                 f"rank ({_measured(run, t, q)}), and rounding of positions had changed velocities by about {over:.1g} "
@@ -283,7 +289,7 @@ def outcome(run: "Run", code: int, t1: float, stall: StallDetector) -> tuple[Sta
     a, t = run.a, float(run.clock[run.a.T])
     if code == a.ALL_OUTPUT_DONE:
         reached = describe_arrival(t, run.control[a.FIXED_STEP] > 0.0)
-        return Status.REACHED_END, reached + _describe_passages(run) + warn_of_singular_end(run)
+        return Status.REACHED_END, reached + _describe_jumps_and_crossings(run) + warn_of_singular_end(run)
     stopped = f"Stopped at t = {t:.10g}"
     failure = int(run.clock[a.FAILURE_CODE])
     if code == INTERRUPTED:
@@ -400,13 +406,16 @@ def warn_of_singular_end(run: "Run") -> str:
     return warn_user(text)
 
 
-def warn_of_own_passages(run: "Run") -> str:
-    """Warn if the run's own steps passed a singular position that no special step could cross; return the sentence."""
+def warn_of_passage_by_ordinary_steps(run: "Run") -> str:
+    """Warn if ordinary steps passed a singular position, after steps across it failed, and accuracy may have suffered.
+
+    Return the sentence of the warning, or an empty string.
+    """
     share = float(run.clock[run.a.PIVOT_PASSED])
     if share == 0.0:
         return ""
     over = EPS / share**3 / float(run.tolerances[indices.LEAST])
-    if over <= LASTING:
+    if over <= MAX_LASTING_ERROR:
         return ""
     return warn_user(
         f"no step led across a singular position, and the run went on with steps within which the smallest pivot of "
@@ -441,7 +450,7 @@ def _measured(run: "Run", t: float, q: Array) -> str:
 
 
 def _describe_near_end(run: "Run", t1: float) -> str:
-    """Return a sentence if the run stopped just before its end, beyond which steps across need nodes; else ""."""
+    """Return a sentence if the run stopped so near its end that steps across would need nodes beyond it; else ""."""
     left = t1 - float(run.clock[run.a.T])
     if left > max(NEXT_TO_END * (t1 - run.t0), float(run.clock[run.a.H_LONG])):
         return ""

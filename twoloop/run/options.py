@@ -19,7 +19,7 @@ SMALLEST_TOLERANCE = 1e-15  # relative or absolute tolerance: if both are smalle
 
 @lru_cache(maxsize=1024)
 def _key(*_: Any) -> object:
-    """Return an object that stands for a tuple of options: it is a faster key of a dictionary than the tuple."""
+    """Return the same object for equal options: as a key of a dictionary it is faster than a tuple of them."""
     return object()
 
 
@@ -51,12 +51,12 @@ class Options:
 
     @cached_property
     def metadata(self) -> dict[str, Any]:
-        """Fields of a result that follow from the options; with `untested` None if all steps have an error test."""
+        """Fields of a result that follow from the options. `untested` is one (None) if all steps have an error test."""
         tested = getattr(self.method, "tested", "all")
         return {"method": self.method.name, "rtol": self.rtol} | ({} if tested == "positions" else {"untested": None})
 
     def set_sizes(self, run: Run, t1: float) -> None:
-        """Set the first and the largest step of a run to t1, unless steps are constant."""
+        """Set the first and the largest step, s, of a run that ends at t1, unless its steps are constant."""
         run.work.notes[indices.KINK_AFTER] = t1  # no jump of C_t before t1 is known yet
         if self.step_size is None:
             run.set_sizes(self.first_step, self.max_step, t1)

@@ -1,8 +1,8 @@
 """Prepare one run for many systems that differ only in their parameters.
 
-All numbers that depend on parameters are in separate arrays: `p`, and values of expressions in `p`. Decisions that
-depend on numbers are made again. For every vector of parameters the callbacks are compared with their traces at the
-start. They are compared along the run, too, where states or parameters are outside the checked region.
+Numbers that depend on parameters are in separate arrays: `p`, and values of expressions in `p`. For every vector of
+parameters, choices that depend on these numbers are checked again, and callbacks are compared with their traces at the
+start. Along the run callbacks are compared where states or parameters are outside the checked region.
 """
 
 import copy
@@ -24,7 +24,7 @@ from twoloop.methods.plan import Method, Plan
 from twoloop.methods.presets import Compiled, code_for, plans_for
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.run import Run
-from twoloop.run.workspace import is_diagonal, kit_with
+from twoloop.run.workspace import is_diagonal, kit_for_plan
 
 Array = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ class SharedSetup:
     Raises
     ------
     ValueError
-        If a number depends on the parameters, but is not known as an expression in them.
+        If some number depends on the parameters, but was not traced as an expression in them.
     """
 
     def __init__(self, run: Run, code: GeneratedCode | None, method: Method, fixed: bool, compiled: Compiled):
@@ -55,8 +55,8 @@ class SharedSetup:
         self.family, self._regions = trace_cache_of(system), dict[bool, CheckedRegion]()
         form, banded = run.kit.flags[FORM], run.kit.flags[BANDWIDTH] >= 0
         if run.static is not None or form == AUGMENTED or banded or system.entries:
-            raise ValueError("of large systems more is decided by numbers")
-        symbolic = copy.copy(system)  # its numbers are expressions in the parameters
+            raise ValueError("for large systems, more choices depend on the numbers")
+        symbolic = copy.copy(system)  # a system whose numbers are expressions in the parameters
         symbolic.derived = {("family", trace_cache_of): self.family, ("numbers", self.family): lambda array: array}
         own = code_for(symbolic, method, fixed, compiled, t, q, unchecked)
         self.plan, self.interiors = plans_for(symbolic, method, run.rtol, run.least_atol, fixed, own, unchecked)
@@ -69,7 +69,7 @@ class SharedSetup:
             raise ValueError("a callback may branch on its parameters")
         evaluated = ParametricRun(self, run.copy()).run
         if (code is None) is not (own is None) or _plan_values(evaluated) != _plan_values(run):
-            raise ValueError("its numbers are not those of the family")
+            raise ValueError("its numbers differ from the values of the traced expressions")
 
     def region(self, with_derivatives: bool) -> CheckedRegion:
         """Return the region in which callbacks were compared, in runs with or without checks of derivatives."""
@@ -107,11 +107,11 @@ class ParametricRun:
             "kits": {},
         }
         self._fill(run.system)
-        run.kit = kit_with(self.system, run.kit.flags, run.plan)
+        run.kit = kit_for_plan(self.system, run.kit.flags, run.plan)
         run.functions = run.kit.functions
 
     def use(self, system: ConstrainedSystem) -> bool:
-        """Fill the arrays with the parameters of a system; return whether they held those of another system."""
+        """Fill the arrays with the parameters of a system; return whether the arrays held those of another system."""
         if system is self.given:
             return False
         self._fill(system)
@@ -130,7 +130,7 @@ class ParametricRun:
             traced.trusted = False
 
     def agrees(self, t0: float, q: Array, v: Array, t1: float, mass: Array, with_derivatives: bool) -> bool:
-        """Return whether callbacks are consistent near the start, and M (`mass`) has the structure of the first run."""
+        """Return whether callbacks agree near the start, and M (`mass`) has the structure of M in the first run."""
         run, system = self.run, self.system
         if not self._mass_agrees:
             system.remember_at("definite mass", None, is_definite(mass))
@@ -145,7 +145,7 @@ class ParametricRun:
         return self._mass_agrees
 
     def _numbered(self, plan: Plan) -> Plan:
-        """Return the plan with arrays of numbers, which this run fills, in place of arrays of expressions."""
+        """Return a copy of the plan with arrays of numbers, which `_fill` fills, in place of arrays of expressions."""
         array, plan_fields = self._formulas.array, vars(plan)
         changes: dict[str, Any] = {name: array(plan_fields[name]) for name in NUMBERS if plan_fields[name] is not None}
         changes |= {name: self._numbered(plan_fields[name]) for name in SUBPLANS if plan_fields[name] is not None}

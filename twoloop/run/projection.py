@@ -30,7 +30,8 @@ from twoloop.run.workspace import kit_of, static_form, workspace
 Array = NDArray[np.float64]
 
 CLEAR = 1e-5  # sine of the angle between a row and the others, below which a position may be near a dead centre
-MAX_CORRECTIONS, ROUNDING = 25, 1e-14  # number of Newton iterations; rounding error relative to the largest coordinate
+# largest number of Newton iterations; correction relative to the largest coordinate at which they stop
+MAX_CORRECTIONS, ROUNDING = 25, 1e-14
 # On the same assembly, a displaced position is projected to the point that C_q predicts, within this share of the
 # displacement.
 LINEAR = 0.5
@@ -55,7 +56,7 @@ class _Metric:
         return int(entry_point(self.kit.inner)(self.kit, self.work, task, self.t, q, v, 0.0, a, lam))
 
     def allowed_part(self, displacement: Array) -> Array:
-        """Return the part of a displacement that is tangential to the constraints, by the current factors."""
+        """Return the part of a displacement that the constraints at `position` allow, by the current factors."""
         rows = self.system.sparse_rows(self.t, self.position)
         change = np.zeros(len(displacement))
         zero, residual = np.zeros(len(displacement)), np.ascontiguousarray(rows @ displacement)
@@ -114,17 +115,17 @@ def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | No
         code = metric.run_task(tasks.RENEW_PARTITION, q.copy(), still)
     if code != indices.DONE or metric.work.notes[indices.PIVOT] < CLEAR:
         return None
-    counted, room = set(metric.work.rows_v.tolist()), np.zeros_like(q)
+    independent_rows, unused = set(metric.work.rows_v.tolist()), np.zeros_like(q)
     shares: dict[int, Array] = {}
     for row in range(system.n_c):
-        if row not in counted:
+        if row not in independent_rows:
             shares[row] = np.zeros(system.n_c)
-            metric.run_task(tasks.SOLVE, all_rows.row(row), np.zeros(system.n_c), room, shares[row])
+            metric.run_task(tasks.SOLVE, all_rows.row(row), np.zeros(system.n_c), unused, shares[row])
     metric.position = q
     columns = units(system, t, q, all_rows, typical_sizes(q))
     allowed = metric.allowed_part(columns * np.random.default_rng(3).uniform(0.5, 1.0, len(q)))
     most = float((np.abs(allowed) / columns).max())
-    return Dependence(len(counted), shares, allowed / most if most > 0.0 else allowed, metric.onto_constraints)
+    return Dependence(len(independent_rows), shares, allowed / most if most > 0.0 else allowed, metric.onto_constraints)
 
 
 def project_sparsely(
@@ -144,7 +145,7 @@ def project_sparsely(
     projected = metric.project(q, v)
     if projected is None or metric.work.notes[indices.PIVOT] < CLEAR:
         return None
-    # the rows that were chosen beside the constraints must be independent on them, too
+    # rows that are independent at the guess must be independent at the projected position, too
     there = _Metric(system, t, projected[0], form, metric.rank)
     if there.run_task(tasks.RENEW_PARTITION, projected[0].copy(), v.copy()) != indices.DONE:
         return None
@@ -154,13 +155,13 @@ def project_sparsely(
     if not is_at_rounding(rows @ projected[1] + rate, rows, projected[1], rate):
         return None
     moved = projected[0] - q
-    if check_assembly and np.abs(moved).max() > 0.0 and not _same_from_elsewhere(metric, projected[0], moved):
+    if check_assembly and np.abs(moved).max() > 0.0 and not _other_guesses_agree(metric, projected[0], moved):
         return None
     return projected
 
 
-def _same_from_elsewhere(metric: _Metric, position: Array, moved: Array) -> bool:
-    """Return whether displaced guesses, as far away as the given one, are projected to the points that C_q predicts."""
+def _other_guesses_agree(metric: _Metric, position: Array, moved: Array) -> bool:
+    """Return whether three other guesses, as far away as the given one, are projected to points that C_q predicts."""
     far = float(np.abs(moved).max())
     generic = np.random.default_rng(8).uniform(-1.0, 1.0, (2, len(position)))
     rest = np.zeros(len(position))
@@ -176,12 +177,12 @@ def _same_from_elsewhere(metric: _Metric, position: Array, moved: Array) -> bool
 
 MAX_ITERATIONS = 50
 CONVERGED = 1e-2  # violation at which the iteration stops, relative to the violation that a start may have
-# relative to the largest singular value: smaller ones are zero in the rank, and in least-squares solutions (WEAK: if
-# rows are redundant)
+# ratios to the largest singular value, below which others count as zero: SINGULAR in ranks, NEGLIGIBLE in least-squares
+# solutions, WEAK in those with redundant rows
 SINGULAR, NEGLIGIBLE, WEAK = 1e-10, 1e-13, 1e-2
 DEAD_CENTRE = 0.01  # smallest over largest singular value, below which a position is called near a dead centre
-SAME = 0.1  # distance below which two positions count as one, relative to the change that the projection makes
-LOST = 1e8  # largest change of a position over its scale: beyond, rounding is larger than the mechanism
+SAME = 0.1  # distance of two positions that count as one, relative to the change that the projection makes
+LOST = 1e8  # largest change of a position, relative to its scale: beyond, rounding errors exceed the mechanism
 
 
 class Move(NamedTuple):
@@ -296,10 +297,10 @@ def _consistent_state(
     scales = scales_of(system, t, position, jacobian)
     wrong = Violation.of_velocity(system, t, position, velocity, jacobian, scales) if len(jacobian) > 0 else None
     if wrong is not None and wrong.excess > 1.0:
-        why = f"max|C_q v + C_t| stays at {_largest(wrong.values)}"
+        why = f"max|C_q v + C_t| stays at {_format_largest(wrong.values)}"
         raise ValueError(_describe_no_freedom(system, t, scales.scaled(jacobian), free, kept, why))
     state = ConsistentState((position, velocity))
-    state.moved_q, state.moved_v = _move(position - guess), _move(velocity - speeds)
+    state.moved_q, state.moved_v = _largest_move(position - guess), _largest_move(velocity - speeds)
     state.dependent, state.determinant_sign, state.margin = _assembly(scales.scaled(jacobian), free)
     return state
 
@@ -325,19 +326,20 @@ def _state_of_large(
 ) -> ConsistentState:
     state = _LargeState((position, velocity))
     state.system, state.t = system, t
-    state.moved_q, state.moved_v = _move(position - guess), _move(velocity - speeds)
+    state.moved_q, state.moved_v = _largest_move(position - guess), _largest_move(velocity - speeds)
     return state
 
 
 def _position(
     system: ConstrainedSystem, t: float, guess: Array, free: NDArray[np.intp], kept: list[int], check_assembly: bool
 ) -> Array:
+    """Project a guess onto the constraints by its free coordinates; raise if that fails or the assembly is in doubt."""
     jacobian = system.jacobian(t, guess)
     scales = scales_of(system, t, guess, jacobian)
     scaled = scales.scaled(jacobian)
     start = Violation.of_position(system, t, guess, jacobian, scales)
     if start.excess > CONVERGED and _rank(scaled[:, free]) < _rank(scaled):
-        why = f"max|C| stays at {_largest(start.values)}"
+        why = f"max|C| stays at {_format_largest(start.values)}"
         raise ValueError(_describe_no_freedom(system, t, scaled, free, kept, why))
     position, excess, iterations = _gauss_newton(system, t, guess, free)
     redundant = position is None or _rank(scales.scaled(system.jacobian(t, position))) < system.n_c
@@ -346,7 +348,7 @@ def _position(
         position, excess, iterations = _gauss_newton(system, t, guess, free, cut)
     if position is None or not excess <= 1.0:
         diverged = position is None
-        worst = _largest(system.constraint(t, guess if diverged else position))
+        worst = _format_largest(system.constraint(t, guess if diverged else position))
         reached = f"the iteration diverges; at q max|C| is {worst}"
         if not diverged:
             reached = f"after {iterations} iterations max|C| is {worst}"
@@ -378,7 +380,7 @@ def _another_assembly(
     scales: Scales,
     cut: float,
 ) -> str | None:
-    """Describe where another guess, as far from the found position as the given one, leads; None: the same assembly.
+    """Describe to which other assembly a guess leads that is as far from the position as the given one; None: to none.
 
     Different assemblies have the same values of all but the dependent coordinates. If there is only one, displaced
     guesses are projected to the points that C_q predicts to first order, with the same sign of the determinant.
@@ -427,7 +429,7 @@ def _describe_change(one: Array, other: Array, scales: Scales) -> str:
 def _gauss_newton(
     system: ConstrainedSystem, t: float, q: Array, free: NDArray[np.intp], cut: float = NEGLIGIBLE
 ) -> tuple[Array | None, float, int]:
-    """Return the position (None: diverged), its violation over the accepted violation, and the number of iterations."""
+    """Project the free coordinates; return q (None: diverged), its violation over the accepted one, and iterations."""
     best, nearest, guess = np.inf, q, q
     for iteration in range(1, MAX_ITERATIONS + 1):
         try:
@@ -450,7 +452,7 @@ def _gauss_newton(
 
 
 def _least_change(jacobian: Array, free: NDArray[np.intp], values: Array, cut: float = NEGLIGIBLE) -> Array:
-    """Return the smallest change of the free coordinates that changes C by `values` to first order."""
+    """Return the smallest change (n_q,) of the free coordinates that changes C by `values` to first order."""
     norms = np.linalg.norm(jacobian, axis=1)
     norms = np.where(norms > 0.0, norms, 1.0)
     change = np.zeros(jacobian.shape[1])
@@ -478,11 +480,11 @@ def _assembly(scaled: Array, free: NDArray[np.intp]) -> tuple[tuple[int, ...], i
 
 
 def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
-    """Return the right singular vector of the smallest singular value that is not zero; its largest entry is 1."""
+    """Return the right singular vector of the smallest nonzero singular value, scaled to a largest entry of 1."""
     values, rows = np.linalg.svd(scaled[:, free], full_matrices=False)[1:]
-    held = values > SINGULAR * values.max()
+    nonzero = values > SINGULAR * values.max()
     direction = np.zeros(scaled.shape[1])
-    direction[free] = rows[held][-1] / np.abs(rows[held][-1]).max()
+    direction[free] = rows[nonzero][-1] / np.abs(rows[nonzero][-1]).max()
     return direction
 
 
@@ -514,10 +516,10 @@ def _describe_no_freedom(
     )
 
 
-def _largest(values: Array) -> str:
+def _format_largest(values: Array) -> str:
     return f"{float(np.abs(values).max()):.3g}"
 
 
-def _move(change: Array) -> Move:
+def _largest_move(change: Array) -> Move:
     j = int(np.abs(change).argmax())
     return Move(float(change[j]), j)

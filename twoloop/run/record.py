@@ -84,7 +84,7 @@ class FileStore:
         """Append rows to an array."""
         dtype, (n, *width) = self._shapes.get(name, (part.dtype, (0, *part.shape[1:])))
         with self._path(name).open("r+b" if name in self._shapes else "x+b") as file:
-            file.seek(HEADER_SIZE + n * self._row(dtype, width))
+            file.seek(HEADER_SIZE + n * self._row_bytes(dtype, width))
             file.write(np.ascontiguousarray(part).data)
             self._write_header(file, name, dtype, (n + len(part), *width))
 
@@ -92,7 +92,7 @@ class FileStore:
         """Keep the first n rows of an array."""
         dtype, (before, *width) = self._shapes[name]
         with self._path(name).open("r+b") as file:
-            file.truncate(HEADER_SIZE + min(n, before) * self._row(dtype, width))
+            file.truncate(HEADER_SIZE + min(n, before) * self._row_bytes(dtype, width))
             self._write_header(file, name, dtype, (min(n, before), *width))
 
     def array(self, name: str) -> NDArray[Any]:
@@ -103,7 +103,7 @@ class FileStore:
         return self.folder / f"{name}.npy"
 
     @staticmethod
-    def _row(dtype: np.dtype[Any], width: list[int]) -> int:
+    def _row_bytes(dtype: np.dtype[Any], width: list[int]) -> int:
         return int(dtype.itemsize * np.prod(width, dtype=np.int64))
 
     def _write_header(self, file: Any, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
@@ -128,9 +128,9 @@ def read(folder: Path) -> dict[str, NDArray[Any]]:
     """Read the arrays in a folder. If a process died, arrays that belong together are cut to equal numbers of rows."""
     arrays = {path.stem: mapped(path) for path in sorted(folder.glob("*.npy"))}
     for group in (("t", "states"), OF_STEPS, ("sol_t", "sol_states")):
-        there = [name for name in group if name in arrays]
-        n = min((len(arrays[name]) for name in there), default=0)
-        arrays |= {name: arrays[name][:n] for name in there}
+        present = [name for name in group if name in arrays]
+        n = min((len(arrays[name]) for name in present), default=0)
+        arrays |= {name: arrays[name][:n] for name in present}
     return arrays
 
 
@@ -209,13 +209,13 @@ class Recorder:
         self.request, self.interpolator, self._n_q, self._width = request, interpolator, n_q, len(state)
         self.n_steps, self.last_step = 0, 0.0
         self.interrupted = False
-        # states of the intervals that were not searched yet, and the states before that their polynomials need
+        # states of the intervals that were not searched yet, and earlier states that their polynomials go through
         self._t, self._rows = np.array([t0]), state[None, :].copy()
         self._kinds = np.empty(0, dtype=np.int64)
         self._next = 0  # index of the first interval between these states that was not searched
         self._n_outputs = 0
         ends = request.events is not None and any(event.terminal < np.inf for event in request.events)
-        self._waits_for = 0 if ends or request.store.finished else PENDING
+        self._max_pending = 0 if ends or request.store.finished else PENDING
         self.search = None if request.events is None else EventSearch(request.events, t0, state[: 2 * n_q], every)
         self._add(self._t, self._rows, self._kinds)
         if request.times is not None and not request.lands:
@@ -231,7 +231,7 @@ class Recorder:
             return
         self._t, self._rows = np.concatenate([self._t, t]), np.concatenate([self._rows, rows])
         self._kinds = np.concatenate([self._kinds, kinds])
-        if len(self._t) > self._waits_for:
+        if len(self._t) > self._max_pending:
             self._search(len(self._t) - WINDOW)
 
     def correct_last(self, t: float, row: Array) -> None:
@@ -240,7 +240,7 @@ class Recorder:
             self._rows[-1, : len(row)] = row
 
     def keep_crossing(self, memory: Array) -> None:
-        """Keep the polynomial across a singular position that `memory` may hold, for the next interval."""
+        """Store `memory` for the next interval if it contains a polynomial across a singular position."""
         from twoloop.kernels.steps.crossing_step import END, N_STORED
 
         if self.interpolator is not None and memory[-N_STORED:][END] > -np.inf:
@@ -274,7 +274,7 @@ class Recorder:
 
     @property
     def interrupted_at(self) -> float | None:
-        """Time at which the search for events was interrupted: the result ends there, as later events are not known."""
+        """Time at which the search for events was interrupted: the result ends there, as later events are unknown."""
         behind = self.interrupted and self.search is not None and self.ended is None
         return self.search.reached if behind and self.search is not None else None
 
@@ -592,13 +592,12 @@ Integers = NDArray[np.int64]
 
 COUNT_NAMES = [each.name for each in fields(Statistics) if each.name != "cpu_time"]
 COUNTERS = itemgetter(*(getattr(indices, name.upper()) for name in COUNT_NAMES))
-INITIAL_COUNTS = np.array(
-    [0, 0, 1]
-)  # counts of rejections and partitions at the start: the first partition is no renewal
+# rejections by error, rejections by convergence and partitions before the first step, whose partition is no renewal
+INITIAL_COUNTS = np.array([0, 0, 1])
 
 
 def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
-    """Return the fields of a record with one row per step; add rejections and partitions of the steps to `counts`."""
+    """Return the fields of a record with one row per step; update `counts`, the totals before and after the steps."""
     n = len(steps)
     h, changes, untested = np.empty(n), np.empty((3, n), dtype=np.int64), np.empty(n, dtype=np.bool_)
     entry_point(cached_run().split_steps)(steps, counts, h, changes, untested)
@@ -610,8 +609,8 @@ def statistics(counted: Integers, cpu: float) -> Statistics:
     return Statistics(**dict(zip(COUNT_NAMES, COUNTERS(counted.tolist()), strict=True)), cpu_time=cpu)
 
 
-def of_run(run: "Run", t: Array, table: Array) -> dict[str, Any]:
-    """Return the fields of the trajectory, from rows [q, v, a, lam], and the fields of the run as a whole."""
+def fields_of_run(run: "Run", t: Array, table: Array) -> dict[str, Any]:
+    """Return the fields of a record for the trajectory (`table`: rows [q, v, a, lam]) and for the whole run."""
     return {
         **state_fields(run.system.n_q, t, table),
         "rank": run.rank,
@@ -622,13 +621,13 @@ def of_run(run: "Run", t: Array, table: Array) -> dict[str, Any]:
 
 
 def state_fields(n: int, t: Array, table: Array) -> dict[str, Array]:
-    """Return the fields of a trajectory of n coordinates, from rows [q, v, a, lam]."""
+    """Return the fields of a record for a trajectory of n coordinates, from rows [q, v, a, lam] in `table`."""
     columns = table.T
     return {"t": t, "q": columns[:n], "v": columns[n : 2 * n], "a": columns[2 * n : 3 * n], "lam": columns[3 * n :]}
 
 
 def interval_kinds(run: "Run", steps: Array) -> Integers:
-    """Return the kind of interval of each step, for the dense solution, if the run's own plan made the steps."""
+    """Return the kind of interval of each step of the run's own plan, for the dense solution."""
     if run.plan.apart:
         return np.full(len(steps), indices.APART)
     explicit = indices.ACROSS if run.substituted else indices.ACCELERATIONS

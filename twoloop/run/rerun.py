@@ -34,7 +34,7 @@ N_DERIVATIVES = 4  # number of states of the run at which derivatives are checke
 def compare_callbacks(
     run: Run, sample: Sample, end: float, check_derivatives: bool, status: Status, message: str
 ) -> tuple[Status, str]:
-    """Return the status and the message of a run, changed if callbacks are wrong at its states.
+    """Return the status and the message of a run, changed if callbacks are wrong at states of its `sample`.
 
     In the region where compiled callbacks were compared before (`CheckedRegion`), they are not compared again.
     """
@@ -73,9 +73,9 @@ def compare_callbacks_at(
     message: str,
     everywhere: bool = False,
 ) -> tuple[Status, str]:
-    """Compare callbacks at states [t, q, v] of the run, latest first; return status and message like the caller.
+    """Compare callbacks at states [t, q, v], latest first; return status and message, changed if one is wrong.
 
-    `everywhere`: also at states in the checked region.
+    `everywhere`: also at states in the checked region, which grows by the states.
     """
     first = states[-1]
     if not everywhere:
@@ -131,7 +131,7 @@ def find_nondeterminism(system: ConstrainedSystem, states: Array) -> str | None:
     if not off.max() > CLEAR * np.abs(once[both]).max(initial=0.0):
         return None
     k, entry = np.unravel_index(off.argmax(), off.shape)
-    return _differs(system.name, float(states[k, 0]), int(entry), once[k, entry], again[k, entry])
+    return _changed_value(system.name, float(states[k, 0]), int(entry), once[k, entry], again[k, entry])
 
 
 def python_functions(system: ConstrainedSystem) -> PythonFunctions | None:
@@ -172,11 +172,13 @@ def describe_changed_force(run: Run) -> str | None:
             off = np.abs(np.subtract(value, again, out=np.zeros(len(value)), where=both))
             if off.max(initial=0.0) > CLEAR * np.abs(value[both]).max(initial=0.0):
                 entry = int(off.argmax())
-                return f"In the run {_differs(system.name, float(arguments[0]), entry, value[entry], again[entry])}."
+                return (
+                    f"In the run {_changed_value(system.name, float(arguments[0]), entry, value[entry], again[entry])}."
+                )
     return None
 
 
-def _differs(name: str, t: float, entry: int, once: float, again: float) -> str:
+def _changed_value(name: str, t: float, entry: int, once: float, again: float) -> str:
     return (
         f"force of {name!r} gives something else when it is called again with the same t, q and v: at "
         f"t = {t:.10g} entry {entry} is {once:.9g}, and then {again:.9g}. It must "
@@ -193,11 +195,11 @@ def _check_traces(run: Run, states: Any, status: Status, message: str) -> tuple[
     return status, message
 
 
-CHUNK = 256  # number of attempted steps in one call of `advance`
+CHUNK = 256  # largest number of attempted steps in one call of `advance`
 FIRST_TRY = 0.1  # first step of a piece, relative to its length, unless the previous piece proposes one
-SHARE = 0.1  # tolerances of the pieces, relative to those of the run ...
-FINEST = 1e-13  # ... but not below this, because of rounding
-MOST_NUMBERS = 100_000  # size of the buffer of states
+SHARE = 0.1  # tolerances of the pieces, relative to those of the run
+FINEST = 1e-13  # smallest tolerance of the pieces, relative or absolute: rounding hides smaller errors
+MOST_NUMBERS = 100_000  # largest number of floats in the buffer of states
 
 
 def tighter_tolerances(tolerance: ArrayLike) -> Array:
@@ -265,7 +267,7 @@ class IndependentRerun:
         self.next_step = np.inf
 
     def integrate(self, t0: float, state: Array, times: Array, most: int) -> RerunPiece | None:
-        """Integrate from a state [q, v] at t0 and land on `times`; return None if that takes over `most` attempts."""
+        """Integrate from a state [q, v] at t0 to all `times`; return None on failure, or after `most` attempts."""
         run, a, n = self.run, self.run.a, len(state)
         first_step, self.next_step = self.next_step, np.inf
         if run.restart(t0, state[: n // 2], state[n // 2 :]) != indices.DONE:

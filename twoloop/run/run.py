@@ -29,15 +29,16 @@ from twoloop.methods.plan import Plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.messages import describe_not_finite
 from twoloop.run.singular_positions import LEAST, MARGIN, WEAK, describe_singular_start, singular_threshold
-from twoloop.run.workspace import kit_of, kit_with, prepare_workspace, static_form, with_newton, workspace
+from twoloop.run.workspace import kit_for_plan, kit_of, prepare_workspace, static_form, with_newton, workspace
 
 Array = NDArray[np.float64]
 Buffers = tuple[Array, Array, Array]  # times, states and steps
 
-FIRST_CHUNK = 1024  # attempts of a small compiled system between two checks in Python, which cost 0.2 ms each
-FIRST_CHUNK_IN_PYTHON = 64  # ... of a system whose callbacks are plain Python functions, which may be slow
-SMALL = 32  # number of coordinates; chunks of larger systems are shorter in proportion
-TRIAL_STEPS = 10  # number of first steps after which a method that needs long steps is replaced if they are short
+# largest number of attempts in the first chunk of a small system; after each chunk, checks in Python take 0.2 ms
+FIRST_CHUNK = 1024
+FIRST_CHUNK_IN_PYTHON = 64  # the same for callbacks that are plain Python functions, which may be slow
+SMALL = 32  # number of coordinates of a small system; the chunks of larger ones are shorter in proportion
+TRIAL_STEPS = 10  # number of first steps after which a method that needs long steps is replaced if its steps are short
 NO_PATTERN = np.zeros((0, 0))
 CONTRADICTS = 1e-6  # largest relative disagreement of redundant rows with the accelerations
 
@@ -78,7 +79,7 @@ class Run:
         self.functions = self.kit.functions
         n_rows = system.n_c + system.n_a
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
-        # ranks are computed at every start; the ranks of the last start are a guess, which may save a second workspace
+        # ranks are computed at every start: those of the last start are a guess that may save a second workspace
         self.work = self._workspace(*(system.derived.get("ranks", ()) if self.static is None else ()))
         self.new_state = np.zeros_like(self.state)
         self.tolerances = np.zeros(indices.ATOL + system.n_q)
@@ -100,9 +101,11 @@ class Run:
         self.control_by(plan)
         self.substituted = False  # whether the substitute plan has replaced the first one
         self.near = singular_threshold(rtol)  # ratio of pivots below which errors of velocities are estimated
-        ran = any("force" in each.kinds for each in plan.traced)
-        changes = system.remembered(("changes", ran), lambda: (may_be_short(system, ran), may_be_steep(system, ran)))
-        short_forces, steep = (ShortForces(False, False), True) if step_size is not None else changes
+        ran = any("force" in each.kinds for each in plan.traced)  # whether the force was traced
+        short_and_steep = system.remembered(
+            ("changes", ran), lambda: (may_be_short(system, ran), may_be_steep(system, ran))
+        )
+        short_forces, steep = (ShortForces(False, False), True) if step_size is not None else short_and_steep
         self.short_forces: ShortForces = short_forces
         self.control[[loop_state.BY_TIME, loop_state.BY_STATE]] = self.short_forces
         self.may_be_steep = steep or plan.unseen == 1.0
@@ -110,9 +113,9 @@ class Run:
         # steps across a singular position, see fallbacks.py
         self.mirrored = 0.0  # length of a step that ends as far beyond the position as its base is before it, s
         self.looser = self.tolerances  # tolerances of these steps
-        self.lengths: list[float] = []  # lengths that are still to be tried
-        self.longer: list[float] = []  # longer ones, for steps with too few nodes beyond the position
-        self.crossed = 0.0  # length of the last attempt, s
+        self.lengths: list[float] = []  # lengths of steps that are still to be tried, s
+        self.longer: list[float] = []  # longer lengths to try if too few nodes of a step are beyond the position, s
+        self.crossed = 0.0  # length of the last attempted step, s
         self.pieces: list[float] = []  # times at which the next pieces of the polynomial end
         # origins of the polynomial still to be tried: earliest time of nodes, base, whether tolerances are looser
         self.origins: list[tuple[float, tuple[float, Array] | None, bool]] = []
@@ -150,7 +153,7 @@ class Run:
         return other
 
     def restart(self, t: float, q: Array, v: Array) -> int:
-        """Set the run to a state, without past steps; return the code of the accelerations there."""
+        """Set the run to a state, without past steps; return the code of the accelerations' computation there."""
         n, state = self.system.n_q, self.state
         state[:n], state[n : 2 * n], state[2 * n :] = q, v, 0.0
         self.plan.memory[:] = self.memory
@@ -175,7 +178,7 @@ class Run:
         filled: NDArray[np.int64],
         active: tuple[Plan, Array, Kit] | None = None,
     ) -> int:
-        """Take steps in compiled code until the last output time, or until Python must act; return the code why.
+        """Take steps in compiled code until the last output time, or until Python must act; return the reason's code.
 
         Parameters
         ----------
@@ -209,7 +212,7 @@ class Run:
         )
         other.looser = other.tolerances
         if self.static is None and self.kit.flags[indices.FORM] == indices.AUGMENTED:  # a run may change these flags
-            other.kit = kit_with(self.system, self.kit.flags, other.plan)
+            other.kit = kit_for_plan(self.system, self.kit.flags, other.plan)
             other.functions = other.kit.functions
         return other
 
@@ -231,7 +234,7 @@ class Run:
         self.clock[a.H_LIMIT] = plan.limit_start
 
     def _workspace(self, rank: int | None = None, rank_v: int | None = None) -> Any:
-        """Create the workspace for ranks of C_q and of all rows; None: full rank."""
+        """Create the workspace for the rank of C_q and that of all rows; None: full rank."""
         q0 = self.state[: self.system.n_q]
         pattern = self._pattern(q0) if self.static is None else NO_PATTERN
         ranks = rank, rank_v
@@ -240,7 +243,7 @@ class Run:
         return work
 
     def _pattern(self, q: Array) -> Array:
-        """Return the pattern of the entries of the constraint rows."""
+        """Return an array with 1 at the entries of the constraint rows, and 0 elsewhere."""
         system, t0 = self.system, self.t0
         return system.remembered_at("pattern", (t0, q.tobytes()), lambda: pattern_of(system, t0, q))  # type: ignore[no-any-return]
 
@@ -379,7 +382,7 @@ class Run:
         return mass_and_rows(system, self.t0, q)[1]
 
     def _in_words(self, all_rows: Rows, rows: list[int]) -> str:
-        """Describe on which other rows some rows depend."""
+        """Describe in words on which of `all_rows` the dependent `rows` (indices) depend."""
         if not isinstance(all_rows, SparseRows):
             return in_words(all_rows, rows)
         q, counted = self.state[: self.system.n_q], self.work.rows_v.tolist()
@@ -402,14 +405,14 @@ class Run:
     def limit_steps(self) -> None:
         """Limit the steps, so that no hundredth of the run passes without an evaluation.
 
-        If forces may be steep, steps are no longer than a hundredth: a single stage that meets one may not reveal it.
+        If forces may be steep, steps are no longer than that: a single stage within a steep force may not reveal it.
         """
         unseen = 1.0 if self.may_be_steep else self.plan.unseen
         longest = np.inf if self.plan.looks_within else self.tolerances[indices.GAP] / unseen
         self.control[self.a.MAX_STEP], self.control[self.a.MAX_EVALUATION_GAP] = min(self.max_step, longest), unseen
 
     def first_step(self, t: float, t1: float, state: Array, longest: float = 0.0) -> float:
-        """Return the first step from a state, s; with `longest`, also bound all steps by a hundredth of the run."""
+        """Return the first step from a state, s. If `longest` > 0, also limit the time between two evaluations."""
         numbers = self.system.n_q, t, t1, self.least_atol, longest, self.plan.looks_within
         first: float = entry_point(cached_run().set_sizes)(self.control, self.tolerances, state, *numbers)
         return first

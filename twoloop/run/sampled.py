@@ -22,7 +22,7 @@ from twoloop.methods.auto import Auto
 from twoloop.methods.plan import Method
 from twoloop.methods.taylor import Taylor
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.fallbacks import MOST, closer_sampling, may_have_missed_changes, warn_of_missed_changes
+from twoloop.run.fallbacks import MAX_REPETITIONS, closer_sampling, may_have_missed_changes, warn_of_missed_changes
 from twoloop.run.loop import IntegrationLoop, Interrupts
 from twoloop.run.messages import warn_of_singular_end, warn_user
 from twoloop.run.record import MemoryStore, OutputRequest, Record, Status, statistics
@@ -32,7 +32,7 @@ from twoloop.run.signals import signals_of
 Array = NDArray[np.float64]
 
 STEPS = 1024  # number of steps that one call of the compiled loop may take
-FORCES = {"force", "force_by_q", "force_by_v"}
+FORCES = {"force", "force_by_q", "force_by_v"}  # callbacks whose parameters may change between samples
 CHANGED = "the parameters changed at samples"
 
 
@@ -167,7 +167,7 @@ class SampledRun:
 
     def _step_to(self, end: float) -> None:
         """Integrate from the last sample to `end`; repeat this with more evaluations after a short change of forces."""
-        for _ in range(MOST):
+        for _ in range(MAX_REPETITIONS):
             self._integrate_to(end)
             if not may_have_missed_changes(self.run):
                 return
@@ -233,7 +233,7 @@ class SampledRun:
         run, a = self.run, self.run.a
         code = entry_point(run.kernels.start)(run.kit, run.work, t, run.state)
         first = 0
-        if run.plan.first is not None:  # for a pair of methods: remember which one is active
+        if run.plan.first is not None:  # a pair of methods: the first numbers of its memory say which is active
             from twoloop.kernels.control.stiffness import N_SCALARS
 
             first = N_SCALARS + 2 * run.system.n_q
@@ -284,14 +284,14 @@ class SampledRun:
         """Refuse a parameter that enters other callbacks than forces: positions or momenta would jump with it."""
         before, n = float(self.p[place]), self.system.n_q
         t, row = self.times[-1], self.rows[-1]
-        known = {"q": row[:n], "v": row[n : 2 * n]}
+        state = {"q": row[:n], "v": row[n : 2 * n]}
         for kind in sorted(self.system.given.keys() - self.system.scattered - FORCES):
-            if not set(KINDS[kind].state) <= set(known):
+            if not set(KINDS[kind].state) <= set(state):
                 continue
             values = []
             for each in (before, value, 0.5 * before + 1.37):
                 self.p[place] = each
-                values.append(np.concatenate([np.ravel(x) for x in parts_of(self._of(kind, t, known))]))
+                values.append(np.concatenate([np.ravel(x) for x in parts_of(self._evaluate(kind, t, state))]))
             self.p[place] = before
             if any((each != values[0]).any() for each in values[1:]):
                 raise ValueError(
@@ -300,5 +300,5 @@ class SampledRun:
                 )
         self._force_parameters.add(place)
 
-    def _of(self, kind: str, t: float, known: dict[str, Array]) -> Any:
-        return self.system.evaluate(kind, t, *(known[name] for name in KINDS[kind].state))
+    def _evaluate(self, kind: str, t: float, state: dict[str, Array]) -> Any:
+        return self.system.evaluate(kind, t, *(state[name] for name in KINDS[kind].state))

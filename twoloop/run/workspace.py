@@ -42,7 +42,8 @@ Array = NDArray[np.float64]
 
 # displacement of coordinates and velocities, relative to max(1, |value|), that reveals which forces depend on them
 DISPLACED = 1e-3
-NEWTON_SPARSE = 0.2  # share of the entries and operations of dense factors above which a program does not pay
+# entries and operations, relative to those of dense factors, above which sparse factors of Newton's matrix do not pay
+NEWTON_SPARSE = 0.2
 
 
 def newton_form(
@@ -54,11 +55,10 @@ def newton_form(
     together: list[tuple[int, ...]],
     stiff: list[int],
 ) -> tuple[NDArray[np.int32], int] | None:
-    """Create the program of Newton's matrix, see sparse_lu.py; return it and the number of groups of columns.
+    """Create the program that factorizes Newton's matrix, see sparse_lu.py, and count the groups of its columns.
 
-    The columns of a group are computed from one difference of forces.
-
-    Return None if the matrix is not sparse, or has no program.
+    The columns of a group are computed from one difference of forces. `together` are the coordinates of each body,
+    `stiff` the constraint rows of `_stiff_rows`. Return None if the matrix is not sparse, or has no program.
     """
     entries: set[tuple[int, int]] = set()
     rng = np.random.default_rng(9)
@@ -83,7 +83,10 @@ def newton_form(
 def _derivative_entries(
     system: ConstrainedSystem, t: float, q: Array, v: Array, lam: Array, most: float
 ) -> set[tuple[int, int]]:
-    """Find the nonzero entries of d(Q - C_q^T lam)/dq and dQ/dv, and make the pattern symmetric."""
+    """Return the indices of the nonzero entries of d(Q - C_q^T lam)/dq and dQ/dv and of their transposes.
+
+    The search stops when there are more than `most` entries.
+    """
 
     def reaction(q: Array) -> Array:
         if "jacobian" not in system.entries:
@@ -107,9 +110,9 @@ def _derivative_entries(
 
 
 SINGULAR = 1e-10  # smallest over largest eigenvalue of a body's M, below which it counts as singular
-ALONG = 1e-3  # a row whose part along a direction without mass is a larger share of its length makes M definite there
+ALONG = 1e-3  # share of a row's length along directions without mass, above which the row makes M definite in one
 MIN_SIZE_NEWTON = 1.6  # number of coordinates, in units of LARGE, from which on Newton's matrices are sparse
-SPARSE = 0.05  # share of the entries and operations of dense factors above which the static form does not pay
+SPARSE = 0.05  # entries and operations, relative to those of dense factors, above which the static form does not pay
 
 
 class StaticForm(NamedTuple):
@@ -130,7 +133,7 @@ class StaticForm(NamedTuple):
         return self.n_groups + float(self.newton[N_UPDATES]) / max(1.0, float(self.program[N_UPDATES]))
 
     def n_matrices(self, matrices: int) -> int:
-        """Return the number of floats of Newton's matrices, for a plan with `matrices` dense ones."""
+        """Return the number of floats of sparse Newton's matrices, in place of `matrices` dense ones of a plan."""
         from twoloop.kernels.steps.newton_systems import matrices_size
         from twoloop.kernels.steps.stages import SYSTEMS
 
@@ -154,7 +157,7 @@ def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -
 
 
 def with_newton(system: ConstrainedSystem, t0: float, q0: Array, form: StaticForm) -> StaticForm | None:
-    """Return the static form with the program of Newton's matrix; None if there is none, or it does not pay."""
+    """Return a copy of `form` with the program of Newton's matrix; None if there is no program, or it does not pay."""
     if system.n_q < MIN_SIZE_NEWTON * LARGE:
         return None
     cached = system.remembered("newton form", lambda: newton_form(system, t0, q0, *form.newton_arguments))
@@ -168,12 +171,12 @@ def _create_static_form(system: ConstrainedSystem, t0: float, q0: Array) -> Stat
         jacobian = system.entries["jacobian"]
     else:
         pattern = pattern_of(system, t0, q0)
-        jacobian = _places(pattern)
+        jacobian = _entries_of(pattern)
     if "mass" in system.entries:
         mass = system.entries["mass"]
     else:
         entries = _mass_pattern(system, t0, q0)
-        mass, dense_mass = _places(entries), not system.constant_mass
+        mass, dense_mass = _entries_of(entries), not system.constant_mass
         mass_pattern = entries if dense_mass else mass_pattern
     if not _is_sparse(system.n_q, len(jacobian[0])) or not _is_sparse(system.n_q, len(mass[0])):
         return None
@@ -188,26 +191,26 @@ def _create_static_form(system: ConstrainedSystem, t0: float, q0: Array) -> Stat
 
 
 def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]:
-    """Return the coordinates of each body in space: of bodies named by joints, and of others with the same layout.
+    """Return the coordinates of each body in space: of bodies that joints name, and of others with the same layout.
 
-    A joint names only one of its two bodies, so the body at the end of a chain may be named by none.
+    A joint names only one of its two bodies, so that some body, as at the end of a chain, may be named by no joint.
     """
-    named = [joint.translation + joint.rotation for joint in system.joints]
-    layouts = {tuple(j - own[0] for j in own) for own in named}
-    if layouts != {tuple(range(7))} or system.n_q % 7 > 0 or any(own[0] % 7 > 0 for own in named):
-        return named
+    coordinates_by_joint = [joint.translation + joint.rotation for joint in system.joints]
+    layouts = {tuple(j - own[0] for j in own) for own in coordinates_by_joint}
+    if layouts != {tuple(range(7))} or system.n_q % 7 > 0 or any(own[0] % 7 > 0 for own in coordinates_by_joint):
+        return coordinates_by_joint
     body_of = bodies_of(system.n_q, mass, ())
     expected = [7 * k + (j if j < 3 else 3) for k in range(system.n_q // 7) for j in range(7)]
-    return named if body_of != expected else [tuple(range(k, k + 7)) for k in range(0, system.n_q, 7)]
+    return coordinates_by_joint if body_of != expected else [tuple(range(k, k + 7)) for k in range(0, system.n_q, 7)]
 
 
 def _stiff_rows(
     system: ConstrainedSystem, t0: float, q0: Array, mass: Entries, jacobian: Entries, together: list[tuple[int, ...]]
 ) -> list[int]:
-    """Find constraint rows of single bodies, such as the norm of Euler parameters, that make a singular M definite.
+    """Find constraint rows g of single bodies, such as the norm of Euler parameters, that make a singular M definite.
 
-    Their products may have entries only where M has some, see sparse_ldl.py. No more rows than necessary are returned:
-    further ones, such as those of a hinge on the ground, are treated like joints.
+    g g^T may have entries only where M has entries, see sparse_ldl.py. No more rows than necessary are returned: other
+    rows of single bodies, such as those of a hinge on the ground, are treated like the rows of joints.
     """
     values = system.mass_values(t0, q0) if "mass" in system.entries else system.mass(t0, q0)[mass]
     body_of = np.array(bodies_of(system.n_q, mass, together))
@@ -215,12 +218,12 @@ def _stiff_rows(
     for j, body in enumerate(body_of.tolist()):
         coordinates.setdefault(body, []).append(j)
     blocks: dict[int, Array] = {body: np.zeros((len(own), len(own))) for body, own in coordinates.items()}
-    place = {j: k for own in coordinates.values() for k, j in enumerate(own)}
-    there = set()
+    index_in_body = {j: k for own in coordinates.values() for k, j in enumerate(own)}
+    mass_entries = set()
     for i, j, value in zip(*(each.tolist() for each in (*mass, values)), strict=True):
-        blocks[int(body_of[i])][place[i], place[j]] += value
-        there.add((i, j))
-    free = {body: ways for body, block in blocks.items() if (ways := _without_mass(block)).size > 0}
+        blocks[int(body_of[i])][index_in_body[i], index_in_body[j]] += value
+        mass_entries.add((i, j))
+    free = {body: directions for body, block in blocks.items() if (directions := _without_mass(block)).size > 0}
     if not free:
         return []
     columns: dict[int, list[tuple[int, float]]] = {}
@@ -230,10 +233,10 @@ def _stiff_rows(
     indices = []
     for i, own in columns.items():
         body = int(body_of[own[0][0]])
-        if body in free and all((j, k) in there for j, _ in own for k, _ in own):
+        if body in free and all((j, k) in mass_entries for j, _ in own for k, _ in own):
             row = np.zeros(len(coordinates[body]))
             for j, value in own:
-                row[place[j]] += value
+                row[index_in_body[j]] += value
             along = free[body] @ row
             if np.linalg.norm(along) > ALONG * np.linalg.norm(row):
                 indices.append(i)
@@ -242,11 +245,11 @@ def _stiff_rows(
 
 
 def _without_mass(block: Array) -> Array:
-    """Return the directions along which a body has no mass, one for each row."""
+    """Return the directions along which a body has no mass, as rows; `block` is its part of M."""
     if not np.isfinite(block).all():
         return np.eye(len(block))
-    values, ways = np.linalg.eigh(block)
-    return np.asarray(ways.T[values <= SINGULAR * values[-1]])
+    values, directions = np.linalg.eigh(block)
+    return np.asarray(directions.T[values <= SINGULAR * values[-1]])
 
 
 def _is_sparse(n_q: int, n_entries: int) -> bool:
@@ -259,26 +262,26 @@ def _dense_work(n_q: int, n_c: int) -> float:
     return 0.5 * n_c * n_c * (n_q + n_c / 3.0)
 
 
-def _places(pattern: Array) -> Entries:
+def _entries_of(pattern: Array) -> Entries:
     rows, columns = np.nonzero(pattern)
     return rows.astype(np.int64), columns.astype(np.int64)
 
 
 def _mass_pattern(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
-    """Return a matrix with 1 at the nonzero entries that M has at a position or, if M is variable, near it."""
+    """Return a matrix with 1 at the entries of M that are not zero at a position or, if M is variable, near it."""
     pattern = np.zeros((system.n_q, system.n_q))
     size = np.maximum(np.abs(q0), np.abs(q0).max())
-    ways = np.random.default_rng(5).uniform(-1.0, 1.0, (len(NEARBY), system.n_q))
-    for share, way in zip(NEARBY[:1] if system.constant_mass else NEARBY, ways, strict=False):
+    directions = np.random.default_rng(5).uniform(-1.0, 1.0, (len(NEARBY), system.n_q))
+    for share, direction in zip(NEARBY[:1] if system.constant_mass else NEARBY, directions, strict=False):
         try:
-            mass = system.mass(t0, q0 + share * size * way)
+            mass = system.mass(t0, q0 + share * size * direction)
         except Exception:  # outside the domain of the callbacks; missed entries are found during the run
             continue
         pattern[(mass != 0.0) | (mass.T != 0.0)] = 1.0
     return pattern
 
 
-GAMMA_ACCURACY = 1e-11  # smallest relative error of gamma that differences of C_q and C_t can reach
+GAMMA_ACCURACY = 1e-11  # smallest relative error that a gamma computed by differences of C_q and C_t can have
 MOST_KITS = 16  # largest number of kits that are cached with a system
 
 
@@ -292,7 +295,7 @@ def kit_of(
         return _static_kit(system, plan, static)
     flags = _flags_at(system, t0, q0)
     if plan is not None:
-        return kit_with(system, flags, plan)
+        return kit_for_plan(system, flags, plan)
 
     def make() -> tuple[Kit, Any]:
         functions = system.functions
@@ -319,21 +322,21 @@ def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) 
 
 
 def _flags_at(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
-    """Return the flags at a position; the array is cached, so it must not be changed."""
+    """Return the flags that choose the linear algebra at a position; the array is cached: do not change it."""
     definite = has_definite_mass(system, t0, q0)
     key = ("flags", system.functions.flags.tobytes(), definite)
     flags, sparse = system.remembered(key, lambda: _flags(system, t0, q0, definite))
     if not sparse:
         return flags  # type: ignore[no-any-return]
-    place = (t0, q0.tobytes())
-    if definite or system.remembered_at("inertia", place, lambda: least_inertia(system, t0, q0)[0]) > 0.0:
+    position = (t0, q0.tobytes())
+    if definite or system.remembered_at("inertia", position, lambda: least_inertia(system, t0, q0)[0]) > 0.0:
         flags = flags.copy()
         flags[FORM] = AUGMENTED
     return flags  # type: ignore[no-any-return]
 
 
 def _flags(system: ConstrainedSystem, t0: float, q0: Array, definite: bool) -> tuple[Array, bool]:
-    """Choose dense or banded algebra; return the flags, and whether sparse factors would be faster."""
+    """Return flags that choose dense or banded algebra, and whether sparse factors would be faster."""
     flags: Array = system.functions.flags.copy()
     if system.constant_mass:
         flags[DIAGONAL_MASS] = is_diagonal(system.mass(t0, q0))
@@ -356,35 +359,35 @@ def is_diagonal(mass: Array) -> bool:
     return np.count_nonzero(mass) == np.count_nonzero(mass.diagonal())
 
 
-def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
-    """Return the kit for some flags and a plan; the system caches it for the next run."""
+def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
+    """Return the kit for the given flags and the steps of a plan; the system caches it for the next run."""
     from twoloop.kernels.evaluation.inner_loop import inner_loop
 
-    read = (plan.numbers, plan.own_numbers)
+    numbers = (plan.numbers, plan.own_numbers)
     kits: dict[Any, tuple[Kit, Any]] = system.remembered("kits", dict)
-    # ids in the key stay unique, as the cached objects keep alive the objects that have them
+    # ids in the key stay unique, as the cached kits keep the objects with these ids alive
     called = (plan.inner, plan.step, plan.first, plan.second)
-    key = (id(system.functions), flags.tobytes(), *called, len(LOADED), *map(id, (*plan.own, *read)))
-    changes = flags[FORM] == AUGMENTED  # a run may change these flags
+    key = (id(system.functions), flags.tobytes(), *called, len(LOADED), *map(id, (*plan.own, *numbers)))
+    run_changes_flags = flags[FORM] == AUGMENTED  # a run may change these flags
     if key in kits:
-        return _with_own_flags(kits[key][0]) if changes else kits[key][0]
+        return _with_own_flags(kits[key][0]) if run_changes_flags else kits[key][0]
     flags = flags.copy()
     flags[STRAIGHT] = plan.inner is not None
     functions = system.functions._replace(flags=flags)
-    kernels = Kit(functions, plan.inner or inner_loop, *_steps_of(plan), inner_loop, plan.own, *read)
+    kernels = Kit(functions, plan.inner or inner_loop, *_steps_of(plan), inner_loop, plan.own, *numbers)
     if len(kits) == MOST_KITS:
         del kits[next(iter(kits))]
     kits[key] = kernels, system.functions
-    return _with_own_flags(kernels) if changes else kernels
+    return _with_own_flags(kernels) if run_changes_flags else kernels
 
 
 def _steps_of(plan: Plan) -> tuple[Any, Any, Any]:
-    """Return the step of a plan, and the two steps between which it chooses; the second is loaded when needed."""
+    """Return the step of a plan, and the two steps between which `auto` switches; the second is not loaded yet."""
     return loaded(plan.step), loaded(plan.first), without_loading(plan.second)
 
 
 def _with_own_flags(kit: Kit) -> Kit:
-    """Copy a kit, with flags that one run may change; this takes a tenth of the time of a new kit."""
+    """Copy a kit with flags of its own, which a run may change; this takes a tenth of the time of a new kit."""
     other, flags, table = object.__new__(Kit), kit.flags.copy(), kit.table.copy()
     table[common.KIT.places["flags"]] = flags.ctypes.data
     functions = kit.functions._replace(flags=flags)
@@ -403,9 +406,9 @@ def workspace(
     static: StaticForm | None = None,
     matrices: int = 0,
 ) -> common.Work:
-    """Create a workspace for ranks of C_q and of all rows (None: full).
+    """Create a workspace for the ranks of C_q and of [C_q; A] (None: full rank).
 
-    `pattern`: 1 at the entries of all rows. `matrices`: number of dense matrices that the plan needs.
+    `pattern`: 1 at the entries of [C_q; A]. `matrices`: number of dense matrices that the plan needs.
     """
     flags = kit.flags
     reduced, augmented = flags[DENSE_FORM] == NULL_SPACE, flags[FORM] == AUGMENTED
@@ -434,14 +437,14 @@ def prepare_workspace(
     given = map(np.ascontiguousarray, (pattern, q0))
     entry_point(cached_run().prepare_workspace)(work, *lasting(work), *given, max(rtol, GAMMA_ACCURACY), reuse)
     if static is not None:
-        _fill(work, system, static, q0)
+        _set_constants(work, system, static, q0)
         return work
     if flags[BANDWIDTH] >= 0:
         work.lapack[:] = lapack_addresses()
     return work
 
 
-def _fill(work: common.Work, system: ConstrainedSystem, form: StaticForm, q0: Array) -> None:
+def _set_constants(work: common.Work, system: ConstrainedSystem, form: StaticForm, q0: Array) -> None:
     """Set the constant parts of a workspace in the static form."""
     work.pattern[:], work.mass_pattern[:] = form.pattern, form.mass_pattern
     work.dependent[:] = work.independent[:] = np.arange(system.n_q)
