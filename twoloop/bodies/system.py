@@ -16,7 +16,7 @@ from twoloop.bodies.parts import COINCIDE, Force
 from twoloop.bodies.tables import Tables
 from twoloop.checks.arguments import Array, shown
 from twoloop.generate.graph import Untraceable
-from twoloop.generate.program import AGREES, BETWEEN, STATES
+from twoloop.generate.program import MAX_TRACE_DIFFERENCE, N_COMPARED, TIME_SPACING
 from twoloop.problem.callbacks import LARGE
 from twoloop.problem.description import Joint
 from twoloop.problem.system import ConstrainedSystem
@@ -277,9 +277,9 @@ def _disagreement(tables: Tables, t: float, q: Array, v: Array) -> str:
         (tables.motions, head[layout.MOTION_PROGRAM]),
         (tables.functions, head[layout.FORCE_PROGRAM]),
     ):
-        for number in range(STATES if functions else 0):
+        for number in range(N_COMPARED if functions else 0):
             offset = generic.uniform(-1.0, 1.0, (2, len(q))) * (number > 0)
-            time = t + BETWEEN * number
+            time = t + TIME_SPACING * number
             near_q, near_v = q + 0.3 * offset[0], v + offset[1]
             extended = (
                 _with_spring_lengths(tables, near_q, near_v, p) if functions is tables.functions else (near_q, near_v)
@@ -292,7 +292,7 @@ def _disagreement(tables: Tables, t: float, q: Array, v: Array) -> str:
                     called = np.full(each.n_results, np.nan)
                 size = each.n_results
                 traced, first = computed[first : first + len(called)], first + size
-                off = np.abs(called - traced) > AGREES * (1.0 + np.abs(called))
+                off = np.abs(called - traced) > MAX_TRACE_DIFFERENCE * (1.0 + np.abs(called))
                 if (off & np.isfinite(called)).any():
                     return f"{each.name} does not give at t = {time:g} what it gave when it was traced"
     return ""

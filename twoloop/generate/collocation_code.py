@@ -5,7 +5,7 @@ another, so that a sweep takes little longer than one evaluation. Usually the ac
 coordinates only: only these coordinates are iterated, and the others follow from the final accelerations. The ends of
 eight steps are projected onto the constraints together, one in each lane.
 
-The functions share an array, `room`, whose layout is in kernels/data/collocation.py; kernels/steps/lobatto_step.py
+The functions share an array, `work`, whose layout is in kernels/data/collocation.py; kernels/steps/lobatto_step.py
 calls them.
 
 The method is Lobatto IIIA with nine nodes, the first of which is the end of the previous step; its order is 16. A
@@ -46,7 +46,7 @@ from twoloop.kernels.data.indices import ATOL, ESTIMATE, RTOL
 
 Array = NDArray[np.float64]
 Extended = NDArray[np.longdouble]
-N = 9
+N = 9  # number of nodes
 
 
 class Tables(NamedTuple):
@@ -129,7 +129,7 @@ MOST_OPERATIONS = 5000  # largest number of operations of the equations: code of
 SMALLEST = 1e-300  # replaces a divisor of zero
 FAILED = -1.0  # result of an audit that cannot evaluate the accelerations (defects are never negative)
 INFINITE = float("inf")
-# number of steps that use `mass_first`, after a step in which the conditions of `reduced` failed
+# number of further steps that eliminate M first, after a step whose accelerations by the shorter program were invalid
 STEPS_BY_MASS_FIRST = 8.0
 FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the second step
 
@@ -142,11 +142,11 @@ KAPPA = 0.02
 TARGET = 6.0
 EXTRA_SWEEPS = 7  # number of sweeps beyond the target after which a step is rejected
 SLOW = 0.8  # contraction of the iteration above which a step is rejected after the third sweep
-MIN_RHO, MAX_RHO = 1e-3, 0.9
-SLOW_START, FAST_START = 0.3, 0.04  # if the contraction of the first step is outside these limits, its size is changed
+MIN_RHO, MAX_RHO = 1e-3, 0.9  # limits to which the measured contraction of a sweep is cut
+SLOW_START, FAST_START = 0.3, 0.04  # limits of the contraction in the first step: outside, another step size is tried
 # ratio of two successive changes from which on the changes are rounding, if they are below NOISE relative to the values
 STAGNANT = 0.5
-# steps of fixed size: their KAPPA and NOISE (forces may have rounding errors, too), and the largest number of sweeps
+# in steps of fixed size: KAPPA, NOISE (larger, as forces may have rounding errors), and the largest number of sweeps
 ROUNDING_OF_FIXED, NOISE_OF_FIXED, MOST_OF_FIXED = 1e-16, 1e-9, 60.0
 LEAST_CHANGE = 1e-30  # added to an error ratio, so that its logarithm exists
 ERROR_WEIGHT = 0.5  # weight of the error estimate
@@ -205,7 +205,7 @@ class CollocationCode:
 
     # the functions
 
-    def attempt(self, emit: LaneEmitter, room: Value, state: Value, tolerances: Value, numbers: Value) -> Value:
+    def attempt(self, emit: LaneEmitter, work: Value, state: Value, tolerances: Value, numbers: Value) -> Value:
         """Iterate the stages of a step; return a code for how the iteration ended, see data/collocation.py.
 
         The accelerations come from the program with the fewest operations. Its conditions are checked once, after the
@@ -215,69 +215,69 @@ class CollocationCode:
         builder, one = emit.builder, Emitter(emit.builder)
         emit.numbers = emit.constants = numbers
 
-        def careful() -> Value:
-            name = self._mass_first_function(emit, [each.type for each in (room, state, tolerances, numbers)])
-            return builder.call(name, DOUBLE, [room, state, tolerances, numbers])
+        def iterate_mass_first() -> Value:
+            name = self._mass_first_function(emit, [each.type for each in (work, state, tolerances, numbers)])
+            return builder.call(name, DOUBLE, [work, state, tolerances, numbers])
 
-        def quick(inputs: list[Value]) -> Callable[[], Value]:
+        def evaluate(inputs: list[Value]) -> Callable[[], Value]:
             if self.parts is not None and not self.has_reduced:
-                return self._caller(emit, room, 0)(inputs)
+                return self._caller(emit, work, 0)(inputs)
             outputs, written = self.equations.accelerations[0], Lowering(emit, self.numbers)
             (forms,), graph = outputs.arrays.values(), self.equations.graph
             for quantity, value in enumerate(inputs):
                 written.define(quantity, value)
 
-            def put(coordinates: list[int]) -> None:
+            def store(coordinates: list[int]) -> None:
                 for i, value in zip(coordinates, written.forms(graph, [forms[i] for i in coordinates]), strict=True):
-                    store_lanes(emit, value, room, self.a + LANES * i)
+                    store_lanes(emit, value, work, self.a + LANES * i)
 
             def finish() -> Value:
-                put(self.others)
+                store(self.others)
                 written.forms(graph, [form for pair in outputs.conditions for form in pair])
-                return written.holds(outputs, self._accelerations(emit, room))
+                return written.holds(outputs, self._accelerations(emit, work))
 
-            put(self.iterated)
+            store(self.iterated)
             return finish
 
         def otherwise() -> Value:
             if not self.has_reduced:
                 return constant(DOUBLE, float(at.NOT_COMPUTED))
-            one.store(constant(DOUBLE, STEPS_BY_MASS_FIRST), room, at.CAREFUL)
-            return careful()
+            one.store(constant(DOUBLE, STEPS_BY_MASS_FIRST), work, at.CAREFUL)
+            return iterate_mass_first()
 
         if self.has_reduced:
-            left = one.load(room, at.CAREFUL)
+            left = one.load(work, at.CAREFUL)
             with self._returning_if(emit, builder.compare("fcmp ogt", left, llvm_code.ZERO)):
-                one.store(one.subtract(left, llvm_code.ONE), room, at.CAREFUL)
-                builder.ret(careful())
-        self._call(emit, "begin_nodes", self._begin, [room, state, tolerances])
-        return self._iterate(emit, room, state, tolerances, quick, otherwise)
+                one.store(one.subtract(left, llvm_code.ONE), work, at.CAREFUL)
+                builder.ret(iterate_mass_first())
+        self._call(emit, "begin_nodes", self._begin, [work, state, tolerances])
+        return self._iterate(emit, work, state, tolerances, evaluate, otherwise)
 
     def _mass_first_function(self, emit: LaneEmitter, kinds: list[str]) -> str:
         """Return the name of the function that iterates by eliminating M first; write it at the first call."""
         module, name = emit.builder.module, "careful_nodes"
         if not module.defines(name):
             builder = module.function(name, DOUBLE, kinds, internal=True)
-            inner, (room, state, tolerances, numbers) = emit.like(builder), builder.arguments
+            inner, (work, state, tolerances, numbers) = emit.like(builder), builder.arguments
             inner.numbers = inner.constants = numbers
-            self._call(inner, "begin_nodes", self._begin, [room, state, tolerances])
-            mass_first, given_up = self._caller(inner, room, -1), constant(DOUBLE, float(at.NOT_COMPUTED))
-            builder.ret(self._iterate(inner, room, state, tolerances, mass_first, lambda: given_up))
+            self._call(inner, "begin_nodes", self._begin, [work, state, tolerances])
+            mass_first, not_computed = self._caller(inner, work, -1), constant(DOUBLE, float(at.NOT_COMPUTED))
+            builder.ret(self._iterate(inner, work, state, tolerances, mass_first, lambda: not_computed))
         return name
 
-    def _caller(self, emit: LaneEmitter, room: Value, way: int) -> Callable[[list[Value]], Callable[[], Value]]:
+    def _caller(self, emit: LaneEmitter, work: Value, index: int) -> Callable[[list[Value]], Callable[[], Value]]:
         """Return a function `evaluate` for `_iterate` that calls `call_accelerations`."""
-        filled = Emitter(emit.builder).pointer(room, self.a)
+        filled = Emitter(emit.builder).pointer(work, self.a)
 
         def evaluate(inputs: list[Value]) -> Callable[[], Value]:
-            holds = call_accelerations(emit, self.equations, way, inputs, self.numbers, filled)
+            holds = call_accelerations(emit, self.equations, index, inputs, self.numbers, filled)
             return lambda: holds
 
         return evaluate
 
-    def _accelerations(self, emit: LaneEmitter, room: Value) -> list[Value]:
+    def _accelerations(self, emit: LaneEmitter, work: Value) -> list[Value]:
         """Load the accelerations from memory: values kept across the loop would be spilled to the stack."""
-        return [load_lanes(emit, room, self.a + LANES * i) for i in range(self.n)]
+        return [load_lanes(emit, work, self.a + LANES * i) for i in range(self.n)]
 
     @contextmanager
     def _returning_if(self, emit: LaneEmitter, condition: Value) -> Iterator[None]:
@@ -298,7 +298,7 @@ class CollocationCode:
             builder.ret(None)
         emit.builder.run(name, arguments)
 
-    def _begin(self, emit: LaneEmitter, room: Value, state: Value, tolerances: Value) -> None:
+    def _begin(self, emit: LaneEmitter, work: Value, state: Value, tolerances: Value) -> None:
         """Store the error weights, and predict positions and velocities at the nodes.
 
         Errors are relative to the position (or velocity) at the beginning, or to its change in half a step if that is
@@ -306,7 +306,7 @@ class CollocationCode:
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
         fixed = builder.compare("fcmp oeq", one.load(tolerances, ESTIMATE), llvm_code.ZERO)
-        h, rtol = one.load(room, at.H), builder.select(fixed, llvm_code.ONE, one.load(tolerances, RTOL))
+        h, rtol = one.load(work, at.H), builder.select(fixed, llvm_code.ONE, one.load(tolerances, RTOL))
         several, starts = self._vector_emitter(emit)
         zero = several.constant(0.0)
         length, half, relative = (several.splat(each) for each in (h, one.multiply(h, constant(DOUBLE, 0.5)), rtol))
@@ -320,7 +320,7 @@ class CollocationCode:
             by_v = builder.compare("fcmp olt", several.multiply(of_v, length), of_q)
             allowed = several.larger(builder.select(by_v, of_v, of_q), several.constant(SMALLEST))
             weight = several.divide(builder.select(by_v, several.constant(1.0), length), allowed)
-            several.store(weight, one.pointer(room, at.WEIGHTS + start))
+            several.store(weight, one.pointer(work, at.WEIGHTS + start))
             iterated = [float(start + k in self.iterated) for k in range(several.lanes)]
             counted = several.multiply(
                 weight, constants(iterated) if several.lanes > 1 else constant(DOUBLE, *iterated)
@@ -329,24 +329,24 @@ class CollocationCode:
             largest = [several.larger(*pair) for pair in zip((weight, counted, size), largest, strict=True)]
         of_all, of_iterated, size = (several.largest_lane(each) for each in largest)
         if self.iterated:
-            one.store(one.divide(of_all, of_iterated), room, at.STRICTER)
-            one.store(size, room, at.SIZE)
-        powers = self._powers(emit, one.divide(h, one.load(room, at.H_BEFORE)))
-        store_lanes(emit, powers, room, at.POWERS)
-        degree = emit.splat(one.load(room, at.DEGREE))
+            one.store(one.divide(of_all, of_iterated), work, at.STRICTER)
+            one.store(size, work, at.SIZE)
+        powers = self._powers(emit, one.divide(h, one.load(work, at.H_BEFORE)))
+        store_lanes(emit, powers, work, at.POWERS)
+        degree = emit.splat(one.load(work, at.DEGREE))
         known = constants([float(k) for k in range(LANES)])
         kept = builder.select(builder.compare("fcmp olt", known, degree), powers, emit.constant(0.0))
-        old = self._polynomial(emit, room, other=False)
+        old = self._polynomial(emit, work, other=False)
         nodes = np.array(tables().nodes)
         # integrals of the powers 0 to 8 from the beginning to the nodes, a row for each power
         velocities = np.array([nodes ** (k + 1) / (k + 1) for k in range(LANES + 1)])
         positions = np.array([nodes ** (k + 2) / ((k + 1) * (k + 2)) for k in range(LANES + 1)])
         with loop_over(emit, self.iterated) as (k, i, _, _):
             scaled = emit.multiply(load_lanes(emit, one.pointer(old, vector_index(emit, k))), kept)
-            store_lanes(emit, scaled, room, at.SCALED)
-            terms = [one.load(one.pointer(state, i), 2 * n), *(one.load(room, at.SCALED + j) for j in range(LANES))]
-            self._put_stages(
-                emit, room, state, k, i, [self._sums(emit, each, terms) for each in (velocities, positions)]
+            store_lanes(emit, scaled, work, at.SCALED)
+            terms = [one.load(one.pointer(state, i), 2 * n), *(one.load(work, at.SCALED + j) for j in range(LANES))]
+            self._store_stages(
+                emit, work, state, k, i, [self._sums(emit, each, terms) for each in (velocities, positions)]
             )
 
     def _powers(self, emit: LaneEmitter, x: Value) -> Value:
@@ -360,14 +360,14 @@ class CollocationCode:
         return emit.multiply(emit.multiply(*factors[:2]), emit.multiply(*factors[2:]))
 
     def _vector_emitter(self, emit: LaneEmitter) -> tuple[LaneEmitter, list[int]]:
-        """Return an emitter for vectors of coordinates, and their first coordinates; the last vector may overlap."""
+        """Return an emitter for vectors of coordinates, and the first coordinate of each; the last two may overlap."""
         lanes = min(LANES, 1 << (self.n.bit_length() - 1))
         return LaneEmitter(emit.builder, lanes), [*range(0, self.n - lanes, lanes), self.n - lanes]
 
     def _iterate(
         self,
         emit: LaneEmitter,
-        room: Value,
+        work: Value,
         state: Value,
         tolerances: Value,
         evaluate: Callable[[list[Value]], Callable[[], Value]],
@@ -385,7 +385,7 @@ class CollocationCode:
             return constant(DOUBLE, value)
 
         estimated = builder.compare("fcmp one", one.load(tolerances, ESTIMATE), llvm_code.ZERO)
-        degree, stricter = one.load(room, at.DEGREE), one.load(room, at.STRICTER)
+        degree, stricter = one.load(work, at.DEGREE), one.load(work, at.STRICTER)
         target = builder.select(
             builder.compare("fcmp oge", degree, number(6.0)),
             builder.select(builder.compare("fcmp oge", degree, number(7.0)), number(TARGET + 2), number(TARGET + 1)),
@@ -396,11 +396,11 @@ class CollocationCode:
             builder.select(estimated, number(usual), number(fixed))
             for usual, fixed in ((KAPPA, ROUNDING_OF_FIXED), (at.NOISE, NOISE_OF_FIXED))
         )
-        noise = one.multiply(noise, one.multiply(one.load(room, at.SIZE), stricter))
-        may_guess = builder.compare("fcmp ogt", one.load(room, at.MAY_GUESS), llvm_code.ZERO)
-        t, h = one.load(room, at.T), one.load(room, at.H)
+        noise = one.multiply(noise, one.multiply(one.load(work, at.SIZE), stricter))
+        may_guess = builder.compare("fcmp ogt", one.load(work, at.MAY_GUESS), llvm_code.ZERO)
+        t, h = one.load(work, at.T), one.load(work, at.H)
         times = emit.fused(constants(tables().nodes), emit.splat(h), emit.splat(t))
-        rho_before = one.load(room, at.RHO)
+        rho_before = one.load(work, at.RHO)
         before, loop, after = builder.block, builder.append_block(), builder.append_block()
         builder.go_to(loop)
         builder.position_at_end(loop)
@@ -410,9 +410,9 @@ class CollocationCode:
             phi.add_incoming(value, before)
         q, v = [emit.constant(0.0)] * n, [emit.constant(0.0)] * n
         for k, i in enumerate(self.iterated):
-            q[i], v[i] = load_lanes(emit, room, self.q + LANES * k), load_lanes(emit, room, self.v + LANES * k)
+            q[i], v[i] = load_lanes(emit, work, self.q + LANES * k), load_lanes(emit, work, self.v + LANES * k)
         finish = evaluate([times, *q, *v])
-        change = one.multiply(stricter, self._integrate(emit, room, state))
+        change = one.multiply(stricter, self._integrate(emit, work, state))
         m = one.add(sweeps, llvm_code.ONE)
 
         def compare(name: str, x: Value, y: Value | float) -> Value:
@@ -448,14 +448,14 @@ class CollocationCode:
         with self._returning_if(emit, builder.operation("xor", all_hold, Value(BIT, "true"))):
             builder.ret(otherwise())
         for value, place in ((m, at.SWEEPS), (change, at.CHANGE), (target, at.TARGETED), (rho_now, at.RHO)):
-            one.store(value, room, place)
+            one.store(value, work, place)
         ended = builder.select(converged, number(at.CONVERGED), number(at.REFUSED))
         ended = builder.select(guessed, number(at.GUESSED), ended)
         with builder.if_then(builder.both(builder.compare("fcmp oeq", ended, number(at.CONVERGED)), estimated)):
-            self._call(emit, "judge_nodes", self._judge, [room, state])
+            self._call(emit, "judge_nodes", self._judge, [work, state])
         return ended
 
-    def _judge(self, emit: LaneEmitter, room: Value, state: Value) -> None:
+    def _judge(self, emit: LaneEmitter, work: Value, state: Value) -> None:
         """Store ERROR and CURVED, and the factors of the next step size by convergence and by the error.
 
         The error estimate extrapolates the decay of the Legendre coefficients of the accelerations. Let t be the larger
@@ -465,7 +465,7 @@ class CollocationCode:
         because the estimate is of order 12.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
-        m, change, target, rho = (one.load(room, place) for place in (at.SWEEPS, at.CHANGE, at.TARGETED, at.RHO))
+        m, change, target, rho = (one.load(work, place) for place in (at.SWEEPS, at.CHANGE, at.TARGETED, at.RHO))
         two = LaneEmitter(builder, 2)
         more = one.divide(one.multiply(rho, change), constant(DOUBLE, KAPPA))
         more = one.add(more, constant(DOUBLE, LEAST_CHANGE))
@@ -474,47 +474,46 @@ class CollocationCode:
         further = one.divide(one.add(left, llvm_code.ONE), one.add(target, constant(DOUBLE, 2.0)))
         with one.loop(integer(0), integer(n), []) as (i, _, _):
             a0 = one.load(one.pointer(state, i), 2 * n)
-            values = emit.function("fabs", self._weighted_rows(emit, tables().spectrum, a0, room, i))
+            values = emit.function("fabs", self._weighted_rows(emit, tables().spectrum, a0, work, i))
             pairs = emit.larger(values, builder.shuffle(values, values, [1, 0, 3, 2, 5, 4, 7, 6]))
-            store_lanes(emit, pairs, one.pointer(room, vector_index(emit, i)), self.spectra)
+            store_lanes(emit, pairs, one.pointer(work, vector_index(emit, i)), self.spectra)
         several, starts = self._vector_emitter(emit)
         error = curved = several.constant(0.0)
         least = several.constant(SMALLEST)
         for start in starts:
-            vectors = [load_lanes(emit, room, self.spectra + LANES * (start + k)) for k in range(several.lanes)]
+            vectors = [load_lanes(emit, work, self.spectra + LANES * (start + k)) for k in range(several.lanes)]
             first, before, top = (column(emit, vectors, lane) for lane in (2, 4, 6))
-            weight = several.load(one.pointer(room, at.WEIGHTS + start))
+            weight = several.load(one.pointer(work, at.WEIGHTS + start))
             of_last = several.larger(several.larger(before, top), least)
             falls = several.divide(top, of_last)
             far = several.divide(top, several.larger(first, of_last))
             falls = several.larger(several.multiply(falls, several.function("sqrt", falls)), far)
             error = several.larger(several.multiply(several.multiply(top, weight), falls), error)
             curved = several.larger(several.multiply(before, weight), curved)
-        h = one.load(room, at.H)
+        h = one.load(work, at.H)
         error = one.multiply(one.multiply(several.largest_lane(error), h), constant(DOUBLE, ERROR_WEIGHT))
-        one.store(error, room, at.ERROR)
-        one.store(one.multiply(several.largest_lane(curved), h), room, at.CURVED)
+        one.store(error, work, at.ERROR)
+        one.store(one.multiply(several.largest_lane(curved), h), work, at.CURVED)
         by_error = one.multiply(builder.extract(two.logarithm(two.splat(error)), 0), constant(DOUBLE, 1.0 / at.ORDER))
         factors = two.exponential(two.negative(two.vector([further, by_error])))
-        one.store(builder.extract(factors, 0), room, at.FACTOR)
-        one.store(builder.extract(factors, 1), room, at.FACTOR_OF_ERROR)
+        one.store(builder.extract(factors, 0), work, at.FACTOR)
+        one.store(builder.extract(factors, 1), work, at.FACTOR_OF_ERROR)
 
-    def audit(self, emit: LaneEmitter, room: Value, state: Value, numbers: Value) -> Value:
+    def audit(self, emit: LaneEmitter, work: Value, state: Value, numbers: Value) -> Value:
         """Evaluate the accelerations between the nodes; return the largest defect, relative to its limit.
 
-        FACTOR_OF_DEFECT becomes the largest factor of the next step size by this defect.
-
+        FACTOR_OF_DEFECT becomes the largest factor of the next step size that this defect allows.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
         emit.numbers = emit.constants = numbers
-        t, h = emit.splat(one.load(room, at.T)), emit.splat(one.load(room, at.H))
+        t, h = emit.splat(one.load(work, at.T)), emit.splat(one.load(work, at.H))
         length = emit.multiply(h, constants(tables().between))
         zero = emit.constant(0.0)
         q, v = [zero] * n, [zero] * n
         for i in self.iterated:
             q0, v0, a0 = (one.load(state, m * n + i) for m in range(3))
-            of_v = self._weighted_rows(emit, tables().velocities_between, a0, room, integer(i))
-            of_q = self._weighted_rows(emit, tables().positions_between, a0, room, integer(i))
+            of_v = self._weighted_rows(emit, tables().velocities_between, a0, work, integer(i))
+            of_q = self._weighted_rows(emit, tables().positions_between, a0, work, integer(i))
             v[i] = emit.fused(h, of_v, emit.splat(v0))
             q[i] = emit.fused(emit.multiply(h, h), of_q, emit.fused(length, emit.splat(v0), emit.splat(q0)))
         inputs, filled = [emit.add(t, length), *q, *v], builder.room(DOUBLE, LANES * n)
@@ -523,8 +522,8 @@ class CollocationCode:
         worst = largest = zero
         for i, value in enumerate(a):
             a0 = one.load(state, 2 * n + i)
-            off = emit.subtract(value, self._weighted_rows(emit, tables().values_between, a0, room, integer(i)))
-            weight = emit.splat(one.load(room, at.WEIGHTS + i))
+            off = emit.subtract(value, self._weighted_rows(emit, tables().values_between, a0, work, integer(i)))
+            weight = emit.splat(one.load(work, at.WEIGHTS + i))
             worst = emit.larger(emit.multiply(emit.function("fabs", off), weight), worst)
             largest = emit.larger(emit.multiply(emit.function("fabs", value), weight), largest)
         beyond_noise = emit.fused(emit.constant(-at.NOISE), largest, worst)
@@ -534,34 +533,34 @@ class CollocationCode:
         power = two.multiply(
             two.logarithm(two.splat(one.larger(defect, constant(DOUBLE, 1e-9)))), two.constant(-1.0 / 9)
         )
-        one.store(builder.extract(two.exponential(power), 0), room, at.FACTOR_OF_DEFECT)
+        one.store(builder.extract(two.exponential(power), 0), work, at.FACTOR_OF_DEFECT)
         all_hold = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [holds])
         return builder.select(all_hold, defect, constant(DOUBLE, FAILED))
 
-    def retry(self, emit: LaneEmitter, room: Value, state: Value) -> None:
+    def retry(self, emit: LaneEmitter, work: Value, state: Value) -> None:
         """Store the polynomial of a rejected step, so that it predicts the shorter step that replaces it."""
-        one, old = Emitter(emit.builder), self._polynomial(emit, room, other=False)
+        one, old = Emitter(emit.builder), self._polynomial(emit, work, other=False)
         with loop_over(emit, self.iterated) as (k, i, _, _):
             a0 = one.load(one.pointer(state, i), 2 * self.n)
             store_lanes(
-                emit, self._weighted_rows(emit, tables().begin, a0, room, i), one.pointer(old, vector_index(emit, k))
+                emit, self._weighted_rows(emit, tables().begin, a0, work, i), one.pointer(old, vector_index(emit, k))
             )
 
-    def end(self, emit: LaneEmitter, room: Value, state: Value, new_state: Value) -> None:
+    def end(self, emit: LaneEmitter, work: Value, state: Value, new_state: Value) -> None:
         """Store [q, v, a] at the end of the step, and the polynomial that predicts the next step, with its degree.
 
         The degree is the one that would have predicted the end of this step best; it changes by at most 2.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
-        last, h = LANES - 1, one.load(room, at.H)
-        powers, new = load_lanes(emit, room, at.POWERS), self._polynomial(emit, room, other=True)
-        old, zero = self._polynomial(emit, room, other=False), emit.constant(0.0)
+        last, h = LANES - 1, one.load(work, at.H)
+        powers, new = load_lanes(emit, work, at.POWERS), self._polynomial(emit, work, other=True)
+        old, zero = self._polynomial(emit, work, other=False), emit.constant(0.0)
         with loop_over(emit, self.iterated, [zero]) as (k, i, (worst,), carried):
-            place = one.pointer(room, vector_index(emit, k))
+            place = one.pointer(work, vector_index(emit, k))
             here = one.pointer(new_state, i)
             a0, a1 = (
                 one.load(one.pointer(state, i), 2 * n),
-                one.load(one.pointer(room, vector_index(emit, i)), self.a + last),
+                one.load(one.pointer(work, vector_index(emit, i)), self.a + last),
             )
             for value, begin in ((one.load(place, self.q + last), 0), (one.load(place, self.v + last), n), (a1, 2 * n)):
                 one.store(value, here, begin)
@@ -570,18 +569,18 @@ class CollocationCode:
                 shifted = [LANES + k if k < distance else k - distance for k in range(LANES)]
                 sums = emit.add(sums, builder.shuffle(sums, zero, shifted))
             off = emit.add(sums, emit.splat(one.subtract(a0, a1)))
-            weight = emit.splat(one.load(one.pointer(room, i), at.WEIGHTS))
+            weight = emit.splat(one.load(one.pointer(work, i), at.WEIGHTS))
             carried.append(emit.larger(emit.multiply(emit.function("fabs", off), weight), worst))
             store_lanes(
-                emit, self._weighted_rows(emit, tables().end, a0, room, i), one.pointer(new, vector_index(emit, k))
+                emit, self._weighted_rows(emit, tables().end, a0, work, i), one.pointer(new, vector_index(emit, k))
             )
-        self._choose_degree(emit, room, carried[0])
+        self._choose_degree(emit, work, carried[0])
         if self.others:
             ends = [constants(table[1:, last]) for table in (tables().velocities, tables().positions)]
             of_first = [constant(DOUBLE, table[0, last]) for table in (tables().velocities, tables().positions)]
             with loop_over(emit, self.others) as (_, i, _, _):
                 first, here = one.pointer(state, i), one.pointer(new_state, i)
-                a = load_lanes(emit, one.pointer(room, vector_index(emit, i)), self.a)
+                a = load_lanes(emit, one.pointer(work, vector_index(emit, i)), self.a)
                 q, v, a0 = (one.load(first, m * n) for m in range(3))
                 of_v, of_q = two_sums(emit, *(emit.multiply(a, end) for end in ends))
                 of_v, of_q = (one.fused(factor, a0, each) for factor, each in zip(of_first, (of_v, of_q), strict=True))
@@ -590,7 +589,7 @@ class CollocationCode:
                 one.store(one.add(v, one.multiply(h, of_v)), here, n)
                 one.store(builder.extract(a, last), here, 2 * n)
 
-    def _choose_degree(self, emit: LaneEmitter, room: Value, worst: Value) -> None:
+    def _choose_degree(self, emit: LaneEmitter, work: Value, worst: Value) -> None:
         """Store NEXT_DEGREE; `worst`: the errors of predictions of degree 1 to 8 at the end of the step."""
         builder, one = emit.builder, Emitter(emit.builder)
         least = one.negative(emit.largest_lane(emit.negative(worst)))
@@ -598,80 +597,80 @@ class CollocationCode:
         bits = builder.convert("zext", builder.convert("bitcast", good, f"i{LANES}"), INTEGER)
         bits = builder.operation("or", bits, integer(1 << LANES - 1))
         first = builder.call("llvm.cttz.i64", INTEGER, [bits, Value(BIT, "true")])
-        best, before = one.add(one.number(first), llvm_code.ONE), one.load(room, at.DEGREE)
+        best, before = one.add(one.number(first), llvm_code.ONE), one.load(work, at.DEGREE)
         lowest, highest = (one.add(before, constant(DOUBLE, each)) for each in (-2.0, 2.0))
         degree = one.smaller(one.larger(best, one.larger(lowest, constant(DOUBLE, 2.0))), highest)
-        predicts = builder.compare("fcmp one", one.load(room, at.PREDICTS), llvm_code.ZERO)
-        one.store(builder.select(predicts, degree, constant(DOUBLE, FIRST_DEGREE)), room, at.NEXT_DEGREE)
+        predicts = builder.compare("fcmp one", one.load(work, at.PREDICTS), llvm_code.ZERO)
+        one.store(builder.select(predicts, degree, constant(DOUBLE, FIRST_DEGREE)), work, at.NEXT_DEGREE)
 
-    def project_positions(self, emit: LaneEmitter, room: Value, numbers: Value) -> None:
+    def project_positions(self, emit: LaneEmitter, work: Value, numbers: Value) -> None:
         """Project the positions at the ends of eight steps; store FINE (success) and MOVED (the largest change)."""
         if self.parts is None:
-            self._project(emit, room, numbers, self.equations.position_projection)
+            self._project(emit, work, numbers, self.equations.position_projection)
         else:
-            self._project_in_parts(emit, room, numbers, self.parts.project_position, ("moved", "q"))
+            self._project_in_parts(emit, work, numbers, self.parts.project_position, ("moved", "q"))
 
-    def project_states(self, emit: LaneEmitter, room: Value, numbers: Value) -> None:
+    def project_states(self, emit: LaneEmitter, work: Value, numbers: Value) -> None:
         """Project the states at the ends of eight steps; compute accelerations and multipliers there."""
         if self.parts is None:
-            self._project(emit, room, numbers, self.equations.projection)
+            self._project(emit, work, numbers, self.equations.projection)
         else:
-            self._project_in_parts(emit, room, numbers, self.parts.project, ("a", "moved", "q", "v", "lam"))
+            self._project_in_parts(emit, work, numbers, self.parts.project, ("a", "moved", "q", "v", "lam"))
 
     # parts of the functions
 
-    def _project(self, emit: LaneEmitter, room: Value, numbers: Value, outputs: Program) -> None:
+    def _project(self, emit: LaneEmitter, work: Value, numbers: Value, outputs: Program) -> None:
         emit.numbers = emit.constants = numbers
-        inputs = [load_lanes(emit, room, self.ends + LANES * k) for k in range(1 + 2 * self.n)]
+        inputs = [load_lanes(emit, work, self.ends + LANES * k) for k in range(1 + 2 * self.n)]
         written, arrays = lower(emit, outputs, inputs, self.numbers)
         values = dict(zip(outputs.arrays, arrays, strict=True))
         holds = written.holds(outputs, [value for array in arrays for value in array])
         for name, place in self._places_of_ends().items():
             for k, value in enumerate(values.get(name, [])):
-                store_lanes(emit, value, room, place + LANES * k)
-        self._store_largest_move(emit, room, values["moved"], holds)
+                store_lanes(emit, value, work, place + LANES * k)
+        self._store_largest_move(emit, work, values["moved"], holds)
 
     def _project_in_parts(
-        self, emit: LaneEmitter, room: Value, numbers: Value, write: Callable[..., Value], names: tuple[str, ...]
+        self, emit: LaneEmitter, work: Value, numbers: Value, write: Callable[..., Value], names: tuple[str, ...]
     ) -> None:
         """Project the ends by a function of compile_equations.py, `write`, that fills the arrays `names`."""
         one, moved = Emitter(emit.builder), emit.builder.room(DOUBLE, LANES * self.n)
-        places = {name: one.pointer(room, place) for name, place in self._places_of_ends().items()} | {"moved": moved}
-        state = load_lanes(emit, room, self.ends), places["q"], places["v"]
+        places = {name: one.pointer(work, place) for name, place in self._places_of_ends().items()} | {"moved": moved}
+        state = load_lanes(emit, work, self.ends), places["q"], places["v"]
         holds = write(emit, *state, numbers, *(places[name] for name in names))
-        self._store_largest_move(emit, room, [load_lanes(emit, moved, LANES * k) for k in range(self.n)], holds)
+        self._store_largest_move(emit, work, [load_lanes(emit, moved, LANES * k) for k in range(self.n)], holds)
 
     def _places_of_ends(self) -> dict[str, int]:
         return {"q": self.ends + LANES, "v": self.ends + LANES * (1 + self.n), "a": self.end_a, "lam": self.lam}
 
-    def _store_largest_move(self, emit: LaneEmitter, room: Value, values: Sequence[Value], holds: Value) -> None:
+    def _store_largest_move(self, emit: LaneEmitter, work: Value, values: Sequence[Value], holds: Value) -> None:
         moved = emit.constant(0.0)
         for value in values:
             moved = emit.larger(emit.function("fabs", value), moved)
-        store_lanes(emit, moved, room, at.MOVED)
-        before = load_lanes(emit, room, at.FINE)
-        store_lanes(emit, emit.builder.select(holds, before, emit.constant(0.0)), room, at.FINE)
+        store_lanes(emit, moved, work, at.MOVED)
+        before = load_lanes(emit, work, at.FINE)
+        store_lanes(emit, emit.builder.select(holds, before, emit.constant(0.0)), work, at.FINE)
 
-    def _integrate(self, emit: LaneEmitter, room: Value, state: Value) -> Value:
+    def _integrate(self, emit: LaneEmitter, work: Value, state: Value) -> Value:
         """Integrate the accelerations up to each node; return the largest change of a velocity since the last sweep."""
         one = Emitter(emit.builder)
         with loop_over(emit, self.iterated, [emit.constant(0.0)]) as (k, i, (largest,), new):
-            before = load_lanes(emit, one.pointer(room, vector_index(emit, k)), self.v)
-            terms = self._values(emit, one.load(one.pointer(state, i), 2 * self.n), room, i)
+            before = load_lanes(emit, one.pointer(work, vector_index(emit, k)), self.v)
+            terms = self._values(emit, one.load(one.pointer(state, i), 2 * self.n), work, i)
             sums = [self._sums(emit, table, terms) for table in (tables().velocities, tables().positions)]
-            v = self._put_stages(emit, room, state, k, i, sums)
-            weight = emit.splat(one.load(one.pointer(room, i), at.WEIGHTS))
+            v = self._store_stages(emit, work, state, k, i, sums)
+            weight = emit.splat(one.load(one.pointer(work, i), at.WEIGHTS))
             change = emit.function("fabs", emit.subtract(v, before))
             new.append(emit.larger(emit.multiply(change, weight), largest))
         return emit.largest_lane(new[0])
 
-    def _put_stages(
-        self, emit: LaneEmitter, room: Value, state: Value, k: Value, i: Value, sums: Sequence[Value]
+    def _store_stages(
+        self, emit: LaneEmitter, work: Value, state: Value, k: Value, i: Value, sums: Sequence[Value]
     ) -> Value:
         """Store velocities and positions of coordinate i, the k-th iterated coordinate; return the velocities."""
         one = Emitter(emit.builder)
-        h = emit.splat(one.load(room, at.H))
-        place, begin = one.pointer(room, vector_index(emit, k)), one.pointer(state, i)
+        h = emit.splat(one.load(work, at.H))
+        place, begin = one.pointer(work, vector_index(emit, k)), one.pointer(state, i)
         q0, v0 = (emit.splat(one.load(begin, m * self.n)) for m in range(2))
         v = emit.fused(h, sums[0], v0)
         inner = emit.fused(h, sums[1], emit.multiply(constants(tables().nodes), v0))
@@ -679,15 +678,15 @@ class CollocationCode:
         store_lanes(emit, emit.fused(h, inner, q0), place, self.q)
         return v
 
-    def _values(self, emit: LaneEmitter, first: Value, room: Value, i: Value) -> list[Value]:
-        """Load the accelerations of coordinate i at all nodes after `first`, its acceleration at the beginning."""
+    def _values(self, emit: LaneEmitter, first: Value, work: Value, i: Value) -> list[Value]:
+        """Return the accelerations of coordinate i at all nodes: `first` at the beginning, the others loaded."""
         one = Emitter(emit.builder)
-        place = one.pointer(room, vector_index(emit, i))
+        place = one.pointer(work, vector_index(emit, i))
         return [first, *(one.load(place, self.a + node) for node in range(LANES))]
 
-    def _weighted_rows(self, emit: LaneEmitter, table: Array, first: Value, room: Value, i: Value) -> Value:
+    def _weighted_rows(self, emit: LaneEmitter, table: Array, first: Value, work: Value, i: Value) -> Value:
         """Return the sum of the rows of a table, weighted by the accelerations of coordinate i (see `_values`)."""
-        return self._sums(emit, table, self._values(emit, first, room, i))
+        return self._sums(emit, table, self._values(emit, first, work, i))
 
     def _sums(self, emit: LaneEmitter, table: Array, terms: Sequence[Value]) -> Value:
         """Return the sum of the rows of a table, weighted by `terms`; in two accumulators, which is faster."""
@@ -696,13 +695,13 @@ class CollocationCode:
             sums[(k + 1) % 2] = emit.fused(emit.splat(term), constants(row), sums[(k + 1) % 2])
         return emit.add_sums(*sums)
 
-    def _polynomial(self, emit: LaneEmitter, room: Value, other: bool) -> Value:
+    def _polynomial(self, emit: LaneEmitter, work: Value, other: bool) -> Value:
         """Return a pointer to the polynomial of the last accepted step; with `other`, of the attempted step."""
         builder, one = emit.builder, Emitter(emit.builder)
-        second = builder.compare("fcmp one" if not other else "fcmp oeq", one.load(room, at.WHICH), llvm_code.ZERO)
+        second = builder.compare("fcmp one" if not other else "fcmp oeq", one.load(work, at.WHICH), llvm_code.ZERO)
         size = LANES * len(self.iterated)
         place = builder.select(second, integer(self.polynomials + size), integer(self.polynomials))
-        return one.pointer(room, place)
+        return one.pointer(work, place)
 
 
 class Collocation(NamedTuple):
@@ -738,7 +737,7 @@ def _compiled(own: SharedCode) -> Collocation:
         module = Module(divided=long)
         for name, emit in parts.items():
             llvm_code.write(module, name, KIT.llvm_type(name), emit, partial(LaneEmitter, lanes=LANES))
-        # if writing numbered further coefficients, the functions would read beyond the end of the array
+        # with coefficients that were added while writing, the functions would read beyond the end of the array
         assert len(code.numbers.values) == len(numbers)
         return list(parts), str(module)
 

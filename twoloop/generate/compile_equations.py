@@ -47,10 +47,10 @@ def write_accelerations(
         lowering.define(quantity, value)
 
     def state() -> list[Value]:
-        place = _stack_array(emit, 2 * n)
+        array = _stack_array(emit, 2 * n)
         for i, value in enumerate(inputs[1:]):
-            emit.store(value, place, i)
-        return [inputs[0], place, emit.pointer(place, n)]
+            emit.store(value, array, i)
+        return [inputs[0], array, emit.pointer(array, n)]
 
     return _accelerations(emit, equations, lowering, state)
 
@@ -62,7 +62,7 @@ def write_acceleration_function(
 
     def emit_all(emit: Emitter, t: Value, q: Value, v: Value, given: Value, filled: Value) -> Value:
         lowering, emit.numbers = Lowering(emit, numbers), given
-        lowering.take(equations.graph, [t, q, v])
+        lowering.define_inputs(equations.graph, [t, q, v])
         a, holds = _accelerations(emit, equations, lowering, lambda: [t, q, v])
         with emit.builder.if_then(holds):
             for i, value in enumerate(a):
@@ -73,25 +73,25 @@ def write_acceleration_function(
 
 
 def call_accelerations(
-    emit: Emitter, equations: Elimination, way: int, inputs: Sequence[Value], numbers: Coefficients, filled: Value
+    emit: Emitter, equations: Elimination, index: int, inputs: Sequence[Value], numbers: Coefficients, filled: Value
 ) -> Value:
     """Write a call of a function that fills an array with the accelerations at [t, q, v]; return whether it is valid.
 
-    `way` is an index of `equations.accelerations`: 0 has the fewest operations, -1 eliminates M.
+    `index`: index of a program in `equations.accelerations`: 0 has the fewest operations, -1 eliminates M.
     """
-    place = _stack_array(emit, 2 * equations.system.n_q)
+    array = _stack_array(emit, 2 * equations.system.n_q)
     for i, value in enumerate(inputs[1:]):
-        emit.store(value, place, i)
-    given = [inputs[0], place, emit.pointer(place, equations.system.n_q), *_numbers(emit), filled]
-    return emit.builder.call(_acceleration_function(emit, equations, way, numbers), emit.bit, given)
+        emit.store(value, array, i)
+    arguments = [inputs[0], array, emit.pointer(array, equations.system.n_q), *_numbers(emit), filled]
+    return emit.builder.call(_acceleration_function(emit, equations, index, numbers), emit.bit, arguments)
 
 
 def _accelerations(
     emit: Emitter, equations: Elimination, lowering: Lowering, state: Callable[[], list[Value]]
 ) -> tuple[list[Value], Value]:
-    """Write the accelerations; return their values and whether they are valid.
+    """Write code for the accelerations; return their values and whether they are valid.
 
-    `state` returns t and pointers to q and v, to be passed to the function that eliminates M.
+    `state` writes code for t and pointers to q and v, the arguments of the function that eliminates M.
     """
     outputs, *alternatives = equations.accelerations
     a, holds = _run_accelerations(emit, equations, lowering, outputs)
@@ -127,9 +127,9 @@ def _run_accelerations(
     return a, lowering.holds(outputs, a)
 
 
-def _acceleration_function(emit: Emitter, equations: Elimination, way: int, numbers: Coefficients) -> str:
-    """Return the name of the module's function for accelerations, which is written at the first call."""
-    outputs, mass_first = equations.accelerations[way], way in (-1, len(equations.accelerations) - 1)
+def _acceleration_function(emit: Emitter, equations: Elimination, index: int, numbers: Coefficients) -> str:
+    """Return the name of the module's function for a program of accelerations; it is written at the first call."""
+    outputs, mass_first = equations.accelerations[index], index in (-1, len(equations.accelerations) - 1)
     module, name = emit.builder.module, f"{'mass_first' if mass_first else 'quick'}_{emit.suffix}"
     if not module.defines(name):
         n, given = equations.system.n_q, _numbers(emit)
@@ -164,8 +164,8 @@ def _stack_array(emit: Emitter, size: int) -> Value:
     return emit.builder.room(DOUBLE, size * width_of(emit.double))
 
 
-# Splitting halves the time to compile. Limits of the number of operations from which on equations are split:
-# SPLIT_PROJECTIONS, if `reduced` computes accelerations; else SPLIT_ALL, as split accelerations take 50 % longer.
+# numbers of operations from which on equations are split, which halves the time to compile. SPLIT_PROJECTIONS: if
+# accelerations have a reduced form, which is not split. SPLIT_ALL: else, as split accelerations take 50 % longer to run
 SPLIT_PROJECTIONS, SPLIT_ALL = 200, 500
 
 
@@ -180,7 +180,7 @@ class SplitFunctions:
     Attributes
     ----------
     solution : Solution
-        Solution of the linear equations; it lists the quantities that parts share, which are stored in memory.
+        Solution of the linear equations; it lists the quantities that are stored in memory, because parts share them.
     at_position, with_factors : dict
         Programs of parts by their names. Parts are functions of the stored quantities and of t, q, v (`at_position`) or
         of r, c (`with_factors`).
@@ -248,7 +248,7 @@ class SplitFunctions:
         if width_of(emit.double) > 1:
             emit.constants = emit.numbers  # type: ignore[attr-defined]
         lowering = Lowering(emit, self.numbers, places)
-        lowering.take(graph, given)
+        lowering.define_inputs(graph, given)
         return lowering
 
     def _factors(self, emit: Emitter, *arguments: Value) -> Value:
@@ -373,7 +373,7 @@ def write_function(
         n_given = len(program.graph.sizes)
         given, emit.numbers, filled = arguments[:n_given], arguments[n_given], arguments[n_given + 1 :]
         lowering = Lowering(emit, numbers)
-        lowering.take(program.graph, given)
+        lowering.define_inputs(program.graph, given)
         results = program.run(lowering)
         holds = lowering.holds(program, results[0])
         with emit.builder.if_then(holds):
@@ -462,8 +462,8 @@ class GeneratedCode(NamedTuple):
         """Return the kinds of callbacks that were traced."""
         return self.traced.kinds
 
-    def serves(self, system: ConstrainedSystem, t0: float, q0: Array) -> bool:
-        """Return whether this is the code for a run of the same system from another start."""
+    def is_valid_from(self, system: ConstrainedSystem, t0: float, q0: Array) -> bool:
+        """Return whether this code can be used for a run from (t0, q0): the same pivots would be chosen there."""
         try:
             return PivotChoice.at(system, t0, q0) == self.shared.equations.choice
         except Untraceable:

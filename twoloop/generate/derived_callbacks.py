@@ -20,7 +20,7 @@ from twoloop.generate.trace import OF_ROWS, Equations, Evaluator, TraceCache, de
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.problem.system import ConstrainedSystem
 
-# callbacks that are derived if they are not given, and their numbers of rows
+# callbacks that are derived if they are not given, with the attributes of a system that count their rows
 DERIVABLE = {"jacobian": "n_c", "gamma": "n_c", "nonholonomic_gamma": "n_a"}
 
 
@@ -30,7 +30,7 @@ class DerivedPrograms:
     Parameters
     ----------
     programs : dict
-        For each missing callback its program, and the indices of the array entries that the program computes.
+        For each missing callback its program, and the flat indices of the array entries that the program computes.
     traced : Traced
         The traces from which they were derived.
     """
@@ -91,7 +91,7 @@ def _derive_programs(system: ConstrainedSystem, absent: Sequence[str], cache: Tr
 
 
 def _results(equations: Equations, absent: Sequence[str]) -> dict[str, dict[int, Affine]]:
-    """Return, for each missing callback, expressions by the indices of the array entries."""
+    """Return, for each missing callback, a dict of expressions by the flat indices of the array entries."""
     system = equations.system
     gamma: dict[int, Affine] = {}
     for kind, first in (("gamma", 0), ("nonholonomic_gamma", system.n_c)):
@@ -139,7 +139,7 @@ def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
     Raises
     ------
     ValueError
-        If C_t is not given and C was traced to depend on time, though not near the start.
+        If C_t is not given, but by its trace C depends on time, although not near the start.
     """
     away = generic_factors(len(q)) * sizes(q)
     places = [(t + share * FIRST_TIME_SCALE, q + share * away) for share in DISPLACEMENTS]

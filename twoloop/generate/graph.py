@@ -61,7 +61,7 @@ class Graph(Symbolic):
         self.traced: dict[str, Any] = {}
         self._recorded: dict[tuple[int, int, int], int] = {}
         self._order: dict[int, int] = {}  # rank of each factor by its first use: the same for all parameter values
-        self._numbers: dict[Any, int] = {}  # an integer for each key of an expression: keys take long to compare
+        self._numbers: dict[Any, int] = {}  # number of each key of an expression: keys take long to compare
         self._quantities: dict[int, Affine] = {}
 
     def copy(self) -> "Graph":
@@ -114,7 +114,7 @@ class Graph(Symbolic):
         return self.quantity(quantity)
 
     def needed_by(self, forms: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
-        """List the quantities to compute for some expressions, arguments first, without inputs and available ones."""
+        """List the quantities that expressions need, arguments first, except inputs and `available` quantities."""
         needed: set[int] = set()
         stack = [i for form in forms for i in form.terms]
         while stack:
@@ -126,7 +126,7 @@ class Graph(Symbolic):
         return sorted(needed)
 
     def kind(self, i: int) -> int:
-        """Return the kind of the operation that computes a quantity; inputs have none."""
+        """Return the kind of the operation that computes quantity i, which must not be an input."""
         operation = self.operations[i]
         assert operation is not None
         return operation[0]
@@ -171,7 +171,7 @@ class Graph(Symbolic):
         return self.operation(op.PRODUCT, a, b)
 
     def square(self, form: "Affine", high: bool) -> "Affine":
-        """Return a square; `high`: it is part of a high power, from which no factors may be taken out."""
+        """Return a square; `high`: for a high power, from which constant factors are not taken out (HIGH_POWER)."""
         return self._product(form, form) if high and form.terms else self.product(form, form)
 
 
@@ -187,8 +187,8 @@ def rounded(value: float) -> Any:
 class Affine:
     """Affine expression of quantities, with the arithmetic of a number.
 
-    An expression has no value that could be compared. While a callback runs on expressions, operations that would
-    distinguish them from numbers are refused.
+    An expression cannot be compared, as it has no value. While a callback runs on expressions, all operations by which
+    the callback could distinguish them from numbers are refused.
     """
 
     __slots__ = ("cached_key", "cached_number", "constant", "graph", "terms")
@@ -225,7 +225,7 @@ class Affine:
         return Affine(self.graph, self.constant * factor, {i: c * factor for i, c in self.terms.items()})
 
     def normalised(self) -> tuple[float, "Affine"]:
-        """Return the first coefficient, and the expression divided by it."""
+        """Return the coefficient of the first quantity, and the expression divided by it."""
         first = min(self.terms)
         factor = self.terms[first]
         if type(factor) is float and factor == 1.0:
@@ -347,7 +347,7 @@ class Affine:
         return self._function(op.COSINE, COS)
 
     def value(self) -> "Affine":
-        """Return the same value as a number or a multiple of one quantity; a longer sum becomes a quantity."""
+        """Return the expression as a number or a multiple of one quantity; record a longer sum as a new quantity."""
         if len(self.terms) + (not _equal(self.constant, 0.0)) < 2:
             return self
         scale, form = self.normalised()
@@ -452,7 +452,7 @@ class Derivative:
     def __init__(self, graph: Graph, direction: dict[int, Affine]):
         self.graph = graph
         self._derivatives = dict(direction)
-        self._changing = sum(1 << i for i in direction)
+        self._changing = sum(1 << i for i in direction)  # bit mask of the inputs that change
 
     def of(self, form: Affine) -> Affine:
         """Return the derivative of an expression."""

@@ -50,8 +50,8 @@ FIRST_UNIT = 0.01  # first guess of the unit of time, relative to the length of 
 # a projection has converged when a correction is below an absolute limit (unit of q), or this share of the largest
 # position
 ABSOLUTE_CORRECTION, RELATIVE_CORRECTION = 1e-14, 1e-14
-CONTRACTION = 0.5  # largest ratio of a correction to the one before; above, the projection does not converge
-IN_PARALLEL = 3  # coordinates in one loop of Horner schemes: each carries three numbers, and there are 16 registers
+CONTRACTION = 0.5  # ratio of a correction to the one before, above which a projection does not converge
+IN_PARALLEL = 3  # number of coordinates in one loop of Horner schemes: each needs 3 of the 16 vector registers
 
 
 class Places(NamedTuple):
@@ -62,7 +62,7 @@ class Places(NamedTuple):
     state: Value
     new: Value
     predicted: Value
-    found: Value
+    series_a: Value  # accelerations of the series; `a`: accelerations by the equations of motion
     a: Value
     lam: Value
     series: Value
@@ -94,10 +94,10 @@ class LaneSteps:
         return unit
 
     def lengths(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store step sizes, chosen by the last two terms of positions and velocities relative to the tolerances."""
+        """Store step sizes, from the last two terms of positions and velocities, relative to the tolerances."""
         builder, n, at = emit.builder, self.n, self.places(emit, order, control, work)
         unit, (rtol, atol) = emit.load(work, lanes.UNIT), self.tolerances(emit, control)
-        one, found = emit.constant(1.0), []
+        one, sizes = emit.constant(1.0), []
         scales = []
         for j in range(n):
             q, v = (emit.function("fabs", emit.load(at.series, i)) for i in (j, n + j))
@@ -111,10 +111,10 @@ class LaneSteps:
             row, largest = emit.pointer(at.series, builder.mul(power, integer(n))), emit.constant(0.0)
             for j, scale in enumerate(scales):
                 largest = emit.larger(emit.multiply(emit.function("fabs", emit.load(row, j)), scale), largest)
-            found.append(largest)
+            sizes.append(largest)
         logarithms = [
             emit.divide(emit.logarithm(value), emit.number(power))
-            for value, power in zip(found, (order, builder.sub(order, integer(1))), strict=True)
+            for value, power in zip(sizes, (order, builder.sub(order, integer(1))), strict=True)
         ]
         length = emit.exponential(emit.negative(emit.larger(*logarithms)))
         emit.store(length, work, lanes.LENGTH)
@@ -161,7 +161,7 @@ class LaneSteps:
                 positions.append(q)
                 emit.store(q, at.new, j)
                 emit.store(emit.multiply(v, per_unit), at.new, n + j)
-                emit.store(emit.multiply(a, twice), at.found, j)
+                emit.store(emit.multiply(a, twice), at.series_a, j)
         return positions
 
     def defect(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
@@ -184,7 +184,7 @@ class LaneSteps:
             largest = emit.larger(emit.function("fabs", each), largest)
         floor = emit.multiply(emit.constant(ROUNDING), largest)
         for j, each in enumerate(a):
-            defect = emit.function("fabs", emit.subtract(emit.load(at.found, j), each))
+            defect = emit.function("fabs", emit.subtract(emit.load(at.series_a, j), each))
             of_q, of_v = (
                 emit.add(atol[j], emit.multiply(rtol, emit.function("fabs", emit.load(at.new, place))))
                 for place in (j, n + j)
@@ -277,8 +277,8 @@ class LaneSteps:
         begin = emit.pointer(work, series)
         following = emit.builder.add(order, integer(1))
         scratch = emit.pointer(begin, emit.builder.mul(following, integer(self.n)))
-        state, new, predicted, found, a, lam = (emit.pointer(work, place) for place in fixed)
-        return Places(order, work, state, new, predicted, found, a, lam, begin, scratch)
+        state, new, predicted, series_a, a, lam = (emit.pointer(work, place) for place in fixed)
+        return Places(order, work, state, new, predicted, series_a, a, lam, begin, scratch)
 
 
 def _triples(values: list[Value]) -> Iterator[tuple[Value, Value, Value]]:
@@ -347,7 +347,7 @@ def turned(emit: LaneEmitter, before: Rows, after: Rows) -> Value:
 
 Array = NDArray[np.float64]
 
-WEIGHT_ROUNDING = 1e-13  # sums of products of weights below this are rounding errors of zero
+WEIGHT_ROUNDING = 1e-13  # smaller weights count as zero: in products such as A A they are rounding errors
 
 
 # A, b and c of an explicit method whose first stage is the state itself, and the weights of two error estimates
@@ -387,11 +387,11 @@ class LaneStages:
             moved = own.move(b, b @ A, x)
             place = emit.builder.gep(control, emit.builder.add(j, integer(lanes.ATOL)))
             atol = emit.splat(emit.builder.load(place))
-            shares = [own.share(atol, rtol, *each) for each in zip(own.before, moved, strict=True)]
+            error_weights = [own.error_weight(atol, rtol, *each) for each in zip(own.before, moved, strict=True)]
             for largest, weights in ((e, fine), (d, coarse)):
                 of_q, of_v = emit.multiply(x, own.sum(weights @ A)), own.sum(weights)
-                for off, share in zip((of_q, of_v), shares, strict=True):
-                    largest = emit.larger(emit.multiply(emit.function("fabs", off), share), largest)
+                for off, weight in zip((of_q, of_v), error_weights, strict=True):
+                    largest = emit.larger(emit.multiply(emit.function("fabs", off), weight), largest)
                     total = emit.add(total, emit.multiply(zero, off))
                 new.append(largest)
             for each in moved:
@@ -408,7 +408,7 @@ class LaneStages:
 
 
 class _Coordinate:
-    """Coordinate j in the loop over the coordinates, with its accelerations at the stages so far."""
+    """Coordinate j in a loop over the coordinates: its state before the step, and accelerations at `count` stages."""
 
     def __init__(self, stages: LaneStages, emit: LaneEmitter, at: Places, j: Value, count: int):
         n, self.emit, self.new, self.n = stages.n, emit, emit.pointer(at.new, j), stages.n
@@ -421,7 +421,7 @@ class _Coordinate:
             emit.store(self._loaded[count - 1], *self._slopes[count - 1])
 
     def sum(self, weights: Array) -> Value:
-        """Return the weighted sum of the accelerations."""
+        """Return the weighted sum of the accelerations at the stages."""
         total: Value | None = None
         for k, weight in enumerate(weights.tolist()):
             if abs(weight) > WEIGHT_ROUNDING:
@@ -431,14 +431,14 @@ class _Coordinate:
                 total = term if total is None else self.emit.add(total, term)
         return self.emit.constant(0.0) if total is None else total
 
-    def share(self, atol: Value, rtol: Value, one: Value, other: Value) -> Value:
-        """Return the reciprocal of the allowed error of a number that changed from `one` to `other`."""
+    def error_weight(self, atol: Value, rtol: Value, before: Value, after: Value) -> Value:
+        """Return the reciprocal of the allowed error of a number that changed from `before` to `after`."""
         emit = self.emit
-        size = emit.larger(emit.function("fabs", one), emit.function("fabs", other))
+        size = emit.larger(emit.function("fabs", before), emit.function("fabs", after))
         return emit.divide(emit.constant(1.0), emit.add(atol, emit.multiply(rtol, size)))
 
     def move(self, weights: Array, twice: Array, x: Value) -> tuple[Value, Value]:
-        """Store and return position and velocity of NEW: `weights` are for velocities, `twice` for positions."""
+        """Store position and velocity in NEW; return them. `weights`: of accelerations in v; `twice`: in q."""
         emit, (q, v) = self.emit, self.before
         drift = emit.multiply(emit.constant(float(weights.sum())), v)
         q = emit.add(q, emit.multiply(x, emit.add(drift, emit.multiply(x, self.sum(twice)))))
@@ -448,9 +448,9 @@ class _Coordinate:
         return q, v
 
 
-GOLDEN = 0.6180339887498949
+GOLDEN = 0.6180339887498949  # golden section: its multiples modulo 1 are spread evenly
 MOST_PARTS = 1000.0  # largest number of parts into which a step is divided to check the defect
-MOST_OPERATIONS = 1500  # largest number of operations of a series: as many take some seconds to compile
+MOST_OPERATIONS = 1500  # largest number of operations of a series: this many take some seconds to compile
 
 
 class LaneCode(LaneSteps):
@@ -518,7 +518,7 @@ class LaneCode(LaneSteps):
         return *lanes.TASKS, *lanes.TASKS_OF_STAGES, *explicit
 
     def series_size(self, order: int) -> int:
-        """Return the length, in vectors, of the memory for a series of an order and its intermediate results."""
+        """Return the length, in vectors, of the memory for a series of the given order and its intermediate results."""
         assert self.recurrences is not None
         return (order + 1) * self.n + self.recurrences.scratch_size(order)
 
@@ -678,7 +678,7 @@ class LaneCode(LaneSteps):
         return rows
 
     def stages(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Compute NEW and ERROR by the stages of an explicit step."""
+        """Store NEW and ERROR, computed by the stages of an explicit step."""
         assert self.explicit is not None
         self.explicit.write(emit, (order, control, work), self.places(emit, order, control, work))
 
@@ -742,6 +742,7 @@ class LaneConstraints(LaneSteps):
 
 BUILD_SECONDS = 3e-4  # estimated time to compile one quantity, s
 ELIMINATION = (elimination, null_space, compile_equations)
+# modules that write the code: a change of one makes cached code invalid
 WRITERS = (series, *ELIMINATION, program, lane_series, llvm_code, llvm_text)
 
 Code = TypeVar("Code", LaneCode, LaneConstraints)

@@ -39,7 +39,7 @@ from twoloop.kernels.evaluation.operations import (
 )
 
 FLAGS = " ".join(sorted(OPTIONS["fastmath"]))
-LONG = 4  # number of terms from which a sum is written as two sums
+LONG = 4  # number of terms from which on a sum is written as two sums
 ZERO, ONE = constant(DOUBLE, 0.0), constant(DOUBLE, 1.0)
 # intrinsic functions of LLVM; other functions are called in libm
 INTRINSICS = {name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqrt", "rint", "ceil", "fabs")}
@@ -67,7 +67,7 @@ class Emitter:
         return constant(self.double, value)
 
     def far(self, value: float) -> Value:
-        """Return a number that is loaded from memory where it is used, see `Builder.far`."""
+        """Write the load of a number that is stored in memory, see `Builder.far`."""
         return self.builder.far(value)
 
     def whole(self, value: int) -> Value:
@@ -75,7 +75,7 @@ class Emitter:
         return constant(self.whole_number, value)
 
     def coefficient(self, number: float) -> Value:
-        """Return a literal number, or load a Coefficient from memory, which never changes."""
+        """Return a literal number, or the value of a Coefficient, which is loaded from memory that never changes."""
         if not isinstance(number, Coefficient):
             return self.constant(number)
         return self.load(self.numbers, number.place, constant=True)
@@ -105,7 +105,7 @@ class Emitter:
         return self.builder.call(f"llvm.fma.{self.suffix}", a.type, [a, b, c])
 
     def polynomial(self, coefficients: Sequence[float], x: Value) -> Value:
-        """Evaluate a polynomial, with pairs of terms that are independent; the constant comes first."""
+        """Evaluate a polynomial by pairs of terms, which are independent; its constant is the first coefficient."""
         square, terms = self.builder.operation("fmul", x, x), [self.far(each) for each in coefficients]
         pairs = [self.fused(second, x, first) for first, second in zip(terms[::2], terms[1::2], strict=False)]
         pairs += terms[2 * len(pairs) :]
@@ -127,7 +127,7 @@ class Emitter:
         return self.builder.select(self.builder.compare("fcmp olt", a, b), a, b)
 
     def times(self, factor: float, a: Value) -> Value:
-        """Multiply by a literal, or by a coefficient loaded from memory."""
+        """Return the product of a literal, or of a Coefficient loaded from memory, and a."""
         if factor in (1.0, -1.0):
             return a if factor == 1.0 else self.negative(a)
         return self.multiply(self.coefficient(factor), a)
@@ -142,7 +142,7 @@ class Emitter:
         return self.builder.call(f"{intrinsic}.{self.suffix}" if intrinsic else name, x.type, [x])
 
     def pointer(self, base: Value, *places: Value | int) -> Value:
-        """Return a pointer advanced by a number of doubles."""
+        """Return a pointer advanced by one or more numbers of doubles."""
         for place in places:
             base = self.builder.gep(base, integer(place) if isinstance(place, int) else place)
         return base
@@ -206,7 +206,7 @@ class Emitter:
 
 
 class Quantities:
-    """Values of numbered quantities, and linear combinations of quantities; each is loaded, or summed, once.
+    """Values of numbered quantities and of linear combinations of them; each is loaded, or summed, only once.
 
     Each part of a divided function loads quantities again: otherwise the compiler would spill them to the stack. So the
     memory from which they are loaded must not change.
@@ -215,7 +215,7 @@ class Quantities:
     ----------
     emit : Emitter
     load : callable
-        Function that writes the load of a quantity whose value was not defined.
+        Function that writes the load of a quantity, for quantities that were not defined.
     """
 
     def __init__(self, emit: Emitter, load: Callable[[int], Value]):
@@ -233,26 +233,26 @@ class Quantities:
         """Return the value of a quantity; load it if it was not defined."""
         if quantity in self._values:
             return self._values[quantity]
-        loaded = self._loaded_here()
+        loaded = self._loaded_in_part()
         if quantity not in loaded:
             loaded[quantity] = self._load(quantity)
         return loaded[quantity]
 
-    def stored(self, quantity: int) -> None:
-        """Forget the value of a quantity that was stored in memory, so that later parts load it."""
-        self._loaded_here()[quantity] = self._values.pop(quantity)
+    def mark_stored(self, quantity: int) -> None:
+        """Mark a quantity as stored in memory: this part of the function uses its value, later parts load it."""
+        self._loaded_in_part()[quantity] = self._values.pop(quantity)
 
-    def _loaded_here(self) -> dict[int, Value]:
+    def _loaded_in_part(self) -> dict[int, Value]:
         """Return the values loaded in this part of the function."""
         if self._part != self._emit.builder.part:
             self._part, self._loaded = self._emit.builder.part, {}
         return self._loaded
 
     def sum(self, terms: Terms, constant: float = 0.0) -> Value:
-        """Return constant + the sum of coefficient * quantity."""
+        """Return `constant` plus the sum of coefficient * quantity over the terms."""
         key = terms, constant
         if self._emit.builder.module.divided and len(terms) == 1 and constant == 0.0:
-            ((quantity, coefficient),) = terms  # to multiply again costs no more than to spill the product
+            ((quantity, coefficient),) = terms  # a second multiplication takes no longer than to spill the product
             return self._emit.times(coefficient, self.value(quantity))
         if key not in self._sums:
             total: Any = None if constant == 0.0 and terms else self._emit.coefficient(constant)
@@ -286,7 +286,7 @@ def write(
 
 # sine and cosine on [-pi/4, pi/4]: coefficients of x^3, x^5, ... and of x^4, x^6, ... from S. Moshier's Cephes library,
 # sin.c; angles are reduced by multiples of pi/2, which is stored as the sum of two numbers
-LARGEST_ANGLE = 1e6  # largest angle, rad; for larger ones the sum of two numbers is not accurate enough
+LARGEST_ANGLE = 1e6  # largest angle, rad: for larger angles HALF_PI, the sum of two numbers, is not accurate enough
 HALF_PI = (1.5707963267948966, 6.123233995736766e-17)
 SINES = (
     -1.66666666666666307295e-1,
@@ -335,7 +335,7 @@ NOWHERE: Mapping[int, Place] = {}
 
 
 class Lowering(Algebra[Value]):
-    """Algebra whose values are those of an LLVM function that is being written: numbers or SIMD lanes.
+    """Algebra that writes an LLVM function: its values are the numbers or vectors of SIMD lanes of that function.
 
     Parameters
     ----------
@@ -359,8 +359,8 @@ class Lowering(Algebra[Value]):
         """Define the value of a quantity."""
         self._quantities.define(quantity, value)
 
-    def take(self, graph: Graph, given: Sequence[Value]) -> None:
-        """Define the inputs of a graph: each argument is a number, or an array from which inputs are loaded."""
+    def define_inputs(self, graph: Graph, given: Sequence[Value]) -> None:
+        """Define the inputs of a graph, from arguments that are numbers, or arrays from which inputs are loaded."""
         first = 0
         for argument, size in zip(given, graph.sizes, strict=True):
             if argument.type == self.emit.double:
@@ -403,7 +403,7 @@ class Lowering(Algebra[Value]):
             if i in places:
                 self.emit.store(self.value(i), *places[i])
                 self._places[i] = places[i]
-                self._quantities.stored(i)
+                self._quantities.mark_stored(i)
         return None
 
     def outputs(self, program: Program) -> list[list[Value]]:
@@ -421,14 +421,14 @@ class Lowering(Algebra[Value]):
         return arrays
 
     def forms(self, graph: Graph, forms: Sequence[Affine]) -> list[Value]:
-        """Compute expressions and return their values; quantities that were computed before are used again."""
+        """Write code for expressions and return their values; quantities that were computed before are not repeated."""
         quantities = graph.in_order_of_use(forms, self._computed)
         self.run(graph, quantities)
         self._computed.update(quantities)
         return [self.affine(form) for form in forms]
 
     def holds(self, program: Program, values: Sequence[Value]) -> Value:
-        """Return whether the conditions hold, no angle is too large, and all values are finite."""
+        """Write code for whether the conditions hold, no angle is too large, and all `values` are finite."""
         emit, builder, zero = self.emit, self.emit.builder, self.emit.constant(0.0)
         total = zero
         for value in values:  # values that are not finite make the sum NaN
@@ -444,6 +444,6 @@ class Lowering(Algebra[Value]):
 def lower(
     emit: Emitter, program: Program, inputs: Sequence[Value], numbers: Coefficients
 ) -> tuple[Lowering, list[list[Value]]]:
-    """Write a program; return its lowering and its arrays."""
+    """Write code for a program; return its lowering and its arrays."""
     lowering = Lowering(emit, numbers)
     return lowering, program.run(lowering, inputs)

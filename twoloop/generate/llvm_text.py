@@ -1,8 +1,8 @@
 """Write LLVM modules as text: functions, blocks and instructions.
 
-llvmlite builds modules from objects, which takes ten times as long as writing text, and longer than LLVM takes to
-compile them. Types are represented by their text. Pointers have the type that they point to, which all versions of LLVM
-read.
+llvmlite builds modules from objects, which takes ten times as long as writing text, and longer than the compilation by
+LLVM. Types are represented by their text. The type of a pointer names the type to which it points, which all versions
+of LLVM read.
 """
 
 import struct
@@ -10,8 +10,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 DOUBLE, INTEGER, WORD, BIT, NOTHING = "double", "i64", "i32", "i1", "void"
-LINE = 8  # number of doubles in a cache line
-# largest number of lines of a block of a divided function; longer blocks take more than twice as long to compile
+LINE = 8  # number of doubles in a cache line of the processor
+# largest number of lines in a block of a divided function: longer blocks take more than twice as long to compile
 LONGEST = 400
 
 
@@ -29,7 +29,7 @@ class Value:
 
 
 class Phi(Value):
-    """Phi node: a value that depends on the block from which its block is entered."""
+    """Phi node: a value that depends on the block from which the node's own block is entered."""
 
     __slots__ = ("incoming",)
 
@@ -38,13 +38,13 @@ class Phi(Value):
         self.incoming: list[tuple[Value, Block]] = []
 
     def add_incoming(self, value: Value, block: "Block") -> None:
-        """Add the value for the case that its block is entered from `block`."""
+        """Add the value for the case that the node's own block is entered from `block`."""
         self.incoming.append((value, block))
 
     def line(self) -> str:
         """Return the text of the instruction."""
-        ways = ", ".join(f"[{value.text}, %{block.name}]" for value, block in self.incoming)
-        return f"{self.text} = phi {self.type} {ways}"
+        pairs = ", ".join(f"[{value.text}, %{block.name}]" for value, block in self.incoming)
+        return f"{self.text} = phi {self.type} {pairs}"
 
 
 class Block:
@@ -200,7 +200,7 @@ class Builder:
         return value
 
     def _divide(self) -> None:
-        """Continue in another block; its address is stored, so that LLVM does not merge it with this one."""
+        """Continue in a new block, whose address is stored, so that LLVM does not merge it with the present block."""
         block = self.append_block()
         self.go_to(block)
         self.module.kept_apart.append(f"i8* blockaddress(@{self.name}, %{block.name})")
@@ -228,7 +228,7 @@ class Builder:
         return self.operation("mul", a, b)
 
     def both(self, a: Value, b: Value) -> Value:
-        """Return the bitwise and."""
+        """Return the bitwise conjunction of a and b."""
         return self.operation("and", a, b)
 
     def convert(self, name: str, a: Value, kind: str) -> Value:
@@ -245,7 +245,7 @@ class Builder:
         return self._value(a.type, f"select {condition}, {a}, {b}")
 
     def call(self, name: str, kind: str, arguments: Sequence[Value], flags: str = "") -> Value:
-        """Call a function, which is declared if the module does not define it; `flags` are those of operations."""
+        """Call a function; declare it if the module does not define it. `flags`: of floating-point operations."""
         self.module.declare(name, kind, [value.type for value in arguments])
         return self._value(kind, f"call {flags} {kind} @{name}({', '.join(map(str, arguments))})")
 
@@ -254,7 +254,7 @@ class Builder:
         self._line(f"call {NOTHING} @{name}({', '.join(map(str, arguments))})")
 
     def room(self, kind: str, size: int) -> Value:
-        """Allocate memory on the stack; in the first block, as the stack would grow with each turn of a loop."""
+        """Allocate memory on the stack, in the first block: within a loop, each iteration would enlarge the stack."""
         pointer = Value(f"{kind}*", f"%room{self._n_rooms}")
         self._blocks[0].lines.insert(
             self._n_rooms, f"{pointer.text} = alloca {kind}, {integer(max(size, 1))}, align 64"
@@ -263,7 +263,7 @@ class Builder:
         return pointer
 
     def far(self, number: float) -> Value:
-        """Load a number where it is used; LLVM would keep a literal in a register, or on the stack, for a long time."""
+        """Load a number from memory where it is used: a literal would occupy a register or the stack for long."""
         if self._far is None:
             self._far = Value(f"{DOUBLE}*", "%far")
             self._blocks[0].lines.insert(0, f"%far = load {DOUBLE}*, {DOUBLE}** @far")
@@ -300,7 +300,7 @@ class Builder:
         return self._value(element_of(vector.type), f"extractelement {vector}, {WORD} {place}")
 
     def shuffle(self, a: Value, b: Value, places: Sequence[int]) -> Value:
-        """Select elements of two vectors; indices of the second continue those of the first."""
+        """Return a vector of elements of two vectors; the indices of b follow those of a."""
         mask = f"<{len(places)} x {WORD}> <{', '.join(f'{WORD} {place}' for place in places)}>"
         return self._value(vector_of(element_of(a.type), len(places)), f"shufflevector {a}, {b}, {mask}")
 
@@ -310,7 +310,7 @@ class Builder:
         return self._value(vector.type, f"shufflevector {vector}, {vector}, {mask}")
 
     def phi(self, kind: str) -> Phi:
-        """Append a phi node, whose value depends on the previous block."""
+        """Append a phi node, whose value depends on the block from which the present one is entered."""
         phi = Phi(kind, f"%{self._n}")
         self._n += 1
         self.block.lines.append(phi)

@@ -17,9 +17,9 @@ from twoloop.generate.graph import Affine, is_zero
 class Block(NamedTuple):
     """Block of one or two rows that are eliminated together, with one division."""
 
-    places: tuple[int, ...]
+    places: tuple[int, ...]  # indices of the rows
     inverse: list[list[Affine]]  # inverse of the pivots
-    below: list[tuple[int, list[Affine]]]  # rows of L below the pivots
+    below: list[tuple[int, list[Affine]]]  # index and nonzero entries of each row of L below the pivots
 
 
 class Factors:
@@ -30,7 +30,7 @@ class Factors:
     blocks : list of Block
         Blocks in the order of elimination.
     conditions : list of (Affine, Affine)
-        For each row of G (`n` and later) its pivot, and its pivot without the other rows of G.
+        For each row of G (index `n` and later) its pivot, and the pivot that it would have without the other rows of G.
     positive : list of Affine
         Pivots that are positive if M, the first `n` rows, is definite.
     """
@@ -62,7 +62,7 @@ class Factors:
             self.blocks.append(Block(places, inverse, below))
 
     def _inverse(self, pivots: list[list[Affine]], alone: list[Any]) -> list[list[Affine]]:
-        """Return the inverse of a block of pivots, and record its conditions; `alone`: pivots without other rows."""
+        """Return the inverse of a block of pivots; add its conditions. `alone`: the pivots without other rows of G."""
         diagonal = [None if each is None else each.value() for each in alone]
         a = pivots[0][0]
         if diagonal[0] is None:
@@ -110,7 +110,7 @@ def solve(blocks: Sequence[Block], right: Sequence[Affine]) -> list[Affine]:
 
 
 def _collected_sum(products: Sequence[tuple[Affine, Affine]]) -> Any:
-    """Return the sum of products a b; those whose a is a multiple of the same expression become one product."""
+    """Return the sum of products a b; products whose factors a are multiples of one expression are combined."""
     total: Any = 0.0
     groups: dict[Any, tuple[Affine, Affine]] = {}
     for factor_a, factor_b in products:
@@ -142,8 +142,8 @@ def _pairs(rows: list[dict[int, Affine]], n: int) -> list[tuple[int, int]]:
 def _order(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, ...]]:
     """Order rows by minimum degree, in pairs where two rows have the same neighbours.
 
-    A row of G (n and later) comes after its coordinates. Among rows of equal degree, those that wait for the fewest
-    divisions come first, so that independent operations can overlap.
+    A row of G (index n and later) comes after its coordinates. Among rows of equal degree, the row with the shortest
+    chain of divisions before it comes first, so that independent operations can overlap.
     """
     neighbours = [set(row) - {i} for i, row in enumerate(rows)]
     waits = [{j for j in neighbours[i] if j < n} if i >= n else set() for i in range(len(rows))]
@@ -168,7 +168,7 @@ def _order(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int, int
 
 
 def _eliminate(neighbours: list[set[int]], places: Sequence[int]) -> set[int]:
-    """Eliminate rows from the graph: connect their neighbours with one another, and return the neighbours."""
+    """Eliminate rows from the graph of entries: connect their neighbours with one another; return the neighbours."""
     around = set().union(*(neighbours[i] for i in places)) - set(places)
     for j in around:
         neighbours[j] = (neighbours[j] | around) - {*places, j}
@@ -178,7 +178,7 @@ def _eliminate(neighbours: list[set[int]], places: Sequence[int]) -> set[int]:
 Blocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # rows and columns of the pivots, one or two each
 Terms = dict[int, Affine]  # nonzero entries of a row, by their columns
 
-# smallest allowed square of three ratios: a pivot over the entries that it divides, a pivot over its column, and the
+# smallest allowed square of three ratios: of a pivot to the entries that it divides, of a pivot to its column, and the
 # sine of the angle between two columns. Accelerations lose up to three times the digits of the ratio. At a start the
 # limits are stricter, see linalg/dependent_columns.py.
 LEAST = 0.03**2
@@ -206,11 +206,11 @@ class DependentCoordinates:
     independent : list of int
         Independent coordinates.
     T : list of dict
-        Nonzero entries of T in each row, by the coordinate that they multiply.
+        Nonzero entries of each row of T, by the independent coordinates that they multiply.
     g : list of Affine
         The vector g; 0 for independent coordinates.
     conditions : list of (Affine, Affine)
-        Pairs of which the first is larger than the second unless a pivot is too small.
+        Pairs; the first expression is larger than the second unless a pivot is too small.
 
     Raises
     ------
@@ -264,7 +264,7 @@ class DependentCoordinates:
             self._add_conditions(block, columns, pivot, solved)
 
     def check(self, more: int = 0) -> None:
-        """Raise `NotReduced` if the elimination is too long, or would be with `more` operations."""
+        """Raise `NotReduced` if the elimination, with `more` further operations, takes more than `most`."""
         if len(self._graph.operations) + more > self._most:
             raise NotReduced
 
@@ -277,12 +277,12 @@ class DependentCoordinates:
             determinant = (a * d - b * c).value()
         if is_zero(determinant):
             raise NotReduced
-        share = determinant.reciprocal()
+        factor = determinant.reciprocal()
         if len(block) == 1:
-            return determinant, [[share]]
+            return determinant, [[factor]]
         return determinant, [
-            [(d * share).value(), (-(b * share)).value()],
-            [(-(c * share)).value(), (a * share).value()],
+            [(d * factor).value(), (-(b * factor)).value()],
+            [(-(c * factor)).value(), (a * factor).value()],
         ]
 
     def _add_conditions(
@@ -290,8 +290,8 @@ class DependentCoordinates:
     ) -> None:
         """Add the conditions that a pivot is not small compared with the entries that it divides, and with its column.
 
-        For a block of two, the second condition means that the columns of the block are not nearly parallel. A pivot
-        may change its sign: the formula for the accelerations stays the same.
+        For a block of two, the second condition means that the columns of the block are not nearly parallel. The sign
+        of a pivot may change: it does not matter in the formula for the accelerations.
         """
         entries = [entry for row in solved for j, entry in row.items() if j < self._n]
         total = _add_products(self._zero, [(entry, entry) for entry in entries])
@@ -328,11 +328,11 @@ def reduced_accelerations(
     matrix: dict[tuple[int, int], Affine] = {}
     coordinates.check(sum(len(row) ** 2 // 2 for row in T))  # operations of T^T M T, if M is diagonal
     for a, x in enumerate(independent):
-        moved = [
+        mass_T = [
             _add_products(zero, ((entry, T[j][x]) for entry, j in row if x in T[j])).value() for row in rows
         ]  # M T
         for b, y in enumerate(independent[: a + 1]):
-            inertia = _add_products(zero, ((T[i][y], moved[i]) for i in range(n) if y in T[i])).value()
+            inertia = _add_products(zero, ((T[i][y], mass_T[i]) for i in range(n) if y in T[i])).value()
             if a == b or not is_zero(inertia):
                 matrix[a, b] = matrix[b, a] = inertia
     right = [_add_products(zero, ((T[i][x], forces[i]) for i in range(n) if x in T[i])).value() for x in independent]

@@ -1,7 +1,7 @@
 """Compute with numbers that record how they depend on parameters, so that one trace serves all parameter values.
 
 A `Parameter` is a float with which callbacks compute as with any other float; the result is a `Parameter` again.
-Tracing uses present values to decide which terms cancel and which expressions are equal, so they must be generic.
+Tracing decides from the present values which terms cancel and which expressions are equal: values must be generic.
 """
 
 import math
@@ -20,8 +20,8 @@ Powers = tuple[tuple[int, float], ...]  # product of powers of atoms: indices of
 
 MOST_TERMS = 200  # largest number of terms of a sum, because long keys take long to compare
 _as_float = float.__pos__  # converts a Parameter to a float; float() would be refused
-CANCELLED = 8.0 * 2.0**-52  # a sum of two terms below this share of a term is a rounding error of zero
-NUMBERS = (int, float, np.number)
+CANCELLED = 8.0 * 2.0**-52  # sum of two terms, relative to one of them, up to which it counts as zero (rounding)
+NUMBERS = (int, float, np.number)  # types of numbers; a Parameter is a float
 _UNARY = ("sin", "cos", "tan", "sqrt", "exp", "log", "arctan", "sinh", "cosh", "tanh", "absolute")
 FUNCTIONS = {name: getattr(np, name) for name in (*_UNARY, "hypot", "power")}
 OPERATORS: dict[str, Callable[..., Any]] = {  # NumPy's functions as Python operators
@@ -41,11 +41,11 @@ NAMES = {"atan": "arctan", "fabs": "absolute", "abs": "absolute", "pow": "power"
 
 
 class Untraceable(ValueError):
-    """Raised for a callback that does not run on symbols; the message says why."""
+    """Raised for a callback that cannot be traced on symbols; the message says why."""
 
 
 class Refusal(BaseException):
-    """Exception that ends a callback that does not run on symbols; its own `except Exception` cannot catch it."""
+    """Exception that ends a callback that cannot be traced; the callback's `except Exception` does not catch it."""
 
 
 class Symbolic:
@@ -104,14 +104,14 @@ class ParameterTape(Symbolic):
             self.parameters[place] = Parameter(float(values[place]), self, 1.0, ((place, 1.0),))
 
     def atom(self, definition: Any) -> Powers:
-        """Return the Powers of the atom with a definition, a sum or a function; equal definitions share an atom."""
+        """Return the Powers of the atom with this definition (sum or function); equal definitions share an atom."""
         if definition not in self._places:
             self._places[definition] = len(self.atoms)
             self.atoms.append(definition)
         return ((self._places[definition], 1.0),)
 
     def terms(self, number: float) -> dict[Powers, float]:
-        """Return the terms of a number that is a sum: a dict of coefficients by Powers."""
+        """Return the terms of a number, which may be a sum, as a dict of coefficients by Powers."""
         if type(number) is not Parameter:
             return {(): number} if number else {}
         (place, exponent), *further = number.powers
@@ -197,7 +197,7 @@ class Parameter(float):
             self.tape.refuse(reason)
 
     def to(self, exponent: float) -> "Parameter":
-        """Return the power with an exponent, a whole number except 0."""
+        """Return this number to the power of a whole number other than 0."""
         powers = tuple([(place, exponent * power) for place, power in self.powers])
         return Parameter(_as_float(self) ** exponent, self.tape, self.scale**exponent, powers)
 
@@ -258,7 +258,7 @@ def _product(a: float, b: float) -> float:
 
 
 def _power(base: float, exponent: float) -> float:
-    # non-integer powers are functions, not Powers: (x^2)^0.5 would become x and lose the absolute value
+    # powers that are not whole numbers are functions, not Powers: as Powers, (x^2)^0.5 would become x instead of |x|
     if type(exponent) is Parameter or not exponent.is_integer():
         return _function("power", base, exponent)
     assert isinstance(base, Parameter)

@@ -24,24 +24,24 @@ from twoloop.kernels.evaluation.operations import KIND, N_COLUMNS, NODE, RESULT
 Array = NDArray[np.float64]
 T = TypeVar("T")
 
-# A program traced from a user's function is compared with calls of the function: at this number of states, ...
-STATES = 5
-BETWEEN = 0.37  # ... whose times differ by this, s, which is no usual period of a force; ...
-AGREES = 1e-10  # ... this is the largest relative difference
+# comparison of a program that was traced from a user's function with calls of the function
+N_COMPARED = 5  # number of states
+TIME_SPACING = 0.37  # time between the states, s, which is no usual period of a force
+MAX_TRACE_DIFFERENCE = 1e-10  # largest relative difference
 
-# cost of operations in multiplications; functions count 0
+# cost of operations, in multiplications; functions cost 0
 COSTS = {op.PRODUCT: 1, op.RECIPROCAL: 4}
 
 
 class Algebra(Generic[T]):
-    """Arithmetic in which a program runs: values of the quantities, and operations on values.
+    """Arithmetic in which a program runs; subclasses define what values are, and the operations on values.
 
     Attributes
     ----------
     functions : mapping
-        Operations of one argument, by their kinds.
+        Functions that perform the operations of one argument, by the kinds of operations.
     values : dict
-        Values by quantity.
+        Values of the quantities that were defined, by the indices of the quantities.
     """
 
     functions: Mapping[int, Callable[[T], T]]
@@ -93,7 +93,7 @@ class Program:
     ----------
     graph : Graph
     arrays : dict
-        Affine expressions, for each array by its name.
+        Names of the arrays, and their entries: affine expressions.
     conditions : list of (Affine, Affine)
         Pairs of which the first must be larger than the second.
     """
@@ -191,7 +191,7 @@ class OperationTable(NamedTuple):
 
     @classmethod
     def of(cls, graph: Graph, n_inputs: int, results: Mapping[int, Affine]) -> "OperationTable":
-        """List the operations for `results`, expressions by their indices; the first quantities are the inputs."""
+        """Create the table that computes `results`, expressions by index; the first quantities are the inputs."""
         needed = graph.needed_by(results.values())
         node = {i: i for i in range(n_inputs)} | {i: n_inputs + k for k, i in enumerate(needed)}
         operations: list[Any] = [(*graph.operations[i], node[i]) for i in needed]  # type: ignore[misc]
@@ -233,14 +233,14 @@ class OperationTable(NamedTuple):
         return integers.astype(np.int64), np.concatenate([self.constants.ravel(), self.coefficients])
 
     def with_numbers(self, numbers_for: Callable[[Any], Array]) -> "OperationTable":
-        """Return the table with each array of coefficients replaced by `numbers_for` of it."""
+        """Return a copy of the table in which `numbers_for` was applied to each array of coefficients."""
         return self._replace(constants=numbers_for(self.constants), coefficients=numbers_for(self.coefficients))
 
 
 Terms = tuple[tuple[int, float], ...]  # quantities and their coefficients
 
 LITERALS = (0.0, 1.0, -1.0)  # coefficients that are literals in the code, as they need no multiplication
-ROUNDING = 8.0 * 2.0**-52  # relative: coefficients that differ by less from one of LITERALS are replaced by it
+ROUNDING = 8.0 * 2.0**-52  # relative difference from one of LITERALS up to which a coefficient is replaced by it
 
 
 class Coefficient(float):
@@ -312,7 +312,7 @@ class Coefficients:
         return numbers
 
     def structure(self, program: Program, given: Mapping[int, int] = MappingProxyType({})) -> Iterable[Any]:
-        """List everything that the code for a program depends on, except the values of coefficients.
+        """Yield everything that the code for a program depends on, except the values of coefficients.
 
         `given` maps quantities that are read from memory to their indices.
         """

@@ -23,23 +23,24 @@ from twoloop.kernels.evaluation.operations import (
 )
 from twoloop.problem.system import ConstrainedSystem
 
-BY_TIME = ("force", "constraint_rate", "nonholonomic_rate")  # callbacks whose dependence on time matters ...
-BY_STATE = ("force", "mass", "constraint", "jacobian", "nonholonomic")  # ... and on the state
-SMOOTH = (PRODUCT, SUM, SINE, COSINE)  # operations of polynomials and vibrations: these have no short pulses ...
-MAX_DEGREE = 8  # ... up to this degree: a high power of a cosine is a pulse
-# Functions of the state are also free of short pulses if they are: polynomials in q and v, or roots, up to this degree;
-# ...
-MAX_DEGREE_OF_STATE = 32
-MAX_DEGREE_OF_DIVISOR = 4  # ... quotients up to this degree of the divisor ...
-SLOWEST_DECAY = -2.0  # ... that decay no faster than this power: 1 / (1 + (x / w)**2), but not its square
+BY_TIME = ("force", "constraint_rate", "nonholonomic_rate")  # callbacks whose dependence on time is analysed
+# callbacks whose dependence on the state is analysed
+BY_STATE = ("force", "mass", "constraint", "jacobian", "nonholonomic")
+SMOOTH = (PRODUCT, SUM, SINE, COSINE)  # operations of polynomials and vibrations, which up to MAX_DEGREE have no pulses
+MAX_DEGREE = 8  # largest degree, in time or in sines and cosines, without short pulses: a high power of a cosine is one
+MAX_DEGREE_OF_STATE = 32  # largest degree of polynomials in q and v, and of their roots, without short pulses
+MAX_DEGREE_OF_DIVISOR = 4  # largest degree of the divisors of a quotient without short pulses
+# lowest power of x with which such a quotient may decay for large x: 1 / (1 + (x / w)**2) is allowed, its square is not
+SLOWEST_DECAY = -2.0
 MAX_RATE = 4.0  # largest rate of a vibration's angle, rad per unit of a coordinate or speed, that long steps resolve
-# largest number of coordinates: tracing more takes up to seconds; sampling forces in a run takes a tenth of that
+# largest number of coordinates for which callbacks are traced for this analysis: for more, tracing takes up to seconds,
+# and sampling the forces in a run a tenth of that
 MAX_COORDINATES = 300
 TIME = 1  # bit mask of t, the first input of a graph
 
 
 class ShortForces(NamedTuple):
-    """Whether forces or drives may act for a short time: at some times, or at some positions or speeds."""
+    """Whether forces or drives may act for a short time: at certain times; at certain positions or speeds."""
 
     by_time: bool
     by_state: bool
@@ -53,36 +54,36 @@ class Dependence(NamedTuple):
     kinds: frozenset[str]  # kinds of callbacks that were traced
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Dependence":
-        """Return the result for one of these systems: it is the same for all parameters."""
+        """Return this result for one of the systems: it is the same for all parameters."""
         return self
 
 
-def may_be_short(system: ConstrainedSystem, ran_on_symbols: bool) -> ShortForces:
-    """Return whether forces, C_t or b may act for a short time; this is assumed of callbacks that cannot be traced.
+def may_be_short(system: ConstrainedSystem, force_was_traced: bool) -> ShortForces:
+    """Return whether forces, C_t or b may act for a short time; callbacks that cannot be traced may.
 
     Functions called in Python may store their arguments. They are traced only if the force was traced before
-    (`ran_on_symbols`).
+    (`force_was_traced`).
     """
     if system.n_q > MAX_COORDINATES:
         return ShortForces(True, False)
-    dependence = _dependence(system, ran_on_symbols)
+    dependence = _dependence(system, force_was_traced)
     return ShortForces(True, True) if dependence is None else dependence.short
 
 
-def may_be_steep(system: ConstrainedSystem, ran_on_symbols: bool) -> bool:
+def may_be_steep(system: ConstrainedSystem, force_was_traced: bool) -> bool:
     """Return whether forces may be short, or may vary much over a distance shorter than a step.
 
-    Quotients and roots of the state may vary so: a long step may pass over the peak of 1 / (1 + (x / w)**2), although
+    Quotients and roots of the state may do so: a long step may pass over the peak of 1 / (1 + (x / w)**2), although
     its flanks are noticed. The stages of a long step may sample a fast vibration at nearly the same phase.
     """
-    if any(may_be_short(system, ran_on_symbols)):
+    if any(may_be_short(system, force_was_traced)):
         return True
-    dependence = _dependence(system, ran_on_symbols)
+    dependence = _dependence(system, force_was_traced)
     return dependence is None or dependence.steep
 
 
-def _dependence(system: ConstrainedSystem, ran_on_symbols: bool) -> Dependence | None:
-    if system.called_in_python and not ran_on_symbols:
+def _dependence(system: ConstrainedSystem, force_was_traced: bool) -> Dependence | None:
+    if system.called_in_python and not force_was_traced:
         return None
     try:
         dependence: Dependence = derive_cached(system, "dependence", _analyse(system), unchecked)
@@ -109,7 +110,7 @@ def _analyse(system: ConstrainedSystem) -> Any:
 
 
 class Degrees(Algebra[float]):
-    """Algebra whose values are degrees: of each quantity, as if it were a polynomial in some of the inputs."""
+    """Algebra of degrees: the value of a quantity is its degree, as if it were a polynomial in some of the inputs."""
 
     functions: Mapping[int, Callable[[float], float]] = MappingProxyType(
         {

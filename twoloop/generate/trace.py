@@ -4,8 +4,8 @@ A callback must do with symbols exactly what it does with numbers. So a function
 refused by name when it is called with one, even if the callback catches the exception. Differences that tracing cannot
 detect, such as a changed global variable, are found by comparing numbers (`traced_values.py`).
 
-`Equations` holds every callback of one system as an array of expressions; exact derivatives replace callbacks that are
-not given. Series, eliminations, references and derived callbacks read them there.
+`Equations` has the result of every callback of one system as an array of expressions; exact derivatives replace
+callbacks that are not given. Series, eliminations, references and derived callbacks are generated from these arrays.
 
 `TraceCache` keeps traces for all systems that share their callbacks: coefficients are expressions in the parameters.
 
@@ -53,6 +53,7 @@ NUMPY_FUNCTIONS = {
     *("size", "square", "squeeze", "stack", "subtract", "sum", "tile", "trace", "transpose", "true_divide", "vdot"),
     *("vstack", "zeros_like", "ones_like", "empty_like", "full_like"),
 }
+# functions of NumPy that are replaced so that the arrays they return can contain expressions
 CONSTRUCTORS = ("zeros", "ones", "empty")
 CONVERSIONS = ("array", "asarray", "ascontiguousarray")
 
@@ -68,7 +69,7 @@ def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
     graph, value = t.graph, None
     with graph.watched():
         try:
-            value = _Traced(lambda copy, _: copy).callback(function)(t, *arguments)
+            value = _CallbackCopier(lambda copy, _: copy).callback(function)(t, *arguments)
         except (Refusal, Untraceable) as refusal:
             raise Untraceable(f"{graph.refused or refusal}{place_of(refusal)}") from None
         except Exception as error:  # a callback may raise anything on symbols
@@ -80,7 +81,7 @@ def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
 
 
 def as_forms(graph: Graph, values: Any) -> Any:
-    """Convert an array that a callback filled or returned to expressions, in place."""
+    """Convert the entries of an array that a callback filled or returned to expressions, in place; return the array."""
     for place in np.ndindex(values.shape):
         entry = values[place]
         if type(entry) is not Affine:
@@ -93,7 +94,7 @@ def as_forms(graph: Graph, values: Any) -> Any:
     return values
 
 
-class _Traced(FunctionCopier):
+class _CallbackCopier(FunctionCopier):
     """Copier of callbacks that replaces `math` and `numpy` by functions of expressions."""
 
     def is_copied(self, value: Any) -> bool:
@@ -144,7 +145,7 @@ def _symbol_in(value: Any) -> Affine | None:
 
 
 def _has_parameters(value: Any) -> bool:
-    """Return whether a value is a Parameter, or an array or a list that holds one."""
+    """Return whether a value is a Parameter, or an array or a list that contains one."""
     if isinstance(value, np.ndarray):
         value = value.ravel().tolist() if value.dtype == object else ()
     return any(map(_has_parameters, value)) if isinstance(value, list | tuple) else type(value) is Parameter
@@ -168,7 +169,7 @@ def _for_numbers_only(function_of_numbers: Any, name: str) -> Callable[..., Any]
 
 
 def _number_or_symbol(of_numbers: Any, of_symbols: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that calls `of_symbols` if an argument holds symbols, else `of_numbers`."""
+    """Return a function that calls `of_symbols` if an argument is or contains a symbol, else `of_numbers`."""
 
     def function(*arguments: Any) -> Any:
         if _symbol_in(arguments) is None:
@@ -264,6 +265,7 @@ CALLBACKS = (
     *("constraint", "constraint_rate", "jacobian", "nonholonomic", "nonholonomic_rate", "mass", "force"),
     *("gamma", "nonholonomic_gamma"),
 )
+# right-hand sides of G a = gamma, and the callbacks (G, G_t) from which they are derived
 OF_ROWS = {"gamma": ("jacobian", "constraint_rate"), "nonholonomic_gamma": ("nonholonomic", "nonholonomic_rate")}
 
 
@@ -422,7 +424,7 @@ Array = NDArray[np.float64]
 ScaledProducts = tuple[Array, NDArray[np.int64], list[Powers]]  # entry i is scales[i] * products[indices[i]]
 Evaluator = Callable[[Any], Array]  # computes the numbers of an array of expressions for one system
 
-# callbacks are traced with random parameters in this range: of similar size, so that rounding hides no term
+# range of the random parameters with which callbacks are traced: similar sizes, so that rounding hides no term
 GENERIC = 0.5, 1.5
 # parameters smaller than this, or larger than its inverse, keep their values: their powers would over- or underflow
 EXTREME = 1e-30
@@ -438,8 +440,8 @@ class TraceCache:
     parameters : ndarray (n_p,)
         Parameters of one of the systems.
     classes : ndarray of int (n_p,)
-        Class of each parameter: parameters of equal magnitude share a number from 1 on, with a minus sign for negative
-        parameters. 0: the parameter keeps its value.
+        Class of each parameter: 1, 2, ..., the same for equal magnitudes, with a minus sign for negative parameters.
+        0: the parameter keeps its value.
 
     Attributes
     ----------
@@ -448,7 +450,7 @@ class TraceCache:
     traced : set of str
         Kinds of callbacks that were traced: these callbacks write the same entries in all systems.
     within_bounds : set of str
-        Those of them that `check_bounds` has checked in one of the systems.
+        Kinds of traced callbacks that `check_bounds` has checked in one of the systems.
     """
 
     def __init__(self, parameters: Array, classes: NDArray[np.int64]):
@@ -470,18 +472,18 @@ class TraceCache:
         self._tracing = RLock()  # one lock, as all traces record on one tape
 
     def equations(self, system: ConstrainedSystem) -> Equations:
-        """Return the traced callbacks, with a graph of their own that may be extended."""
+        """Return the traced callbacks, with a copy of the graph, which may be extended."""
         if system.called_in_python:  # such a function may store its arguments, so it is traced as late as possible
             return Equations(system, self.parameters)
         traced: Equations = self.remembered("equations", lambda: Equations(system, self.parameters).trace_all())
         return traced.copy()
 
     def numbers(self, parameters: Array) -> Array:
-        """Return the magnitude that the parameters of each class have in a system."""
+        """Return the magnitude of each class of parameters, given the parameters of a system."""
         return np.abs(parameters[self._first])
 
     def products(self, parameters: Array) -> Callable[[Powers], Any]:
-        """Return a function that evaluates products of atoms for a system's parameters."""
+        """Return a function that evaluates Powers (products of atoms), given the parameters of a system."""
         return self._tape.products(self.numbers(parameters))
 
     def evaluator(self, parameters: Array) -> Evaluator:
@@ -519,7 +521,7 @@ class TraceCache:
         if what not in self._results:
             with self._tracing:
                 if what not in self._results:
-                    with garbage_collection_off():  # there is no garbage: everything stays in the cache
+                    with garbage_collection_off():  # no garbage arises, because everything stays in the cache
                         self._results[what] = make()
         return self._results[what]
 
@@ -527,10 +529,10 @@ class TraceCache:
 def derive_cached(
     system: ConstrainedSystem, what: Any, make: Callable[[TraceCache], Any], check: Callable[[Any], None]
 ) -> Any:
-    """Return the object that `make` derives from shared traces, converted for one system by its method `of`.
+    """Return the object that `make` derives from shared traces, converted for one system by the object's method `of`.
 
-    The system gets a trace of its own if callbacks cannot be traced with variable parameters, or if `check` refuses the
-    result, as a callback may treat variable parameters differently from numbers.
+    If callbacks cannot be traced with variable parameters, or `check` refuses the result (a callback may treat variable
+    parameters differently from numbers), the callbacks are traced for this system alone.
 
     Raises
     ------
@@ -563,7 +565,7 @@ def _derive(system: ConstrainedSystem, cache: TraceCache, what: Any, make: Calla
 
 
 def load_checked_bounds(system: ConstrainedSystem) -> None:
-    """Take over the results of `check_bounds` from systems with the same traces, whose callbacks do the same."""
+    """Copy the results of `check_bounds` from systems with the same traces, as their callbacks do the same."""
     if not system.called_in_python:
         system.within_bounds |= shared_cache(system).within_bounds
 
@@ -598,7 +600,7 @@ def _own_cache(system: ConstrainedSystem) -> TraceCache:
 
 
 def _classes(parameters: Array) -> NDArray[np.int64]:
-    """Return the class of each parameter, see `TraceCache`; classes are numbered in order of appearance."""
+    """Return the class of each parameter, see `TraceCache`; classes are numbered in the order of the parameters."""
     size = np.abs(parameters)
     varies = (size > EXTREME) & (size < 1.0 / EXTREME) & (size != np.floor(size))
     _, first, which = np.unique(size[varies], return_index=True, return_inverse=True)
@@ -645,7 +647,7 @@ class ParameterArrays:
         return numbers.reshape(expressions.shape)
 
     def write(self, product: Callable[[Powers], Any]) -> None:
-        """Write the numbers for the parameters of `product`, see TraceCache.products."""
+        """Fill all arrays; `product` evaluates Powers for the parameters of a system, see `TraceCache.products`."""
         if self._gathered is None:
             return
         products, scales, product_of = self._gathered

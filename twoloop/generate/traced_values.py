@@ -1,7 +1,7 @@
 """Compare the values of traces with the values that calls of the callbacks return.
 
-A trace is wrong if the callback branches undetected, keeps something from call to call, or reads data that change and
-are not its arguments (a global variable that numba froze when it compiled the callback). Before a run, values are
+A trace is wrong if the callback branches undetected, stores something from call to call, or reads changing data that
+are not its arguments (a global variable, whose value numba froze at compilation). Before a run, values are
 compared at states near the start and at times spread over the run; later at states of the run itself.
 """
 
@@ -31,20 +31,20 @@ KINDS = (
 )
 N_NEARBY = 8  # number of random states near the start at which traces are compared, besides the start
 TIMES = np.linspace(0.0, 1.0, N_NEARBY)  # times of these states, as shares of the run
-DISTANCE = 0.3  # distance of these states from the start, relative to the size of coordinates
-# largest number of states that are compared: of a chunk of a run, of a run, of a run with callbacks called in Python
+DISTANCE = 0.3  # largest distance of these states from the start, relative to the sizes of coordinates
+# largest number of compared states: in a chunk of a run, in a run, in a run with callbacks called in Python
 MAX_OF_CHUNK, MAX_STATES, MAX_IN_PYTHON = 32, 64, 9
-MAX_ENTRIES = 20_000  # approximate limit of the entries compared in a run: large systems are compared at fewer states
-LOST = 16.0 * np.finfo(float).eps  # relative to the largest term of a kind: a smaller difference is rounding
-# relative to the largest term: a smaller difference counts only if it is the same at neighbouring states, ...
-CLEAR = 1e-6
-PERTURBATION, N_NEIGHBOURS = 1e-7, 12  # ... which are this many states, perturbed by this relative change
+MAX_ENTRIES = 20_000  # approximate limit of the compared entries in a run: large systems are compared at fewer states
+# difference of call and trace, relative to the largest term of a kind, up to which it is rounding
+LOST = 16.0 * np.finfo(float).eps
+CLEAR = 1e-6  # relative difference up to which it counts only if it is the same at neighbouring states
+PERTURBATION, N_NEIGHBOURS = 1e-7, 12  # largest relative distance of neighbouring states, and their number
 MARGIN = 0.01  # margin of a CheckedRegion relative to its sides; small compared with the steps of a run
-MARGIN_AT_REST = 1e-9  # margin relative to the longest side (without time), for coordinates at rest
+MARGIN_AT_REST = 1e-9  # further margin relative to the longest side except time: coordinates at rest have no side
 
 
 class Traced:
-    """Operation table of traced callbacks, to be compared with calls of the callbacks.
+    """Traced callbacks as an operation table, to be compared with calls of the callbacks.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class Traced:
         self.program = OperationTable.of(graph, 1 + 2 * system.n_q, results)
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Traced":
-        """Return the traces for another system of the same cache, with coefficients for its parameters."""
+        """Return the traces for another system of the same cache, with the coefficients of that system."""
         traced = self.with_numbers(evaluate)
         traced.name = system.name
         return traced
@@ -172,7 +172,7 @@ class Sample:
     """Sample of the states [t, q, v] of a run, from its start to its present time."""
 
     def __init__(self, t: float, state: Array, n: int) -> None:
-        self._n, self._random_parts = n, list[Array]()
+        self._n, self._parts = n, list[Array]()
         self.add(state[:0], state[None, :][:0], t, state)
 
     def add(self, t: Array, rows: Array, end: float, state: Array) -> None:
@@ -182,19 +182,19 @@ class Sample:
         part = np.empty((len(some) + 1, 1 + self._n))
         part[0, 0], part[0, 1:] = end, state[: self._n]
         part[:0:-1, 0], part[:0:-1, 1:] = some, rows[::stride, : self._n]
-        self._random_parts.insert(0, part)
-        if len(self._random_parts) > MAX_STATES:
-            self._random_parts = self._random_parts[::2]
+        self._parts.insert(0, part)
+        if len(self._parts) > MAX_STATES:
+            self._parts = self._parts[::2]
 
     def end(self, t: float, state: Array) -> None:
         """Drop the states after the time at which a run ended, and add the state at that time."""
         states = self.states()
-        self._random_parts = [states[states[:, 0] <= t]]
+        self._parts = [states[states[:, 0] <= t]]
         self.add(states[:0, 0], states[:0], t, state)
 
     def states(self) -> Array:
         """Return all states, the latest first."""
-        return np.concatenate(self._random_parts)
+        return np.concatenate(self._parts)
 
 
 def refuse_wrong(traced: Sequence[Traced], system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:
@@ -248,12 +248,12 @@ def extreme_states(t: Array, rows: Array) -> Array:
 
 
 class CheckedRegion:
-    """Region of [t, q, v] and of parameters in which callbacks agreed with their traces: two boxes.
+    """Region in which callbacks agreed with their traces: a box of states [t, q, v], and a box of parameters.
 
     Attributes
     ----------
     bounds : ndarray (2, 1 + 2 n_q) or (2, 0)
-        Smallest and largest components of the states that need no new comparison: the box with its margin.
+        Smallest and largest components of the states that need no new comparison: the box of states and its margin.
     """
 
     def __init__(self) -> None:
@@ -263,7 +263,7 @@ class CheckedRegion:
         self.bounds = self._box
 
     def is_comparison_due(self) -> bool:
-        """Return whether the next run must compare at all its states: this holds for the runs 1, 2, 4, 8, ..."""
+        """Return whether the next run must compare callbacks at all its states, as the runs 1, 2, 4, 8, ... do."""
         return (self._runs + 1) & self._runs == 0
 
     def count(self) -> None:

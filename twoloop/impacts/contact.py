@@ -10,7 +10,7 @@ import numpy as np
 from twoloop.checks.arguments import Array, shown
 from twoloop.generate.derived_callbacks import with_derived_callbacks
 from twoloop.generate.graph import Affine, Derivative, Graph, Untraceable, symbols
-from twoloop.generate.program import AGREES, BETWEEN, STATES, OperationTable
+from twoloop.generate.program import MAX_TRACE_DIFFERENCE, N_COMPARED, TIME_SPACING, OperationTable
 from twoloop.generate.trace import as_forms, trace
 from twoloop.generate.traced_values import unchecked
 from twoloop.kernels.compile.linking import entry_point
@@ -79,10 +79,10 @@ class Gaps:
     def _compare(self, stops: Sequence[Stop], t0: float, q0: Array) -> None:
         """Raise unless the traced programs return the values of the functions, at q0 and near it."""
         # a fixed seed, so that every call accepts or rejects the same model
-        displacements = np.random.default_rng(4).uniform(-0.3, 0.3, (STATES, len(q0)))
+        displacements = np.random.default_rng(4).uniform(-0.3, 0.3, (N_COMPARED, len(q0)))
         displacements[0] = 0.0
         for k, displacement in enumerate(displacements):
-            t, q = t0 + BETWEEN * k, q0 + displacement
+            t, q = t0 + TIME_SPACING * k, q0 + displacement
             traced = self.at(t, q, np.zeros_like(q)).g
             for stop, traced_value in zip(stops, traced, strict=True):
                 value: Any = getattr(stop, self._function)(t, q.copy())
@@ -90,7 +90,7 @@ class Gaps:
                     raise ValueError(
                         f"{self._function} of {stop.name!r} must return a finite number; it returned {shown(value)}"
                     )
-                if np.isfinite(value) and abs(value - traced_value) > AGREES * (1.0 + abs(traced_value)):
+                if np.isfinite(value) and abs(value - traced_value) > MAX_TRACE_DIFFERENCE * (1.0 + abs(traced_value)):
                     raise ValueError(
                         f"{self._function} of {stop.name!r} has another value at t = {t:g} than when it was traced: it "
                         "must depend on t and q alone, without branches"

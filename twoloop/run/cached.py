@@ -594,7 +594,7 @@ def _copy_for_start(
 ) -> Run | None:
     """Return a copy of a cached run for another start; None if that start needs other code or another form."""
     _check_start(system, t0, q0, v0, options.check_derivatives)
-    if entry.code is not None and not entry.code.serves(system, t0, q0):
+    if entry.code is not None and not entry.code.is_valid_from(system, t0, q0):
         return None
     run = entry.run.from_start(t0, q0, v0) if has_definite_mass(system, t0, q0) == entry.definite else None
     if run is not None:
