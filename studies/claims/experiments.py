@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,8 @@ import numpy as np
 from references.paper.four_bar_minimal import MinimalFourBar
 from references.paper.paper_step import Step, independents, true_states
 from studies.bench import end_states
-from studies.bench.solvers import IMPLICIT
+from studies.bench.collector import Case
+from studies.bench.solvers import CATALOGUE, IMPLICIT, IRK_LINE, NEWMARK, OWN_BDF
 from studies.bench.store import Array
 from studies.reproduction.motion import PASSES
 from studies.validation import study as validation
@@ -30,6 +31,14 @@ ORDERS = dict(zip(IMPLICIT, (5, 6, 12, 5, 9, 13, 2, 4, 2, 5), strict=True))
 STEPS = (4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 48, 64, 96, 128)  # a second
 FALLING = (1e-9, 1e-2)  # errors between which an order is seen
 ENOUGH = 0.9  # of the order
+PROCEDURES = {  # solvers of the catalogue, by the unknowns and the method of the outer loop
+    "accelerations, Newmark's method": NEWMARK,
+    "accelerations, BDF of variable order": OWN_BDF,
+    "positions and velocities, the paper's Runge–Kutta method": IRK_LINE,
+    "positions and velocities, `Gauss12`": "Gauss12",
+    "positions and velocities, `Lobatto16`, eight stages at once": "auto, compiled",
+}
+ERRORS = (1e-4, 1e-6, 1e-8)  # m, of positions after 10 s
 PAIRS = 200  # of successive steps at which the choice of coordinates is compared
 GEOMETRIES = (  # lengths of the bars and of the ground, m: the assumed one, that of Table 3 beside it, and others
     *((1.0, 2.0, 1.5, 3.0), (0.8, 1.2, 1.0, 2.0), (1.0, 1.2, 0.5, 1.0)),
@@ -40,8 +49,30 @@ GEOMETRIES = (  # lengths of the bars and of the ground, m: the assumed one, tha
 def make(quick: bool) -> dict[str, float]:
     linkage = four_bar()
     found = predictor(linkage, true_states(linkage, 8 if quick else 40)) | values_alone(linkage)
-    found |= generality(validation.MAKE[:: 7 if quick else 1]) | nonholonomic()
+    found |= generality(validation.MAKE[:: 7 if quick else 1]) | nonholonomic() | ({} if quick else procedures(linkage))
     return found | outer_loops() | orders() | passing(GEOMETRIES[: 1 if quick else None])
+
+
+def procedures(problem: Problem) -> dict[str, float]:
+    """Find the fewest iterations of the outer loop by which each two-loop procedure reaches each error."""
+    case = Case(problem.name, problem, 10.0, time_limit=TIME_LIMIT)
+    truth, found = MinimalFourBar.from_parameters(problem.parameters).states(case.instants[-1:])[0][:, 0], {}
+    for name, solver in ((name, CATALOGUE[each]) for name, each in PROCEDURES.items()):
+        results = [each for value in solver.grid(case) if (each := solver.run(case, value, 0)).success]
+        errors = [float(np.abs(each.q[:, -1] - truth).max()) for each in results]
+        for most in ERRORS:
+            if fits := [each.stats.n_outer or 0 for each, error in zip(results, errors, strict=True) if error <= most]:
+                found[f"{name} | {most:g}"] = float(min(fits))
+    return found
+
+
+def table_of_procedures(found: Mapping[str, float]) -> list[list[str]]:
+    """Return a row for each procedure: its name, and the iterations for each error, as found by `procedures`."""
+    keys = [[f"{name} | {error:g}" for error in ERRORS] for name in PROCEDURES]
+    if not any(key in found for row in keys for key in row):
+        return []  # of a quick run
+    rows = [[f"{found[key]:,.0f}" if key in found else "not reached" for key in row] for row in keys]
+    return [[name, *row] for name, row in zip(PROCEDURES, rows, strict=True)]
 
 
 def predictor(problem: Problem, states: list[tuple[float, Array, Array]]) -> dict[str, float]:
