@@ -13,7 +13,7 @@ from numba.extending import register_jitable
 from tests.compiled import unit_mass
 from tests.problems import pendulum, quick
 from twoloop import ConstrainedSystem, Integrator, callback, consistent_state, consistent_states, ensemble, solve_dae
-from twoloop.kernels.compile.dependencies import frozen_places
+from twoloop.kernels.compile.dependencies import frozen_locations
 
 GRAVITY = 9.81
 START = [1.0, 0.0], [0.0, 0.0]
@@ -217,7 +217,7 @@ def test_names_that_lead_back_to_themselves_and_long_tuples_end():
 
     back, cyclic = modules[0], njit(cyclic)
     loop = (cyclic, 1.0, many)
-    names = [place.name for place in frozen_places(cyclic.py_func)]
+    names = [place.name for place in frozen_locations(cyclic.py_func)]
     assert {"loop", "loop[0]", "loop[2]", "many", "back", "back.other"} <= set(names) and len(names) < 20
 
 

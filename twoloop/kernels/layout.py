@@ -249,7 +249,7 @@ def _layout(
     masks = np.zeros((2, WORK.n_words), dtype=np.int64)
     for mask, places in zip(masks, (of_numbers, of_integers), strict=True):
         for name, (begin, _, shape) in places.items():
-            word = WORK.places[name]
+            word = WORK.offsets[name]
             table[word], mask[word] = WORD * begin, 1
             table[word + 1 : word + 1 + len(shape)] = shape
     named = [[(name, *place) for name, place in places.items()] for places in (of_numbers, of_integers)]

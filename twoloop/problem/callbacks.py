@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from twoloop.checks.arguments import Array, check_call, check_real, shaped, shown
 from twoloop.kernels.compile.caches import digests_of, with_unique_name
 from twoloop.kernels.compile.callbacks import KINDS, compile_callback, zero_callback
-from twoloop.kernels.compile.dependencies import digest_as, digest_of
+from twoloop.kernels.compile.dependencies import digest_of, register_digest
 from twoloop.kernels.compile.linking import Dispatcher
 
 Integers = NDArray[np.int64]
@@ -271,7 +271,7 @@ def through_python(kind: str) -> Dispatcher:
 
     callback_function = at_position if len(KINDS[kind].state) == 1 else at_state
     callback = compile_callback(kind, callback_function, ("through Python", str(place)))
-    digest_as(callback, digest_of(f"through Python, {place}", __file__))
+    register_digest(callback, digest_of(f"through Python, {place}", __file__))
     return callback
 
 

@@ -389,7 +389,7 @@ def _steps_of(plan: Plan) -> tuple[Any, Any, Any]:
 def _with_own_flags(kit: Kit) -> Kit:
     """Copy a kit with flags of its own, which a run may change; this takes a tenth of the time of a new kit."""
     other, flags, table = object.__new__(Kit), kit.flags.copy(), kit.table.copy()
-    table[common.KIT.places["flags"]] = flags.ctypes.data
+    table[common.KIT.offsets["flags"]] = flags.ctypes.data
     functions = kit.functions._replace(flags=flags)
     vars(other).update(vars(kit), functions=functions, flags=flags, table=table, address=table.ctypes.data)
     return other

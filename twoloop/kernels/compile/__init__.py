@@ -1,4 +1,4 @@
-"""Compile callbacks and kernels and cache them on disk; all uses of private parts of numba are here."""
+"""Compile callbacks and kernels, and cache machine code on disk. Only this package uses private parts of numba."""
 
 import re
 
@@ -8,17 +8,17 @@ LEAST, BELOW = (0, 61), (0, 69)  # supported versions of numba: from LEAST to be
 
 
 def check_version(installed: str) -> None:
-    """Raise unless this version of numba is supported, because twoloop replaces private parts of numba.
+    """Raise an error if this version of numba is not supported; twoloop replaces private parts of numba.
 
     Raises
     ------
     ImportError
-        If the version is not supported; the message names those that are.
+        If the version is not supported; the message gives the supported versions.
     """
     if not LEAST <= tuple(int(number) for number in re.findall(r"\d+", installed)[:2]) < BELOW:
         least, below = (".".join(map(str, version)) for version in (LEAST, BELOW))
         raise ImportError(
-            f"twoloop uses private parts of numba, which it knows of versions from {least} to below {below}; numba "
+            f"twoloop uses private parts of numba, and supports versions from {least} to below {below}; numba "
             f"{installed} is installed: pip install 'numba>={least},<{below}'"
         )
 

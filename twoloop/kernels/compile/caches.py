@@ -1,11 +1,13 @@
 """Cache machine code on disk: where it is stored, when it is out of date, and what happens if it cannot be stored.
 
-Numba's cache watches only the file in which a function is defined: neither helpers in other files nor the values of
-globals, which numba freezes. It raises if no folder can be written or a file is damaged, and it runs code that other
-users have put into its folder. Here each function and key has its own file with a checksum, and code is loaded only
-from files and folders that belong to the user or root and that no other user can write. SSH has the same rule for its
-keys: whoever can write or replace a file of machine code can run any code in the name of the user who loads it. A
-checksum does not prevent this, because the attacker can write the checksum, too.
+Numba's own cache has three shortcomings. It notices changes only of the file in which a function is defined, not of
+helpers in other files or of the values of globals, which numba freezes. It raises an error if no folder can be written
+or if a file is damaged. And it runs code that other users have put into its folder.
+
+Here each function and key has its own file with a checksum. Code is loaded only from files and folders that belong to
+the user or root, and that no other user can write, as SSH requires of its keys: whoever can write or replace a file of
+machine code can run any code in the name of the user who loads it. A checksum does not prevent this, because the
+attacker can write the checksum, too.
 """
 
 import gc
@@ -34,7 +36,7 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 from numba.misc.appdirs import AppDirs
 
-from twoloop.kernels.compile.dependencies import Digest, NotDigestible, enclosed_by, names_reached
+from twoloop.kernels.compile.dependencies import Digest, NotDigestible, closure_values, reachable_names
 from twoloop.kernels.compile.linking import forget_compiled, jitable_templates
 
 ADVICE = (
@@ -44,16 +46,16 @@ ADVICE = (
 
 
 class Untrusted(OSError):
-    """Error for a file or folder that another user could have written; the text gives the reason."""
+    """Error for a file that another user could have written; the text gives the reason."""
 
 
 def read_trusted(path: Path) -> bytes:
-    """Read a file in a folder of `trusted_folder`.
+    """Return the content of a file in a folder that `trusted_folder` has returned.
 
     Raises
     ------
     OSError
-        If there is no file. `Untrusted`, with a warning on stderr, if another user could have written it.
+        If there is no file. `Untrusted`, with a warning on stderr, if another user could have written the file.
     """
     with path.open("rb") as file:
         if why := _reason_of_mode(os.fstat(file.fileno())):
@@ -63,13 +65,13 @@ def read_trusted(path: Path) -> bytes:
 
 
 def write_trusted(path: Path, content: bytes) -> None:
-    """Write a new file that no other user may write, whatever the umask."""
+    """Write a new file that no other user can write, whatever the umask."""
     with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644), "wb") as file:
         file.write(content)
 
 
 def make_trusted_folder(folder: Path) -> None:
-    """Create a folder, and missing ones above it, that no other user may write, whatever the umask."""
+    """Create a folder and missing folders above it, which no other user can write, whatever the umask."""
     for each in [*reversed(folder.parents), folder]:
         if not each.exists():
             each.mkdir(0o755, exist_ok=True)
@@ -77,24 +79,25 @@ def make_trusted_folder(folder: Path) -> None:
 
 @cache
 def trusted_folder(folder: Path) -> Path:
-    """Return the folder if only the user can write it and change the folders above it; otherwise a replacement.
+    """Return the folder if no other user can write it or the folders above it; otherwise, return a replacement.
 
-    The replacement is in the user's cache folder; if others can write that too, a temporary folder of this process.
+    The replacement is in the user's cache folder. If others can write this folder, too, it is a temporary folder of
+    this process.
     """
     why = reason_to_distrust(folder)
     if not why:
         return folder
     subfolder = f"{folder.name}_{hashlib.sha256(str(folder).encode()).hexdigest()[:16]}"
-    instead = Path(AppDirs(appname="twoloop", appauthor=False).user_cache_dir) / "code" / subfolder
-    if reason_to_distrust(instead):
-        instead = Path(_temporary_folder()) / subfolder
-    _warn_first(f"twoloop: no code is loaded from {folder}: {why}. It is kept in {instead} instead. {ADVICE}")
-    return instead
+    replacement = Path(AppDirs(appname="twoloop", appauthor=False).user_cache_dir) / "code" / subfolder
+    if reason_to_distrust(replacement):
+        replacement = Path(_temporary_folder()) / subfolder
+    _warn_first(f"twoloop: no code is loaded from {folder}: {why}. It is kept in {replacement} instead. {ADVICE}")
+    return replacement
 
 
 def reason_to_distrust(folder: Path) -> str:
-    """Return why another user may have written a folder, or one above it; "" if nobody else can."""
-    if os.name != "posix":  # other systems do not keep access rights in the mode
+    """Return why another user could have written a folder or a folder above it, or "" if nobody could."""
+    if os.name != "posix":  # on other systems, the mode does not contain the access rights
         return ""
     real = Path(os.path.realpath(folder))
     for each in [real, *real.parents]:
@@ -103,7 +106,7 @@ def reason_to_distrust(folder: Path) -> str:
         except FileNotFoundError:  # the folder does not exist yet
             continue
         except OSError as error:
-            return f"{each} cannot be looked at ({error.strerror})"
+            return f"{each} cannot be examined ({error.strerror})"
         # in a sticky folder only the owner of an entry can replace it
         sticky = each != real and status.st_mode & stat.S_ISVTX
         why = _reason_of_owner(status) if sticky else _reason_of_mode(status)
@@ -113,6 +116,7 @@ def reason_to_distrust(folder: Path) -> str:
 
 
 def _reason_of_mode(status: os.stat_result) -> str:
+    """Return why another user can write a file or folder with this status, or "" if nobody can."""
     if os.name != "posix":
         return ""
     if why := _reason_of_owner(status):
@@ -125,13 +129,14 @@ def _reason_of_mode(status: os.stat_result) -> str:
 
 
 def _reason_of_owner(status: os.stat_result) -> str:
+    """Return that a file or folder belongs to another user, or "" if it belongs to the user or root."""
     return "" if status.st_uid in (0, os.geteuid()) else f"belongs to user {status.st_uid}"
 
 
 @cache
 def _is_private_group(gid: int) -> bool:
-    """Return whether a group has no other member: root's, or the user's own, which some distributions create."""
-    import grp  # not on Windows
+    """Return whether only the user and root belong to a group: that of root, or the user's own one."""
+    import grp  # not available on Windows
     import pwd
 
     try:
@@ -146,6 +151,7 @@ _temporary: list[tempfile.TemporaryDirectory[str]] = []
 
 
 def _temporary_folder() -> str:
+    """Return the temporary folder of this process, which is created at the first call."""
     if not _temporary:
         _temporary.append(tempfile.TemporaryDirectory(prefix="twoloop-"))
     return _temporary[0].name
@@ -155,21 +161,21 @@ _warnings: list[str] = []
 
 
 def _warn_first(text: str) -> None:
-    """Print a warning on stderr if it is the first of this process."""
+    """Print a warning on stderr, unless this process has printed one before."""
     if not _warnings:
         _warnings.append(text)
         print(text, file=sys.stderr, flush=True)
 
 
-MAX_ON_DISK = 500  # largest number of files on disk of each kind of function generated for single mechanisms
-CHECKSUM = hashlib.sha256().digest_size
+MAX_ON_DISK = 500  # largest number of files on disk for each kind of function generated for single mechanisms
+CHECKSUM = hashlib.sha256().digest_size  # length of the checksum at the beginning of a file, bytes
 
 
 class CodeFiles:
-    """Store machine code of one function: a file for each key, with a checksum, that only the user can write.
+    """Store the machine code of a function, in a file with a checksum for each key, which only the user can write.
 
-    A file that is damaged or out of date counts as missing. Numba's own cache has an index, through which two processes
-    that write at the same time may give one function the machine code of another.
+    A file that is damaged or out of date counts as missing. Numba's own cache has an index, which may assign the
+    machine code of one function to another if two processes write at the same time; here there is none.
     """
 
     def __init__(self, folder: Path, name: str, stamp: Any, limited: bool = False):
@@ -177,7 +183,7 @@ class CodeFiles:
         self.made_of = numba.__version__, stamp
 
     def save(self, key: Any, data: Any) -> None:
-        """Write numba's data for a key, in place of the previous file."""
+        """Write the data for a key, and replace the previous file."""
         content = pickle.dumps((repr((*self.made_of, key)), dumps(data)))
         path = self._path(key)
         unfinished = path.with_suffix(f".{uuid.uuid4().hex}")
@@ -192,11 +198,11 @@ class CodeFiles:
                 old.unlink(missing_ok=True)
 
     def has(self, key: Any) -> bool:
-        """Return whether there is a file for a key."""
+        """Return whether there is a file for a key, which may be damaged or out of date."""
         return self._path(key).exists()
 
     def load(self, key: Any) -> Any:
-        """Read numba's data for a key; return None if the file is missing."""
+        """Return the data for a key, or None if the file is missing, damaged or out of date."""
         try:
             content = read_trusted(self._path(key))
         except OSError:
@@ -212,14 +218,16 @@ class CodeFiles:
             path.unlink(missing_ok=True)
 
     def _all(self) -> list[Path]:
+        """Return the files of all keys."""
         return list(self.folder.glob(f"{glob.escape(self.name)}.*.nbc"))
 
     def _path(self, key: Any) -> Path:
+        """Return the file for a key."""
         return self.folder / f"{self.name}.{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.nbc"
 
 
 def _time_written(path: Path) -> float:
-    """Return the time at which a file was written; 0 if another process has removed it."""
+    """Return the time at which a file was written, s, or 0 if another process has removed the file."""
     try:
         return path.stat().st_mtime
     except OSError:
@@ -230,8 +238,8 @@ UNWRITABLE = (
     "twoloop: machine code cannot be kept on disk, so every process compiles again. Set NUMBA_CACHE_DIR to a folder "
     "that only you can write"
 )
-MAX_IN_MEMORY = 50  # the same limit in memory
-# numba 0.61 has a private name for this class
+MAX_IN_MEMORY = 50  # largest number of entries of a BoundedCache, in memory
+# the class has a private name in numba 0.61
 _LOCATOR: Any = vars(caching).get("UserProvidedCacheLocator") or vars(caching)["_UserProvidedCacheLocator"]
 
 
@@ -243,7 +251,7 @@ def compile_cached(
     announcement: str = "",
     **options: Any,
 ) -> Dispatcher:
-    """Compile a function for one signature, or read its machine code from the disk.
+    """Compile a function for one signature, or read its machine code from the disk; return numba's dispatcher.
 
     Parameters
     ----------
@@ -252,10 +260,11 @@ def compile_cached(
     signature : numba signature
         Its only signature.
     watched : (str, str) or None
-        Digests of what the machine code depends on, see `digests_of`. If the first changes, all is compiled again; the
-        second tells functions apart that share their source. None: the machine code is not stored.
+        Digests of all on which the machine code depends, see `digests_of`. Machine code with another first digest is
+        out of date; the second digest is the key of a file, because functions with the same source may have other
+        closure variables. None: the machine code is not stored.
     announcement : str
-        Printed on stderr before the first compilation of a process.
+        Text printed on stderr before the first compilation of this process.
     **options
         Options of numba.njit.
     """
@@ -264,7 +273,7 @@ def compile_cached(
     if watched is not None:
         try:
             dispatcher._cache = _Cache(function, *watched, announcement)
-        except RuntimeError:  # numba finds no folder; functions typed at a prompt have none
+        except RuntimeError:  # numba finds no folder, for example for functions typed at a prompt
             if Path(inspect.getfile(function)).exists():
                 warn_once(UNWRITABLE)
     with garbage_collection_off():
@@ -276,7 +285,7 @@ def compile_cached(
 
 @contextmanager
 def garbage_collection_off() -> Iterator[None]:
-    """Suspend the collection of cycles, a sixth of the compile time: numba's objects live until the process ends."""
+    """Suspend garbage collection, which takes a sixth of the compile time: numba's objects are never garbage."""
     collecting = gc.isenabled()
     gc.disable()
     try:
@@ -287,7 +296,7 @@ def garbage_collection_off() -> Iterator[None]:
 
 
 class BoundedCache(dict[Any, Any]):
-    """Cache data of single mechanisms by digest: the newest MAX_IN_MEMORY, because a sweep adds one for each run."""
+    """Cache the newest MAX_IN_MEMORY entries: each entry is for one mechanism, and a sweep adds one for each run."""
 
     def __setitem__(self, key: Any, made: Any) -> None:
         super().__setitem__(key, made)
@@ -295,16 +304,16 @@ class BoundedCache(dict[Any, Any]):
             self.pop(old, None)
 
 
-_N_COMPILED = [0]
+_N_COMPILED = [0]  # number of calls of `compile_cached`
 
 
 def n_compiled() -> int:
-    """Return the number of numba functions that this process has compiled or read from the disk; all are in memory."""
+    """Return the number of functions that this process has compiled with numba or read from the disk."""
     return _N_COMPILED[0]
 
 
 def cache_folder(package: types.ModuleType) -> Path | None:
-    """Return the folder of the machine code of a package; None if no folder can be written."""
+    """Return the folder in which the machine code of a package is cached, or None if no folder can be written."""
 
     def placeholder() -> None:
         pass
@@ -318,10 +327,11 @@ def cache_folder(package: types.ModuleType) -> Path | None:
 
 
 def with_unique_name(function: Callable[..., Any], watched: tuple[str, str] | None) -> Callable[..., Any]:
-    """Return a copy of a nested function, or a lambda, under a unique name; return any other function unchanged.
+    """Return a copy of a nested function or lambda with a unique name; return any other function unchanged.
 
-    Numba's symbols consist of the qualified name and of a number that counts within a process. Two closures of one name
-    whose machine code comes from different processes may share a symbol: then both call the code that was loaded first.
+    Numba's symbols consist of the qualified name of a function and a number that counts within a process. If machine
+    code of two closures with the same name comes from different processes, they may have the same symbol: then both run
+    the code that was loaded first.
     """
     if watched is None or "<" not in function.__qualname__:
         return function
@@ -330,17 +340,17 @@ def with_unique_name(function: Callable[..., Any], watched: tuple[str, str] | No
         code, function.__globals__, function.__name__, function.__defaults__, function.__closure__
     )
     copy.__kwdefaults__, copy.__module__ = function.__kwdefaults__, function.__module__
-    apart = hashlib.sha256(repr((watched, code.co_filename, code.co_firstlineno)).encode()).hexdigest()
-    copy.__qualname__ = f"{function.__qualname__}.{apart[:16]}"
+    suffix = hashlib.sha256(repr((watched, code.co_filename, code.co_firstlineno)).encode()).hexdigest()
+    copy.__qualname__ = f"{function.__qualname__}.{suffix[:16]}"
     return copy
 
 
 class _Cache(FunctionCache):
-    """Extend numba's cache of one function by the digests of twoloop; an error costs time but is never raised."""
+    """Numba's cache of a function, with the digests and files of twoloop; an error costs time, but is never raised."""
 
     def __init__(self, function: Callable[..., Any], stamp: str, key: str, announcement: str):
         chosen: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
-        if chosen:  # numba would create the folder with the rights that the umask allows
+        if chosen:  # numba would create the folder with access rights that depend on the umask
             with suppress(OSError):
                 make_trusted_folder(Path(chosen, _LOCATOR.get_suitable_cache_subpath(inspect.getfile(function))))
         super().__init__(function)
@@ -351,18 +361,21 @@ class _Cache(FunctionCache):
         self._key, self._announcement = key, announcement
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
+        """Return the key of a file: signature, processor and second digest."""
         return sig, codegen.magic_tuple(), self._key
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return the machine code for a signature, or None if it has to be compiled."""
         try:
             found = super().load_overload(sig, target_context)
-        except Exception:  # a file of another installation: compile again, and overwrite the file
+        except Exception:  # an incompatible file, of another installation: compile, and overwrite it
             found = None
         if found is None and self._announcement:
             warn_once(self._announcement)
         return found
 
     def save_overload(self, sig: Any, data: Any) -> None:
+        """Store machine code, or warn that this is impossible."""
         try:
             super().save_overload(sig, data)
         except OSError:
@@ -370,9 +383,9 @@ class _Cache(FunctionCache):
 
 
 def sources_folder() -> Path:
-    """Return the folder of generated source: in NUMBA_CACHE_DIR if it is set, else in the user's cache folder.
+    """Return the folder of generated code: in NUMBA_CACHE_DIR if this is set, otherwise in the user's cache folder.
 
-    If other users can write there, return a folder that they cannot write.
+    If other users can write this folder, return its replacement, see `trusted_folder`.
     """
     chosen: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
     folder = chosen or AppDirs(appname="twoloop", appauthor=False).user_cache_dir
@@ -381,18 +394,18 @@ def sources_folder() -> Path:
 
 @cache
 def warn_once(text: str) -> None:
-    """Print a line on stderr, once a process."""
+    """Print a text on stderr, once in a process."""
     print(text, file=sys.stderr, flush=True)
 
 
 def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
-    """Return a decorator, numba.njit(**options) with a cache on disk; the function is compiled at its first call."""
+    """Return a decorator like numba.njit(**options), with a cache on disk; the first call compiles the function."""
 
     def decorate(function: Callable[..., Any]) -> Dispatcher:
         watched = digests_of(function)
         dispatcher = njit(**options)(with_unique_name(function, watched))
         if watched is not None:
-            # then a closure that encloses this function does not compile it again
+            # so that a callback that uses this function as a closure variable does not compile it again
             _COMPILED_DIGESTS[dispatcher] = watched
             with suppress(RuntimeError):  # no folder can be written
                 dispatcher._cache = _Cache(dispatcher.py_func, *watched, "")
@@ -402,24 +415,25 @@ def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispa
 
 
 def digests_of(function: Callable[..., Any]) -> tuple[str, str] | None:
-    """Return digests of all that the machine code of a function depends on, and of the values that it encloses.
+    """Return two digests for the machine code of a function, the second of its closure variables.
 
-    The first covers its code, its defaults, the globals and attributes of modules that it names, and all of this for
-    the compiled helpers among them. Returns None if one of these values may change unnoticed.
+    The first digest is of its code, its defaults, and the globals and attributes of modules that it uses. For compiled
+    helpers among these values, their own values are hashed, too. Returns None if a value may change without a change of
+    the digest. The helpers get the cache of twoloop.
     """
     watched, helpers = _digests_and_helpers(function)
     for each in helpers:
-        _use_cache(each)
+        _use_twoloop_cache(each)
     return watched
 
 
 def _digests_and_helpers(function: Callable[..., Any]) -> tuple[tuple[str, str] | None, list[Any]]:
-    """Return the digests of `digests_of`, and all helpers: each one follows the helpers that it names."""
+    """Return the digests of `digests_of`, and all compiled helpers, each after the helpers that it calls itself."""
     code, enclosed = Digest(), Digest()
-    enclosed.names = names_reached(function)  # names of module attributes that it may use
+    enclosed.names = reachable_names(function)  # names of the attributes that the function may use of modules
     try:
         code.add_function(function, enclosed=False)
-        enclosed.add(enclosed_by(function))
+        enclosed.add(closure_values(function))
         watched = code.hash.hexdigest(), enclosed.hash.hexdigest()
     except NotDigestible:
         watched = None
@@ -427,26 +441,27 @@ def _digests_and_helpers(function: Callable[..., Any]) -> tuple[tuple[str, str] 
 
 
 def helper(function: Callable[..., Any]) -> Any:
-    """Decorate a function that compiled callbacks call: numba's `njit` with the cache of twoloop.
+    """Decorate a function that compiled callbacks call, like numba's `njit` with the cache of twoloop.
 
-    Such a function allocates nothing and needs no numba runtime, whose reference counts take longer than a row of C_q.
+    The function must not allocate arrays. So it does not need numba's runtime, whose reference counts would take longer
+    than the computation of a row of C_q.
     """
     options: dict[str, Any] = {"_nrt": False, "error_model": "numpy"}
     dispatcher = njit(**options)(function)
     dispatcher.enable_caching()
-    _use_cache(dispatcher)
+    _use_twoloop_cache(dispatcher)
     return dispatcher
 
 
-# digests of each helper when it was compiled
+# digests of helpers at the time of their compilation
 _COMPILED_DIGESTS: WeakKeyDictionary[Any, tuple[str, str]] = WeakKeyDictionary()
 
 
-def _use_cache(helper: Any) -> None:
-    """Replace numba's cache of a helper by that of twoloop, and recompile a helper whose digests have changed.
+def _use_twoloop_cache(helper: Any) -> None:
+    """Replace numba's cache of a helper by that of twoloop, and recompile the helper if its digests have changed.
 
-    Numba's cache does not see what a helper calls in other files, and functions compiled later use the helper as numba
-    first compiled or loaded it. Unless its signatures were given, that may have been before the helper came here.
+    Numba's cache does not notice changes of functions in other files that the helper calls. Functions compiled later
+    use the helper as numba first compiled or loaded it, which may have been before the first call of this function.
     """
     watched, known = _digests_and_helpers(getattr(helper, "py_func", helper))[0], _COMPILED_DIGESTS.get(helper)
     changed = known is not None and known != watched

@@ -1,12 +1,12 @@
-"""Define the kinds of callback that a mechanism may have, in one table, and the decorator that compiles one.
+"""Define the kinds of callback that a mechanism may have, and the decorator that compiles a callback.
 
-`KINDS` is the one place where a kind is defined. From its entry follow the signature that numba compiles, the fields of
-`Functions` that the kernels see, the methods and the documentation of `ConstrainedSystem`, and the adapters for plain
-Python functions.
+All kinds are defined in the table `KINDS`. Its entries determine the signature that numba compiles, the fields of
+`Functions` in the kernels, the methods and the documentation of `ConstrainedSystem`, and the adapters for plain Python
+functions.
 
-Functions that compute indices, for example into a table, have their bounds checked in every call. Otherwise machine
-code would read memory beyond the end of a table, or crash the process. Functions that use only constant indices and
-loop counters are not checked: their first call shows whether these are correct.
+If a function computes indices, for example into a table, all its indices are checked in every call. Otherwise machine
+code might read memory beyond the end of an array, or crash the process. Functions with constant indices and loop
+counters only are not checked: their first call shows whether these indices are valid.
 """
 
 import ast
@@ -25,39 +25,39 @@ from numba.core.dispatcher import Dispatcher
 from twoloop.kernels.compile.caches import compile_cached, digests_of, with_unique_name
 from twoloop.kernels.compile.dependencies import (
     FunctionCopier,
-    digest_as,
-    frozen_places,
+    frozen_locations,
     frozen_values,
     is_library,
     is_twoloop,
     python_function,
+    register_digest,
 )
 from twoloop.kernels.compile.linking import add_signature, options_of
 
 BOUNDS_CHECK = {"boundscheck": True}  # option of numba
-# calls whose result is safe as an index if their arguments are
+# built-in functions whose result is a constant or loop counter if their arguments are
 SAFE_CALLS = ("len", "min", "max", "abs", "range", "enumerate", "zip", "reversed")
 
 
 def with_bounds_checks(function: Callable[..., Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
-    """Return a function (or its copy with bounds-checked helpers) and the options that numba needs for it."""
-    helpers = [helper for place in frozen_places(function) if (helper := python_function(place.value)) is not None]
+    """Return a function, or its copy with bounds-checked helpers, and numba's options that check its own indices."""
+    helpers = [helper for place in frozen_locations(function) if (helper := python_function(place.value)) is not None]
     if any(map(has_computed_indices, helpers)):
         return FunctionCopier(_with_bounds_checks).copy_of(function), BOUNDS_CHECK
     return function, BOUNDS_CHECK if has_computed_indices(function) else {}
 
 
 def _with_bounds_checks(copy: Any, original: Any) -> Any:
-    """Recompile a copy of a helper, with the helper's options and bounds checks; return other functions unchanged."""
+    """Compile the copy of a helper with bounds checks; return other functions unchanged."""
     helper = python_function(original)
     if helper is None:
         return copy
-    copy.__qualname__ = f"{helper.__qualname__}.watched"  # numba's symbols contain this name
+    copy.__qualname__ = f"{helper.__qualname__}.watched"  # a different name in numba's symbols
     return jit(**{**options_of(original), **BOUNDS_CHECK})(with_unique_name(copy, digests_of(helper)))
 
 
 def has_computed_indices(function: Callable[..., Any]) -> bool:
-    """Return whether an index in the source of a function may depend on more than constants and loop counters."""
+    """Return whether an index in a function may be other than a constant or a loop counter; True without its source."""
     if is_twoloop(function.__module__ or "") or is_library(function.__module__ or ""):
         return False
     try:
@@ -69,7 +69,7 @@ def has_computed_indices(function: Callable[..., Any]) -> bool:
 
 
 def _computed_names(tree: ast.AST) -> set[str]:
-    """Return the names that may have values other than constants and loop counters."""
+    """Return the names whose values may be other than constants and loop counters."""
     computed = {node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)}
     while True:
         before = len(computed)
@@ -90,7 +90,7 @@ def _computed_names(tree: ast.AST) -> set[str]:
 
 
 def _is_safe(node: ast.AST | None, computed: set[str]) -> bool:
-    """Return whether an expression consists of constants, loop counters and array sizes only."""
+    """Return whether an expression contains only constants, loop counters and sizes of arrays."""
     if node is None or isinstance(node, ast.Constant):
         return True
     if isinstance(node, ast.Name):
@@ -111,11 +111,11 @@ def _is_safe(node: ast.AST | None, computed: set[str]) -> bool:
 
 f8 = numba.types.float64
 VECTOR = numba.types.float64[::1]
-READ = numba.types.Array(f8, 1, "C", readonly=True)  # has the same layout in memory
+READ = numba.types.Array(f8, 1, "C", readonly=True)  # has the layout of VECTOR in memory
 MATRIX = numba.types.float64[:, ::1]
 
-# arguments of callbacks beside t and p, and the size of each
-STATE = {"q": "n_q", "v": "n_q", "lam": "n_c"}  # the multipliers are those of C only
+# sizes of the arguments of callbacks other than t and p; lam are the multipliers of C, without those of A
+STATE = {"q": "n_q", "v": "n_q", "lam": "n_c"}
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class Kind:
     Attributes
     ----------
     state : tuple of str
-        Arguments beside t and p, keys of `STATE`.
+        Arguments other than t and p, keys of `STATE`.
     output : str
         Name of the array that the callback fills.
     shape : tuple of str
@@ -135,9 +135,9 @@ class Kind:
     note : str
         Remarks for the documentation.
     absent : str
-        Replacement if the callback is not given. "": it must be given; "zeros": a callback that leaves zeros;
-        "differences": one that differences C, see `jacobian.py`; "kernels": none, because the kernels take their own
-        differences.
+        Replacement if the callback is not given. "": none, it must be given; "zeros": a callback that leaves zeros;
+        "differences": a callback that computes differences of C, see `jacobian.py`; "kernels": none, because the
+        kernels compute differences themselves.
     needed_by : str
         Size of the system, "n_c" or "n_a"; the callback must be given if this is above zero.
     more : tuple
@@ -155,17 +155,17 @@ class Kind:
 
     @property
     def optional(self) -> bool:
-        """Return whether it may be left out."""
+        """Return whether a system may be defined without this callback."""
         return self.absent != ""
 
     @cached_property
     def outputs(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
-        """Return names and sizes of all arrays that it fills."""
+        """Return the names and shapes of all arrays that the callback fills."""
         return ((self.output, self.shape), *self.more)
 
     @property
     def arguments(self) -> tuple[str, ...]:
-        """Return the names of the arguments of a callback that works in place."""
+        """Return the names of the arguments of a callback of this kind that fills its arrays in place."""
         return ("t", *self.state, "p", *(name for name, _ in self.outputs))
 
     @cached_property
@@ -175,16 +175,17 @@ class Kind:
 
     @property
     def reading(self) -> Any:
-        """Return the signature that numba compiles: arrays other than the output cannot be written."""
+        """Return the signature that numba compiles, in which all arrays except for the outputs are read-only."""
         return self._signature(READ)
 
     def _signature(self, given: Any) -> Any:
+        """Return the signature in which all arrays except for the outputs have the type `given`."""
         filled = [VECTOR if len(shape) == 1 else MATRIX for _, shape in self.outputs]
         return numba.types.void(f8, *[given] * len(self.state), given, *filled)
 
     @property
     def size(self) -> str:
-        """Return the shapes of the arrays, in words."""
+        """Return the shapes of the outputs as text, such as "(n_c, n_q)"."""
         return ", ".join(f"({', '.join(shape)}{',' if len(shape) == 1 else ''})" for _, shape in self.outputs)
 
 
@@ -304,32 +305,33 @@ OPTIONAL = tuple(name for name, kind in KINDS.items() if kind.optional)
 
 
 def callback(kind: str, allocates: bool = True) -> Callable[[Callable[..., None]], Dispatcher]:
-    """Compile one callback of a mechanism with the signature that its kind has.
+    """Compile a callback of a mechanism with the signature of its kind.
 
-    The function gets the time, the coordinates `q` (n_q,), where the kind has them the velocities `v` (n_q,) or the
-    multipliers `lam` (n_c,), the parameters `p`, and the array to fill, which arrives full of zeros (a tangent's of a
-    system with a bandwidth only within the band: add to it). It must not write to the others::
+    The arguments are the time, the coordinates `q` (n_q,), in some kinds the velocities `v` (n_q,) or the multipliers
+    `lam` (n_c,), the parameters `p`, and the array to fill. This array contains zeros at first; for a tangent of a
+    system with a bandwidth, only its band does: add to it. The function must not write to the other arrays::
 
         @callback("jacobian")
         def jacobian(t, q, p, Cq):
             Cq[0, 0] = q[0]
             Cq[0, 1] = q[1]
 
-    Its machine code is kept on disk until it, a helper that it calls, or a global that one of them names, changes.
+    Machine code is cached on disk. It is compiled again after a change of the function, of a helper that it calls, or
+    of a global variable that they use.
 
     Parameters
     ----------
     kind : str
         {kinds}.
     allocates : bool
-        False: it makes no arrays, so that references to arrays need not be counted, which takes about 10 ns a call.
+        False: the function creates no arrays. Then references to arrays are not counted, which saves 10 ns per call.
 
     Raises
     ------
     ValueError
         If `kind` is unknown.
     TypeError
-        If the function has other arguments, writes to one that it is given, or numba cannot compile it.
+        If the function has other arguments or writes to an input array, or if numba cannot compile it.
 
     Examples
     --------
@@ -367,7 +369,7 @@ if callback.__doc__:  # python -OO removes docstrings
     )
 
 
-# option of numba: a division by zero gives an infinity, as in the kernels
+# options of numba: a division by zero yields an infinity, as in the kernels
 _OPTIONS: dict[str, Any] = {"error_model": "numpy"}
 
 
@@ -378,9 +380,10 @@ def compile_callback(
     named: Callable[..., Any] | None = None,
     allocates: bool = True,
 ) -> Dispatcher:
-    """Compile a function that works in place for the signature of its kind; raise TypeError if that fails.
+    """Compile a function that fills its arrays in place as a callback; raise TypeError if it cannot be compiled.
 
-    `watched`: see `compile_cached`; `named`: the function that the message names, if it is another one.
+    `watched`: see `compile_cached`; `named`: function to name in the message, by default `function`; `allocates`: see
+    `callback`.
     """
     compiled, more = with_bounds_checks(function)
     options = {**_OPTIONS, **more} if allocates else {**_OPTIONS, **more, "_nrt": False}
@@ -393,8 +396,8 @@ def compile_callback(
     else:
         add_signature(made, KINDS[kind].signature)
     if watched is not None:
-        # keep the digest of this compilation: the values that the function names may change later
-        digest_as(made, f"{kind} {watched}")
+        # the digest of this compilation: values that the function uses may change later
+        register_digest(made, f"{kind} {watched}")
     frozen_values(made, function)
     return made
 
@@ -407,11 +410,11 @@ def _compile_writable(
     error: Exception,
     options: dict[str, Any],
 ) -> Dispatcher:
-    """Compile a function whose helpers require writable arrays; refuse one that itself writes to its arguments."""
+    """Compile a function whose helpers require writable arrays; raise TypeError if it writes to its own arguments."""
     try:
         made = compile_cached(function, KINDS[kind].signature, watched, **options)
-    except Exception as its_own:
-        raise TypeError(_failure_message(kind, named, its_own)) from None
+    except Exception as second_error:
+        raise TypeError(_failure_message(kind, named, second_error)) from None
     if _ONLY_A_HELPER.search(plain := _without_colours(error)) and "setitem" not in plain:
         return made
     raise TypeError(
@@ -421,28 +424,29 @@ def _compile_writable(
     ) from None
 
 
+# message of numba if a helper does not accept read-only arrays
 _ONLY_A_HELPER = re.compile(r"Invalid use of type\(CPUDispatcher\(")
 
 
 @cache
 def zero_callback(kind: str) -> Dispatcher:
-    """Compile the replacement of an optional callback that is missing: it leaves the output zero."""
+    """Compile the replacement of an optional callback that is missing: it leaves its outputs at zero."""
 
     def leaves_zeros(t, q, p, out):
         pass
 
-    def leaves_zeros_too(t, q, x, p, out):
+    def leaves_zeros_3(t, q, x, p, out):
         pass
 
-    def leaves_four(t, q, v, p, C, Cq, Ct, Qd):
+    def leaves_zeros_4(t, q, v, p, C, Cq, Ct, Qd):
         pass
 
-    function = leaves_zeros if len(KINDS[kind].state) == 1 else leaves_four if KINDS[kind].more else leaves_zeros_too
+    function = leaves_zeros if len(KINDS[kind].state) == 1 else leaves_zeros_4 if KINDS[kind].more else leaves_zeros_3
     return compile_callback(kind, function, ("leaves zeros", ""))
 
 
 def _failure_message(kind: str, function: Callable[..., Any], error: Exception) -> str:
-    """Return the message for a function that numba cannot compile, with the best line of numba's message."""
+    """Return the message for a function that numba cannot compile, with a line of numba's message."""
     return (
         f"{kind}: numba cannot compile the function {_described(function)}; it must use numbers, numpy arrays of one "
         f"type and of the shape that {kind} asks for, and functions that numba knows (helpers need numba.njit)\n"
@@ -451,12 +455,13 @@ def _failure_message(kind: str, function: Callable[..., Any], error: Exception) 
 
 
 def _described(function: Callable[..., Any]) -> str:
+    """Return the name of a function with its file and line."""
     name, code = getattr(function, "__name__", "?"), getattr(function, "__code__", None)
     return f"{name!r} ({code.co_filename}, line {code.co_firstlineno})" if code else repr(name)
 
 
-_SOURCE = re.compile(r"^File \".*?^[ ]*\^$", re.MULTILINE | re.DOTALL)  # numba's excerpt of a file, down to its mark
-# lines of numba's messages that only refer to another line
+_SOURCE = re.compile(r"^File \".*?^[ ]*\^$", re.MULTILINE | re.DOTALL)  # numba's excerpt of a file, down to a mark ^
+# beginnings of lines of numba's messages that only refer to other lines
 _UNINFORMATIVE = re.compile(
     r"Failed in |- Resolution failure|During: |File \"|>>> |There (is|are) \d+ candidate|- Of which|Overload (in|of) |"
     r"With argument|Rejected as|raised from|None$|Tried |This (is usually|error)|<source elided>|Enable logging"
@@ -464,12 +469,14 @@ _UNINFORMATIVE = re.compile(
 
 
 def _without_colours(error: Exception) -> str:
+    """Return the text of an error without the codes that colour it in a terminal."""
     return re.sub(r"\x1b\[[0-9;]*m", "", str(error))
 
 
 def _informative_line(error: Exception) -> str:
+    """Return the type of an error, and the last line of numba's message that gives a reason."""
     plain = _without_colours(error)
-    plain = re.sub(r":\s*>>> ", ": ", _SOURCE.sub("", plain))  # remove the mark before a signature without a match
+    plain = re.sub(r":\s*>>> ", ": ", _SOURCE.sub("", plain))  # >>> marks a signature without a match
     lines = [line.strip() for line in plain.splitlines() if line and not line.startswith("    ")]
-    telling = [line for line in lines if line and not _UNINFORMATIVE.match(line) and not line.startswith("def ")]
-    return f"{type(error).__name__}: {telling[-1] if telling else plain.strip()[:200]}"
+    informative = [line for line in lines if line and not _UNINFORMATIVE.match(line) and not line.startswith("def ")]
+    return f"{type(error).__name__}: {informative[-1] if informative else plain.strip()[:200]}"

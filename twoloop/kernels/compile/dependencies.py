@@ -1,7 +1,7 @@
-"""Find the values that machine code depends on, all that a function names, encloses and freezes; digest or copy them.
+"""Find the values on which the machine code of a function depends, to hash, compare or replace them.
 
-Numba freezes globals, free variables, defaults, attributes of modules, items of tuples and compiled helpers in the
-functions that it compiles. `Digest` hashes these values, `frozen_places` lists where they are stored, and
+Numba freezes values when it compiles a function: globals, closure variables, defaults, attributes of modules, items of
+tuples, and compiled helpers. `Digest` hashes these values, `frozen_values` lists where they are stored, and
 `FunctionCopier` copies a function with other helpers.
 """
 
@@ -24,51 +24,51 @@ from numba.core.types import Type
 
 from twoloop.kernels.compile.linking import Dispatcher, jitable_templates, options_of
 
-# libraries whose functions are identified by name; versions of numba and numpy are compared as well
+# libraries whose functions are identified by their names; the versions of numba and numpy are compared, too
 LIBRARIES = {*sys.stdlib_module_names, "numpy", "numba", "scipy"}
 
-# number of code objects whose names are cached: each run creates new functions of the same code, and reading the
-# instructions of helpers again would take most of the time of tracing
+# number of code objects whose names are cached: each run creates new functions with the same code, and reading the
+# instructions of helpers each time would take most of the time of tracing
 MAX_CODES = 2000
-FORM = 2  # version of the digests: increase it if files of earlier versions may have wrong machine code
+FORM = 2  # version of the digests: increase it if machine code cached by earlier versions may be wrong
 
 
 def digest_of(text: str, *sources: str | types.ModuleType) -> str:
-    """Return a digest of a text and of the files of modules."""
+    """Return a digest of a text and of files, given as paths or modules."""
     digest = hashlib.sha256(text.encode())
     for source in sources:
         digest.update(Path(source if isinstance(source, str) else str(source.__file__)).read_bytes())
     return digest.hexdigest()
 
 
-_DIGEST_TEXTS: WeakKeyDictionary[Dispatcher, str] = WeakKeyDictionary()
+_DIGEST_TEXTS: WeakKeyDictionary[Dispatcher, str] = WeakKeyDictionary()  # texts of `register_digest`
 
 
-def digest_as(callback: Dispatcher, what: str) -> None:
-    """Register a text as the digest of a callback that calls Python: its code cannot be digested."""
-    _DIGEST_TEXTS[callback] = what
+def register_digest(callback: Dispatcher, text: str) -> None:
+    """Register the text that is hashed for a callback instead of its code and the values that it uses."""
+    _DIGEST_TEXTS[callback] = text
 
 
-def enclosed_by(function: Any) -> list[Any]:
-    """Return the values of the closure of a function."""
+def closure_values(function: Any) -> list[Any]:
+    """Return the values of the closure variables of a function."""
     return [cell.cell_contents for cell in function.__closure__ or ()]
 
 
 class NotDigestible(Exception):
-    """Error for a value that may change unnoticed."""
+    """Error for a value that may change without a change of its digest."""
 
 
 class Digest:
-    """Hash values of many types; follow functions to all values that they name."""
+    """Hash values of many types, and for functions, all values that they use."""
 
     def __init__(self) -> None:
         self.hash = hashlib.sha256(f"{FORM} {np.__version__}".encode())
-        self.names: set[str] = set()  # attributes that the current code, or its helpers, may take from modules
-        self.seen: dict[tuple[int, str], int] = {}  # values added so far, with their order
-        self.helpers: list[Any] = []  # compiled helpers added so far, each after the helpers that it names
+        self.names: set[str] = set()  # names of attributes that the present function may use of a module
+        self.seen: dict[tuple[int, str], int] = {}  # numbers of the values added so far, by id and name
+        self.helpers: list[Any] = []  # compiled helpers added so far, each after the helpers that it calls
 
     def add(self, value: Any) -> None:
-        """Add a value of any type to the hash; raise NotDigestible for one that may change unnoticed."""
+        """Add a value to the hash; raise NotDigestible if it may change without a change of the hash."""
         self.hash.update(f"<{type(value).__qualname__}>".encode())
         if value is None or isinstance(value, (bool, int, float, complex, str, bytes, np.generic, Type)):
             self.hash.update(repr(value).encode())
@@ -95,16 +95,17 @@ class Digest:
             self._add_name(value)
 
     def add_function(self, function: Any, enclosed: bool = True) -> None:
-        """Add the code of a function, its defaults, and the values of the globals that it names."""
-        outer, self.names = self.names, names_reached(function)
+        """Add the code, the defaults and the globals of a function, and if `enclosed`, its closure variables."""
+        outer, self.names = self.names, reachable_names(function)
         self.add([function.__code__, function.__defaults__, function.__kwdefaults__])
         if enclosed:
-            self.add(enclosed_by(function))
+            self.add(closure_values(function))
         for name, value in globals_of(function).items():
             self.add([name, value])
         self.names = outer
 
     def _add_helper(self, helper: Any) -> None:
+        """Add a compiled helper, with all values that it uses."""
         if helper in _DIGEST_TEXTS:
             self.add(_DIGEST_TEXTS[helper])
         elif self._is_new(helper):
@@ -115,6 +116,7 @@ class Digest:
                 self.helpers.append(helper)
 
     def _add_module(self, module: types.ModuleType) -> None:
+        """Add the name of a module, and unless it is a library, the attributes that the present function may use."""
         self.hash.update(module.__name__.encode())
         if not is_library(module.__name__):
             for name in sorted(self.names & set(vars(module))):
@@ -122,7 +124,7 @@ class Digest:
                     self.add([name, vars(module)[name]])
 
     def _add_name(self, value: Any) -> None:
-        """Add functions and types of libraries by their names; reject any other value."""
+        """Add a function or type of a library by its name; raise NotDigestible for any other value."""
         if isinstance(value, type) and hasattr(value, "_fields"):
             self.hash.update(f"{value.__qualname__}{value._fields}".encode())
             return
@@ -134,68 +136,71 @@ class Digest:
         self.hash.update(f"{module}.{name}".encode())
 
     def _is_new(self, value: Any, name: str = "") -> bool:
+        """Return whether a value was not added before, and register it; if it was, add its number."""
         key = (id(value), name)
-        if key in self.seen:  # the value was added before: add its position
+        if key in self.seen:
             self.hash.update(f"<again {self.seen[key]}>".encode())
             return False
         self.seen[key] = len(self.seen)
         return True
 
 
-def names_in(code: types.CodeType) -> set[str]:
-    """Return the names of globals and attributes in a code object and in the functions within it."""
+def names_of_code(code: types.CodeType) -> set[str]:
+    """Return the names of all globals and attributes in a code object, including functions within it."""
     inner = [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
-    return set(code.co_names).union(*map(names_in, inner))
+    return set(code.co_names).union(*map(names_of_code, inner))
 
 
 def globals_of(function: Any) -> dict[str, Any]:
-    """Return the globals that a function, or one within it, loads; attributes, as in `math.log`, are not included."""
+    """Return the globals that a function and functions within it load, by name; of `math.log` this is `math` only."""
     names = {each.name for each in _loads(function.__code__) if not each.free} & set(function.__globals__)
     return {name: function.__globals__[name] for name in sorted(names)}
 
 
-def names_reached(function: Any, seen: set[int] | None = None) -> set[str]:
-    """Return the names used in a function and in its compiled helpers, to which it may pass a module."""
+def reachable_names(function: Any, seen: set[int] | None = None) -> set[str]:
+    """Return the names in a function and in its compiled helpers: attributes of a module that it may pass to them."""
     seen = set() if seen is None else seen
     seen.add(id(function))
-    names = names_in(function.__code__)
-    values = [*globals_of(function).values(), *enclosed_by(function)]
+    names = names_of_code(function.__code__)
+    values = [*globals_of(function).values(), *closure_values(function)]
     modules = [value for value in values if isinstance(value, types.ModuleType) and not is_library(value.__name__)]
     values += [vars(module)[name] for module in modules for name in names & set(vars(module))]
     helpers = [value for value in values if isinstance(value, Dispatcher) or jitable_templates(value)]
     functions = [getattr(helper, "py_func", helper) for helper in helpers if helper not in _DIGEST_TEXTS]
-    return names.union(*(names_reached(each, seen) for each in functions if id(each) not in seen))
+    return names.union(*(reachable_names(each, seen) for each in functions if id(each) not in seen))
 
 
 def is_library(module: str) -> bool:
-    """Return whether a module belongs to Python, or to a package that is identified by its version."""
+    """Return whether a module belongs to LIBRARIES, whose functions are identified by name."""
     return module.partition(".")[0] in LIBRARIES
 
 
 def is_twoloop(module: str) -> bool:
-    """Return whether a module belongs to twoloop or is generated: its names are constant, its indices in bounds."""
+    """Return whether a module is part of twoloop or generated: names in it are constant, and indices are valid."""
     return f"{module}.".startswith(("twoloop.", "twoloop_equations_"))
 
 
-LOADS_GLOBAL = ("LOAD_GLOBAL", "LOAD_NAME")  # LOAD_NAME occurs within a class
+# names of Python's instructions that load a global, or an attribute; LOAD_NAME occurs within a class
+LOADS_GLOBAL = ("LOAD_GLOBAL", "LOAD_NAME")
 LOADS_ATTRIBUTE = ("LOAD_ATTR", "LOAD_METHOD")
-FROZEN_VALUES = "__as_compiled__"  # attribute of a compiled callback with the values of its names at compilation
-NO_EFFECT = ("EXTENDED_ARG", "CACHE", "NOP", "PUSH_NULL")  # instructions that do not change the loaded value
+FROZEN_VALUES = "__as_compiled__"  # attribute of a compiled callback with the result of `frozen_values`
+NO_EFFECT = ("EXTENDED_ARG", "CACHE", "NOP", "PUSH_NULL")  # instructions that may follow a load without using its value
 
 
-class Place(NamedTuple):
-    """Describe where a function finds a value.
+class FrozenValue(NamedTuple):
+    """Describe a value that a function uses, and where it is stored.
 
     Attributes
     ----------
     holder : cell, dict or None
-        Container whose value may be replaced later; None: a default, or an item of a tuple, which cannot be replaced.
+        Container in which the value may be replaced later. None: the value is a default or an item of a tuple, which
+        cannot be replaced.
     key : str
-        Key of the value in a dict.
+        Key of the value if the holder is a dict.
     name : str
         Name in messages, such as "package.module.K" or "TABLES[0]".
     value : object
-        Present value.
+        The value.
     """
 
     holder: CellType | dict[str, Any] | None
@@ -205,50 +210,52 @@ class Place(NamedTuple):
 
 
 class _Loaded(NamedTuple):
-    """Global or free variable that a code object loads, and the chain of attributes taken from it."""
+    """Global or closure variable (`free`) that a code object loads, and the attributes then loaded from its value."""
 
     free: bool
     name: str
     attributes: tuple[str, ...]
 
 
-def frozen_values(compiled: Any, function: Any = None) -> list[tuple[Place, bytes | None]]:
-    """Return the `frozen_places` of a function at the first call, each with the bytes of its value if it is an array.
+def frozen_values(compiled: Any, function: Any = None) -> list[tuple[FrozenValue, bytes | None]]:
+    """Return the values that were frozen in a compiled function, with the bytes of those that are arrays.
 
-    `function` is the one that was compiled, or the original of its copy.
+    They are collected and stored at the first call, when the function is compiled. `function`: the original, if a copy
+    of it was compiled.
     """
-    found: list[tuple[Place, bytes | None]] | None = getattr(compiled, FROZEN_VALUES, None)
+    found: list[tuple[FrozenValue, bytes | None]] | None = getattr(compiled, FROZEN_VALUES, None)
     if found is None:
-        found = [(each, _content(each.value)) for each in frozen_places(function or compiled.py_func)]
+        found = [(each, _content(each.value)) for each in frozen_locations(function or compiled.py_func)]
         setattr(compiled, FROZEN_VALUES, found)
     return found
 
 
 def _content(value: Any) -> bytes | None:
+    """Return the bytes of an array, None for other values."""
     return value.tobytes() if isinstance(value, (np.ndarray, np.void)) else None
 
 
-def frozen_places(function: Any, seen: set[int] | None = None) -> Iterator[Place]:
-    """List where a function and its helpers find values that numba freezes: numbers, arrays, text, functions, modules.
+def frozen_locations(function: Any, seen: set[int] | None = None) -> Iterator[FrozenValue]:
+    """Yield the values in a function and its helpers that numba freezes: numbers, arrays, text, functions, modules.
 
-    Names in modules of twoloop are constant; in these modules, only helpers are followed.
+    Values in modules of twoloop are constant, and not yielded; only their helpers are searched.
     """
     seen = set() if seen is None else seen
     if id(function) in seen:
         return
     seen.add(id(function))
     ours = is_twoloop(function.__globals__.get("__name__", ""))
-    for found in _direct_places(function):
-        for place in _with_items(found, seen):
-            if not ours and _is_frozen(place.value):
-                yield place
-            helper = python_function(place.value)
+    for found in _direct_locations(function):
+        for location in _with_items(found, seen):
+            if not ours and _is_frozen(location.value):
+                yield location
+            helper = python_function(location.value)
             if helper is not None:
-                yield from frozen_places(helper, seen)
+                yield from frozen_locations(helper, seen)
 
 
 def python_function(value: Any) -> FunctionType | None:
-    """Return the function of a compiled helper (`njit`, `register_jitable`, `vectorize` or `cfunc`); else None."""
+    """Return the Python function of a compiled helper (`njit`, `register_jitable`, `vectorize`, `cfunc`), else None."""
     if isinstance(value, Dispatcher):
         return value.py_func  # type: ignore[no-any-return]
     if isinstance(value, FunctionType):
@@ -260,6 +267,7 @@ def python_function(value: Any) -> FunctionType | None:
 
 
 def _is_frozen(value: Any) -> bool:
+    """Return whether numba freezes a value of this type."""
     if isinstance(value, ModuleType):
         return not is_library(value.__name__)
     if isinstance(value, (np.ndarray, np.void)):
@@ -268,54 +276,55 @@ def _is_frozen(value: Any) -> bool:
     return isinstance(value, kinds) or callable(value)
 
 
-def _with_items(place: Place, seen: set[int]) -> Iterator[Place]:
-    """Yield a place, and those of its items if it holds a tuple."""
-    yield place
-    if not isinstance(place.value, tuple) or id(place.value) in seen:
+def _with_items(location: FrozenValue, seen: set[int]) -> Iterator[FrozenValue]:
+    """Yield a value, and if it is a tuple, the items in it that can change."""
+    yield location
+    if not isinstance(location.value, tuple) or id(location.value) in seen:
         return
-    seen.add(id(place.value))
-    fields = getattr(place.value, "_fields", None)
-    for k, value in enumerate(place.value):
-        if isinstance(value, (tuple, np.ndarray, np.void)) or callable(value):  # numbers in a tuple do not change
-            name = f"{place.name}[{k}]" if fields is None else f"{place.name}.{fields[k]}"
-            yield from _with_items(Place(None, "", name, value), seen)
+    seen.add(id(location.value))
+    fields = getattr(location.value, "_fields", None)
+    for k, value in enumerate(location.value):
+        if isinstance(value, (tuple, np.ndarray, np.void)) or callable(value):  # other items cannot change
+            name = f"{location.name}[{k}]" if fields is None else f"{location.name}.{fields[k]}"
+            yield from _with_items(FrozenValue(None, "", name, value), seen)
 
 
-def _direct_places(function: FunctionType) -> Iterator[Place]:
-    """Yield defaults, and the globals and free variables that are loaded, with the attributes taken from modules."""
+def _direct_locations(function: FunctionType) -> Iterator[FrozenValue]:
+    """Yield the defaults of a function, and its globals and closure variables, with the attributes used of modules."""
     code, space = function.__code__, function.__globals__
     last = code.co_varnames[: code.co_argcount][::-1]
     for name, value in zip(last, (function.__defaults__ or ())[::-1], strict=False):
-        yield Place(None, "", name, value)
+        yield FrozenValue(None, "", name, value)
     cells: dict[str, CellType] = dict(zip(code.co_freevars, function.__closure__ or (), strict=True))
     for free, name, attributes in _loads(code):
-        if not free and name not in space:  # a built-in name
+        if not free and name not in space:  # a built-in function
             continue
         holder, value = (cells[name], cells[name].cell_contents) if free else (space, space[name])
-        place = Place(holder, name, name, value)
-        yield place
+        location = FrozenValue(holder, name, name, value)
+        yield location
         if isinstance(value, ModuleType) and not is_library(value.__name__):
-            yield from _places_of_module(place, attributes, names_reached(function))
+            yield from _locations_in_module(location, attributes, reachable_names(function))
 
 
-def _places_of_module(place: Place, attributes: tuple[str, ...], names: set[str]) -> Iterator[Place]:
-    """Yield the attributes that are taken from a module of the user, and from modules within it.
+def _locations_in_module(location: FrozenValue, attributes: tuple[str, ...], names: set[str]) -> Iterator[FrozenValue]:
+    """Yield the attributes that are used of a user's module, and of modules within it.
 
-    If the module itself is passed on, as to a local variable or a helper, all attributes with `names` are yielded.
+    If no attribute of the module is loaded, the module itself is passed on, for example to a local variable or a
+    helper. Then all attributes are yielded that are listed in `names`.
     """
-    if not isinstance(place.value, ModuleType) or is_library(place.value.__name__):
+    if not isinstance(location.value, ModuleType) or is_library(location.value.__name__):
         return
-    space = vars(place.value)
+    space = vars(location.value)
     for attribute in attributes[:1] or sorted(names & set(space)):
         if attribute in space:
-            inner = Place(space, attribute, f"{place.name}.{attribute}", space[attribute])
+            inner = FrozenValue(space, attribute, f"{location.name}.{attribute}", space[attribute])
             yield inner
-            yield from _places_of_module(inner, attributes[1:], names - {attribute})
+            yield from _locations_in_module(inner, attributes[1:], names - {attribute})
 
 
 @lru_cache(MAX_CODES)
 def _loads(code: CodeType) -> tuple[_Loaded, ...]:
-    """Return the globals and free variables that a code object and the functions within it load."""
+    """Return the globals and closure variables that a code object and the functions within it load."""
     found: dict[_Loaded, None] = {}
     loaded = None
     for each in dis.get_instructions(code):
@@ -326,21 +335,23 @@ def _loads(code: CodeType) -> tuple[_Loaded, ...]:
                 found[loaded] = None
             free = each.opname == "LOAD_DEREF" and each.argval in code.co_freevars
             loaded = _Loaded(free, each.argval, ()) if free or each.opname in LOADS_GLOBAL else None
-    inner = [one for constant in code.co_consts if isinstance(constant, CodeType) for one in _loads(constant)]
-    found.update((one, None) for one in inner if not one.free or one.name in code.co_freevars)
+    inner = [entry for constant in code.co_consts if isinstance(constant, CodeType) for entry in _loads(constant)]
+    found.update((entry, None) for entry in inner if not entry.free or entry.name in code.co_freevars)
     return tuple(found)
 
 
 class FunctionCopier:
-    """Copy functions with replacements for the compiled helpers that they name or enclose."""
+    """Copy functions, and replace the compiled helpers in their globals, defaults and closure variables.
 
-    # wrap(copy, original) -> replacement of the original
+    `wrap(copy, original)` returns the replacement of a helper, from a copy that already contains replacements.
+    """
+
     def __init__(self, wrap: Callable[[types.FunctionType, Any], Any]):
         self.wrap = wrap
         self.known: dict[Any, Any] = {}
 
     def value(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        """Return the replacement of a value; `names` are the attributes that may be taken from a module."""
+        """Return the replacement of a value, or the value itself; `names` are the attributes replaced in a module."""
         if self.is_copied(value):
             if id(value) not in self.known:
                 self._rewrite(value)
@@ -352,11 +363,11 @@ class FunctionCopier:
         return value
 
     def is_copied(self, value: Any) -> bool:
-        """Return whether a value is a compiled helper, which has to be copied."""
+        """Return whether a value has to be replaced: here, whether it is a compiled helper."""
         return isinstance(value, Dispatcher) or bool(jitable_templates(value))
 
     def _module(self, module: types.ModuleType, names: frozenset[str]) -> types.ModuleType:
-        """Copy a module with replacements for the functions of these names."""
+        """Return a copy of a module with replacements of the attributes listed in `names`."""
         key = (id(module), names)
         if key not in self.known:
             self.known[key] = copy = types.ModuleType(module.__name__)
@@ -365,18 +376,19 @@ class FunctionCopier:
         return self.known[key]  # type: ignore[no-any-return]
 
     def copy_of(self, function: Any) -> Any:
-        """Copy a function that is not a compiled helper itself."""
+        """Return the replacement of a function that is not a compiled helper itself."""
         self._rewrite(function)
         return self.known[id(function)]
 
     def _rewrite(self, helper: Any) -> None:
+        """Add the replacement of a helper or function to `known`."""
         function = getattr(helper, "py_func", helper)
-        own, names = names_in(function.__code__), frozenset(names_reached(function))
+        own, names = names_of_code(function.__code__), frozenset(reachable_names(function))
         cells = tuple(types.CellType() for _ in function.__closure__ or ())
         own_globals = dict(function.__globals__)
         copy = types.FunctionType(function.__code__, own_globals, function.__name__, function.__defaults__, cells)
         copy.__kwdefaults__, copy.__qualname__ = function.__kwdefaults__, function.__qualname__
-        self.known[id(helper)] = self.wrap(copy, helper)  # set first, because the values that it names may include it
+        self.known[id(helper)] = self.wrap(copy, helper)  # before its values are replaced, as it may use itself
         for name in own & set(own_globals):
             own_globals[name] = self.value(own_globals[name], names)
         if function.__defaults__ is not None:

@@ -1,8 +1,8 @@
-"""Compile LLVM functions generated for one mechanism, cache them on disk, and load them; numba is not involved.
+"""Compile LLVM functions generated for one mechanism, cache them on disk, and load them, without numba.
 
-Numba writes, parses and optimises some thousand lines around each function, and its front end takes ten milliseconds
-for a line of source. Generated code is arithmetic on numbers in memory, already in the right order, so that LLVM has
-little to do before it emits machine code.
+Numba writes, parses and optimises some thousand lines of code around each function, and its front end takes ten
+milliseconds for each line of source. Generated code consists of arithmetic on numbers in memory, already in the right
+order, so that LLVM can emit machine code after few optimisations.
 """
 
 from collections import defaultdict
@@ -15,6 +15,7 @@ from numba.core.registry import cpu_target
 
 from twoloop.kernels.compile.caches import UNWRITABLE, BoundedCache, CodeFiles, sources_folder, warn_once
 
+# whether this version of llvmlite can run single passes of LLVM
 SINGLE_PASSES = hasattr(binding.ModulePassManager, "add_reassociate_pass")
 
 
@@ -24,6 +25,7 @@ class GeneratedFunctions:
     Parameters
     ----------
     names : list of str
+        Names of the functions.
     content : bytes
         Result of `object_code`.
 
@@ -42,7 +44,7 @@ class GeneratedFunctions:
 
 
 class DeferredFunctions:
-    """Generate functions when their addresses are first used: many runs do not need them."""
+    """Generate functions only when their addresses are first used, because many runs do not need them."""
 
     def __init__(self, make: Callable[[], GeneratedFunctions]):
         self._make = make
@@ -68,14 +70,14 @@ def generated_functions(
     write: Callable[[], tuple[list[str], str]],
     passes: bool = True,
 ) -> GeneratedFunctions:
-    """Return the functions of a module, from memory or the disk if they are there; otherwise call `write`, and compile.
+    """Return the functions of a module from memory or from the disk; if it is in neither, compile the text of `write`.
 
     Parameters
     ----------
     kind : str
-        Name of the cache; it holds the newest MAX_ON_DISK modules.
+        Name of the cache; on disk it contains the newest MAX_ON_DISK modules.
     stamp, key : str
-        Digests of the code that writes the functions, and of what they compute.
+        Digests of the Python code that generates the functions, and of the expressions that they compute.
     write : callable
         Returns the names of the functions and the text of the LLVM module.
     passes : bool
@@ -83,19 +85,19 @@ def generated_functions(
     """
     if (functions := _IN_MEMORY[kind].get(key)) is not None:
         return functions  # type: ignore[no-any-return]
-    files, place = _code_files(kind, stamp), _disk_key(key)
+    files, disk_key = _code_files(kind, stamp), _disk_key(key)
     try:
-        kept = files.load(place)
-    except Exception:  # a file of another installation: compile again, and overwrite it
-        kept = None
-    if kept is None:
+        stored = files.load(disk_key)
+    except Exception:  # an incompatible file, of another installation: compile, and overwrite it
+        stored = None
+    if stored is None:
         names, text = write()
-        kept = names, object_code(text, passes)
+        stored = names, object_code(text, passes)
         try:
-            files.save(place, kept)
+            files.save(disk_key, stored)
         except OSError:
             warn_once(UNWRITABLE)
-    names, content = kept
+    names, content = stored
     _IN_MEMORY[kind][key] = functions = GeneratedFunctions(names, content)
     return functions
 
@@ -106,15 +108,17 @@ def are_cached(kind: str, stamp: str, key: str) -> bool:
 
 
 def _code_files(kind: str, stamp: str) -> CodeFiles:
+    """Return the files of a cache on disk."""
     return CodeFiles(sources_folder(), kind, (binding.llvm_version_info, stamp), True)
 
 
 def _disk_key(key: str) -> Any:
+    """Return the key of a file: the processor, as numba describes it, and the key of the functions."""
     return (*cpu_target.target_context.codegen().magic_tuple(), key)
 
 
 def object_code(text: str, passes: bool = True) -> bytes:
-    """Compile an LLVM module for this processor to object code; with `passes`, simplify the operations first."""
+    """Compile the text of an LLVM module to object code for this processor; with `passes`, optimise it first."""
     machine = _compiler()
     target = f'target triple = "{_triple()}"\ntarget datalayout = "{machine.target_data}"\n'
     module = binding.parse_assembly(target + text)
@@ -132,9 +136,10 @@ def _compiler() -> Any:
 
 @cache
 def _two_passes() -> tuple[Any, Any]:
-    """Create the two passes that speed up small mechanisms by a tenth; all other passes together gain nothing more.
+    """Return a manager of the two passes that accelerate the code of small mechanisms by a tenth, and their builder.
 
-    They are created once per process, because LLVM leaks about 300 kB for each pass.
+    All other passes together gain nothing more. Passes are created once per process, because LLVM leaks about 300 kB
+    for each pass.
     """
     passes = binding.create_new_module_pass_manager()
     passes.add_reassociate_pass()
@@ -143,7 +148,7 @@ def _two_passes() -> tuple[Any, Any]:
 
 
 def _all_passes() -> tuple[Any, Any]:
-    """Create the passes of llvmlite 0.44, which can be used for one module only."""
+    """Return a manager of all passes, for llvmlite 0.44, and their builder; they can be used for one module only."""
     builder = _pass_builder()
     return builder.getModulePassManager(), builder
 
@@ -158,13 +163,13 @@ def _triple() -> str:
 
 
 def _machine() -> Any:
-    """Create LLVM's description of the processor that numba uses (NUMBA_CPU_NAME); an engine takes ownership of it."""
+    """Create LLVM's description of the processor for which numba compiles; each engine needs a new one."""
     options: dict[str, Any] = {"opt": 1}  # level 2 takes a quarter longer and gains nothing in straight-line code
     cpu_target.target_context.codegen()._customize_tm_options(options)
     return binding.Target.from_triple(_triple()).create_target_machine(**options)
 
 
 def has_wide_vectors() -> bool:
-    """Return whether a vector of the processor that numba uses holds eight doubles."""
+    """Return whether the processor for which numba compiles has vectors of eight doubles."""
     _, _, features = cpu_target.target_context.codegen().magic_tuple()
     return "+avx512f" in features.split(",")

@@ -1,17 +1,17 @@
-"""Compile kernels together with their helpers, which get no machine code of their own.
+"""Compile kernels together with their helpers, for which no separate machine code is emitted.
 
-Numba optimises each function together with all that it calls and emits its machine code. So a helper at depth five is
-optimised six times, and its own machine code is never called. Here numba passes helpers on as LLVM's intermediate code,
-and only the kernel at the top is optimised. Passes of numba's front end (half of the time) that find nothing to do are
-left out. Loops are neither unrolled nor vectorised: those of a mechanism are short, and the tests of their length cost
-more than they gain.
+By default, numba optimises each function together with all functions that it calls, and emits its machine code. So a
+helper at depth five is optimised six times, and the machine code emitted for the helper alone is never called. Here,
+helpers remain LLVM's intermediate code, and only the kernel that calls them is optimised. Passes of numba's front end
+that find nothing to do are skipped; they take half of its time. Loops are neither unrolled nor vectorised: in the
+kernels they are short, and the tests of their length would cost more than is gained.
 
-While a kernel is compiled, `kernel_rules` replaces some of numba's functions; compilations of other functions meanwhile
-are not affected. In a kernel no index is negative, so negative indices do not count from the end: the code for this
-would hide from LLVM that elements are adjacent. The other rules give the same machine code in less time: half of a
-compilation is Python, in which numba computes the same results again and again.
+While a kernel is compiled, `kernel_rules` replaces some of numba's functions; other functions compiled at that time are
+not affected. In kernels, negative indices do not count from the end of an array: kernels have none, and the code for
+this would hide from LLVM that elements are adjacent. The other replacements yield the same machine code in less time:
+half of a compilation is Python code, in which numba repeatedly computes the same results.
 
-Other modules import the private parts of numba that code generation uses from here.
+Modules that need private parts of numba to generate code import them from this one.
 """
 
 from collections.abc import Callable, Iterator
@@ -43,9 +43,9 @@ __all__ = ["Dispatcher", "add_signature", "cgutils", "forget_compiled", "jitable
 
 
 def jitable_templates(function: Any) -> list[Any]:
-    """Return numba's templates of a function made by `register_jitable`, which each caller compiles again.
+    """Return numba's templates of a function decorated by `register_jitable`, or an empty list for other functions.
 
-    The list is empty for any other function.
+    Every caller of such a function compiles it again.
     """
     context: Any = cpu_target.typing_context
     if not isinstance(function, FunctionType):
@@ -53,121 +53,130 @@ def jitable_templates(function: Any) -> list[Any]:
     context.refresh()  # include functions registered since numba last compiled
     try:
         templates = list(getattr(context.resolve_value_type(function), "templates", ()))
-    except ValueError:  # numba does not know the function
+    except ValueError:  # no function that numba supports
         return []
     sources = [getattr(getattr(each, "_overload_func", None), "__closure__", None) for each in templates]
     own = [any(cell.cell_contents is function for cell in source or ()) for source in sources]
-    return templates if all(own) else []  # else another implementation may replace the function
+    return templates if all(own) else []  # not all: another implementation may replace the function
 
 
 def add_signature(function: Dispatcher, signature: Any) -> None:
-    """Let a function of one signature be called with another, whose arguments have the same layout in memory."""
+    """Make a function, compiled for one signature, callable by a second one.
+
+    The arguments of both signatures must have the same layout in memory.
+    """
     own: Any = function
     (compiled,) = own.overloads.values()
     own._insert([each._code for each in signature.args], compiled.entry_point, False)
     own.overloads[signature.args] = compiled._replace(signature=signature)
-    described = copy(compiled.fndesc)  # compiled callers use this description
+    described = copy(compiled.fndesc)  # read by compiled callers
     described.argtypes = signature.args
     own.targetctx.insert_user_function(compiled.entry_point, described, [compiled.library])
 
 
 def options_of(helper: Any) -> dict[str, Any]:
-    """Return numba's options of a compiled helper, or of a function made by `register_jitable`."""
+    """Return numba's options of a compiled helper, or of a function decorated by `register_jitable`."""
     return helper.targetoptions if isinstance(helper, Dispatcher) else jitable_templates(helper)[0]._jit_options
 
 
 def forget_compiled(function: Any) -> None:
-    """Make numba compile a function made by `register_jitable` again at its next call."""
+    """Discard the compiled code of a function decorated by `register_jitable`: numba compiles it at the next call."""
     for template in jitable_templates(function):
         template._impl_cache.clear()
 
 
-_index_from_either_end = arrayobj.fix_integer_index
+_numba_fix_index = arrayobj.fix_integer_index
 
 
 def _resolve_index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
+    """Emit code for an index; in kernels and helpers, negative ones do not count from the end."""
     if kind.signed and isinstance(context.active_code_library, _HelperLibrary | _KernelLibrary):
         return context.cast(builder, index, kind, types.intp)
-    return _index_from_either_end(context, builder, kind, index, size)
+    return _numba_fix_index(context, builder, kind, index, size)
 
 
-_any_indexing: Any = arrayobj.basic_indexing
+_numba_indexing: Any = arrayobj.basic_indexing
 
 
 def _indexing(context: Any, builder: Any, kind: Any, array: Any, index_types: Any, indices: Any, **options: Any) -> Any:
-    """Return the address of one element of a contiguous array, without the code that only slices need."""
+    """Emit code for the address of an element of a contiguous array, without the code that only slices need.
+
+    All other indexing is left to numba.
+    """
     of_element = len(indices) == kind.ndim and all(isinstance(each, types.Integer) for each in index_types)
     if kind.layout != "C" or not of_element or options.get("boundscheck"):
-        return _any_indexing(context, builder, kind, array, index_types, indices, **options)
+        return _numba_indexing(context, builder, kind, array, index_types, indices, **options)
     sizes = cgutils.unpack_tuple(builder, array.shape, kind.ndim)
     given = zip(index_types, indices, sizes, strict=True)
-    places = [arrayobj.fix_integer_index(context, builder, *each) for each in given]
-    return cgutils.get_item_pointer2(context, builder, array.data, sizes, None, "C", places), [], []
+    resolved = [arrayobj.fix_integer_index(context, builder, *each) for each in given]
+    return cgutils.get_item_pointer2(context, builder, array.data, sizes, None, "C", resolved), [], []
 
 
-_plain_call_type: Any = BaseFunction.get_call_type
+_numba_call_type: Any = BaseFunction.get_call_type
 _call_types: dict[Any, tuple[Any, Any]] = {}
-# options and their texts by id; the options are stored so that no other object gets their id
+# options and their texts by the id of the options, which are stored here so that no other object gets this id
 _options: dict[int, tuple[Any, str]] = {}
 
 
 def _text_of(options: Any) -> str:
+    """Return numba's options of a compilation as text, cached."""
     if id(options) not in _options:
         _options[id(options)] = options, repr(options and options._values)
     return _options[id(options)][1]
 
 
 def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
-    """Return the signature of a call of one of numba's functions, cached for the same types and options.
+    """Return the signature of a call of a function that numba implements, cached by types and options.
 
-    Without the cache numba tries all implementations of an operator at each call, a tenth of a compilation.
+    Without this cache, numba tries all implementations of an operator at each call, which takes a tenth of a
+    compilation.
     """
     key = self, args, tuple(kws.items()), _text_of(ConfigStack.top_or_none())
     if key not in _call_types:
-        signature = _plain_call_type(self, context, args, kws)
+        signature = _numba_call_type(self, context, args, kws)
         _call_types[key] = signature, self._impl_keys[signature.args]
     signature, self._impl_keys[signature.args] = _call_types[key]
     return signature
 
 
-_compute_size: Any = BaseContext.get_abi_sizeof
+_numba_size: Any = BaseContext.get_abi_sizeof
 _sizes: dict[str, int] = {}
 
 
 def _size_of(self: Any, kind: Any) -> Any:
-    """Return the size of a type, cached, because numba has LLVM parse a module for each variable."""
+    """Return the size of a type, cached; numba would let LLVM parse a module for each variable."""
     name = str(kind)
     if name not in _sizes:
-        _sizes[name] = _compute_size(self, kind)
+        _sizes[name] = _numba_size(self, kind)
     return _sizes[name]
 
 
-_inlined_passes: Any = InlineWorker.run_untyped_passes
+_numba_inlined_passes: Any = InlineWorker.run_untyped_passes
 _inlined: dict[Any, Any] = {}
 
 
 def _inlined_code(self: Any, function: Any, enable_ssa: bool = False) -> Any:
-    """Return the cached code of an inlined function, which numba would analyse again at each call."""
+    """Return the intermediate code of an inlined function, cached; numba would analyse the function at each call."""
     if (function, enable_ssa) not in _inlined:
-        _inlined[function, enable_ssa] = _inlined_passes(self, function, enable_ssa)
+        _inlined[function, enable_ssa] = _numba_inlined_passes(self, function, enable_ssa)
     self.flags.enable_ssa = enable_ssa
     code = copy(_inlined[function, enable_ssa])
-    code.func_id = FunctionIdentity.from_function(function)  # variables get their names from it
+    code.func_id = FunctionIdentity.from_function(function)  # new for each copy: it determines the names of variables
     return code
 
 
 _LEAF_TYPES = {ir.Loc, str, int, bool, type(None)}  # types within a statement that contain no variables
 
 
-def _variables(self: Any, held: Any) -> list[Any]:
-    """Return the variables of a statement; numba's version is slower because it calls a function for each part."""
-    if isinstance(held, ir.Var):
-        return [held]
-    if isinstance(held, ir.Inst):
-        return held.list_vars()  # type: ignore[no-any-return]
+def _variables(self: Any, part: Any) -> list[Any]:
+    """Return the variables of a statement; numba's version is slower, because it calls a function for each part."""
+    if isinstance(part, ir.Var):
+        return [part]
+    if isinstance(part, ir.Inst):
+        return part.list_vars()  # type: ignore[no-any-return]
     found: list[Any] = []
-    if isinstance(held, (dict, list, tuple)):
-        for each in held.values() if isinstance(held, dict) else held:
+    if isinstance(part, (dict, list, tuple)):
+        for each in part.values() if isinstance(part, dict) else part:
             if type(each) is ir.Var:
                 found.append(each)
             elif type(each) not in _LEAF_TYPES:
@@ -175,30 +184,30 @@ def _variables(self: Any, held: Any) -> list[Any]:
     return found
 
 
-_load_registries: Any = CPUContext.load_additional_registries
+_numba_load_registries: Any = CPUContext.load_additional_registries
 
 
 def _load_registries_once(self: Any) -> None:
-    """Install numba's implementations of Python's and NumPy's functions, which numba imports again for each function.
+    """Install numba's implementations of Python's and NumPy's functions; numba would import them for each function.
 
-    All copies of a context share the registries; a new intrinsic is added to one of these.
+    All copies of a context share the registries, to which numba adds new intrinsics.
     """
     if self._registries:
         for registry in list(self._registries):
             self.install_registry(registry)
     else:
-        _load_registries(self)
+        _numba_load_registries(self)
 
 
 _LOCKS = ("numba:llvm_lock", "numba:compiler_lock")
 
 
-def _ignoring_locks(tell: Any) -> Any:
-    """Report events, but not those of locks: there are thousands for each kernel, and numba sums the times of all."""
-    return lambda kind, *args, **named: None if kind in _LOCKS else tell(kind, *args, **named)
+def _ignoring_locks(report: Any) -> Any:
+    """Return a function that reports events, except for those of locks: there are thousands of them for each kernel."""
+    return lambda kind, *args, **named: None if kind in _LOCKS else report(kind, *args, **named)
 
 
-# owner, name and replacement of each of numba's functions
+# numba's functions that are replaced: owner, name and replacement
 _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
     (Function, "get_call_type", _call_type),
     (arrayobj, "fix_integer_index", _resolve_index),
@@ -210,13 +219,13 @@ _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
     (event, "start_event", _ignoring_locks(event.start_event)),
     (event, "end_event", _ignoring_locks(event.end_event)),
 ]
-_NONE = object()
+_NONE = object()  # stands for an attribute that an owner does not have
 _depth = [0]  # number of nested compilations of kernels
 
 
 @contextmanager
 def kernel_rules() -> Iterator[None]:
-    """Replace numba's functions by these rules while a kernel is compiled."""
+    """Replace numba's functions by those of `_RULES` while a kernel is compiled."""
     if _depth[0] == 0:
         before = [vars(owner).get(name, _NONE) for owner, name, _ in _RULES]
         for owner, name, rule in _RULES:
@@ -227,15 +236,15 @@ def kernel_rules() -> Iterator[None]:
     finally:
         _depth[0] -= 1
         if _depth[0] == 0:
-            for (owner, name, _), numbas in zip(_RULES, before, strict=True):
-                if numbas is _NONE:
+            for (owner, name, _), original in zip(_RULES, before, strict=True):
+                if original is _NONE:
                     delattr(owner, name)
                 else:
-                    setattr(owner, name, numbas)
+                    setattr(owner, name, original)
 
 
 class _WithoutEnvironment:
-    """Code generator for code that is never loaded, so that its environment has no address."""
+    """Numba's code generator for code that is never loaded: its environment has no address."""
 
     def __init__(self, codegen: Any):
         self._codegen = codegen
@@ -248,7 +257,7 @@ class _WithoutEnvironment:
 
 
 class _HelperLibrary(CPUCodeLibrary):
-    """Code of a helper, to be linked into its callers."""
+    """Intermediate code of a helper, which is linked into its callers."""
 
     @property
     def codegen(self) -> Any:
@@ -258,10 +267,10 @@ class _HelperLibrary(CPUCodeLibrary):
         return 0
 
     def _optimize_final_module(self) -> None:
-        pass  # its callers optimise it
+        pass  # the code is optimised as part of the callers
 
     def _get_module_for_linking(self) -> Any:
-        """Return the code itself instead of a copy, because nothing else uses it."""
+        """Return the module itself; a copy, as in numba, is not needed, because nothing else uses it."""
         if self._shared_module is None:
             self._ensure_finalized()
             for function in self._final_module.functions:
@@ -275,7 +284,7 @@ class _HelperLibrary(CPUCodeLibrary):
 
 
 class _KernelLibrary(JITCodeLibrary):
-    """Code of a kernel and of all that it calls."""
+    """Code of a kernel and of all functions that it calls."""
 
     vectorized = False
 
@@ -287,13 +296,13 @@ class _KernelLibrary(JITCodeLibrary):
 
 
 class _VectorizedLibrary(_KernelLibrary):
-    """Code of a kernel whose loops are worth vectorizing."""
+    """Code of a kernel with long loops, which are vectorised."""
 
     vectorized = True
 
 
-# passes that find nothing to do in kernels: functions within functions; expressions of whole arrays, as none is
-# allocated; overloads that replace calls before lowering; code that a compiled function cannot contain
+# passes that find nothing to do in kernels: they treat functions within functions, expressions of whole arrays,
+# overloads that replace calls before lowering, and code that is not allowed in compiled functions
 _SKIPPED_PASSES = {InlineClosureLikes, NopythonRewrites, InlineOverloads, IRLegalization}
 
 
@@ -301,7 +310,7 @@ class _Compiler(Compiler):
     """Numba's compiler without the passes that kernels do not need."""
 
     def define_pipelines(self) -> list[Any]:
-        """Return the passes."""
+        """Return the passes, without _SKIPPED_PASSES."""
         pipelines: list[Any] = super().define_pipelines()
         for pipeline in pipelines:
             pipeline.passes = [each for each in pipeline.passes if each[0] not in _SKIPPED_PASSES]
@@ -309,14 +318,14 @@ class _Compiler(Compiler):
 
 
 class HelperCompiler(_Compiler):
-    """Compile a function that only compiled functions call; a call from Python would crash."""
+    """Compile a helper, which only compiled functions may call; a call from Python would crash."""
 
     def __init__(self, typing_context: Any, target_context: Any, library: Any, *others: Any):
         super().__init__(typing_context, target_context, _HelperLibrary(target_context.codegen(), "helper"), *others)
 
 
 class KernelCompiler(_Compiler):
-    """Compile a function and optimise it together with its helpers, once."""
+    """Compile a kernel, and optimise it once, together with its helpers."""
 
     library: type[_KernelLibrary] = _KernelLibrary
 
@@ -326,33 +335,33 @@ class KernelCompiler(_Compiler):
         super().__init__(typing_context, target_context, library, *others)
 
     def compile_extra(self, function: Any) -> Any:
-        """Compile a function and all that it calls."""
+        """Compile a function and all functions that it calls."""
         with kernel_rules():
             return super().compile_extra(function)
 
 
 class VectorizingCompiler(KernelCompiler):
-    """Compile a kernel whose loops are long enough to be unrolled and vectorised."""
+    """Compile a kernel with long loops, which are unrolled and vectorised."""
 
     library = _VectorizedLibrary
 
 
 @cache
 def entry_point(function: Dispatcher) -> Any:
-    """Return the function that Python calls for a compiled function, without the check of argument types.
+    """Return a function that calls a compiled function without a check of the types of arguments.
 
-    That check costs as much as two steps of a small mechanism; the caller has to pass the right types.
+    The check takes as long as two steps of a small mechanism. Wrong types crash the process.
     """
     compiled: Any = next(iter(function.overloads.values()))
     return compiled.entry_point
 
 
-# addresses of compiled functions, each with one signature
+# addresses of compiled functions, each of which has one signature
 _ADDRESSES: WeakKeyDictionary[Dispatcher, int] = WeakKeyDictionary()
 
 
 def machine_code(function: Dispatcher, signature: Any) -> int:
-    """Return the address of a compiled function; arguments and errors are passed by numba's calling convention."""
+    """Return the address of a compiled function, which has numba's calling convention for arguments and errors."""
     if function not in _ADDRESSES:
         compiled: Any = function.overloads.get(signature.args) or function.get_compile_result(signature)
         _ADDRESSES[function] = int(compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name))

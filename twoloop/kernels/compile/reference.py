@@ -1,7 +1,8 @@
-"""Structures that kernels get by reference: one pointer to a table of addresses and lengths.
+"""Types of structures that kernels get by reference: one pointer to a table of addresses and lengths.
 
 Numba passes a named tuple by value, member by member: a workspace of forty arrays becomes some three hundred arguments,
-which each call that LLVM does not inline writes to memory. A `Reference` has the same attributes and is one argument.
+which every call that LLVM does not inline writes to memory. A value of type `Reference` has the members as attributes,
+and is a single argument.
 """
 
 import hashlib
@@ -21,26 +22,27 @@ from numba.np.numpy_support import as_dtype
 from twoloop.kernels.compile.caches import BoundedCache
 from twoloop.kernels.compile.linking import machine_code
 
-_REFERENCES: dict[str, Any] = {}
+_REFERENCES: dict[str, Any] = {}  # all references by name
 
 
 def _reference(name: str) -> Any:
-    """Return the `Reference` with a name; pickle calls this, because functions may require that very object."""
+    """Return the only `Reference` of this name; pickle calls this function, so that it never creates a second one."""
     return _REFERENCES[name]
 
 
 class Reference(types.Type):
-    """Pass a structure by one pointer to a table: address and shape of each array, address of each function.
+    """Type of a structure that is passed as a pointer to a table.
 
-    Functions are compiled by numba, or generated as LLVM (see generated_functions.py): the latter get addresses of
-    arrays, and report no errors.
+    The table contains the address and shape of each array, and the address of each function. Functions are compiled by
+    numba, or generated as LLVM code (see generated_functions.py). Generated functions get addresses of arrays, and
+    report no errors.
 
     Parameters
     ----------
     name : str
         Unique name of the type.
     arrays : dict
-        Types of the fields that are contiguous arrays, one- or two-dimensional.
+        Types of the fields that are arrays: contiguous, with one or two dimensions.
     """
 
     def __init__(self, name: str, arrays: Mapping[str, types.Array]):
@@ -50,18 +52,18 @@ class Reference(types.Type):
         self.dtypes = {field: as_dtype(kind.dtype) for field, kind in self.arrays.items()}
         self.functions: dict[str, Signature] = {}
         self.llvm_functions: set[str] = set()  # names of the generated functions among `functions`
-        self.places: dict[str, int] = {}
+        self.offsets: dict[str, int] = {}
         self.n_words = 0
-        self._addresses: Any = BoundedCache()  # addresses by tuple of functions, because finding them is slow
+        self._addresses: Any = BoundedCache()  # addresses by tuple of functions; `machine_code` is slow
         for field, kind in self.arrays.items():
-            self.places[field] = self.n_words
+            self.offsets[field] = self.n_words
             self.n_words += 1 + kind.ndim
 
     def __reduce__(self) -> Any:
         return _reference, (self.name,)
 
     def __repr__(self) -> str:
-        """Return the name with a digest of the layout, because it is part of the key of machine code on disk."""
+        """Return the name and a digest of the layout; the keys of machine code on disk contain this text."""
         fields: list[Any] = [(field, str(kind)) for field, kind in self.arrays.items()]
         fields += [
             (field, str(self.functions[field])) if field in self.llvm_functions else field for field in self.functions
@@ -69,30 +71,34 @@ class Reference(types.Type):
         return f"{self.name}-{hashlib.sha256(repr(fields).encode()).hexdigest()[:16]}"
 
     def add_function(self, field: str, signature: Signature) -> None:
-        """Add a function; its signature may contain this type."""
+        """Add a function compiled by numba; its signature may contain this type."""
         self.functions[field] = signature
-        self.places[field] = self.n_words
+        self.offsets[field] = self.n_words
         self.n_words += 1
         _define_call(self, field, signature)
 
     def add_llvm_functions(self, signatures: Mapping[str, Signature]) -> None:
-        """Add generated functions, which may be called only if present; arrays are passed as one-dimensional."""
+        """Add generated functions, which get the addresses of arrays.
+
+        Callers have to check that such a function is present.
+        """
         for field, signature in signatures.items():
             self.functions[field] = signature
             self.llvm_functions.add(field)
-            self.places[field] = self.n_words
+            self.offsets[field] = self.n_words
             self.n_words += 1
             _define_llvm_call(self, field, signature)
 
     def llvm_type(self, field: str) -> tuple[str, list[str]]:
-        """Return the types of the result and of the arguments of a generated function, as LLVM writes them."""
+        """Return the types of the result and of the arguments of a generated function, in LLVM's notation."""
         signature = self.functions[field]
         return str(_llvm_type(signature.return_type)), [str(_llvm_type(kind)) for kind in signature.args]
 
     def table(self, values: Any) -> Any:
-        """Return the int64 table of an object with arrays and functions of these names; the object has to outlive it.
+        """Return the table (int64) for an object whose attributes are the arrays and functions of this type.
 
-        For generated functions the object holds addresses, 0 if a function is missing.
+        The object has to live as long as the table is used. Its attributes for generated functions are addresses, 0 if
+        a function is missing.
         """
         words: list[int] = []
         for field, kind in self.arrays.items():
@@ -109,6 +115,7 @@ class Reference(types.Type):
         return np.array(words, dtype=np.int64)
 
     def _address(self, field: str, function: Any) -> int:
+        """Return the address of a function, 0 if it is missing."""
         if field in self.llvm_functions:
             return int(function)
         return 0 if function is None else machine_code(function, self.functions[field])
@@ -119,9 +126,9 @@ register_model(Reference)(models.OpaqueModel)
 
 @unbox(Reference)
 def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
-    """Unbox a Python object that represents a reference: its attribute `address`, or the object if it is a number.
+    """Convert an argument from Python: the pointer is its attribute `address`, or the argument itself if it is an int.
 
-    Callers that pass the number save the lookup of the attribute, a tenth of a microsecond.
+    An int saves the lookup of the attribute, a tenth of a microsecond.
     """
     kind = c.builder.load(
         c.builder.gep(c.builder.bitcast(obj, obj.type.as_pointer()), [ir.Constant(ir.IntType(32), 1)])
@@ -139,9 +146,9 @@ def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
     return NativeValue(pointer, is_error=c.pyapi.c_api_error())
 
 
-def _load_word(context: Any, builder: Any, pointer: Any, place: int, kind: Any) -> Any:
-    """Load a word of a table; mark it as constant, so that LLVM loads it only once."""
-    slot = builder.gep(builder.bitcast(pointer, ir.IntType(64).as_pointer()), [ir.Constant(ir.IntType(64), place)])
+def _load_word(context: Any, builder: Any, pointer: Any, offset: int, kind: Any) -> Any:
+    """Emit code that loads the word at an offset of a table; mark it as constant, so that LLVM loads it only once."""
+    slot = builder.gep(builder.bitcast(pointer, ir.IntType(64).as_pointer()), [ir.Constant(ir.IntType(64), offset)])
     word = builder.load(builder.bitcast(slot, kind.as_pointer()))
     word.set_metadata("invariant.load", builder.module.add_metadata([]))
     return word
@@ -149,6 +156,8 @@ def _load_word(context: Any, builder: Any, pointer: Any, place: int, kind: Any) 
 
 @infer_getattr
 class _Fields(AttributeTemplate):
+    """Numba's typing of the attributes of a reference."""
+
     key = Reference
 
     def generic_resolve(self, typ: Any, field: str) -> Any:  # type: ignore[override]
@@ -166,12 +175,13 @@ class _Fields(AttributeTemplate):
 
 @lower_getattr_generic(Reference)
 def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) -> Any:
-    if field in typ.functions:  # the lowering of a call needs the table itself
+    """Emit code that loads a field: numba's structure of an array, or the table itself for a function."""
+    if field in typ.functions:  # `call` below loads the address of the function from the table
         return pointer
-    kind, place = typ.arrays[field], typ.places[field]
+    kind, offset = typ.arrays[field], typ.offsets[field]
     item = context.get_data_type(kind.dtype)
     word = ir.IntType(64)
-    shape = [_load_word(context, builder, pointer, place + 1 + axis, word) for axis in range(kind.ndim)]
+    shape = [_load_word(context, builder, pointer, offset + 1 + axis, word) for axis in range(kind.ndim)]
     size = ir.Constant(word, context.get_abi_sizeof(item))
     strides = [size] if kind.ndim == 1 else [builder.mul(shape[1], size), size]
     fields = {
@@ -179,13 +189,13 @@ def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) 
         "parent": None,
         "nitems": shape[0] if kind.ndim == 1 else builder.mul(*shape, flags=["nsw"]),
         "itemsize": size,
-        "data": _load_word(context, builder, pointer, place, item.as_pointer()),
+        "data": _load_word(context, builder, pointer, offset, item.as_pointer()),
         "shape": cgutils.pack_array(builder, shape),
         "strides": cgutils.pack_array(builder, strides),
     }
     model = context.data_model_manager[kind]
     array = ir.Constant(context.get_value_type(kind), ir.Undefined)
-    for name, value in fields.items():  # keep the array in registers; numba's helper would store it to memory
+    for name, value in fields.items():  # the structure remains in registers; numba's helper would store it to memory
         at = model.get_field_position(name)
         element = ir.Constant(array.type.elements[at], None) if value is None else value
         array = builder.insert_value(array, element, at)
@@ -193,13 +203,14 @@ def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) 
 
 
 def _define_call(typ: Reference, field: str, signature: Signature) -> None:
-    place = typ.places[field]
+    """Define how numba calls a function of a reference that it has compiled."""
+    offset = typ.offsets[field]
 
     @lower_builtin((typ.name, field), typ, *signature.args)
     def call(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         convention = context.call_conv
         kind = convention.get_function_type(signature.return_type, signature.args).as_pointer()
-        function = _load_word(context, builder, args[0], place, kind)
+        function = _load_word(context, builder, args[0], offset, kind)
         status, value = convention.call_function(builder, function, signature.return_type, signature.args, args[1:])
         with builder.if_then(status.is_error, likely=False):
             convention.return_status_propagate(builder, status)
@@ -215,17 +226,18 @@ _LLVM_TYPES = {
 
 
 def _llvm_type(kind: Any) -> Any:
-    """Return the LLVM type of an argument of a generated function."""
+    """Return the LLVM type of an argument or result of a generated function; arrays are pointers."""
     return _LLVM_TYPES[kind.dtype].as_pointer() if isinstance(kind, types.Array) else _LLVM_TYPES[kind]
 
 
 def _define_llvm_call(typ: Reference, field: str, signature: Signature) -> None:
-    place = typ.places[field]
+    """Define how numba calls a generated function of a reference."""
+    offset = typ.offsets[field]
 
     @lower_builtin((typ.name, field), typ, *signature.args)
     def call(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         kind = ir.FunctionType(_llvm_type(signature.return_type), [_llvm_type(each) for each in signature.args])
-        function = _load_word(context, builder, args[0], place, kind.as_pointer())
+        function = _load_word(context, builder, args[0], offset, kind.as_pointer())
         plain = [
             make_array(kind)(context, builder, value).data if isinstance(kind, types.Array) else value
             for kind, value in zip(signature.args, args[1:], strict=True)
