@@ -1,6 +1,6 @@
 """Advance by many steps with step-size control, until the last output time, a full buffer or a failure.
 
-`advance` is the same for all methods: the kit `f` holds the functions of the step, `options` and `memory` its data.
+`advance` is the same for all methods: `f` (a `Kit`) has the functions of the step, `options` and `memory` its data.
 """
 
 import numpy as np
@@ -63,15 +63,16 @@ from twoloop.kernels.evaluation.inner_loop import (
 from twoloop.kernels.evaluation.partition import CHANGED
 from twoloop.kernels.linalg.dense import copy
 
-# ratio of a rejected step's error to the tolerance above which the force is assumed to jump or bend within the step
+# error of a rejected step, in tolerances: above this, a force is assumed to jump or bend within the step
 SUDDEN_ERROR = 10.0
-REFUSED = 0.95  # maximum ratio of the next step to a rejected one
-FIRST_JUDGED = 2  # number of accepted steps before the step size may replace a trial method: the first one is a guess
+MAX_RATIO_AFTER_REJECTION = 0.95  # maximum ratio of the next step size to that of a rejected step
+# number of accepted steps from which on a short next step ends the trial of a method; the first step size is a guess
+FIRST_JUDGED = 2
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR))
 def start(f, w, t, state):
-    """Factor the mass matrix, choose the partition, and complete the state (q, v given) by a and lam."""
+    """Factor the mass matrix, choose the partition, and compute a and lam of `state` from q and v; return a code."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     w.notes[KINK_BEFORE] = t  # C_t or b of a drive may be discontinuous at the start
@@ -82,14 +83,14 @@ def start(f, w, t, state):
         code = find_tangents(f, w, t, q)
     if code == DONE:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
-    if code == DONE and f.flags[GAMMA_GIVEN] == 0:  # again: the scale of the errors of Gamma is known only now
+    if code == DONE and f.flags[GAMMA_GIVEN] == 0:  # repeat: the first evaluation has found the scale of Gamma's errors
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
     return code
 
 
 @merged
 def _locate_kink(f, w, t, size, tolerances, accepted, state, new_state):
-    """Locate a jump or a ramp of C_t or b within a step; return its kind, SMOOTH if there is none, and its interval."""
+    """Return JUMP, RAMP or SMOOTH for C_t and b within a step, and beginning and end of the jump or ramp."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     if not accepted:
@@ -103,7 +104,10 @@ def _locate_kink(f, w, t, size, tolerances, accepted, state, new_state):
 
 @merged
 def _attempt(f, w, options, memory, tolerances, control, clock, t, size, jumps, state, new_state):
-    """Attempt a step; return its code, its error and the factor of the next step."""
+    """Attempt a step; return its code, its error in tolerances, and the ratio of the next step size to this one.
+
+    With `jumps`, the step crosses a jump of C_t or b: the caller has already computed `new_state`.
+    """
     w.notes[ORIENTATION_NEW] = 0.0
     if clock[at.FAILURE_CODE] == DONE:
         w.notes[FAULT_KIND] = -1.0
@@ -125,7 +129,10 @@ def _attempt(f, w, options, memory, tolerances, control, clock, t, size, jumps, 
 
 @merged
 def _ends_at_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
-    """Return whether C_t or b jumps or bends within a step, which is then repeated to end there."""
+    """Return whether a step is to be repeated, because C_t or b jumps or bends within it.
+
+    Stores the interval of the jump, where the repeated step ends, or the size of the repeated step.
+    """
     kind, low, high = _locate_kink(f, w, t, size, tolerances, accepted, state, new_state)
     if kind == JUMP:
         clock[at.JUMP_FROM] = t if low - t <= EQUAL_SPACINGS * np.spacing(abs(t)) else low
@@ -142,8 +149,8 @@ def _ends_at_kink(f, w, tolerances, control, clock, t, size, accepted, state, ne
 def _handle_failure(f, w, control, clock, t, size, code, retried, state):
     """Handle a step that failed: shorten it, renew the partition, or return the code that ends the loop.
 
-    A step of fixed size cannot become shorter: only the partition is renewed. `retried` is the time of the last step
-    that was repeated with a renewed partition.
+    A step of fixed size cannot become shorter: only the partition is renewed. `retried` is the time at which a step of
+    fixed size was last repeated.
     """
     n = w.Q.size
     poor = code in (SINGULAR, INNER_DIVERGED)
@@ -172,13 +179,13 @@ def _handle_failure(f, w, control, clock, t, size, code, retried, state):
 
 @merged
 def _handle_rejection(f, w, control, clock, t, size, proposal, state):
-    """Handle a step whose error is too large: shorten it by one spacing of t at least, or stop if it is singular."""
+    """Handle a step whose error is too large: shorten it, or return the end code of a singular position nearby."""
     n = w.Q.size
     w.counters[N_REJECTED_ERROR] += 1
     clock[at.FAILURE_CODE] = DONE
     if retry_projected(f, w, control, clock, size):
         return at.CONTINUE
-    clock[at.H_NEXT] = min(proposal, REFUSED * size, size - np.spacing(abs(t + size)))
+    clock[at.H_NEXT] = min(proposal, MAX_RATIO_AFTER_REJECTION * size, size - np.spacing(abs(t + size)))
     if fails_at_singular(f, clock, size):
         return at.NEEDS_DENSE
     if size < SHORT_STEP * clock[at.H_LONG] and near_singular(f, w, control, clock, t, state[:n]):
@@ -215,8 +222,8 @@ def advance(
 
     Steps are shortened to end at output times. A step is the difference of two floating-point times, so that the steps
     add up to the time exactly.
-    With STORE_ALL = 1 every accepted state is stored, otherwise the states at output times. `filled` becomes the
-    number of rows written to out_t and out_state, and to out_steps, which gets a row for every accepted step.
+    With STORE_ALL = 1 every accepted state is stored, otherwise the states at output times. `filled` becomes two
+    numbers of rows: those written to out_t and out_state, and those written to out_steps, one for each accepted step.
     """
     fixed = control[at.FIXED_STEP] > 0.0
     n = w.Q.size
@@ -285,7 +292,7 @@ def advance(
         if w.notes[TIME_IS_UP] == 1.0:  # evaluations of this attempt may have ended early
             f.settle(f, w, options, memory, tolerances, False)
             return at.PAUSED
-        # at a jump of the force an estimate may be small by chance: until ROUGH_TO it has to be smaller by `strict`
+        # where a force jumps, an estimated error may be small by chance: until ROUGH_TO it is multiplied by `strict`
         strict = control[at.ROUGH] if t < clock[at.ROUGH_TO] else 1.0
         accepted = code == DONE and error * strict <= 1.0
         if accepted and not reaches and ends_at_singular(f, w, control, clock):
@@ -319,7 +326,7 @@ def advance(
         error *= strict
         if factor == 0.0:
             factor = factor_of(control, clock, size, error)
-        elif strict > 1.0 and error > 0.0:  # the step chose its factor without `strict`: the factor may exceed 1
+        elif strict > 1.0 and error > 0.0:  # the step computed `factor` without `strict`: `factor` may be too large
             factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
         proposal = min(size * factor, clock[at.H_LIMIT])
         if not accepted and factor > 1.0:
@@ -348,12 +355,12 @@ def advance(
             out_t[filled[0]] = clock[at.T]
             copy(state, out_state[filled[0]])
             filled[0] += 1
-        # a step cut short by an output time says little about the next
+        # the size of a step shortened to end at an output time says little about the next step
         clock[at.H_NEXT] = max(proposal, h) if shortened else proposal
         clock[at.LIMIT_AGE] += 1.0
         if clock[at.LIMIT_AGE] > control[at.LIMIT_MEMORY]:
             clock[at.H_LIMIT] = control[at.LIMIT_START]
-            clock[at.FAILURE_CODE] = DONE  # until now it was kept as the reason for short steps
+            clock[at.FAILURE_CODE] = DONE  # no longer the reason for short steps
         if lands and _pass_output_time(f, w, clock, outputs, state):
             return at.ALL_OUTPUT_DONE
         if fixed and not lands:

@@ -1,13 +1,13 @@
 """Start a run and take its first steps in one compiled call, and report on them in one array.
 
-`start_and_advance` checks the start, repeats the choices of the run before (independent rows, dependent coordinates),
-takes steps, and fills one block:
+`start_and_advance` checks the start, repeats the choices of the previous run (independent rows, dependent coordinates),
+takes steps, and fills one array:
 
     ... | report: N_REPORT numbers, counters | times | steps | states ...
-                                                             ^ a fixed place
-`advance` writes states from the fixed place on. The report, whose length depends on the number of steps, is copied
-afterwards so that it ends where the states begin. A result is then one piece without gaps: Python copies it by one
-slice, and splits it when a field of the result is used.
+                                                             ^ a fixed index
+`advance` writes states from the fixed index on. The report, whose length depends on the number of steps, is copied
+afterwards so that it ends where the states begin. A result is then contiguous: Python copies it as one slice, and
+splits the copy when a field of the result is used.
 """
 
 import math
@@ -40,7 +40,11 @@ ROUNDING = 1e-15  # relative to the largest coordinate: smaller corrections are 
 
 @merged
 def prepare_work(w, numbers, integers, pattern, q, accuracy, reuse):
-    """Reset a workspace before a run from q; `numbers` and `integers` are its arrays that last from step to step."""
+    """Reset the workspace `w` before a run from q.
+
+    `numbers` and `integers` are the arrays of `w` that keep data from step to step, `accuracy` is GAMMA_REQUIRED, and
+    `reuse` the least REUSE (see data/indices.py).
+    """
     for k in range(numbers.size):
         numbers[k] = 0.0
     for k in range(integers.size):
@@ -65,18 +69,18 @@ def prepare_workspace(w, numbers, integers, pattern, q, accuracy, reuse):
     prepare_work(w, numbers, integers, pattern, q, accuracy, reuse)
 
 
-FIRST_STEP = 0.01  # first step, relative to the shortest time scale of the state ...
-RESOLVED = 1e4  # ... but at least this many spacings of floating-point numbers at the start
-SHORTEST_STEP = 1e-16  # shortest step, relative to the first step
-SHARPER = 10  # ratio of GAP to LOOK, if forces may change suddenly with place or speed
+FIRST_STEP = 0.01  # first step size, relative to the shortest time scale of the state
+MIN_FIRST_STEP = 1e4  # smallest first step size, in spacings of floating-point numbers at the start time
+SHORTEST_STEP = 1e-16  # shortest step size, relative to the first one
+GAP_TO_LOOK = 10  # ratio of GAP to LOOK, if forces may change suddenly with position or velocity
 
 
 @exact
 def _first_step(state, n, t, span, smallest):
-    """Return the first step, s: a share of the time in which the state moves by the size of its coordinates.
+    """Return the first step size, s: a fraction of the time in which coordinates change by as much as their size.
 
-    `smallest` replaces the size of coordinates that are all zero. Near zero the time may be shorter than the spacing of
-    floating-point numbers near t: a number of spacings is then the lower bound.
+    That size is max|q|, or `smallest` if this is larger. The result is at most a fraction of `span`, and at least
+    MIN_FIRST_STEP spacings of floating-point numbers, however small the coordinates are.
     """
     far, fast, sharp = smallest, 0.0, 0.0
     for j in range(n):
@@ -87,19 +91,19 @@ def _first_step(state, n, t, span, smallest):
         scale = min(scale, far / fast)
     if sharp > 0.0:
         scale = min(scale, math.sqrt(far / sharp))
-    if fast > 0.0 and sharp > 0.0 and fast / sharp > FIRST_STEP * scale:  # not if the motion is almost at rest
+    if fast > 0.0 and sharp > 0.0 and fast / sharp > FIRST_STEP * scale:  # unless the motion is almost at rest
         scale = min(scale, fast / sharp)
-    return max(FIRST_STEP * scale, RESOLVED * np.spacing(abs(t)))
+    return max(FIRST_STEP * scale, MIN_FIRST_STEP * np.spacing(abs(t)))
 
 
 @exact
 def _limit_steps(control, tolerances, span, longest, within):
     """Limit the time between two evaluations of the equations to a hundredth of the run.
 
-    `within`: steps evaluate the equations at interior points as well, so that only `longest` limits their size.
+    `within`: steps evaluate the equations at interior points as well, so that only `longest` (s) limits the step size.
     """
     gap = LONGEST_UNSEEN * span
-    tolerances[GAP], tolerances[LOOK] = gap, gap / (SHARPER if control[at.BY_STATE] > 0.0 else 1.0)
+    tolerances[GAP], tolerances[LOOK] = gap, gap / (GAP_TO_LOOK if control[at.BY_STATE] > 0.0 else 1.0)
     control[at.MAX_STEP] = longest if within else min(longest, gap / control[at.MAX_EVALUATION_GAP])
     control[at.APART] = gap / N_SAMPLES
     control[at.SPACING] = control[at.APART] if control[at.BY_TIME] + control[at.BY_STATE] > 0.0 else 0.0
@@ -107,7 +111,7 @@ def _limit_steps(control, tolerances, span, longest, within):
 
 @kernel(f8(VECTOR, VECTOR, VECTOR, i8, f8, f8, f8, f8, types.boolean))
 def set_sizes(control, tolerances, state, n, t, t1, smallest, longest, within):
-    """Return the first step from a state, s; if `longest` is given, also limit the time between two evaluations."""
+    """Return the first step size from a state, s; if `longest` > 0, also limit the time between two evaluations."""
     if longest > 0.0:
         _limit_steps(control, tolerances, t1 - t, longest, within)
     return _first_step(state, n, t, t1 - t, smallest)
@@ -115,7 +119,7 @@ def set_sizes(control, tolerances, state, n, t, t1, smallest, longest, within):
 
 @merged
 def _all_within(t, rows, box):
-    """Return whether all times and rows are within the bounds `box` (lower, upper row) of as many of [t, q, v]."""
+    """Return whether all [t, q, v] are within `box`: its rows are lower and upper bounds of the first entries."""
     for k in range(t.size):
         if not box[0, 0] <= t[k] <= box[1, 0]:
             return False
@@ -127,7 +131,7 @@ def _all_within(t, rows, box):
 
 @kernel(types.void(MATRIX, INTEGERS, VECTOR, types.int64[:, ::1], types.boolean[::1]))
 def split_steps(steps, counts, h, changes, untested):
-    """Split the rows of steps into sizes `h`, increments of the counters, and whether Newton's method was used.
+    """Split the rows of steps into step sizes `h`, `changes` of the counters, and whether Newton's method was used.
 
     `counts` are the rejections and partitions before these steps on entry, and after these steps on return.
     """
@@ -138,15 +142,16 @@ def split_steps(steps, counts, h, changes, untested):
             changes[i, k], counts[i] = count - counts[i], count
 
 
-# codes that `start_and_advance` returns instead of a number of steps. REFUSED: the start needs other choices. IN_DOUBT:
-# the start may be inconsistent and needs a closer check. UNUSUAL: Python has to read the report or to continue the run
+# codes that `start_and_advance` returns instead of a number of steps. REFUSED: the choices of the previous run do not
+# suit this start. IN_DOUBT: the start may be inconsistent and needs a closer check. UNUSUAL: Python has to read the
+# report or to continue the run
 REFUSED, IN_DOUBT, UNUSUAL = -1, -2, -3
 
-# Arrays of a run that starts again and again: first for the checks of a start and for choices, then for the run.
+# Arrays of runs that are repeated from different starts: for checking a start, for choosing rows, and for the run.
 # - `start_numbers`: clock, control and tolerances at a start, which are copied to `numbers`
-# - `start_memory`: nonzero values of the method's `memory`, at `memory_places`; nearly all others are zero
+# - `start_memory`: initial values of the method's `memory` at the indices `memory_places`; the other values are zero
 # - `last_start`: the last start, see START; `saved`, `saved_integers`: the state of the whole run at that start, stored
-#   when the start is repeated; `start_rows`: the independent rows there
+#   when the start is repeated; `start_rows`: the independent rows at that start
 RUN_ARRAYS = Reference(
     "RunArrays",
     {
@@ -168,13 +173,15 @@ RUN_ARRAYS.add_function("choose", i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INT
 RUN_ARRAYS.add_function("dependents", i8(MATRIX, INTEGERS, INTEGERS, i8, VECTOR, INTEGERS, INTEGERS))
 RUN_ARRAYS.add_function("start", i8(KIT, WORK, f8, VECTOR))
 RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS))
-# indices in `constants`. Starts: whether rows have entries wherever `kinds` says so, arguments of `choose`, the flag
-# (DEFINITE, INDEFINITE or 0) of M, the smallest pivot of an accepted start, and the form of the equations. Steps: the
-# given first step, or 0, and arguments of set_sizes. Ends: the pivot below which velocities are checked, the largest
-# ratio of their change to that by the accelerations, and the least time between two sudden changes, in samples
+# indices in `constants`. For starts: values of w.notes; whether rows have entries wherever `kinds` says so; arguments
+# of `choose`; tolerance of redundant rows; flag of M (DEFINITE, INDEFINITE or 0); smallest pivot of an accepted start;
+# form of the equations. For steps: the user's first step size, or 0; arguments of set_sizes. For ends: the pivot below
+# which Python checks the run; the largest ratio of a change of velocities to that by accelerations; and the least time
+# between two sudden changes, in samples
 ACCURACY, REUSE, NEARLY_SINGULAR, HAS_ALL_ENTRIES, RANK, WEAK, SCALE, CONTRADICTS, MASS_FLAG, LEAST_PIVOT = range(10)
 EQUATION_FORM, FIRST, LEAST, LONGEST, EVALUATES_WITHIN, NEAR, MAX_CHANGE_RATIO, MIN_SAMPLES = range(10, 18)
-# indices in `expected`, the choices of the generated code (empty without it); rows added to M follow the kept rows
+# indices in `expected`, the choices of the generated code (empty without generated code): result of choose_rows,
+# numbers of kept rows and of rows added to M, then these rows
 PLACE, N_KEPT, N_ADDED, KEPT = range(4)
 
 
@@ -211,7 +218,7 @@ def _copy(source, target):
 
 @merged
 def _redundant_rows_hold(w, b, n):
-    """Return whether the accelerations satisfy all rows, the redundant rows that were left out included."""
+    """Return whether the accelerations satisfy all rows, including redundant rows that were left out."""
     if w.rows_v.size == len(b.rows):
         return True
     for i in range(len(b.rows)):
@@ -233,7 +240,7 @@ def _check_start(given, b, t, q, v, sizes, shifts):
 
 @merged
 def _has_all_entries(b):
-    """Return whether all entries of the rows that may be nonzero are nonzero: then no position nearby is checked."""
+    """Return whether rows are nonzero wherever `kinds` says so: then entries are not sought at positions nearby."""
     n, same = b.rows.shape[1], True
     for k in range(b.kinds.size):
         same = same and (b.kinds[k] != 0) == (b.rows[k // n, k % n] != 0.0)
@@ -242,7 +249,7 @@ def _has_all_entries(b):
 
 @merged
 def _start_run(f, given, w, b, t, t1, q, v, sizes, sure):
-    """Begin a run to t1 at a state with the choices of the run before; return 0, REFUSED or IN_DOUBT.
+    """Start a run from t to t1 with the choices of the previous run; return 0, REFUSED or IN_DOUBT.
 
     `given`: the system that is checked, `sizes`: see `evaluate_start`. `sure`: the state is known to be consistent.
     """
@@ -298,14 +305,14 @@ def _restore_start(b):
     _copy(b.saved_integers, b.lasting_integers)
 
 
-# indices in `last_start`: how often a run began there, at most IS_SAVED; from START on: t, t1, q and v
+# indices in `last_start`: the number of successive runs from that start, at most IS_SAVED; from START on: t, t1, q, v
 N_EQUAL, START = 0, 1
 NEVER, IS_SAVED = 0.0, 2.0
 
 
 @exact
 def _is_last_start(last_start, t, t1, q, v):
-    """Return whether a start equals the last one to the bit; store it as the last one."""
+    """Return whether a start equals the last one bit for bit; it becomes the last one."""
     n, same = q.size, last_start[N_EQUAL] > NEVER
     for k in range(2 + 2 * n):
         x = t if k == 0 else t1 if k == 1 else q[k - 2] if k < 2 + n else v[k - 2 - n]
@@ -316,9 +323,9 @@ def _is_last_start(last_start, t, t1, q, v):
 
 
 # entries of the report: number of states (with the first) and of steps; then 1 or 0 for: NO_REMARK, nothing has to be
-# checked; JUMPED, velocities changed suddenly in the last step; IN_CHECKED_REGION, all states are where callbacks were
-# compared with their traces; HAS_DEFECTS, every step evaluated its defect; then the largest defect, the longest time
-# between two evaluations, the code of `advance`, 1 if the start is new, and the counters
+# checked; JUMPED, velocities changed suddenly in the last step; IN_CHECKED_REGION, all states are in the region where
+# callbacks were compared with their traces; HAS_DEFECTS, every step evaluated its defect; then the largest defect, the
+# longest time between two evaluations, the code of `advance`, 1 if the start is new, and the counters
 N_STATES, N_STEPS, NO_REMARK, JUMPED, IN_CHECKED_REGION, HAS_DEFECTS = range(6)
 DEFECT, LONGEST_GAP, END_CODE, IS_NEW, N_REPORT = range(6, 11)
 N_HEAD = N_REPORT + N_COUNTERS
@@ -365,7 +372,8 @@ def _write_report(w, b, box, n_rows, n_steps, code, is_new):
 def start_and_advance(f, given, w, b, t, t1, q, v, sizes, box, sure):
     """Start a run to t1 and take the first steps; return their number, or a code if Python has to check something.
 
-    A start that equals the last one to the bit is checked a second time and then saved: further repetitions restore it.
+    If a start is repeated bit for bit, the second run still checks it and saves the state of the started run; from the
+    third run on, that state is restored without a check.
     """
     f.flags[FORM] = int(b.constants[EQUATION_FORM])  # a run may have changed it
     same, often = _is_last_start(b.last_start, t, t1, q, v), b.last_start[N_EQUAL]

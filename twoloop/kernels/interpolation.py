@@ -1,7 +1,7 @@
 """Interpolate states within steps by polynomials through neighbouring states, projected onto the constraints.
 
-States are rows [q, v, a] at the times `t`; interval i lies between rows i and i + 1. With PARTS > 1 interior states are
-computed first, by steps of the method, and a polynomial goes through those of one interval.
+States are rows [q, v, a] at the times `t`; interval i lies between rows i and i + 1. For methods that take
+long steps, `fill` computes interior states first, and a polynomial goes through the states of one interval.
 """
 
 import numpy as np
@@ -25,20 +25,23 @@ from twoloop.kernels.evaluation.partition import least_pivot, partition_is_poor
 from twoloop.kernels.linalg.dense import copy, largest_of
 
 TABLE = types.int64[:, ::1]
-PLACES = (0.3, 0.7)  # positions within an interval, relative to its length, at which polynomials are checked
-LOOKS = len(PLACES)
+CHECKED_AT = (0.3, 0.7)  # where polynomials are checked: time since the beginning of an interval, over its length
+N_CHECKED = len(CHECKED_AT)
 EPS = 2.0**-52
-EVEN = 8.0  # largest ratio of two gaps at which steps count as equally long
-NOISY = 10.0  # relative to the tolerance of velocities: rounding above this counts as noise
-SINGULAR_SHARE = 0.01  # relative to the smallest pivots at the ends of an interval: a smaller pivot is singular
-SINGULAR_PIVOT = 1e-5  # a smaller pivot (rows scaled to 1) counts as singular, too ...
-RESIDUAL, WEAK_PIVOT = 10.0, 0.05  # ... and one below WEAK_PIVOT if velocities violate rows by fewer tolerances
+MAX_GAP_RATIO = 8.0  # largest ratio of the longest to the shortest of neighbouring steps that count as equally long
+NOISY = 10.0  # rounding of q over the length of an interval, in tolerances of v: above this, v gets its own polynomial
+# largest pivot of a singular position within an interval, relative to the larger of the pivots at the ends
+SINGULAR_SHARE = 0.01
+SINGULAR_PIVOT = 1e-5  # largest pivot of a singular position, see least_pivot in partition.py
+# a pivot below WEAK_PIVOT is singular, too, if it times the change of velocities by the projection, about the violation
+# of the rows, is below RESIDUAL tolerances
+RESIDUAL, WEAK_PIVOT = 10.0, 0.05
 
 
 @merged
 def _window(low, high, i, last):
-    """Return the first and last row of the polynomial of the interval from row i: centred, except at ends."""
-    if last > i + 1:  # interior states of the interval are given
+    """Return the first and last state of the polynomial for the interval from state i: centred, except near an end."""
+    if last > i + 1:  # `fill` has computed interior states of the interval
         return i, last
     size = min(kinds.WINDOW, high - low + 1)
     lo = max(low, min(i + 1 - size // 2, high + 1 - size))
@@ -47,10 +50,11 @@ def _window(low, high, i, last):
 
 @compiled
 def _divided_differences(t, states, lo, hi, i, h, place, order, z, c):
-    """Compute Newton's form of the Hermite polynomial through rows lo to hi, in (time - t[i]) / h; return its size.
+    """Compute the Hermite polynomial through rows lo to hi in Newton's form; return the number of coefficients.
 
-    For the block of columns from `place` on, less row i of them, with `order` values at each node: the blocks behind it
-    are its derivatives.
+    It interpolates n columns of `states` from `place` on, less the values in row i; its variable is (time - t[i]) / h.
+    The columns behind these are their derivatives: `order` values are used at each node. `z` becomes the nodes, `c` the
+    coefficients.
     """
     n = c.shape[1]
     size = (hi - lo + 1) * order
@@ -74,7 +78,7 @@ def _divided_differences(t, states, lo, hi, i, h, place, order, z, c):
 
 @merged
 def _interpolate(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
-    """Evaluate q and v of the polynomials by Horner's scheme."""
+    """Evaluate the polynomials of an interval of length h at t[i] + s h into q and v, by Horner's scheme."""
     n = q.size
     for m in range(n):
         value, slope = c[size - 1, m], 0.0
@@ -92,7 +96,7 @@ def _interpolate(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
 
 @merged
 def _kind(kind, tolerances, h, states, i):
-    """Return `kind`, but APART if an interval is so short that rounding of q exceeds the tolerances of its slope."""
+    """Return `kind`, or APART for an interval so short that rounding of q would spoil the slope of its polynomial."""
     n = tolerances.size - ATOL
     for m in range(n):
         atol, rtol = tolerances[ATOL + m], tolerances[RTOL]
@@ -102,8 +106,8 @@ def _kind(kind, tolerances, h, states, i):
 
 
 @merged
-def _turn(tolerances, v_0, v):
-    """Return the change of restored velocities over the tolerances; errors of polynomials explain up to UNTRUE."""
+def _change(tolerances, v_0, v):
+    """Return the largest change of a velocity by the projection, from v_0 to v, in tolerances."""
     speed, largest = largest_of(v_0), 0.0
     for m in range(v.size):
         change = abs(v[m] - v_0[m]) / (tolerances[ATOL + m] + tolerances[RTOL] * speed)
@@ -113,10 +117,12 @@ def _turn(tolerances, v_0, v):
 
 
 @compiled
-def _is_singular(f, w, t, states, i, last, time, q, turn):
-    """Return whether the rows are so close to losing rank within an interval that rounding explains `turn`.
+def _is_singular(f, w, t, states, i, last, time, q, change):
+    """Return whether q, within an interval, is so near a singular position that rounding explains `change`.
 
-    They are if they are much closer than at its ends, or the velocities of the polynomials satisfy the constraints.
+    `change` is the change of velocities by the projection, in tolerances. Its cause is rounding if the smallest pivot
+    at q is very small, or small relative to the pivots at the ends of the interval, or if the polynomials' velocities
+    nearly satisfy the constraints.
     """
     n, largest = w.Q.size, 0.0
     for r in (i, last):
@@ -124,22 +130,22 @@ def _is_singular(f, w, t, states, i, last, time, q, turn):
             largest = max(largest, least_pivot(f, w, t[r], states[r, :n]))
     code = renew_partition(f, w, time, q)
     pivot = least_pivot(f, w, time, q) if code == DONE else 0.0
-    return pivot < max(SINGULAR_SHARE * largest, SINGULAR_PIVOT, min(RESIDUAL / turn, WEAK_PIVOT))
+    return pivot < max(SINGULAR_SHARE * largest, SINGULAR_PIVOT, min(RESIDUAL / change, WEAK_PIVOT))
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR, VECTOR, MATRIX, TABLE, VECTOR, VECTOR, MATRIX, MATRIX))
 def between(f, w, tolerance, tolerances, t, states, groups, times, z, room, out):
-    """Write rows [q, v] of `out` at `times`; return the number of failed projections.
+    """Compute [q, v] at `times` into the rows of `out`; return the number of failed projections.
 
-    A projection fails if no dependent coordinates are found, or if rounding determines its velocities beside a singular
-    position: q and v are then those of the polynomials. `z` and `room` hold the nodes and coefficients of two
-    polynomials.
+    A projection fails if no dependent coordinates are found, or if rounding determines the projected velocities near a
+    singular position: q and v are then those of the polynomials. `groups` is the table of intervals described in
+    data/indices.py; `z` and `room` are scratch, for the nodes and coefficients of two polynomials.
     """
     n = w.Q.size
     half = z.size // 2
     z_q, z_v, c_q, c_v = z[:half], z[half:], room[:half], room[half:]
     q_0, v_0 = room[2 * half - 2], room[2 * half - 1]  # the last two rows, which c_v does not use
-    reduced = f.flags[FORM] == NULL_SPACE  # then w.D is known
+    reduced = f.flags[FORM] == NULL_SPACE  # this form computes w.D, which shows whether a partition is poor
     failures = 0
     for g in range(groups.shape[0]):
         i, last, kind = groups[g, kinds.FIRST_OWN], groups[g, kinds.LAST_OWN], groups[g, kinds.KIND]
@@ -149,7 +155,7 @@ def between(f, w, tolerance, tolerances, t, states, groups, times, z, room, out)
         order = 3 if kind >= kinds.ACCELERATIONS else 2
         size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
         size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == kinds.APART else 0
-        # the choice of independent coordinates must not depend on other output times
+        # choose independent coordinates for each interval anew: results must not depend on other output times
         chosen = False
         for p in range(groups[g, kinds.FIRST_TIME], groups[g, kinds.END_TIME]):
             q, v = out[p, :n], out[p, n : 2 * n]
@@ -166,15 +172,15 @@ def between(f, w, tolerance, tolerances, t, states, groups, times, z, room, out)
             code = DONE if chosen else renew_partition(f, w, t[i], states[i, :n])
             if code == DONE:
                 code = restore(f, w, times[p], q, v, tolerance)
-            chosen = code == DONE and not (reduced and partition_is_poor(w)) and _turn(tolerances, v_0, v) <= UNTRUE
+            chosen = code == DONE and not (reduced and partition_is_poor(w)) and _change(tolerances, v_0, v) <= UNTRUE
             if not chosen:
                 copy(q_0, q)
                 copy(v_0, v)
                 code = renew_partition(f, w, times[p], q)
                 if code == DONE:
                     code = restore(f, w, times[p], q, v, tolerance)
-                turn = _turn(tolerances, v_0, v) if code == DONE else 0.0
-                if not turn <= UNTRUE and _is_singular(f, w, t, states, i, last, times[p], q, turn):
+                change = _change(tolerances, v_0, v) if code == DONE else 0.0
+                if not change <= UNTRUE and _is_singular(f, w, t, states, i, last, times[p], q, change):
                     code = SINGULAR
             if code != DONE:
                 failures += 1
@@ -184,8 +190,8 @@ def between(f, w, tolerance, tolerances, t, states, groups, times, z, room, out)
 
 
 @merged
-def _off(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other):
-    """Return the largest difference of two states, in positions and velocities, over the tolerances."""
+def _difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other):
+    """Return the largest of scale_q times a difference of q, and scale_v times one of v, in tolerances at state i."""
     n = q.size
     rtol, largest = tolerances[RTOL], 0.0
     for m in range(n):
@@ -196,8 +202,8 @@ def _off(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other):
 
 
 @merged
-def _slope_of_velocity(kind, h, s, z, c, size, z_v, c_v, size_v, a):
-    """Write the accelerations of the polynomials to `a`."""
+def _accelerations_of_polynomials(kind, h, s, z, c, size, z_v, c_v, size_v, a):
+    """Evaluate the accelerations of the polynomials at t[i] + s h into `a`; for the arguments see `_interpolate`."""
     for m in range(a.size):
         value, slope, bend = c[size - 1, m], 0.0, 0.0
         for r in range(size - 2, -1, -1):
@@ -215,23 +221,23 @@ def _slope_of_velocity(kind, h, s, z, c, size, z_v, c_v, size_v, a):
 
 
 @merged
-def _even(t, lo, hi):
-    """Return whether the gaps between these times are of similar length."""
+def _has_similar_gaps(t, lo, hi):
+    """Return whether the gaps between the times lo to hi are of similar length."""
     shortest, longest = np.inf, 0.0
     for r in range(lo, hi):
         shortest, longest = min(shortest, t[r + 1] - t[r]), max(longest, t[r + 1] - t[r])
-    return longest <= EVEN * shortest
+    return longest <= MAX_GAP_RATIO * shortest
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR, VECTOR, MATRIX, TABLE, VECTOR, MATRIX, MATRIX, VECTOR))
 def judge(f, w, tolerance, tolerances, t, states, groups, z, room, rows, out):
-    """Estimate the error of the polynomials of these intervals over the tolerances, into `out`.
+    """Estimate the error of the polynomials in each of `groups`, in tolerances, into `out`.
 
     The error is 0 if the last node changes a polynomial by less than the tolerances. Otherwise the polynomial is
-    compared with the constraints and the equations at positions within the interval: the error of its accelerations,
-    times the time in which a polynomial of its degree can turn, is an error of velocity. If accelerations hold the
-    noise of stiff modes, only the change by the last node counts. Methods of low order take steps that are short for
-    their polynomials: these are checked only between steps of unequal length. Divided intervals are always checked.
+    compared with the constraints and the equations of motion at CHECKED_AT: the error of its accelerations, times h
+    over the number of coefficients, is an error of velocity. If accelerations contain the noise of stiff modes, only
+    the change by the last node counts. Methods of low order take steps that are short for their polynomials, which are
+    therefore checked only between steps of unequal length. Intervals with interior states are always checked.
     """
     n = w.Q.size
     half = z.size // 2
@@ -246,23 +252,23 @@ def judge(f, w, tolerance, tolerances, t, states, groups, z, room, rows, out):
         size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
         size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == kinds.APART else 0
         out[g] = 0.0
-        if kind < kinds.ACCELERATIONS and last == i + 1 and hi - lo > 1 and _even(t, lo, hi):
+        if kind < kinds.ACCELERATIONS and last == i + 1 and hi - lo > 1 and _has_similar_gaps(t, lo, hi):
             continue
         if hi - lo > 1:
-            for k in range(LOOKS):
-                s = PLACES[k]
+            for k in range(N_CHECKED):
+                s = CHECKED_AT[k]
                 _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
                 shorter = size_v - 2 if kind == kinds.APART else 0
                 _interpolate(states, i, kind, h, s, z_q, c_q, size - order, z_v, c_v, shorter, q_1, v_1)
-                out[g] = max(out[g], _off(tolerances, 1.0, 1.0, states, i, q, v, q_1, v_1))
+                out[g] = max(out[g], _difference(tolerances, 1.0, 1.0, states, i, q, v, q_1, v_1))
             if out[g] <= 1.0 or kind == kinds.VELOCITIES:
                 continue
         out[g] = 0.0
-        for k in range(LOOKS):
-            s = PLACES[k]
+        for k in range(N_CHECKED):
+            s = CHECKED_AT[k]
             time = t[i] + s * h
             _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
-            _slope_of_velocity(kind, h, s, z_q, c_q, size, z_v, c_v, size_v, v_1)
+            _accelerations_of_polynomials(kind, h, s, z_q, c_q, size, z_v, c_v, size_v, v_1)
             copy(rows[0], rows[2])
             code = DONE if k > 0 else renew_partition(f, w, t[i], states[i, :n])
             if code == DONE:
@@ -273,13 +279,13 @@ def judge(f, w, tolerance, tolerances, t, states, groups, z, room, rows, out):
                 if code == DONE:
                     code = restore(f, w, time, rows[2, :n], rows[2, n:], tolerance)
             if code == DONE:
-                out[g] = max(out[g], _off(tolerances, 1.0, 1.0, states, i, q, v, rows[2, :n], rows[2, n:]))
+                out[g] = max(out[g], _difference(tolerances, 1.0, 1.0, states, i, q, v, rows[2, :n], rows[2, n:]))
                 code = accelerations(f, w, time, rows[2, :n], rows[2, n:], q_1, w.lam)
             if code != DONE:
                 out[g] = np.inf
                 break
             turn = h / size
-            out[g] = max(out[g], _off(tolerances, turn * turn, turn, states, i, v_1, v_1, q_1, q_1))
+            out[g] = max(out[g], _difference(tolerances, turn * turn, turn, states, i, v_1, v_1, q_1, q_1))
         if not np.isfinite(out[g]):
             out[g] = np.inf
     return DONE
@@ -287,7 +293,7 @@ def judge(f, w, tolerance, tolerances, t, states, groups, z, room, rows, out):
 
 @kernel(i8(KIT, WORK, VECTOR, MATRIX, MATRIX))
 def complete(f, w, times, states, out):
-    """Write rows [a, lam] of `out` at consistent states [q, v]; return the number of failures (rows of NaN)."""
+    """Compute rows [a, lam] of `out` at consistent states [q, v]; return the number of failures (rows of NaN)."""
     n = w.Q.size
     code = SINGULAR
     failures = 0
@@ -313,10 +319,11 @@ def complete(f, w, times, states, out):
 
 
 @kernel(i8(KIT, WORK, *(VECTOR,) * 7, MATRIX, INTEGERS, VECTOR, MATRIX))
-def fill(f, w, options, memory, at_rest, tolerances, state, new_state, t, states, intervals, out_t, out):
-    """Compute states within intervals by equal steps of the method; return the number of failures, whose t is NaN.
+def fill(f, w, options, memory, initial_memory, tolerances, state, new_state, t, states, intervals, out_t, out):
+    """Compute states within intervals by equal steps of the method; return the number of intervals that failed.
 
-    `out_t` and `out` have the same number of rows for each; the first and the last are the ends of the interval.
+    `out_t` and `out` have the same number of rows for each interval: its first state, the interior states, and its last
+    state. After a failure the first time of the interval is NaN. `initial_memory` is the method's memory at a start.
     """
     n = w.Q.size
     rows = out_t.size // intervals.size
@@ -324,7 +331,7 @@ def fill(f, w, options, memory, at_rest, tolerances, state, new_state, t, states
     for g in range(intervals.size):
         i, first = intervals[g], g * rows
         last = first + rows - 1
-        copy(at_rest, memory)
+        copy(initial_memory, memory)
         state[:] = 0.0
         copy(states[i], state[: 3 * n])
         out_t[first], out_t[last] = t[i], t[i + 1]
@@ -338,7 +345,7 @@ def fill(f, w, options, memory, at_rest, tolerances, state, new_state, t, states
                 size = out_t[r] - before
                 code, _, _ = f.attempt(f, w, options, memory, before, size, tolerances, state, new_state)
                 if code != DONE and renew_partition(f, w, before, state[:n]) == DONE:
-                    copy(at_rest, memory)
+                    copy(initial_memory, memory)
                     code, _, _ = f.attempt(f, w, options, memory, before, size, tolerances, state, new_state)
                 f.settle(f, w, options, memory, tolerances, True)
             copy(new_state, state)

@@ -14,9 +14,9 @@ from twoloop.kernels.data.indices import N_COUNTERS, N_NOTES
 from twoloop.kernels.linalg.band import N_ROUTINES
 from twoloop.kernels.linalg.markowitz_lu import MAX_ENTRIES_PER_LINE, N_COUNTS, N_LISTS, index_size, values_size
 
-# largest number of unused workspaces that are kept for later runs, and of numbers that one of them may have
+# largest number of unused workspaces that are kept for later runs, and largest number of floats in one of them
 MOST_FREE, LARGEST_FREE = 32, 100_000
-WORD, LINE = 8, 8  # bytes of a number; numbers in a cache line, at the start of which each array begins
+WORD, LINE = 8, 8  # bytes of a number; numbers in a cache line: each array begins at the start of one
 
 
 class Static(NamedTuple):
@@ -25,8 +25,8 @@ class Static(NamedTuple):
     n_factors: int
     n_mass_values: int
     n_jacobian_values: int
-    dense_mass: bool  # whether M, or C_q, is stored as a full matrix, from which the values are taken
-    dense_jacobian: bool
+    dense_mass: bool  # whether M varies and is given as a full matrix, from which its values are copied
+    dense_jacobian: bool  # whether C_q is given as a full matrix, from which its values are copied
 
 
 # n_q, n_c, n_a, ranks of C_q and of all rows, whether T^T M T and whether the augmented matrix is used, numbers of
@@ -55,7 +55,7 @@ class Layout(NamedTuple):
 
 
 def empty(sizes: Sizes) -> Work:
-    """Return a workspace full of zeros; an unused one of these sizes is cleared, which is faster than allocation."""
+    """Return a workspace in its initial state: a cleared unused one of these sizes, or else a newly allocated one."""
     given_back = _take_unused(sizes)
     return _allocate(sizes) if given_back is None else cleared(given_back)
 
@@ -95,7 +95,7 @@ def _allocate(sizes: Sizes) -> Work:
 
 
 def give_back(work: Work) -> None:
-    """Keep a workspace that is no longer used for the next run of the same sizes."""
+    """Keep an unused workspace for a later run of the same sizes."""
     free = _free.pop(work.sizes, [])
     if work.notes.base.size <= LARGEST_FREE and len(free) < MOST_FREE:
         free.append(work)
@@ -126,9 +126,9 @@ def cached_run() -> Any:
 
 
 def _of_static_form(n_q: int, n_c: int, rank: int, static: Static) -> tuple[dict[str, tuple[int, ...]], ...]:
-    """Return the shapes of numbers and integers that differ in the static form, which has no partition.
+    """Return the shapes of the arrays (numbers, integers) that differ in the static form, which has no partition.
 
-    All coordinates count as dependent, because the predictions of all are compared, and all as independent.
+    All coordinates count as dependent, because the predictions of all are compared, and also as independent.
     """
     n, n_redundant = n_q + n_c, n_c - rank
     n_rows = n_c if static.dense_jacobian else 0
@@ -181,7 +181,7 @@ def _layout(
     size = n_q + r_v if augmented else 0
     n_entries = (n_rows + 1) * n_q
     numbers: dict[str, tuple[int, ...]] = {
-        "augmented": (n_entries + n_q * n_q,),  # first: `entries`, `G` and `M` are parts of it
+        "augmented": (n_entries + n_q * n_q,),  # the first array, whose parts are `entries`, `G` and `M`
         "L": (n_q, n_q),
         "S": (r_v, r_v),
         "W": (r_v, n_q),
@@ -209,7 +209,7 @@ def _layout(
         "nodes": (n_nodes,),
         **dict.fromkeys(("mass_values", "jacobian_values", "counts", "factors", "pivot_sizes"), (0,)),
         **dict.fromkeys(("unknowns", "solutions"), (0,)),
-        "matrices": (n_matrices,),  # last
+        "matrices": (n_matrices,),  # the last array, the only one whose data do not last
     }
     integers: dict[str, tuple[int, ...]] = {
         "places": (n_rows + 1 + n_rows * n_q,),
@@ -220,7 +220,7 @@ def _layout(
         "row_order": (n_rows,),
         "counters": (N_COUNTERS,),
         "lapack": (N_ROUTINES,),
-        "index": (index_size(r),),  # last
+        "index": (index_size(r),),  # the last array: data at its end do not last
     }
     rows_of_G, side = n_rows + 1, n_q
     if static is not None:
@@ -229,7 +229,7 @@ def _layout(
         integers |= changed[1]
         rows_of_G, side = (n_rows + 1) * static.dense_jacobian, n_q * static.dense_mass
         n_entries = rows_of_G * n_q
-    # arrays of positions that velocities use as well
+    # arrays of positions that velocities share if there are no rows of A
     of_positions = {name for name in integers if n_a == 0 and f"{name}_v" in integers}
     for name in of_positions:
         del integers[f"{name}_v"]
@@ -239,7 +239,7 @@ def _layout(
     of_integers, n_integers = _place_arrays(integers)
     of_numbers["entries"], of_numbers["G"] = (0, n_entries, (n_entries,)), (0, n_entries, (rows_of_G, n_q))
     of_numbers["M"] = n_entries, n_entries + side * side, (side, side)
-    # numbers at the end of `index` that only the ordering uses
+    # number of integers at the end of `index` that are used only while an order of elimination is chosen
     lists = (N_COUNTS + N_LISTS * min(r, MAX_ENTRIES_PER_LINE)) * r if static is None else 0
     lasting = of_numbers["matrices"][0], of_integers["index"][1] - lists
     if n_a == 0:
@@ -257,7 +257,7 @@ def _layout(
 
 
 def _place_arrays(shapes: Mapping[str, tuple[int, ...]]) -> tuple[dict[str, tuple[int, int, tuple[int, ...]]], int]:
-    """Return where arrays begin and end, each at the start of a cache line, and the total length."""
+    """Return (begin, end, shape) of each array, which begins at the start of a cache line, and the total length."""
     places, end = {}, 0
     for name, shape in shapes.items():
         size = math.prod(shape)

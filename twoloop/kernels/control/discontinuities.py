@@ -3,21 +3,22 @@
 A step evaluates the equations at its stages only, and may pass over a force that acts between two stages. So forces,
 C_t and b are sampled ahead: a sample calls single callbacks and costs less than an evaluation of the equations.
 
-- A value is smooth if the second differences of its samples are small against its range (of which the straight line
-  from the first to the last sample is subtracted). A change within one or two samples makes them as large as the range.
-  The step then ends there, and the run does not miss the change. It also ends where a value is not finite.
-- Where forces may change suddenly with place or speed and steps are longer than the spacing, samples follow the
-  parabola of the present position, velocity and acceleration: each long step is sampled, and all short ones that end
-  within LEAST_DISTANCE spacings at once. Elsewhere the samples stay at the state at which the step begins.
-- Samples in time alone are also no further apart than a share of the step.
-- The shortest time between two changes is recorded, and the shortest time for which a value differs from those before
-  and after. Where samples were further apart, other changes as short may have been missed: a message says so.
+- A value is smooth if the second differences of its samples are small relative to its range (after the straight line
+  from the first to the last sample is subtracted). A change within one or two samples makes these differences as large
+  as the range. The step then ends at the change. A step also ends where a value is not finite.
+- Where forces may change suddenly with position or velocity, and steps are longer than the spacing of samples, samples
+  follow the motion: the parabola of the present position, velocity and acceleration. One set of samples is for one long
+  step, or for all short steps that end within LEAST_DISTANCE spacings. Other samples are samples in time alone, at the
+  state at which the step begins.
+- Samples in time alone are no further apart than a fraction of the step, either.
+- Two times are recorded: the shortest between two changes, and the shortest for which a value differs from the values
+  before and after. If samples were further apart, other changes as short may have been missed: a message says so.
 
 A jump of C_t or b, as at the end of a ramp in a drive, changes velocities as an impulse does. Methods that restore the
 dependent coordinates leave the independent ones unchanged, which violates the balance of momentum. So a step is checked
-if its velocities change by more than its accelerations explain: C_t and b are sampled at thirteen times along a line.
-The twelfth difference of these samples is almost zero if they are smooth on the scale of the step, and falls by 2^12
-where an interval is halved. At a jump it is the size of the jump, in one of the halves, however short they are.
+if its velocities change by more than its accelerations explain: C_t and b are sampled at thirteen times within it. The
+twelfth difference of these samples is almost zero if C_t and b are smooth on the scale of the step, and falls by 2^12
+when the interval is halved. If they jump, it stays as large as the jump in one of the halves, however short.
 """
 
 import numpy as np
@@ -29,29 +30,27 @@ from twoloop.kernels.data.indices import ATOL, DONE, FORM, GAP, RTOL, STATIC
 from twoloop.kernels.evaluation.constraints import constraint_rates, representable_step
 from twoloop.kernels.linalg.symbolic_factorization import jacobian_of
 
-N_PARTS = 12
+N_PARTS = 12  # number of parts of an interval, at whose ends C_t and b are sampled
 # coefficients of the twelfth difference
 BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.0, 66.0, -12.0, 1.0)
-RATE_HALVINGS = 60
-RATE_ROUNDING = 1e-11  # relative to C_t: rounding errors of the twelfth difference
-TIME_ROUNDING = 5e3  # times the slope and the spacing of t: rounding errors that are due to t
-# relative to the mean slope over the step: a steeper part is a ramp, which the step must not pass over if the length of
-# the part is at most ...
-STEEPNESS = 4.0
-MAX_RAMP_SHARE = 0.125  # ... this share of the step
+RATE_HALVINGS = 60  # largest number of bisections that locate a jump or a ramp
+RATE_ROUNDING = 1e-11  # rounding errors of the twelfth difference, relative to C_t
+TIME_ROUNDING = 5e3  # rounding errors of the twelfth difference due to t, relative to slope times spacing of t
+STEEPNESS = 4.0  # slope of C_t or b relative to its mean over the step: a steeper part of the step is a ramp
+MAX_RAMP_SHARE = 0.125  # longest ramp that a step must not pass over, relative to the step
 MIN_SPACINGS = 8.0  # shortest interval that is halved, in spacings of floating-point numbers
 SMOOTH, RAMP, JUMP = range(3)
 
 
 @compiled
 def _sample_rates(f, w, t, q, way, begin, end):
-    """Evaluate C_t and b at thirteen times from begin to end, at q + way (time - t), into w.rates."""
+    """Evaluate C_t and b at thirteen times from begin to end into w.rates; the position is q + way (time - t)."""
     for k in range(N_PARTS + 1):
         time = end if k == N_PARTS else begin + (end - begin) * (k / N_PARTS)
         for m in range(q.size):
             w.x[m] = q[m] + (time - t) * way[m]
         constraint_rates(f, w, time, w.x, w.rates[k])
-        if not finite_vector(w.rates[k]):  # such as the derivative of |t| at 0: take the value next to it
+        if not finite_vector(w.rates[k]):  # such as the derivative of |t| at 0: use the next floating-point time
             constraint_rates(f, w, time + np.spacing(abs(time)), w.x, w.rates[k])
 
 
@@ -104,10 +103,11 @@ def unexplained_velocity_change(tolerances, h, state, new_state, n):
 
 @compiled
 def locate_discontinuity(f, w, t, end, q, v, way, tolerances):
-    """Return SMOOTH, RAMP or JUMP, and the interval from t to `end` in which the least smooth row changes.
+    """Return SMOOTH, RAMP or JUMP for the row of C_t and b that is least smooth from t to `end`, and where it changes.
 
-    After RAMP, the next step is at most as long as the interval. A ramp that fills a whole step is invisible to methods
-    whose accelerations at both ends are zero.
+    The second and third result are beginning and end of the jump or ramp, or t and `end` if the row is smooth. A ramp
+    that is as long as the step counts as one of half this length: accelerations may be zero at both of its ends, and a
+    method that evaluates only there would miss it. `way`: velocity along which positions are extrapolated.
     """
     begin = t
     h = end - t
@@ -150,37 +150,40 @@ def locate_discontinuity(f, w, t, end, q, v, way, tolerances):
             return JUMP, begin, end
     if steepest > STEEPNESS * mean:
         return RAMP, low, high
-    if end - begin < h:  # half the step is not smooth either: a ramp as long as the step, or a kink
+    if end - begin < h:  # one half of the step is not smooth either: a ramp as long as the step, or a kink
         return RAMP, t, t + 0.5 * h
     return SMOOTH, t, t + h
 
 
 N_SAMPLES = 20  # number of sample times ahead that are compared
-LEAST_DISTANCE = 12.0  # shortest distance ahead over which the motion is sampled, in spacings of samples
-SUDDEN_SHARE = 0.1  # relative to the range: second difference of a sudden change, as of a bell four spacings wide
-LEAST_RANGE = 0.1  # relative to rtol times the largest value so far: smallest range that may matter
-# ... and its lower bound in any units: squares below this underflow, and subnormal numbers change in steps
+LEAST_DISTANCE = 12.0  # shortest time ahead over which the motion is sampled, in spacings of samples
+SUDDEN_SHARE = 0.1  # smallest second difference of a sudden change, relative to the range: a bell four spacings wide
+LEAST_RANGE = 0.1  # smallest range of samples that matters, relative to rtol times the largest value so far
+# absolute lower bound of that range, in any units: squares of smaller values underflow, and subnormal numbers are too
+# coarsely spaced to look smooth
 LEAST_VALUE = 1e-150
-N_IN_STEP = 8.0  # samples within a step: stages are up to a quarter of it apart, and may all miss a shorter force
-RESAMPLE_BELOW = 0.25  # ratio of the spacing to the last one below which the rest of the samples is taken again
+N_IN_STEP = 8.0  # samples in a step: its stages are up to a quarter of it apart, and may all miss a shorter force
+RESAMPLE_BELOW = 0.25  # ratio of the required spacing to the last one: below this, samples ahead are taken again
 LEAST_APART = 16.0  # smallest spacing of samples, in spacings of floating-point numbers
-HALVINGS = 20  # number of bisections to find when a value changes between two samples
-SAME_CHANGE = 1e-5  # relative to the widest spacing: changes closer than this are one change
-# relative to a hundredth of the run: before that, a force that begins at zero (1 - cos(t)) changes by rounding
+HALVINGS = 20  # number of bisections that find when a value changes between two samples
+SAME_CHANGE = 1e-5  # relative to the widest spacing of samples: changes closer together than this count as one
+# time after the start, relative to GAP, before which no change is recorded: a force that begins at zero, such as
+# 1 - cos(t), changes there by rounding
 SOONEST = 5e-5
-STEEPER = 2.0  # ratio to the changes before and after: the flank of a pulse is steeper than this, a slope is not
+STEEPER = 2.0  # smallest ratio of a sudden change to the changes before and after; a smooth slope is below it
 SHORT_STEP = 0.5  # relative to the longest of the last steps: shorter steps suggest a discontinuity
 N_IN_SHORT = 4  # number of samples within a short step
-DECAYED = 0.5  # relative to an acceleration: a larger change, while velocities change by their tolerance, is a decay
-AT_CHANGE = 0.01  # relative to the spacing: a step that begins closer than this to a change begins at the change
-LARGEST = N_SAMPLES + 1  # row of w.changes for the largest values so far; the samples are in the rows before
+# relative to the largest acceleration: if it changes by more while a velocity changes by its tolerance, it decays
+DECAYED = 0.5
+AT_CHANGE = 0.01  # relative to the spacing of samples: a step that begins this close to a change begins at the change
+LARGEST = N_SAMPLES + 1  # row of w.changes for the largest absolute values so far, after the rows of samples
 MIDDLE = N_SAMPLES + 2  # row of w.changes for values between two samples
-N_CHANGES = N_SAMPLES + 3
+N_CHANGES = N_SAMPLES + 3  # number of rows of w.changes
 
 
 @compiled
 def _sample(f, w, time, since, q, v, a, now):
-    """Write forces, C_t and b into `now`, at a time and at the state `since` seconds after (q, v, a)."""
+    """Evaluate forces, C_t and b into `now` at `time` and the state `since` seconds after (q, v), if a is constant."""
     for m in range(q.size):
         w.x[m] = q[m] + since * (v[m] + 0.5 * since * a[m])
         w.y[m] = v[m] + since * a[m]
@@ -191,7 +194,7 @@ def _sample(f, w, time, since, q, v, a, now):
 
 @compiled
 def _largest(values):
-    """Return the largest of these values: a coordinate without a force has no scale of its own."""
+    """Return the largest of these values, or 0: the scale of all, as a coordinate without a force has no scale."""
     largest = 0.0
     for x in values:
         largest = max(largest, x)
@@ -200,18 +203,22 @@ def _largest(values):
 
 @compiled
 def _is_smooth(values, k, n):
-    """Return whether the second difference at index k of n + 1 values is close to that of its neighbour."""
+    """Return whether second differences of n + 1 values at index k and next to it have one sign and similar sizes."""
     second_value = k + 1 if k + 2 <= n else k - 1
     if second_value < 1:
         return False
-    here = values[k + 1] - 2.0 * values[k] + values[k - 1]
-    there = values[second_value + 1] - 2.0 * values[second_value] + values[second_value - 1]
-    return here * there > 0.0 and abs(there) > 0.5 * abs(here)
+    difference = values[k + 1] - 2.0 * values[k] + values[k - 1]
+    neighbour = values[second_value + 1] - 2.0 * values[second_value] + values[second_value - 1]
+    return difference * neighbour > 0.0 and abs(neighbour) > 0.5 * abs(difference)
 
 
 @compiled
 def _find_bend(values, n, slope, least, within):
-    """Return the first index at which n + 1 values, less a line, bend suddenly (0: nowhere), and the limit for that."""
+    """Return the first index at which n + 1 values bend suddenly (0: none), and the limit of second differences.
+
+    A line of this slope (per sample) is subtracted. Ranges up to `least` do not matter; with `within` smooth bends are
+    excluded.
+    """
     low = high = 0.0
     for k in range(1, n + 1):
         off = values[k] - values[0] - k * slope
@@ -229,11 +236,11 @@ def _find_bend(values, n, slope, least, within):
 def _first_sudden_bend(values, n, along, least):
     """Return the index of the first sudden bend of sampled values (0: there is none), and the limit that it exceeds.
 
-    With `along` = 1 the straight line from the first to the last value is subtracted before. The search is repeated
-    among the values before the bend, until it finds no earlier one.
+    With `along` = 1 the straight line from the first to the last value is subtracted first. The search is repeated
+    among the values before the bend, until there is no earlier bend.
     """
     place, limit = _find_bend(values, n, along * (values[n] - values[0]) / max(n, 1), least, False)
-    while place > 1:  # among few values a smooth curve may bend as much: _is_smooth excludes it
+    while place > 1:  # few values of a smooth curve may bend as much: _find_bend excludes these with `within`
         before, share = _find_bend(values, place, along * (values[place] - values[0]) / place, least, True)
         if before == 0:
             break
@@ -243,7 +250,7 @@ def _first_sudden_bend(values, n, along, least):
 
 @compiled
 def _is_sudden_change(previous, first_value, second_value, following, limit):
-    """Return whether values change suddenly between two samples, and much less before and after these two."""
+    """Return whether values change suddenly between two of four samples, and much less before and after these two."""
     change = second_value - first_value
     sign = 1.0 if change > 0.0 else -1.0
     beside = max(sign * (first_value - previous), sign * (following - second_value))
@@ -268,7 +275,7 @@ def _locate_change(f, w, low, high, k, j, q, v, a):
 
 @compiled
 def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, place, column, limit, q, v, a):
-    """Record the time of a change next to the bend at index `place`, and the time since the previous change."""
+    """Record when values of a column change next to the bend at index `place`, and how long after the last change."""
     values, apart = w.changes[:, column], max(AT_CHANGE * spacing, SAME_CHANGE * clock[at.WIDEST_SAMPLING])
     soonest = clock[at.T_START] + SOONEST * tolerances[GAP]
     for k in range(place - 1, place + 1):
@@ -289,7 +296,8 @@ def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, place, column
 def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, along, q, v, a):
     """Return the time of the first sample at which a value changes suddenly, or infinity; and the end of the samples.
 
-    (q, v, a) is the state at t; samples go from `begin` to `last` at most. `along` = 1: they follow the motion.
+    (q, v, a) is the state at t; samples begin at `begin` and end at `last` or earlier. With `along` = 1 they follow the
+    motion, with 0 they stay at the state.
     """
     changes, n, first = w.changes, 0, np.inf
     for k in range(N_SAMPLES + 1):
@@ -323,7 +331,7 @@ def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, along,
 
 @compiled
 def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, a):
-    """Record how long a value in a short step differs from its neighbours: the samples ahead have missed it."""
+    """Record for how long a value within a short step differs from values around it: samples ahead have missed this."""
     changes, wide, begin, end = w.changes, control[at.APART], clock[at.T_START], t + size
     clock[at.COMPARED] = t
     if end + wide > last or (t - 2.0 * wide < begin and end + 2.0 * wide > last):
@@ -351,8 +359,8 @@ def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, 
 def _acceleration_lasts(f, w, tolerances, t, way, q, v, a, Q, V, A):
     """Return whether accelerations hardly change until they have changed a velocity by its tolerance.
 
-    The accelerations of a body that stiff friction holds do change: they are rounding errors of balanced forces. A
-    parabola that continued them would leave the state of rest far behind.
+    They do change if stiff friction keeps a body at rest: its acceleration is then a rounding error of balanced forces,
+    and a parabola with this acceleration would lead far away from the state of rest. (Q, V, A) is scratch.
     """
     n, time, largest, change = w.Q.size, way, 0.0, 0.0
     for m in range(n):
@@ -372,7 +380,7 @@ def _acceleration_lasts(f, w, tolerances, t, way, q, v, a, Q, V, A):
 
 @compiled
 def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a, Q, V, A):
-    """Sample along the motion of a step, and of all following steps that end within LEAST_DISTANCE spacings."""
+    """Sample along the motion of a step, and of later ones that end within LEAST_DISTANCE spacings; store results."""
     if clock[at.MOTION_SAMPLED_TO] >= t + (1.0 - AT_CHANGE) * size:
         return
     way = min(max(size, LEAST_DISTANCE * spacing), last - t)
@@ -386,9 +394,11 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
             f, w, tolerances, clock, t, t, way / N_SAMPLES, last, 1.0, q, v, A
         )
     clock[at.SAMPLES_MOTION] = 0.0
-    # a change found by the last samples in time: the next samples in time begin there, and need their own spacing
+    # if the last samples in time found a change, the next samples in time begin there, with their own spacing
     known = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t
-    if not known and way <= N_SAMPLES * min(control[at.APART], size / N_IN_STEP):  # as close as samples in time alone
+    if not known and way <= N_SAMPLES * min(
+        control[at.APART], size / N_IN_STEP
+    ):  # as closely spaced as samples in time
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], way / N_SAMPLES)
         if clock[at.MOTION_SAMPLED_TO] > clock[at.SAMPLED_TO]:
             clock[at.SAMPLED_TO], clock[at.SAMPLED_EVERY] = clock[at.MOTION_SAMPLED_TO], way / N_SAMPLES
@@ -399,15 +409,15 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
 
 @compiled
 def _sample_ahead(f, w, tolerances, control, clock, known, t, size, last, q, v, a):
-    """Return the next sudden change with time ahead of a step, or `known` (infinite: none) if that is earlier."""
+    """Return when a value next changes suddenly with time, or `known` (infinite: no time) if that is earlier."""
     every = max(min(control[at.APART], size / N_IN_STEP), LEAST_APART * np.spacing(abs(t)))
-    # multistep methods (ROUGH = 1) restart only after a rejected step, because no jump deceives their formula; steps
-    # find jumps of C_t and b themselves unless they end next to them
+    # samples need not be taken again for multistep methods (ROUGH = 1), which no jump deceives, and which restart only
+    # after a rejected step, or if C_t or b may jump: steps find these jumps themselves, unless they end next to one
     closer = control[at.ROUGH] > 1.0 and control[at.DRIVEN] == 0.0
     if closer and every < RESAMPLE_BELOW * clock[at.SAMPLED_EVERY]:
         clock[at.SAMPLED_TO] = t
     begin = max(t, clock[at.SAMPLED_TO])
-    at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # samples from here have to find the change again
+    at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # samples from here on have to find the change again
     while begin < min(t + size, last, known):
         apart, at_change = min(every, clock[at.SAMPLED_EVERY]) if at_change else every, False
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], apart)
@@ -419,7 +429,7 @@ def _sample_ahead(f, w, tolerances, control, clock, known, t, size, last, q, v, 
 
 @compiled
 def limit_to_discontinuity(f, w, tolerances, control, clock, t, size, last, state, new_state):
-    """Return the size of a step, reduced to end at the next sudden change; `new_state` is scratch."""
+    """Return the size of a step, reduced so that it ends at the next sudden change; `new_state` is scratch."""
     n, spacing = w.Q.size, control[at.SPACING]
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
@@ -430,7 +440,7 @@ def limit_to_discontinuity(f, w, tolerances, control, clock, t, size, last, stat
     known = clock[at.DISCONTINUITY] if clock[at.DISCONTINUITY] > near else np.inf
     along = clock[at.DISCONTINUITY_OF_MOTION] if clock[at.DISCONTINUITY_OF_MOTION] > near else np.inf
     at_change = known == np.inf and clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO] > -np.inf
-    # not at the end of a run, where samples of ever shorter remaining spans would find the change again
+    # do not sample again near the end of a run: samples of ever shorter spans would find the same change again
     if control[at.BY_TIME] == 1.0 and not (at_change and size <= (1.0 + AT_CHANGE) * clock[at.SAMPLED_EVERY]):
         known = _sample_ahead(f, w, tolerances, control, clock, known, t, size, last, q, v, a)
         clock[at.DISCONTINUITY] = known

@@ -21,30 +21,37 @@ from twoloop.kernels.evaluation.inner_loop import find_tangents, renew_partition
 from twoloop.kernels.evaluation.partition import MAX_ROWS_ELIMINATED, least_pivot, partition_is_poor, smallest_pivot
 from twoloop.kernels.evaluation.sparse_inner_loop import PROJECT_STAGES
 
-SHORT_STEP = 0.5  # relative to the longest of the last steps: a shorter step may be near a singular position ...
+SHORT_STEP = 0.5  # relative to the longest of the last steps: a shorter step may be near a singular position
 COLLAPSED = 0.2  # relative to the longest of the last steps: after a shorter one the pivots of C_q are computed again
-SINGULAR_PIVOT = 0.2  # ... and is near one if the smallest pivot of C_q is below this share of the largest so far
-STATIC_SINGULAR = 0.01  # the same share for the static form, whose pivots are sines of single rows
-REPEAT_BELOW = 0.05  # share below which a rejected step of the static form is repeated with projected stages ...
-SHRINKAGE = 0.8  # ... at ever smaller sizes, by this factor ...
-GIVE_UP_BELOW = 0.001  # ... down to this size relative to the longest of the last steps
-# share of the largest pivot below which rounding determines accelerations: short steps must not continue
+# smallest pivot of C_q relative to its largest value so far: a position with a smaller one is near a singular position
+SINGULAR_PIVOT = 0.2
+STATIC_SINGULAR = 0.01  # the same limit for the static form, whose pivots are sines of angles between rows
+# smallest pivot relative to its largest value so far: near a smaller one, a rejected step of the static form is
+# repeated with projected stages
+REPEAT_BELOW = 0.05
+SHRINKAGE = 0.8  # ratio of the size of such a repeated step to that of the one before
+GIVE_UP_BELOW = 0.001  # relative to the longest of the last steps: smallest size of a step near a singular position
+# pivot relative to its largest value so far: below this, rounding determines accelerations, and short steps must stop
 UNDETERMINED = 1e-6
 CHECK_INTERVAL = 16  # accepted steps from one check of the partition to the next, if steps do not use it
-FREEDOMS_PER_CHECK = 32  # with k times as many, a partition is checked every k + 1 steps, because T is a full matrix
-N_CHECKED = 8  # number of parts of an accepted step at whose ends the pivots of C_q are computed ...
-CHECKED_BELOW = 0.5  # ... if it begins or ends below this share of the largest pivot
-PASSED_SHARE = 0.6  # relative to the largest change from one to the next: a smaller pivot passes zero within the step
-# near_share: its bounds, the share of the tolerances that rounding may take, and the unit roundoff
+# with k times this number of freedoms, a partition is checked every k + 1 steps, because T is a full matrix
+FREEDOMS_PER_CHECK = 32
+N_CHECKED = 8  # number of parts of an accepted step at whose ends the smallest pivot of C_q is computed
+CHECKED_BELOW = (
+    0.5  # pivot relative to its largest value so far: steps that begin or end with a smaller one are checked
+)
+# pivot relative to its largest change between these samples: a smaller one passes zero within the step
+PASSED_SHARE = 0.6
+# numbers in near_share: lower and upper bound of the result, rounding errors relative to tolerances, unit roundoff
 NEAR_LEAST, NEAR_MOST, SHARE_OF_NOISE, EPS = 0.02, 0.1, 0.2, 2.0**-53
-END_SHARE = 0.25  # relative to the smallest sine at the start of a step: a step that ends below this is halved
+END_SHARE = 0.25  # smallest sine at the end of a step, relative to that at its start: below this, the step is halved
 
 
 @merged
 def near_singular(f, w, control, clock, t, q):
-    """Return whether C_q was close to losing rank when the partition was chosen, if the caller stops there (BRIDGE).
+    """Return whether C_q was close to losing rank when the partition was chosen, if BRIDGE requires a stop there.
 
-    Steps that do not use partitions may have an old one: it is renewed once the run has come near such a position.
+    If steps do not use partitions, the partition may be old: near a singular position it is renewed first.
     """
     if control[at.BRIDGE] != 1.0:
         return False
@@ -149,7 +156,8 @@ def record_pivot_at_output(f, w, clock, state):
     """Record the distance from a singular position at an output time, or at the end of a step of fixed size."""
     pivot = least_pivot(f, w, clock[at.T], state[: w.Q.size])
     if f.flags[FORM] == STATIC and pivot > 0.0:
-        # sines are small in large mechanisms: only their ratio to the largest shows a singular position
+        # pivots of the static form are sines of angles, all of them small in large mechanisms: only the ratio to the
+        # largest pivot so far shows a singular position
         pivot /= max(pivot, clock[at.LARGEST_PIVOT])
     clock[at.PIVOT_AT_OUTPUT] = min(clock[at.PIVOT_AT_OUTPUT], pivot)
 

@@ -5,11 +5,11 @@ depends on how the error has changed since the last accepted step.
 
 Errors that the embedded formula does not show are measured in two ways:
 
-- `departure` compares the dependent positions that the formula predicts with those that the constraints give. On one
-  assembly of the mechanism the difference is of the order of the step's error. On another assembly it is larger,
+- `departure` compares the dependent positions that the formula predicts with those that satisfy the constraints. On the
+  same assembly of the mechanism the difference is of the order of the step's error. On another assembly it is larger,
   however smooth the independent coordinates are. A mechanism without independent coordinates (each is prescribed) has
   no other estimate. Where two assemblies come close to one another, a large step may end on the wrong one with a small
-  difference; det C_qd then changes sign, which a motion does only through a singular position. So after a change of
+  difference; det C_qd then changes sign, as it does along a motion only at a singular position. So after a change of
   sign the prediction must be nearly exact, as it is in short steps through a singular position.
 - `defect_ratio` is the defect of a Taylor step: how far its accelerations are from those of the equations at the same
   states. A series contains the forces at its beginning, to all orders, and no later change of them. So the equations
@@ -57,12 +57,12 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, restore
 from twoloop.kernels.evaluation.tasks import PROJECT
 from twoloop.kernels.linalg.markowitz_lu import sign_of
 
-KEEP_BELOW = 1.2  # with the trend, a factor from 1 to this becomes 1, because a new size needs a new factorization
+KEEP_BELOW = 1.2  # with the trend, a factor between 1 and this becomes 1: a new step size needs a new factorization
 
 
 @compiled
 def factor_of(rule, past, h, error):
-    """Return the factor of the next step after a step h with this error, which is accepted up to 1."""
+    """Return the ratio of the next step size to h, after a step of size h whose error, in tolerances, is `error`."""
     if not error > 0.0:
         return rule[FACTOR_MAX]
     follows = error <= 1.0 and rule[LEAST_ERROR] > 0.0
@@ -76,15 +76,14 @@ def factor_of(rule, past, h, error):
 
 @merged
 def record_accepted(rule, past, h, error):
-    """Record size and error of an accepted step."""
+    """Record size and error of an accepted step in the history `past`."""
     past[H_BEFORE], past[ERROR_BEFORE] = h, max(error, rule[LEAST_ERROR])
 
 
 @compiled
 def evaluate_near(f, w, t, Q, V, A):
     """Project a state (Q, V) near the constraints onto them, and evaluate its accelerations A; return the code."""
-    # generated code projects to the nearest state at less cost; with the static form `evaluate` would not project
-    # at all
+    # generated code projects to the nearest state at less cost, and the static form projects only by this task
     if (f.flags[STRAIGHT] == 1 and w.Rate.size == w.C.size) or f.flags[FORM] == STATIC:
         return f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
     return evaluate(f, w, t, Q, V, INNER_TOL, A)
@@ -100,15 +99,15 @@ EQUAL_SPACINGS = 4.0  # times closer than this many spacings of floating-point n
 
 @merged
 def on_grid(clock, t, h, target, goal):
-    """Return the size of a step of a fixed grid, how many grid steps it covers, and whether it reaches the goal.
+    """Return the size of a step of a fixed grid, how many grid steps it covers, and whether it reaches `goal`.
 
-    Times are multiples of h, not sums; an output time within a millionth of a step of a grid point counts as on it.
+    Grid times are multiples of h, not sums; an output time within a millionth of h from a grid point counts as equal.
     """
     rounding = EQUAL_SPACINGS * np.spacing(max(abs(t), abs(target)))
     near = max(1e-6 * h, rounding)
     in_grid = 1.0
     if target <= clock[at.T_START] + clock[at.N_FIXED] * h + near:
-        in_grid = 0.0  # a second output time next to the same grid point
+        in_grid = 0.0  # a second output time close to the grid point reached before
     end = clock[at.T_START] + (clock[at.N_FIXED] + in_grid) * h
     reaches = goal <= end + near
     size = h
@@ -121,7 +120,7 @@ def on_grid(clock, t, h, target, goal):
 
 @merged
 def off_grid(control, t, h, left, jumps):
-    """Return the size of a step under step-size control, and whether it reaches the goal in `left` seconds."""
+    """Return the size of a step under step-size control, and whether it reaches the goal, `left` seconds ahead."""
     reaches = jumps or h >= left * (1.0 - 1e-10)
     size = h
     if h > 0.5 * left and not reaches:
@@ -132,7 +131,7 @@ def off_grid(control, t, h, left, jumps):
     return size, reaches
 
 
-FADING = 0.98  # factor of the longest recent step with each accepted step
+FADING = 0.98  # factor on H_LONG, the longest recent step, at each accepted step
 
 
 @merged
@@ -158,11 +157,11 @@ def count_step(w, tolerances, control, clock, size, out_step):
     out_step[at.JACOBIANS] = 0.0 if w.notes[EXPLICIT_STEP] == 1.0 else w.counters[N_JACOBIANS]
 
 
-# relative to the motion of the coordinates in the step: largest error of a prediction at any tolerance
+# largest error of a prediction at any tolerance, relative to the largest motion of a coordinate in the step
 SHARE_OF_MOTION = 0.1
-SHARE_THROUGH_ZERO = 1e-6  # ... if the sign of det C_qd changes
-LEAST = 1e-300  # replaces a scale of zero, so that a distance of zero needs no branch
-FLOOR = 0.01  # relative to the tolerances: smaller distances are allowed even where SHARE_OF_MOTION is stricter
+SHARE_THROUGH_ZERO = 1e-6  # the same limit if the sign of det C_qd changes in the step
+LEAST = 1e-300  # lower bound of a scale, which avoids a division by zero
+FLOOR = 0.01  # in tolerances: distance that is added to the limit SHARE_OF_MOTION, for steps with hardly any motion
 
 
 @merged
@@ -174,9 +173,9 @@ def store_prediction(w, q1):
 
 @merged
 def departure(w, tolerances, h, q, v, q1):
-    """Return the largest distance of the stored prediction from q1, over the tolerances or over a share of the motion.
+    """Return the largest distance of the stored prediction from q1, in tolerances or stricter fractions of the motion.
 
-    Needs the factors of C_qd at q1, which the inner loop leaves. With fixed steps the distance is 0.
+    Needs the factors of C_qd at q1, which the inner loop stores in `w`. With fixed steps the result is 0.
     """
     if tolerances[ESTIMATE] == 0.0:
         return 0.0
@@ -203,15 +202,15 @@ def project_prediction(f, w, tolerances, t, h, q, v, q1, v1, inner_tol):
     return code, departure(w, tolerances, h, q, v, q1) if code == DONE else 0.0
 
 
-ROUNDING = 1e-13  # relative to the largest acceleration: a smaller defect is rounding
+ROUNDING = 1e-13  # relative to the largest acceleration: a smaller defect is a rounding error
 
 
 @compiled
 def defect_ratio(tolerances, h, order, predicted, a, q, v):
-    """Return the defect |found - a| of a step h over what the tolerances allow; infinite where it is not finite.
+    """Return the defect |predicted - a| at the end of a step h, over the largest that the tolerances of q and v allow.
 
-    The defect of a series of this order grows as the highest power of the time: its integral is h / order times its
-    value at the end.
+    The result is infinite if a defect is not finite. The defect of a series of this order grows as the highest power of
+    the time: its integral is h / order times its value at the end.
     """
     rtol, share, largest, worst = tolerances[RTOL], h / order, 0.0, 0.0
     for j in range(a.size):

@@ -1,25 +1,25 @@
 """Combine two methods in one run: an explicit one, and an implicit one where stiffness would make its steps tiny.
 
-The largest rate of the motion, rho, is the root of the largest eigenvalue of dF/dq, or that of dF/dv, F being the
-accelerations. From time to time a few power iterations, one evaluation each, estimate it. While the explicit method
-takes steps of h rho well below its limit of stability, nothing is stiff. Near the limit, stiffness or accuracy may be
-the reason. Then the implicit method is tried for a window of steps, in which its errors count tenfold, and is kept if
-it costs less per second of motion.
+The largest rate of the motion, rho, is the square root of the largest eigenvalue of dF/dq, or the largest eigenvalue of
+dF/dv, where F are the accelerations. From time to time a few power iterations, of one evaluation each, estimate it. If
+h rho is well below the limit of stability of the explicit method, the motion is not stiff. Near the limit, either
+stiffness or accuracy may determine the step size h. Then the implicit method is tried for a window of steps, in which
+its errors count tenfold, and replaces the explicit one if it costs less per second of motion.
 
-A trial also begins where h rho is smaller, but
+A trial also begins at smaller h rho if
 
 - rho is far above the rates that the motion shows: a component that decays so fast may prevent longer steps through the
   error estimate;
-- all components that could move at that rate are about the tolerances: steps at the limit of stability excite them;
-- the run would cost a thousand trials.
+- all components that could move at the rate rho are about the tolerances: steps at the limit of stability excite them;
+- the run as a whole is expected to cost a thousand times as much as a trial.
 
-A trial that may be in vain waits until the run has cost a few times as much, unless the run as a whole is to cost ten
-times as much at its present rate. Costs are counted in evaluations of the explicit method; with generated code an
-evaluation of the implicit method counts several times. The implicit method is left in the same way, after a trial of
-the explicit one, if its steps are below that limit, or if a second of motion costs more than with the explicit method
-before. A method that was tried in vain is next tried after twice as many estimates.
+A trial that may be in vain waits until the run has cost a few times as much as a trial, or is expected to cost ten
+times as much. Costs are counted in evaluations of the explicit method; with generated code an evaluation of the implicit
+method counts several times. In the same way the explicit method is tried during the use of the implicit one, if h rho
+is well below the limit, or if a second of motion costs more than it did with the explicit method. A method that was
+tried in vain is tried again after twice as many estimates.
 
-Both methods are called by their addresses: their own modules compile them.
+Kernels call both methods by their addresses, so that each method is compiled in its own module.
 """
 
 import numpy as np
@@ -67,36 +67,46 @@ from twoloop.kernels.data.indices import (
 from twoloop.kernels.evaluation.inner_loop import renew_partition
 from twoloop.kernels.linalg.dense import copy
 
-# evaluations before the first estimate of the rate, and between two estimates; with generated code times COST_RATIO
-EARLY, INTERVAL = 100.0, 600.0  # an estimate takes about eight evaluations by the general code
+# number of evaluations before the first estimate of the rate, and between two estimates, which take about eight each;
+# during the explicit method these numbers are multiplied by COST_RATIO
+EARLY, INTERVAL = 100.0, 600.0
 ITERATIONS = 4  # iterations of the power method for dF/dq, and for dF/dv
-NEGLIGIBLE = 1e-3  # relative to 1 / h: a rate of decay below this needs no second iteration
-SEED = 1e-3  # relative to the largest component of a direction: start value of a component that was zero
-AT_LIMIT = 3.0  # times LIMIT: above this, the step is at the limit of stability
-MIN_COST = 64.0  # evaluations per independent coordinate before a trial with differences, which takes about eight
+NEGLIGIBLE = 1e-3  # rate of decay times step size below which a second iteration is unnecessary
+SEED = 1e-3  # new value of a zero component of a direction, relative to its largest component
+STABILITY_LIMIT = 3.0  # h rho relative to LIMIT: above this, stability limits the step of the explicit method
+# cost of the run, in evaluations per independent coordinate, before a trial whose Jacobian needs finite differences,
+# about eight evaluations per coordinate
+MIN_COST = 64.0
 TRIAL = 300.0  # approximate number of evaluations that a trial of the implicit method takes
-AFFORDED = 3.0  # number of trials whose cost the run has to exceed before a trial that may be in vain
-OF_RUN = 0.3  # relative to the expected cost of the whole run: its cost so far counts as at least this
-# times the cost of AFFORDED trials, and once more for each trial so far: then a trial begins whatever the rates are
+AFFORDED = 3.0  # cost of the run, in costs of a trial, before a trial that may be in vain
+OF_RUN = 0.3  # fraction of the expected cost of the whole run: the cost so far counts as at least this
+# cost of the run, relative to AFFORDED trials, at which a trial begins whatever the rates are; it doubles after one
+# trial, triples after two, and so on
 COST_OF_ANY_TRIAL = 100.0
-HIDDEN_RATIO = 30.0  # a rate this many times above those that the motion shows counts as hidden
-QUIET_TOLERANCES = 10.0  # tolerances of velocities: residual oscillation of a decay at the limit of stability
-HIDDEN_FROM = 0.05  # h rho relative to LIMIT: above this, damping a hidden rate may allow longer steps
+HIDDEN_RATIO = 30.0  # smallest ratio of a hidden rate to the rates that the motion shows
+# in tolerances of velocities: at its stability limit an explicit method leaves about this much oscillation of components
+# that would decay
+QUIET_FACTOR = 10.0
+HIDDEN_FROM = (
+    0.05  # h rho relative to LIMIT: above this, an implicit method that damps a hidden rate may take longer steps
+)
 INSTANT = 1e-4  # relative to 1 / rate: time step of the difference that estimates the rate of the motion
-RETURN_BELOW = 0.4  # relative to LIMIT: if h rho is below this, the explicit method is tried again
+RETURN_BELOW = 0.4  # h rho relative to LIMIT: below this, the explicit method is tried again
 # factor on the error during a trial of the implicit method, whose order is lower than that of the explicit one
 STRICT = 10.0
-MEAN = 0.8  # weight of the previous mean in the mean step
-SETTLED = 5.0  # number of accepted steps of a trial before its cost is measured
+MEAN = 0.8  # weight of the previous mean step size in the new one
+SETTLED = 5.0  # number of accepted steps of a trial before its cost is measured: the first steps are untypical
 WINDOW = 10.0  # number of accepted steps over which the cost of the method on trial is measured
 MIN_GAIN = 1.2  # ratio of costs above which the method on trial replaces the other
-PATIENCE = 4.0  # number of estimates before the next trial
+PATIENCE = 4.0  # number of estimates from a successful trial to the next one
 
-EXPLICIT, ON_TRIAL, IMPLICIT, BACK_ON_TRIAL = range(4)  # phases
+# phases: explicit method, implicit method on trial, implicit method, explicit method on trial
+EXPLICIT, ON_TRIAL, IMPLICIT, BACK_ON_TRIAL = range(4)
 
 # indices in `options`: first those of the pair, then for each method its step-size rule (see loop_state.py) and
-# REUSE_OF, then the options of each method. LIMIT: h rho above which the implicit method is tried, if N_ESTIMATES
-# successive estimates exceed it. COST_RATIO: cost of an evaluation of the second method in evaluations of the first
+# REUSE_OF, its value of REUSE, then the options of each method. LIMIT: h rho above which the implicit method is tried,
+# if N_ESTIMATES successive estimates exceed it. MATRIX_COST: cost of a Jacobian in evaluations. COST_RATIO: cost of an
+# evaluation of the second method in evaluations of the first. SIZE_1: length of the options of the first method
 LIMIT, N_ESTIMATES, MATRIX_COST, COST_RATIO, SIZE_1, N_PAIR = range(6)
 REUSE_OF, N_OF_EACH = N_RULE, N_RULE + 1
 N_OPTIONS = N_PAIR + 2 * N_OF_EACH
@@ -107,18 +117,18 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
     STEPS,  # number of accepted steps in this phase
     MAY_ESTIMATE,  # 1: the last attempt was accepted, so that the rate may be estimated
     NEXT_ESTIMATE,  # number of evaluations at which the rate is estimated again
-    ESTIMATES_TO_WAIT,  # number of estimates before the next trial
-    WAIT,
-    T_BEGIN,
-    COST_BEGIN,
-    COST_PER_SECOND,  # cost of a second of motion by the method before the trial
+    ESTIMATES_TO_WAIT,  # number of estimates that are left before the next trial
+    WAIT,  # value of ESTIMATES_TO_WAIT after the last trial
+    T_BEGIN,  # time from which costs per second are measured, s
+    COST_BEGIN,  # cost of the run at that time
+    COST_PER_SECOND,  # cost of a second of motion by the method used before the trial
     RATE,  # last estimate of the largest rate, 1 / s
-    FIRST_MEMORY,
-    H_MEAN,
+    FIRST_MEMORY,  # length of the memory of the first method
+    H_MEAN,  # mean step size, s
     HISTORY,  # history of the steps of this phase, see loop_state.py
     _HISTORY_ERROR,
-    H_TRIED,
-    ERROR_TRIED,
+    H_TRIED,  # size of the last attempted step, s
+    ERROR_TRIED,  # its error
     N_TRIALS,
     N_ABOVE_LIMIT,  # number of estimates in a row with h rho above LIMIT
     N_SCALARS,
@@ -128,14 +138,18 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
 def switching_options(
     limit: float, estimates: int, matrix_cost: float, ratio: float, each: ArrayLike, first: ArrayLike, second: ArrayLike
 ) -> NDArray[np.float64]:
-    """Return `options`: of the pair (from LIMIT on); `each`: rule and REUSE_OF of each method; their own options."""
+    """Return `options` of a pair of methods.
+
+    The first four arguments are the options from LIMIT on. `each` has the step-size rule and REUSE_OF of both methods,
+    `first` and `second` are the options of each method.
+    """
     first = np.asarray(first)  # array of numbers, or of expressions in the parameters
     scalars = [limit, float(estimates), matrix_cost, ratio, float(first.size)]
     return np.concatenate([scalars, np.asarray(each, dtype=np.float64).ravel(), first, np.asarray(second)])
 
 
 def switching_memory(n_q: int, first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
-    """Return `memory` for two methods with these memories."""
+    """Return the initial `memory` of a pair of methods with the initial memories `first` and `second`."""
     first, second = np.asarray(first), np.asarray(second)
     scalars = np.zeros(N_SCALARS)
     scalars[T_BEGIN], scalars[WAIT], scalars[FIRST_MEMORY] = np.nan, PATIENCE, first.size
@@ -163,7 +177,8 @@ def _memories(memory, n):
 def _power_iteration(f, w, t, state, direction, by_v, Q, V, A):
     """Take one step of a power iteration: return the growth of `direction` under dF/dq (with `by_v` under dF/dv).
 
-    `direction`, of the independent coordinates, becomes its image, scaled to length 1.
+    `direction` becomes its image, scaled to a largest component of 1; its components are those of the independent
+    coordinates. (Q, V, A) is scratch. Returns 0 if the image cannot be evaluated.
     """
     n = Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
@@ -207,7 +222,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
         damping = _power_iteration(f, w, t, state, by_v, True, Q, V, A)
         if damping * memory[H_MEAN] < NEGLIGIBLE:
             break
-    for m in range(n):  # zero components belong to coordinates that were dependent at all estimates so far
+    for m in range(n):  # components of coordinates that were dependent at all estimates so far are zero
         if by_q[m] == 0.0:
             by_q[m] = SEED
         if by_v[m] == 0.0:
@@ -217,7 +232,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
 
 @compiled
 def _motion_rate(f, w, t, state, rate, Q, V, A):
-    """Return the rate, 1/s, at which the motion changes its velocities or accelerations; infinite where unknown."""
+    """Return the rate, 1/s, at which velocities or accelerations change; infinite if it cannot be computed."""
     n = Q.size
     instant = INSTANT / rate
     fastest = largest = change = 0.0
@@ -237,11 +252,11 @@ def _motion_rate(f, w, t, state, rate, Q, V, A):
 
 @compiled
 def _is_quiet(w, tolerances, state, rate):
-    """Return whether all velocities would change by about the tolerances only, if they changed at this rate."""
+    """Return whether accelerations belong to motion at this rate with velocities of about the tolerances only."""
     n = w.Q.size
     for i in w.independent_v:
         v = state[n + i]
-        if abs(state[2 * n + i]) > QUIET_TOLERANCES * rate * allowed(tolerances, i, v, v):
+        if abs(state[2 * n + i]) > QUIET_FACTOR * rate * allowed(tolerances, i, v, v):
             return False
     return True
 
@@ -254,20 +269,20 @@ def _cost(w, options):
 
 @compiled
 def _cost_per_second(w, options, memory, t):
-    """Return the cost of a second of motion since the count last began, in evaluations of the first method."""
+    """Return the cost of a second of motion since T_BEGIN, in evaluations of the first method."""
     price = (_cost(w, options) - memory[COST_BEGIN]) / (t - memory[T_BEGIN])
     return price if _is_explicit(memory) else options[COST_RATIO] * price
 
 
 @compiled
 def _interval(options, memory):
-    """Return the number of evaluations until the next estimate of the rate, which itself uses the general code."""
+    """Return the number of evaluations until the next estimate: more for the explicit method, whose evaluations cost less."""
     return INTERVAL * options[COST_RATIO] if _is_explicit(memory) else INTERVAL
 
 
 @compiled
 def _begin_phase(w, options, memory, phase, t):
-    """Begin another phase: its method starts without a history of steps."""
+    """Begin another phase: its method starts without a history of step sizes and errors."""
     memory[PHASE] = phase
     memory[STEPS] = 0.0
     memory[HISTORY + ERROR_BEFORE] = 0.0
@@ -292,7 +307,7 @@ def _judge_trial(w, options, memory, t):
 
 
 @compiled
-def _choose_phase(f, w, options, memory, tolerances, t, state, new_state):
+def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
     """Estimate the rate and decide whether to try the other method; return the phase to begin, or -1."""
     n = w.Q.size
     memory[RATE] = _largest_rate(f, w, memory, t, state, new_state)
@@ -305,7 +320,7 @@ def _choose_phase(f, w, options, memory, tolerances, t, state, new_state):
         memory[N_ABOVE_LIMIT] += 1.0
     if memory[ESTIMATES_TO_WAIT] > 0.0:
         return -1
-    # a trial that may be in vain, or that needs differences, has to cost little compared with the run so far
+    # a trial that may be in vain, or that needs finite differences, has to cost little compared with the run so far
     paid, afforded = cost, AFFORDED * TRIAL * options[COST_RATIO]
     if np.isfinite(tolerances[GAP]):
         paid = max(paid, OF_RUN * tolerances[GAP] / LONGEST_UNSEEN * price)
@@ -316,10 +331,10 @@ def _choose_phase(f, w, options, memory, tolerances, t, state, new_state):
         hidden = _is_quiet(w, tolerances, state, memory[RATE])
         if not hidden:
             hidden = memory[RATE] > HIDDEN_RATIO * _motion_rate(f, w, t, state, memory[RATE], Q, V, A)
-    # explicit steps that have cost this much start a trial at any rate: near a speed at which friction reverses, few
-    # states show the rate, and the cost of a run is known only after the short steps of its start
+    # a run that has cost this much starts a trial whatever the rate is: where friction is about to reverse, few states
+    # show the largest rate, and the cost of a run is known only after the short steps of its start
     costs_enough = cheap and cost > afforded and paid > COST_OF_ANY_TRIAL * afforded * (1.0 + memory[N_TRIALS])
-    due = share > AT_LIMIT or hidden or costs_enough or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and cheap)
+    due = share > STABILITY_LIMIT or hidden or costs_enough or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and cheap)
     if cheap and share <= 1.0:  # while a trial is too expensive, N_ABOVE_LIMIT remembers that one is due
         memory[N_ABOVE_LIMIT] = 0.0
     expensive = price > MIN_GAIN * memory[COST_PER_SECOND]  # compared with the explicit method before it was left
@@ -356,9 +371,9 @@ def settle_switching(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step by the active method, with the factor of step-size control that this method would have alone.
+    """Attempt a step by the active method, whose step-size control is the same as if it were used alone.
 
-    At each change to a method its memory is cleared.
+    When the other method becomes active, its memory is cleared.
     """
     n = w.Q.size
     first, second = _memories(memory, n)
@@ -370,7 +385,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if memory[PHASE] == ON_TRIAL or memory[PHASE] == BACK_ON_TRIAL:
             phase = _judge_trial(w, options, memory, t)
         elif w.counters[N_EVALUATIONS] >= memory[NEXT_ESTIMATE]:
-            phase = _choose_phase(f, w, options, memory, tolerances, t, state, new_state)
+            phase = _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state)
         if phase >= 0:
             was_explicit = _is_explicit(memory)
             _begin_phase(w, options, memory, phase, t)
@@ -390,7 +405,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
             w.notes[EXPLICIT_STEP] = 0.0
             code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     else:
-        # only the first method may take steps longer than GAP: it evaluates within them, or has closely spaced stages
+        # only the first method may take steps longer than GAP: it also evaluates the equations between their ends
         longer = gap_ratio(tolerances, h)
         if longer > 0.0:
             return Attempt(DONE, longer, 1.0 / longer)
