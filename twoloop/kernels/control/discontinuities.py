@@ -396,9 +396,7 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
     clock[at.SAMPLES_MOTION] = 0.0
     # if the last samples in time found a change, the next samples in time begin there, with their own spacing
     known = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t
-    if not known and way <= N_SAMPLES * min(
-        control[at.APART], size / N_IN_STEP
-    ):  # as closely spaced as samples in time
+    if not known and way <= N_SAMPLES * min(control[at.APART], size / N_IN_STEP):  # spacing as of samples in time alone
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], way / N_SAMPLES)
         if clock[at.MOTION_SAMPLED_TO] > clock[at.SAMPLED_TO]:
             clock[at.SAMPLED_TO], clock[at.SAMPLED_EVERY] = clock[at.MOTION_SAMPLED_TO], way / N_SAMPLES

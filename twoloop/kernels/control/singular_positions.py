@@ -37,9 +37,7 @@ CHECK_INTERVAL = 16  # accepted steps from one check of the partition to the nex
 # with k times this number of freedoms, a partition is checked every k + 1 steps, because T is a full matrix
 FREEDOMS_PER_CHECK = 32
 N_CHECKED = 8  # number of parts of an accepted step at whose ends the smallest pivot of C_q is computed
-CHECKED_BELOW = (
-    0.5  # pivot relative to its largest value so far: steps that begin or end with a smaller one are checked
-)
+CHECKED_BELOW = 0.5  # pivot over its largest value so far: steps that begin or end with a smaller one are checked
 # pivot relative to its largest change between these samples: a smaller one passes zero within the step
 PASSED_SHARE = 0.6
 # numbers in near_share: lower and upper bound of the result, rounding errors relative to tolerances, unit roundoff

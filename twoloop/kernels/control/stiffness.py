@@ -14,10 +14,10 @@ A trial also begins at smaller h rho if
 - the run as a whole is expected to cost a thousand times as much as a trial.
 
 A trial that may be in vain waits until the run has cost a few times as much as a trial, or is expected to cost ten
-times as much. Costs are counted in evaluations of the explicit method; with generated code an evaluation of the implicit
-method counts several times. In the same way the explicit method is tried during the use of the implicit one, if h rho
-is well below the limit, or if a second of motion costs more than it did with the explicit method. A method that was
-tried in vain is tried again after twice as many estimates.
+times as much. Costs are counted in evaluations of the explicit method; with generated code, an evaluation of the
+implicit method counts several times. In the same way the explicit method is tried again if h rho is well below the
+limit, or if a second of motion costs more than it did with the explicit method. A method that was tried in vain is
+tried again after twice as many estimates.
 
 Kernels call both methods by their addresses, so that each method is compiled in its own module.
 """
@@ -84,12 +84,10 @@ OF_RUN = 0.3  # fraction of the expected cost of the whole run: the cost so far 
 # trial, triples after two, and so on
 COST_OF_ANY_TRIAL = 100.0
 HIDDEN_RATIO = 30.0  # smallest ratio of a hidden rate to the rates that the motion shows
-# in tolerances of velocities: at its stability limit an explicit method leaves about this much oscillation of components
-# that would decay
+# in tolerances of velocities: at its stability limit an explicit method leaves about this much oscillation of decaying
+# components
 QUIET_FACTOR = 10.0
-HIDDEN_FROM = (
-    0.05  # h rho relative to LIMIT: above this, an implicit method that damps a hidden rate may take longer steps
-)
+HIDDEN_FROM = 0.05  # h rho relative to LIMIT: above this, damping a hidden rate may allow longer steps
 INSTANT = 1e-4  # relative to 1 / rate: time step of the difference that estimates the rate of the motion
 RETURN_BELOW = 0.4  # h rho relative to LIMIT: below this, the explicit method is tried again
 # factor on the error during a trial of the implicit method, whose order is lower than that of the explicit one
@@ -276,7 +274,7 @@ def _cost_per_second(w, options, memory, t):
 
 @compiled
 def _interval(options, memory):
-    """Return the number of evaluations until the next estimate: more for the explicit method, whose evaluations cost less."""
+    """Return the number of evaluations until the next estimate of the rate: the more, the less one costs."""
     return INTERVAL * options[COST_RATIO] if _is_explicit(memory) else INTERVAL
 
 
