@@ -144,7 +144,7 @@ def _sparse_column_scales(jacobian: SparseRows, typical: Array) -> Array:
 
 def scales_of(system: ConstrainedSystem, t: float, q: Array, jacobian: Array) -> Scales:
     """Return the scales at a position, from C_q there and nearby; from C_q and A, if `jacobian` has both."""
-    from twoloop.kernels.evaluation.checks import NEGLIGIBLE, row_reaches
+    from twoloop.kernels.evaluation.checks import NEGLIGIBLE, linear_ranges
 
     size, columns = np.abs(q), units(system, t, q, jacobian, typical_sizes(q))
     in_units = np.abs(jacobian) * columns
@@ -155,7 +155,7 @@ def scales_of(system: ConstrainedSystem, t: float, q: Array, jacobian: Array) ->
     radius = lengths / np.maximum(curvature, 1e-300 * np.maximum(lengths, 1.0))
     in_units = np.ascontiguousarray((jacobian != 0.0) * (size / columns))
     reach, negligible = np.ones(len(rows)), NEGLIGIBLE * float(in_units.max(initial=0.0))
-    entry_point(row_reaches)(in_units, radius, negligible, np.zeros(len(q)), reach)
+    entry_point(linear_ranges)(in_units, radius, negligible, np.zeros(len(q)), reach)
     return Scales(columns, rows, reach)
 
 

@@ -274,7 +274,7 @@ def _cost_per_second(w, options, memory, t):
 
 @compiled
 def _interval(options, memory):
-    """Return the number of evaluations until the next estimate of the rate: the more, the less one costs."""
+    """Return the number of evaluations, until the next estimate, that cost as much as INTERVAL general ones."""
     return INTERVAL * options[COST_RATIO] if _is_explicit(memory) else INTERVAL
 
 

@@ -1,7 +1,7 @@
 """Shared definitions of kernels: types, compiling decorators, the workspace, the table of callbacks, tolerances.
 
-Every callback of a mechanism has one fixed signature and works in place. The integrator is compiled once, and takes any
-mechanism and any method as first-class functions.
+Each kind of callback has a fixed signature, and writes its results into an argument. So the integrator is compiled
+once, and receives the functions of any mechanism and any method as arguments.
 """
 
 import hashlib
@@ -28,8 +28,8 @@ i8 = types.int64
 INTEGERS = types.int64[::1]
 PLACES = types.int32[::1]  # type of long programs: 32-bit integers, so that they fit in the cache
 
-# Programs that replace missing callbacks (evaluation/operations.py), and those of the sparse elimination of large
-# systems and of their Newton matrices (linalg/symbolic_factorization.py); of size 0 if there is none
+# programs that replace missing callbacks (evaluation/operations.py), and programs of the sparse elimination of large
+# systems and of their Newton matrices (linalg/symbolic_factorization.py); a missing program has size 0
 PROGRAMS = (
     "jacobian_program",
     "jacobian_numbers",
@@ -52,64 +52,64 @@ class Work(NamedTuple):
     M: Any  # (n_q, n_q) mass matrix
     L: Any  # (n_q, n_q) inverse of a constant M, else the factors of M, dense (see ldl_factor) or banded
     G: Any  # (n_c + n_a + 1, n_q) C_q and A at the last position, and a row of zeros
-    entries: Any  # the same numbers as `G`, as a vector
-    augmented: Any  # the numbers of `G`, followed by those of M
+    entries: Any  # view of `G` as a vector
+    augmented: Any  # the numbers of `G`, followed by those of `M`
     S: Any  # (r_v, r_v) G M^-1 G^T of the independent rows, and its factors
     W: Any  # (r_v, n_q) rows G M^-1 of the independent rows
     A: Any  # (n_dof, n_dof) T^T M T and its factors; empty where S is used
     MT: Any  # (n_q, n_dof) M T
     D: Any  # (n_dof + 1, r_v) rows of -(G_d^-1 G_i)^T, and the dependent velocities at v_i = 0; in elimination order
-    Gx: Any  # (n_c + n_a, n_q) rows at a displaced point (Q_d by differences); scratch for full pivoting
+    Gx: Any  # (n_c + n_a, n_q) C_q and A at a displaced position (for Gamma by differences); scratch for full pivoting
     G_of_S: Any  # (n_c + n_a, n_q) the G from which S and W were computed, if M is constant and not diagonal; NaN: none
-    pattern: Any  # (n_c + n_a, n_q) 1 where G has had a nonzero entry
-    mass_pattern: Any  # (n_q, n_q) 1 where M has had a nonzero entry; empty without the augmented form
+    pattern: Any  # (n_c + n_a, n_q) 1 where G has had a nonzero entry, else 0
+    mass_pattern: Any  # (n_q, n_q) 1 where M has had a nonzero entry, else 0; empty without the augmented form
     places: Any  # index of the first entry of each row of G (n_c + n_a + 1), then the columns of the entries
-    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences: over twice the length, and over the length tried before
+    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences: over twice the present length, and over the length before
     rates: Any  # (13, n_c + n_a) C_t and b at times within a step, see discontinuities.py
     changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces, C_t and b ahead, see discontinuities.py
     Q: Any  # (n_q) force
     x: Any  # (n_q) scratch
     y: Any  # (n_q) scratch
-    C: Any  # (n_c) constraint, and corrections
+    C: Any  # (n_c) C(t, q); scratch for corrections
     Rate: Any  # (n_c + n_a) C_t and b
     Gamma: Any  # (n_c + n_a) right-hand side of G a = Gamma
     g: Any  # (n_c + n_a) scratch
     z: Any  # (r_v) scratch
-    lam: Any  # (n_c + n_a) multipliers of an evaluation that is not kept
-    minimum: Any  # memory for the multipliers of least norm
-    rows: Any  # (r) independent rows of C
-    dependent: Any  # (r) columns of the coordinates that they determine
+    lam: Any  # (n_c + n_a) scratch for multipliers that the caller does not need
+    minimum: Any  # scratch for the multipliers of least norm, see saddle_point.py
+    rows: Any  # (r) indices of the independent rows of C_q
+    dependent: Any  # (r) columns of the coordinates that these rows determine
     independent: Any  # (n_q - r) columns of the independent coordinates
     index: Any  # program of the factors of C_qd, see markowitz_lu.py
     values: Any  # the factors of C_qd
-    rows_v: Any  # (r_v) independent rows of G
-    dependent_v: Any  # (r_v)
-    independent_v: Any  # (n_dof)
-    index_v: Any
-    values_v: Any
-    index_a: Any  # program and factors of the augmented matrix; size 0: none yet. Empty without this form
-    values_a: Any
+    rows_v: Any  # (r_v) indices of the independent rows of G
+    dependent_v: Any  # (r_v) columns of the velocities that these rows determine
+    independent_v: Any  # (n_dof) columns of the independent velocities
+    index_v: Any  # program of the factors of G_d
+    values_v: Any  # the factors of G_d
+    index_a: Any  # program of the factors of the augmented matrix; its SIZE is 0 if there is none yet
+    values_a: Any  # the factors of the augmented matrix; empty without this form
     right: Any  # (2 (n_q + r_v)) right-hand side of the augmented matrix, and scratch
     order: Any  # (n_q) scratch: column order of the full pivoting
     row_order: Any  # (n_c + n_a) scratch: row order of the full pivoting
     counters: Any  # (N_COUNTERS) see indices.py
     lapack: Any  # addresses of band.ROUTINES; 0 where linear algebra is dense
-    predicted: Any  # (r) dependent positions that the integration formula gives, before the constraints restore them
+    predicted: Any  # (r) dependent positions predicted by the integration formula, before they are projected
     notes: Any  # (N_NOTES) see indices.py
-    nodes: Any  # results of the operations of a program
+    nodes: Any  # results of the operations of a traced program
     matrices: Any  # matrices of Newton's method, see steps/stages.py and steps/newton_systems.py
-    # fields of the static form, empty in other forms, as are fields of other forms in this one; N is n_q + n_c
+    # fields of the static form, empty in other forms, just as their fields are empty in this one; N is n_q + n_c
     mass_values: Any  # entries of M, see linalg/symbolic_factorization.py
     jacobian_values: Any  # entries of G
     counts: Any  # (n_c) 1 for independent rows, else 0
-    factors: Any
-    pivot_sizes: Any  # (N)
+    factors: Any  # numbers of the factors, in the slots of the program
+    pivot_sizes: Any  # (N) scratch: sizes of the rows, to which pivots are compared
     unknowns: Any  # (N) right-hand side and solution
     solutions: Any  # (3 N) scratch, and (n_c) the stiffening of M along rows, see linalg/sparse_ldl.py
 
-    sizes: Any = None  # arguments of `empty` that allocated it
-    address: Any = 0  # address of the table by which kernels find these arrays
-    table: Any = None
+    sizes: Any = None  # the Sizes of layout.py for which the arrays are allocated
+    address: Any = 0  # address of `table`
+    table: Any = None  # addresses and shapes of these arrays, for kernels
 
 
 _INTEGER_FIELDS = {
@@ -135,10 +135,10 @@ class Attempt(NamedTuple):
     """Result of an attempted step: its code, its error and the factor of the next step.
 
     code : DONE, or the reason why the step failed.
-    error : over the tolerances; up to 1 the step is accepted. If a step is longer than the method allows, it is not
-        taken, and the error is the ratio of the two lengths.
-    factor : ratio of the next step size to this one; 0: the controller chooses it from the error. Above 1 after an
-        error above 1: the step size was a guess, and the step was not taken, because a longer one will do.
+    error : error in tolerances: the step is accepted up to 1. If a step is longer than the method allows, it is not
+        computed, and `error` is the ratio of its length to the allowed one.
+    factor : ratio of the next step size to this one; 0: the controller computes it from the error. If both factor and
+        error exceed 1, the step size was a guess: the step was not completed, and a longer one is to be tried.
     """
 
     code: int
@@ -147,9 +147,9 @@ class Attempt(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Compiled functions of a step: `attempt` takes it, `settle` commits or discards it in the method's memory.
+    """Compiled functions of a step: `attempt` computes it, `settle` commits or discards it in the method's memory.
 
-    `many` takes several steps in one call, for methods that can.
+    `many` computes several steps in one call; None if the method cannot.
     """
 
     attempt: Any = None
@@ -178,22 +178,23 @@ for _name in ("attempt", "attempt_first", "attempt_second"):
 SETTLE = types.void(KIT, WORK, VECTOR, VECTOR, VECTOR, types.boolean)
 for _name in ("settle", "settle_first", "settle_second"):
     KIT.add_function(_name, SETTLE)
-# (kit, work, options, memory, tolerances, control, clock, goal, state, new_state, times, states, steps) -> how many
+# (kit, work, options, memory, tolerances, control, clock, goal, state, new_state, times, states, steps)
+# -> number of steps taken
 MANY = i8(KIT, WORK, *[VECTOR] * 5, f8, *[VECTOR] * 3, MATRIX, MATRIX)
 KIT.add_function("attempt_many", MANY)
 
-# Functions generated for a mechanism, see generate/elimination.py and collocation_code.py. Those that return a flag
-# say whether their conditions hold, and fill their arrays only then
+# functions generated for a mechanism, see generate/elimination.py and collocation_code.py. A boolean result tells
+# whether the conditions of the generated code are satisfied; only then are the results written
 OWN_FUNCTIONS = {
-    # arguments (t, q, v, numbers, ...); results: accelerations; corrected positions and the correction x; these with
-    # velocities, accelerations and multipliers; accelerations if redundant rows hold, too
+    # arguments (t, q, v, numbers), then arrays for the results: accelerations; corrected positions and the correction;
+    # corrected positions, velocities, accelerations and multipliers; accelerations that satisfy redundant rows, too
     "own_accelerate": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
     "own_correct_positions": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR),
     "own_project": types.boolean(f8, *[VECTOR] * 8),
     "own_redundant": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
-    # functions of collocation, on a memory that data/collocation.py describes. attempt_nodes (room, state, tolerances,
-    # numbers) returns how the iteration ended; audit_nodes (room, state, numbers) the defect between nodes; then
-    # (room, state); (room, state, new_state); (room, numbers)
+    # functions of collocation; their first argument is the memory described in data/collocation.py. attempt_nodes
+    # (memory, state, tolerances, numbers) returns how the iteration ended, audit_nodes (memory, state, numbers) the
+    # defect between nodes. The others have (memory, state), (memory, state, new_state), and twice (memory, numbers)
     "attempt_nodes": f8(*[VECTOR] * 4),
     "audit_nodes": f8(*[VECTOR] * 3),
     "retry_nodes": types.none(*[VECTOR] * 2),
@@ -220,20 +221,20 @@ def _text(module: str) -> str:
 def _imports(text: str) -> set[str]:
     """Return the names of the kernels' modules that a source imports, such as "steps.stages"."""
     names = set()
-    for room, several, one in re.findall(
+    for folder, several, single in re.findall(
         r"^from twoloop\.kernels([\w.]*) import (?:\(([^)]*)\)|(.+))$", text, re.MULTILINE
     ):
-        if _path(room[1:]).exists():
-            names.add(room[1:])
+        if _path(folder[1:]).exists():
+            names.add(folder[1:])
         else:
-            modules = (name.split(" as ")[0].strip() for name in (several or one).split(","))
-            names |= {f"{room}.{module}"[1:] for module in modules if module}
+            modules = (name.split(" as ")[0].strip() for name in (several or single).split(","))
+            names |= {f"{folder}.{module}"[1:] for module in modules if module}
     return names
 
 
 @cache
 def stamp(module: str) -> str:
-    """Return a digest of what the kernels of a module, such as "steps.stages", depend on: sources and callbacks."""
+    """Return a digest of all sources and callback signatures on which a module, such as "steps.stages", depends."""
     known: set[str] = set()
     pending = {module}
     while pending:
@@ -246,7 +247,7 @@ def stamp(module: str) -> str:
 
 
 def _module(function: Callable[..., Any]) -> str:
-    """Return the module of a kernel, such as "steps.stages"."""
+    """Return the name of the module of a kernel, such as "steps.stages"."""
     path = Path(inspect.getfile(function)).with_suffix("")
     return ".".join(path.relative_to(_FOLDER).parts) if path.is_relative_to(_FOLDER) else path.stem
 
@@ -270,8 +271,9 @@ def kernel(signature: Any, vectorized: bool = False) -> Callable[[Callable[..., 
     return compile_now
 
 
-# NaN and infinity keep their meaning. `_nrt`: without numba's runtime, code that allocates arrays does not compile, and
-# there are no reference counts, which would take a third of the time of an evaluation of the four-bar
+# fastmath without "nnan" and "ninf", so that NaN and infinity are respected. `_nrt`: without numba's runtime, code that
+# allocates arrays does not compile, and there are no reference counts, which would take a third of the time of an
+# evaluation of the four-bar
 OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "fastmath": {"contract", "reassoc", "nsz", "arcp"},
@@ -286,8 +288,8 @@ def _helper(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
     return njit(**{**OPTIONS, **wrappers, "pipeline_class": HelperCompiler, **options})
 
 
-# Flags are given explicitly because a callee inherits those of its caller: all that a merged helper calls would be
-# merged, too. `exact` keeps the order of floating-point operations
+# forceinline is always set explicitly, because a callee inherits the flags of its caller: all helpers that a merged
+# helper calls would be merged, too. `exact` keeps the order of floating-point operations
 exact = _helper(fastmath=False, forceinline=False)
 compiled = _helper(forceinline=False)  # compiled as one copy, unless LLVM finds it short enough to inline
 inlined = _helper(inline="always")  # inlined by numba; only such a helper can return views of arrays
@@ -299,12 +301,13 @@ NONE = np.zeros(0)
 
 
 class Kit:
-    """Data of a system and a method that kernels get by one reference: callbacks, inner loop and step.
+    """Functions and data of a system and a method, passed to kernels as one reference.
 
-    Inner loop and step are compiled once, and not again in each caller; None: never called. A step that chooses between
-    two steps has these as `first` and `second`. `own` are sets of functions generated for the mechanism: an inner loop
-    that calls them leaves other tasks to `general`. `numbers` are the data of these functions, `own_numbers` those of
-    the collocation functions.
+    `functions` are the callbacks, `inner` is the inner loop, and `step` the step; None: never called. Kernels call the
+    inner loop and the step by their addresses, and do not compile them again. A step that switches between two steps
+    calls them as `first` and `second`. `own` are sets of functions generated for the mechanism: an inner loop that
+    calls them leaves other tasks to the inner loop `general`. `numbers` are the data of these functions, and
+    `own_numbers` those of the collocation functions.
     """
 
     def __init__(
@@ -341,6 +344,7 @@ def _type_of_kit(value: Any, context: Any) -> Any:
     return KIT
 
 
+# indices of callbacks in Functions, for FAULT_KIND
 MASS, FORCE, CONSTRAINT, JACOBIAN, RATE, GAMMA = (
     Functions._fields.index(kind) for kind in ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")
 )
@@ -351,7 +355,7 @@ NONHOLONOMIC, NONHOLONOMIC_RATE, NONHOLONOMIC_GAMMA = (
 
 @compiled
 def finite_vector(x):
-    """Return whether all entries are finite."""
+    """Return whether all entries of a vector are finite."""
     all_finite = True
     for j in range(x.size):
         all_finite = all_finite and np.isfinite(x[j])
@@ -369,7 +373,7 @@ def finite(A):
 
 @compiled
 def not_finite(notes, kind, t, q):
-    """Record which callback gave a value that is not finite, for the message; none if q itself is not finite."""
+    """Record for the message which callback returned a value that is not finite (-1 if q is not); return NOT_FINITE."""
     notes[FAULT_KIND] = kind if finite_vector(q) else -1.0
     notes[FAULT_TIME] = t
     return NOT_FINITE
@@ -377,7 +381,7 @@ def not_finite(notes, kind, t, q):
 
 @compiled
 def faulty_callback(w):
-    """Return the index in Functions of the callback that made an acceleration not finite; -1: unknown."""
+    """Return the index in Functions of the callback because of which an acceleration is not finite; -1: unknown."""
     n_c = w.C.size
     if not finite_vector(w.Rate[:n_c]):
         return RATE
@@ -409,7 +413,7 @@ def is_beyond_gap(tolerances, h):
 
 @merged
 def gap_ratio(tolerances, h):
-    """Return the ratio of a step to GAP; 0 if it is at most 1, or if the step size is fixed."""
+    """Return the ratio of a step size to GAP; 0 if the ratio is at most 1, or if the step size is fixed."""
     if tolerances[ESTIMATE] == 1.0 and is_beyond_gap(tolerances, h):
         return h / tolerances[GAP]
     return 0.0

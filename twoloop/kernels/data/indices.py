@@ -1,7 +1,7 @@
 """Indices into the arrays that kernels share, and the codes that they return.
 
-Kernels keep their state in arrays of numbers, because compiled code passes these by reference. Each group below names
-the indices of one array; those that only the loop over steps reads are in control/loop_state.py.
+Kernels keep their state in arrays of numbers, because compiled code passes arrays by reference. Each group below names
+the indices of one array; control/loop_state.py has the indices that only the loop over steps uses.
 """
 
 from twoloop.kernels.compile.callbacks import OPTIONAL
@@ -20,7 +20,7 @@ from twoloop.kernels.compile.callbacks import OPTIONAL
     NEEDS_DENSE,  # the sparse form cannot decide whether rows are independent
     NOT_LOADED,  # the caller has to load the machine code of the step
     UNSUITED,  # the method does not suit the motion here: the caller continues with another one
-    STOPPED,  # time_limit is over, see Work.notes
+    STOPPED,  # the time limit has passed, see TIME_IS_UP
 ) = range(13)
 
 # Functions.flags: whole numbers that describe a system to kernels. BANDWIDTH is -1 if linear algebra is not banded.
@@ -28,7 +28,7 @@ from twoloop.kernels.compile.callbacks import OPTIONAL
 # sparse factors have too many entries. STRAIGHT is 1 if the inner loop is code generated for the mechanism
 CONSTANT_MASS, DIAGONAL_MASS, BANDWIDTH, FORM, DENSE_FORM, STRAIGHT, FIRST_GIVEN = range(7)
 MULTIPLIERS, NULL_SPACE, AUGMENTED, STATIC = range(4)  # values of FORM; for STATIC see sparse_inner_loop.py
-GIVEN = {name: place for place, name in enumerate(OPTIONAL, FIRST_GIVEN)}  # whether an optional callback is given
+GIVEN = {name: index for index, name in enumerate(OPTIONAL, FIRST_GIVEN)}  # flags: 1 if an optional callback is given
 N_FLAGS = FIRST_GIVEN + len(GIVEN)
 CONSTRAINT_RATE_GIVEN, GAMMA_GIVEN, FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, KINEMATICS_GIVEN = (
     GIVEN[name] for name in ("constraint_rate", "gamma", "force_by_q", "force_by_v", "reaction_by_q", "kinematics")
@@ -55,37 +55,37 @@ MASS_VALUES_GIVEN, JACOBIAN_VALUES_GIVEN = (GIVEN[name] for name in ("mass_value
 # Work.notes: values that one kernel stores for another
 (
     SENSITIVITY,  # max|Cqd^-1 Cqi| after the first step under this partition; 0: not known yet
-    ORIENTATION,  # sign of det C_qd at the last accepted state under this partition; 0: not known
-    ORIENTATION_NEW,  # ... and at the end of this attempt
-    FAULT_KIND,  # index in Functions of the callback that gave a value that is not finite; -1: none known
+    ORIENTATION,  # sign of det C_qd at the last accepted state under this partition; 0: not known yet
+    ORIENTATION_NEW,  # sign of det C_qd at the end of the attempted step; 0: not known yet
+    FAULT_KIND,  # index in Functions of the callback that returned a value that is not finite; -1: none known
     FAULT_TIME,  # time of that evaluation
-    GAMMA_REQUIRED,  # required relative accuracy of Q_d by differences, see evaluation/constraints.py
-    GAMMA_SHARE,  # length of the differences, as a share of the longest one
-    GAMMA_ACCURACY,  # accuracy that was reached when that share was chosen
-    GAMMA_SCALE,  # largest entry of Q_d so far
-    REUSE,  # correction of a position below which the Jacobian before it still serves for velocities and accelerations
-    ROUNDED,  # the same limit at a state that may be accepted: rounding of the positions
+    GAMMA_REQUIRED,  # required relative accuracy of Gamma by differences, see evaluation/constraints.py
+    GAMMA_SHARE,  # length of the differences over longest_difference
+    GAMMA_ACCURACY,  # relative accuracy of Gamma when GAMMA_SHARE was chosen
+    GAMMA_SCALE,  # largest entry of Gamma so far
+    REUSE,  # largest last correction of a position after which the factors of C_qd are not computed again
+    ROUNDED,  # value of REUSE at states that may be accepted: rounding of the positions
     GENERATION,  # number of partitions so far
-    RANK,  # rank of C_q, if it differs from the rank of the workspace
-    RANK_V,  # rank of C_q and A, likewise
-    CONTRADICTION,  # index of a row that was taken for redundant but is violated
+    RANK,  # rank of C_q, if it differs from the rank for which the workspace is allocated
+    RANK_V,  # rank of C_q and A together, if it differs from the rank for which the workspace is allocated
+    CONTRADICTION,  # index of a row that was considered redundant but is violated
     PIVOT,  # smallest pivot of the last full pivoting, rows scaled to 1: small near a singular position
-    NEARLY_SINGULAR,  # 1: the run has come near a singular position, or does not watch for one
-    NEAR_NOW,  # 1: a singular position was near at the last check; 2: near one a step skipped the check of its defect
-    MASS_SCALE,  # s of the augmented matrix, see linalg/saddle_point.py
+    NEARLY_SINGULAR,  # 1: the run has come near a singular position, or does not check for one
+    NEAR_NOW,  # 1: a singular position was near at the last check; 2: near it, a step did not check its defect
+    MASS_SCALE,  # factor on M in the augmented matrix, see linalg/saddle_point.py
     FACTORED,  # 1: the factors of the linear problem belong to w.M and w.G
     KNOWN,  # 1: w.Rate and w.Gamma[:n_c] belong to the state, computed by the fused callback
-    BY_GENERAL,  # 1: generated code left the last state to the general inner loop
+    BY_GENERAL,  # 1: the general inner loop computed the last state in place of the generated code
     EXPLICIT_STEP,  # 1: a method that switches took an explicit step
-    DEFECT,  # largest defect of this attempt over what the tolerances allow; -1: none was evaluated
+    DEFECT,  # largest defect of the attempted step over what the tolerances allow; -1: not evaluated
     LARGEST_DEFECT,  # largest defect of the accepted steps
     UNCHECKED,  # number of accepted steps for which no defect was evaluated
     WIDEST_GAP,  # s, the longest time between two evaluations within accepted steps
-    KINK_BEFORE,  # times of the last and the next jump of C_t or b that are known
-    KINK_AFTER,
+    KINK_BEFORE,  # time of the last known jump of C_t or b
+    KINK_AFTER,  # time of the next known jump of C_t or b
     LEANING,  # largest coefficient of an independent row in a redundant one, when this partition was chosen
-    SMALLEST,  # sparse form: least pivot of a row over its size, the squared sine of its angle to the others
-    TIME_IS_UP,  # 1: evaluations of stages return STOPPED; another thread sets it during a chunk of steps
+    SMALLEST,  # static form: smallest pivot of a row over its size, the squared sine of its angle to the other rows
+    TIME_IS_UP,  # 1: evaluations of stages return STOPPED; another thread sets it while steps are computed
     N_NOTES,
 ) = range(33)
 
@@ -95,21 +95,22 @@ MASS_VALUES_GIVEN, JACOBIAN_VALUES_GIVEN = (GIVEN[name] for name in ("mass_value
     ESTIMATE,  # 0 for a fixed step, else 1
     LEAST,  # the smallest tolerance
     GAP,  # s, the longest time between two evaluations of the equations
-    LOOK,  # s, the same for steps that evaluate their defect between nodes
+    LOOK,  # s, the longest time between two evaluations in steps that evaluate their defect between nodes
     ATOL,  # from this index on: the absolute tolerance of each coordinate and of its velocity
 ) = range(6)
-LONGEST_UNSEEN = 0.01  # GAP over the length of the run
-UNTRUE = 30.0  # times the tolerances: larger errors of velocities next to a singular position are reported
+LONGEST_UNSEEN = 0.01  # GAP over the duration of the run
+UNTRUE = 30.0  # in tolerances: larger errors of velocities next to a singular position are reported
 
-# kinds of intervals between accepted states, for dense output: which values of the states the polynomials take
+# kinds of intervals between accepted states, for dense output: which values of the states the polynomials interpolate
 WINDOW = 4  # number of states that a polynomial goes through
 (
     APART,  # q and v in one polynomial, v and a in another: errors of q and v are independent, and steps are small
-    VELOCITIES,  # q and v in one polynomial and its derivative: a holds the noise of stiff modes
+    VELOCITIES,  # q and v in one polynomial and its derivative: a contains the noise of stiff modes
     ACCELERATIONS,  # q, v and a in one polynomial and its derivatives
-    ACROSS,  # as ACCELERATIONS, for a step across a singular position
+    ACROSS,  # the same as ACCELERATIONS, for a step across a singular position
     JUMP,  # no polynomial: velocities jump within a few spacings of floating-point numbers
 ) = range(5)
-# columns of the table of intervals; a row is for all output times within one interval. No polynomial extends beyond
-# the rows LOW and HIGH, at which velocities jump
+# columns of the table of intervals, a row of which describes one interval with output times: FIRST_OWN and LAST_OWN are
+# the states at its ends, FIRST_TIME and END_TIME the first output time within it and the end of these times. No
+# polynomial extends beyond the states LOW and HIGH, at which velocities jump
 FIRST_OWN, LAST_OWN, KIND, FIRST_TIME, END_TIME, LOW, HIGH, N_COLUMNS = range(8)

@@ -1,10 +1,11 @@
 """Compiled parts of the checks of a start: evaluation of all callbacks, checks of the rows, and units of coordinates.
 
-If the evaluation finds nothing wrong, no other check needs to run. In units of rows and of coordinates the entries of a
-matrix are of similar size; the reach of a row says how far coordinates can move until it changes (checks/scales.py).
+If the evaluation finds nothing wrong, no other check needs to run. Units of rows and of coordinates are such that the
+entries of C_q have similar sizes in them. The linear range of a row is the distance over which coordinates can move
+before the row changes much (checks/scales.py).
 
-Callbacks are also compared with their traces, see generate/traced_values.py. Each traced number has a bound of its
-rounding error, in units of EPS, which is at least the sum of the sizes of its terms.
+Callbacks are also compared with their traces, see generate/traced_values.py. With each traced number a bound of its
+rounding error is computed, in units of EPS: at least the sum of the absolute values of its terms.
 """
 
 import math
@@ -26,8 +27,8 @@ from twoloop.kernels.evaluation.operations import operation
 from twoloop.kernels.linalg.dense import largest_of, ldl_factor
 
 NO_ENTRY = 1e-12  # relative to the largest entry of a row: smaller entries are rounding errors
-MAX_SWEEPS = 20  # largest number of sweeps of the alternating least squares
-NEGLIGIBLE = 1e-6  # relative to the largest coordinate: smaller ones are zero up to rounding and give no size
+MAX_SWEEPS = 20  # largest number of sweeps of the alternating least squares, in column_units
+NEGLIGIBLE = 1e-6  # relative to the largest coordinate: smaller coordinates count as zero, and are no measure of size
 
 
 @exact
@@ -41,8 +42,8 @@ def _sort(values):
 
 
 @exact
-def _columns_from(rows, columns, counts, logs):
-    """Fit units of the columns to norms of the rows; return whether they are unchanged."""
+def _fit_columns(rows, columns, counts, logs):
+    """Compute the logarithms of the units of columns that best fit those of the rows; return whether none changed."""
     same = True
     for j in range(columns.size):
         total, n = 0.0, 0
@@ -57,7 +58,8 @@ def _columns_from(rows, columns, counts, logs):
 
 
 @exact
-def _rows_from(columns, rows, counts, logs):
+def _fit_rows(columns, rows, counts, logs):
+    """Compute the logarithms of the units of rows that best fit those of the columns."""
     for i in range(rows.size):
         total, n = 0.0, 0
         for j in range(columns.size):
@@ -71,9 +73,9 @@ def _rows_from(columns, rows, counts, logs):
 def column_units(matrix, typical, columns, counts, logs, rows, room):
     """Estimate the units of the coordinates from a constraint Jacobian, so that lengths and angles can be compared.
 
-    |entry (i, j)| is about unit of row i / unit of coordinate j: log|entry| + log column - log row has least squares.
-    One factor is left free: the median unit is that of `typical`. Coordinates without entries get their typical units.
-    The results are in `columns`; the other arrays are scratch.
+    |entry (i, j)| is about unit of row i / unit of coordinate j: the sum of squares of log|entry| + log(unit of j) -
+    log(unit of i) is least. The free common factor follows from the units `typical`: the median ratio to them is 1.
+    Coordinates without entries get their typical units. `columns` becomes the result; the last four arrays are scratch.
     """
     n_used, shift = 0, 0.0
     for i in range(rows.size):
@@ -84,8 +86,8 @@ def column_units(matrix, typical, columns, counts, logs, rows, room):
     for j in range(columns.size):
         columns[j] = 0.0
     for _ in range(MAX_SWEEPS):
-        _rows_from(columns, rows, counts, logs)
-        if _columns_from(rows, columns, counts, logs):
+        _fit_rows(columns, rows, counts, logs)
+        if _fit_columns(rows, columns, counts, logs):
             break
     for j in range(columns.size):
         used = False
@@ -104,37 +106,39 @@ def column_units(matrix, typical, columns, counts, logs, rows, room):
 
 
 @kernel(types.void(MATRIX, VECTOR, f8, VECTOR, VECTOR))
-def row_reaches(in_units, radius, negligible, room, reach):
-    """Compute the reach of each row: its radius, or the values of its coordinates if these are smaller.
+def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
+    """Compute the linear range of each row: the radius if this is at most 1, or at most the largest coordinate.
 
-    Of the values the lower median is taken, so that an offset has no effect; negligible values are left out.
+    Otherwise it is the lower median of the coordinates that are not negligible, which an offset does not affect; or 1
+    if all are negligible. `coordinates_in_units`: coordinates of each row, 0 where the row is 0.
     """
-    for i in range(reach.size):
+    for i in range(ranges.size):
         largest, n = 0.0, 0
-        for j in range(in_units.shape[1]):
-            largest = max(largest, in_units[i, j])
-        reach[i] = 1.0
+        for j in range(coordinates_in_units.shape[1]):
+            largest = max(largest, coordinates_in_units[i, j])
+        ranges[i] = 1.0
         if radius[i] <= max(largest, 1.0):
-            reach[i] = radius[i]
+            ranges[i] = radius[i]
         elif largest > negligible:
-            for j in range(in_units.shape[1]):
-                if in_units[i, j] > NEGLIGIBLE * largest:
-                    room[n] = in_units[i, j]
+            for j in range(coordinates_in_units.shape[1]):
+                if coordinates_in_units[i, j] > NEGLIGIBLE * largest:
+                    scratch[n] = coordinates_in_units[i, j]
                     n += 1
-            _sort(room[:n])
-            reach[i] = room[(n - 1) // 2]
+            _sort(scratch[:n])
+            ranges[i] = scratch[(n - 1) // 2]
 
 
-# flags of results. IN_ORDER: all values are finite, M is symmetric, no row is empty. CONSISTENT: the state is on the
-# constraints up to rounding. DEFINITE, INDEFINITE: an M that varies is so by a margin
+# flags that evaluate_start returns. IN_ORDER: all values are finite, M is symmetric, no row is empty. CONSISTENT: the
+# state satisfies the constraints up to rounding. DEFINITE, INDEFINITE: M varies, and is positive definite, or not
+# positive definite, by a margin
 IN_ORDER, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
-NEAR_SHARE = 0.5  # relative to the sizes of the coordinates: a position within this distance has the same sizes
+NEAR_SHARE = 0.5  # relative to the sizes of the coordinates: within this distance the sizes count as equal
 ROUNDING_OF_ZERO = 2.0**-52  # relative to the largest coordinate: a smaller one is a rounded zero
-EIGENVALUE_MARGIN = 2.0  # factor on the eigenvalue that counts as zero: rounding changes it by less
+EIGENVALUE_MARGIN = 2.0  # factor on the limit below which an eigenvalue counts as zero: rounding changes it by less
 
 
 def room_size(n: int, n_c: int, n_a: int) -> int:
-    """Return the length of `room`: the outputs of callbacks other than M and the rows, and scratch."""
+    """Return the length of `room` in evaluate_start: results of callbacks except M and rows, and scratch."""
     return n + 2 * (n_c + n_a) + n_c * (n + 4) + n * max(n, n_c + n_a + 1)
 
 
@@ -156,7 +160,7 @@ def _has_empty_row(rows):
 
 @exact
 def _is_symmetric(mass, allowed):
-    """Return whether no entry differs from its transposed entry by more than this share of the largest entry."""
+    """Return whether no entry differs from its transposed entry by more than `allowed` times the largest entry."""
     largest, off, same = 0.0, 0.0, True
     for i in range(len(mass)):
         for j in range(i):
@@ -171,7 +175,10 @@ def _is_symmetric(mass, allowed):
 
 @exact
 def _is_rounding(value, row, state, sizes, least, rate, allowed):
-    """Return whether a sum is rounding: at most this share of its terms, each at the size of its state."""
+    """Return whether the sum `value` is a rounding error: at most `allowed` times the sum of the sizes of its terms.
+
+    The terms are `rate`, and entries of `row` times values of `state`, which count as at least `sizes` and `least`.
+    """
     size = abs(rate)
     for j in range(state.size):
         size += abs(row[j]) * max(abs(state[j]), sizes[j], least)
@@ -180,7 +187,7 @@ def _is_rounding(value, row, state, sizes, least, rate, allowed):
 
 @exact
 def _is_near(q, sizes, place):
-    """Return whether a position is so near to `place` that the sizes of coordinates known there hold for it, too."""
+    """Return whether q is so near the position `place` that the sizes of the coordinates at `place` apply to q, too."""
     near = True
     for j in range(q.size):
         near = near and abs(q[j] - place[j]) <= NEAR_SHARE * sizes[j]
@@ -189,7 +196,7 @@ def _is_near(q, sizes, place):
 
 @exact
 def _has_entries(rows, entries):
-    """Return whether exactly these entries of rows are nonzero; without one of them the sizes would not apply."""
+    """Return whether `rows` is nonzero exactly where `entries` is: otherwise stored sizes do not apply."""
     same, n = True, rows.shape[1]
     for i in range(entries.size // n):
         largest = largest_of(rows[i])
@@ -200,7 +207,7 @@ def _has_entries(rows, entries):
 
 @exact
 def _find_known_sizes(q, rows, n_c, sizes):
-    """Return the index of the sizes that belong to a position near this one; -1: there are none."""
+    """Return the index in `sizes` of the sizes stored for a position near q; -1: there are none."""
     n = q.size
     width = 2 * n + n_c * n
     for k in range(0, sizes.size, width):
@@ -213,8 +220,9 @@ def _find_known_sizes(q, rows, n_c, sizes):
 def _is_consistent(C, rate, rows, q, v, sizes, allowed):
     """Return whether positions and velocities satisfy the rows up to rounding.
 
-    A coordinate counts with its known size at least, and with the rounding error of the largest coordinate: where the
-    coordinates of a constraint are zero but for rounding, as in a plane, its value is not small relative to its terms.
+    The size of a coordinate counts as at least its stored size, and at least the rounding error of the largest
+    coordinate: if the coordinates of a constraint are zero but for rounding, as out of the plane of a motion, the value
+    of the constraint is not small relative to its terms.
     """
     fastest, nothing = largest_of(v), ROUNDING_OF_ZERO * largest_of(q)
     begin = _find_known_sizes(q, rows, C.size, sizes)
@@ -240,7 +248,7 @@ def _record_entries(rows, pattern):
 
 @exact
 def _record_entries_near(f, t, q, shifts, place, rows, n_c, pattern):
-    """Add entries of rows to the pattern at positions that differ from q by `shifts` times the size of q."""
+    """Add to `pattern` where rows are nonzero at positions that differ from q by `shifts` times the size of q."""
     largest = largest_of(q)
     for k in range(len(shifts)):
         for j in range(q.size):
@@ -268,11 +276,14 @@ def _is_definite(mass, least, factors):
 def evaluate_start(f, t, q, v, sizes, lam, room, mass, rows, shifts, pattern, roundings):
     """Evaluate all callbacks at (t, q, v); return flags of the results.
 
-    Arrays other than `lam` and the following arguments are full of zeros. `roundings`: relative rounding of a state, of
-    the symmetry of M, and of its eigenvalues. `sizes`: positions with the sizes of their coordinates (`keep` of
-    checks/scales.py), which count as smallest sizes near these positions. `shifts`: displacements of q, over its size,
-    at which entries of rows are also recorded. `mass` and `rows` become M, and C_q with A, `pattern` becomes 1 where
-    rows have entries; `room`, of `room_size` numbers, begins with the force, C, and C_t with b.
+    Arguments:
+
+    - roundings: relative rounding errors that are allowed in constraints, in the symmetry of M, and in its eigenvalues
+    - sizes: stored positions and the sizes of their coordinates (`keep` of checks/scales.py), which are the smallest
+      sizes near these positions
+    - shifts: displacements of q, over its size, at which nonzero entries of rows are also recorded
+    - mass, rows, pattern: zeros on entry, become M, C_q with A, and 1 where rows are nonzero
+    - room: `room_size` zeros on entry, becomes the force, C, C_t with b, and other values and scratch
     """
     n, n_c, n_rows, flags = q.size, lam.size, rows.shape[0], f.flags
     force, C, rate, gamma = n, n + n_c, n + n_c + n_rows, n + n_c + 2 * n_rows  # ends of the parts of `room`
@@ -314,7 +325,7 @@ def evaluate_start(f, t, q, v, sizes, lam, room, mass, rows, shifts, pattern, ro
         bits = IN_ORDER
         if _is_consistent(room[force:C], room[C:rate], rows, q, v, sizes, roundings[0]):
             bits |= CONSISTENT
-    if flags[CONSTANT_MASS] == 0:  # neither flag if the smallest eigenvalue is between the two margins
+    if flags[CONSTANT_MASS] == 0:  # neither flag is set if the smallest eigenvalue is between the two margins
         if _is_definite(mass, EIGENVALUE_MARGIN * roundings[2], scratch):
             bits |= DEFINITE
         elif not _is_definite(mass, roundings[2] / EIGENVALUE_MARGIN, scratch):
@@ -327,7 +338,7 @@ def evaluate_start(f, t, q, v, sizes, lam, room, mass, rows, shifts, pattern, ro
 
 @kernel(types.void(KIT, f8, MATRIX, i8, MATRIX))
 def rows_at(f, t, places, n_c, rows):
-    """Evaluate C_q (n_c rows) and A at each of these positions, one below the other; `rows` contains zeros."""
+    """Evaluate C_q (n_c rows) and A at the positions `places` into `rows`, full of zeros, one below the other."""
     n_rows = len(rows) // len(places)
     for k in range(len(places)):
         begin = k * n_rows
@@ -337,7 +348,7 @@ def rows_at(f, t, places, n_c, rows):
 
 @exact
 def _agrees(fused, given, allowed, more):
-    """Return whether no number differs by more than this share of the largest, plus the number that `more` adds."""
+    """Return whether numbers of row i differ by at most more[i], plus `allowed` times the largest number of all."""
     largest = 0.0
     for i in range(given.shape[0]):
         for j in range(given.shape[1]):
@@ -351,10 +362,10 @@ def _agrees(fused, given, allowed, more):
 
 @kernel(types.boolean(KIT, f8, VECTOR, VECTOR, MATRIX, MATRIX, VECTOR, f8, f8))
 def kinematics_agree(f, t, q, v, fused, given, more, allowed, rounding):
-    """Return whether the fused callback agrees with the separate ones, up to a share of the largest number of each.
+    """Return whether the fused callback agrees with the separate ones, up to `allowed` times the largest number.
 
-    Constraints may also differ by rounding of their terms. Arrays are full of zeros: `fused` and `given` have the rows
-    C, C_t and gamma, then C_q, (3 + n_q, n_c); `more` has n_c numbers.
+    Constraints may also differ by `rounding` times the sizes of their terms. `fused` and `given`, (3 + n_q, n_c),
+    become C, C_t, gamma and the numbers of C_q; `more`, (n_c), is scratch. All three are full of zeros on entry.
     """
     n, n_c = q.size, more.size
     by_one, by_others = fused[3:].reshape((n_c, n)), given[3:].reshape((n_c, n))
@@ -372,16 +383,16 @@ def kinematics_agree(f, t, q, v, fused, given, more, allowed, rounding):
     return agree and _agrees(fused[:1].reshape((n_c, 1)), given[:1].reshape((n_c, 1)), allowed, more)
 
 
-VALUE, BOUND = range(2)  # rows of `nodes`
+VALUE, BOUND = range(2)  # rows of `nodes`: values of the nodes of a program, and bounds of their rounding errors
 
 EPS = 2.0**-52
-SAME = 1e-9  # relative to the largest number: a larger difference counts unless it may be rounding, which is ...
-ROUNDED = 200.0 * EPS  # ... this multiple of the bound
+SAME = 1e-9  # largest difference of a callback and its trace, relative to the largest number, apart from rounding
+ROUNDED = 200.0 * EPS  # largest rounding error of a traced number, over its bound
 
 
 @exact
 def _sum(columns, coefficients, constant, nodes, begin, end):
-    """Return an affine expression, and a bound of its rounding error."""
+    """Return an affine expression of nodes, and a bound of its rounding error."""
     total, bound = constant, abs(constant)
     for k in range(begin, end):
         term = coefficients[k] * nodes[VALUE, columns[k]]
@@ -392,7 +403,7 @@ def _sum(columns, coefficients, constant, nodes, begin, end):
 
 @exact
 def _operation(kind, x, dx, y, dy):
-    """Return the result of an operation, and a bound of its rounding error."""
+    """Return the result of an operation on x and y, whose bounds are dx and dy, and a bound of its rounding error."""
     z = operation(kind, x, y)
     if kind == op.PRODUCT:
         dz = abs(x) * dy + abs(y) * dx
@@ -414,7 +425,7 @@ def _operation(kind, x, dx, y, dy):
 
 @exact
 def _run_trace(program, columns, coefficients, constants, nodes, values, bounds):
-    """Compute results and bounds of a traced program from its inputs, which are the first nodes."""
+    """Compute the results of a traced program, and their bounds, from its inputs, which are the first nodes."""
     for i in range(len(program)):
         first, second, end = program[i, op.FIRST], program[i, op.SECOND], program[i, op.END]
         x, dx = _sum(columns, coefficients, constants[i, 0], nodes, first, second)
@@ -428,7 +439,7 @@ def _run_trace(program, columns, coefficients, constants, nodes, values, bounds)
 
 @exact
 def _count_differences(called, traced, bounds):
-    """Count the numbers that differ by more than rounding, or are not finite."""
+    """Count the numbers that differ by more than SAME and ROUNDED allow, or are not finite."""
     count = 0
     for i in range(called.shape[1]):
         largest = 0.0
@@ -447,9 +458,8 @@ def _count_differences(called, traced, bounds):
 def compare_traces(f, sizes, which, states, program, columns, coefficients, constants, nodes, called, traced, bounds):
     """Compare callbacks at states [t, q, v], one a row, with their traces; return how many numbers differ.
 
-    A number differs if it is off by more than SAME of the largest at these states plus ROUNDED times its bound.
-
-    `sizes`: n_q, n_c and n_a; `which`: 1 for each of KINDS in traced_values.py to be compared; `called`: zeros.
+    Two numbers differ if their difference exceeds SAME times the largest value at these states, plus ROUNDED times the
+    bound. `sizes`: n_q, n_c and n_a; `which`: 1 for each of KINDS in traced_values.py to be compared; `called`: zeros.
     """
     n, n_c, n_a = sizes[0], sizes[1], sizes[2]
     for k in range(len(states)):

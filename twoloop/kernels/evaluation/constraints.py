@@ -1,9 +1,9 @@
 """Rows of the constraints on velocities, their rates, and Gamma (right-hand side of accelerations) by differences.
 
-Rows are C_q of C(t, q) = 0, then A of A(t, q) v + b(t, q) = 0.
+The first rows are C_q of C(t, q) = 0, the others A of A(t, q) v + b(t, q) = 0.
 
-Q_d, and the right-hand side of non-holonomic rows, are differenced along the motion: two central differences, over a
-length e and over 2 e, give the derivative to order 4, and their disagreement its error, by which the length is chosen.
+Gamma is computed by differences along the motion: two central differences, over times e and 2 e, give the derivative to
+order 4. Their disagreement estimates its error, by which the length e is chosen.
 """
 
 import numpy as np
@@ -48,7 +48,7 @@ def _clear_places(w):
 def clear_rows(f, w):
     """Set w.G to zero.
 
-    In large matrices only recorded entries are cleared; another entry is found by VERIFY_PATTERN after the step.
+    In large matrices only recorded entries are cleared; the task VERIFY_PATTERN detects new entries after a step.
     """
     if f.flags[FORM] == AUGMENTED:
         _clear_places(w)
@@ -58,7 +58,7 @@ def clear_rows(f, w):
 
 @merged
 def row_residual(w, v, rows):
-    """Compute G v + (C_t, b) of these rows into w.z."""
+    """Compute G v + (C_t, b) of the rows with indices `rows` into w.z."""
     for k in range(rows.size):
         row = rows[k]
         total = w.Rate[row]
@@ -69,7 +69,7 @@ def row_residual(w, v, rows):
 
 @merged
 def constraint_rates(f, w, t, q, rate):
-    """Evaluate C_t and b at (t, q)."""
+    """Evaluate C_t and b at (t, q) into `rate`."""
     n_c, n_rows = w.C.size, w.Rate.size
     rate[:] = 0.0
     if f.flags[CONSTRAINT_RATE_GIVEN] == 1:
@@ -95,7 +95,7 @@ def kinematics(f, w, t, q, v):
 
 @merged
 def gather_independent_columns(G, rate, rows, independent, D):
-    """Gather the right-hand sides for w.D: columns of the independent coordinates, and rates."""
+    """Write right-hand sides into the rows of D: minus the independent columns of G, and minus `rate`."""
     for j in range(independent.size):
         column = independent[j]
         for k in range(rows.size):
@@ -105,15 +105,15 @@ def gather_independent_columns(G, rate, rows, independent, D):
 
 
 MAX_DIFFERENCE, MIN_SHARE = 2e-4, 1e-4  # see longest_difference
-LEVELS = 12  # number of lengths that _choose_length tries, each a quarter of the one before
-ROUNDING_DISAGREEMENT = 1e-9  # relative disagreement that rounding alone may cause
-# relative disagreement below which a longer length loses nothing and has less rounding
+LEVELS = 12  # number of lengths that _choose_length tries, each a quarter of the length before
+ROUNDING_DISAGREEMENT = 1e-9  # disagreement of both differences, relative to Gamma, that rounding alone may cause
+# disagreement, relative to Gamma, below which the length is doubled: this loses no accuracy and reduces rounding
 LENGTHENING_DISAGREEMENT = 1e-11
 # weights of values at 0, e, 2 e and 4 e: first derivatives of order 2, over e and over 2 e
 ONE_SIDED, ONE_SIDED_TWICE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
-# relative to the two-sided length: the error is of lower order, and a shorter length saves the search for one
+# length of one-sided differences relative to two-sided ones: their order is lower, and a shorter length saves a search
 ONE_SIDED_LENGTH = 1.0 / 16.0
-# relative to the terms of G v over the longest length: where these cancel, Gamma cannot be more accurate
+# rounding error of Gamma relative to the largest term of G v over longest_difference, for terms that cancel
 ROUNDING_OF_TERMS = 1e-14
 CONVERGED_SHARE = 0.01  # relative to the required accuracy: a smaller change ends the search for a length
 
@@ -138,7 +138,7 @@ def longest_difference(q, v):
 
 @merged
 def _one_sided_direction(notes, t, e):
-    """Return the side of t (1 or -1) on which to difference near a known jump of C_t or b; 0: both sides."""
+    """Return on which side of t (1 or -1) to take differences near a known jump of C_t or b; 0: on both sides."""
     before, after = t - notes[KINK_BEFORE], notes[KINK_AFTER] - t
     if min(before, after) >= 2.0 * e:
         return 0.0
@@ -147,7 +147,7 @@ def _one_sided_direction(notes, t, e):
 
 @compiled
 def _differences(f, w, t, q, v, e, first, last):
-    """Difference Gamma over e and 2 e; return its largest entry, the largest disagreement and largest term of G v."""
+    """Compute Gamma by differences over e and 2 e; return its largest entry, disagreement, and term of G v."""
     twice = w.Gamma_tried[0]
     side = _one_sided_direction(w.notes, t, e)
     shorter = representable_step(t, ONE_SIDED_LENGTH * e)
@@ -188,15 +188,15 @@ def _differences(f, w, t, q, v, e, first, last):
 
 @merged
 def _max_disagreement(notes):
-    """Return the disagreement up to which a length is accepted: the combination of both differences is far better."""
+    """Return the largest accepted disagreement of both differences: their combination is far more accurate."""
     return max(notes[GAMMA_REQUIRED], ROUNDING_DISAGREEMENT) * notes[GAMMA_SCALE]
 
 
 @compiled
 def _choose_length(f, w, t, q, v, longest, first, last):
-    """Difference over ever shorter lengths until the result no longer changes, or use the length with the least change.
+    """Compute Gamma over ever shorter lengths until it no longer changes, or use the length with the least change.
 
-    Returns GAMMA_INACCURATE if this change exceeds the required accuracy, else DONE.
+    Stores the length as GAMMA_SHARE. Returns GAMMA_INACCURATE if the change exceeds the required accuracy, else DONE.
     """
     best = np.inf
     share = 1.0
@@ -229,8 +229,8 @@ def gamma_by_differences(f, w, t, q, v, first, last):
 
     Gamma = -d/de [G v + (C_t, b)](t + e, q + e v) at e = 0.
 
-    Errors are relative to the largest entry of Gamma so far in this run. The length is a share of longest_difference;
-    if the two differences disagree, it is chosen anew: a drive of kilohertz needs a short one.
+    Errors are relative to the largest entry of Gamma so far in this run. The length is GAMMA_SHARE of
+    longest_difference; if the two differences disagree, it is chosen anew: a drive of kilohertz needs a short length.
     """
     longest = longest_difference(q, v)
     e = representable_step(t, w.notes[GAMMA_SHARE] * longest)

@@ -1,8 +1,8 @@
 """Operations of traced programs: their kinds, the layout of their tables, and an interpreter in compiled code.
 
-Programs compute C_q and Gamma where no callback gives them (generate/derived_callbacks.py), and forces, motions and
-rows of models that are functions (bodies/program_results.py). An exact derivative may overflow where the function does
-not: for example that of tanh for large numbers.
+Programs compute C_q and Gamma if no callback computes them (generate/derived_callbacks.py), and forces, motions and
+rows that the user of a model gives as functions (bodies/program_results.py). An exact derivative may overflow where the
+function does not, for example that of tanh at large arguments.
 """
 
 import math
@@ -10,13 +10,13 @@ import math
 from twoloop.kernels.data.common import compiled, exact
 
 # kinds of operations. PENDING: product in a Taylor series whose second factor is known only after the linear equations
-# of the present order are solved. RESULT: output of a table
+# of the present order are solved. RESULT: output of a program
 PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGENT, PENDING, SUM, RESULT = range(11)
-# columns of a row of a table: kind; index of its result among the nodes (or results); first term of its first argument
-# and of its second, and end of these terms
+# columns of a table, a row of which is an operation: kind; index of its result among the nodes (or among the results);
+# first term of its first argument, first term of its second argument, and end of the terms of the second
 KIND, NODE, FIRST, SECOND, END, N_COLUMNS = range(6)
-# a table is stored as a vector of integers: these sizes, the rows, the node of each term, and the entry of each result
-# in its array; results are the last nodes
+# a program is a vector of integers: the sizes N_NODES to N_RESULTS, the rows of the table, the node of each term, and
+# the index of each result in its array; the last nodes are the results
 N_NODES, N_ROWS, N_TERMS, N_RESULTS, HEAD = range(5)
 
 
@@ -55,10 +55,10 @@ def affine(nodes, table, columns, numbers, coefficients, constant, begin, end):
 
 @exact
 def run_table(table, rows, n_rows, columns, numbers, coefficients, constants, nodes, inputs, t, q, v):
-    """Compute all nodes of a table from t, q and v, which become the nodes from `inputs` on.
+    """Compute all nodes of a table from its inputs t, q and v, which become the nodes from index `inputs` on.
 
-    The table holds integers, or whole floats if it is among the parameters of a model. `rows` and `columns` are indices
-    in it, `coefficients` and `constants` indices in `numbers`.
+    The table contains integers, or whole floats if it is among the parameters of a model. `rows` and `columns` are
+    indices in the table, `coefficients` and `constants` indices in `numbers`.
     """
     nodes[inputs] = t
     for j in range(q.size):
@@ -82,14 +82,14 @@ def _run(program, numbers, nodes, t, q, v):
 
 @exact
 def _results(program):
-    """Return the number of results, the first node that is a result, and the first index of their entries."""
+    """Return the number of results, the first node that is a result, and where their indices begin in the program."""
     n = program[N_RESULTS]
     return n, program[N_NODES] - n, HEAD + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
 
 
 @compiled
 def gamma_by_program(f, w, t, q, v):
-    """Compute the rows of Gamma that no callback gives; return whether there is a program and all are finite."""
+    """Compute the rows of Gamma that no callback computes; return whether there is a program and all are finite."""
     program = f.gamma_program
     if program.size == 0:
         return False
@@ -104,7 +104,7 @@ def gamma_by_program(f, w, t, q, v):
 
 @compiled
 def jacobian_by_program(f, w, t, q, G):
-    """Compute C_q into the first rows of G, which are zero; return whether there is a program and all is finite."""
+    """Compute C_q into the first rows of G, full of zeros; return whether there is a program and all is finite."""
     program = f.jacobian_program
     if program.size == 0:
         return False

@@ -1,6 +1,6 @@
 """Partition coordinates by LU: choose independent coordinates and rows, and restore the dependent coordinates.
 
-Dependent positions follow by Newton's method, dependent velocities by a linear solve: the inner loop of the paper.
+Dependent positions follow from Newton's method, the inner loop of the paper, dependent velocities from a linear solve.
 Equation numbers are those of Zhang & Zhang (2016), doi 10.1007/s11071-016-2682-8.
 """
 
@@ -53,10 +53,10 @@ from twoloop.kernels.linalg.markowitz_lu import (
     solve_rows,
 )
 
-RANK_TOLERANCE = 1e-11  # a smaller pivot counts as zero; rows are scaled to 1
-CHANGED = -1  # returned like DONE: the partition has changed
+RANK_TOLERANCE = 1e-11  # largest pivot that counts as zero, for rows scaled to 1
+CHANGED = -1  # code, in place of DONE: a new partition has been adopted
 MAX_ROWS_ELIMINATED = 200  # largest number of rows that are eliminated only to measure how near a singular position is
-SENSITIVITY_GROWTH = 3.0  # growth of max|C_qd^-1 C_qi| since the choice of a partition above which it is renewed
+SENSITIVITY_GROWTH = 3.0  # a partition is renewed if max|C_qd^-1 C_qi| has grown by more since the partition was chosen
 
 
 @compiled
@@ -81,11 +81,10 @@ def _largest_from(row, first):
 
 @compiled
 def full_pivoting(A, order, row_order, largest, first, last, max_rank):
-    """Eliminate A by Gauss with full pivoting, in place: pivots `first`, first + 1, ... from rows below `last`.
+    """Eliminate A in place by Gauss with full pivoting, from pivot `first` on; return the numerical rank.
 
-    At most `max_rank` pivots are eliminated. `order` and `row_order` become the order of columns and rows. Returns the
-    number of pivots, the numerical rank. `largest` is scratch: the largest entry of each row, updated where a row has
-    changed.
+    Pivots are chosen among the rows before `last`, and there are at most `max_rank`, including those before `first`.
+    `order` and `row_order` become the order of columns and rows. `largest` is scratch: the largest |entry| of each row.
     """
     n_q = A.shape[1]
     k = first
@@ -123,7 +122,7 @@ def full_pivoting(A, order, row_order, largest, first, last, max_rank):
 
 @compiled
 def least_pivot(f, w, t, q):
-    """Return the ratio of the smallest to the largest pivot at a position, without scaling; the partition stays.
+    """Return the ratio of the smallest to the largest pivot at (t, q), without scaling; keep the partition.
 
     Scaling would hide that a row or a column is short at a singular position. With sparse factors or too many rows the
     result is the smallest pivot of the last partition.
@@ -150,7 +149,7 @@ def least_pivot(f, w, t, q):
 
 @compiled
 def _eliminate(w, max_rank, max_rank_v):
-    """Order rows and columns of w.Gx: first those of the constraints C, then those that the rows A add.
+    """Order rows and columns of w.Gx: first the independent ones of C_q, then those that A adds.
 
     Returns the rank of C_q and that of C_q and A together, counted up to `max_rank` and `max_rank_v`.
     """
@@ -176,7 +175,7 @@ def _eliminate(w, max_rank, max_rank_v):
 
 @compiled
 def smallest_pivot(f, w, t, q):
-    """Return the smallest pivot at a position, scaled as in w.notes[PIVOT]; the partition stays."""
+    """Return the smallest pivot at (t, q), scaled as in w.notes[PIVOT]; keep the partition."""
     rank = w.rows.size
     if rank == 0:
         return 1.0
@@ -205,9 +204,9 @@ def _insert_sorted(source, target):
 
 @compiled
 def _adopt_order(w):
-    """Adopt the order of `_eliminate` as the partition; return False if C_qd is singular by its pattern."""
+    """Adopt the order found by `_eliminate` as the partition; return False if C_qd is singular."""
     rank, rank_v = w.rows.size, w.rows_v.size
-    # ascending, so that equal sets give equal partitions
+    # in ascending order, so that equal sets of coordinates are equal partitions
     _insert_sorted(w.row_order[:rank], w.rows)
     _insert_sorted(w.order[:rank], w.dependent)
     _insert_sorted(w.order[rank:], w.independent)
@@ -222,13 +221,13 @@ def _adopt_order(w):
     if w.G_of_S.size > 0:
         w.G_of_S[0, 0] = np.nan
     if rank_v < w.Rate.size:
-        w.index_a[SIZE] = 0  # the program is for other independent rows
+        w.index_a[SIZE] = 0  # the program was written for other independent rows
     return write_programs(w)
 
 
 @compiled
 def write_programs(w):
-    """Choose the order of elimination for the numbers in w.G; return False if they are singular."""
+    """Write the programs that factor the dependent columns of w.G; return False if these are singular."""
     _record_places(w)
     w.notes[FACTORED] = 0.0
     done = make_program(w.G, w.pattern, w.rows, w.dependent, w.index, w.values)
@@ -239,7 +238,7 @@ def write_programs(w):
 
 @compiled
 def _record_places(w):
-    """Record the columns of the entries of each row in w.places, see Work."""
+    """Record in w.places (see Work) in which columns each row has entries."""
     n_rows = w.Rate.size
     place = n_rows + 1
     for i in range(n_rows):
@@ -253,7 +252,7 @@ def _record_places(w):
 
 @compiled
 def record_entries(w):
-    """Record the entries of w.G; return whether there are new ones, so that programs must be written again."""
+    """Record where w.G has entries; return whether any entry is new, so that programs must be written again."""
     if not note_pattern(w.G, w.pattern):
         return False
     w.index_a[SIZE] = 0
@@ -264,8 +263,8 @@ def record_entries(w):
 def choose_partition(f, w, t, q):
     """Choose dependent and independent coordinates at (t, q), and the independent rows.
 
-    Returns SINGULAR if the rank is less than that of the partition before. Returns RANK_DIFFERS, with the ranks in
-    w.notes, if this is the first partition and the workspace has other ranks.
+    Returns SINGULAR if the rank is less than that of the previous partition. Returns RANK_DIFFERS, with the ranks in
+    w.notes, if this is the first partition and the workspace is allocated for other ranks.
     """
     w.entries[:] = 0.0
     constraint_rows(f, w, t, q, w.G)
@@ -286,14 +285,14 @@ def choose_partition(f, w, t, q):
 
 @compiled
 def partition_of_midpoint(f, w, t_mid, state, new_state):
-    """Adopt the partition that full pivoting finds in the middle of a step; return CHANGED, or DONE if it is the same.
+    """Adopt the partition that full pivoting finds in the middle of a step; return CHANGED, or DONE without a change.
 
     The reversed step has the same middle, so that the choice, and with it the map of a symmetric tableau, is symmetric
     in time. A partition that is kept until it is poor would depend on the direction of time.
 
     The middle is computed from the attempt under the current partition, and is not checked again after the step is
-    repeated under the new one. Where two choices tie within the difference of the two attempts, O(h^(p+1)), the
-    reversed step may choose the other one.
+    repeated under the new one. If two choices are equally good within the difference of the two attempts, O(h^(p+1)),
+    the reversed step may choose the other one.
     """
     n = w.Q.size
     for j in range(n):
@@ -324,7 +323,7 @@ def _same_set(a, b):
 
 @compiled
 def choose_oriented_partition(f, w, t, q):
-    """Choose a partition at an accepted state, and record the sign of det C_qd that its motion has to keep."""
+    """Choose a partition at an accepted state, and record the sign of det C_qd, which later states must have, too."""
     code = choose_partition(f, w, t, q)
     w.notes[ORIENTATION] = 0.0
     if code != DONE:
@@ -337,7 +336,7 @@ def choose_oriented_partition(f, w, t, q):
 
 
 @compiled
-def _largest_share(w):
+def _largest_coefficient(w):
     """Return the largest coefficient, from w.minimum, of an independent row in a redundant one (rows scaled to 1)."""
     rows = rows_of(w.index_v)
     largest = 0.0
@@ -347,20 +346,20 @@ def _largest_share(w):
             continue
         size = _largest_from(w.G[row], 0)
         for k in range(rows.size):
-            share = abs(w.minimum[place + k]) * _largest_from(w.G[rows[k]], 0)
-            if share > largest * size:
-                largest = share / size
+            scaled = abs(w.minimum[place + k]) * _largest_from(w.G[rows[k]], 0)
+            if scaled > largest * size:
+                largest = scaled / size
         place += rows.size
     return largest
 
 
 @compiled
 def partition_is_poor(w):
-    """Return whether dependents move much faster per independent than when the partition was chosen.
+    """Return whether dependent coordinates move much faster, relative to independent ones, than under a new partition.
 
-    Measures max|C_qd^-1 C_qi|, which is in w.D. Full pivoting leaves it near 1; it grows without bound where the
-    independent coordinates stop being valid. The coefficients of independent rows in a redundant one grow in the same
-    way where these rows become dependent: C_qd is singular there, but not C_q.
+    The measure is max|C_qd^-1 C_qi|, from w.D. It is near 1 after full pivoting, and grows without bound where the
+    independent coordinates stop being valid. The coefficients of independent rows in a redundant row grow in the same
+    way where the independent rows become dependent: there C_qd is singular, but not C_q.
     """
     largest = 0.0
     for j in range(w.independent_v.size):
@@ -372,26 +371,26 @@ def partition_is_poor(w):
     # the static form chooses its independent rows at every state
     if w.rows_v.size == w.Rate.size or w.factors.size > 0:
         return False
-    share = _largest_share(w)
+    coefficient = _largest_coefficient(w)
     if w.notes[LEANING] == 0.0:
-        w.notes[LEANING] = max(share, 1.0)
-    return not share <= SENSITIVITY_GROWTH * w.notes[LEANING]
+        w.notes[LEANING] = max(coefficient, 1.0)
+    return not coefficient <= SENSITIVITY_GROWTH * w.notes[LEANING]
 
 
 MAX_ITERATIONS = 25  # Newton iterations; quadratic convergence needs 2 to 5
-CONTRACTION = 0.5  # largest ratio of a correction to the one before
-ROUNDING_OF_CORRECTIONS = 1e-12  # relative to the largest value: changes of this size no longer shrink
-# corrections may be so many times larger where all rows hold to rounding: the rounding of a position of 1 m turns a rod
-# of 1 mm by 1e-13, and a chain of 1,000 such rods by more
+CONTRACTION = 0.5  # largest ratio of a correction to the correction before
+ROUNDING_OF_CORRECTIONS = 1e-12  # relative to the largest coordinate: corrections of this size no longer shrink
+# factor on ROUNDING_OF_CORRECTIONS if all rows are satisfied up to rounding: the rounding of a position of 1 m turns a
+# rod of 1 mm by 1e-13, and a chain of 1,000 such rods by more
 AMPLIFIED = 1e3
-CLOSED = 2e-15  # relative to the largest of its terms: violation of a row that is rounding
-MIN_CORRECTION = 10.0  # smallest correction that is required, in units of the rounding of positions
-MAX_VIOLATION = 1e-7  # relative to the mechanism's size: largest violation of a redundant row
+CLOSED = 2e-15  # violation of a row that is a rounding error, relative to the largest term of the row
+MIN_CORRECTION = 10.0  # smallest tolerance of corrections, in roundings of positions
+MAX_VIOLATION = 1e-7  # largest violation of a redundant row, relative to the size of the mechanism
 
 
 @compiled
 def _factor_anew(w, t, q):
-    """Factor in a new order of elimination; return DONE, SINGULAR or NOT_FINITE."""
+    """Factor the dependent columns in a new order of elimination; return DONE, SINGULAR or NOT_FINITE."""
     record_entries(w)
     if not finite(w.G):
         return not_finite(w.notes, JACOBIAN, t, q)
@@ -403,20 +402,20 @@ def _factor_anew(w, t, q):
 
 @merged
 def factor_rows(w, t, q):
-    """Factor the dependent columns of w.G."""
+    """Factor the dependent columns of w.G; return DONE, SINGULAR or NOT_FINITE."""
     w.notes[FACTORED] = 0.0
     ratio = factor(w.entries, w.index, w.values)
     w.counters[N_FACTORIZATIONS] += 1
     if w.Rate.size > w.C.size:
         ratio = min(ratio, factor(w.entries, w.index_v, w.values_v))
         w.counters[N_FACTORIZATIONS] += 1
-    # after small pivots or NaN: the order of elimination no longer suits these numbers, or they are not finite
+    # after a small pivot, the order of elimination no longer suits the numbers; after NaN, they are not finite
     return DONE if ratio > RANK_TOLERANCE else _factor_anew(w, t, q)
 
 
 @merged
 def factor_dependent(f, w, t, q):
-    """Evaluate C_q and A at (t, q), and factor the dependent columns."""
+    """Evaluate C_q and A at (t, q), and factor the dependent columns; return DONE, SINGULAR or NOT_FINITE."""
     w.notes[KNOWN] = 0.0
     clear_rows(f, w)
     constraint_rows(f, w, t, q, w.G)
@@ -425,7 +424,7 @@ def factor_dependent(f, w, t, q):
 
 @compiled
 def rows_hold(w, q):
-    """Return whether w.C is rounding: |C_i| at most a few roundings of the largest |G_ij q_j|."""
+    """Return whether w.C are rounding errors: |C_i| at most CLOSED times the largest |G_ij q_j|."""
     for i in range(w.C.size):
         size = 0.0
         for p in range(w.places[i], w.places[i + 1]):
@@ -437,10 +436,10 @@ def rows_hold(w, q):
 
 @merged
 def restore_positions(f, w, t, q, v, tolerance, reuse):
-    """Solve eq. (15) by Newton's method for the dependent positions; correct first, then test the correction.
+    """Solve eq. (15) by Newton's method for the dependent positions, up to corrections of `tolerance`; return a code.
 
-    Leaves rows and factors in w: those at q, or before a last correction of at most `reuse`. The fused callback also
-    leaves w.Rate and w.Gamma at v, which is not restored yet.
+    Rows and factors remain in w: those at q, or those before a last correction of at most `reuse`. With the fused
+    callback w.Rate and w.Gamma remain, too, for the velocities v before these are restored.
     """
     before = np.inf
     converged = w.C.size == 0
@@ -483,7 +482,7 @@ def restore_positions(f, w, t, q, v, tolerance, reuse):
 
 @merged
 def find_null_space(f, w, t, q):
-    """Compute the velocities that the constraints allow into w.D, from the rows and factors in w."""
+    """Compute w.D, the velocities that the constraints allow, from the rows and factors in w."""
     if f.flags[KINEMATICS_GIVEN] == 0 or w.notes[KNOWN] == 0.0:
         constraint_rates(f, w, t, q, w.Rate)
     gather_independent_columns(w.G, w.Rate, rows_of(w.index_v), w.independent_v, w.D)
@@ -495,7 +494,7 @@ def find_null_space(f, w, t, q):
 def restore_velocities(f, w, t, q, v, reuse):
     """Solve eq. (14) for the dependent velocities, G_d v_d = -(C_t, b) - G_i v_i, with the rows and factors in w.
 
-    If the fused callback has computed w.Gamma, it stays valid for changes of velocities up to `reuse`.
+    If the fused callback has computed w.Gamma, w.Gamma is used further if velocities change by at most `reuse`.
     """
     rows, columns = rows_of(w.index_v), columns_of(w.index_v)
     n_dof = w.independent_v.size
@@ -525,7 +524,7 @@ def restore_velocities(f, w, t, q, v, reuse):
 
 @compiled
 def redundant_rows_hold(f, w, t, q, v):
-    """Check whether the redundant rows hold at an accepted state; needs C_q and A there in w.G."""
+    """Return DONE if an accepted state, whose C_q and A are in w.G, satisfies all rows, else ROWS_CONTRADICT."""
     w.C[:] = 0.0
     f.constraint(t, q, f.p, w.C)
     size, speed = max(1.0, largest_of(q)), max(1.0, largest_of(v))

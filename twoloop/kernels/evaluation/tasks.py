@@ -1,4 +1,4 @@
-"""Tasks of an inner loop: for each of them inner_loop.py has a function of the same name."""
+"""Tasks of an inner loop: inner_loop.py has a function of the same name for each task, which explains it."""
 
 (
     EVALUATE,
@@ -14,5 +14,5 @@
     ADOPT_MIDPOINT,
     VERIFY_PATTERN,
     CHECK_REDUNDANT,
-    SOLVE,  # large systems only, see sparse_inner_loop.py
+    SOLVE,  # only in large systems, see sparse_inner_loop.py
 ) = range(14)
