@@ -1,11 +1,11 @@
-"""Factor and solve banded matrices by LAPACK: the constant mass matrix, and systems with a border of constraints.
+"""Factor and solve banded matrices by LAPACK: the mass matrix, and systems with a border of constraints.
 
-LAPACK's band storage has entry (i, j) at [j, top + i - j] of a C-ordered array: top = b for the upper triangle of M,
-2 b for an LU, whose row exchanges fill another b diagonals. b is the bandwidth that the system declares.
+LAPACK's band storage has entry (i, j) at [j, top + i - j] of a C-ordered array, with top = b for the upper triangle of
+M, and top = 2 b for an LU, whose row exchanges fill another b diagonals. b is the bandwidth that the system declares.
 
-The routines are those of the library that SciPy uses. Their addresses differ from process to process and kernels are
-stored on disk, so no address is compiled in: a run puts `lapack_addresses` into its workspace, and `call_lapack` takes
-one of them. (Numba has LAPACK only for dense matrices and with allocation.)
+The routines are those of the library that SciPy uses. Their addresses differ from process to process, and kernels are
+stored on disk, so no address is compiled in: a run stores `lapack_addresses` in its workspace, and `call_lapack` gets
+one of these addresses. (Numba calls LAPACK only for dense matrices, and allocates memory.)
 """
 
 import numpy as np
@@ -19,7 +19,8 @@ from twoloop.kernels.data.common import compiled, inlined, merged
 from twoloop.kernels.data.indices import BANDWIDTH, DIAGONAL_MASS, DONE, MASS_NOT_DEFINITE, SINGULAR
 from twoloop.kernels.linalg.dense import lu_factor, lu_solve
 
-# indices in `lapack_addresses`: Cholesky factorization of a banded matrix, its solve; LU with row exchanges, its solve
+# routines, in the order of `lapack_addresses`: Cholesky factorization of a banded matrix, and solution with its factor;
+# LU factorization with row exchanges, and solution, of real matrices, then of complex ones
 ROUTINES = ("dpbtrf", "dpbtrs", "dgbtrf", "dgbtrs", "zgbtrf", "zgbtrs")
 DPBTRF, DPBTRS, DGBTRF, DGBTRS, ZGBTRF, ZGBTRS, N_ROUTINES = range(7)
 
@@ -45,8 +46,8 @@ def lapack_addresses() -> list[int]:
 def call_lapack(typing_context, address, arguments):
     """Call the LAPACK routine at `address` with Fortran's conventions; add its last argument, `info`, and return that.
 
-    `arguments` is a tuple of arrays, given by their first element, and of integers, given by a 32-bit copy, which
-    stands for a character too (the machines that numba knows have the low byte first).
+    `arguments` is a tuple of arrays, passed by the address of their first element, and of integers, passed by that of
+    a 32-bit copy. Integers also serve as characters: the machines that numba supports have the low byte first.
     """
 
     def generate(context, builder, signature, values):
@@ -68,9 +69,9 @@ def call_lapack(typing_context, address, arguments):
     return types.int64(address, arguments), generate
 
 
-# number of coordinates above which a Newton step by banded algebra is faster: measured 36 to 75, on chains of bandwidth
-# 1 to 11 and on beams. Single evaluations, as in a fixed-point iteration, gain above about 150 only, and at 56 they
-# take a third longer
+# number of coordinates from which on a Newton step by banded algebra is faster: measured 36 to 75, on chains of
+# bandwidth 1 to 11 and on beams. Single evaluations, as in a fixed-point iteration, are faster only above about 150
+# coordinates; at 56 they take a third longer
 BANDED_FROM = 56
 
 
@@ -81,7 +82,7 @@ def banded_pays(n_q: int, n_c: int, bandwidth: int) -> bool:
 
 @merged
 def banded_mass(f):
-    """Return whether M is factored as a band; not if it is diagonal, which is simpler still."""
+    """Return whether M is factored as a band; False if M is diagonal, because dividing is faster."""
     return f.flags[BANDWIDTH] >= 0 and f.flags[DIAGONAL_MASS] == 0
 
 
@@ -93,14 +94,14 @@ def _mass_band(w, b):
 
 @inlined
 def _mass_diagonals(w, b):
-    """Return the memory behind the factor, with entry (i, i + k) of M at [k, i]."""
+    """Return the part of w.L after the factor, with entry (i, i + k) of M at [k, i]."""
     n = w.Q.size
     return w.L.reshape(n * n)[n * (b + 1) : 2 * n * (b + 1)].reshape((b + 1, n))
 
 
 @compiled
 def factor_banded_mass(f, w):
-    """Factor w.M by Cholesky; its factor and its diagonals are stored in the memory of w.L."""
+    """Factor w.M by Cholesky; store the factor, and the diagonals of w.M, in w.L; return DONE or MASS_NOT_DEFINITE."""
     n = w.Q.size
     b = f.flags[BANDWIDTH]
     band = _mass_band(w, b)
@@ -124,7 +125,7 @@ def solve_banded_mass(f, w, x):
 
 @compiled
 def add_banded_mass_times(f, w, x, y):
-    """Add M x to y along the diagonals, because rows of a band are too short to be fast."""
+    """Add M x to y, diagonal by diagonal, because rows of a band are too short for fast loops."""
     n = w.Q.size
     for i in range(n):
         y[i] += w.M[i, i] * x[i]
@@ -139,13 +140,14 @@ def add_banded_mass_times(f, w, x, y):
             y[i + k] += diagonals[k, i] * x[i]
 
 
-# The system [[B, Cq^T], [Cq, 0]] [x; mu] = [r; 0], B of bandwidth b, is solved by mu = (Cq B^-1 Cq^T)^-1 Cq B^-1 r. Its
-# `numbers`, real or complex: the LU of B, then B^-1 Cq^T as rows, Cq B^-1 Cq^T, and a vector (n_c).
+# The system [[B, Cq^T], [Cq, 0]] [x; mu] = [r; 0], where b is the bandwidth of B, has the solution
+# mu = (Cq B^-1 Cq^T)^-1 Cq B^-1 r. The array `numbers`, real or complex, contains the LU of B, the transpose of
+# B^-1 Cq^T, Cq B^-1 Cq^T, and scratch (n_c).
 
 
 @inlined
 def lu_band(numbers, n, b):
-    """Return the part of `numbers` that holds B, and then its LU: entry (i, j) at [j, 2 b + i - j]."""
+    """Return the part of `numbers` for B, which its LU overwrites: entry (i, j) is at [j, 2 b + i - j]."""
     return numbers[: n * (3 * b + 1)].reshape((n, 3 * b + 1))
 
 
@@ -169,7 +171,7 @@ def _scratch(numbers, n, n_c, b):
 
 @compiled
 def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
-    """Factor the system whose B is in lu_band(numbers) by xGBTRF and xGBTRS of its kind."""
+    """Factor the system whose B is in lu_band(numbers); `factorize`, `substitute`: indices of xGBTRF and xGBTRS."""
     n_c, n = Cq.shape
     band = lu_band(numbers, n, b)
     rows = pivots[: n - n_c].view(np.int32)
@@ -191,7 +193,7 @@ def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
 
 @compiled
 def solve_bordered(w, b, Cq, numbers, pivots, substitute, x):
-    """Solve with the factors of `factor_bordered`; x (n_q) is overwritten."""
+    """Solve with the factors of `factor_bordered`; x (n_q), r on entry, becomes the solution."""
     n_c, n = Cq.shape
     band, rows = lu_band(numbers, n, b), pivots[: n - n_c].view(np.int32)
     call_lapack(w.lapack[substitute], (NO_TRANSPOSE, n, b, b, 1, band, 3 * b + 1, rows, x, n))

@@ -32,7 +32,7 @@ def largest_of(x):
 
 @merged
 def contains(numbers, number):
-    """Return whether a number is among the given ones."""
+    """Return whether `number` is one of `numbers`."""
     contained = False
     for each in numbers:
         contained = contained or each == number
@@ -47,7 +47,7 @@ def _magnitude(x):
 
 @merged
 def lu_factor(A, pivots):
-    """Factor A, real or complex, into L U with row exchanges, in place; 1/u_kk stands on the diagonal.
+    """Factor A, real or complex, into L U with row exchanges, in place, with 1/u_kk on the diagonal.
 
     Returns min|u_kk| / max|u_kk|; 0 for a singular matrix or one with values that are not finite.
     """
@@ -191,7 +191,7 @@ def ldl_solve_rows(A, B):
 
 @merged
 def has_new_entries(G, pattern):
-    """Return whether an entry of G outside its pattern is not zero."""
+    """Return whether G has an entry, not zero, where `pattern` is 0."""
     entries, seen = G.reshape(G.size), pattern.reshape(pattern.size)
     unseen = 0.0  # a sum without a branch, because new entries are rare
     for i in range(seen.size):
@@ -201,7 +201,7 @@ def has_new_entries(G, pattern):
 
 @compiled
 def note_pattern(G, pattern):
-    """Add the nonzero entries of G to its pattern; return whether there are new ones."""
+    """Set `pattern` to 1 where G is not zero; return whether this changes it."""
     if not has_new_entries(G, pattern):
         return False
     new = False

@@ -1,31 +1,32 @@
-"""Choose the coordinates that rows of G determine from the others: pivots, in blocks of one or two, for generated code.
+"""Choose dependent coordinates for generated code, as pivots of rows of G, in blocks of one or two.
 
-Constant entries come first: they need no division and do not change. Among other entries that are large enough, those
-with the least fill are chosen instead of the largest, so that neighbouring positions mostly have the same pivots.
+Constant entries are chosen first: they need no division and do not change. Among other entries that are large enough,
+those with the least fill are chosen, not the largest, so that neighbouring positions mostly have the same pivots.
 """
 
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, i8, kernel
 
-NONE, NUMBER, VARIES = 0, 1, 2  # kinds of entries
-# number of shortest rows among which pairs are searched: a search among all takes milliseconds for 60 rows
+NONE, NUMBER, VARIES = 0, 1, 2  # kinds of entries: always zero, constant, varying
+# number of rows, those with the fewest entries, among which pairs are sought: among all 60 rows this takes milliseconds
 ROWS_SEARCHED = 4
-# limits of a block, in three tiers. MAX_SQUARES: sum of squares of the changes of its coordinates, if each other
-# coordinate moves by 1. MIN_SINE_SQUARES: squared sine between its columns, or of a single pivot over its column of G.
-# With the first tier pivots stay large for most of a turn (spatial four-bar: 98 % of the time, 34 % with the second
-# tier); the last tier is far enough from LEAST of generate/null_space.py
+# limits of a pivot block, in three tiers, which are tried in this order. MAX_SQUARES: sum of squares of the changes of
+# its coordinates, if each other coordinate moves by 1. MIN_SINE_SQUARES: squared sine of the angle between its columns,
+# or square of a single pivot over that of its column of G. With the first tier pivots stay large for most of a
+# turn (spatial four-bar: 98 % of the time, 34 % with the second tier); the last tier is far enough from LEAST of
+# generate/null_space.py
 MAX_SQUARES, MIN_SINE_SQUARES = (4.0, 20.0, 200.0), (0.2**2, 0.1**2, 0.04**2)
-SMALL = 1e-3  # relative to the largest entry of its row: a smaller constant is not used as a pivot
-CANCELLATION = 1e-12  # relative: a smaller difference of constants counts as zero
+SMALL = 1e-3  # smallest constant that may be a pivot, relative to the largest entry of its row
+CANCELLATION = 1e-12  # difference of constants that counts as zero, relative to the subtracted one
 
 
 def room_size(n_rows: int, n: int) -> tuple[int, int]:
-    """Return how many real numbers, and integers, `choose_dependent_columns` needs as scratch."""
+    """Return how many real numbers and how many integers `choose_dependent_columns` needs as scratch."""
     return n_rows * n + n, n_rows * n + 3 * n_rows + 2 * n
 
 
 @compiled
 def _find_constant_pivot(R, K, row_left, row_sizes, column_sizes):
-    """Return the index n row + column of the constant entry with the least fill; -1: there is none."""
+    """Return n * row + column of the constant entry with the least fill; -1 if there is none."""
     best, best_fill, best_size, (m, n) = -1, 0, 0, R.shape
     for i in range(m):
         if not row_left[i]:
@@ -67,12 +68,16 @@ def _is_pivot_block(R, column_left, squares, i, k, j, l, largest, parallel):
 
 
 @compiled
-def _find_varying_pivots(R, K, row_left, column_left, squares, rows, column_sizes, found):
-    """Find pivots among entries that vary; `found` becomes two rows and two columns, or one row and column, twice."""
+def _find_varying_pivots(R, K, row_left, column_left, squares, rows, column_sizes, block):
+    """Find a pivot block among entries that vary, and return whether there is one.
+
+    `block` becomes its two rows and two columns, or one row and one column, each twice. `rows` and `column_sizes` are
+    scratch.
+    """
     m, n = R.shape
     n_rows = 0
     column_sizes[:] = 0
-    for i in range(m):  # the shortest rows, sorted
+    for i in range(m):  # sort the rows by their numbers of entries
         if row_left[i]:
             size = 0
             for j in range(n):
@@ -112,7 +117,7 @@ def _find_varying_pivots(R, K, row_left, column_left, squares, rows, column_size
                                 R, column_left, squares, i, k, j, l, MAX_SQUARES[tier], MIN_SINE_SQUARES[tier]
                             ):
                                 best = fill
-                                found[0], found[1], found[2], found[3] = i, k, j, l
+                                block[0], block[1], block[2], block[3] = i, k, j, l
             if best >= 0:
                 return True
     return False
@@ -120,7 +125,7 @@ def _find_varying_pivots(R, K, row_left, column_left, squares, rows, column_size
 
 @compiled
 def _subtract(R, K, column_left, row_sizes, column_sizes, r, j, i):
-    """Subtract row i, solved for column j, from row r, so that row r has no entry there."""
+    """Subtract a multiple of row i, solved for column j, from row r, so that row r has no entry in column j."""
     factor, kind = R[r, j], K[r, j]
     R[r, j], K[r, j] = 0.0, NONE
     if kind == NONE:
@@ -173,10 +178,10 @@ def _eliminate(R, K, row_left, column_left, row_sizes, column_sizes, i, k, j, l)
 
 @kernel(i8(MATRIX, INTEGERS, INTEGERS, i8, VECTOR, INTEGERS, INTEGERS))
 def choose_dependent_columns(G, kinds, rows, n_kept, room, work, out):
-    """Choose dependent columns for the first `n_kept` of the rows `rows` of G; return the number of blocks, 0: none.
+    """Choose dependent columns for the first `n_kept` of the rows `rows` of G; return the number of blocks (0: failed).
 
-    kinds : of the entries of G, row by row. out : for each block two rows, as indices in `rows`, and two columns, or
-    one row and one column, each twice.
+    kinds : kind of each entry of G, row by row. out : becomes, for each block, its two rows, as indices in `rows`, and
+    its two columns, or one row and one column, each twice. room, work : scratch, see `room_size`.
     """
     n = G.shape[1]
     if n_kept > n:
@@ -199,18 +204,18 @@ def choose_dependent_columns(G, kinds, rows, n_kept, room, work, out):
             row_sizes[i], column_sizes[j] = row_sizes[i] + there, column_sizes[j] + there
     n_left, n_blocks = n_kept, 0
     while n_left > 0:
-        found = out[4 * n_blocks : 4 * n_blocks + 4]
+        block = out[4 * n_blocks : 4 * n_blocks + 4]
         place = _find_constant_pivot(R, K, row_left, row_sizes, column_sizes)
         if place < 0:
             break
-        found[0] = found[1] = place // n
-        found[2] = found[3] = place % n
-        _eliminate(R, K, row_left, column_left, row_sizes, column_sizes, found[0], found[1], found[2], found[3])
+        block[0] = block[1] = place // n
+        block[2] = block[3] = place % n
+        _eliminate(R, K, row_left, column_left, row_sizes, column_sizes, block[0], block[1], block[2], block[3])
         n_left, n_blocks = n_left - 1, n_blocks + 1
     while n_left > 0:
-        found = out[4 * n_blocks : 4 * n_blocks + 4]
-        if not _find_varying_pivots(R, K, row_left, column_left, squares, both, column_sizes, found):
+        block = out[4 * n_blocks : 4 * n_blocks + 4]
+        if not _find_varying_pivots(R, K, row_left, column_left, squares, both, column_sizes, block):
             return 0
-        _eliminate(R, K, row_left, column_left, row_sizes, column_sizes, found[0], found[1], found[2], found[3])
-        n_left, n_blocks = n_left - (1 if found[0] == found[1] else 2), n_blocks + 1
+        _eliminate(R, K, row_left, column_left, row_sizes, column_sizes, block[0], block[1], block[2], block[3])
+        n_left, n_blocks = n_left - (1 if block[0] == block[1] else 2), n_blocks + 1
     return n_blocks

@@ -1,41 +1,46 @@
 """Factor the dependent columns of the constraint Jacobian by LU, with a program for their pattern.
 
-A mechanism's Jacobian has few entries, always in the same places. The order of elimination is chosen once for each
-partition (Markowitz's rule with a threshold), and with it the list of operations: later factorizations follow this
-list, without a search for pivots and without tests for zeros. Large multipliers show that the order no longer suits the
-numbers. If the list would be as long as that of a full matrix, the factors are dense with row exchanges.
+A mechanism's Jacobian has few nonzero entries, and their pattern does not change. So the order of elimination is chosen
+once for each partition (Markowitz's rule with a threshold), and with it the program, a list of operations: later
+factorizations follow this list, without a search for pivots and without tests for zeros. If multipliers become large,
+another order is chosen. If the list is nearly as long as that of a full matrix, the factors are dense, with row
+exchanges.
 
 To choose an order, entries are stored in lists by row and by column, and each step of the elimination uses only the
 lists that it changes: the work is proportional to size times entries, whereas full matrices would take the third power
 of the size.
 
-The factors of a matrix are two arrays: `index`, the program, and `values`. Vectors to solve for are in the order of
-elimination: entry k belongs to row rows_of(index)[k] of the Jacobian, the solution's to columns_of(index)[k].
+The factors of a matrix are two arrays: `index`, the program, and `values`. Right-hand sides and solutions are in the
+order of elimination: entry k of a right-hand side belongs to row rows_of(index)[k] of the Jacobian, and entry k of a
+solution to column columns_of(index)[k].
 """
 
 from twoloop.kernels.data.common import compiled, inlined, merged
 from twoloop.kernels.linalg.dense import copy, lu_factor, lu_sign, lu_solve
 
 THRESHOLD = 0.1  # smallest pivot, relative to the largest entry in its column
-DENSE_SHARE = 0.5  # share of the operations of a dense factorization above which a dense one is used
-SMALL_SIZE = 3  # number of rows up to which factors are never dense
-ZERO_PIVOT = 1e-11  # a pivot below this fraction of the largest one counts as zero
-# largest number of subtractions in a list: MIN_SUBTRACTIONS + PER_ROW r, for which memory is allocated
+DENSE_SHARE = 0.5  # number of operations, relative to a dense factorization, above which the factors are dense
+SMALL_SIZE = 3  # largest number of rows for which factors are never dense
+ZERO_PIVOT = 1e-11  # largest pivot that counts as zero, relative to the largest pivot so far
+# largest number of subtractions in a program, for which memory is allocated: MIN_SUBTRACTIONS + PER_ROW r
 MIN_SUBTRACTIONS, PER_ROW = 2000, 100
 MAX_ENTRIES_PER_LINE = 64  # largest number of entries in a row or a column of the factors
 
 ORDERED, SINGULAR_MATRIX, TOO_MANY = range(3)  # results of `order`; TOO_MANY: too many entries for sparse factors
 
-# indices in `index`: the size r, whether the factors are dense, the sign of the permutations, the number of entries of
-# the factors, the first entry of L, and the number of columns of the Jacobian; then rows (r), columns (r), row
-# exchanges of dense factors (r), where rows of U begin (r) and end (r) and where rows of L begin (r + 1); then the row,
-# the column and the source of each entry; then the targets of the subtractions. Order of entries: the diagonal, U from
-# its last row up, L from its first row down. The lists for ordering follow
+# indices in `index`: the size r, 1 if the factors are dense, the sign of the permutations, the number of entries of the
+# factors, the first entry of L, and the number of columns of the Jacobian. Arrays follow: rows (r), columns (r), row
+# exchanges of dense factors (r), where rows of U begin (r) and end (r), where rows of L begin (r + 1); row, column and
+# source of each entry, where the source is the index of a number in the matrix; the targets of the subtractions; and
+# the lists for choosing an order. Entries are in this order: the diagonal, U from its last row up, L from its first
+# row down
 SIZE, DENSE, SIGN, N_SLOTS, FIRST_LOWER, WIDTH, N_HEAD = range(7)
-# for each row and column of the matrix: number of entries in its list (a column loses those of eliminated rows); of a
-# row, number of entries left; position in the order so far; and of a row, its index in the list of a column, from 1 on
-ROW_SIZE, COLUMN_SIZE, ROW_LEFT, ROW_PLACE, COLUMN_PLACE, FOUND, N_COUNTS = range(7)
-COLUMNS, SOURCES, ROWS, N_LISTS = range(4)  # lists of a row: columns and sources of its entries; list of a column: rows
+# numbers for each row and column of the matrix: entries in the list of a row, and of a column, less eliminated rows;
+# entries of a row in columns that are not eliminated; positions of a row and of a column in the order so far; scratch:
+# 1 + index of a row in the list of a column, or slot of the entry in a column
+ROW_SIZE, COLUMN_SIZE, ROW_LEFT, ROW_POSITION, COLUMN_POSITION, WHERE, N_COUNTS = range(7)
+# lists of a row: columns and sources of its entries; list of a column: rows of its entries
+COLUMNS, SOURCES, ROWS, N_LISTS = range(4)
 
 
 def index_size(r: int) -> int:
@@ -49,7 +54,7 @@ def values_size(r: int, may_be_dense: bool = True) -> int:
 
 
 def max_subtractions(r: int) -> int:
-    """Return the largest number of subtractions of a program, for which there is memory."""
+    """Return the largest number of subtractions in a program of r rows, for which memory is allocated."""
     return min(r * r * (r + 1) // 2, MIN_SUBTRACTIONS + PER_ROW * r)
 
 
@@ -73,31 +78,31 @@ def pivots_of(index):
 
 @merged
 def begin_upper(r):
-    """Return the index in `index` of the list of the beginnings of the rows of U."""
+    """Return where in `index` the list begins that tells where the rows of U begin."""
     return N_HEAD + 3 * r
 
 
 @merged
 def end_upper(r):
-    """Return the index in `index` of the list of the ends of the rows of U."""
+    """Return where in `index` the list begins that tells where the rows of U end."""
     return N_HEAD + 4 * r
 
 
 @merged
 def begin_lower(r):
-    """Return the index in `index` of the list of the beginnings of the rows of L, and the end of the last one."""
+    """Return where in `index` the list begins that tells where the rows of L begin, and the last one ends."""
     return N_HEAD + 5 * r
 
 
 @merged
 def begin_entries(r):
-    """Return the index in `index` of the lists of rows, columns and sources of the entries."""
+    """Return where in `index` the lists of rows, columns and sources of the entries begin."""
     return N_HEAD + 6 * r + 1
 
 
 @inlined
 def lists_of(index, values):
-    """Return the lists of a matrix to be ordered: (N_COUNTS, r), (N_LISTS, r, entries), and the entries by column."""
+    """Return the lists of a matrix to be ordered: (N_COUNTS, r), (N_LISTS, r, entries), and the numbers by column."""
     r = index[SIZE]
     width = min(r, MAX_ENTRIES_PER_LINE)
     counts = index[index.size - N_COUNTS * r :].reshape((N_COUNTS, r))
@@ -107,7 +112,7 @@ def lists_of(index, values):
 
 @compiled
 def clear_lists(index, r):
-    """Empty the lists for a matrix of r rows."""
+    """Set r as the number of rows, and empty the lists of the matrix."""
     index[SIZE] = r
     index[DENSE] = 0
     for k in range(index.size - N_COUNTS * r, index.size):
@@ -116,7 +121,7 @@ def clear_lists(index, r):
 
 @compiled
 def put_entry(matrix, i, j, number, source):
-    """Add entry (i, j), which is not in the lists yet; return whether there is room for it."""
+    """Add entry (i, j), which is not in the lists yet; return False if a list is full."""
     counts, lists, numbers = matrix
     n, m = counts[ROW_SIZE, i], counts[COLUMN_SIZE, j]
     if n == numbers.shape[1] or m == numbers.shape[1]:
@@ -131,9 +136,9 @@ def put_entry(matrix, i, j, number, source):
 
 @compiled
 def _choose_pivot(matrix, rows, columns, k):
-    """Return row and column of pivot k: the one with the least fill among those large enough; (-1, -1): there is none.
+    """Return row and column of pivot k, which has the least fill of those large enough; (-1, -1) if there is none.
 
-    Among pivots with equal fill it is the largest, then the first in the order so far.
+    Of pivots with equal fill the largest is chosen, and of equally large ones the first in the order so far.
     """
     counts, lists, numbers = matrix
     r = rows.size
@@ -153,7 +158,7 @@ def _choose_pivot(matrix, rows, columns, k):
             i, size = lists[ROWS, j, m], abs(numbers[j, m])
             if size > 0.0 and size >= THRESHOLD * largest:
                 cost = (counts[ROW_LEFT, i] - 1) * others
-                place = counts[ROW_PLACE, i] * r + p
+                place = counts[ROW_POSITION, i] * r + p
                 better = cost < best_cost or (cost == best_cost and size > best_size)
                 if better or (cost == best_cost and size == best_size and place < best_place):
                     best_cost, best_size, best_place, row, column = cost, size, place, i, j
@@ -170,68 +175,68 @@ def _exchange(order, place, k, chosen):
 
 
 @compiled
-def _subtract(matrix, row, column, pivot, j, nothing):
-    """Subtract the pivot's row from the others in column j, and remove it there; return False if lists are full."""
+def _subtract(matrix, row, column, pivot, j, zero_source):
+    """Subtract multiples of the pivot's row from others in column j, then remove it; return False if a list is full."""
     counts, lists, numbers = matrix
     for m in range(counts[COLUMN_SIZE, j]):
-        counts[FOUND, lists[ROWS, j, m]] = m + 1
-    place = counts[FOUND, row] - 1
+        counts[WHERE, lists[ROWS, j, m]] = m + 1
+    place = counts[WHERE, row] - 1
     number = numbers[j, place]
     done = True
     for m in range(counts[COLUMN_SIZE, column]):
         i = lists[ROWS, column, m]
         if i == row:
             continue
-        change, entry = numbers[column, m] / pivot * number, counts[FOUND, i]
+        change, entry = numbers[column, m] / pivot * number, counts[WHERE, i]
         if entry > 0:
             numbers[j, entry - 1] -= change
         else:
-            done = done and put_entry(matrix, i, j, -change, nothing)
+            done = done and put_entry(matrix, i, j, -change, zero_source)
     last = counts[COLUMN_SIZE, j] - 1
     for m in range(last + 1):
-        counts[FOUND, lists[ROWS, j, m]] = 0
+        counts[WHERE, lists[ROWS, j, m]] = 0
     lists[ROWS, j, place], numbers[j, place] = lists[ROWS, j, last], numbers[j, last]
     counts[COLUMN_SIZE, j] = last
     return done
 
 
 @compiled
-def order(index, matrix, nothing, zero):
-    """Choose pivots one after another by eliminating the entries in the lists; write the program of that order.
+def order(index, matrix, zero_source, zero_share):
+    """Choose the pivots by eliminating `matrix` step by step, and write order and operations to `index`.
 
-    New entries get the source `nothing`, which holds a zero. A pivot of at most `zero` times the largest counts as
-    zero. Returns ORDERED, with rows and columns of the matrix in `index`, SINGULAR_MATRIX or TOO_MANY.
+    Fill-in entries get the source `zero_source`, the index of a zero. A pivot of at most `zero_share` times the largest
+    one so far counts as zero. Returns ORDERED, SINGULAR_MATRIX or TOO_MANY; `index` is complete only if ORDERED.
     """
     counts, lists, numbers = matrix
     r = index[SIZE]
     rows, columns = rows_of(index), columns_of(index)
     for k in range(r):
-        rows[k] = columns[k] = counts[ROW_PLACE, k] = counts[COLUMN_PLACE, k] = k
+        rows[k] = columns[k] = counts[ROW_POSITION, k] = counts[COLUMN_POSITION, k] = k
     index[SIGN] = 1
-    first = 0.0
+    largest = 0.0
     for k in range(r):
         i, j = _choose_pivot(matrix, rows, columns, k)
         if i < 0:
             return SINGULAR_MATRIX
-        index[SIGN] *= _exchange(rows, counts[ROW_PLACE], k, i) * _exchange(columns, counts[COLUMN_PLACE], k, j)
+        index[SIGN] *= _exchange(rows, counts[ROW_POSITION], k, i) * _exchange(columns, counts[COLUMN_POSITION], k, j)
         pivot = 0.0
         for m in range(counts[COLUMN_SIZE, j]):
             counts[ROW_LEFT, lists[ROWS, j, m]] -= 1
             if lists[ROWS, j, m] == i:
                 pivot = numbers[j, m]
-        first = max(first, abs(pivot))
-        if not abs(pivot) > zero * first:
+        largest = max(largest, abs(pivot))
+        if not abs(pivot) > zero_share * largest:
             return SINGULAR_MATRIX
         for n in range(counts[ROW_SIZE, i]):
             other = lists[COLUMNS, i, n]
-            if counts[COLUMN_PLACE, other] > k and not _subtract(matrix, i, j, pivot, other, nothing):
+            if counts[COLUMN_POSITION, other] > k and not _subtract(matrix, i, j, pivot, other, zero_source):
                 return TOO_MANY
     return ORDERED if _store_program(index, counts, lists) else TOO_MANY
 
 
 @compiled
 def _sort(columns, sources, size, place):
-    """Sort the list of a row by the order of elimination."""
+    """Sort the first `size` entries of a row, in place, by the order of elimination of their columns."""
     for n in range(1, size):
         column, source, k = columns[n], sources[n], n
         while k > 0 and place[columns[k - 1]] > place[column]:
@@ -246,7 +251,7 @@ def _size_of_program(rows, counts, lists):
 
     Leaves the number of entries of each row of U, in elimination order, in counts[ROW_LEFT].
     """
-    place = counts[COLUMN_PLACE]
+    place = counts[COLUMN_POSITION]
     entries, subtractions = 0, 0
     for k in range(rows.size):
         i = rows[k]
@@ -262,7 +267,7 @@ def _size_of_program(rows, counts, lists):
 
 @compiled
 def _store_program(index, counts, lists):
-    """Write the program; return whether it is short enough: False if dense factors would be faster."""
+    """Write the program to `index`; return False, without writing, if dense factors would be faster."""
     r = index[SIZE]
     rows = rows_of(index)
     n_slots, subtractions = _size_of_program(rows, counts, lists)
@@ -282,7 +287,7 @@ def _store_program(index, counts, lists):
         index[begin_lower(r) + k] = slot
         next_upper = index[begin_upper(r) + k]
         for n in range(counts[ROW_SIZE, i]):
-            j = counts[COLUMN_PLACE, lists[COLUMNS, i, n]]
+            j = counts[COLUMN_POSITION, lists[COLUMNS, i, n]]
             s = k
             if j < k:
                 s = slot
@@ -290,18 +295,18 @@ def _store_program(index, counts, lists):
             elif j > k:
                 s = next_upper
                 next_upper += 1
-            counts[FOUND, j] = s
+            counts[WHERE, j] = s
             index[in_row + s], index[in_column + s], index[source + s] = k, j, lists[SOURCES, i, n]
         for s in range(index[begin_lower(r) + k], slot):
             j = index[in_column + s]
             for u in range(index[begin_upper(r) + j], index[end_upper(r) + j]):
-                index[target] = counts[FOUND, index[in_column + u]]
+                index[target] = counts[WHERE, index[in_column + u]]
                 target += 1
     index[begin_lower(r) + r] = slot
     return True
 
 
-GROWTH = 1e3  # largest multiplier; after a larger one the order of elimination is chosen again
+GROWTH = 1e3  # largest multiplier: after a larger one, the order of elimination is chosen again
 
 
 @compiled
@@ -336,10 +341,10 @@ def make_program(G, pattern, rows, columns, index, values):
 
 @merged
 def factor(entries, index, values):
-    """Factor G[rows][:, columns], with 1/pivots on the diagonal; `entries` are those of G (n, n_q), last row zero.
+    """Factor G[rows][:, columns], with 1/pivot on the diagonal; `entries` are G as a vector, whose last row is zero.
 
-    Returns the ratio of the smallest to the largest pivot. It is negative if a pivot is zero or not finite, or if
-    multipliers have grown: the order must then be chosen again.
+    Returns the ratio of the smallest to the largest pivot. If a pivot is zero or not finite, or a multiplier exceeds
+    GROWTH, a negative number (0 from dense factors) shows that the order must be chosen again.
     """
     r = index[SIZE]
     if index[DENSE] == 1:
@@ -357,7 +362,7 @@ def factor(entries, index, values):
 
 @merged
 def run_program(index, values):
-    """Run the program with the entries in `values`; return the same as `factor`."""
+    """Factor the entries in `values` by the program; return the same ratio as `factor`."""
     r, n_slots = index[SIZE], index[N_SLOTS]
     in_column = begin_entries(r) + n_slots
     target = in_column + 2 * n_slots
@@ -381,14 +386,14 @@ def run_program(index, values):
     if not growth <= GROWTH:
         return -1.0
     in_row = begin_entries(r)
-    for u in range(r, index[FIRST_LOWER]):  # scale U to 1 on the diagonal, which makes solutions faster
+    for u in range(r, index[FIRST_LOWER]):  # divide U by its diagonal, which makes solutions faster
         values[u] *= values[index[in_row + u]]
     return smallest / largest if r > 0 else 1.0
 
 
 @merged
 def sign_of(index, values):
-    """Return the sign of the determinant, rows and columns ascending, from the factors."""
+    """Return the sign of the determinant, for rows and columns in ascending order, from the factors."""
     r = index[SIZE]
     if index[DENSE] == 1:
         return lu_sign(values[: r * r].reshape((r, r)), pivots_of(index))
@@ -401,7 +406,7 @@ def sign_of(index, values):
 
 @merged
 def solve(index, values, x):
-    """Solve for one right-hand side, overwritten."""
+    """Solve for one right-hand side x, which becomes the solution."""
     r, n_slots, first_lower = index[SIZE], index[N_SLOTS], index[FIRST_LOWER]
     if index[DENSE] == 1:
         lu_solve(values[: r * r].reshape((r, r)), pivots_of(index), x)
@@ -417,14 +422,14 @@ def solve(index, values, x):
 
 @merged
 def solve_rows(index, values, X, n):
-    """Solve for each of the first n rows of X."""
+    """Solve for each of the first n rows of X, which become the solutions."""
     for j in range(n):
         solve(index, values, X[j])
 
 
 @merged
 def solve_transposed(index, values, x):
-    """Solve with the transposed matrix: x is in the order of columns on entry, in that of rows on return."""
+    """Solve with the transposed matrix: x, in the order of columns, becomes the solution, in the order of rows."""
     r = index[SIZE]
     if index[DENSE] == 1:
         A, pivots = values[: r * r].reshape((r, r)), pivots_of(index)

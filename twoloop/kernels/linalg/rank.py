@@ -1,4 +1,4 @@
-"""Choose independent rows of G and rows that make M invertible, and bound pivots and solutions with these rows."""
+"""Choose independent rows of G, and rows to add to M so that it is invertible; bound the pivots and the solutions."""
 
 import math
 
@@ -7,9 +7,10 @@ from numba import types
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, f8, i8, kernel, merged
 from twoloop.kernels.linalg.dense import copy_matrix, ldl_factor, ldl_solve, ldl_solve_rows
 
-# rounding errors of a product of rows, relative to the sum of squares of all entries, for each row
+# rounding errors of a product of two rows, relative to the sum of squares of all entries, times the number of rows
 ROUNDING_OF_SQUARES = 4.0 * 2.0**-52
-MOST_OF_SQUARE = 0.5  # share of a row's squared length: if more is left, the rest is orthogonal up to rounding
+# squared length of the rest of a row over that of the row: a longer rest is orthogonal up to rounding
+MOST_OF_SQUARE = 0.5
 
 
 @compiled
@@ -22,7 +23,7 @@ def _dot(x, y):
 
 @compiled
 def _orthogonalise(basis, n, rest, parts):
-    """Subtract a row's components along n orthonormal rows; return the squared length of the rest."""
+    """Subtract from `rest` its components along n orthonormal rows, add these to `parts`; return its squared length."""
     for i in range(n):
         part = _dot(basis[i], rest)
         if part != 0.0:
@@ -34,12 +35,12 @@ def _orthogonalise(basis, n, rest, parts):
 
 @merged
 def select_rows(G, least, basis, factors, kept):
-    """Select the rows that are independent of those selected before, into `kept`; return their number.
+    """Select each row that is independent of those selected before; write indices to `kept`; return their number.
 
-    A row is independent if more than the share `least` of its length is orthogonal to the rows before, by Gram-Schmidt
-    orthogonalisation, repeated if most of the row is lost. `basis` gets orthonormal rows, and `factors` the lower
-    triangle whose product with them gives the selected rows. Both have as many rows as can be independent, and one more
-    for scratch.
+    A row is independent if the part of it that is orthogonal to the selected rows is longer than `least` times the row.
+    The part is computed by Gram-Schmidt orthogonalisation, repeated if most of the row is lost. `basis` becomes
+    orthonormal rows, and `factors` the lower triangle whose product with `basis` is the selected rows. Both have as
+    many rows as can be independent, and one more for scratch.
     """
     n_kept = 0
     for k in range(len(G)):
@@ -70,8 +71,8 @@ def independent_rows(G, least, basis, factors, kept):
 
 
 @merged
-def _find_shares(n, basis, factors, row, shares):
-    """Express a row as a combination of the n selected rows, by least squares; `shares` are its coefficients."""
+def _find_coefficients(n, basis, factors, row, shares):
+    """Express `row` as a combination of the n selected rows, by least squares; `shares` become the coefficients."""
     for k in range(n):
         shares[k] = _dot(basis[k], row)
     for k in range(n - 1, -1, -1):
@@ -84,8 +85,8 @@ def _find_shares(n, basis, factors, row, shares):
 def size_of_inverse(factors, n, column):
     """Return the Frobenius norm of the inverse of a lower triangle of n rows; `column` is scratch.
 
-    Times the norm of the right-hand side it bounds the solutions of least norm of G x = b, if `factors` are those of
-    the independent rows of G.
+    If `factors` are those of the independent rows of G, this result times the norm of b bounds the solution of least
+    norm of G x = b.
     """
     total = 0.0
     for j in range(n):
@@ -100,10 +101,10 @@ def size_of_inverse(factors, n, column):
 
 @kernel(types.boolean(MATRIX, INTEGERS, f8, MATRIX, MATRIX, MATRIX, INTEGERS, MATRIX, VECTOR), vectorized=True)
 def shares_of_others(rows, order, least, others, basis, factors, kept, shares, lengths):
-    """Return whether `others` are independent; then express some rows as combinations of them, by least squares.
+    """Return whether the first n of `rows` in `order` are independent; then express the following rows by these.
 
-    `order` has the indices in `rows` of those to put into `others`, then of the rows to express; `lengths` become those
-    of all rows; for the other arguments see `select_rows`.
+    `others`, (n, n_q), becomes the first n rows in `order`; `shares` become the coefficients of the following rows in
+    these, by least squares; `lengths` become the lengths of all `rows`. For other arguments see `select_rows`.
     """
     n = len(others)
     for i in range(len(rows)):
@@ -114,16 +115,17 @@ def shares_of_others(rows, order, least, others, basis, factors, kept, shares, l
     if select_rows(others, least, basis, factors, kept) < n:
         return False
     for i in range(len(shares)):
-        _find_shares(n, basis, factors, rows[order[n + i]], shares[i])
+        _find_coefficients(n, basis, factors, rows[order[n + i]], shares[i])
     return True
 
 
 @kernel(i8(MATRIX, VECTOR, f8, MATRIX, MATRIX, INTEGERS, MATRIX, MATRIX, MATRIX, VECTOR), vectorized=True)
 def least_solution(rows, values, least, basis, factors, kept, shares, gram, parts, x):
-    """Compute the x of least norm that gives rows these values, by least squares; return how many are independent.
+    """Compute the x of least norm for which rows @ x is nearest to `values`; return the number of independent rows.
 
-    With b the values and S the coefficients of the other rows in the independent rows, the latter's values are y + S^T
-    z, (1 + S S^T) z = b - S y. `values` become the residuals; `parts` is scratch for y and z.
+    `x` is zero on entry, `values` become the residuals. Let y be the values of the independent rows, b those of the
+    other rows, and S the coefficients of the independent rows in the other ones. Then x gives the independent rows the
+    values y + S^T z, with (1 + S S^T) z = b - S y. `parts` is scratch for y and z.
     """
     n, m = select_rows(rows, least, basis, factors, kept), 0
     y, z = parts[0], parts[1]
@@ -131,7 +133,7 @@ def least_solution(rows, values, least, basis, factors, kept, shares, gram, part
         if i - m < n and kept[i - m] == i:
             y[i - m] = values[i]
             continue
-        _find_shares(n, basis, factors, rows[i], shares[m])
+        _find_coefficients(n, basis, factors, rows[i], shares[m])
         z[m] = values[i]
         m += 1
     for i in range(m):
@@ -156,9 +158,10 @@ def least_solution(rows, values, least, basis, factors, kept, shares, gram, part
 
 @kernel(types.boolean(MATRIX, f8, MATRIX), vectorized=True)
 def singular_values_exceed(rows, ratio, gram):
-    """Return whether all singular values exceed this share of the largest: whether G G^T less its square is definite.
+    """Return whether all singular values of the rows exceed `ratio` times the largest one.
 
-    The Frobenius norm of the rows replaces the largest singular value; `gram` is scratch.
+    So it is if G G^T minus (ratio times the largest one)^2 is definite. The Frobenius norm of the rows replaces the
+    largest singular value; `gram` is scratch.
     """
     n, total = len(rows), 0.0
     for i in range(n):
@@ -170,28 +173,29 @@ def singular_values_exceed(rows, ratio, gram):
     return math.isfinite(total) and ldl_factor(gram)
 
 
-BOUND_ROUNDING = 1e-12  # relative: pivots may be below a bound by this much
-NOT_DEFINITE, STAYS_SINGULAR = -1, -2
-TINY = 1e-300
-# smallest ratio of two eigenvalues of M. Above it, pivots that keep one of the bounds, 1e-5 at least, show that all
-# rows are independent and that M needs none: the orthogonal part of a row is then 1e-6 of it, where 1e-9 would do
+BOUND_ROUNDING = 1e-12  # relative amount by which pivots may be below a bound, because of rounding
+NOT_DEFINITE, STAYS_SINGULAR = -1, -2  # codes: M is not positive definite; no rows make M invertible
+TINY = 1e-300  # replaces zero as a divisor
+# smallest over largest eigenvalue of M. Above this, pivots larger than one of the bounds, which are at least 1e-5, show
+# that all rows are independent, and that no row needs to be added to M: the part of a row that is orthogonal to the
+# others is then at least 1e-6 of the row, whereas 1e-9 suffices
 SIMILAR_EIGENVALUES = 1e-7
-# largest coefficient of an independent row in a redundant one, both scaled to length 1: above it the rows change roles.
-# If the coefficient passes zero on the way, the independent rows become dependent, as at each dead centre of the
-# slider-crank with two rods; so rows are chosen whose coefficient is far from zero. The limit is above 1, because
-# dependent rows often have equal coefficients
-MAX_SHARE = 1.5
+# largest coefficient of an independent row in a redundant one, both scaled to length 1: above it the two rows are
+# exchanged. If the coefficient passes through zero during the motion, the independent rows become dependent, as at each
+# dead centre of the slider-crank with two rods; hence redundant rows with large coefficients become independent ones.
+# The limit exceeds 1, because equal coefficients of magnitude 1 are common, and must not lead to exchanges
+MAX_COEFFICIENT = 1.5
 
 
 def room_size(n_rows: int, n: int) -> int:
-    """Return the length of `room`, the scratch of `choose_rows`."""
+    """Return the length of the scratch `room` of `choose_rows`."""
     most = min(n_rows, n) + 1
     return most * (n + most) + 2 * n * n + n_rows * (2 * n + 2 * n_rows + 1) + n
 
 
 @merged
 def _factor_and_count_negative(A):
-    """Factor a symmetric A as `ldl_factor` does; return how many of its eigenvalues are negative."""
+    """Factor a symmetric A as `ldl_factor` does, but also if indefinite; return its number of negative eigenvalues."""
     n, count = len(A), 0
     for k in range(n):
         if not A[k, k] > 0.0:
@@ -209,7 +213,7 @@ def _factor_and_count_negative(A):
 
 @compiled
 def _count_weak(mass, weak, A):
-    """Count eigenvalues of M below a share of (a bound of) the largest; A gets the factors of M less that share."""
+    """Count the eigenvalues of M below b, `weak` times a bound of the largest; A becomes the factors of M - b I."""
     largest = 0.0
     for i in range(len(mass)):
         total = 0.0
@@ -224,7 +228,7 @@ def _count_weak(mass, weak, A):
 
 @compiled
 def _has_similar_eigenvalues(mass):
-    """Return whether Gershgorin's circles show that the eigenvalues of M are of similar size."""
+    """Return whether Gershgorin's circles show that all eigenvalues of M exceed SIMILAR_EIGENVALUES of the largest."""
     least, largest = math.inf, 0.0
     for i in range(len(mass)):
         beside = 0.0
@@ -249,7 +253,7 @@ def _scale(mass, G):
 
 @merged
 def _sort_by_entries(G, order, counts):
-    """Sort the indices of the rows by their number of entries, few first."""
+    """Write the indices of the rows to `order`, sorted by their numbers of entries; `counts` become these."""
     for k in range(len(G)):
         count, i = 0.0, k
         for j in range(G.shape[1]):
@@ -262,7 +266,10 @@ def _sort_by_entries(G, order, counts):
 
 @merged
 def _removes_weak_eigenvalue(A, g, scale, x):
-    """Return whether adding g g^T makes one negative eigenvalue positive: whether the determinant changes its sign."""
+    """Return whether adding scale g g^T to the matrix with factors A changes the sign of its determinant.
+
+    Then a negative eigenvalue becomes positive. `x` is scratch.
+    """
     for j in range(x.size):
         x[j] = g[j]
     ldl_solve(A, x)
@@ -273,8 +280,11 @@ def _removes_weak_eigenvalue(A, g, scale, x):
 
 
 @merged
-def _add_rows(mass, G, weak, scale, A, x, order, added):
-    """Add rows to M until no eigenvalue is weak, and record them; return their number, or STAYS_SINGULAR."""
+def _stiffen_mass(mass, G, weak, scale, A, x, order, added):
+    """Add scale g g^T to M for rows g of G until no eigenvalue of M is below `weak` times the largest.
+
+    `added` becomes the indices of these rows. Returns their number, or STAYS_SINGULAR.
+    """
     n_added = 0
     while _count_weak(mass, weak, A) > 0:
         position = -1
@@ -296,27 +306,27 @@ def _add_rows(mass, G, weak, scale, A, x, order, added):
 
 @compiled
 def _exchange_rows(G, n_kept, basis, factors, kept, order, shares, others):
-    """Exchange independent rows for redundant ones in which they have large coefficients, to keep them independent.
+    """Exchange independent rows for redundant rows in which they have coefficients above MAX_COEFFICIENT.
 
     An exchange multiplies the volume that the independent rows span by the coefficient. `basis`, `factors` and `kept`
-    are results of `select_rows`; `order` and `shares` (n_rows each) and `others` (n, n) are scratch.
+    are results of `select_rows`, and are updated; `order`, `shares` (n_rows each) and `others` (n, n) are scratch.
     """
     for _ in range(2 * (len(G) - n_kept)):
-        largest, leaves, enters, place = MAX_SHARE, -1, -1, 0
+        largest, leaves, enters, place = MAX_COEFFICIENT, -1, -1, 0
         for i in range(len(G)):
             if place < n_kept and kept[place] == i:
                 place += 1
                 continue
-            _find_shares(n_kept, basis, factors, G[i], shares)
+            _find_coefficients(n_kept, basis, factors, G[i], shares)
             length = _dot(G[i], G[i])
             for k in range(n_kept):
                 square = _dot(G[kept[k]], G[kept[k]])
-                share = abs(shares[k]) * math.sqrt(square / max(length, TINY))
-                if share > largest:
-                    largest, leaves, enters = share, k, i
+                coefficient = abs(shares[k]) * math.sqrt(square / max(length, TINY))
+                if coefficient > largest:
+                    largest, leaves, enters = coefficient, k, i
         if leaves < 0:
             return
-        k = leaves  # move the rows between, so that `kept` stays sorted
+        k = leaves  # move the rows between both, so that `kept` stays sorted
         while k + 1 < n_kept and kept[k + 1] < enters:
             kept[k] = kept[k + 1]
             k += 1
@@ -332,10 +342,10 @@ def _exchange_rows(G, n_kept, basis, factors, kept, order, shares, others):
 
 @merged
 def _first_bound_kept(mass, G, kept, n_rows, bounds, factors, solved_room, S_room, sizes):
-    """Return the index of the first bound below all pivots, where pivots are relative to their rows alone.
+    """Return the index of the first of `bounds` that is below all pivots, which are relative to their rows alone.
 
     No pivot is below the least eigenvalue of S = G M^-1 G^T, scaled to a diagonal of 1. This eigenvalue exceeds a bound
-    if S less the bound is definite. Returns the number of bounds if pivots keep none, and NOT_DEFINITE if M is not.
+    b if S - b I is definite. Returns bounds.size if no bound is below all pivots, and NOT_DEFINITE if M is not.
     """
     copy_matrix(mass, factors)
     if not ldl_factor(factors):
@@ -370,12 +380,13 @@ def _first_bound_kept(mass, G, kept, n_rows, bounds, factors, solved_room, S_roo
 
 @kernel(i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS), vectorized=True)
 def choose_rows(given, G, least, weak, bounds, room, chosen):
-    """Choose the independent rows of G and the rows that make M invertible; return the index of the first bound kept.
+    """Choose the independent rows of G, and the rows that make M = `given` invertible; return an index or a code.
 
     Rows of G are independent as in `select_rows` for `least`, except for exchanges. Rows are added to M if it has
-    eigenvalues below the share `weak` of the largest; weak = 0: no rows. `chosen`, of 2 + 3 n_rows numbers, begins with
-    the numbers of independent and of added rows; two lists of these follow, of length n_rows each. `room` begins with
-    the factor of the added rows. See generate/elimination.py.
+    eigenvalues below `weak` times the largest; weak = 0: no rows. `chosen`, of 2 + 3 n_rows numbers, becomes the number
+    of independent rows, that of added rows, and a list of each, of length n_rows. `room` is scratch, of `room_size`
+    numbers; room[0] becomes the factor of the added rows. The result is that of `_first_bound_kept`, or STAYS_SINGULAR.
+    See generate/elimination.py.
     """
     n_rows, n = G.shape
     most = min(n_rows, n) + 1
@@ -402,7 +413,7 @@ def choose_rows(given, G, least, weak, bounds, room, chosen):
     if n_kept > 0 and weak > 0.0 and _count_weak(mass, weak, A) > 0:
         scale = _scale(mass, G)
         _sort_by_entries(G, order, sizes)
-        n_added = _add_rows(mass, G, weak, scale, A, x, order, added)
+        n_added = _stiffen_mass(mass, G, weak, scale, A, x, order, added)
     chosen[0], chosen[1], place = n_kept, max(n_added, 0), n_added
     if n_added >= 0:
         place = _first_bound_kept(mass, G, kept, n_kept, bounds, A, solved, S, sizes)

@@ -1,7 +1,10 @@
-"""Solve the linear problem of accelerations; first on the velocities that the constraints allow, for few freedoms.
+"""Solve the linear problem of accelerations, M a + G^T lam = r and G a = c, in one of three forms.
 
-With T = [I; D^T], D^T = -G_d^-1 G_i, whose columns are these velocities, a = g + T x. g satisfies G g = c with zero
-independent entries, and (T^T M T) x = T^T (r - M g): M need only be positive definite on these velocities.
+- NULL_SPACE, for few degrees of freedom: a = g + T x, where g satisfies G g = c with zero independent entries, and the
+  columns of T = [I; D^T], D^T = -G_d^-1 G_i, are the velocities that the constraints allow. x follows from
+  (T^T M T) x = T^T (r - M g): M need only be positive definite on these velocities.
+- MULTIPLIERS: by the Schur complement G M^-1 G^T.
+- AUGMENTED: by sparse factors of the whole matrix, in which M is multiplied by w.notes[MASS_SCALE].
 """
 
 import numpy as np
@@ -52,7 +55,7 @@ from twoloop.kernels.linalg.markowitz_lu import solve as solve_dependent
 
 @compiled
 def find_null_space(w):
-    """Compute D, the velocities that the constraints allow, from the rows and factors in w."""
+    """Compute w.D, the velocities that the constraints allow, from the rows and factors in w."""
     rows, independent = rows_of(w.index_v), w.independent_v
     for j in range(independent.size):
         for k in range(rows.size):
@@ -62,7 +65,7 @@ def find_null_space(w):
 
 @merged
 def _reduce_diagonal(columns, independent, M, D, A, m):
-    """Compute the upper triangle of T^T M T of a diagonal M into A; m is scratch."""
+    """Compute the upper triangle of T^T M T into A, for a diagonal M; m is scratch."""
     for k in range(columns.size):
         m[k] = M[columns[k], columns[k]]
     for i in range(independent.size):
@@ -76,7 +79,7 @@ def _reduce_diagonal(columns, independent, M, D, A, m):
 
 @merged
 def _reduce_dense(columns, independent, M, D, A, MT):
-    """Compute the upper triangle of T^T M T of any M into A; MT is scratch."""
+    """Compute the upper triangle of T^T M T into A, for any M; MT is scratch."""
     n, n_dof = M.shape[0], independent.size
     for i in range(n):
         for j in range(n_dof):
@@ -98,7 +101,7 @@ def _reduce_dense(columns, independent, M, D, A, MT):
 
 @merged
 def factor_reduced(f, w):
-    """Factor T^T M T into w.A; needs w.D."""
+    """Factor T^T M T into w.A, from w.M and w.D; return DONE, MASS_NOT_DEFINITE or NOT_FINITE."""
     columns = columns_of(w.index_v)
     if f.flags[DIAGONAL_MASS] == 1:
         _reduce_diagonal(columns, w.independent_v, w.M, w.D, w.A, w.x)
@@ -118,7 +121,8 @@ def solve_reduced(f, w, r, c, a):
     for k in range(rows.size):
         z[k] = c[rows[k]]
     solve_dependent(w.index_v, w.values_v, z)
-    copy(r, a)  # a holds r - M g for now
+    copy(r, a)
+    # a = r - M g for now: g are the accelerations if the independent ones are zero, with z as dependent entries
     for k in range(columns.size):
         m = columns[k]
         if f.flags[DIAGONAL_MASS] == 1:
@@ -143,7 +147,7 @@ def solve_reduced(f, w, r, c, a):
 
 @merged
 def reduced_multipliers(f, w, r, a, lam):
-    """Compute the multipliers of the independent rows: G^T lam = r - M a in the dependent columns."""
+    """Compute the multipliers of the independent rows into lam, from G^T lam = r - M a in the dependent columns."""
     rows, columns, z = rows_of(w.index_v), columns_of(w.index_v), w.z
     for k in range(columns.size):
         m = columns[k]
@@ -161,7 +165,7 @@ def reduced_multipliers(f, w, r, a, lam):
 
 @merged
 def factor_mass(f, w):
-    """Invert a constant w.M, because the inverse is faster to apply, or factor one that varies."""
+    """Invert w.M if it is constant and dense, because the inverse is faster to apply, or factor it; return a code."""
     if banded_mass(f):
         definite = factor_banded_mass(f, w) == DONE
     else:
@@ -244,14 +248,14 @@ def solve_schur(f, w, r, c, a):
             a[j] -= solved[i, j] * w.z[i]
 
 
-MIN_ROWS = 8  # smallest number of rows and of freedoms for which this form is the fastest (on chains from about 7 on)
-# smallest number of coordinates from which it is the fastest with few degrees of freedom, too, unless M is diagonal:
-# measured about 30
+MIN_ROWS = 8  # smallest number of rows, and of freedoms, for which the sparse form is the fastest (on chains: 7)
+# smallest number of coordinates for which the sparse form is the fastest with few freedoms, too, unless M is diagonal
+# (measured: about 30)
 MIN_COORDINATES = 32
 
 
 def sparse_pays(n_q: int, n_rows: int, diagonal: bool) -> bool:
-    """Return whether this form is faster than the dense ones for a sparse pattern; `diagonal`: M is always diagonal."""
+    """Return whether the sparse form is faster than dense ones for a sparse pattern; `diagonal`: M is diagonal."""
     return n_rows >= MIN_ROWS and (n_q - n_rows >= MIN_ROWS or (n_q >= MIN_COORDINATES and not diagonal))
 
 
@@ -266,7 +270,7 @@ def _largest(A):
 
 @compiled
 def _make_program(w):
-    """Choose the order of elimination for the numbers in w.M and w.G."""
+    """Choose the order of elimination of the augmented matrix for w.M and w.G; return the code of `order`."""
     n, rows, index, values = w.Q.size, w.rows_v, w.index_a, w.values_a
     note_pattern(w.M, w.mass_pattern)
     clear_lists(index, n + rows.size)
@@ -289,7 +293,7 @@ def _make_program(w):
 
 @compiled
 def _factor(w):
-    """Factor by the current program; return False if its order of elimination does not suit these numbers."""
+    """Factor the augmented matrix by its program; return False if the program does not suit the numbers."""
     index, values, scale, first_of_mass = w.index_a, w.values_a, w.notes[MASS_SCALE], w.entries.size
     source = begin_entries(index[at.SIZE]) + 2 * index[at.N_SLOTS]
     for s in range(index[at.N_SLOTS]):
@@ -300,7 +304,7 @@ def _factor(w):
 
 @compiled
 def factor_sparse(f, w):
-    """Factor for the current w.M and w.G; f.flags[FORM] becomes the dense form if the factors are not sparse."""
+    """Factor the augmented matrix, or choose a dense form in f.flags if the factors are not sparse; return a code."""
     w.counters[N_FACTORIZATIONS] += 1
     new = f.flags[CONSTANT_MASS] == 0 and note_pattern(w.M, w.mass_pattern)
     if w.index_a[at.SIZE] == 0 or new or not _factor(w):
@@ -341,7 +345,7 @@ def solve_sparse(w, r, c, a):
 
 @compiled
 def _factor_sparse(f, w):
-    """Factor the sparse matrix, or prepare what the dense form needs if the factors are not sparse."""
+    """Factor the augmented matrix; if dense forms take over, compute w.D or the factors of M; return a code."""
     code = factor_sparse(f, w)
     if code == DONE and f.flags[FORM] == NULL_SPACE:
         find_null_space(w)
@@ -352,7 +356,7 @@ def _factor_sparse(f, w):
 
 @merged
 def factor(f, w):
-    """Factor for the current w.M and the rows, factors and null space of G; return DONE, or why that failed."""
+    """Factor the linear problem for w.M, and rows, factors and null space in w; return DONE, or why this failed."""
     if w.notes[FACTORED] == 1.0:
         return DONE
     code = _factor_sparse(f, w) if f.flags[FORM] == AUGMENTED else DONE
@@ -371,7 +375,7 @@ def factor(f, w):
 
 @merged
 def solve(f, w, r, c, a):
-    """Solve for a with any right-hand side; r, c and a are different arrays."""
+    """Solve for `a` with any right-hand side (r, c); r, c and `a` are different arrays."""
     if f.flags[FORM] == NULL_SPACE:
         solve_reduced(f, w, r, c, a)
     elif f.flags[FORM] == MULTIPLIERS:
@@ -382,7 +386,7 @@ def solve(f, w, r, c, a):
 
 @merged
 def multipliers(f, w, r, a, lam):
-    """Compute the multipliers of the accelerations just computed; those of redundant rows stay unchanged."""
+    """Compute the multipliers of the last solution `a` into lam; those of redundant rows stay unchanged."""
     if f.flags[FORM] == NULL_SPACE:
         reduced_multipliers(f, w, r, a, lam)
     else:
@@ -392,17 +396,17 @@ def multipliers(f, w, r, a, lam):
 
 @merged
 def solve_both(f, w, r, c, a, lam):
-    """Solve for a and multipliers with any right-hand side."""
+    """Solve for `a` and the multipliers lam with any right-hand side (r, c)."""
     solve(f, w, r, c, a)
     multipliers(f, w, r, a, lam)
 
 
 @compiled
 def least_norm(w, lam):
-    """Remove the null space of G^T from lam, so that its norm is least.
+    """Replace lam by the multipliers of least norm with the same G^T lam.
 
-    Redundant row i is sum_k Z[i, k] of independent rows. The null space is spanned by n_i = e_i - sum_k Z[i, k] e_k,
-    and lam -= N (N^T N)^-1 N^T lam.
+    Redundant row i is the sum over k of Z[i, k] times independent row k. The columns n_i = e_i - sum_k Z[i, k] e_k of N
+    span the null space of G^T, and lam -= N (N^T N)^-1 N^T lam.
     """
     rows, columns = rows_of(w.index_v), columns_of(w.index_v)
     r, n_red = rows.size, lam.size - rows.size

@@ -1,15 +1,15 @@
 """Factor and solve the matrix of a large system by its program, see symbolic_factorization.py.
 
-An independent row of G has a negative pivot: minus the square of the part of the row that rows before it do not span.
-Divided by the sum of the bodies' contributions, it is the squared sine of the angle between the row and those before,
-in the metric of M^-1: `smallest` is the least of these. For a redundant row 0 replaces 1 / pivot, which removes it from
-the solution without another program. Solutions lose as many digits as the smallest pivot has; refinement against M and
-G recovers them.
+An independent row of G has a negative pivot: minus the squared length of the part of the row that previous rows do not
+span. Divided by the squared length of the row, which is the sum of the bodies' contributions, it is the squared sine of
+the angle between the row and the previous rows, in the metric of M^-1; `smallest` is the least of these. For a
+redundant row, 0 replaces 1 / pivot, which removes the row from the solution without another program. If the smallest
+squared sine is 10^-k, solutions lose k digits, which refinement against M and G recovers.
 
-If a body's M is singular, as with four Euler parameters, rows that touch this body alone stiffen it: with M + s g g^T
-accelerations are the same, as g a is given, and the multiplier of g is less by s g a. So M need only be positive
-definite on the velocities that such rows allow. Such a row stiffens M even where other rows imply it, as loops through
-a hub do; then s g (g a) is added to the right-hand side.
+If a body's M is singular, as with four Euler parameters, rows g that involve this body alone stiffen it: M + s g g^T
+replaces M. Accelerations are the same, because g a is prescribed, and the multiplier of g is less by s g a. So M need
+only be positive definite on the velocities that these rows allow. A row stiffens M even if it is redundant, as rows of
+loops through a hub may be; then s g^T (g a) is added to the right-hand side.
 """
 
 from twoloop.kernels.data.common import compiled, merged
@@ -29,7 +29,7 @@ NOT_DEFINITE = -1.0  # returned instead of the smallest pivot if a pivot of M is
 
 @compiled
 def _find_stiffness(program, mass, jacobian, stiffness, scratch):
-    """Compute how much each row stiffens M: by the largest diagonal entry of M among the coordinates of the row."""
+    """Compute s for each row that stiffens M: largest diagonal entry of M in its columns, over its squared length."""
     n_q = program[N_COORDINATES]
     for k in range(program[N_PIVOTS]):
         scratch[k] = 0.0
@@ -55,7 +55,7 @@ def _find_stiffness(program, mass, jacobian, stiffness, scratch):
 
 @merged
 def load(program, mass, jacobian, values, stiffness, scratch):
-    """Copy the numbers of M and G to their slots."""
+    """Copy the numbers of M and G to their slots in `values`, and stiffen M."""
     for s in range(values.size):
         values[s] = 0.0
     _, _, slots = mass_of(program)
@@ -75,9 +75,9 @@ def load(program, mass, jacobian, values, stiffness, scratch):
 def factor(program, counts, values, sizes, least):
     """Factor the numbers in place, with 1/pivot on the diagonal; return the smallest ratio of a pivot to its row.
 
-    Returns NOT_DEFINITE if M is not positive definite on what the rows so far allow. `counts` is 0 for redundant rows,
-    and becomes 0 for rows with a ratio below `least`, which does not count as the smallest. `sizes`, the sizes of the
-    rows, is scratch.
+    The ratio is that to the squared length of the row. Returns NOT_DEFINITE if M is not positive definite on the
+    velocities that the rows allow. `counts` is 0 for redundant rows, and becomes 0 for rows with a ratio up to `least`,
+    which the result excludes. `sizes` is scratch: the squared lengths.
     """
     (n_q, n) = program[N_COORDINATES], program[N_PIVOTS]
     order, runs = order_of(program), runs_of(program)
@@ -126,9 +126,10 @@ def factor(program, counts, values, sizes, least):
 
 @compiled
 def solve(program, values, stiffness, x, y):
-    """Solve in place for x = [r, c] by the factors; y is scratch."""
+    """Solve by the factors: x, the right-hand side [r, c], becomes the solution [a, lam]; y is scratch."""
     n, order, n_q = program[N_PIVOTS], order_of(program), program[N_COORDINATES]
-    # with M + s g g^T the right-hand side is r + s g c, and the multiplier is less by s c: r can be used unchanged
+    # M + s g g^T replaces M, with r + s g c on the right. As g a = c, r alone gives the same accelerations, and a
+    # multiplier that is less by s c, which is added at the end
     begin, row_of = columns_of(program)
     for k in range(n):
         y[k] = x[order[k]]
@@ -148,7 +149,7 @@ def solve(program, values, stiffness, x, y):
 
 @compiled
 def add_redundant_stiffness(program, jacobian, counts, stiffness, c, right):
-    """Add s g^T c for the redundant rows g that stiffen M."""
+    """Add s g^T c to `right` for the redundant rows g that stiffen M."""
     n_q = program[N_COORDINATES]
     _, columns, _ = jacobian_of(program)
     which, first, second, _ = stiffened_of(program)
@@ -160,7 +161,7 @@ def add_redundant_stiffness(program, jacobian, counts, stiffness, c, right):
 
 @compiled
 def subtract_product(program, mass, jacobian, counts, x, b):
-    """Subtract [M x_q + G^T x_c, G x_q] from b in place; redundant rows stay zero."""
+    """Subtract [M x_q + G^T x_c, G x_q] from b in place; entries of redundant rows become zero."""
     n_q = program[N_COORDINATES]
     rows, columns, _ = mass_of(program)
     for k in range(rows.size):
@@ -177,9 +178,9 @@ def subtract_product(program, mass, jacobian, counts, x, b):
 
 @compiled
 def solve_refined(program, mass, jacobian, counts, values, stiffness, x, times, right, residual, y):
-    """Solve in place for x = [r, c] and refine the solution `times` times; the other arrays are scratch.
+    """Solve for x, [r, c] on entry, and refine the solution `times` times; `right`, `residual` and `y` are scratch.
 
-    Returns the largest entry of the last correction over the largest of the solution; 0 without refinement.
+    Returns the largest acceleration in the last correction over the largest in the solution; 0 without refinement.
     """
     n_q, change = program[N_COORDINATES], 0.0
     for k in range(x.size):

@@ -1,12 +1,12 @@
-"""Factor Newton's matrix of a large system, which is not symmetric, by a static program, and group its columns.
+"""Factor the unsymmetric Newton matrix of a large system by a static program, and group its columns.
 
     [M - z^2 K - z D  G^T]
     [G                 0 ]  = L U
 
-in the order of symbolic_factorization.py with couplings; pivots are single rows, chosen without regard to the numbers.
-The entries of M come first, then those of K and D. After the program follow groups of columns of K and D: no two
-columns of a group have an entry in the same row, so that one displacement serves all (Curtis, Powell & Reid 1974, doi
-10.1093/imamat/13.1.117).
+The order of elimination is that of symbolic_factorization.py with couplings; pivots are single rows, chosen without
+regard to the numbers. The program lists the entries of M first, then those of K and D. Groups of columns of K and D
+follow the program: no two columns of a group have an entry in the same row, so that one displacement gives all columns
+of the group by differences (Curtis, Powell & Reid 1974, doi 10.1093/imamat/13.1.117).
 """
 
 from collections.abc import Iterable, Sequence
@@ -32,7 +32,7 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     stiffened_of,
 )
 
-MIN_PIVOT = 1e-11  # relative to the terms whose difference is the pivot: a smaller pivot is rounding
+MIN_PIVOT = 1e-11  # smallest pivot relative to the terms whose difference it is: a smaller one is a rounding error
 
 
 def newton_program(
@@ -57,7 +57,7 @@ def newton_program(
 
 
 def grouped_entries(tangents: Entries, n_q: int) -> Entries:
-    """Sort the entries by the groups of their columns."""
+    """Return the entries, sorted by the groups of their columns."""
     sequence = np.argsort(column_groups(tangents, n_q)[tangents[1]], kind="stable")
     return tangents[0][sequence], tangents[1][sequence]
 
@@ -68,7 +68,7 @@ def column_groups(entries: Entries, n_q: int) -> Integers:
     for i, j in zip(*(each.tolist() for each in entries), strict=True):
         rows_of[j].append(i)
     groups = np.zeros(n_q, dtype=np.int64)
-    by_row: list[set[int]] = [set() for _ in range(n_q)]  # groups of the columns with an entry in a row
+    by_row: list[set[int]] = [set() for _ in range(n_q)]  # for each row: groups of the columns with an entry in it
     for j, own in enumerate(rows_of):
         used = set().union(*(by_row[i] for i in own))
         groups[j] = group = next(k for k in range(n_q) if k not in used)
@@ -79,7 +79,7 @@ def column_groups(entries: Entries, n_q: int) -> Integers:
 
 @inlined
 def tangents_of(program):
-    """Return rows and columns of the entries of K and D, and where each group begins and the last one ends."""
+    """Return rows and columns of the entries of K and D; and among these, where groups begin and the last one ends."""
     begins = program[end_of_sections(program) :]
     rows, columns, _ = mass_of(program)
     n_mass = rows.size - begins[begins.size - 1]
@@ -88,7 +88,7 @@ def tangents_of(program):
 
 @compiled
 def load(program, mass, jacobian, K, D, z, stiffness, values):
-    """Copy the numbers of Newton's matrix for z to their slots."""
+    """Copy the numbers of Newton's matrix, for the number z (real or complex), to their slots in `values`."""
     for s in range(values.size):
         values[s] = 0.0
     off = program[N_OFF]
@@ -113,7 +113,7 @@ def load(program, mass, jacobian, K, D, z, stiffness, values):
 def factor(program, counts, values, sizes):
     """Factor the numbers in place, with 1/pivot on the diagonal; return whether all pivots are large enough.
 
-    Redundant rows, 0 in `counts`, have 0 on the diagonal and do not take part. `sizes` is scratch of real numbers.
+    Redundant rows, 0 in `counts`, get zeros, which remove them from solutions. `sizes` is scratch of real numbers.
     """
     n_q, n, off = program[N_COORDINATES], program[N_PIVOTS], program[N_OFF]
     order, runs = order_of(program), runs_of(program)
@@ -162,7 +162,7 @@ def factor(program, counts, values, sizes):
 
 @compiled
 def solve(program, values, x, y):
-    """Solve in place for x = [r, c] by the factors; y is scratch."""
+    """Solve by the factors: x, the right-hand side [r, c], becomes the solution; y is scratch."""
     n, off, order = program[N_PIVOTS], program[N_OFF], order_of(program)
     begin, row_of = columns_of(program)
     for k in range(n):

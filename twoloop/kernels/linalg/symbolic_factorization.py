@@ -3,15 +3,16 @@
     [M  G^T]
     [G   0 ]  = L D L^T
 
-is factored in an order that is chosen once from the pattern of entries. Pivots are single rows, chosen without regard
-to the numbers: see sparse_ldl.py and sparse_lu.py. A slot holds a number of the factors: the pivots in their order,
-then the columns of L, each downwards.
+is factored in an order of elimination that is chosen once, from the pattern of entries. Pivots are single rows, chosen
+without regard to the numbers: see sparse_ldl.py and sparse_lu.py. A slot is the index of a number of the factors: the
+pivots come first, in their order, then the columns of L, each downwards.
 
-Coordinates that M couples, or that a joint names together, form a body; the rows that touch the same bodies form a
-joint. Bodies of a few joints come first. What remains is G M^-1 G^T, positive definite, and any order of its joints is
-stable. A body with more joints, a hub, would couple all of them, and is ordered among the joints: with hubs the order
-is that of constrained minimum degree. A joint may precede a hub that it touches, or that joints before it touch, only
-if its rows are independent even without the hub's motion: one of its bodies must not be supported by anything yet.
+Coordinates that M couples, or that a joint has in one group, form a body; the rows that involve the same bodies form a
+joint. Bodies with few joints are eliminated first. Then G M^-1 G^T remains, which is positive definite, so that any
+order of its joints is stable. A body with more joints, a hub, would couple all of them, and is ordered among the
+joints: with hubs the order is that of constrained minimum degree. A joint may precede a hub that it involves, or that
+joints before it involve, only if its rows are independent even without the motion of the hub: one of its bodies must
+have no support yet. A support is the ground or a hub, to which eliminated joints connect the body.
 """
 
 import heapq
@@ -23,13 +24,13 @@ from numpy.typing import NDArray
 
 from twoloop.kernels.data.common import inlined
 
-MAX_JOINTS = 4  # largest number of joints of a body that comes before its joints
+MAX_JOINTS = 4  # largest number of joints of a body that is eliminated before its joints; others are hubs
 
 Integers = NDArray[np.int64]
 
 
 class _DisjointSets:
-    """Disjoint sets of the numbers below n (union-find)."""
+    """Disjoint sets of the integers below n (union-find), each named by its smallest member."""
 
     def __init__(self, n: int):
         self.parent = list(range(n))
@@ -47,24 +48,24 @@ class _DisjointSets:
 
 
 class _Supports:
-    """Supports of the parts that eliminated bodies and joints form: the ground, and hubs not eliminated yet."""
+    """Supports of the parts, which are bodies connected by eliminated joints: the ground, and remaining hubs."""
 
     def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int], lone: AbstractSet[int]):
-        self.joints, self.hubs = joints, set(hubs)  # hubs that are not eliminated yet
+        self.joints, self.hubs = joints, set(hubs)  # bodies of each joint; hubs that are not eliminated yet
         self.lone = lone  # bodies with a single known coordinate: parts that contain one may be fixed
         self.parts = _DisjointSets(n_bodies)
         self.grounded = [False] * n_bodies
-        self.hangs: list[set[int]] = [set() for _ in range(n_bodies)]
-        # bodies whose parts are, or were, supported by a hub
-        self.hanging: dict[int, list[int]] = {hub: [] for hub in hubs}
+        self.hubs_of: list[set[int]] = [set() for _ in range(n_bodies)]  # hubs that support each part
+        # for each hub: bodies whose parts are, or were, supported by the hub
+        self.supported: dict[int, list[int]] = {hub: [] for hub in hubs}
 
-    def lets(self, joint: int) -> bool:
-        """Return whether a joint may be eliminated."""
+    def may_eliminate(self, joint: int) -> bool:
+        """Return whether a joint may be eliminated now."""
         bodies = self.joints[joint]
         parts = {self.parts.find(body) for body in bodies if body not in self.hubs}
-        if not bodies & self.lone and any(not self.grounded[part] and not self.hangs[part] for part in parts):
+        if not bodies & self.lone and any(not self.grounded[part] and not self.hubs_of[part] for part in parts):
             return True
-        return not bodies & self.hubs and not any(self.hangs[part] for part in parts)
+        return not bodies & self.hubs and not any(self.hubs_of[part] for part in parts)
 
     def eliminate(self, joint: int) -> None:
         """Join the parts that a joint connects."""
@@ -73,12 +74,12 @@ class _Supports:
         self._join((body for body in bodies if body not in self.hubs), grounded, bodies & self.hubs)
 
     def eliminate_hub(self, hub: int) -> None:
-        """Join a hub and the parts that hang on it."""
+        """Join a hub and the parts that it supports."""
         self.hubs.discard(hub)
-        hanging = self.hanging.pop(hub)
-        for body in hanging:
-            self.hangs[body].discard(hub)
-        self._join([hub, *hanging], False, frozenset())
+        supported = self.supported.pop(hub)
+        for body in supported:
+            self.hubs_of[body].discard(hub)
+        self._join([hub, *supported], False, frozenset())
 
     def _join(self, bodies: Iterable[int], grounded: bool, hubs: AbstractSet[int]) -> None:
         first, *others = bodies
@@ -87,12 +88,12 @@ class _Supports:
             other = self.parts.find(other)
             if other != part:
                 grounded = grounded or self.grounded[other] or self.grounded[part]
-                hubs = {*hubs, *self.hangs[other], *self.hangs[part]}
+                hubs = {*hubs, *self.hubs_of[other], *self.hubs_of[part]}
                 part = self.parts.join(part, other)
         self.grounded[part] = self.grounded[part] or grounded
-        for hub in hubs - self.hangs[part]:
-            self.hangs[part].add(hub)
-            self.hanging[hub].append(part)
+        for hub in hubs - self.hubs_of[part]:
+            self.hubs_of[part].add(hub)
+            self.supported[hub].append(part)
 
 
 def elimination_order(
@@ -104,7 +105,7 @@ def elimination_order(
     first: Sequence[int] = (),
     couplings: tuple[Integers, Integers] | None = None,
 ) -> Integers:
-    """Return the order of elimination: coordinates j, and rows i as n_q + i.
+    """Return the order of elimination: coordinate j as j, and row i of G as n_q + i.
 
     Parameters
     ----------
@@ -114,10 +115,10 @@ def elimination_order(
     together : iterable of sequence of int
         Coordinates that form one body although M does not couple them.
     first : sequence of int
-        Rows of single bodies that precede all joints (unless the body is a hub), so that they are always independent.
+        Rows of single bodies that are eliminated before all joints, unless the body is a hub, and so are independent.
     couplings : (rows, columns), optional
-        Entries by which bodies are coupled other than by joints, as by springs. All bodies then are hubs, each with its
-        rows in `first`.
+        Entries of K and D, which couple bodies other than by joints, such as by springs. All bodies are then hubs, each
+        with its rows in `first`.
     """
     body_of = bodies_of(n_q, mass_entries, together)
     touched: list[set[int]] = [set() for _ in range(n_rows)]
@@ -182,9 +183,10 @@ def _minimum_degree(
     pairs: Iterable[tuple[int, int]],
     lone: AbstractSet[int],
 ) -> list[int]:
-    """Order joints, and hubs as len(joints) + their index: always next the allowed one with the fewest neighbours.
+    """Return the order of joints, and of hubs as len(joints) + their index.
 
-    `pairs`: hubs that are coupled other than by joints. `lone`: see `_Supports`.
+    The next one is always the allowed one with the fewest neighbours (as rows or coordinates). `pairs`: hubs that are
+    coupled other than by joints. `lone`: see `_Supports`.
     """
     n_joints = len(joints)
     place = {hub: n_joints + k for k, hub in enumerate(hubs)}
@@ -202,7 +204,7 @@ def _minimum_degree(
         near[place[other]].add(place[one])
     for k, others in enumerate(near):
         others.discard(k)
-    holds = _Supports(joints, n_bodies, set(hubs), lone)
+    supports = _Supports(joints, n_bodies, set(hubs), lone)
 
     def degree(node: int) -> int:
         return sum(sizes[other] for other in near[node])
@@ -214,8 +216,8 @@ def _minimum_degree(
         known, node = heapq.heappop(heap)
         if done[node] or known != degree(node):
             continue  # the heap has a newer entry
-        if node < n_joints and not holds.lets(node):
-            continue  # it returns to the heap when the hub that supports its parts, a neighbour, is eliminated
+        if node < n_joints and not supports.may_eliminate(node):
+            continue  # the hub that supports its parts is a neighbour: its elimination puts the joint on the heap again
         done[node] = True
         order.append(node)
         changed = near[node]
@@ -223,9 +225,9 @@ def _minimum_degree(
             near[other] |= changed
             near[other] -= {node, other}
         if node < n_joints:
-            holds.eliminate(node)
+            supports.eliminate(node)
         else:
-            holds.eliminate_hub(hubs[node - n_joints])
+            supports.eliminate_hub(hubs[node - n_joints])
         for other in changed:
             heapq.heappush(heap, (degree(other), other))
     return order
@@ -235,9 +237,9 @@ Entries = tuple[Integers, Integers]  # rows and columns
 
 # indices in the program; the sections that the functions below return follow
 N_COORDINATES, N_PIVOTS, N_OFF, N_UPDATES, N_RUNS, N_OF_MASS, N_OF_JACOBIAN, N_STIFFENED, N_HEAD = range(9)
-ALWAYS_ALLOWED_UPDATES = 3_000_000  # largest number of updates (multiplications) for which a program always pays ...
-MAX_UPDATE_SHARE = 1e-3  # ... above it, a program pays up to this share of n^3 ...
-MAX_UPDATES = 30_000_000  # ... and up to this number, because of the memory that making the program takes
+ALWAYS_ALLOWED_UPDATES = 3_000_000  # number of updates (multiplications) up to which a program is always faster
+MAX_UPDATE_SHARE = 1e-3  # number of updates over n^3 up to which a program is faster, for n pivots
+MAX_UPDATES = 30_000_000  # number of updates up to which the memory needed for making the program is acceptable
 
 
 def factorization_program(
@@ -248,17 +250,17 @@ def factorization_program(
     together: Iterable[Sequence[int]] = (),
     stiff_rows: Sequence[int] = (),
 ) -> NDArray[np.int32] | None:
-    """Return the program for M and G with these entries; None if there would be too many updates.
+    """Return the program for M and G with these entries; None if it would have too many updates.
 
     Parameters
     ----------
     n_q, n_rows : int
     mass, jacobian : (rows, columns)
-        Of M, both triangles, and of G. An entry may occur more than once: the numbers are added.
+        Entries of M, both triangles, and of G. If an entry occurs more than once, its numbers are added.
     together : iterable of sequence of int
-        Coordinates of one body each, as far as they are known.
+        Groups of coordinates of one body each, as far as they are known.
     stiff_rows : sequence of int
-        Rows g along which M is to be stiffened, by a multiple of g g^T, whose entries M has.
+        Rows g along which M is to be stiffened by a multiple of g g^T; M must have the entries of g g^T.
     """
     order = elimination_order(n_q, n_rows, mass, jacobian, together, stiff_rows)
     return program_in_order(order, n_q, mass, jacobian, stiff_rows)
@@ -267,7 +269,7 @@ def factorization_program(
 def program_in_order(
     order: Integers, n_q: int, mass: Entries, jacobian: Entries, stiff_rows: Sequence[int], both: bool = False
 ) -> NDArray[np.int32] | None:
-    """Return the program for a given order; with `both` for unsymmetric factors, with U N_OFF places behind L."""
+    """Return the program for an order; with `both` for unsymmetric factors: slots of U are those of L plus N_OFF."""
     n = len(order)
     position = np.empty(n, dtype=np.int64)
     position[order] = np.arange(n)
@@ -308,7 +310,7 @@ def program_in_order(
 
 
 def _runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
-    """Return length and first target of each run: updates off the diagonal with consecutive targets.
+    """Return length and first target of each run, a sequence of off-diagonal updates with consecutive targets.
 
     The rows of a joint are neighbours in all columns, so that runs are long: the numbers of a run are read and written
     as vectors, and the program is a tenth as long as a list of all targets.
@@ -320,7 +322,7 @@ def _runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
 
 
 def _products(rows: Integers, chosen: Sequence[int]) -> tuple[Integers, Integers, Integers]:
-    """Return all products of two entries of one of these rows: the row, and the indices of both entries."""
+    """Return all products of two entries in one of the rows `chosen`: the row, and the indices of both entries."""
     parts: list[tuple[Integers, Integers, Integers]] = [(rows[:0], rows[:0], rows[:0])]
     where = np.argsort(rows, kind="stable")
     ordered = rows[where]
@@ -336,14 +338,17 @@ _PAIRS: dict[int, Entries] = {}
 
 
 def _pairs(m: int) -> Entries:
-    """Return first and second index of all pairs of m items, each with itself included."""
+    """Return first and second index of all unordered pairs of m items, including each item with itself."""
     if m not in _PAIRS:
         _PAIRS[m] = tuple(each.astype(np.int64) for each in np.triu_indices(m))  # type: ignore[assignment]
     return _PAIRS[m]
 
 
 def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]:
-    """Return the row indices of each column of L below the diagonal; a column passes its rows on to its first row's."""
+    """Return the row indices of each column of L below the diagonal.
+
+    If i is the first row of a column, elimination adds all rows of the column to column i.
+    """
     below: list[set[int]] = [set() for _ in range(n)]
     for column, row in zip(low.tolist(), high.tolist(), strict=True):
         below[column].add(row)
@@ -373,7 +378,7 @@ def order_of(program):
 
 @inlined
 def columns_of(program):
-    """Return where each column of L begins and the last one ends; and the position of each entry among the pivots."""
+    """Return where each column of L begins and the last one ends; and the row of each entry, in the order of pivots."""
     first = N_HEAD + program[N_PIVOTS]
     middle = first + program[N_PIVOTS] + 1
     return program[first:middle], program[middle : middle + program[N_OFF]]
@@ -381,7 +386,7 @@ def columns_of(program):
 
 @inlined
 def runs_of(program):
-    """Return length and first slot of the runs of updates off the diagonal, pivot by pivot and entry by entry."""
+    """Return length and first slot of the runs of off-diagonal updates, pivot by pivot and entry by entry."""
     first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF]
     return program[first : first + program[N_RUNS]]
 
@@ -404,7 +409,7 @@ def jacobian_of(program):
 
 @inlined
 def stiffened_of(program):
-    """Return rows, both entries and slots of the products that stiffen M."""
+    """Return the row, the indices of both entries, and the slot of each product that stiffens M."""
     n = program[N_STIFFENED]
     first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_RUNS]
     first += 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN])
