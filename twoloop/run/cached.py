@@ -528,9 +528,9 @@ def set_up(
     """
     if system.called_in_python:  # functions called in Python may depend on variables that change
         return _new_run(system, t0, t1, q0, v0, options)[0], None
-    start, call = (t0, q0.tobytes(), v0.tobytes()), options.key
-    came_from, runs, before = system.derived.get("runs", NO_RUNS)
-    entries = runs.get(call, ())
+    start, key = (t0, q0.tobytes(), v0.tobytes()), options.key
+    last_start, runs, last_code = system.derived.get("runs", NO_RUNS)
+    entries = runs.get(key, ())
     run, entry = None, next((each for each in entries if each.start == start), None)
     if entry is not None:
         run, code = entry.run.copy(), entry.code
@@ -543,10 +543,10 @@ def set_up(
         (run, code), entry = _new_run(system, t0, t1, q0, v0, options), None
         if run.system is system:
             _share_setup(system, run, code, t1, options)
-    new, added = not entries or before == id(code) if entry is None else came_from == start != entry.start, None
+    new, added = not entries or last_code == id(code) if entry is None else last_start == start != entry.start, None
     if new and (added := _entry_of(run, code, t1, options)) is not None:
         runs = {} if len(runs) == MAX_OPTIONS else dict(runs)  # a copy, because another thread may read the dict
-        runs[call] = added, *[each for each in entries if each is not entry][: MAX_ENTRIES - 1]
+        runs[key] = added, *[each for each in entries if each is not entry][: MAX_ENTRIES - 1]
     system.derived["runs"] = start, runs, id(code) if entry is None else None
     return run, added
 
@@ -558,11 +558,11 @@ def _entry_of(run: Run, code: GeneratedCode | None, t1: float, options: Options)
     if not trusted or run.work.notes.base.size > MAX_WORKSPACE:
         return None
     t0, q0, v0 = run.t0, run.state[:n], run.state[n : 2 * n]
-    settled = code is not None or not may_have_code(
+    final = code is not None or not may_have_code(
         system, options.method, options.step_size is not None, options.compiled
     )
     definite = has_definite_mass(system, t0, q0)
-    for_other_starts = run.static is None and settled and (definite or not sparse_factors_pay(system, run.kit.flags))
+    for_other_starts = run.static is None and final and (definite or not sparse_factors_pay(system, run.kit.flags))
     start = t0, q0.tobytes(), v0.tobytes()
     idle: list[CachedIntegrator] | None = [] if for_other_starts and CachedIntegrator.can_start(run) else None
     return CacheEntry(run.copy(), start, t1, code, definite, for_other_starts, idle)
@@ -575,18 +575,18 @@ def _trace_cache(system: ConstrainedSystem) -> TraceCache:
 
 def _share_setup(system: ConstrainedSystem, run: Run, code: GeneratedCode | None, t1: float, options: Options) -> None:
     """Cache the setup of a run for systems with other parameters, once a second such system is integrated."""
-    call, functions, cached = (options.key, _trace_cache(system)), system.functions, system.shared.get("runs", {})
-    if call not in cached:
-        system.shared["runs"] = (cached if len(cached) < MAX_OPTIONS else {}) | {call: functions}
-    elif type(cached[call]) is type(functions) and cached[call] is not functions:
+    key, functions, cached = (options.key, _trace_cache(system)), system.functions, system.shared.get("runs", {})
+    if key not in cached:
+        system.shared["runs"] = (cached if len(cached) < MAX_OPTIONS else {}) | {key: functions}
+    elif type(cached[key]) is type(functions) and cached[key] is not functions:
         entry = _entry_of(run, code, t1, options)
         if entry is not None and entry.idle is not None:
             fixed = options.step_size is not None
             with suppress(ValueError):
                 shared = SharedSetup(entry.run, code, options.method, fixed, options.compiled)
-                cached[call] = entry._replace(shared=shared)
+                cached[key] = entry._replace(shared=shared)
                 return
-        cached[call] = None
+        cached[key] = None
 
 
 def _copy_for_start(

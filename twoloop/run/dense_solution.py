@@ -136,7 +136,7 @@ class Interpolator:
         self.filled, self.across, self.accurate = {}, {}, set()
         prepare_workspace(self.work, system, self.kit.flags, pattern, row[: system.n_q], self.rtol, 0.0)
         self._start()
-        self.nodes[:], self.room[:], self.rows[:] = 0.0, 0.0, 0.0
+        self.nodes[:], self.scratch[:], self.rows[:] = 0.0, 0.0, 0.0
 
     def _become_dense(self) -> None:
         """Replace the static form of linear algebra, which failed, by the dense form."""
@@ -147,14 +147,14 @@ class Interpolator:
         """Allocate scratch arrays for the coefficients of two polynomials."""
         half = 3 * max(indices.WINDOW, self.parts + 1)
         n = self.system.n_q
-        self.nodes, self.room, self.rows = np.zeros(2 * half), np.zeros((2 * half, n)), np.zeros((3, 2 * n))
+        self.nodes, self.scratch, self.rows = np.zeros(2 * half), np.zeros((2 * half, n)), np.zeros((3, 2 * n))
 
     def __reduce__(self) -> tuple[Any, ...]:  # for copies and pickles
         *arguments, plans = self.arguments
         # generated code has addresses that are valid in this process only: copies do without it
         plans = {kind: plan.changed(own=()) if plan.own else plan for kind, plan in plans.items()}
-        kept = {name: getattr(self, name) for name in ("parts", "filled", "across", "judges")}
-        return type(self), (*arguments, plans), kept
+        state = {name: getattr(self, name) for name in ("parts", "filled", "across", "judges")}
+        return type(self), (*arguments, plans), state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -171,13 +171,13 @@ class Interpolator:
         groups[-1, indices.END_TIME] = len(times)
         out = np.empty((len(times), 2 * self.system.n_q))
         failures = 0
-        others = []
+        undivided = []
         for block in _blocks(groups):
             self._divide_where_needed(table, block)
             divided, own, rest = self._divided(table, block)
             failures += self._interpolate(divided, own, times, out)
-            others.append(rest)
-        failures += self._interpolate(table, np.concatenate(others), times, out)
+            undivided.append(rest)
+        failures += self._interpolate(table, np.concatenate(undivided), times, out)
         self._warn_of_failures(failures, len(times))
         return out
 
@@ -205,7 +205,7 @@ class Interpolator:
     def _interpolate(self, table: Table, groups: Groups, times: Array, out: Array) -> int:
         """Write rows [q, v] at the times of the groups to `out`; return the number of failures."""
         states = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups))
-        rest = (times, self.nodes, self.room, out)
+        rest = (times, self.nodes, self.scratch, out)
         failures = int(entry_point(self.kernels.between)(self.kit, self.work, INNER_TOL, *states, *rest))
         if failures > 0 and self.static is not None:
             self._become_dense()
@@ -215,36 +215,36 @@ class Interpolator:
     def _divide_where_needed(self, table: Table, groups: Groups) -> None:
         """Compute interior states of each interval that is new, unless its polynomials are accurate without them."""
         begins = table.t[groups[:, indices.FIRST_OWN]].tolist()
-        new = np.array([t not in self.accurate and t not in self.filled for t in begins])
-        if not self.judges or not new.any():
+        is_new = np.array([t not in self.accurate and t not in self.filled for t in begins])
+        if not self.judges or not is_new.any():
             return
         if len(self.filled) > MAX_DIVIDED:
             self.filled.clear()
-            new = np.array([t not in self.accurate for t in begins])
+            is_new = np.array([t not in self.accurate for t in begins])
         if len(self.accurate) > MAX_ACCURATE:
             self.accurate.clear()
-        groups = groups[new & (groups[:, indices.KIND] != indices.JUMP)]
+        groups = groups[is_new & (groups[:, indices.KIND] != indices.JUMP)]
         for kind, plan in self.plans.items():
             of_kind = groups[:, indices.KIND] == kind
             self.filled.update(self._fill(table, plan, self.kits[kind], groups[of_kind, indices.FIRST_OWN]))
         for i in groups[:, indices.FIRST_OWN].tolist():
             if (memory := self.across.get(float(table.t[i]))) is not None:
                 self.filled[float(table.t[i])] = self._of_crossing(table, i, memory)
-        inner = np.array([t in self.filled for t in table.t[groups[:, indices.FIRST_OWN]].tolist()], dtype=bool)
+        is_divided = np.array([t in self.filled for t in table.t[groups[:, indices.FIRST_OWN]].tolist()], dtype=bool)
         divided, own, rest = self._divided(table, groups)
-        off = np.zeros(len(groups))
-        off[inner], off[~inner] = self._errors(divided, own), self._errors(table, rest)
+        errors = np.zeros(len(groups))
+        errors[is_divided], errors[~is_divided] = self._errors(divided, own), self._errors(table, rest)
         # where a plan was to divide the interval, and failed, the step is too long for a polynomial through its ends
-        off[~inner & np.isin(groups[:, indices.KIND], list(self.plans))] = np.inf
-        fits = off <= np.where(groups[:, indices.KIND] == indices.ACROSS, MAX_ERROR_ACROSS, MAX_ERROR)
-        self.accurate.update(table.t[groups[~inner & fits, indices.FIRST_OWN]].tolist())
-        for k in (~fits).nonzero()[0]:
-            self._repair(table, groups[k], float(off[k]))
+        errors[~is_divided & np.isin(groups[:, indices.KIND], list(self.plans))] = np.inf
+        is_accurate = errors <= np.where(groups[:, indices.KIND] == indices.ACROSS, MAX_ERROR_ACROSS, MAX_ERROR)
+        self.accurate.update(table.t[groups[~is_divided & is_accurate, indices.FIRST_OWN]].tolist())
+        for k in (~is_accurate).nonzero()[0]:
+            self._repair(table, groups[k], float(errors[k]))
 
     def _errors(self, table: Table, groups: Groups) -> Array:
         """Estimate the residuals of the polynomials of intervals, relative to the tolerances."""
         out, groups = np.zeros(len(groups)), np.ascontiguousarray(groups)
-        arrays = self.tolerances, table.t, table.states, groups, self.nodes, self.room, self.rows, out
+        arrays = self.tolerances, table.t, table.states, groups, self.nodes, self.scratch, self.rows, out
         entry_point(self.kernels.judge)(self.kit, self.work, INNER_TOL, *arrays)
         return out
 
@@ -263,13 +263,13 @@ class Interpolator:
         for candidate in candidates:
             if smallest <= MAX_ERROR_ACROSS or (interior := candidate()) is None:
                 continue
-            own = Table(np.ascontiguousarray(interior[0]), np.ascontiguousarray(interior[1]), table.kinds)
-            single, last = group[None, :].copy(), len(own.t) - 1
-            single[0, [indices.FIRST_OWN, indices.LAST_OWN, indices.LOW, indices.HIGH]] = 0, last, 0, last
-            error = float(self._errors(own, single)[0])
+            new_table = Table(np.ascontiguousarray(interior[0]), np.ascontiguousarray(interior[1]), table.kinds)
+            new_group, last = group[None, :].copy(), len(new_table.t) - 1
+            new_group[0, [indices.FIRST_OWN, indices.LAST_OWN, indices.LOW, indices.HIGH]] = 0, last, 0, last
+            error = float(self._errors(new_table, new_group)[0])
             if error < smallest or not np.isfinite(smallest):
                 smallest = error
-                self.filled[begin] = own.t, own.states
+                self.filled[begin] = new_table.t, new_table.states
         if begin not in self.filled:
             self.accurate.add(begin)
 
@@ -397,24 +397,24 @@ def _blocks(groups: Groups) -> list[Groups]:
     return [groups[begin : begin + MAX_DIVIDED] for begin in range(0, len(groups), MAX_DIVIDED)]
 
 
-def _groups(table: Table, which: Groups) -> Groups:
-    """Return a group (row of indices for kernels) for each interval in `which`; those of output times are not set."""
-    groups = np.zeros((len(which), indices.N_COLUMNS), dtype=np.int64)
-    groups[:, indices.FIRST_OWN], groups[:, indices.LAST_OWN] = which, which + 1
-    groups[:, indices.KIND] = table.kinds[which]
+def _groups(table: Table, intervals: Groups) -> Groups:
+    """Return a group (row of indices for kernels) for each of `intervals`; those of output times are not set."""
+    groups = np.zeros((len(intervals), indices.N_COLUMNS), dtype=np.int64)
+    groups[:, indices.FIRST_OWN], groups[:, indices.LAST_OWN] = intervals, intervals + 1
+    groups[:, indices.KIND] = table.kinds[intervals]
     groups[:, indices.HIGH] = len(table.t) - 1
     # polynomials across a singular position do not use the states before it, which may have rounding errors
     across = np.append(False, table.kinds == indices.ACROSS)
     (begins,) = (across[1:] & ~across[:-1]).nonzero()
     if begins.size:
-        inner = across[which + 1]
-        groups[inner, indices.LOW] = begins[np.searchsorted(begins, which[inner], side="right") - 1]
+        is_across = across[intervals + 1]
+        groups[is_across, indices.LOW] = begins[np.searchsorted(begins, intervals[is_across], side="right") - 1]
     (jumps,) = (table.kinds == indices.JUMP).nonzero()
     if not jumps.size:
         return groups
-    behind = np.searchsorted(jumps, which)
-    groups[:, indices.LOW] = np.maximum(groups[:, indices.LOW], np.append(0, jumps + 1)[behind])
-    groups[:, indices.HIGH] = np.append(jumps, len(table.t) - 1)[behind]
+    next_jump = np.searchsorted(jumps, intervals)
+    groups[:, indices.LOW] = np.maximum(groups[:, indices.LOW], np.append(0, jumps + 1)[next_jump])
+    groups[:, indices.HIGH] = np.append(jumps, len(table.t) - 1)[next_jump]
     return groups
 
 

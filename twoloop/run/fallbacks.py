@@ -68,9 +68,9 @@ def state_behind_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -
     """
     q = corrected(system, t, q)
     equations, lengths, size = scaled_equations(system, t, q)
-    right = np.concatenate([np.zeros(system.n_q), -system.velocity_constraint(t, q, v) / lengths * size])
-    change = np.linalg.lstsq(equations, right, rcond=NEGLIGIBLE)[0]
-    if not np.abs(equations @ change - right).max() <= MAX_RESIDUAL * np.abs(right).max():
+    right_side = np.concatenate([np.zeros(system.n_q), -system.velocity_constraint(t, q, v) / lengths * size])
+    change = np.linalg.lstsq(equations, right_side, rcond=NEGLIGIBLE)[0]
+    if not np.abs(equations @ change - right_side).max() <= MAX_RESIDUAL * np.abs(right_side).max():
         return None
     return np.concatenate([q, v + change[: system.n_q]])
 
@@ -209,9 +209,9 @@ def _state_farther_away(run: Run, past: list[Place]) -> tuple[Place | None, floa
     step ends as far beyond the position as the base is before it, if the distance changes linearly; 0 if it grows.
     """
     a, n, t = run.a, run.system.n_q, float(run.clock[run.a.T])
-    here = least_singular_value(run.system, t, run.state[:n], run.rank)
-    farthest = now = run.work.notes[indices.PIVOT] / max(float(run.clock[a.LARGEST_PIVOT]), MIN_DIVISOR)
-    scale = now / here if here > 0.0 else np.inf
+    singular_value = least_singular_value(run.system, t, run.state[:n], run.rank)
+    farthest = present = run.work.notes[indices.PIVOT] / max(float(run.clock[a.LARGEST_PIVOT]), MIN_DIVISOR)
+    scale = present / singular_value if singular_value > 0.0 else np.inf
     base: Place | None = None
     length, oldest = 0.0, LONGEST_PAST * float(run.clock[a.H_LONG])
     for time, state in reversed(past):
@@ -219,7 +219,7 @@ def _state_farther_away(run: Run, past: list[Place]) -> tuple[Place | None, floa
         if (farthest >= FAR and length > 0.0) or distance < BEYOND * farthest or t - time > oldest:
             break
         if distance > farthest:
-            length = 2.0 * now * (t - time) / (distance - now)
+            length = 2.0 * present * (t - time) / (distance - present)
             oldest = max(oldest, FARTHEST * length)
             if farthest < FAR:
                 farthest, base, length = distance, (time, state.copy()), length + t - time

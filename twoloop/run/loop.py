@@ -121,8 +121,8 @@ class Interrupts:
 
 def describe_interrupt(t: float, table: Array) -> str:
     """Describe a run that Ctrl-C ended at t; `table` has its rows [q, v, a, lam]."""
-    gaps = int(np.isnan(table[:, -1:]).sum())  # [a, lam] of a row is either complete or NaN
-    unknown = f" Accelerations and multipliers are NaN at {gaps} of its times." if gaps else ""
+    n_missing = int(np.isnan(table[:, -1:]).sum())  # [a, lam] of a row is either complete or NaN
+    unknown = f" Accelerations and multipliers are NaN at {n_missing} of its times." if n_missing else ""
     return f"Interrupted from the keyboard at t = {t:.10g}. The result holds what was computed before.{unknown}"
 
 
@@ -471,8 +471,8 @@ class IntegrationLoop:
     def _suspicious_outputs(self, t: Array, table: Array) -> list[Place]:
         """Return the states at which steps had to end, if one of them is near a singular position; else []."""
         run, request = self.run, self.request
-        grid = run.control[run.a.FIXED_STEP] > 0.0 and request.times is None
-        if not run.passed_near_singular() or not (grid or (request.times is not None and request.lands)):
+        equal_steps = run.control[run.a.FIXED_STEP] > 0.0 and request.times is None
+        if not run.passed_near_singular() or not (equal_steps or (request.times is not None and request.lands)):
             return []
         return list(zip(t.tolist(), table, strict=True))
 
@@ -489,8 +489,8 @@ class IntegrationLoop:
         """Create the recorder, with an interpolator if states between steps are requested."""
         run, n = self.run, self.run.system.n_q
         interpolator = interpolator_of(run, self.start[: 3 * n]) if self.request.between_steps else None
-        apart = LONGEST_UNSEEN * (self.t1 - run.t0) / SAMPLES
-        every = float(run.tolerances[indices.LOOK]) if run.short_forces.by_state else apart
+        spacing = LONGEST_UNSEEN * (self.t1 - run.t0) / SAMPLES
+        every = float(run.tolerances[indices.LOOK]) if run.short_forces.by_state else spacing
         return Recorder(self.request, interpolator, n, run.t0, self.start, every)
 
     def _kinds(self, steps: Array, across: bool, over_jump: bool) -> NDArray[np.int64]:

@@ -169,31 +169,31 @@ def _rates(kit: Any, work: Any, sample: StiffnessSample, directions: list[Array]
 
 
 def _dominant_eigenvalue(
-    kit: Any, work: Any, sample: StiffnessSample, direction: Array, places: NDArray[np.int64], by_v: bool
+    kit: Any, work: Any, sample: StiffnessSample, direction: Array, independent: NDArray[np.int64], by_v: bool
 ) -> tuple[float, bool]:
     """Return |x| of the largest eigenvalue x of dF/dq or (`by_v`) dF/dv, and whether x < 0.
 
-    Power iteration in the independent coordinates `places`, from `direction`, which becomes the eigenvector.
+    Power iteration in the independent coordinates `independent`, from `direction`, which becomes the eigenvector.
     """
     from twoloop.kernels.evaluation import tasks
 
-    size = DISPLACEMENT * max(1.0, float(np.abs(sample.v if by_v else sample.q).max()))
-    factor, opposed = 0.0, False
+    displacement = DISPLACEMENT * max(1.0, float(np.abs(sample.v if by_v else sample.q).max()))
+    eigenvalue, opposed = 0.0, False
     a = np.zeros_like(sample.a)
     for _ in range(ITERATIONS):
         Q, V = sample.q.copy(), sample.v.copy()
-        (V if by_v else Q)[places] += size * direction[places]
+        (V if by_v else Q)[independent] += displacement * direction[independent]
         if kit.inner(kit, work, tasks.EVALUATE, sample.t, Q, V, INNER_TOL, a, work.lam) != indices.DONE:
             return 0.0, False
-        image = (a - sample.a)[places]
+        image = (a - sample.a)[independent]
         longest = float(np.abs(image).max(initial=0.0))
         if not 0.0 < longest < np.inf:
             return 0.0, False
-        before = direction[places]
-        cosine = float(image @ before) / float(np.linalg.norm(image) * np.linalg.norm(before))
-        factor, opposed = longest / (size * float(np.abs(before).max())), cosine < -ALIGNED
-        direction[places] = image / longest
-    return factor, opposed
+        previous = direction[independent]
+        cosine = float(image @ previous) / float(np.linalg.norm(image) * np.linalg.norm(previous))
+        eigenvalue, opposed = longest / (displacement * float(np.abs(previous).max())), cosine < -ALIGNED
+        direction[independent] = image / longest
+    return eigenvalue, opposed
 
 
 NEARLY_SINGULAR = 1e-3  # smallest over largest singular value of C_q, below which a message mentions it
@@ -253,13 +253,13 @@ def reject_turned_velocities(
     `last_step`: state before the last step, if velocities turned in it. `landed`: states at which steps had to end.
     """
     now, crossings = (float(run.clock[run.a.T]), run.state), [each for each in run.crossings if each[0][0] < end]
-    turned = describe_rounding(run, [*(place for each in crossings for place in each), *landed], end)
+    reason = describe_rounding(run, [*(place for each in crossings for place in each), *landed], end)
     if last_step:
         crossings.append(last_step)
-    if crossings and not turned:
+    if crossings and not reason:
         rtol, atol = float(run.tolerances[indices.RTOL]), run.tolerances[indices.ATOL :]
-        turned = describe_turn(run.system, crossings, now, run.rank, rtol, atol)
-    return (Status.RANK_LOST, turned) if turned else (status, message)
+        reason = describe_turn(run.system, crossings, now, run.rank, rtol, atol)
+    return (Status.RANK_LOST, reason) if reason else (status, message)
 
 
 def describe_rounding(run: "Run", places: list[Place], end: float) -> str:
@@ -269,12 +269,12 @@ def describe_rounding(run: "Run", places: list[Place], end: float) -> str:
         q, v = state[:n], state[n : 2 * n]
         if t >= end or surely_above(run.near, system.rows(t, q), run.rank):
             continue
-        over = _velocity_error_ratio(run, t, q, v)
-        if over > MAX_LASTING_ERROR:
+        excess = _velocity_error_ratio(run, t, q, v)
+        if excess > MAX_LASTING_ERROR:
             return (
                 f"Not to be trusted beyond t = {t:.10g}: steps went on from there, where the constraints nearly lose "
-                f"rank ({_measured(run, t, q)}), and rounding of positions had changed velocities by about {over:.1g} "
-                "times what rtol and atol allow. Take another method, or end t_span before."
+                f"rank ({_measured(run, t, q)}), and rounding of positions had changed velocities by about "
+                f"{excess:.1g} times what rtol and atol allow. Take another method, or end t_span before."
             )
     return ""
 
@@ -349,7 +349,7 @@ def outcome(run: "Run", code: int, t1: float, stall: StallDetector) -> tuple[Sta
 
 def _describe_stall(run: "Run", t1: float, stall: StallDetector) -> str:
     """Describe how short the steps are, how many more the run would take, and the likely reason."""
-    left = (t1 - float(run.clock[run.a.T])) / stall.mean
+    n_left = (t1 - float(run.clock[run.a.T])) / stall.mean
     before, advice = "", "Shorten t_span, or look at the units of velocities, masses and forces. "
     if stall.has_slowed:
         before = f", after steps of up to {stall.longest:.2g} s"
@@ -359,7 +359,7 @@ def _describe_stall(run: "Run", t1: float, stall: StallDetector) -> str:
         advice = "Take a larger step_size, or shorten t_span. "
     return (
         f"the last {STAGNATION_STEPS} steps were {stall.mean:.2g} s long on average{before}, and the rest needs "
-        f"{left:.1g} of them. {advice}With max_steps the run goes on up to that number of steps."
+        f"{n_left:.1g} of them. {advice}With max_steps the run goes on up to that number of steps."
     )
 
 
@@ -367,8 +367,8 @@ def _describe_contradiction(run: "Run") -> str:
     """Describe a redundant row that is violated although the other rows hold, and the rows on which it depended."""
     t, n, row = float(run.clock[run.a.T]), run.system.n_q, int(run.work.notes[indices.CONTRADICTION])
     words = in_words(run.system.rows(t, run.state[:n]), [row])
-    beside = run.state[:n] + AFTER * run.state[n : 2 * n]
-    if t == run.t0 and np.linalg.matrix_rank(run.system.rows(t, beside), NEGLIGIBLE_SLOPE) > run.rank:
+    nearby_q = run.state[:n] + AFTER * run.state[n : 2 * n]
+    if t == run.t0 and np.linalg.matrix_rank(run.system.rows(t, nearby_q), NEGLIGIBLE_SLOPE) > run.rank:
         return (
             f"Stopped at its start, t = {t:.10g}, a singular position: the constraints have lost rank there ({words}), "
             "but not beside it. Start a little before that position, or beyond."
@@ -395,12 +395,12 @@ def warn_of_singular_end(run: "Run") -> str:
             "and accelerations there. End t_span a little before, or beyond"
         )
     else:
-        over = _velocity_error_ratio(run, t, q, v)
-        if over <= indices.UNTRUE:
+        excess = _velocity_error_ratio(run, t, q, v)
+        if excess <= indices.UNTRUE:
             return ""
         text = (
             f"the run ends where the constraints nearly lose rank ({_measured(run, t, q)}): rounding of positions "
-            f"changes velocities there {_times_allowed(over)}, and accelerations by more. "
+            f"changes velocities there {_times_allowed(excess)}, and accelerations by more. "
             "End t_span a little before, or beyond, or loosen rtol and atol"
         )
     return warn_user(text)
@@ -411,16 +411,16 @@ def warn_of_passage_by_ordinary_steps(run: "Run") -> str:
 
     Return the sentence of the warning, or an empty string.
     """
-    share = float(run.clock[run.a.PIVOT_PASSED])
-    if share == 0.0:
+    ratio = float(run.clock[run.a.PIVOT_PASSED])
+    if ratio == 0.0:
         return ""
-    over = EPS / share**3 / float(run.tolerances[indices.LEAST])
-    if over <= MAX_LASTING_ERROR:
+    excess = EPS / ratio**3 / float(run.tolerances[indices.LEAST])
+    if excess <= MAX_LASTING_ERROR:
         return ""
     return warn_user(
         f"no step led across a singular position, and the run went on with steps within which the smallest pivot of "
-        f"the constraint Jacobian came down to {share:.1g} of its largest: rounding of accelerations there may be "
-        f"about {over:.1g} times what rtol and atol allow. Loosen rtol and atol, take another method, or change the "
+        f"the constraint Jacobian came down to {ratio:.1g} of its largest: rounding of accelerations there may be "
+        f"about {excess:.1g} times what rtol and atol allow. Loosen rtol and atol, take another method, or change the "
         "geometry slightly"
     )
 
@@ -440,8 +440,8 @@ def _velocity_error_ratio(run: "Run", t: float, q: Array, v: Array) -> float:
     return float((velocity_rounding_errors(run.system, t, q, v, run.rank) / allowed).max())
 
 
-def _times_allowed(over: float) -> str:
-    return f"by about {over:.1g} times what rtol and atol allow" if np.isfinite(over) else "by more than can be told"
+def _times_allowed(ratio: float) -> str:
+    return f"by about {ratio:.1g} times what rtol and atol allow" if np.isfinite(ratio) else "by more than can be told"
 
 
 def _measured(run: "Run", t: float, q: Array) -> str:
@@ -451,10 +451,10 @@ def _measured(run: "Run", t: float, q: Array) -> str:
 
 def _describe_near_end(run: "Run", t1: float) -> str:
     """Return a sentence if the run stopped so near its end that steps across would need nodes beyond it; else ""."""
-    left = t1 - float(run.clock[run.a.T])
-    if left > max(NEXT_TO_END * (t1 - run.t0), float(run.clock[run.a.H_LONG])):
+    time_left = t1 - float(run.clock[run.a.T])
+    if time_left > max(NEXT_TO_END * (t1 - run.t0), float(run.clock[run.a.H_LONG])):
         return ""
-    return f" The end of t_span is {left:.1g} s ahead: end a little before that position, or beyond."
+    return f" The end of t_span is {time_left:.1g} s ahead: end a little before that position, or beyond."
 
 
 def _describe_near_singular(run: "Run", t1: float) -> str:

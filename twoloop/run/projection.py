@@ -108,11 +108,11 @@ def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | No
     form, all_rows = static_form(system, t, q), system.sparse_rows(t, q)
     if form is None or not isinstance(all_rows, SparseRows):
         return None
-    metric, still = _Metric(system, t, q, form), np.zeros_like(q)
-    code = metric.run_task(tasks.RENEW_PARTITION, q.copy(), still)
+    metric, at_rest = _Metric(system, t, q, form), np.zeros_like(q)
+    code = metric.run_task(tasks.RENEW_PARTITION, q.copy(), at_rest)
     if code == indices.RANK_DIFFERS:
         metric = _Metric(system, t, q, form, int(metric.work.notes[indices.RANK]))
-        code = metric.run_task(tasks.RENEW_PARTITION, q.copy(), still)
+        code = metric.run_task(tasks.RENEW_PARTITION, q.copy(), at_rest)
     if code != indices.DONE or metric.work.notes[indices.PIVOT] < CLEAR:
         return None
     independent_rows, unused = set(metric.work.rows_v.tolist()), np.zeros_like(q)
@@ -124,8 +124,8 @@ def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | No
     metric.position = q
     columns = units(system, t, q, all_rows, typical_sizes(q))
     allowed = metric.allowed_part(columns * np.random.default_rng(3).uniform(0.5, 1.0, len(q)))
-    most = float((np.abs(allowed) / columns).max())
-    return Dependence(len(independent_rows), shares, allowed / most if most > 0.0 else allowed, metric.onto_constraints)
+    norm = float((np.abs(allowed) / columns).max())
+    return Dependence(len(independent_rows), shares, allowed / norm if norm > 0.0 else allowed, metric.onto_constraints)
 
 
 def project_sparsely(
@@ -146,31 +146,31 @@ def project_sparsely(
     if projected is None or metric.work.notes[indices.PIVOT] < CLEAR:
         return None
     # rows that are independent at the guess must be independent at the projected position, too
-    there = _Metric(system, t, projected[0], form, metric.rank)
-    if there.run_task(tasks.RENEW_PARTITION, projected[0].copy(), v.copy()) != indices.DONE:
+    metric_there = _Metric(system, t, projected[0], form, metric.rank)
+    if metric_there.run_task(tasks.RENEW_PARTITION, projected[0].copy(), v.copy()) != indices.DONE:
         return None
     rows, rate = system.sparse_rows(t, projected[0]), system.rates(t, projected[0])
     if not is_at_rounding(system.constraint(t, projected[0]), rows, projected[0]):
         return None
     if not is_at_rounding(rows @ projected[1] + rate, rows, projected[1], rate):
         return None
-    moved = projected[0] - q
-    if check_assembly and np.abs(moved).max() > 0.0 and not _other_guesses_agree(metric, projected[0], moved):
+    change = projected[0] - q
+    if check_assembly and np.abs(change).max() > 0.0 and not _other_guesses_agree(metric, projected[0], change):
         return None
     return projected
 
 
-def _other_guesses_agree(metric: _Metric, position: Array, moved: Array) -> bool:
+def _other_guesses_agree(metric: _Metric, position: Array, change: Array) -> bool:
     """Return whether three other guesses, as far away as the given one, are projected to points that C_q predicts."""
-    far = float(np.abs(moved).max())
-    generic = np.random.default_rng(8).uniform(-1.0, 1.0, (2, len(position)))
+    distance = float(np.abs(change).max())
+    directions = np.random.default_rng(8).uniform(-1.0, 1.0, (2, len(position)))
     rest = np.zeros(len(position))
-    for displacement in (-2.0 * moved, far * generic[0], far * generic[1]):
+    for displacement in (-2.0 * change, distance * directions[0], distance * directions[1]):
         if metric.project(position, rest) is None:
             return False
         expected = position + metric.allowed_part(displacement)
-        again = metric.project(position + displacement, rest)
-        if again is None or np.abs(again[0] - expected).max() > LINEAR * np.abs(displacement).max():
+        projected = metric.project(position + displacement, rest)
+        if projected is None or np.abs(projected[0] - expected).max() > LINEAR * np.abs(displacement).max():
             return False
     return True
 
@@ -356,8 +356,8 @@ def _position(
             f"q cannot be projected onto the constraints of {system.name!r} at t = {t!r}: {reached}. Give a guess that "
             f"is nearer to an assembled position{_describe_rank_loss(scales, jacobian, free, kept)}"
         )
-    far = float((np.abs(position - guess) / scales.columns).max())
-    if check_assembly and (start.excess > 1.0 or far > CONSISTENT):  # next to a dead centre a small error moves far
+    shift = float((np.abs(position - guess) / scales.columns).max())
+    if check_assembly and (start.excess > 1.0 or shift > CONSISTENT):  # next to a dead centre a small error moves far
         other = _another_assembly(system, t, position, guess, free, scales, cut)
         if other is not None:
             there = system.jacobian(t, position)
@@ -391,39 +391,39 @@ def _another_assembly(
     dependent, sign, _ = _assembly(scales.scaled(jacobian), free)
     columns = list(dependent)
 
-    def distance(one: Array, other: Array) -> float:
-        return float(np.abs((one - other) / scales.columns).max())
+    def distance(a: Array, b: Array) -> float:
+        return float(np.abs((a - b) / scales.columns).max())
 
     def sign_at(q: Array) -> int:
         block = scales.scaled(system.jacobian(t, q))[:, columns]
         return int(np.linalg.slogdet(block)[0]) if sign != 0 else 0
 
     weakest = far * _weakest_direction(scales.scaled(jacobian), free)
-    for other in (-2.0 * moved, weakest, -weakest):
-        way = other * scales.columns
-        again, excess, _ = _gauss_newton(system, t, position + way, free, cut)
-        if again is None or not excess <= 1.0:
+    for direction in (-2.0 * moved, weakest, -weakest):
+        displacement = direction * scales.columns
+        projected, excess, _ = _gauss_newton(system, t, position + displacement, free, cut)
+        if projected is None or not excess <= 1.0:
             return "does not converge"
-        expected = position + way + _least_change(jacobian, free, -(jacobian @ way), cut)
-        if distance(again, expected) <= LINEAR * float(np.abs(other).max()) and sign_at(again) == sign:
+        expected = position + displacement + _least_change(jacobian, free, -(jacobian @ displacement), cut)
+        if distance(projected, expected) <= LINEAR * float(np.abs(direction).max()) and sign_at(projected) == sign:
             continue
         # curvature or another assembly: project a guess with the new dependent and the old independent coordinates
         mixed = position.copy()
-        mixed[columns] = again[columns]
-        beside, excess, _ = _gauss_newton(system, t, mixed, np.array(columns, dtype=int), cut)
-        if beside is None or not excess <= 1.0:
+        mixed[columns] = projected[columns]
+        mixed_projected, excess, _ = _gauss_newton(system, t, mixed, np.array(columns, dtype=int), cut)
+        if mixed_projected is None or not excess <= 1.0:
             return "ends elsewhere, from where no way leads back to it"
-        if distance(beside, position) > SAME * far or sign_at(beside) != sign:
-            return f"ends on another one, which differs by {_describe_change(position, beside, scales)}"
+        if distance(mixed_projected, position) > SAME * far or sign_at(mixed_projected) != sign:
+            return f"ends on another one, which differs by {_describe_change(position, mixed_projected, scales)}"
     return None
 
 
-def _describe_change(one: Array, other: Array, scales: Scales) -> str:
+def _describe_change(before: Array, after: Array, scales: Scales) -> str:
     """Describe which coordinate changes most, with enough digits to show the change."""
-    j = int(np.abs((other - one) / scales.columns).argmax())
-    size, change = max(abs(float(one[j])), abs(float(other[j]))), abs(float(other[j] - one[j]))
+    j = int(np.abs((after - before) / scales.columns).argmax())
+    size, change = max(abs(float(before[j])), abs(float(after[j]))), abs(float(after[j] - before[j]))
     digits = min(17, 3 + max(0, math.ceil(math.log10(size / change)))) if change > 0.0 else 3
-    return f"coordinate {j} from {one[j]:.{digits}g} to {other[j]:.{digits}g}"
+    return f"coordinate {j} from {before[j]:.{digits}g} to {after[j]:.{digits}g}"
 
 
 def _gauss_newton(

@@ -108,11 +108,11 @@ class FileStore:
 
     def _write_header(self, file: Any, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
         """Write the header, after the rows: if the process dies before, the file still has the previous array."""
-        head = repr({"descr": dtype.str, "fortran_order": False, "shape": shape})
-        head = head.ljust(HEADER_SIZE - len(MAGIC) - 3) + "\n"
+        header = repr({"descr": dtype.str, "fortran_order": False, "shape": shape})
+        header = header.ljust(HEADER_SIZE - len(MAGIC) - 3) + "\n"
         file.flush()
         file.seek(0)
-        file.write(MAGIC + (len(head)).to_bytes(2, "little") + head.encode())
+        file.write(MAGIC + (len(header)).to_bytes(2, "little") + header.encode())
         self._shapes[name] = dtype, shape
 
 
@@ -275,8 +275,8 @@ class Recorder:
     @property
     def interrupted_at(self) -> float | None:
         """Time at which the search for events was interrupted: the result ends there, as later events are unknown."""
-        behind = self.interrupted and self.search is not None and self.ended is None
-        return self.search.reached if behind and self.search is not None else None
+        ended_early = self.interrupted and self.search is not None and self.ended is None
+        return self.search.reached if ended_early and self.search is not None else None
 
     @property
     def ended(self) -> tuple[Event, float] | None:
@@ -553,8 +553,8 @@ class Record:
         return state
 
     def __repr__(self) -> str:
-        known = {f.name: getattr(self.stats, f.name) for f in fields(self.stats)}
-        counts = ", ".join(f"{name}={value}" for name, value in known.items() if value is not None)
+        by_name = {f.name: getattr(self.stats, f.name) for f in fields(self.stats)}
+        counts = ", ".join(f"{name}={value}" for name, value in by_name.items() if value is not None)
         end = f"t[-1]={self.t[-1]:g}" if self.t.size else "no output"
         return f"Result({self.status.name}: {self.message} n_t={self.t.size}, {end}; {counts})"
 
@@ -576,11 +576,11 @@ class _Deferred:
         self.name = name
 
     def __get__(self, record: Any, owner: Any = None) -> Any:
-        known = {} if record is None else vars(record)
-        if "later" not in known:
+        values = {} if record is None else vars(record)
+        if "later" not in values:
             raise AttributeError(self.name)  # the class has no such attribute; dataclass fields hold the defaults
-        known.update(known["later"](self.name) | known)
-        return known[self.name]
+        values.update(values["later"](self.name) | values)
+        return values[self.name]
 
 
 DEFAULTS = {each.name: each.default for each in fields(Record) if each.default is not MISSING}

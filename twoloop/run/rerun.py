@@ -86,9 +86,9 @@ def compare_callbacks_at(
             status, message = _check_derivatives(run, states, first, status, message)
         status, message = _check_traces(run, states, status, message)
         if status == before and run.system.called_in_python and run.control[run.a.FIXED_STEP] == 0.0:
-            unlike = find_nondeterminism(run.system, states[:: 1 + len(states) // MAX_IN_PYTHON])
-            if unlike is not None:
-                status, message = Status.WRONG_TRACE, f"In the run {unlike}. {message}"
+            difference = find_nondeterminism(run.system, states[:: 1 + len(states) // MAX_IN_PYTHON])
+            if difference is not None:
+                status, message = Status.WRONG_TRACE, f"In the run {difference}. {message}"
     if status == before:
         region.add(states)
     return status, message
@@ -98,11 +98,11 @@ def _check_derivatives(run: Run, states: Array, first: Array, status: Status, me
     """Return the status and the message, changed if a derivative or a constant mass is wrong at states of the run."""
     n = run.system.n_q
     chosen = states[:: 1 + (len(states) - 1) // N_DERIVATIVES][::-1]
-    some = [(float(each[0]), each[1 : 1 + n], each[1 + n :]) for each in chosen]
+    compared = [(float(each[0]), each[1 : 1 + n], each[1 + n :]) for each in chosen]
     exact = exact_derivatives(run.system)
-    fine = exact is not None and exact.difference(run.system, generic_states(some)) is None
-    difference = run_inconsistency(run.system, some, float(first[0]), first[1 : 1 + n])
-    for t, q, v in () if fine or difference is not None else some:
+    agrees = exact is not None and exact.difference(run.system, generic_states(compared)) is None
+    difference = run_inconsistency(run.system, compared, float(first[0]), first[1 : 1 + n])
+    for t, q, v in () if agrees or difference is not None else compared:
         wrong = wrong_derivative(run.system, t, q, v)
         if wrong is not None:
             difference = t, wrong
@@ -125,13 +125,13 @@ def find_nondeterminism(system: ConstrainedSystem, states: Array) -> str | None:
                 forces.append(system.force(t, np.array(state[:n]), np.array(state[n:])))
             except Exception:  # the state is outside the domain of the force
                 forces.append(np.full(n, np.nan))
-    once, again = np.array(forces[: len(states)]), np.array(forces[len(states) :][::-1])
-    both = np.isfinite(once) & np.isfinite(again)
-    off = np.abs(np.subtract(once, again, out=np.zeros_like(once), where=both))
-    if not off.max() > CLEAR * np.abs(once[both]).max(initial=0.0):
+    first_forces, second_forces = np.array(forces[: len(states)]), np.array(forces[len(states) :][::-1])
+    comparable = np.isfinite(first_forces) & np.isfinite(second_forces)
+    differences = np.abs(np.subtract(first_forces, second_forces, out=np.zeros_like(first_forces), where=comparable))
+    if not differences.max() > CLEAR * np.abs(first_forces[comparable]).max(initial=0.0):
         return None
-    k, entry = np.unravel_index(off.argmax(), off.shape)
-    return _changed_value(system.name, float(states[k, 0]), int(entry), once[k, entry], again[k, entry])
+    k, entry = np.unravel_index(differences.argmax(), differences.shape)
+    return _changed_value(system.name, float(states[k, 0]), int(entry), first_forces[k, entry], second_forces[k, entry])
 
 
 def python_functions(system: ConstrainedSystem) -> PythonFunctions | None:
@@ -168,10 +168,10 @@ def describe_changed_force(run: Run) -> str | None:
                 again = np.asarray(force(float(arguments[0]), *map(np.copy, arguments[1:])))
             except Exception:  # the state is outside the domain of the force
                 continue
-            both = np.isfinite(value) & np.isfinite(again)
-            off = np.abs(np.subtract(value, again, out=np.zeros(len(value)), where=both))
-            if off.max(initial=0.0) > CLEAR * np.abs(value[both]).max(initial=0.0):
-                entry = int(off.argmax())
+            comparable = np.isfinite(value) & np.isfinite(again)
+            differences = np.abs(np.subtract(value, again, out=np.zeros(len(value)), where=comparable))
+            if differences.max(initial=0.0) > CLEAR * np.abs(value[comparable]).max(initial=0.0):
+                entry = int(differences.argmax())
                 return (
                     f"In the run {_changed_value(system.name, float(arguments[0]), entry, value[entry], again[entry])}."
                 )
@@ -196,15 +196,15 @@ def _check_traces(run: Run, states: Any, status: Status, message: str) -> tuple[
 
 
 CHUNK = 256  # largest number of attempted steps in one call of `advance`
-FIRST_TRY = 0.1  # first step of a piece, relative to its length, unless the previous piece proposes one
-SHARE = 0.1  # tolerances of the pieces, relative to those of the run
+FIRST_STEP = 0.1  # first step of a piece, relative to its length, unless the previous piece proposes one
+TOLERANCE_SHARE = 0.1  # tolerances of the pieces, relative to those of the run
 FINEST = 1e-13  # smallest tolerance of the pieces, relative or absolute: rounding hides smaller errors
-MOST_NUMBERS = 100_000  # largest number of floats in the buffer of states
+MAX_BUFFER_SIZE = 100_000  # largest number of floats in the buffer of states
 
 
 def tighter_tolerances(tolerance: ArrayLike) -> Array:
     """Return the tolerances of the pieces, given those of the run."""
-    return np.minimum(tolerance, np.maximum(SHARE * np.asarray(tolerance), FINEST))
+    return np.minimum(tolerance, np.maximum(TOLERANCE_SHARE * np.asarray(tolerance), FINEST))
 
 
 def nonstiff_method() -> tuple[Method, Array]:
@@ -261,7 +261,7 @@ class IndependentRerun:
         control[a.MAX_STEP], control[a.BRIDGE], control[a.STORE_ALL] = max_step, 0.0, 0.0
         control[a.MAX_ATTEMPTS] = CHUNK
         self.run.work.notes[indices.GAMMA_REQUIRED] = np.inf  # the run checked the accuracy of gamma by differences
-        n_rows = max(2, min(CHUNK, MOST_NUMBERS // len(self.run.state)))
+        n_rows = max(2, min(CHUNK, MAX_BUFFER_SIZE // len(self.run.state)))
         rows = (np.empty(n_rows), np.empty((n_rows, len(self.run.state))))
         self.buffers, self.filled = (*rows, np.empty((CHUNK, a.N_STEP_COLUMNS))), np.zeros(2, dtype=np.int64)
         self.next_step = np.inf
@@ -273,7 +273,7 @@ class IndependentRerun:
         if run.restart(t0, state[: n // 2], state[n // 2 :]) != indices.DONE:
             return None
         t1 = float(times[-1])
-        run.clock[a.H_NEXT] = first_step if first_step < np.inf else FIRST_TRY * (t1 - t0)
+        run.clock[a.H_NEXT] = first_step if first_step < np.inf else FIRST_STEP * (t1 - t0)
         run.work.notes[indices.KINK_AFTER] = t1
         states: list[Array] = []
         longest, n_total = 0.0, 0

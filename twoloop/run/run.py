@@ -101,9 +101,9 @@ class Run:
         self.control_by(plan)
         self.substituted = False  # whether the substitute plan has replaced the first one
         self.near = singular_threshold(rtol)  # ratio of pivots below which errors of velocities are estimated
-        ran = any("force" in each.kinds for each in plan.traced)  # whether the force was traced
+        force_traced = any("force" in each.kinds for each in plan.traced)  # whether the force was traced
         short_and_steep = system.remembered(
-            ("changes", ran), lambda: (may_be_short(system, ran), may_be_steep(system, ran))
+            ("changes", force_traced), lambda: (may_be_short(system, force_traced), may_be_steep(system, force_traced))
         )
         short_forces, steep = (ShortForces(False, False), True) if step_size is not None else short_and_steep
         self.short_forces: ShortForces = short_forces
@@ -275,8 +275,8 @@ class Run:
         self.functions = self.kit.functions
         self.work = self._workspace(rank, rank)
         self.work.counters[:] = before.counters
-        kept = [indices.LARGEST_DEFECT, indices.UNCHECKED, indices.WIDEST_GAP, indices.KINK_BEFORE, indices.KINK_AFTER]
-        self.work.notes[kept] = before.notes[kept]
+        notes = [indices.LARGEST_DEFECT, indices.UNCHECKED, indices.WIDEST_GAP, indices.KINK_BEFORE, indices.KINK_AFTER]
+        self.work.notes[notes] = before.notes[notes]
         self.control[self.a.BRIDGE] = self.static is None
         clock, a = self.clock, self.a
         if clock[a.FAILURE_CODE] != indices.DONE:
@@ -341,14 +341,15 @@ class Run:
         n_rows = self.system.n_c + self.system.n_a
         if self.rank == n_rows:
             return np.zeros(0, dtype=np.int64), ""
-        counted = set(self.work.rows_v.tolist())
-        redundant = [i for i in range(n_rows) if i not in counted]
+        independent = set(self.work.rows_v.tolist())
+        redundant = [i for i in range(n_rows) if i not in independent]
         rows = self._rows() if rows is None else rows
-        wrong = self.violated_rows(rows).tolist()
-        if wrong:
+        violated = self.violated_rows(rows).tolist()
+        if violated:
             raise ValueError(
                 f"the constraints of {self.system.name!r} contradict one another at t = {self.t0:g}: "
-                f"{self._in_words(rows, wrong)}, but not so their accelerations. Correct or leave out one of these rows"
+                f"{self._in_words(rows, violated)}, but not so their accelerations. Correct or leave out one of these "
+                "rows"
             )
         if (redundant_rows := tuple(redundant)) not in self.descriptions:
             self.descriptions[redundant_rows] = (
@@ -369,10 +370,10 @@ class Run:
         """Return the rows of [C_q; A] that the accelerations at the start violate."""
         n = self.system.n_q
         a, gamma = self.state[2 * n : 3 * n], self.work.Gamma
-        off = np.abs(rows @ a - gamma)
-        if off.max() <= CONTRADICTS:  # no row has a smaller tolerance
+        residual = np.abs(rows @ a - gamma)
+        if residual.max() <= CONTRADICTS:  # no row has a smaller tolerance
             return np.zeros(0, dtype=np.int64)
-        return np.flatnonzero(off > CONTRADICTS * np.maximum(abs(rows) @ np.abs(a) + np.abs(gamma), 1.0))
+        return np.flatnonzero(residual > CONTRADICTS * np.maximum(abs(rows) @ np.abs(a) + np.abs(gamma), 1.0))
 
     def _rows(self) -> Rows:
         """Return C_q and A at the start."""

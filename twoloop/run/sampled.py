@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 
 STEPS = 1024  # number of steps that one call of the compiled loop may take
 FORCES = {"force", "force_by_q", "force_by_v"}  # callbacks whose parameters may change between samples
-CHANGED = "the parameters changed at samples"
+CHANGED = "the parameters changed at samples"  # field `changes` of the result
 
 
 class SampledState(NamedTuple):
@@ -261,10 +261,10 @@ class SampledRun:
         """Continue if one call of the compiled loop did not reach the end: many steps, a jump, or a failure."""
         run = self.run
         run.t0, run.start_warning = float(run.clock[run.a.T]), ""
-        wanted = OutputRequest(np.array([end]), True, False, None, MemoryStore())
+        request = OutputRequest(np.array([end]), True, False, None, MemoryStore())
         interrupts = Interrupts().listen()
         try:
-            record = IntegrationLoop(run, end, wanted, lambda t: None, None, interrupts).to_end(False)
+            record = IntegrationLoop(run, end, request, lambda t: None, None, interrupts).to_end(False)
         finally:
             interrupts.leave()
         run.control[run.a.STORE_ALL], run.work.notes[indices.KINK_AFTER] = 0.0, np.inf

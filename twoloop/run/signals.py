@@ -12,10 +12,12 @@ from twoloop.problem.callbacks import PythonFunctions
 from twoloop.problem.events import Event
 from twoloop.problem.system import ConstrainedSystem
 
-CALLS_A_USER = (PythonFunctions.call.__code__, Event.__call__.__code__)
+# code of the functions that call functions of the user
+USER_CALLERS = (PythonFunctions.call.__code__, Event.__call__.__code__)
 COMPILERS = ("numba", "llvmlite")  # packages that an exception between two of their instructions would break
-NAMES = ("SIGALRM", "SIGINT", "SIGTERM", "SIGUSR1", "SIGUSR2", "SIGVTALRM", "SIGPROF", "SIGHUP")  # not all on Windows
-NUMBERS = [int(getattr(signal, name)) for name in NAMES if hasattr(signal, name)]
+# not all of them exist on Windows
+SIGNAL_NAMES = ("SIGALRM", "SIGINT", "SIGTERM", "SIGUSR1", "SIGUSR2", "SIGVTALRM", "SIGPROF", "SIGHUP")
+SIGNAL_NUMBERS = [int(getattr(signal, name)) for name in SIGNAL_NAMES if hasattr(signal, name)]
 
 
 class SignalHandlers:
@@ -36,7 +38,7 @@ class SignalHandlers:
         self._before: dict[int, Any] = {}
         self._waiting: list[tuple[int, FrameType | None]] = []
         self._raised: BaseException | None = None
-        for number in NUMBERS:
+        for number in SIGNAL_NUMBERS:
             handler = _signal.getsignal(number)
             if callable(handler) and (ctrl_c or handler is not signal.default_int_handler):
                 if threading.current_thread() is not threading.main_thread():
@@ -88,7 +90,7 @@ def signals_of(system: ConstrainedSystem) -> AbstractContextManager[Any]:
 def within_a_users_function(frame: FrameType | None) -> bool:
     """Return whether a frame is in a user's function that machine code or the search for events called."""
     while frame is not None:
-        if frame.f_code in CALLS_A_USER:
+        if frame.f_code in USER_CALLERS:
             return True
         frame = frame.f_back
     return False
@@ -96,7 +98,7 @@ def within_a_users_function(frame: FrameType | None) -> bool:
 
 def within_a_compiler(frame: FrameType | None) -> bool:
     """Return whether a frame is in a compiler, and not in a user's function that was called from there."""
-    while frame is not None and frame.f_code not in CALLS_A_USER:
+    while frame is not None and frame.f_code not in USER_CALLERS:
         if frame.f_globals.get("__name__", "").partition(".")[0] in COMPILERS:
             return True
         frame = frame.f_back

@@ -41,9 +41,9 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 # displacement of coordinates and velocities, relative to max(1, |value|), that reveals which forces depend on them
-DISPLACED = 1e-3
+DISPLACEMENT = 1e-3
 # entries and operations, relative to those of dense factors, above which sparse factors of Newton's matrix do not pay
-NEWTON_SPARSE = 0.2
+MAX_NEWTON_SHARE = 0.2
 
 
 def newton_form(
@@ -52,40 +52,40 @@ def newton_form(
     q0: Array,
     mass: Entries,
     jacobian: Entries,
-    together: list[tuple[int, ...]],
+    bodies: list[tuple[int, ...]],
     stiff: list[int],
 ) -> tuple[NDArray[np.int32], int] | None:
     """Create the program that factorizes Newton's matrix, see sparse_lu.py, and count the groups of its columns.
 
-    The columns of a group are computed from one difference of forces. `together` are the coordinates of each body,
-    `stiff` the constraint rows of `_stiff_rows`. Return None if the matrix is not sparse, or has no program.
+    The columns of a group are computed from one difference of forces. `bodies`: coordinates of each body;
+    `stiff`: constraint rows of `_stiff_rows`. Return None if the matrix is not sparse, or has no program.
     """
     entries: set[tuple[int, int]] = set()
     rng = np.random.default_rng(9)
     size, lam = max(1.0, float(np.abs(q0).max())), rng.uniform(0.5, 1.5, system.n_c)
-    most = NEWTON_SPARSE * system.n_q**2
+    max_entries = MAX_NEWTON_SHARE * system.n_q**2
     for share in NEARBY[:2]:
         q = q0 + share * size * rng.uniform(-1.0, 1.0, system.n_q)
         try:
-            entries |= _derivative_entries(system, t0, q, rng.uniform(-1.0, 1.0, system.n_q), lam, most)
+            entries |= _derivative_entries(system, t0, q, rng.uniform(-1.0, 1.0, system.n_q), lam, max_entries)
         except Exception:  # outside the domain of the callbacks; missed entries are found during the run
             continue
-        if len(entries) > most:
+        if len(entries) > max_entries:
             return None
-    places = np.array(sorted(entries), dtype=np.int64).reshape(-1, 2)
-    tangents = grouped_entries((places[:, 0], places[:, 1]), system.n_q)
-    program = newton_program(system.n_q, system.n_c, mass, jacobian, tangents, together, stiff)
-    if program is None or program[N_UPDATES] > NEWTON_SPARSE * system.n_q**3 / 3.0:
+    indices = np.array(sorted(entries), dtype=np.int64).reshape(-1, 2)
+    tangents = grouped_entries((indices[:, 0], indices[:, 1]), system.n_q)
+    program = newton_program(system.n_q, system.n_c, mass, jacobian, tangents, bodies, stiff)
+    if program is None or program[N_UPDATES] > MAX_NEWTON_SHARE * system.n_q**3 / 3.0:
         return None
     return program, int(column_groups(tangents, system.n_q).max(initial=-1)) + 1
 
 
 def _derivative_entries(
-    system: ConstrainedSystem, t: float, q: Array, v: Array, lam: Array, most: float
+    system: ConstrainedSystem, t: float, q: Array, v: Array, lam: Array, max_entries: float
 ) -> set[tuple[int, int]]:
     """Return the indices of the nonzero entries of d(Q - C_q^T lam)/dq and dQ/dv and of their transposes.
 
-    The search stops when there are more than `most` entries.
+    The search stops when there are more than `max_entries` entries.
     """
 
     def reaction(q: Array) -> Array:
@@ -98,21 +98,23 @@ def _derivative_entries(
     entries: set[tuple[int, int]] = set()
     for j in range(len(q)):
         moved, faster = q.copy(), v.copy()
-        moved[j] += DISPLACED * max(1.0, abs(q[j]))
-        faster[j] += DISPLACED * max(1.0, abs(v[j]))
-        changed = (system.force(t, moved, v) != force) | (reaction(moved) != of_rows)
-        changed |= system.force(t, q, faster) != force
-        for i in np.flatnonzero(changed).tolist():
+        moved[j] += DISPLACEMENT * max(1.0, abs(q[j]))
+        faster[j] += DISPLACEMENT * max(1.0, abs(v[j]))
+        differs = (system.force(t, moved, v) != force) | (reaction(moved) != of_rows)
+        differs |= system.force(t, q, faster) != force
+        for i in np.flatnonzero(differs).tolist():
             entries |= {(i, j), (j, i)}
-        if len(entries) > most:
+        if len(entries) > max_entries:
             break
     return entries
 
 
 SINGULAR = 1e-10  # smallest over largest eigenvalue of a body's M, below which it counts as singular
-ALONG = 1e-3  # share of a row's length along directions without mass, above which the row makes M definite in one
+# share of a row's length along directions without mass, above which the row makes M definite in one
+MIN_SHARE_ALONG = 1e-3
 MIN_SIZE_NEWTON = 1.6  # number of coordinates, in units of LARGE, from which on Newton's matrices are sparse
-SPARSE = 0.05  # entries and operations, relative to those of dense factors, above which the static form does not pay
+# entries and operations, relative to those of dense factors, above which the static form does not pay
+MAX_STATIC_SHARE = 0.05
 
 
 class StaticForm(NamedTuple):
@@ -180,14 +182,14 @@ def _create_static_form(system: ConstrainedSystem, t0: float, q0: Array) -> Stat
         mass_pattern = entries if dense_mass else mass_pattern
     if not _is_sparse(system.n_q, len(jacobian[0])) or not _is_sparse(system.n_q, len(mass[0])):
         return None
-    together = _coordinates_of_bodies(system, mass)
-    stiff = _stiff_rows(system, t0, q0, mass, jacobian, together)
-    program = factorization_program(system.n_q, system.n_c, mass, jacobian, together, stiff)
-    if program is None or program[N_UPDATES] > SPARSE * _dense_work(system.n_q, system.n_c):
+    bodies = _coordinates_of_bodies(system, mass)
+    stiff = _stiff_rows(system, t0, q0, mass, jacobian, bodies)
+    program = factorization_program(system.n_q, system.n_c, mass, jacobian, bodies, stiff)
+    if program is None or program[N_UPDATES] > MAX_STATIC_SHARE * _dense_work(system.n_q, system.n_c):
         return None
     n_factors = int(program[N_PIVOTS] + program[N_OFF] + 1)
     static = Static(n_factors, len(mass[0]), len(jacobian[0]), dense_mass, "jacobian" not in system.entries)
-    return StaticForm(program, static, mass, pattern, mass_pattern, (mass, jacobian, together, stiff))
+    return StaticForm(program, static, mass, pattern, mass_pattern, (mass, jacobian, bodies, stiff))
 
 
 def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]:
@@ -205,7 +207,7 @@ def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tup
 
 
 def _stiff_rows(
-    system: ConstrainedSystem, t0: float, q0: Array, mass: Entries, jacobian: Entries, together: list[tuple[int, ...]]
+    system: ConstrainedSystem, t0: float, q0: Array, mass: Entries, jacobian: Entries, bodies: list[tuple[int, ...]]
 ) -> list[int]:
     """Find constraint rows g of single bodies, such as the norm of Euler parameters, that make a singular M definite.
 
@@ -213,7 +215,7 @@ def _stiff_rows(
     rows of single bodies, such as those of a hinge on the ground, are treated like the rows of joints.
     """
     values = system.mass_values(t0, q0) if "mass" in system.entries else system.mass(t0, q0)[mass]
-    body_of = np.array(bodies_of(system.n_q, mass, together))
+    body_of = np.array(bodies_of(system.n_q, mass, bodies))
     coordinates: dict[int, list[int]] = {}
     for j, body in enumerate(body_of.tolist()):
         coordinates.setdefault(body, []).append(j)
@@ -230,7 +232,7 @@ def _stiff_rows(
     values = system.jacobian_values(t0, q0) if "jacobian" in system.entries else system.jacobian(t0, q0)[jacobian]
     for i, j, value in zip(*(each.tolist() for each in (*jacobian, values)), strict=True):
         columns.setdefault(i, []).append((j, value))
-    indices = []
+    stiff_rows = []
     for i, own in columns.items():
         body = int(body_of[own[0][0]])
         if body in free and all((j, k) in mass_entries for j, _ in own for k, _ in own):
@@ -238,10 +240,10 @@ def _stiff_rows(
             for j, value in own:
                 row[index_in_body[j]] += value
             along = free[body] @ row
-            if np.linalg.norm(along) > ALONG * np.linalg.norm(row):
-                indices.append(i)
+            if np.linalg.norm(along) > MIN_SHARE_ALONG * np.linalg.norm(row):
+                stiff_rows.append(i)
                 free[body] = np.linalg.svd(along[None, :])[2][1:] @ free[body]
-    return indices
+    return stiff_rows
 
 
 def _without_mass(block: Array) -> Array:
@@ -254,7 +256,7 @@ def _without_mass(block: Array) -> Array:
 
 def _is_sparse(n_q: int, n_entries: int) -> bool:
     """Return whether a matrix has so few entries that it pays to search for an elimination order."""
-    return n_entries <= SPARSE * n_q * n_q + 24 * n_q
+    return n_entries <= MAX_STATIC_SHARE * n_q * n_q + 24 * n_q
 
 
 def _dense_work(n_q: int, n_c: int) -> float:
@@ -366,8 +368,8 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
     numbers = (plan.numbers, plan.own_numbers)
     kits: dict[Any, tuple[Kit, Any]] = system.remembered("kits", dict)
     # ids in the key stay unique, as the cached kits keep the objects with these ids alive
-    called = (plan.inner, plan.step, plan.first, plan.second)
-    key = (id(system.functions), flags.tobytes(), *called, len(LOADED), *map(id, (*plan.own, *numbers)))
+    steps = (plan.inner, plan.step, plan.first, plan.second)
+    key = (id(system.functions), flags.tobytes(), *steps, len(LOADED), *map(id, (*plan.own, *numbers)))
     run_changes_flags = flags[FORM] == AUGMENTED  # a run may change these flags
     if key in kits:
         return _with_own_flags(kits[key][0]) if run_changes_flags else kits[key][0]
