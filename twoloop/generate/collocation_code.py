@@ -162,6 +162,8 @@ def compiles_quickly(own: SharedCode) -> bool:
 class CollocationCode:
     """Generator of the functions for the collocation steps of one mechanism.
 
+    In the methods, `emit` writes operations on vectors of LANES numbers, and `one` operations on single numbers.
+
     Parameters
     ----------
     own : SharedCode
@@ -222,19 +224,19 @@ class CollocationCode:
         def evaluate(inputs: list[Value]) -> Callable[[], Value]:
             if self.parts is not None and not self.has_reduced:
                 return self._caller(emit, work, 0)(inputs)
-            outputs, written = self.equations.accelerations[0], Lowering(emit, self.numbers)
+            outputs, lowering = self.equations.accelerations[0], Lowering(emit, self.numbers)
             (forms,), graph = outputs.arrays.values(), self.equations.graph
             for quantity, value in enumerate(inputs):
-                written.define(quantity, value)
+                lowering.define(quantity, value)
 
             def store(coordinates: list[int]) -> None:
-                for i, value in zip(coordinates, written.forms(graph, [forms[i] for i in coordinates]), strict=True):
+                for i, value in zip(coordinates, lowering.forms(graph, [forms[i] for i in coordinates]), strict=True):
                     store_lanes(emit, value, work, self.a + LANES * i)
 
             def finish() -> Value:
                 store(self.others)
-                written.forms(graph, [form for pair in outputs.conditions for form in pair])
-                return written.holds(outputs, self._accelerations(emit, work))
+                lowering.forms(graph, [form for pair in outputs.conditions for form in pair])
+                return lowering.holds(outputs, self._accelerations(emit, work))
 
             store(self.iterated)
             return finish
@@ -313,20 +315,20 @@ class CollocationCode:
         largest = [zero] * 3
         for start in starts:
             q, v, a = (several.function("fabs", several.load(one.pointer(state, m * n + start))) for m in range(3))
-            longest = several.larger(q, several.multiply(half, v)), several.larger(v, several.multiply(half, a))
+            sizes = several.larger(q, several.multiply(half, v)), several.larger(v, several.multiply(half, a))
             atol = several.load(one.pointer(tolerances, ATOL + start))
             atol = builder.select(fixed, several.constant(1.0), atol)
-            of_q, of_v = (several.fused(relative, each, atol) for each in longest)
+            of_q, of_v = (several.fused(relative, each, atol) for each in sizes)
             by_v = builder.compare("fcmp olt", several.multiply(of_v, length), of_q)
             allowed = several.larger(builder.select(by_v, of_v, of_q), several.constant(SMALLEST))
             weight = several.divide(builder.select(by_v, several.constant(1.0), length), allowed)
             several.store(weight, one.pointer(work, at.WEIGHTS + start))
             iterated = [float(start + k in self.iterated) for k in range(several.lanes)]
-            counted = several.multiply(
+            iterated_weight = several.multiply(
                 weight, constants(iterated) if several.lanes > 1 else constant(DOUBLE, *iterated)
             )
-            size = several.multiply(counted, several.fused(length, a, v))
-            largest = [several.larger(*pair) for pair in zip((weight, counted, size), largest, strict=True)]
+            size = several.multiply(iterated_weight, several.fused(length, a, v))
+            largest = [several.larger(*pair) for pair in zip((weight, iterated_weight, size), largest, strict=True)]
         of_all, of_iterated, size = (several.largest_lane(each) for each in largest)
         if self.iterated:
             one.store(one.divide(of_all, of_iterated), work, at.STRICTER)
@@ -334,15 +336,15 @@ class CollocationCode:
         powers = self._powers(emit, one.divide(h, one.load(work, at.H_BEFORE)))
         store_lanes(emit, powers, work, at.POWERS)
         degree = emit.splat(one.load(work, at.DEGREE))
-        known = constants([float(k) for k in range(LANES)])
-        kept = builder.select(builder.compare("fcmp olt", known, degree), powers, emit.constant(0.0))
+        exponents = constants([float(k) for k in range(LANES)])
+        used_powers = builder.select(builder.compare("fcmp olt", exponents, degree), powers, emit.constant(0.0))
         old = self._polynomial(emit, work, other=False)
         nodes = np.array(tables().nodes)
         # integrals of the powers 0 to 8 from the beginning to the nodes, a row for each power
         velocities = np.array([nodes ** (k + 1) / (k + 1) for k in range(LANES + 1)])
         positions = np.array([nodes ** (k + 2) / ((k + 1) * (k + 2)) for k in range(LANES + 1)])
         with loop_over(emit, self.iterated) as (k, i, _, _):
-            scaled = emit.multiply(load_lanes(emit, one.pointer(old, vector_index(emit, k))), kept)
+            scaled = emit.multiply(load_lanes(emit, one.pointer(old, vector_index(emit, k))), used_powers)
             store_lanes(emit, scaled, work, at.SCALED)
             terms = [one.load(one.pointer(state, i), 2 * n), *(one.load(work, at.SCALED + j) for j in range(LANES))]
             self._store_stages(
@@ -354,8 +356,8 @@ class CollocationCode:
         builder, power = emit.builder, emit.splat(x)
         factors = []
         for bit in (1, 2, 4, 8):
-            has = Value(emit.bit, f"<{', '.join(f'{BIT} {int(bool(k + 1 & bit))}' for k in range(LANES))}>")
-            factors.append(builder.select(has, power, emit.constant(1.0)))
+            has_bit = Value(emit.bit, f"<{', '.join(f'{BIT} {int(bool(k + 1 & bit))}' for k in range(LANES))}>")
+            factors.append(builder.select(has_bit, power, emit.constant(1.0)))
             power = emit.multiply(power, power)
         return emit.multiply(emit.multiply(*factors[:2]), emit.multiply(*factors[2:]))
 
@@ -391,7 +393,7 @@ class CollocationCode:
             builder.select(builder.compare("fcmp oge", degree, number(7.0)), number(TARGET + 2), number(TARGET + 1)),
             number(TARGET),
         )
-        most = builder.select(estimated, one.add(target, number(EXTRA_SWEEPS)), number(MOST_OF_FIXED))
+        max_sweeps = builder.select(estimated, one.add(target, number(EXTRA_SWEEPS)), number(MOST_OF_FIXED))
         kappa, noise = (
             builder.select(estimated, number(usual), number(fixed))
             for usual, fixed in ((KAPPA, ROUNDING_OF_FIXED), (at.NOISE, NOISE_OF_FIXED))
@@ -438,22 +440,22 @@ class CollocationCode:
         )
         converged = either(compare("ole", one.multiply(rho_now, change), kappa), stagnant)
         slow = builder.both(builder.both(compare("ogt", m, 3.0), estimated), compare("oge", rho_now, SLOW))
-        refused = either(either(slow, compare("oge", m, most)), compare("uge", change, INFINITE))
-        ends = builder.operation("or", either(guessed, converged), refused)
+        refused = either(either(slow, compare("oge", m, max_sweeps)), compare("uge", change, INFINITE))
+        stops = builder.operation("or", either(guessed, converged), refused)
         for phi, value in zip(carried, (m, change, rho_now), strict=True):
             phi.add_incoming(value, builder.block)
-        builder.branch(ends, after, loop)
+        builder.branch(stops, after, loop)
         builder.position_at_end(after)
         all_hold = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [finish()])
         with self._returning_if(emit, builder.operation("xor", all_hold, Value(BIT, "true"))):
             builder.ret(otherwise())
         for value, place in ((m, at.SWEEPS), (change, at.CHANGE), (target, at.TARGETED), (rho_now, at.RHO)):
             one.store(value, work, place)
-        ended = builder.select(converged, number(at.CONVERGED), number(at.REFUSED))
-        ended = builder.select(guessed, number(at.GUESSED), ended)
-        with builder.if_then(builder.both(builder.compare("fcmp oeq", ended, number(at.CONVERGED)), estimated)):
+        code = builder.select(converged, number(at.CONVERGED), number(at.REFUSED))
+        code = builder.select(guessed, number(at.GUESSED), code)
+        with builder.if_then(builder.both(builder.compare("fcmp oeq", code, number(at.CONVERGED)), estimated)):
             self._call(emit, "judge_nodes", self._judge, [work, state])
-        return ended
+        return code
 
     def _judge(self, emit: LaneEmitter, work: Value, state: Value) -> None:
         """Store ERROR and CURVED, and the factors of the next step size by convergence and by the error.
@@ -467,9 +469,9 @@ class CollocationCode:
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
         m, change, target, rho = (one.load(work, place) for place in (at.SWEEPS, at.CHANGE, at.TARGETED, at.RHO))
         two = LaneEmitter(builder, 2)
-        more = one.divide(one.multiply(rho, change), constant(DOUBLE, KAPPA))
-        more = one.add(more, constant(DOUBLE, LEAST_CHANGE))
-        by_rho = two.logarithm(two.vector([more, rho]))
+        excess = one.divide(one.multiply(rho, change), constant(DOUBLE, KAPPA))
+        excess = one.add(excess, constant(DOUBLE, LEAST_CHANGE))
+        by_rho = two.logarithm(two.vector([excess, rho]))
         left = one.fused(one.subtract(target, m), builder.extract(by_rho, 1), builder.extract(by_rho, 0))
         further = one.divide(one.add(left, llvm_code.ONE), one.add(target, constant(DOUBLE, 2.0)))
         with one.loop(integer(0), integer(n), []) as (i, _, _):
@@ -485,10 +487,10 @@ class CollocationCode:
             first, before, top = (column(emit, vectors, lane) for lane in (2, 4, 6))
             weight = several.load(one.pointer(work, at.WEIGHTS + start))
             of_last = several.larger(several.larger(before, top), least)
-            falls = several.divide(top, of_last)
-            far = several.divide(top, several.larger(first, of_last))
-            falls = several.larger(several.multiply(falls, several.function("sqrt", falls)), far)
-            error = several.larger(several.multiply(several.multiply(top, weight), falls), error)
+            decay = several.divide(top, of_last)
+            total_decay = several.divide(top, several.larger(first, of_last))
+            decay = several.larger(several.multiply(decay, several.function("sqrt", decay)), total_decay)
+            error = several.larger(several.multiply(several.multiply(top, weight), decay), error)
             curved = several.larger(several.multiply(before, weight), curved)
         h = one.load(work, at.H)
         error = one.multiply(one.multiply(several.largest_lane(error), h), constant(DOUBLE, ERROR_WEIGHT))
@@ -557,13 +559,13 @@ class CollocationCode:
         old, zero = self._polynomial(emit, work, other=False), emit.constant(0.0)
         with loop_over(emit, self.iterated, [zero]) as (k, i, (worst,), carried):
             place = one.pointer(work, vector_index(emit, k))
-            here = one.pointer(new_state, i)
+            target = one.pointer(new_state, i)
             a0, a1 = (
                 one.load(one.pointer(state, i), 2 * n),
                 one.load(one.pointer(work, vector_index(emit, i)), self.a + last),
             )
             for value, begin in ((one.load(place, self.q + last), 0), (one.load(place, self.v + last), n), (a1, 2 * n)):
-                one.store(value, here, begin)
+                one.store(value, target, begin)
             sums = emit.multiply(load_lanes(emit, one.pointer(old, vector_index(emit, k))), powers)
             for distance in (1, 2, 4):  # partial sums of all terms up to each degree
                 shifted = [LANES + k if k < distance else k - distance for k in range(LANES)]
@@ -579,15 +581,15 @@ class CollocationCode:
             ends = [constants(table[1:, last]) for table in (tables().velocities, tables().positions)]
             of_first = [constant(DOUBLE, table[0, last]) for table in (tables().velocities, tables().positions)]
             with loop_over(emit, self.others) as (_, i, _, _):
-                first, here = one.pointer(state, i), one.pointer(new_state, i)
+                first, target = one.pointer(state, i), one.pointer(new_state, i)
                 a = load_lanes(emit, one.pointer(work, vector_index(emit, i)), self.a)
                 q, v, a0 = (one.load(first, m * n) for m in range(3))
                 of_v, of_q = two_sums(emit, *(emit.multiply(a, end) for end in ends))
                 of_v, of_q = (one.fused(factor, a0, each) for factor, each in zip(of_first, (of_v, of_q), strict=True))
                 further = one.multiply(h, one.fused(h, of_q, v))
-                one.store(one.add(q, further), here, 0)
-                one.store(one.add(v, one.multiply(h, of_v)), here, n)
-                one.store(builder.extract(a, last), here, 2 * n)
+                one.store(one.add(q, further), target, 0)
+                one.store(one.add(v, one.multiply(h, of_v)), target, n)
+                one.store(builder.extract(a, last), target, 2 * n)
 
     def _choose_degree(self, emit: LaneEmitter, work: Value, worst: Value) -> None:
         """Store NEXT_DEGREE; `worst`: the errors of predictions of degree 1 to 8 at the end of the step."""
@@ -622,9 +624,9 @@ class CollocationCode:
     def _project(self, emit: LaneEmitter, work: Value, numbers: Value, outputs: Program) -> None:
         emit.numbers = emit.constants = numbers
         inputs = [load_lanes(emit, work, self.ends + LANES * k) for k in range(1 + 2 * self.n)]
-        written, arrays = lower(emit, outputs, inputs, self.numbers)
+        lowering, arrays = lower(emit, outputs, inputs, self.numbers)
         values = dict(zip(outputs.arrays, arrays, strict=True))
-        holds = written.holds(outputs, [value for array in arrays for value in array])
+        holds = lowering.holds(outputs, [value for array in arrays for value in array])
         for name, place in self._places_of_ends().items():
             for k, value in enumerate(values.get(name, [])):
                 store_lanes(emit, value, work, place + LANES * k)
@@ -712,11 +714,11 @@ class Collocation(NamedTuple):
     numbers: Any  # coefficients that the functions read, or (shared between systems) expressions for them
 
 
-def compiled_collocation(of_one: GeneratedCode) -> Collocation:
+def compiled_collocation(generated: GeneratedCode) -> Collocation:
     """Return the functions of a mechanism, which are compiled at the first step and cached on disk."""
-    own = of_one.shared
-    shared: Collocation = own.cache.remembered(("collocation", own.equations.choice), lambda: _compiled(own))
-    return shared._replace(numbers=of_one.evaluate(shared.numbers))
+    code = generated.shared
+    collocation: Collocation = code.cache.remembered(("collocation", code.equations.choice), lambda: _compiled(code))
+    return collocation._replace(numbers=generated.evaluate(collocation.numbers))
 
 
 def _compiled(own: SharedCode) -> Collocation:
@@ -731,10 +733,10 @@ def _compiled(own: SharedCode) -> Collocation:
         "correct_ends": code.project_positions,
         "project_ends": code.project_states,
     }
-    long, numbers = own.parts is not None, code.numbers.formulas
+    is_split, numbers = own.parts is not None, code.numbers.formulas
 
     def write() -> tuple[list[str], str]:
-        module = Module(divided=long)
+        module = Module(divided=is_split)
         for name, emit in parts.items():
             llvm_code.write(module, name, KIT.llvm_type(name), emit, partial(LaneEmitter, lanes=LANES))
         # with coefficients that were added while writing, the functions would read beyond the end of the array
@@ -742,7 +744,7 @@ def _compiled(own: SharedCode) -> Collocation:
         return list(parts), str(module)
 
     functions = DeferredFunctions(
-        lambda: generated_functions("collocation", _stamp(), code.structure, write, passes=not long)
+        lambda: generated_functions("collocation", _stamp(), code.structure, write, passes=not is_split)
     )
     return Collocation(functions, code, numbers)
 

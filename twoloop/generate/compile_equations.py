@@ -98,12 +98,12 @@ def _accelerations(
     if not alternatives:
         return a, holds
     builder = emit.builder
-    everywhere = holds
+    all_hold = holds
     if (width := width_of(holds.type)) > 1:
-        everywhere = builder.call(f"llvm.vector.reduce.and.v{width}i1", BIT, [holds])
-    before, otherwise, after = builder.block, builder.append_block(), builder.append_block()
-    builder.branch(everywhere, after, otherwise)
-    builder.position_at_end(otherwise)
+        all_hold = builder.call(f"llvm.vector.reduce.and.v{width}i1", BIT, [holds])
+    before, fallback, after = builder.block, builder.append_block(), builder.append_block()
+    builder.branch(all_hold, after, fallback)
+    builder.position_at_end(fallback)
     name, place = _acceleration_function(emit, equations, -1, lowering.numbers), _stack_array(emit, len(a))
     finite = builder.call(name, emit.bit, [*state(), *_numbers(emit), place])
     b = [builder.select(holds, value, emit.load(place, i)) for i, value in enumerate(a)]

@@ -107,10 +107,10 @@ class Graph(Symbolic):
             quantity = self._recorded[key] = len(self.operations)
             self.operations.append((kind, first, second))
             self.late.append(first.late or (second is not None and second.late))
-            bits = 0
+            mask = 0
             for i in (*first.terms, *(() if second is None else second.terms)):
-                bits |= self.inputs_of[i]
-            self.inputs_of.append(bits)
+                mask |= self.inputs_of[i]
+            self.inputs_of.append(mask)
         return self.quantity(quantity)
 
     def needed_by(self, forms: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
@@ -164,9 +164,9 @@ class Graph(Symbolic):
         return self._product(first, second).times(factor)
 
     def _product(self, a: "Affine", b: "Affine") -> "Affine":
-        seen = self._order
-        first = seen.setdefault(self.number(a), len(seen))
-        if seen.setdefault(self.number(b), len(seen)) < first:
+        order = self._order
+        first = order.setdefault(self.number(a), len(order))
+        if order.setdefault(self.number(b), len(order)) < first:
             a, b = b, a
         return self.operation(op.PRODUCT, a, b)
 

@@ -82,12 +82,12 @@ class LaneSteps:
         select, unit = emit.builder.select, emit.load(work, lanes.UNIT)
         fresh, accepted = (is_set(emit, work, field) for field in (lanes.FRESH, lanes.ACCEPTED))
         span = emit.subtract(broadcast_entry(emit, control, lanes.T1), broadcast_entry(emit, control, lanes.T0))
-        following = emit.smaller(
+        next_unit = emit.smaller(
             emit.multiply(emit.load(work, lanes.LENGTH), unit),
             emit.multiply(emit.constant(MAX_FACTOR), emit.load(work, lanes.H)),
         )
         first = emit.multiply(emit.constant(FIRST_UNIT), span)
-        unit = select(fresh, first, select(accepted, following, unit))
+        unit = select(fresh, first, select(accepted, next_unit, unit))
         emit.store(unit, work, lanes.UNIT)
         for field, value in ((lanes.LONGEST, math.inf), (lanes.SHIFT, 0.0)):
             emit.store(select(fresh, emit.constant(value), emit.load(work, field)), work, field)
@@ -119,18 +119,18 @@ class LaneSteps:
         length = emit.exponential(emit.negative(emit.larger(*logarithms)))
         emit.store(length, work, lanes.LENGTH)
         t, t1 = emit.load(work, lanes.T), broadcast_entry(emit, control, lanes.T1)
-        left, zero = emit.subtract(t1, t), emit.constant(0.0)
+        time_left, zero = emit.subtract(t1, t), emit.constant(0.0)
         h = emit.smallest_of(emit.multiply(length, unit), emit.load(work, lanes.LONGEST))
-        h = builder.select(builder.compare("fcmp oge", h, left), left, h)
+        h = builder.select(builder.compare("fcmp oge", h, time_left), time_left, h)
         largest = emit.larger(emit.function("fabs", t), emit.function("fabs", t1))
-        goes = builder.compare("fcmp ogt", h, emit.multiply(emit.constant(lanes.SHORTEST), largest))
+        may_step = builder.compare("fcmp ogt", h, emit.multiply(emit.constant(lanes.SHORTEST), largest))
         for field in (lanes.RUNNING, lanes.FINE):
-            goes = builder.both(goes, is_set(emit, work, field))
-        h = builder.select(goes, h, zero)
+            may_step = builder.both(may_step, is_set(emit, work, field))
+        h = builder.select(may_step, h, zero)
         emit.store(h, work, lanes.H)
         emit.store(emit.divide(h, unit), work, lanes.X)
         for field in (lanes.RUNNING, lanes.FINE):
-            store_mask(emit, work, field, goes)
+            store_mask(emit, work, field, may_step)
 
     def evaluate(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Evaluate the series at X units of time; store NEW (positions, velocities), accelerations, predictions."""
@@ -182,7 +182,7 @@ class LaneSteps:
         largest = worst = emit.constant(0.0)
         for each in a:
             largest = emit.larger(emit.function("fabs", each), largest)
-        floor = emit.multiply(emit.constant(ROUNDING), largest)
+        noise = emit.multiply(emit.constant(ROUNDING), largest)
         for j, each in enumerate(a):
             defect = emit.function("fabs", emit.subtract(emit.load(at.series_a, j), each))
             of_q, of_v = (
@@ -190,7 +190,7 @@ class LaneSteps:
                 for place in (j, n + j)
             )
             allowed = emit.smallest_of(of_v, emit.multiply(of_q, per_share))
-            worst = emit.largest_of(emit.divide(emit.subtract(defect, floor), allowed), worst)
+            worst = emit.largest_of(emit.divide(emit.subtract(defect, noise), allowed), worst)
         return emit.multiply(share, worst)
 
     def departure(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
@@ -238,24 +238,24 @@ class LaneSteps:
         def root(x: Value) -> Value:
             return emit.exponential(emit.multiply(emit.logarithm(x), per_order))
 
-        nearer = root(emit.divide(emit.constant(ALLOWED), off))
-        factor = select(builder.compare("fcmp ogt", off, one), nearer, one)
-        truer = emit.multiply(emit.constant(SAFETY), root(emit.divide(one, defect)))
-        truer = emit.smaller(factor, emit.larger(shortest, truer))
-        factor = select(builder.compare("fcmp ogt", defect, one), truer, factor)
+        by_departure = root(emit.divide(emit.constant(ALLOWED), off))
+        factor = select(builder.compare("fcmp ogt", off, one), by_departure, one)
+        by_defect = emit.multiply(emit.constant(SAFETY), root(emit.divide(one, defect)))
+        by_defect = emit.smaller(factor, emit.larger(shortest, by_defect))
+        factor = select(builder.compare("fcmp ogt", defect, one), by_defect, factor)
         factor = select(fine, factor, shortest)
         running, refused = is_set(emit, work, lanes.RUNNING), builder.compare("fcmp olt", factor, one)
         accepted = builder.both(running, builder.compare("fcmp oge", factor, one))
         store_mask(emit, work, lanes.ACCEPTED, accepted)
-        times = emit.load(work, lanes.REFUSED)
-        times = select(builder.both(running, refused), emit.add(times, one), times)
+        n_refused = emit.load(work, lanes.REFUSED)
+        n_refused = select(builder.both(running, refused), emit.add(n_refused, one), n_refused)
         # fail if a value is not finite: shorter steps could pass over the point where the equations are undefined
-        times = select(fine, times, emit.constant(math.inf))
-        emit.store(times, work, lanes.REFUSED)
-        grown = emit.multiply(emit.load(work, lanes.H), select(refused, factor, emit.constant(MAX_FACTOR)))
-        emit.store(select(running, grown, emit.load(work, lanes.LONGEST)), work, lanes.LONGEST)
-        few = builder.compare("fcmp ole", times, emit.constant(float(MAX_REJECTIONS)))
-        store_mask(emit, work, lanes.RUNNING, builder.both(running, few))
+        n_refused = select(fine, n_refused, emit.constant(math.inf))
+        emit.store(n_refused, work, lanes.REFUSED)
+        longest = emit.multiply(emit.load(work, lanes.H), select(refused, factor, emit.constant(MAX_FACTOR)))
+        emit.store(select(running, longest, emit.load(work, lanes.LONGEST)), work, lanes.LONGEST)
+        within_limit = builder.compare("fcmp ole", n_refused, emit.constant(float(MAX_REJECTIONS)))
+        store_mask(emit, work, lanes.RUNNING, builder.both(running, within_limit))
 
     def commit(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Copy the end of an accepted step to the state."""
@@ -384,17 +384,17 @@ class LaneStages:
         rtol, zero = broadcast_entry(emit, control, lanes.RTOL), emit.constant(0.0)
         with emit.loop(integer(0), integer(self.n), [zero, zero, zero]) as (j, (e, d, total), new):
             own = _Coordinate(self, emit, at, j, len(b))
-            moved = own.move(b, b @ A, x)
+            new_state = own.move(b, b @ A, x)
             place = emit.builder.gep(control, emit.builder.add(j, integer(lanes.ATOL)))
             atol = emit.splat(emit.builder.load(place))
-            error_weights = [own.error_weight(atol, rtol, *each) for each in zip(own.before, moved, strict=True)]
+            error_weights = [own.error_weight(atol, rtol, *each) for each in zip(own.before, new_state, strict=True)]
             for largest, weights in ((e, fine), (d, coarse)):
                 of_q, of_v = emit.multiply(x, own.sum(weights @ A)), own.sum(weights)
                 for off, weight in zip((of_q, of_v), error_weights, strict=True):
                     largest = emit.larger(emit.multiply(emit.function("fabs", off), weight), largest)
                     total = emit.add(total, emit.multiply(zero, off))
                 new.append(largest)
-            for each in moved:
+            for each in new_state:
                 total = emit.add(total, emit.multiply(zero, each))
             new.append(total)
         e, d, total = (*(emit.multiply(x, each) for each in new[:2]), new[2])
@@ -549,8 +549,8 @@ class LaneCode(LaneSteps):
         builder, n, at = emit.builder, self.n, self.places(emit, order, control, work)
         unit, out, scratch = self.unit(emit, control, work), at.series, at.scratch
         inputs = [emit.load(work, lanes.T), *(emit.load(at.state, i) for i in range(2 * n))]
-        written, (kept,) = lower(emit, self.solution.kept, inputs, self.numbers)
-        holds = written.holds(self.solution.kept, kept)
+        lowering, (kept,) = lower(emit, self.solution.kept, inputs, self.numbers)
+        holds = lowering.holds(self.solution.kept, kept)
         for i, value in enumerate(kept):
             emit.store(value, scratch, i)
         for j in range(n):
@@ -581,14 +581,14 @@ class LaneCode(LaneSteps):
         shift = emit.add(emit.load(work, lanes.SHIFT), emit.constant(GOLDEN))
         shift = emit.subtract(shift, builder.select(builder.compare("fcmp oge", shift, one), one, zero))
         emit.store(shift, work, lanes.SHIFT)
-        moved = emit.multiply(
+        offset = emit.multiply(
             emit.subtract(emit.multiply(two, shift), one), emit.larger(emit.subtract(gap, part), zero)
         )
-        most = builder.convert("fptosi", emit.largest_lane(parts), INTEGER)
-        with emit.loop(integer(1), most, [zero]) as (place, (worst,), new):
+        n_parts = builder.convert("fptosi", emit.largest_lane(parts), INTEGER)
+        with emit.loop(integer(1), n_parts, [zero]) as (place, (worst,), new):
             number = emit.number(place)
             is_inside = builder.compare("fcmp olt", number, parts)
-            x = builder.select(is_inside, emit.add(emit.multiply(number, part), moved), zero)
+            x = builder.select(is_inside, emit.add(emit.multiply(number, part), offset), zero)
             emit.store(emit.add(emit.load(work, lanes.T), x), work, lanes.AHEAD)
             self.positions(emit, at, emit.divide(x, emit.load(work, lanes.UNIT)))
             holds, a = self._accelerations(emit, work, at)
@@ -601,29 +601,29 @@ class LaneCode(LaneSteps):
 
     def approach(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Project the positions of the lanes in which FINE is set: the first correction."""
-        act, _ = self._project(
+        active, _ = self._project(
             emit, self.equations.position_projection, lanes.FINE, self.places(emit, order, control, work)
         )
         for field in (lanes.FINE, lanes.LEFT_TO_MOVE):
-            store_mask(emit, work, field, act)
+            store_mask(emit, work, field, active)
         emit.store(emit.constant(math.inf), work, lanes.MOVED_BEFORE)
 
     def refine(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Project positions and velocities once more in the lanes that need it, with accelerations and multipliers."""
         builder, at = emit.builder, self.places(emit, order, control, work)
         fine, left = (is_set(emit, work, field) for field in (lanes.FINE, lanes.LEFT_TO_MOVE))
-        act, moved = self._project(emit, self.equations.basic_projection, lanes.LEFT_TO_MOVE, at)
+        active, moved = self._project(emit, self.equations.basic_projection, lanes.LEFT_TO_MOVE, at)
         largest = emit.constant(0.0)
         for j in range(self.n):
             largest = emit.larger(emit.function("fabs", emit.load(at.new, j)), largest)
-        least = emit.multiply(emit.constant(RELATIVE_CORRECTION), largest)
-        least = emit.larger(least, emit.constant(ABSOLUTE_CORRECTION))
-        converged = builder.both(act, builder.compare("fcmp ole", moved, least))
-        before = emit.multiply(emit.constant(CONTRACTION), emit.load(work, lanes.MOVED_BEFORE))
-        goes_on = builder.both(act, builder.compare("fcmp ole", moved, before))
-        goes_on = builder.both(goes_on, builder.compare("fcmp ogt", moved, least))
-        emit.store(emit.larger(moved, least), work, lanes.MOVED_BEFORE)
-        store_mask(emit, work, lanes.LEFT_TO_MOVE, goes_on)
+        tolerance = emit.multiply(emit.constant(RELATIVE_CORRECTION), largest)
+        tolerance = emit.larger(tolerance, emit.constant(ABSOLUTE_CORRECTION))
+        converged = builder.both(active, builder.compare("fcmp ole", moved, tolerance))
+        limit = emit.multiply(emit.constant(CONTRACTION), emit.load(work, lanes.MOVED_BEFORE))
+        continues = builder.both(active, builder.compare("fcmp ole", moved, limit))
+        continues = builder.both(continues, builder.compare("fcmp ogt", moved, tolerance))
+        emit.store(emit.larger(moved, tolerance), work, lanes.MOVED_BEFORE)
+        store_mask(emit, work, lanes.LEFT_TO_MOVE, continues)
         unchanged = builder.operation("xor", fine, builder.both(fine, left))
         store_mask(emit, work, lanes.FINE, builder.operation("or", unchanged, converged))
 
@@ -634,18 +634,18 @@ class LaneCode(LaneSteps):
         """
         select, work = emit.builder.select, at.work
         inputs = self._new_state(emit, work, at)
-        written, arrays = lower(emit, outputs, inputs, self.numbers)
+        lowering, arrays = lower(emit, outputs, inputs, self.numbers)
         values = dict(zip(outputs.arrays, arrays, strict=True))
-        act = emit.builder.both(is_set(emit, work, which), written.holds(outputs, arrays[0]))
+        active = emit.builder.both(is_set(emit, work, which), lowering.holds(outputs, arrays[0]))
         largest = emit.constant(0.0)
         for value in values["moved"]:
             largest = emit.larger(emit.function("fabs", value), largest)
         for k, value in enumerate([*values["q"], *values.get("v", [])]):
-            emit.store(select(act, value, inputs[1 + k]), at.new, k)
+            emit.store(select(active, value, inputs[1 + k]), at.new, k)
         for base, name in ((at.a, "a"), (at.lam, "lam")):
             for k, value in enumerate(values.get(name, [])):
-                emit.store(select(act, value, emit.load(base, k)), base, k)
-        return act, largest
+                emit.store(select(active, value, emit.load(base, k)), base, k)
+        return active, largest
 
     def accelerate(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Compute the accelerations at the state NEW and the time AHEAD; clear FINE where they are invalid."""
@@ -685,8 +685,8 @@ class LaneCode(LaneSteps):
     def redundant(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Clear FINE in the lanes in which a redundant row is violated."""
         at, outputs = self.places(emit, order, control, work), self.equations.redundant_rows
-        written, (none,) = lower(emit, outputs, self._new_state(emit, work, at), self.numbers)
-        clear_fine_unless(emit, work, written.holds(outputs, none))
+        lowering, (no_values,) = lower(emit, outputs, self._new_state(emit, work, at), self.numbers)
+        clear_fine_unless(emit, work, lowering.holds(outputs, no_values))
 
     def _new_state(self, emit: LaneEmitter, work: Value, at: Places) -> list[Value]:
         return [emit.load(work, lanes.AHEAD), *(emit.load(at.new, i) for i in range(2 * self.n))]
@@ -733,11 +733,11 @@ class LaneConstraints(LaneSteps):
         """Compute C, C_t and the entries of C_q at the state NEW and the time AHEAD; store them at `Places.series`."""
         at = self.places(emit, order, control, work)
         inputs = [emit.load(work, lanes.AHEAD), *(emit.load(at.new, i) for i in range(2 * self.n))]
-        written, arrays = lower(emit, self._rows, inputs, self.numbers)
+        lowering, arrays = lower(emit, self._rows, inputs, self.numbers)
         values = [value for array in arrays for value in array]
         for k, value in enumerate(values):
             emit.store(value, at.series, k)
-        clear_fine_unless(emit, work, written.holds(self._rows, values))
+        clear_fine_unless(emit, work, lowering.holds(self._rows, values))
 
 
 BUILD_SECONDS = 3e-4  # estimated time to compile one quantity, s

@@ -183,19 +183,19 @@ class Emitter:
         a list to which their new values are appended. After the loop that list has the final values.
         """
         builder = self.builder
-        goes = builder.compare("icmp slt", first, end)
+        enters = builder.compare("icmp slt", first, end)
         before, body, after = builder.block, builder.append_block(), builder.append_block()
-        builder.branch(goes, body, after)
+        builder.branch(enters, body, after)
         builder.position_at_end(body)
         index = builder.phi(INTEGER)
         index.add_incoming(first, before)
         carried = [builder.phi(value.type) for value in initial]
         new: list[Any] = []
         yield index, carried, new
-        following = builder.add(index, integer(1))
-        goes, last = builder.compare("icmp slt", following, end), builder.block
-        index.add_incoming(following, last)
-        builder.branch(goes, body, after)
+        next_index = builder.add(index, integer(1))
+        enters, last = builder.compare("icmp slt", next_index, end), builder.block
+        index.add_incoming(next_index, last)
+        builder.branch(enters, body, after)
         builder.position_at_end(after)
         for k, value in enumerate(initial):
             result = builder.phi(value.type)
@@ -310,18 +310,18 @@ def sine_and_cosine(emit: Emitter, x: Value) -> tuple[Value, Value]:
     """Return sine and cosine of x, correct to rounding for angles up to LARGEST_ANGLE."""
     builder, whole = emit.builder, emit.whole
     turns = emit.function("rint", builder.operation("fmul", x, emit.far(1.0 / HALF_PI[0])))
-    rest = x
+    remainder = x
     for part in HALF_PI:
-        rest = emit.fused(turns, emit.far(-part), rest)
-    square = builder.operation("fmul", rest, rest)
+        remainder = emit.fused(turns, emit.far(-part), remainder)
+    square = builder.operation("fmul", remainder, remainder)
     fourth = builder.operation("fmul", square, square)
-    sine = emit.fused(builder.operation("fmul", square, rest), emit.polynomial(SINES, square), rest)
+    sine = emit.fused(builder.operation("fmul", square, remainder), emit.polynomial(SINES, square), remainder)
     cosine = emit.fused(square, emit.far(-0.5), emit.constant(1.0))
     cosine = emit.fused(fourth, emit.polynomial(COSINES, square), cosine)
     quarter = builder.convert("fptosi", turns, emit.whole_number)
-    odd, following = builder.convert("trunc", quarter, emit.bit), builder.add(quarter, whole(1))
+    odd, next_quarter = builder.convert("trunc", quarter, emit.bit), builder.add(quarter, whole(1))
     results = []
-    for if_odd, if_even, turn in ((cosine, sine, quarter), (sine, cosine, following)):
+    for if_odd, if_even, turn in ((cosine, sine, quarter), (sine, cosine, next_quarter)):
         sign = builder.operation("shl", builder.both(turn, whole(2)), whole(62))
         bits = builder.convert("bitcast", builder.select(odd, if_odd, if_even), emit.whole_number)
         results.append(builder.convert("bitcast", builder.operation("xor", bits, sign), emit.double))

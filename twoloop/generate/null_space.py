@@ -45,11 +45,11 @@ class Factors:
         alone: dict[int, Any] = {}
         pairs = _pairs(rows, n)
         for places in [*pairs, *_order(rows, n, pairs)]:
-            nothing = Affine(rows[places[0]][places[0]].graph, 0.0, {})
-            pivots = [[rows[i].pop(j, nothing).value() for j in places] for i in places]
+            zero = Affine(rows[places[0]][places[0]].graph, 0.0, {})
+            pivots = [[rows[i].pop(j, zero).value() for j in places] for i in places]
             inverse = self._inverse(pivots, [alone.get(i) for i in places])
             neighbours = dict.fromkeys(j for i in places for j in rows[i])
-            entries = [(j, [rows[i].get(j, nothing).value() for i in places]) for j in neighbours]
+            entries = [(j, [rows[i].get(j, zero).value() for i in places]) for j in neighbours]
             below = [(j, [_dot(row, values).value() for row in inverse]) for j, values in entries]
             for first, (j, multiples) in enumerate(below):
                 for k, values in entries[first:]:
@@ -146,23 +146,23 @@ def _order(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int, int
     chain of divisions before it comes first, so that independent operations can overlap.
     """
     neighbours = [set(row) - {i} for i, row in enumerate(rows)]
-    waits = [{j for j in neighbours[i] if j < n} if i >= n else set() for i in range(len(rows))]
+    waiting_for = [{j for j in neighbours[i] if j < n} if i >= n else set() for i in range(len(rows))]
     order: list[tuple[int, ...]] = []
     remaining, depth = set(range(len(rows))), [0] * len(rows)
     for pair in pairs:
         remaining -= set(pair)
         _eliminate(neighbours, pair)
         for j in remaining:
-            waits[j] -= set(pair)
+            waiting_for[j] -= set(pair)
     while remaining:
-        i = min((j for j in remaining if not waits[j]), key=lambda j: (len(neighbours[j]), depth[j], j))
-        ready = [j for j in neighbours[i] if not waits[j] and (j < n) == (i < n)]
+        i = min((j for j in remaining if not waiting_for[j]), key=lambda j: (len(neighbours[j]), depth[j], j))
+        ready = [j for j in neighbours[i] if not waiting_for[j] and (j < n) == (i < n)]
         alike = [j for j in ready if neighbours[j] | {j} == neighbours[i] | {i}]
         places = (i, *sorted(alike)[:1])
         order.append(places)
         remaining -= set(places)
         for j in _eliminate(neighbours, places):
-            waits[j] -= set(places)
+            waiting_for[j] -= set(places)
             depth[j] = max(depth[j], depth[i] + 1)
     return order
 
@@ -243,8 +243,8 @@ class DependentCoordinates:
         self.check()
         block = [[self._rows[i].get(j, self._zero) for j in columns] for i in places]
         pivot, inverse = self._inverse(block)
-        around = sorted({j for i in places for j in self._rows[i]} - set(columns))
-        entries = {j: [self._rows[i].get(j, self._zero) for i in places] for j in around}
+        other_columns = sorted({j for i in places for j in self._rows[i]} - set(columns))
+        entries = {j: [self._rows[i].get(j, self._zero) for i in places] for j in other_columns}
         solved = [
             _not_zero({j: _add_products(self._zero, zip(row, known, strict=True)) for j, known in entries.items()})
             for row in inverse

@@ -158,13 +158,13 @@ class ParameterTape(Symbolic):
     def evaluate(self, numbers: Sequence["Parameter"], parameters: Array) -> Array:
         """Evaluate numbers for other parameters (n_runs, n_p); return an array (n_runs, len(numbers))."""
         product = self.products(parameters)
-        places = {powers: k for k, powers in enumerate(dict.fromkeys(each.powers for each in numbers))}
-        products = np.empty((len(places), len(parameters)))
+        rows = {powers: k for k, powers in enumerate(dict.fromkeys(each.powers for each in numbers))}
+        products = np.empty((len(rows), len(parameters)))
         with np.errstate(all="ignore"):
-            for powers, k in places.items():
+            for powers, k in rows.items():
                 products[k] = product(powers)
             scales = np.array([[each.scale] for each in numbers]).reshape(-1, 1)
-            values = scales * products[[places[each.powers] for each in numbers]]
+            values = scales * products[[rows[each.powers] for each in numbers]]
         return np.ascontiguousarray(values.T)
 
 
@@ -316,11 +316,11 @@ def _operator(name: str, swapped: bool) -> Callable[[Parameter, Any], Any]:
 
 
 def _refusing_method(name: str) -> Callable[..., Any]:
-    plain = getattr(float, name)
+    float_method = getattr(float, name)
 
     def decide(self: Parameter, *others: Any) -> Any:
         self._refuse_decision()
-        return plain(self, *others)
+        return float_method(self, *others)
 
     return decide
 
@@ -369,5 +369,5 @@ def number(value: Any) -> float:
 
 def function_of_number(name: str) -> Callable[[float], float]:
     """Return a function of `math` that returns a Parameter if its argument is one."""
-    plain = getattr(math, name)
-    return lambda x: apply_function(name, x) if type(x) is Parameter else plain(x)
+    function = getattr(math, name)
+    return lambda x: apply_function(name, x) if type(x) is Parameter else function(x)

@@ -224,12 +224,12 @@ class OperationTable(NamedTuple):
         parts: list[Any] = [sizes, rows.ravel(), self.columns + n_results, self.coefficients, self.constants.ravel()]
         return [float(x) for part in parts for x in part]
 
-    def packed(self, places: Sequence[int]) -> tuple[Any, Any]:
-        """Return the table as one array of integers and one of floats; results are stored at the indices `places`."""
-        rows, n = self.rows.copy(), len(places)
+    def packed(self, result_indices: Sequence[int]) -> tuple[Any, Any]:
+        """Return the table as one array of integers and one of floats; results are stored at `result_indices`."""
+        rows, n = self.rows.copy(), len(result_indices)
         rows[rows[:, KIND] == RESULT, NODE] += self.n_nodes
-        head = [self.n_nodes + n, len(rows), len(self.columns), n]
-        integers = np.concatenate([head, rows.ravel(), self.columns, places])
+        header = [self.n_nodes + n, len(rows), len(self.columns), n]
+        integers = np.concatenate([header, rows.ravel(), self.columns, result_indices])
         return integers.astype(np.int64), np.concatenate([self.constants.ravel(), self.coefficients])
 
     def with_numbers(self, numbers_for: Callable[[Any], Array]) -> "OperationTable":
@@ -356,5 +356,5 @@ def literal(value: float) -> float | None:
     """Return 0, 1 or -1 if a number equals it up to rounding; None if the number must be read as a coefficient."""
     if type(value) is Parameter or not math.isfinite(value):
         return None
-    near = float(round(value))
-    return near if near in LITERALS and abs(value - near) <= ROUNDING * abs(near) else None
+    nearest = float(round(value))
+    return nearest if nearest in LITERALS and abs(value - nearest) <= ROUNDING * abs(nearest) else None

@@ -373,8 +373,8 @@ class Equations:
         constraint, unit = self.of("constraint"), Affine(self.graph, 1.0, {})
         jacobian = np.empty((self.system.n_c, self.system.n_q), dtype=object)
         for j, coordinate in enumerate(self.q):
-            by = Derivative(self.graph, {only_quantity(coordinate): unit})
-            jacobian[:, j] = [by.of(form) for form in constraint]
+            derivative = Derivative(self.graph, {only_quantity(coordinate): unit})
+            jacobian[:, j] = [derivative.of(form) for form in constraint]
         return jacobian
 
     def _rate(self) -> Any:
@@ -461,9 +461,9 @@ class TraceCache:
         self._tape = ParameterTape(np.random.default_rng(7).uniform(*GENERIC, n_numbers).tolist(), range(n_numbers))
         self.parameters = parameters.astype(object) if self._classes.any() else parameters.copy()
         for place in np.flatnonzero(self._classes).tolist():
-            which = int(self._classes[place])
-            parameter = self._tape.parameters[abs(which) - 1]
-            self.parameters[place] = parameter if which > 0 else -parameter
+            signed = int(self._classes[place])
+            parameter = self._tape.parameters[abs(signed) - 1]
+            self.parameters[place] = parameter if signed > 0 else -parameter
         self.traced: set[str] = set()
         self.within_bounds: set[str] = set()
         self._results: dict[Any, Any] = {}
@@ -493,9 +493,9 @@ class TraceCache:
         def evaluate(array: Any) -> Array:
             if array.dtype != object:
                 return array
-            scales, places, products = self._scaled_products(array)
+            scales, indices, products = self._scaled_products(array)
             with np.errstate(all="ignore"):
-                values: Array = scales * np.array(list(map(product, products)))[places]
+                values: Array = scales * np.array(list(map(product, products)))[indices]
             if not np.isfinite(values).all():  # an expression may divide by a sum of parameters that is zero
                 raise Untraceable("a number of them is not finite for these parameters")
             return values
@@ -511,9 +511,9 @@ class TraceCache:
             scales = np.array(
                 [each.scale if type(each) is Parameter else each for each in array.ravel()], dtype=np.float64
             )
-            places = np.array([products[each] for each in powers], dtype=np.int64)
-            gathered = scales.reshape(array.shape), places.reshape(array.shape), list(products)
-            entry = self._arrays[id(array)] = array, gathered
+            indices = np.array([products[each] for each in powers], dtype=np.int64)
+            scaled = scales.reshape(array.shape), indices.reshape(array.shape), list(products)
+            entry = self._arrays[id(array)] = array, scaled
         return entry[1]
 
     def remembered(self, what: Any, make: Callable[[], Any]) -> Any:
@@ -539,9 +539,9 @@ def derive_cached(
     Untraceable
         If the result cannot be derived, or `check` refuses it.
     """
-    for find in (_own_cache,) if system.called_in_python else (trace_cache_of, _own_cache):
-        cache = system.remembered(("family", find), partial(find, system))
-        derived = system.remembered((what, find), partial(_derive, system, cache, what, make))
+    for cache_for in (_own_cache,) if system.called_in_python else (trace_cache_of, _own_cache):
+        cache = system.remembered(("family", cache_for), partial(cache_for, system))
+        derived = system.remembered((what, cache_for), partial(_derive, system, cache, what, make))
         try:
             if isinstance(derived, Untraceable):
                 raise derived

@@ -111,25 +111,25 @@ class Traced:
         """
         from twoloop.kernels.evaluation import checks as kernels
 
-        kit, most = system.kit, MAX_IN_PYTHON if system.called_in_python else MAX_STATES
-        states = states[:: 1 + max(len(states) // most, len(states) * len(self.places) // MAX_ENTRIES)]
+        kit, max_states = system.kit, MAX_IN_PYTHON if system.called_in_python else MAX_STATES
+        states = states[:: 1 + max(len(states) // max_states, len(states) * len(self.places) // MAX_ENTRIES)]
         n_different, called, traced, bounds = self._evaluate(kit, states)
         if n_different == 0:
             return None
         finite = np.isfinite(called)
         with np.errstate(all="ignore"):
             largest = np.abs(np.where(finite, called, 0.0)).max(axis=0)
-            off = np.abs(called - traced)
-            same = off <= kernels.SAME * largest + kernels.ROUNDED * bounds
+            differences = np.abs(called - traced)
+            agree = differences <= kernels.SAME * largest + kernels.ROUNDED * bounds
         if everywhere:
-            same |= ~finite & ~np.isfinite(traced)
+            agree |= ~finite & ~np.isfinite(traced)
         else:
-            same |= ~finite
+            agree |= ~finite
         largest = np.where(np.isfinite(bounds), bounds, 0.0).max(axis=0)
         # the largest term of the kind of each entry
         size = np.repeat(np.maximum.reduceat(largest, np.cumsum(self.n_entries) - self.n_entries), self.n_entries)
-        for k, entry in np.argwhere(~same & ~(off <= LOST * size)):
-            if not off[k, entry] <= CLEAR * size[entry] or self._is_systematic(system, states[k], int(entry)):
+        for k, entry in np.argwhere(~agree & ~(differences <= LOST * size)):
+            if not differences[k, entry] <= CLEAR * size[entry] or self._is_systematic(system, states[k], int(entry)):
                 return self._message(states[k], int(entry), called[k, entry], traced[k, entry])
         return None
 
@@ -154,8 +154,8 @@ class Traced:
         """Return whether a difference is about the same at neighbouring states, as rounding errors would not be."""
         parts = np.random.default_rng(5).uniform(-1.0, 1.0, (N_NEIGHBOURS, len(state)))
         _, called, traced, _ = self._evaluate(system.kit, state * (1.0 + PERTURBATION * parts))
-        off = (called - traced)[:, entry]
-        return bool(np.abs(off).min() > 0.5 * np.abs(off).max() and np.abs(off.sum()) == np.abs(off).sum())
+        gap = (called - traced)[:, entry]
+        return bool(np.abs(gap).min() > 0.5 * np.abs(gap).max() and np.abs(gap.sum()) == np.abs(gap).sum())
 
     def _message(self, state: Array, entry: int, called: float, traced: float) -> str:
         kind, place = self.places[entry]
@@ -178,10 +178,10 @@ class Sample:
     def add(self, t: Array, rows: Array, end: float, state: Array) -> None:
         """Add a selection of the states of a chunk (times `t`, rows that begin with [q, v]), and its last state."""
         stride = 1 + len(t) // MAX_OF_CHUNK
-        some = t[::stride]
-        part = np.empty((len(some) + 1, 1 + self._n))
+        times = t[::stride]
+        part = np.empty((len(times) + 1, 1 + self._n))
         part[0, 0], part[0, 1:] = end, state[: self._n]
-        part[:0:-1, 0], part[:0:-1, 1:] = some, rows[::stride, : self._n]
+        part[:0:-1, 0], part[:0:-1, 1:] = times, rows[::stride, : self._n]
         self._parts.insert(0, part)
         if len(self._parts) > MAX_STATES:
             self._parts = self._parts[::2]
@@ -205,13 +205,13 @@ def refuse_wrong(traced: Sequence[Traced], system: ConstrainedSystem, t0: float,
     Untraceable
         If a trace is wrong; the message names the callback and the entry.
     """
-    new = [each for each in traced if not each.trusted]
-    if not new:
+    untrusted = [each for each in traced if not each.trusted]
+    if not untrusted:
         return
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         nearby = states_near_start(t0, t1, q, v)
-        for each in new:
+        for each in untrusted:
             each.check_near_start(system, nearby)
 
 
@@ -275,8 +275,8 @@ class CheckedRegion:
         if not self._box.size:
             return states
         least, largest = self.bounds
-        new = (states < least) | (states > largest)
-        return states[new.any(axis=1)] if new.any() else states[:0]
+        outside = (states < least) | (states > largest)
+        return states[outside.any(axis=1)] if outside.any() else states[:0]
 
     def contains_parameters(self, parameters: Array) -> bool:
         """Return whether parameters lie in the region or its margin."""

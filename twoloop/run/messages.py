@@ -173,7 +173,7 @@ def _dominant_eigenvalue(
 ) -> tuple[float, bool]:
     """Return |x| of the largest eigenvalue x of dF/dq or (`by_v`) dF/dv, and whether x < 0.
 
-    Power iteration in the independent coordinates `independent`, from `direction`, which becomes the eigenvector.
+    Power iteration in the coordinates `independent`, from `direction`, which becomes the eigenvector.
     """
     from twoloop.kernels.evaluation import tasks
 

@@ -380,7 +380,7 @@ def _another_assembly(
     scales: Scales,
     cut: float,
 ) -> str | None:
-    """Describe to which other assembly a guess leads that is as far from the position as the given one; None: to none.
+    """Describe where other guesses, as far from `position` as `guess`, lead; None: to the same assembly.
 
     Different assemblies have the same values of all but the dependent coordinates. If there is only one, displaced
     guesses are projected to the points that C_q predicts to first order, with the same sign of the determinant.
