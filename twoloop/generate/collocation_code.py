@@ -472,8 +472,8 @@ class CollocationCode:
         excess = one.divide(one.multiply(rho, change), constant(DOUBLE, KAPPA))
         excess = one.add(excess, constant(DOUBLE, LEAST_CHANGE))
         by_rho = two.logarithm(two.vector([excess, rho]))
-        left = one.fused(one.subtract(target, m), builder.extract(by_rho, 1), builder.extract(by_rho, 0))
-        further = one.divide(one.add(left, llvm_code.ONE), one.add(target, constant(DOUBLE, 2.0)))
+        exponent = one.fused(one.subtract(target, m), builder.extract(by_rho, 1), builder.extract(by_rho, 0))
+        by_convergence = one.divide(one.add(exponent, llvm_code.ONE), one.add(target, constant(DOUBLE, 2.0)))
         with one.loop(integer(0), integer(n), []) as (i, _, _):
             a0 = one.load(one.pointer(state, i), 2 * n)
             values = emit.function("fabs", self._weighted_rows(emit, tables().spectrum, a0, work, i))
@@ -497,7 +497,7 @@ class CollocationCode:
         one.store(error, work, at.ERROR)
         one.store(one.multiply(several.largest_lane(curved), h), work, at.CURVED)
         by_error = one.multiply(builder.extract(two.logarithm(two.splat(error)), 0), constant(DOUBLE, 1.0 / at.ORDER))
-        factors = two.exponential(two.negative(two.vector([further, by_error])))
+        factors = two.exponential(two.negative(two.vector([by_convergence, by_error])))
         one.store(builder.extract(factors, 0), work, at.FACTOR)
         one.store(builder.extract(factors, 1), work, at.FACTOR_OF_ERROR)
 

@@ -147,17 +147,17 @@ class LaneSteps:
         twice = emit.multiply(emit.constant(2.0), emit.multiply(per_unit, per_unit))
         last = emit.pointer(at.series, builder.mul(order, integer(n)))
         for begin in range(0, n, IN_PARALLEL):
-            some = range(begin, min(begin + IN_PARALLEL, n))
-            initial = [each for j in some for each in (emit.load(last, j), zero, zero)]
+            group = range(begin, min(begin + IN_PARALLEL, n))
+            initial = [each for j in group for each in (emit.load(last, j), zero, zero)]
             with emit.loop(integer(0), order, initial) as (m, carried, new):
                 power = builder.sub(builder.sub(order, integer(1)), m)
                 row = emit.pointer(at.series, builder.mul(power, integer(n)))
-                for j, (q, v, a) in zip(some, _triples(carried), strict=True):
+                for j, (q, v, a) in zip(group, _triples(carried), strict=True):
                     # from a to q: in this order each new number takes the register of the old one
                     a = emit.add(emit.multiply(a, x), v)
                     v = emit.add(emit.multiply(v, x), q)
                     new += [emit.add(emit.multiply(q, x), emit.load(row, j)), v, a]
-            for j, (q, v, a) in zip(some, _triples(new), strict=True):
+            for j, (q, v, a) in zip(group, _triples(new), strict=True):
                 positions.append(q)
                 emit.store(q, at.new, j)
                 emit.store(emit.multiply(v, per_unit), at.new, n + j)

@@ -26,8 +26,8 @@ from twoloop.problem.system import ConstrainedSystem
 BY_TIME = ("force", "constraint_rate", "nonholonomic_rate")  # callbacks whose dependence on time is analysed
 # callbacks whose dependence on the state is analysed
 BY_STATE = ("force", "mass", "constraint", "jacobian", "nonholonomic")
-SMOOTH = (PRODUCT, SUM, SINE, COSINE)  # operations of polynomials and vibrations, which up to MAX_DEGREE have no pulses
-MAX_DEGREE = 8  # largest degree, in time or in sines and cosines, without short pulses: a high power of a cosine is one
+SMOOTH = (PRODUCT, SUM, SINE, COSINE)  # operations whose results, up to MAX_DEGREE, have no short pulses
+MAX_DEGREE = 8  # largest degree, in time or in sines and cosines, that excludes pulses, such as cos(t)**100
 MAX_DEGREE_OF_STATE = 32  # largest degree of polynomials in q and v, and of their roots, without short pulses
 MAX_DEGREE_OF_DIVISOR = 4  # largest degree of the divisors of a quotient without short pulses
 # lowest power of x with which such a quotient may decay for large x: 1 / (1 + (x / w)**2) is allowed, its square is not

@@ -35,9 +35,9 @@ DISTANCE = 0.3  # largest distance of these states from the start, relative to t
 # largest number of compared states: in a chunk of a run, in a run, in a run with callbacks called in Python
 MAX_OF_CHUNK, MAX_STATES, MAX_IN_PYTHON = 32, 64, 9
 MAX_ENTRIES = 20_000  # approximate limit of the compared entries in a run: large systems are compared at fewer states
-# difference of call and trace, relative to the largest term of a kind, up to which it is rounding
+# largest difference of call and trace that is rounding, relative to the largest term of a kind
 LOST = 16.0 * np.finfo(float).eps
-CLEAR = 1e-6  # relative difference up to which it counts only if it is the same at neighbouring states
+CLEAR = 1e-6  # relative as LOST: smaller differences count only if they are the same at neighbouring states
 PERTURBATION, N_NEIGHBOURS = 1e-7, 12  # largest relative distance of neighbouring states, and their number
 MARGIN = 0.01  # margin of a CheckedRegion relative to its sides; small compared with the steps of a run
 MARGIN_AT_REST = 1e-9  # further margin relative to the longest side except time: coordinates at rest have no side

@@ -46,7 +46,7 @@ from twoloop.methods.taylor import Taylor
 from twoloop.problem.description import Stop
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
-from twoloop.run.fallbacks import corrected
+from twoloop.run.fallbacks import corrected_positions
 from twoloop.run.options import check_method
 from twoloop.run.record import Status
 from twoloop.run.signals import SignalHandlers
@@ -474,7 +474,7 @@ class Motion:
 
     def _project(self, system: ConstrainedSystem, resting: tuple[int, ...]) -> None:
         """Project the state onto the constraints of a mode, from which it deviates by less than the tolerances."""
-        self.q = corrected(system, self.t, self.q)
+        self.q = corrected_positions(system, self.t, self.q)
         if resting:
             self.q[np.abs(self.q) < ZERO] = 0.0
             gap = self.gaps.at(self.t, self.q, self.v)

@@ -335,7 +335,7 @@ class Interpolator:
         return Table(np.concatenate(t), np.concatenate(states), table.kinds), own, groups[~filled]
 
     def _fill(self, table: Table, plan: Plan, kit: Any, intervals: Groups) -> dict[float, tuple[Array, Array]]:
-        """Compute (times, states) in intervals by fixed steps, fewer if steps fail; return them by the first time."""
+        """Divide intervals by fixed steps, fewer if steps fail; return (times, states) by their first time."""
         n = self.system.n_q
         tolerances = np.zeros(ATOL + n)  # zeros: no error estimate
         state = np.zeros(3 * n + self.system.n_c + self.system.n_a)

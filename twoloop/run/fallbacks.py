@@ -66,7 +66,7 @@ def state_behind_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -
     Solve M (v+ - v) + G^T p = 0 and G v+ + (C_t, b) = 0. Of all velocities that the constraints allow, v+ is nearest to
     v in the metric of M.
     """
-    q = corrected(system, t, q)
+    q = corrected_positions(system, t, q)
     equations, lengths, size = scaled_equations(system, t, q)
     right_side = np.concatenate([np.zeros(system.n_q), -system.velocity_constraint(t, q, v) / lengths * size])
     change = np.linalg.lstsq(equations, right_side, rcond=NEGLIGIBLE)[0]
@@ -75,7 +75,7 @@ def state_behind_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -
     return np.concatenate([q, v + change[: system.n_q]])
 
 
-def corrected(system: ConstrainedSystem, t: float, q: Array) -> Array:
+def corrected_positions(system: ConstrainedSystem, t: float, q: Array) -> Array:
     """Project positions onto the constraints by Newton's method."""
     for _ in range(CORRECTIONS if system.n_c > 0 else 0):
         q = q - np.linalg.lstsq(system.jacobian(t, q), system.constraint(t, q), rcond=NEGLIGIBLE)[0]
@@ -242,7 +242,7 @@ def crossing_kit(kit: Kit) -> Kit:
     return attributes["crossing"]  # type: ignore[no-any-return]
 
 
-def after_crossing(run: Run, plan: Plan, control: Array, code: int, accepted: int) -> tuple[Plan, Array, int]:
+def after_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted: int) -> tuple[Plan, Array, int]:
     """Return plan, controls and code for what follows an attempt to step across a singular position.
 
     What follows is the next piece of the polynomial, an attempt with another length, or the run's own method.
@@ -258,17 +258,17 @@ def after_crossing(run: Run, plan: Plan, control: Array, code: int, accepted: in
             run.pieces = kernels.piece_ends(plan.memory, plan.options[-kernels.S :], float(clock[a.T]))
             if clock[a.T] > clock[a.T_START]:
                 run.state[: 3 * run.system.n_q] = kernels.state_at(plan.memory, plan.options, float(clock[a.T]))
-        elif accepted == 0:
+        elif n_accepted == 0:
             run.pieces.pop(0)
         run.pieces = [piece for piece in run.pieces if piece > now]
         if run.pieces:
             clock[a.H_NEXT], clock[a.H_LIMIT] = run.pieces[0] - clock[a.T], np.inf
             return plan, control, a.PAUSED
     run.pieces, plan.memory[-kernels.N_STORED :][kernels.END] = [], -np.inf
-    if accepted > 0:  # the whole polynomial counts as one step
+    if n_accepted > 0:  # the whole polynomial counts as one step
         clock[a.H_LONG] = max(clock[a.H_LONG], run.crossed)
         clock[a.H_NEXT] = max(clock[a.H_NEXT], run.crossed)
-    if code == a.PAUSED and accepted == 0:
+    if code == a.PAUSED and n_accepted == 0:
         if clock[a.FAILURE_CODE] not in (indices.SINGULAR, indices.OUTER_DIVERGED):
             run.longer = []
         if run.longer or run.lengths:
@@ -278,7 +278,7 @@ def after_crossing(run: Run, plan: Plan, control: Array, code: int, accepted: in
         if run.origins:
             _next_origin(run, plan, control)
             return plan, control, code
-    if code == a.PAUSED and accepted > 0 and (run.work.notes[indices.PIVOT] < CLEAR * clock[a.LARGEST_PIVOT]):
+    if code == a.PAUSED and n_accepted > 0 and (run.work.notes[indices.PIVOT] < CLEAR * clock[a.LARGEST_PIVOT]):
         proposal = clock[a.H_NEXT]
         run.origins = [(float(clock[a.T]), None, False), (float(clock[a.T]), None, True)]
         _next_origin(run, plan, control)
@@ -286,7 +286,7 @@ def after_crossing(run: Run, plan: Plan, control: Array, code: int, accepted: in
         return plan, control, code
     if code not in (a.PAUSED, a.STEP_TOO_SMALL, a.FIXED_STEP_FAILED, a.RANK_LOST):
         return plan, control, code
-    if accepted == 0:  # all attempts failed: the run's own steps continue as far as they can
+    if n_accepted == 0:  # all attempts failed: the run's own steps continue as far as they can
         run.control[a.BRIDGE] = a.SUSPENDED
     run.crossings[-1].append((float(run.clock[a.T]), run.state.copy()))
     run.work.notes[indices.NEAR_NOW] = 0.0

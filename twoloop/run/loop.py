@@ -215,7 +215,7 @@ class IntegrationLoop:
         self.plan, self.control, self.kit = run.plan, run.control, run.kit  # replaced in steps across a singularity
         self.counts = INITIAL_COUNTS.copy()
         self.latest: list[tuple[Array, Array]] = []  # times and rows of the last two chunks
-        self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # steps that were not stored yet, after an empty array
+        self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # an empty array, then the steps not stored yet
         if self.request.store.finished:
             self._store_step_fields()
         self.filled = np.zeros(2, dtype=np.int64)
@@ -290,10 +290,9 @@ class IntegrationLoop:
                 self.code = run.advance(self.outputs, buffers, self.filled, (self.plan, self.control, self.kit))
         except KeyboardInterrupt:
             self.code = INTERRUPTED
-        except (
-            Exception
-        ) as error:  # raised by a callback; `to_end` raises it again unless an event ended the run before
-            # a sample of forces ahead may be at a state that the motion never reaches: continue without samples
+        except Exception as error:
+            # raised by a callback; `to_end` raises it again unless an event ended the run before. But a sample of
+            # forces ahead may be at a state that the motion never reaches: in this case continue without samples
             if run.clock[a.SAMPLES_MOTION] == 1.0 and not self.interrupts.n_signals:
                 run.clock[a.SAMPLES_MOTION] = self.control[a.SAMPLE_MOTION] = 0.0
             else:
@@ -384,7 +383,7 @@ class IntegrationLoop:
             had_pieces = bool(run.pieces)
             self.plan, self.control, self.code = after_crossing(run, self.plan, self.control, self.code, n_steps)
             if run.pieces and not had_pieces:
-                self._correct_last()
+                self._correct_last_state()
             if self.plan is run.plan:
                 self.kit = run.kit
 
@@ -397,7 +396,7 @@ class IntegrationLoop:
             places += zip(t[-MOST_PAST:].tolist(), rows[-MOST_PAST:], strict=True)
         return places[-MOST_PAST:]
 
-    def _correct_last(self) -> None:
+    def _correct_last_state(self) -> None:
         """Replace the last stored state by that of the polynomial across a singular position: it is more accurate."""
         run = self.run
         t, row = float(run.clock[run.a.T]), run.state[: 3 * run.system.n_q]

@@ -450,7 +450,7 @@ def _measured(run: "Run", t: float, q: Array) -> str:
 
 
 def _describe_near_end(run: "Run", t1: float) -> str:
-    """Return a sentence if the run stopped so near its end that steps across would need nodes beyond it; else ""."""
+    """Return a sentence if the run stopped so near its end that a step across needs nodes beyond it; else ""."""
     time_left = t1 - float(run.clock[run.a.T])
     if time_left > max(NEXT_TO_END * (t1 - run.t0), float(run.clock[run.a.H_LONG])):
         return ""

@@ -51,7 +51,7 @@ class Options:
 
     @cached_property
     def metadata(self) -> dict[str, Any]:
-        """Fields of a result that follow from the options. `untested` is one (None) if all steps have an error test."""
+        """Fields of a result that follow from the options, with untested=None if all steps have an error test."""
         tested = getattr(self.method, "tested", "all")
         return {"method": self.method.name, "rtol": self.rtol} | ({} if tested == "positions" else {"untested": None})
 

@@ -361,7 +361,7 @@ class Recorder:
 
 
 AnyRecord = TypeVar("AnyRecord", bound="Record")
-Later = Callable[[str], dict[str, Any]]  # computes a deferred field by its name; returns it, and others, by name
+Later = Callable[[str], dict[str, Any]]  # returns a deferred field, given its name, and related fields, by name
 
 
 class Status(IntEnum):

@@ -39,8 +39,8 @@ FIRST_CHUNK = 1024
 FIRST_CHUNK_IN_PYTHON = 64  # the same for callbacks that are plain Python functions, which may be slow
 SMALL = 32  # number of coordinates of a small system; the chunks of larger ones are shorter in proportion
 TRIAL_STEPS = 10  # number of first steps after which a method that needs long steps is replaced if its steps are short
-NO_PATTERN = np.zeros((0, 0))
-CONTRADICTS = 1e-6  # largest relative disagreement of redundant rows with the accelerations
+NO_PATTERN = np.zeros((0, 0))  # pattern of the constraint rows for workspaces of the static form
+CONTRADICTS = 1e-6  # relative residual of a redundant row above which it contradicts the accelerations
 
 
 class Run:

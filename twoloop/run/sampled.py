@@ -114,7 +114,8 @@ class SampledRun:
         self._outputs, self._filled = np.zeros(1), np.zeros(2, dtype=np.int64)
         self._buffers = np.empty(1), np.empty((1, len(self.run.state))), np.empty((STEPS, self.run.a.N_STEP_COLUMNS))
         self.rows, self.times, self.steps = list[Array](), list[float](), list[Array]()
-        self.cpu, self._every = 0.0, np.inf  # time between evaluations, s; finite once a sample has met a short change
+        # CPU time, s; largest time between evaluations, s, which is finite once a sample has met a short change
+        self.cpu, self._every = 0.0, np.inf
         self._store_sample(t0)
 
     def _run_from(self, t: float, q: Array, v: Array) -> Run:

@@ -125,7 +125,7 @@ class StaticForm(NamedTuple):
     mass: Entries
     pattern: Array  # (n_c, n_q), 1 at the entries of a Jacobian that is computed as a dense array; else empty
     mass_pattern: Array  # (n_q, n_q), 1 at the entries of a variable M that is computed as a dense array; else empty
-    newton_arguments: tuple[Any, ...]  # last arguments of `newton_form`
+    newton_arguments: tuple[Any, ...]  # arguments of `newton_form` after t0 and q0
     newton: NDArray[np.int32] | None = None  # program of Newton's matrix, once it is needed
     n_groups: int = 0  # number of groups of columns of Newton's matrix, which is the number of displaced forces
 
