@@ -147,7 +147,7 @@ def is_series_costly(system: ConstrainedSystem) -> bool:
     Return False if a force may be steep: DOP853 would then need short steps, while series only check the defect more
     often.
     """
-    if may_be_steep(system, ran_on_symbols=True):
+    if may_be_steep(system, force_was_traced=True):
         return False
     try:
         return series_for(system).n_operations > COSTLY_SERIES * system.n_q
@@ -268,8 +268,8 @@ class LaneRuns:
         self.system, self.starts, self.method, self.kit = system, starts, method, kit_to_write(system)
         generic, varying = generic_parameters(starts.parameters)
         with_all_terms = generic_system(system, starts)
-        short_forces = may_be_short(with_all_terms, ran_on_symbols=True)
-        unseen = 1.0 if may_be_steep(with_all_terms, ran_on_symbols=True) else method.unseen
+        short_forces = may_be_short(with_all_terms, force_was_traced=True)
+        unseen = 1.0 if may_be_steep(with_all_terms, force_was_traced=True) else method.unseen
         self.n_gaps = N_SHORT if any(short_forces) else N_SAMPLES * unseen  # smallest number of steps in a run
         self.sampling = ForceSampling(system, generic, varying) if short_forces.by_time else None
         choice = PivotChoice.at(system_of(system, starts, 0), starts.t0, starts.q[0])

@@ -177,7 +177,7 @@ class Auto:
             series = self.series.for_system(system, code, check)
         except ValueError:
             return chosen
-        return replace(chosen, series=series, narrow=may_be_steep(system, ran_on_symbols=True))
+        return replace(chosen, series=series, narrow=may_be_steep(system, force_was_traced=True))
 
     def _series_pays(self, n_q: int, tolerance: float) -> bool:
         """Return whether a step of the series costs less than the steps that it replaces."""

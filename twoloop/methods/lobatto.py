@@ -72,7 +72,7 @@ class Lobatto16:
                 f"method='Lobatto16' needs code made for {system.name!r}, whose equations are too long. "
                 "Take method='auto'"
             )
-        return replace(self, code=code, narrow=may_be_steep(system, ran_on_symbols=True))
+        return replace(self, code=code, narrow=may_be_steep(system, force_was_traced=True))
 
     def takes_code(self, fixed: bool) -> bool:
         """Return whether its steps may call generated code."""
