@@ -246,7 +246,7 @@ def solve_dae(
             end_folder(kept, result)
         return result
     except (KeyboardInterrupt, SystemError) as error:
-        if not (interrupted(error) and interrupts.gives_result()):
+        if not (interrupted(error) and interrupts.returns_result()):
             raise
     finally:
         interrupts.leave()

@@ -252,7 +252,7 @@ class CollocationCode:
             with self._returning_if(emit, builder.compare("fcmp ogt", left, llvm_code.ZERO)):
                 one.store(one.subtract(left, llvm_code.ONE), work, at.CAREFUL)
                 builder.ret(iterate_mass_first())
-        self._call(emit, "begin_nodes", self._begin, [work, state, tolerances])
+        self._call(emit, "begin_nodes", self._begin_nodes, [work, state, tolerances])
         return self._iterate(emit, work, state, tolerances, evaluate, otherwise)
 
     def _mass_first_function(self, emit: LaneEmitter, kinds: list[str]) -> str:
@@ -262,7 +262,7 @@ class CollocationCode:
             builder = module.function(name, DOUBLE, kinds, internal=True)
             inner, (work, state, tolerances, numbers) = emit.like(builder), builder.arguments
             inner.numbers = inner.constants = numbers
-            self._call(inner, "begin_nodes", self._begin, [work, state, tolerances])
+            self._call(inner, "begin_nodes", self._begin_nodes, [work, state, tolerances])
             mass_first, not_computed = self._caller(inner, work, -1), constant(DOUBLE, float(at.NOT_COMPUTED))
             builder.ret(self._iterate(inner, work, state, tolerances, mass_first, lambda: not_computed))
         return name
@@ -300,7 +300,7 @@ class CollocationCode:
             builder.ret(None)
         emit.builder.run(name, arguments)
 
-    def _begin(self, emit: LaneEmitter, work: Value, state: Value, tolerances: Value) -> None:
+    def _begin_nodes(self, emit: LaneEmitter, work: Value, state: Value, tolerances: Value) -> None:
         """Store the error weights, and predict positions and velocities at the nodes.
 
         Errors are relative to the position (or velocity) at the beginning, or to its change in half a step if that is
@@ -348,7 +348,7 @@ class CollocationCode:
             store_lanes(emit, scaled, work, at.SCALED)
             terms = [one.load(one.pointer(state, i), 2 * n), *(one.load(work, at.SCALED + j) for j in range(LANES))]
             self._store_stages(
-                emit, work, state, k, i, [self._sums(emit, each, terms) for each in (velocities, positions)]
+                emit, work, state, k, i, [self._weighted_sum(emit, each, terms) for each in (velocities, positions)]
             )
 
     def _powers(self, emit: LaneEmitter, x: Value) -> Value:
@@ -454,10 +454,10 @@ class CollocationCode:
         code = builder.select(converged, number(at.CONVERGED), number(at.REFUSED))
         code = builder.select(guessed, number(at.GUESSED), code)
         with builder.if_then(builder.both(builder.compare("fcmp oeq", code, number(at.CONVERGED)), estimated)):
-            self._call(emit, "judge_nodes", self._judge, [work, state])
+            self._call(emit, "judge_nodes", self._estimate_error, [work, state])
         return code
 
-    def _judge(self, emit: LaneEmitter, work: Value, state: Value) -> None:
+    def _estimate_error(self, emit: LaneEmitter, work: Value, state: Value) -> None:
         """Store ERROR and CURVED, and the factors of the next step size by convergence and by the error.
 
         The error estimate extrapolates the decay of the Legendre coefficients of the accelerations. Let t be the larger
@@ -658,8 +658,8 @@ class CollocationCode:
         one = Emitter(emit.builder)
         with loop_over(emit, self.iterated, [emit.constant(0.0)]) as (k, i, (largest,), new):
             before = load_lanes(emit, one.pointer(work, vector_index(emit, k)), self.v)
-            terms = self._values(emit, one.load(one.pointer(state, i), 2 * self.n), work, i)
-            sums = [self._sums(emit, table, terms) for table in (tables().velocities, tables().positions)]
+            terms = self._at_nodes(emit, one.load(one.pointer(state, i), 2 * self.n), work, i)
+            sums = [self._weighted_sum(emit, table, terms) for table in (tables().velocities, tables().positions)]
             v = self._store_stages(emit, work, state, k, i, sums)
             weight = emit.splat(one.load(one.pointer(work, i), at.WEIGHTS))
             change = emit.function("fabs", emit.subtract(v, before))
@@ -680,17 +680,17 @@ class CollocationCode:
         store_lanes(emit, emit.fused(h, inner, q0), place, self.q)
         return v
 
-    def _values(self, emit: LaneEmitter, first: Value, work: Value, i: Value) -> list[Value]:
+    def _at_nodes(self, emit: LaneEmitter, first: Value, work: Value, i: Value) -> list[Value]:
         """Return the accelerations of coordinate i at all nodes: `first` at the beginning, the others loaded."""
         one = Emitter(emit.builder)
         place = one.pointer(work, vector_index(emit, i))
         return [first, *(one.load(place, self.a + node) for node in range(LANES))]
 
     def _weighted_rows(self, emit: LaneEmitter, table: Array, first: Value, work: Value, i: Value) -> Value:
-        """Return the sum of the rows of a table, weighted by the accelerations of coordinate i (see `_values`)."""
-        return self._sums(emit, table, self._values(emit, first, work, i))
+        """Return the sum of the rows of a table, weighted by the accelerations of coordinate i (see `_at_nodes`)."""
+        return self._weighted_sum(emit, table, self._at_nodes(emit, first, work, i))
 
-    def _sums(self, emit: LaneEmitter, table: Array, terms: Sequence[Value]) -> Value:
+    def _weighted_sum(self, emit: LaneEmitter, table: Array, terms: Sequence[Value]) -> Value:
         """Return the sum of the rows of a table, weighted by `terms`; in two accumulators, which is faster."""
         sums = [emit.multiply(emit.splat(term), constants(row)) for term, row in zip(terms[:2], table[:2], strict=True)]
         for k, (term, row) in enumerate(zip(terms[2:], table[2:], strict=True)):

@@ -276,7 +276,7 @@ class CachedIntegrator:
             fields["sol"] = DenseSolution(interpolator_of(run, table.states[0]), table, t1)
         if output.times is not None:
             ends = [0 if time == run.t0 else -1 for time in output.times.tolist()]
-            states = rows[ends] if output.at_ends else self.between.completed(output.times)
+            states = rows[ends] if output.at_ends else self.between.complete_rows(output.times)
             if states is None:
                 return None
             timed_states = output.times.copy(), states

@@ -174,11 +174,11 @@ class Interpolator:
         undivided = []
         for block in _blocks(groups):
             self._divide_where_needed(table, block)
-            divided, own, rest = self._divided(table, block)
+            divided, own, rest = self._split_divided(table, block)
             failures += self._interpolate(divided, own, times, out)
             undivided.append(rest)
         failures += self._interpolate(table, np.concatenate(undivided), times, out)
-        self._warn_of_failures(failures, len(times))
+        self._record_failures(failures, len(times))
         return out
 
     def within(self, table: Table, t: float) -> Callable[[float], Array]:
@@ -186,18 +186,18 @@ class Interpolator:
         groups = _groups(table, np.searchsorted(table.t[1:-1], [t], side="right"))
         groups[:, indices.END_TIME] = 1
         self._divide_where_needed(table, groups)
-        divided, own, rest = self._divided(table, groups)
+        divided, own, rest = self._split_divided(table, groups)
         source, group = (divided, own) if len(own) else (table, rest)
         time, out = np.empty(1), np.empty((1, 2 * self.system.n_q))
 
         def row(t: float) -> Array:
             time[0] = t
-            self._warn_of_failures(self._interpolate(source, group, time, out), 1)
+            self._record_failures(self._interpolate(source, group, time, out), 1)
             return out[0].copy()
 
         return row
 
-    def _warn_of_failures(self, failures: int, n_times: int) -> None:
+    def _record_failures(self, failures: int, n_times: int) -> None:
         self.failures = failures
         if failures > 0 and self.warns:
             _warn(f"at {failures} of {n_times} times the state is interpolated and off the constraints", 5)
@@ -226,12 +226,12 @@ class Interpolator:
         groups = groups[is_new & (groups[:, indices.KIND] != indices.JUMP)]
         for kind, plan in self.plans.items():
             of_kind = groups[:, indices.KIND] == kind
-            self.filled.update(self._fill(table, plan, self.kits[kind], groups[of_kind, indices.FIRST_OWN]))
+            self.filled.update(self._divide(table, plan, self.kits[kind], groups[of_kind, indices.FIRST_OWN]))
         for i in groups[:, indices.FIRST_OWN].tolist():
             if (memory := self.across.get(float(table.t[i]))) is not None:
-                self.filled[float(table.t[i])] = self._of_crossing(table, i, memory)
+                self.filled[float(table.t[i])] = self._states_of_crossing(table, i, memory)
         is_divided = np.array([t in self.filled for t in table.t[groups[:, indices.FIRST_OWN]].tolist()], dtype=bool)
-        divided, own, rest = self._divided(table, groups)
+        divided, own, rest = self._split_divided(table, groups)
         errors = np.zeros(len(groups))
         errors[is_divided], errors[~is_divided] = self._errors(divided, own), self._errors(table, rest)
         # where a plan was to divide the interval, and failed, the step is too long for a polynomial through its ends
@@ -256,8 +256,8 @@ class Interpolator:
         i, kind = int(group[indices.FIRST_OWN]), int(group[indices.KIND])
         begin = float(table.t[i])
         candidates = (
-            lambda: self._crossing(table, i),
-            lambda: self._fill(table, *self._repair_plan(kind), np.array([i])).get(begin),
+            lambda: self._cross_interval(table, i),
+            lambda: self._divide(table, *self._repair_plan(kind), np.array([i])).get(begin),
             lambda: (table.t[i : i + 2], table.states[i : i + 2]),
         )
         for candidate in candidates:
@@ -273,7 +273,7 @@ class Interpolator:
         if begin not in self.filled:
             self.accurate.add(begin)
 
-    def _crossing(self, table: Table, i: int) -> tuple[Array, Array] | None:
+    def _cross_interval(self, table: Table, i: int) -> tuple[Array, Array] | None:
         """Compute interior states by a step across a singular position, as long as the interval; None if it fails."""
         from twoloop.kernels.steps import crossing_step as kernels
 
@@ -288,9 +288,9 @@ class Interpolator:
         attempt = entry_point(kernels.crossing_step)
         attempt(self.kit, self.work, plan.options, plan.memory, begin, end - begin, tolerances, state, state.copy())
         succeeded = plan.memory[-kernels.N_STORED :][kernels.END] > begin
-        return self._of_crossing(table, i, plan.memory) if succeeded else None
+        return self._states_of_crossing(table, i, plan.memory) if succeeded else None
 
-    def _of_crossing(self, table: Table, i: int, memory: Array) -> tuple[Array, Array]:
+    def _states_of_crossing(self, table: Table, i: int, memory: Array) -> tuple[Array, Array]:
         """Return times and states in interval i, by the polynomial of a step across a singular position in `memory`."""
         from twoloop.kernels.steps.crossing_step import state_at
 
@@ -320,7 +320,7 @@ class Interpolator:
             self.repairs[stiff] = plan, kit_of(self.system, self.arguments[1], q0, plan, self.static)
         return self.repairs[stiff]
 
-    def _divided(self, table: Table, groups: Groups) -> tuple[Table, Groups, Groups]:
+    def _split_divided(self, table: Table, groups: Groups) -> tuple[Table, Groups, Groups]:
         """Return a table of cached interior states, the groups of intervals with such states, and the other groups."""
         begins = table.t[groups[:, indices.FIRST_OWN]].tolist()
         filled = np.array([t in self.filled for t in begins], dtype=bool)
@@ -334,7 +334,7 @@ class Interpolator:
         own[:, indices.FIRST_OWN] = own[:, indices.LOW] = own[:, indices.LAST_OWN] - sizes + 1
         return Table(np.concatenate(t), np.concatenate(states), table.kinds), own, groups[~filled]
 
-    def _fill(self, table: Table, plan: Plan, kit: Any, intervals: Groups) -> dict[float, tuple[Array, Array]]:
+    def _divide(self, table: Table, plan: Plan, kit: Any, intervals: Groups) -> dict[float, tuple[Array, Array]]:
         """Divide intervals by fixed steps, fewer if steps fail; return (times, states) by their first time."""
         n = self.system.n_q
         tolerances = np.zeros(ATOL + n)  # zeros: no error estimate
@@ -451,7 +451,7 @@ class OutputInterpolation:
             interpolator.begin(run.system, run.t0, table.states[0], pattern)
         self._interpolator, self._rows = interpolator, interpolator.states(table, times)
 
-    def completed(self, times: Array) -> Array | None:
+    def complete_rows(self, times: Array) -> Array | None:
         """Return rows [q, v, a, lam] at the times of `interpolate`; None if one of them fails."""
         interpolator, rows = self._interpolator, self._rows
         if interpolator is None or interpolator.failures > 0:

@@ -60,7 +60,7 @@ NEGLIGIBLE = 1e-12  # singular values below this share of the largest count as z
 MAX_RESIDUAL = 1e-8  # relative residual of the equations below which they count as solved
 
 
-def state_behind_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Array | None:
+def state_after_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Array | None:
     """Return the state [q, v] right after a jump of C_t or b at t; None if no velocities satisfy the constraints.
 
     Solve M (v+ - v) + G^T p = 0 and G v+ + (C_t, b) = 0. Of all velocities that the constraints allow, v+ is nearest to
@@ -159,7 +159,7 @@ def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
     earliest, fixed = max(clock[a.T_START], clock[a.LAST_CHANGE], *run.jumps), run.control[a.FIXED_STEP] > 0.0
     base, run.mirrored = None, 0.0
     if not fixed:
-        base, run.mirrored = _state_farther_away(run, [place for place in past if place[0] >= earliest])
+        base, run.mirrored = _find_base(run, [place for place in past if place[0] >= earliest])
     # nodes at earlier times are wrong if a force jumped since, and too few near the start of the run: try other origins
     run.origins = [(earliest, base, False), (np.inf, None, False)]
     if float(clock[a.T] - clock[a.T_START]) < clock[a.H_LONG] and not run.system.called_in_python:
@@ -174,11 +174,11 @@ def cross_singularity(run: Run, past: list[Place]) -> tuple[Plan, Array]:
     if control[a.FIXED_STEP] == 0.0:
         control[a.MAX_EVALUATION_GAP] = 1.0 if run.may_be_steep else UNSEEN / (1.0 - BACK)
     clock[a.LIMIT_AGE] = 0.0
-    _next_origin(run, plan, control)
+    _prepare_next_origin(run, plan, control)
     return plan, control
 
 
-def _next_origin(run: Run, plan: Plan, control: Array) -> None:
+def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
     """Prepare the first attempt with the next origin of the polynomial."""
     from twoloop.kernels.steps.crossing_step import begin
 
@@ -201,7 +201,7 @@ def _next_origin(run: Run, plan: Plan, control: Array) -> None:
     run.crossed = float(clock[a.H_NEXT])
 
 
-def _state_farther_away(run: Run, past: list[Place]) -> tuple[Place | None, float]:
+def _find_base(run: Run, past: list[Place]) -> tuple[Place | None, float]:
     """Return the base of the polynomial: the latest state in `past` that is far from the singular position.
 
     If none is far, the base is the farthest one, or None if the present state is farther. (At a distance s, measured by
@@ -276,12 +276,12 @@ def after_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted: 
             run.crossed = float(clock[a.H_NEXT])
             return plan, control, code
         if run.origins:
-            _next_origin(run, plan, control)
+            _prepare_next_origin(run, plan, control)
             return plan, control, code
     if code == a.PAUSED and n_accepted > 0 and (run.work.notes[indices.PIVOT] < CLEAR * clock[a.LARGEST_PIVOT]):
         proposal = clock[a.H_NEXT]
         run.origins = [(float(clock[a.T]), None, False), (float(clock[a.T]), None, True)]
-        _next_origin(run, plan, control)
+        _prepare_next_origin(run, plan, control)
         clock[a.H_NEXT] = run.crossed = proposal
         return plan, control, code
     if code not in (a.PAUSED, a.STEP_TOO_SMALL, a.FIXED_STEP_FAILED, a.RANK_LOST):
@@ -299,7 +299,7 @@ def apply_jump(run: Run, t1: float) -> bool:
     """Apply a jump of C_t or b to the velocities, and restart the method; return whether that is possible."""
     a, clock, n = run.a, run.clock, run.system.n_q
     end = float(clock[a.JUMP_TO])
-    state = state_behind_jump(run.system, end, run.state[:n], run.state[n : 2 * n])
+    state = state_after_jump(run.system, end, run.state[:n], run.state[n : 2 * n])
     if state is None:
         return False
     run.new_state[: 2 * n] = state

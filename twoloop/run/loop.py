@@ -101,7 +101,7 @@ class Interrupts:
                 self._installed = True
         return self
 
-    def gives_result(self) -> bool:
+    def returns_result(self) -> bool:
         """Return whether a run that Ctrl-C ended returns its result; else a handler raised KeyboardInterrupt."""
         self.listen()  # a handler of the user stays, and raises; so does `_on_signal` after PATIENCE signals
         return self._installed and self.n_signals <= PATIENCE
@@ -230,8 +230,8 @@ class IntegrationLoop:
     def resume(self, code: int, t: Array, rows: Array, steps: Array, cpu_time: float) -> None:
         """Record a copy of the first chunk (times, rows and steps of `advance`), and handle the code of `advance`."""
         self.code, self.cpu = code, cpu_time
-        self._store_chunk(t.copy(), rows.copy(), steps.copy(), self._kinds(steps, False, False))
-        self._handle(steps, False, cpu_time)
+        self._store_chunk(t.copy(), rows.copy(), steps.copy(), self._interval_kinds(steps, False, False))
+        self._handle_code(steps, False, cpu_time)
 
     def to_end(self, check_derivatives: bool) -> Record:
         """Integrate to the end, check callbacks at states of the run, and return its record."""
@@ -248,13 +248,13 @@ class IntegrationLoop:
             if copied:
                 t, rows, steps = t.copy(), rows.copy(), steps.copy()
             if across and n_steps and self.request.between_steps:
-                self.recorder.keep_crossing(self.plan.memory)
-            self._store_chunk(t, rows, steps, self._kinds(steps, across, over_jump))
+                self.recorder.store_crossing(self.plan.memory)
+            self._store_chunk(t, rows, steps, self._interval_kinds(steps, across, over_jump))
             spent = time.process_time() - began
             self.cpu += spent
             if recorder.ended is not None:
                 break
-            self._handle(steps, across, spent)
+            self._handle_code(steps, across, spent)
             if not copied or len(buffers[0]) < min(run.chunk, BUFFER_ROWS):
                 buffers = self._buffers()
         if copied and buffers[1].size <= LARGEST_SPARE:
@@ -269,7 +269,7 @@ class IntegrationLoop:
             raise self.raised
         return self._record(check_derivatives)
 
-    def _handle(self, steps: Array, across: bool, spent: float) -> None:
+    def _handle_code(self, steps: Array, across: bool, spent: float) -> None:
         """Handle the code that `advance` returned, and set it to PAUSED if the loop is to continue."""
         if self.code == self.run.a.ALL_OUTPUT_DONE:
             if self.stiffness.samples:
@@ -364,7 +364,7 @@ class IntegrationLoop:
             run.change_form()
             self.plan, self.kit, self.code = run.plan, run.kit, a.PAUSED
         elif may_cross(run, self.code):
-            self.plan, self.control = cross_singularity(run, self._past())
+            self.plan, self.control = cross_singularity(run, self._last_states())
             self.kit = crossing_kit(run.kit)
             self.code = a.PAUSED
         elif self.code == a.SWITCH_METHOD or self._is_stalled(across):
@@ -387,7 +387,7 @@ class IntegrationLoop:
             if self.plan is run.plan:
                 self.kit = run.kit
 
-    def _past(self) -> list[Place]:
+    def _last_states(self) -> list[Place]:
         """Return the states of the last accepted steps, oldest first; an empty list if not all are stored."""
         if not self.request.every_step:
             return []
@@ -400,7 +400,7 @@ class IntegrationLoop:
         """Replace the last stored state by that of the polynomial across a singular position: it is more accurate."""
         run = self.run
         t, row = float(run.clock[run.a.T]), run.state[: 3 * run.system.n_q]
-        self.recorder.correct_last(t, row)
+        self.recorder.correct_last_state(t, row)
         if self.latest and len(self.latest[-1][0]) and self.latest[-1][0][-1] == t:
             self.latest[-1][1][-1, : len(row)] = row
 
@@ -492,7 +492,7 @@ class IntegrationLoop:
         every = float(run.tolerances[indices.LOOK]) if run.short_forces.by_state else spacing
         return Recorder(self.request, interpolator, n, run.t0, self.start, every)
 
-    def _kinds(self, steps: Array, across: bool, over_jump: bool) -> NDArray[np.int64]:
+    def _interval_kinds(self, steps: Array, across: bool, over_jump: bool) -> NDArray[np.int64]:
         """Return the kind of interval of each accepted step, for the dense solution."""
         run = self.run
         if not self.request.between_steps:

@@ -141,7 +141,7 @@ def describe_stiffness(monitor: StiffnessMonitor, kit: Any, work: Any) -> str:
         for direction in directions:  # of the previous sample; INITIAL_SHARE restores coordinates that became zero
             direction += INITIAL_SHARE * start
         try:
-            vibration, decay = _rates(kit, work, sample, directions)
+            vibration, decay = _fastest_rates(kit, work, sample, directions)
         except Exception:  # raised by a callback at a displaced state, which the run did not visit
             return ""
         h = sample.h
@@ -156,7 +156,7 @@ def describe_stiffness(monitor: StiffnessMonitor, kit: Any, work: Any) -> str:
     )
 
 
-def _rates(kit: Any, work: Any, sample: StiffnessSample, directions: list[Array]) -> tuple[float, float]:
+def _fastest_rates(kit: Any, work: Any, sample: StiffnessSample, directions: list[Array]) -> tuple[float, float]:
     """Return the angular frequency of the fastest vibration and the rate of the fastest decay, 1/s; 0 if unknown."""
     from twoloop.kernels.evaluation import tasks
 
@@ -273,7 +273,7 @@ def describe_rounding(run: "Run", places: list[Place], end: float) -> str:
         if excess > MAX_LASTING_ERROR:
             return (
                 f"Not to be trusted beyond t = {t:.10g}: steps went on from there, where the constraints nearly lose "
-                f"rank ({_measured(run, t, q)}), and rounding of positions had changed velocities by about "
+                f"rank ({_ratio_text(run, t, q)}), and rounding of positions had changed velocities by about "
                 f"{excess:.1g} times what rtol and atol allow. Take another method, or end t_span before."
             )
     return ""
@@ -391,16 +391,16 @@ def warn_of_singular_end(run: "Run") -> str:
     ratios = [ratio(system, t, q, run.rank) for ratio in (singular_ratio, ratio_in_any_units)]
     if max(ratios) <= LOST_AT_END:
         text = (
-            f"the run ends where the constraints lose rank ({_measured(run, t, q)}): they do not determine velocities "
-            "and accelerations there. End t_span a little before, or beyond"
+            f"the run ends where the constraints lose rank ({_ratio_text(run, t, q)}): they do not determine "
+            "velocities and accelerations there. End t_span a little before, or beyond"
         )
     else:
         excess = _velocity_error_ratio(run, t, q, v)
         if excess <= indices.UNTRUE:
             return ""
         text = (
-            f"the run ends where the constraints nearly lose rank ({_measured(run, t, q)}): rounding of positions "
-            f"changes velocities there {_times_allowed(excess)}, and accelerations by more. "
+            f"the run ends where the constraints nearly lose rank ({_ratio_text(run, t, q)}): rounding of positions "
+            f"changes velocities there {_format_excess(excess)}, and accelerations by more. "
             "End t_span a little before, or beyond, or loosen rtol and atol"
         )
     return warn_user(text)
@@ -440,11 +440,11 @@ def _velocity_error_ratio(run: "Run", t: float, q: Array, v: Array) -> float:
     return float((velocity_rounding_errors(run.system, t, q, v, run.rank) / allowed).max())
 
 
-def _times_allowed(ratio: float) -> str:
+def _format_excess(ratio: float) -> str:
     return f"by about {ratio:.1g} times what rtol and atol allow" if np.isfinite(ratio) else "by more than can be told"
 
 
-def _measured(run: "Run", t: float, q: Array) -> str:
+def _ratio_text(run: "Run", t: float, q: Array) -> str:
     ratio = singular_ratio(run.system, t, q, run.rank)
     return f"the smallest singular value of the constraint Jacobian is {ratio:.1g} of the largest"
 

@@ -106,7 +106,7 @@ class ParametricRun:
             ("kit", id(self._functions)): Kit(self._functions),
             "kits": {},
         }
-        self._fill(run.system)
+        self._fill_arrays(run.system)
         run.kit = kit_for_plan(self.system, run.kit.flags, run.plan)
         run.functions = run.kit.functions
 
@@ -114,10 +114,10 @@ class ParametricRun:
         """Fill the arrays with the parameters of a system; return whether the arrays held those of another system."""
         if system is self.given:
             return False
-        self._fill(system)
+        self._fill_arrays(system)
         return True
 
-    def _fill(self, system: ConstrainedSystem) -> None:
+    def _fill_arrays(self, system: ConstrainedSystem) -> None:
         self.given = system
         self._functions.p[:] = system.functions.p
         self._formulas.write(self.shared.family.products(self._functions.p))
@@ -145,7 +145,7 @@ class ParametricRun:
         return self._mass_agrees
 
     def _numbered(self, plan: Plan) -> Plan:
-        """Return a copy of the plan with arrays of numbers, which `_fill` fills, in place of arrays of expressions."""
+        """Return a copy of the plan in which arrays of numbers, see `_fill_arrays`, replace arrays of expressions."""
         array, plan_fields = self._formulas.array, vars(plan)
         changes: dict[str, Any] = {name: array(plan_fields[name]) for name in NUMBERS if plan_fields[name] is not None}
         changes |= {name: self._numbered(plan_fields[name]) for name in SUBPLANS if plan_fields[name] is not None}
@@ -155,13 +155,13 @@ class ParametricRun:
 def _plan_values(run: Run) -> list[Any]:
     """List all values of the plans of a run, with arrays as bytes, to compare plans exactly."""
     plans = [run.plan, *run.interiors.values()]
-    return [run.kit.flags.tobytes(), *(each for plan in plans for each in _of_plan(plan))]
+    return [run.kit.flags.tobytes(), *(each for plan in plans for each in _values_of_plan(plan))]
 
 
-def _of_plan(plan: Plan) -> Iterator[Any]:
+def _values_of_plan(plan: Plan) -> Iterator[Any]:
     for name, value in vars(plan).items():
         if isinstance(value, Plan):
-            yield from _of_plan(value)
+            yield from _values_of_plan(value)
         elif name == "traced":
             yield [part.tobytes() for each in value for part in each.program[:-1]]
         elif name != "stable_to":  # a lambda, which equals only itself

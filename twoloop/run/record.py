@@ -217,7 +217,7 @@ class Recorder:
         ends = request.events is not None and any(event.terminal < np.inf for event in request.events)
         self._max_pending = 0 if ends or request.store.finished else PENDING
         self.search = None if request.events is None else EventSearch(request.events, t0, state[: 2 * n_q], every)
-        self._add(self._t, self._rows, self._kinds)
+        self._store_output(self._t, self._rows, self._kinds)
         if request.times is not None and not request.lands:
             self._store(self._t[:0], self._rows[:0, : 2 * self._n_q])
 
@@ -226,7 +226,7 @@ class Recorder:
 
         There is one kind per step if states between steps are requested, else none.
         """
-        self._add(t, rows, kinds)
+        self._store_output(t, rows, kinds)
         if not self.request.between_steps:
             return
         self._t, self._rows = np.concatenate([self._t, t]), np.concatenate([self._rows, rows])
@@ -234,19 +234,19 @@ class Recorder:
         if len(self._t) > self._max_pending:
             self._search(len(self._t) - WINDOW)
 
-    def correct_last(self, t: float, row: Array) -> None:
+    def correct_last_state(self, t: float, row: Array) -> None:
         """Replace [q, v, a] of the last state, if its time is t, for the interpolation between steps."""
         if self.request.between_steps and len(self._t) and self._t[-1] == t:
             self._rows[-1, : len(row)] = row
 
-    def keep_crossing(self, memory: Array) -> None:
+    def store_crossing(self, memory: Array) -> None:
         """Store `memory` for the next interval if it contains a polynomial across a singular position."""
         from twoloop.kernels.steps.crossing_step import END, N_STORED
 
         if self.interpolator is not None and memory[-N_STORED:][END] > -np.inf:
             self.interpolator.across[float(self._t[-1])] = memory.copy()
 
-    def _add(self, t: Array, rows: Array, kinds: NDArray[np.int64]) -> None:
+    def _store_output(self, t: Array, rows: Array, kinds: NDArray[np.int64]) -> None:
         request, store = self.request, self.request.store
         if request.times is None:
             self._store(t, rows)

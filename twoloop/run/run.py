@@ -123,7 +123,7 @@ class Run:
         self.compared_until = [-np.inf]  # time up to which callbacks were compared; copies of the run share the list
         self.region: CheckedRegion | None = None  # where callbacks were compared; cached integrators share it
         self.varied_parameters: Array | None = None  # parameters, if the run is used for several systems
-        self._begin()
+        self._compute_start()
         self.rank = len(self.work.rows_v)
         self.descriptions: dict[tuple[int, ...], str] = {}  # warnings by redundant rows, written when first needed
         self.redundant, self.rows_warning = self.redundant_rows()
@@ -291,7 +291,7 @@ class Run:
             pivot = self.work.notes[indices.PIVOT]
             self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest / before.notes[indices.PIVOT])
 
-    def _begin(self) -> None:
+    def _compute_start(self) -> None:
         """Compute the accelerations at the start; change the workspace and the form if they fail."""
         start = entry_point(self.kernels.start)
         code = start(self.kit, self.work, self.t0, self.state)
@@ -343,7 +343,7 @@ class Run:
             return np.zeros(0, dtype=np.int64), ""
         independent = set(self.work.rows_v.tolist())
         redundant = [i for i in range(n_rows) if i not in independent]
-        rows = self._rows() if rows is None else rows
+        rows = self._rows_at_start() if rows is None else rows
         violated = self.violated_rows(rows).tolist()
         if violated:
             raise ValueError(
@@ -375,7 +375,7 @@ class Run:
             return np.zeros(0, dtype=np.int64)
         return np.flatnonzero(residual > CONTRADICTS * np.maximum(abs(rows) @ np.abs(a) + np.abs(gamma), 1.0))
 
-    def _rows(self) -> Rows:
+    def _rows_at_start(self) -> Rows:
         """Return C_q and A at the start."""
         system, q = self.system, self.state[: self.system.n_q]
         if system.called_in_python or system.entries:
