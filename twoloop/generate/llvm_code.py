@@ -142,7 +142,7 @@ class Emitter:
         return self.builder.call(f"{intrinsic}.{self.suffix}" if intrinsic else name, x.type, [x])
 
     def pointer(self, base: Value, *places: Value | int) -> Value:
-        """Return a pointer advanced by one or more numbers of doubles."""
+        """Return the pointer `base` advanced by the sum of `places`, counted in doubles."""
         for place in places:
             base = self.builder.gep(base, integer(place) if isinstance(place, int) else place)
         return base

@@ -398,7 +398,7 @@ def _blocks(groups: Groups) -> list[Groups]:
 
 
 def _groups(table: Table, intervals: Groups) -> Groups:
-    """Return a group (row of indices for kernels) for each of `intervals`; those of output times are not set."""
+    """Return a group (row of indices for kernels) for each of `intervals`, without indices of output times."""
     groups = np.zeros((len(intervals), indices.N_COLUMNS), dtype=np.int64)
     groups[:, indices.FIRST_OWN], groups[:, indices.LAST_OWN] = intervals, intervals + 1
     groups[:, indices.KIND] = table.kinds[intervals]

@@ -83,7 +83,7 @@ LAST_STEPS = 8  # the step at a state is the median of this number of steps befo
 ITERATIONS = 6  # number of power iterations at each state
 # a vector with all coordinates, times this share, is added to the directions before each estimate (see below)
 INITIAL_SHARE = 0.1
-ALIGNED = 0.9  # absolute cosine above which the image counts as parallel to the direction
+ALIGNED = 0.9  # an image counts as opposed to its direction if the cosine between them is below -ALIGNED
 MIN_STEPS = 200  # number of accepted steps below which stiffness is not mentioned
 # share of the stability limit that half of the sampled states must reach; smooth motion stays below 0.4
 STABILITY_SHARE = 0.45

@@ -140,7 +140,7 @@ def python_functions(system: ConstrainedSystem) -> PythonFunctions | None:
 
 
 def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> tuple[Any, Array] | None:
-    """Return arguments and value of a compiled force at the start. A force called in Python discards its samples."""
+    """Return arguments and value of a compiled force at the start; clear the samples of a force called in Python."""
     if functions := python_functions(system):
         functions.restart()
         return None

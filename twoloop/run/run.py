@@ -178,7 +178,7 @@ class Run:
         filled: NDArray[np.int64],
         active: tuple[Plan, Array, Kit] | None = None,
     ) -> int:
-        """Take steps in compiled code until the last output time, or until Python must act; return the reason's code.
+        """Take compiled steps until the last output time, or until Python must act; return the code of the reason.
 
         Parameters
         ----------
