@@ -1,1 +1,1 @@
-"""Runs of one mechanism, one in each SIMD lane: their memory, their loop, and a file for each method."""
+"""Runs of one mechanism, one in each SIMD lane: layout of memory, integration loop, and a module for each method."""

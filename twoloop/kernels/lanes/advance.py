@@ -1,7 +1,7 @@
-"""Integration loop of runs in lanes: each lane has its own steps, and takes the next run when its run has ended.
+"""Integration loop of runs in lanes: each lane has its own step size, and gets a new run when its run has ended.
 
-A run leaves its lane, and is repeated alone, if a condition of the generated code does not hold, or if many steps in a
-row are rejected. `CODE.step` takes the steps.
+A run is removed from its lane, to be repeated alone, if a condition of the generated code does not hold, or if many
+successive steps are rejected. The function `step` of `CODE` takes the steps.
 """
 
 import numpy as np
@@ -48,12 +48,12 @@ TABLE, STATES = types.float64[:, ::1], types.float64[:, :, ::1]
 
 @compiled
 def _refill(code, order, control, work, n, n_rows, numbers, q0, v0, next_run, status):
-    """Give new runs to idle lanes; return the index of the next run, and how many lanes are running."""
+    """Start new runs in idle lanes; return the index of the next new run, and the number of lanes with a run."""
     state, new, _, _, _, _, own, _ = places_of(n, n_rows, numbers.shape[1])
     n_fresh, n_running = 0, 0
     for k in range(LANES):
         last = int(work[RUN * LANES + k])
-        # generated code of a series stops a run without setting the reason
+        # the generated code of a series ends a run without a reason
         if work[RUNNING * LANES + k] == 0.0 and last >= 0 and status[last] == UNDECIDED:
             status[last] = OFTEN_REFUSED if work[REFUSED * LANES + k] < np.inf else NO_VALUES
         work[FINE * LANES + k] = work[FRESH * LANES + k] = 0.0
@@ -85,7 +85,7 @@ def _refill(code, order, control, work, n, n_rows, numbers, q0, v0, next_run, st
 
 @compiled
 def _write_within_steps(code, settings, control, options, work, n, new, times, out_q, out_v, status, n_steps):
-    """Write the states at output times within the accepted steps."""
+    """Compute the states at output times within the accepted steps, into out_q and out_v; NaN where this fails."""
     while True:
         n_wanted = 0
         for k in range(LANES):
@@ -114,7 +114,7 @@ def _write_within_steps(code, settings, control, options, work, n, new, times, o
 
 @compiled
 def _write_ends(work, control, n, n_rows, new, a, last, out_q, out_v, out_a, status):
-    """Write the final states of runs that have reached t1."""
+    """Copy the final states of runs that have reached t1 to out_q, out_v and out_a, and end these runs."""
     for k in range(LANES):
         if work[ACCEPTED * LANES + k] == 0.0 or work[H * LANES + k] != control[T1] - work[T * LANES + k]:
             continue
@@ -128,7 +128,7 @@ def _write_ends(work, control, n, n_rows, new, a, last, out_q, out_v, out_a, sta
 
 @compiled
 def _count(settings, work, n_evaluations):
-    """Count evaluations of steps, accepted or not, and one at their ends; not of runs that have left their lanes."""
+    """Count the evaluations of a step in lanes with a run: those within the step, and one at its end."""
     for k in range(LANES):
         if work[RUNNING * LANES + k] == 1.0:
             n_before = settings[N_EVALUATIONS] + int(work[EVALUATED * LANES + k])
@@ -137,7 +137,7 @@ def _count(settings, work, n_evaluations):
 
 @compiled
 def _advance_time(work, control, n_steps):
-    """Advance time in the lanes whose steps were accepted."""
+    """Advance the time in lanes whose step was accepted, and count this step."""
     for k in range(LANES):
         if work[ACCEPTED * LANES + k] == 1.0:
             h, t = work[H * LANES + k], work[T * LANES + k]
@@ -155,8 +155,10 @@ def advance_lanes(
 ):
     """Integrate runs, one for each row of `numbers`, from t0 to t1.
 
-    times : (n_t,) output times, the last of them t1; out_q, out_v : (n_runs, n, n_t); out_a : (n_runs, n + n_rows),
-    accelerations and multipliers at t1. n_evaluations : is increased by the counts. options : those of the method.
+    times : (n_t,) output times, the last of which is t1; numbers : data of the generated code; q0, v0 : (n_runs, n)
+    initial states; out_q, out_v : (n_runs, n, n_t) results; out_a : (n_runs, n + n_rows) accelerations and multipliers
+    at t1; status, n_steps : (n_runs,) results; n_evaluations : (n_runs,) increased by the number of evaluations;
+    options : those of the method.
     """
     n, n_rows, order = settings[N], settings[N_ROWS], settings[ORDER]
     _, new, _, _, a, _, _, _ = places_of(n, n_rows, numbers.shape[1])

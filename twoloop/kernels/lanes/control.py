@@ -1,7 +1,7 @@
-"""Steps of explicit methods in lanes, and step-size control of Runge-Kutta methods, separately for each lane.
+"""Steps of explicit methods in lanes, and step-size control of Runge-Kutta methods for each lane.
 
-Stages of DOP853 are not projected, as in `explicit_step`: only the end of a step is projected onto the constraints.
-Step-size control of a Taylor series is code generated for the mechanism, see generate/lane_code.py.
+As in `explicit_step`, the stages of DOP853 are not projected onto the constraints, only the end of the step is. The
+step-size control of Taylor series is part of the code generated for the mechanism, see generate/lane_code.py.
 """
 
 import numpy as np
@@ -57,27 +57,29 @@ from twoloop.kernels.lanes.layout import (
     project_lanes,
 )
 
-# `options` begin with the rule of step-size control, then ROUGH: factor by which errors may exceed their estimates
-# where a force jumps; FIRST: first step, relative to the shortest time scale of the start; LEAST: tolerance. The
-# options of the method's single step follow
+# indices in `options`, after the rule of step-size control. ROUGH: factor by which errors may exceed their estimates if
+# a force jumps; FIRST: first step, relative to the shortest time scale at the start; LEAST: the smallest tolerance.
+# Then follow the options of the method for runs outside the lanes
 ROUGH, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
 
-# as SUDDEN_ERROR, REFUSED and the rounding of the last step in kernels/advance.py and step_size.py
+# the values of SUDDEN_ERROR and REFUSED in kernels/advance.py, and of the relative rounding error of a time in
+# `off_grid`
 SUDDEN_ERROR, AFTER_REJECTION, ROUNDING_OF_END = 10.0, 0.95, 1e-10
-LIMIT_FACTOR, LIMIT_MEMORY = 0.7, 10.0  # as in methods/plan.py
-RESOLVED = 20.0 * SHORTEST  # relative to the time at the start: lower bound of the first step
-MOST_REFUSED = 30  # rejected steps in a row: estimates may not show how much shorter a stiff step has to be
+LIMIT_FACTOR, LIMIT_MEMORY = 0.7, 10.0  # the values in methods/plan.py
+RESOLVED = 20.0 * SHORTEST  # lower bound of the first step, relative to t0
+MOST_REFUSED = 30  # largest number of successive rejected steps: of stiff steps, estimates may be far too large
 MOST_STEPS = 100_000  # largest number of steps of a run in lanes, because the user cannot interrupt it
 
 
 @inlined
 def _history(work, k):
+    """Return a view (N_PAST) of the history of step-size control in lane k."""
     return work[PAST * LANES + N_PAST * k : PAST * LANES + N_PAST * (k + 1)]
 
 
 @compiled
 def _first_step(options, control, work, n, state, a, k):
-    """Return the first step: a share of the time in which the state moves by the size of its coordinates."""
+    """Return the first step, s: options[FIRST] times the shortest time scale of the motion of lane k at t0."""
     far, fast, sharp, least = 0.0, 0.0, 0.0, np.inf
     for j in range(n):
         far = max(far, abs(work[(state + j) * LANES + k]))
@@ -96,7 +98,7 @@ def _first_step(options, control, work, n, state, a, k):
 
 @compiled
 def begin_control(options, control, work, n, state, a, start):
-    """Choose first steps of new runs, and copy their accelerations A to `start`."""
+    """Choose the first steps of new runs, and copy their accelerations A to `start`."""
     for k in range(LANES):
         if work[FRESH * LANES + k] == 1.0:
             for j in range(n):
@@ -110,7 +112,7 @@ def begin_control(options, control, work, n, state, a, start):
 
 @compiled
 def choose_steps(work, control, status, n_steps):
-    """Choose H and X of each lane, at most GAP; 0 in lanes without a run. FINE marks lanes with a run."""
+    """Choose the step size H = X of each lane, at most GAP; 0 in lanes without a run. Set FINE to RUNNING."""
     t1 = control[T1]
     for k in range(LANES):
         work[H * LANES + k], t = 0.0, work[T * LANES + k]
@@ -142,10 +144,10 @@ def set_end(work, control):
 
 @compiled
 def end_steps(code, settings, control, work, predicted_v):
-    """Project NEW; raise ERROR to the distance from the prediction, in positions and velocities.
+    """Project NEW; set ERROR to the change by the projection over the tolerances, if this is larger.
 
-    If the projection changes velocities by more than the tolerances, a drive jumps or bends between the stages.
-    `predicted_v`: scratch for velocities.
+    If velocities change by more than the tolerances, a drive has a jump or kink between the stages. `predicted_v` (n)
+    is scratch.
     """
     n, order = settings[N], settings[ORDER]
     state, new, predicted, _, _, _, _, _ = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
@@ -167,13 +169,13 @@ def end_steps(code, settings, control, work, predicted_v):
 
 @merged
 def _accept_or_shorten(options, work, k):
-    """Return whether the step of a lane is accepted, and choose the size of the next one."""
+    """Return whether the step of lane k is accepted, and choose the size of the next step."""
     h, t, error = work[H * LANES + k], work[T * LANES + k], work[ERROR * LANES + k]
     if work[FINE * LANES + k] == 0.0 or not np.isfinite(error):
         work[H_NEXT * LANES + k], work[H_LIMIT * LANES + k] = 0.5 * h, LIMIT_FACTOR * h
         work[LIMIT_AGE * LANES + k] = 0.0
         return False
-    # at a jump of the force an estimate may be small by chance: until ROUGH_TO it has to be smaller by `strict`
+    # at a jump of the force, an estimate may be small by chance: up to ROUGH_TO, the estimate is multiplied by ROUGH
     strict = options[ROUGH] if t < work[ROUGH_TO * LANES + k] else 1.0
     accepted = error * strict <= 1.0
     if error > SUDDEN_ERROR and not accepted:
@@ -194,7 +196,7 @@ def _accept_or_shorten(options, work, k):
 
 @compiled
 def judge_steps(options, work, n, a, start, status):
-    """Set ACCEPTED from ERROR and FINE; copy the accelerations A at the ends of accepted steps to `start`."""
+    """Set ACCEPTED according to ERROR and FINE; copy the accelerations A at the end of accepted steps to `start`."""
     for k in range(LANES):
         work[ACCEPTED * LANES + k] = 0.0
         if work[RUNNING * LANES + k] == 0.0:
@@ -234,19 +236,22 @@ def step_by_dop853(code, settings, control, options, work, status, n_steps, with
 
 @kernel(STEP)
 def step_by_series(code, settings, control, options, work, status, n_steps, within):
-    """Take a step by the series about its beginning; or compute the states X seconds after it (`within`)."""
+    """Take a step by the series about its beginning in each lane.
+
+    With `within`, compute instead the states at the time X after the beginning of the last accepted step.
+    """
     order = settings[ORDER]
     if within:
         for k in range(LANES):
             work[X * LANES + k] = work[X * LANES + k] / work[UNIT * LANES + k]
         code.evaluate(order, control, work)
         return
-    for k in range(LANES):  # with stiff motion the number of steps is not bounded by the tolerance
+    for k in range(LANES):  # of stiff motion, the tolerance does not limit the number of steps
         if work[RUNNING * LANES + k] == 1.0 and n_steps[int(work[RUN * LANES + k])] >= MOST_STEPS:
             leave_run(work, status, k, MANY_STEPS)
     code.series(order, control, work)
     code.lengths(order, control, work)
-    for k in range(LANES):  # count the evaluations of the defect within the step
+    for k in range(LANES):  # number of evaluations of the defect within the step
         if work[FINE * LANES + k] == 1.0 and work[H * LANES + k] > control[GAP]:
             work[EVALUATED * LANES + k] = np.ceil(work[H * LANES + k] / control[GAP]) - 1.0
     code.check_within(order, control, work)

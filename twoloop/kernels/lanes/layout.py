@@ -1,8 +1,8 @@
-"""Layout of the memory of runs in lanes, operations on it, functions that kernels call, and codes for how a run ends.
+"""Layout of the memory `work` of runs in lanes, operations on it, generated functions, and codes for the end of a run.
 
-Kernels call functions generated for a mechanism, and the step of a method. Operations work on vectors with one number
-for each lane: LU factors of one matrix per lane, and projections. Their arguments are offsets counted in vectors. The
-imaginary part of a complex number is `imaginary` vectors after the real part; 0: the number is real.
+`work` consists of vectors with one number for each lane. Offsets of vectors, and distances between them, are counted in
+vectors. The operations treat all lanes at once, for example the LU factorization of one matrix in each lane. The
+imaginary part of a complex number is `imaginary` vectors after the real part; if `imaginary` is 0, the number is real.
 """
 
 from typing import Any
@@ -15,75 +15,75 @@ from twoloop.kernels.compile.generated_functions import GeneratedFunctions, has_
 from twoloop.kernels.compile.reference import Reference
 from twoloop.kernels.data.common import INTEGERS, compiled, inlined, merged
 
-# how a run ends: at the end of the span, or outside the lanes, where it is repeated alone for one of these reasons
+# status of a run: not ended, ended at t1, or (below 0) the reason why it has to be repeated alone, outside the lanes
 UNDECIDED, ENDED = 0, 1
 NO_START, NO_STATE, NO_VALUES, OFTEN_REFUSED, MANY_STEPS, UNLIKE = range(-6, 0)
 
 
-LANES = 8 if has_wide_vectors() else 4  # runs side by side; with two vectors, each number would take two registers
+LANES = 8 if has_wide_vectors() else 4  # number of runs at once: that of doubles in a SIMD register
 
 # offsets in `work` of vectors with one number for each lane; STATE, NEW, PREDICTED, ... follow, see `places`
 (
-    T,
-    AHEAD,
-    UNIT,
-    H,
-    X,
-    FINE,  # 1 in the lanes for which a task runs; it leaves 1 where it succeeded
+    T,  # time of STATE, s
+    AHEAD,  # time of NEW, s
+    UNIT,  # unit of time of a series, s
+    H,  # size of the step, s
+    X,  # time of a state to compute, after the beginning of the step, s
+    FINE,  # 1 in lanes for which a task is to run; it remains 1 if the task succeeds
     DEFECT,
-    OFF,
-    LENGTH,
+    OFF,  # departure of the step, see control/step_size.py
+    LENGTH,  # size of the step that a series allows, in units
     LONGEST,  # longest step allowed, s
     REQUESTED,  # 1 in lanes that begin a run, or for which a state within a step is requested
     WORST,  # largest defect within the step
-    REFUSED,  # number of rejected steps in a row
-    RUNNING,
+    REFUSED,  # number of successive rejected steps
+    RUNNING,  # 1 in lanes with a run
     RUN,  # index of the run in this lane
     REACHED,  # number of output times reached
-    LEFT_TO_MOVE,
-    MOVED_BEFORE,
-    ACCEPTED,
+    LEFT_TO_MOVE,  # 1 in lanes whose projection has not converged yet
+    MOVED_BEFORE,  # largest change of positions by the previous pass of a projection
+    ACCEPTED,  # 1 in lanes whose step was accepted
     FRESH,  # 1 in lanes whose run has not taken a step yet
     ERROR,  # error of a step, over the tolerances
-    H_FREE,  # size of the step before it is shortened to the end of the run
-    H_NEXT,
-    H_LIMIT,  # limit of the step size after a step that failed ...
-    LIMIT_AGE,  # ... and number of accepted steps since then
-    ROUGH_TO,  # end of the last step that was rejected for a sudden error
+    H_FREE,  # size of the step before it was shortened to reach the end of the run, s
+    H_NEXT,  # size of the next step, s
+    H_LIMIT,  # upper limit of the step size after a step that failed, s; infinite: none
+    LIMIT_AGE,  # number of accepted steps since H_LIMIT was set
+    ROUGH_TO,  # end of the last step that was rejected because of a suddenly large error, s
     SHIFT,  # shift of the times within a step at which the defect is evaluated
-    EVALUATED,  # number of evaluations within the step, besides the number in `settings`
-    PAST,  # history of step-size control, lane by lane, see control/step_size.py
+    EVALUATED,  # number of evaluations within the step, in addition to N_EVALUATIONS in `settings`
+    PAST,  # history of step-size control, stored lane by lane, see control/step_size.py
     _MORE_PAST,
     N_FIELDS,
 ) = range(31)
-# functions generated for a mechanism, with arguments (order, control, work), which work on the vectors of `work`
+# names of functions generated for a mechanism; their arguments are (order, control, work), and they change `work`
 TASKS = (
-    "approach",  # move positions of NEW, at AHEAD, towards the constraints, in lanes that are FINE
-    "refine",  # move positions that are LEFT_TO_MOVE, and velocities; compute A and LAM there; FINE: converged
-    "redundant",  # check whether redundant rows hold at NEW
-    "departure",  # OFF: departure of a step H from STATE by PREDICTED to NEW
-    "commit",  # NEW becomes STATE where ACCEPTED
+    "approach",  # move the positions of NEW, at the time AHEAD, towards the constraints, in lanes with FINE = 1
+    "refine",  # project NEW in lanes with LEFT_TO_MOVE = 1; compute A and LAM; FINE: the projection converges
+    "redundant",  # clear FINE in lanes in which redundant constraints do not hold at NEW
+    "departure",  # compute OFF, the departure of NEW from PREDICTED, in a step H from STATE
+    "commit",  # copy NEW to STATE in lanes with ACCEPTED = 1
 )
-# "rows": compute C, C_t and the entries of C_q at NEW and AHEAD, into the method's memory; FINE: all are finite
+# "rows": compute C, C_t and the entries of C_q at NEW and AHEAD into the method's memory; FINE: all of them are finite
 TASKS_OF_STARTS = ("rows",)
 TASKS_OF_STAGES = ("accelerate",)  # compute the accelerations A at the state NEW, without a projection
 # "stages": compute the state NEW at the time X after the beginning of the step, and ERROR if X is the whole step; FINE
 # remains 1 in lanes where that succeeded
 TASKS_OF_EXPLICIT = ("stages",)
 TASKS_OF_SERIES = (
-    "series",  # coefficients about STATE at T, in units of time UNIT
-    "lengths",  # LENGTH in units, H and X of the steps of the lanes that can continue, which are FINE
-    "check_within",  # WORST: the largest defect within a step H; AHEAD: its end
-    "evaluate",  # NEW, PREDICTED and FOUND: the state and its accelerations by the series, after X units of time
-    "defect",  # DEFECT: defect of A at NEW, the end of a step H
-    "judge",  # ACCEPTED: 1 for accepted steps; chooses the size of the next one
+    "series",  # compute the coefficients of the series about STATE at T, in units of time UNIT
+    "lengths",  # compute LENGTH, H and X of the step; FINE: the run can continue
+    "check_within",  # compute WORST, the largest defect within a step H, and AHEAD, the time of its end
+    "evaluate",  # compute NEW, PREDICTED and FOUND, the accelerations, by the series after X units of time
+    "defect",  # compute DEFECT, the defect of A at NEW, the end of a step H
+    "judge",  # compute ACCEPTED, and choose the size of the next step
 )
 CODE = Reference("LaneKit", {})
 ALL_TASKS = (*TASKS, *TASKS_OF_STARTS, *TASKS_OF_STAGES, *TASKS_OF_EXPLICIT, *TASKS_OF_SERIES)
 CODE.add_llvm_functions(dict.fromkeys(ALL_TASKS, types.none(types.int64, VECTOR, VECTOR)))
-# step of a method, (code, settings, control, options, work, status, n_steps, within): take a step H in each lane that
-# runs; set ACCEPTED, and NEW, A and LAM to its end. With `within`, write the state X seconds after the beginning of the
-# step just accepted to NEW, not yet projected, in lanes that are FINE
+# step of a method, (code, settings, control, options, work, status, n_steps, within): in each lane with a run, take a
+# step H, set ACCEPTED, and compute NEW, A and LAM at the end of the step. With `within`, instead compute the state NEW
+# at the time X after the beginning of the last accepted step, without a projection, in lanes with FINE = 1
 STEP = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[INTEGERS] * 2, types.boolean)
 CODE.add_function("step", STEP)
 
@@ -92,13 +92,13 @@ CODE.add_function("step", STEP)
 START, BEGIN, _BEGIN_V, PREDICTED_V, SLOPES = range(5)
 
 N, N_ROWS, ORDER, CHECKS_REDUNDANT, N_NUMBERS, N_EVALUATIONS = range(6)  # indices in `settings`
-T0, T1, GAP, RTOL, ATOL = range(5)  # indices in `control`; from ATOL on a tolerance for each coordinate
+T0, T1, GAP, RTOL, ATOL = range(5)  # indices in `control`; from ATOL on, one absolute tolerance for each coordinate
 
-SHORTEST = 1e-13  # shortest step, relative to the time
+SHORTEST = 1e-13  # shortest step, relative to the time of its beginning or to t1
 
 
 class LaneKit:
-    """Functions generated for a mechanism, and the step of a method, passed to kernels as one reference."""
+    """Functions generated for a mechanism, and the step of a method, passed to kernels as a reference (`CODE`)."""
 
     def __init__(self, own: GeneratedFunctions, step: Any = None):
         self.__dict__.update(dict.fromkeys(ALL_TASKS, 0))
@@ -114,9 +114,10 @@ def _type_of_kit(value: Any, context: Any) -> Any:
 
 
 def places(n, n_rows, n_numbers):
-    """Return the offsets of STATE, NEW, PREDICTED, FOUND, A, LAM, the numbers of the code and the method's memory.
+    """Return the offsets in `work`, in vectors, of the arrays that follow its fields.
 
-    Offsets are counted in vectors.
+    These are STATE, NEW (q and v each), PREDICTED (q), FOUND (accelerations by a series), A, LAM, the data of the
+    generated code (n_numbers), and the memory of the method.
     """
     state = N_FIELDS
     new = state + 2 * n
@@ -133,40 +134,40 @@ places_of = merged(places)
 
 @merged
 def fill_field(work, field, value):
-    """Set a field to the same number in all lanes."""
+    """Set a vector to `value` in all lanes."""
     for k in range(LANES):
         work[field * LANES + k] = value
 
 
 @merged
 def leave_run(work, status, k, reason):
-    """Take a run out of its lane, with the reason why it has to be repeated alone."""
+    """Remove the run of lane k, and store the reason, such as NO_VALUES, why it has to be repeated alone."""
     work[RUNNING * LANES + k] = 0.0
     status[int(work[RUN * LANES + k])] = reason
 
 
 @inlined
 def vectors(work, begin, count):
-    """Return a view of vectors, one after the other."""
+    """Return a flat view of `count` adjacent vectors of `work`, from vector number `begin` on."""
     return work[begin * LANES : (begin + count) * LANES]
 
 
 @inlined
 def table(work, begin, rows, count):
-    """Return a view of vectors as rows of a table, `count` vectors each."""
+    """Return a view (rows, count * LANES) of adjacent vectors of `work`, from vector number `begin` on."""
     return work[begin * LANES : (begin + rows * count) * LANES].reshape((rows, count * LANES))
 
 
 @compiled
 def copy_vectors(work, source, target, count):
-    """Copy vectors from source to target."""
+    """Copy `count` adjacent vectors from the offset `source` to the offset `target`."""
     for i in range(count * LANES):
         work[target * LANES + i] = work[source * LANES + i]
 
 
 @compiled
 def sum_rows(weights, rows, total):
-    """Compute the sum of weights[k] rows[k], four rows at once, so that LLVM vectorizes it."""
+    """Compute the sum of weights[k] rows[k] over k into `total`, four rows at once, which LLVM can vectorise."""
     first = weights.size % 4
     for m in range(total.size):
         total[m] = 0.0
@@ -182,6 +183,7 @@ def sum_rows(weights, rows, total):
 
 @merged
 def _add_four(work, t, p, q, sign):
+    """Add sign x y to the target in four adjacent lanes; t, p and q are indices of target, x and y in `work`."""
     t0, t1 = work[t] + sign * work[p] * work[q], work[t + 1] + sign * work[p + 1] * work[q + 1]
     t2, t3 = work[t + 2] + sign * work[p + 2] * work[q + 2], work[t + 3] + sign * work[p + 3] * work[q + 3]
     work[t], work[t + 1], work[t + 2], work[t + 3] = t0, t1, t2, t3
@@ -189,20 +191,21 @@ def _add_four(work, t, p, q, sign):
 
 @compiled
 def add_product(work, target, x, y, sign):
-    """Add sign x y to target in each lane; read four before writing, because LLVM cannot rule out that they overlap."""
+    """Add sign x y to the vector `target`; four lanes are read before any is written, because vectors may overlap."""
     for k in range(0, LANES, 4):
         _add_four(work, target * LANES + k, x * LANES + k, y * LANES + k, sign)
 
 
 @merged
 def _larger(work, most, error, factor, one, other, atol, rtol):
+    """Return the new value of `most` in one lane, see `enlarge`."""
     scale = atol + rtol * max(abs(work[one]), abs(work[other]))
     return max(work[most], abs(work[error]) * work[factor] / scale)
 
 
 @compiled
 def enlarge(work, most, error, factor, one, other, atol, rtol):
-    """Raise `most` to |error| factor / (atol + rtol max(|one|, |other|)) in each lane."""
+    """Set the vector `most` to |error| factor / (atol + rtol max(|one|, |other|)) in lanes in which this is larger."""
     for k in range(0, LANES, 4):
         m, e, f, x, y = most * LANES + k, error * LANES + k, factor * LANES + k, one * LANES + k, other * LANES + k
         m0 = _larger(work, m, e, f, x, y, atol, rtol)
@@ -214,7 +217,10 @@ def enlarge(work, most, error, factor, one, other, atol, rtol):
 
 @merged
 def _scale(work, target, apart, x, imaginary):
-    """Multiply entry `target` of a matrix by x, real or complex."""
+    """Multiply the number `target` by x; if `imaginary` > 0, both are complex.
+
+    Imaginary parts are `apart` vectors after the real part of `target`, and `imaginary` vectors after that of x.
+    """
     for k in range(LANES):
         t, p = target * LANES + k, x * LANES + k
         if imaginary == 0:
@@ -227,7 +233,10 @@ def _scale(work, target, apart, x, imaginary):
 
 @merged
 def _subtract(work, target, x, y, imaginary, imaginary_y):
-    """Subtract x y from target; y and target have their imaginary parts `imaginary_y` vectors behind, x `imaginary`."""
+    """Subtract x y from the number `target`; if `imaginary` > 0, all are complex.
+
+    Imaginary parts are `imaginary` vectors after the real part of x, and `imaginary_y` after those of y and `target`.
+    """
     add_product(work, target, x, y, -1.0)
     if imaginary > 0:
         add_product(work, target, x + imaginary, y + imaginary_y, 1.0)
@@ -237,19 +246,24 @@ def _subtract(work, target, x, y, imaginary, imaginary_y):
 
 @merged
 def _exchange(work, one, other, k):
+    """Exchange two vectors in lane k."""
     i, j = one * LANES + k, other * LANES + k
     work[i], work[j] = work[j], work[i]
 
 
 @merged
-def _size(work, place, imaginary, k):
-    size = abs(work[place * LANES + k])
-    return size if imaginary == 0 else size + abs(work[(place + imaginary) * LANES + k])
+def _size(work, entry, imaginary, k):
+    """Return the absolute value of a real number in lane k; of a complex one, the sum for its two parts."""
+    size = abs(work[entry * LANES + k])
+    return size if imaginary == 0 else size + abs(work[(entry + imaginary) * LANES + k])
 
 
 @compiled
 def _pivot(work, matrix, pivots, n, imaginary, c):
-    """Exchange rows so that the largest entry of a column is the pivot, and invert it; clear FINE if it is zero."""
+    """Make the largest entry of column c, from row c on, the pivot, by an exchange of rows, and invert it.
+
+    Clear FINE in lanes in which the pivot is zero.
+    """
     for k in range(LANES):
         best, top = c, _size(work, matrix + c * n + c, imaginary, k)
         for i in range(c + 1, n):
@@ -275,7 +289,7 @@ def _pivot(work, matrix, pivots, n, imaginary, c):
 
 @compiled
 def factor_lanes(work, matrix, pivots, n, imaginary):
-    """Replace a matrix (n, n) by its LU factors, with row exchanges for each lane."""
+    """Replace a matrix (n, n) in each lane by its LU factors, with inverted pivots; store row exchanges in `pivots`."""
     for c in range(n):
         _pivot(work, matrix, pivots, n, imaginary, c)
         for i in range(c + 1, n):
@@ -287,7 +301,10 @@ def factor_lanes(work, matrix, pivots, n, imaginary):
 
 @compiled
 def solve_lanes(work, matrix, pivots, n, imaginary, x):
-    """Replace a right-hand side x (n), followed by n imaginary parts, by the solution."""
+    """Replace a right-hand side x (n) by the solution, with the factors of `factor_lanes`.
+
+    If `imaginary` > 0, the system is complex, and n imaginary parts follow the real parts of x.
+    """
     apart = n if imaginary > 0 else 0
     for c in range(n):
         for k in range(LANES):
@@ -305,12 +322,12 @@ def solve_lanes(work, matrix, pivots, n, imaginary, x):
         _scale(work, x + i, apart, matrix + i * n + i, imaginary)
 
 
-MOST_PASSES = 10
+MOST_PASSES = 10  # largest number of passes of a projection
 
 
 @compiled
 def project_lanes(code, order, control, work):
-    """Project NEW onto the constraints in lanes that are FINE; FINE remains 1 where the projection converges."""
+    """Project NEW onto the constraints in lanes with FINE = 1; clear FINE where the projection does not converge."""
     code.approach(order, control, work)
     for _ in range(MOST_PASSES):
         code.refine(order, control, work)

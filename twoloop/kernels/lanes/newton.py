@@ -4,9 +4,9 @@ The unknowns are the accelerations a_j of all coordinates at the stages,
 
     F(t_j, Q_j, V_j) - a_j = 0,  Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k,  V_j = v + h sum_k A_jk a_k,
 
-F being the accelerations at a state without a projection: stages are off the constraints by the error of the formula,
-and only the end of the step is projected. Derivatives are differences, computed for all lanes at once, anew in each
-step.
+where F are the accelerations at a state that is not projected: stages violate the constraints by the error of the
+formula, and only the end of the step is projected. In each step, the derivatives of F are computed anew, by
+differences, for all lanes at once.
 """
 
 import numpy as np
@@ -59,23 +59,23 @@ from twoloop.kernels.steps.stages import (
 )
 from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STEPS_TO_DECAY
 
-# offsets in the method's memory, in vectors: first one number for each lane, ...
+# offsets of single vectors in the method's memory; blocks of vectors follow
 (
-    ITERATING,  # 1: lanes in which the iteration has not ended
+    ITERATING,  # 1 in lanes whose iteration has not ended
     DONE,  # 1 in lanes whose iteration has converged
     CHANGE_BEFORE,  # size of the previous correction
-    SCALE_Q,
-    SCALE_V,
-    LARGEST_Q,  # largest correction of positions; LARGEST_V: of velocities
-    LARGEST_V,
-    H_PREVIOUS,  # size of the step to which PREVIOUS belongs; 0: none
-    CONSTANT,  # 1: predicted accelerations of the stages are constant, those at the beginning
-    DURATION,  # s: how long an error of velocity lasts, see velocity_errors.py; 0: not known
+    SCALE_Q,  # largest position of the stages, at least 1
+    SCALE_V,  # largest velocity of the stages, at least 1
+    LARGEST_Q,  # largest correction of positions, for a step of 1
+    LARGEST_V,  # largest correction of velocities, for a step of 1
+    H_PREVIOUS,  # size of the step whose accelerations are PREVIOUS, s; 0: none
+    CONSTANT,  # 1: the stages are predicted to have the accelerations at the beginning of the step
+    DURATION,  # s, duration of an error of the velocities, see velocity_errors.py; 0: not known
     N_OF_LANES,
 ) = range(11)
-# ... then blocks of n: accelerations at STATE; q, v and a at the beginning of the step; sums; a state in the middle of
-# the step, and its accelerations; the estimated error; the error of velocities, unfiltered and filtered once; and a
-# complex vector, real part first
+# numbers of the blocks of n vectors: accelerations at STATE; q, v and a at the beginning of the step; sums; a state in
+# the middle of the step, and its accelerations; the estimated error of q and v; that of v unfiltered, and filtered
+# once; and a complex vector, real part first
 (
     START,
     BEGIN_Q,
@@ -93,49 +93,53 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     _IMAGINARY,
     N_VECTORS,
 ) = range(15)
-STAGES, PREVIOUS, RESIDUAL, CHANGES, N_BLOCKS = range(5)  # blocks of (s, n); followed by weights (s, s)
-# matrices (n, n); each system has its real and its imaginary part; the pivots of all systems follow
+STAGES, PREVIOUS, RESIDUAL, CHANGES, N_BLOCKS = range(5)  # numbers of the blocks (s, n); then follow weights (s, s)
+# numbers of the matrices (n, n): from SYSTEMS on, a real and an imaginary part for each system; then follow the pivots
 BY_Q, BY_V, SYSTEMS = range(3)
 
 
 def memory_size(s: int, n: int) -> int:
-    """Return the length of the method's memory, in vectors, for s stages; a system for each eigenvalue or pair."""
+    """Return the length of the method's memory, in vectors, for s stages; each eigenvalue or pair has a system."""
     n_systems = (s + 1) // 2
     return N_OF_LANES + (N_VECTORS + N_BLOCKS * s + n_systems) * n + s * s + (SYSTEMS + 2 * n_systems) * n * n
 
 
 @merged
 def vector_at(memory, n, which):
-    """Return the place of a vector (n)."""
+    """Return the offset of block number `which` (n), such as START."""
     return memory + N_OF_LANES + which * n
 
 
 @merged
 def block_at(memory, n, s, which):
-    """Return the place of a block (s, n)."""
+    """Return the offset of block number `which` (s, n), such as STAGES."""
     return memory + N_OF_LANES + (N_VECTORS + which * s) * n
 
 
 @merged
 def _weights_at(memory, n, s):
+    """Return the offset of the weights (s, s)."""
     return memory + N_OF_LANES + (N_VECTORS + N_BLOCKS * s) * n
 
 
 @merged
 def matrix_at(memory, n, s, which):
-    """Return the offset of a matrix (n, n); that of system k is SYSTEMS + 2 k."""
+    """Return the offset of matrix number `which` (n, n); system k has the numbers SYSTEMS + 2 k and the next one."""
     return _weights_at(memory, n, s) + s * s + which * n * n
 
 
 @merged
 def pivots_at(memory, n, s, n_systems, k):
-    """Return the place of the pivots of system k."""
+    """Return the offset of the pivots (n) of system k."""
     return matrix_at(memory, n, s, SYSTEMS + 2 * n_systems) + k * n
 
 
 @compiled
 def _evaluate_middle(code, settings, control, c, work, new, a, memory):
-    """Compute the state in the middle of the step, near the constraints, and its accelerations."""
+    """Compute the state in the middle of the step and its accelerations, into MIDDLE_Q, MIDDLE_V and MIDDLE_A.
+
+    It is extrapolated from the beginning of the step, and its positions are moved towards the constraints.
+    """
     n, order = settings[N], settings[ORDER]
     share, begin = middle_node(c), vector_at(memory, n, BEGIN_Q)
     for k in range(LANES):
@@ -154,9 +158,9 @@ def _evaluate_middle(code, settings, control, c, work, new, a, memory):
 
 @compiled
 def find_derivatives(code, settings, control, c, work):
-    """Difference the accelerations by positions and velocities, in the middle of the step, in lanes that are FINE.
+    """Compute the derivatives of the accelerations by q and v in the middle of the step, in lanes with FINE = 1.
 
-    The time is that of a stage, so that the differences see no force that the stages do not see.
+    The time is that of a stage, so that the derivatives contain no force that no stage has.
     """
     n, order = settings[N], settings[ORDER]
     _, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
@@ -179,16 +183,16 @@ def find_derivatives(code, settings, control, c, work):
 
 @compiled
 def factor_systems_of_lanes(settings, own, s, work):
-    """Factor I - (X l)^2 J_q - X l J_v for each eigenvalue l."""
+    """Factor I - (X l)^2 J_q - X l J_v for each eigenvalue l, or pair, of A; `own`: the options of the method."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
-    n_systems, place = count_eigenvalues(own, s), eigen_offset(s)
-    n_real = int(own[place + N_REAL])
-    place += N_EIGEN_SCALARS + s
+    n_systems, offset = count_eigenvalues(own, s), eigen_offset(s)
+    n_real = int(own[offset + N_REAL])
+    offset += N_EIGEN_SCALARS + s
     by_q, by_v = matrix_at(memory, n, s, BY_Q), matrix_at(memory, n, s, BY_V)
     for system in range(n_systems):
-        re, im = own[place], own[place + 1]
-        place += 2 + 4 * s
+        re, im = own[offset], own[offset + 1]
+        offset += 2 + 4 * s
         matrix, apart = matrix_at(memory, n, s, SYSTEMS + 2 * system), n * n * LANES
         for i in range(n * n):
             diagonal = 1.0 if i % (n + 1) == 0 else 0.0
@@ -203,7 +207,11 @@ def factor_systems_of_lanes(settings, own, s, work):
 
 @compiled
 def predict_stages(settings, c, work, begins):
-    """Predict stages from the polynomial of the last step (`begins` = 0: of this step), or as constant."""
+    """Predict the stage accelerations by the polynomial PREVIOUS, or as constant if there is none.
+
+    `begins`: time at which the step begins, relative to the step of PREVIOUS: 1 if that is the last step, 0 if it is
+    this step, within which a state is computed.
+    """
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     s = c.size
@@ -224,17 +232,17 @@ def predict_stages(settings, c, work, begins):
                 work[(weights + j * s + i) * LANES + k] = product
     for j in range(s):
         for m in range(n):
-            place = stages + j * n + m
+            offset = stages + j * n + m
             for k in range(LANES):
-                work[place * LANES + k] = 0.0
-            add_product(work, place, memory + CONSTANT, a + m, 1.0)
+                work[offset * LANES + k] = 0.0
+            add_product(work, offset, memory + CONSTANT, a + m, 1.0)
             for i in range(s):
-                add_product(work, place, weights + j * s + i, previous + i * n + m, 1.0)
+                add_product(work, offset, weights + j * s + i, previous + i * n + m, 1.0)
 
 
 @compiled
 def _residuals(code, settings, control, A, A2, c, work):
-    """Compute the residuals of the stages and their largest entries; FINE remains 1 in lanes with finite values."""
+    """Compute RESIDUAL, SCALE_Q and SCALE_V for the present stages; clear FINE in lanes with invalid values."""
     n, order = settings[N], settings[ORDER]
     _, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     s = c.size
@@ -267,20 +275,20 @@ def _residuals(code, settings, control, A, A2, c, work):
 
 @compiled
 def _correct(settings, own, s, work):
-    """Compute corrections of the stages into CHANGES; add them in lanes that still iterate."""
+    """Compute the corrections of the stages into CHANGES; add them to STAGES in lanes with ITERATING = 1."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
-    n_systems, place = count_eigenvalues(own, s), eigen_offset(s)
-    n_real = int(own[place + N_REAL])
-    place += N_EIGEN_SCALARS + s
+    n_systems, offset = count_eigenvalues(own, s), eigen_offset(s)
+    n_real = int(own[offset + N_REAL])
+    offset += N_EIGEN_SCALARS + s
     one, changes = vector_at(memory, n, COMPLEX), block_at(memory, n, s, CHANGES)
     residual, stages = block_at(memory, n, s, RESIDUAL), block_at(memory, n, s, STAGES)
     left, width = table(work, residual, s, n), n * LANES
     for i in range(s * width):
         work[changes * LANES + i] = 0.0
     for system in range(n_systems):
-        row, column = place + 2, place + 2 + 2 * s
-        place += 2 + 4 * s
+        row, column = offset + 2, offset + 2 + 2 * s
+        offset += 2 + 4 * s
         sum_rows(own[row : row + s], left, vectors(work, one, n))
         sum_rows(own[row + s : row + 2 * s], left, vectors(work, one + n, n))
         matrix, pivots = matrix_at(memory, n, s, SYSTEMS + 2 * system), pivots_at(memory, n, s, n_systems, system)
@@ -299,7 +307,7 @@ def _correct(settings, own, s, work):
 
 @merged
 def _enlarge(work, most, sums, n):
-    """Raise `most` in each lane to the largest entry of n vectors; NaN counts as largest."""
+    """Set `most` to the largest absolute value of n vectors in lanes in which this is larger, or NaN."""
     for i in range(n * LANES):
         size, at = abs(work[sums * LANES + i]), most * LANES + i % LANES
         if size > work[at] or size != size:
@@ -308,7 +316,7 @@ def _enlarge(work, most, sums, n):
 
 @compiled
 def _largest_corrections(settings, A, A2, work):
-    """Compute the largest corrections that CHANGES make to positions and velocities of the stages, for a step of 1."""
+    """Compute LARGEST_Q and LARGEST_V, the largest corrections of the stages by CHANGES, for a step of size 1."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     s = A.shape[0]
@@ -324,7 +332,7 @@ def _largest_corrections(settings, A, A2, work):
 
 @merged
 def _end_iteration(options, work, memory, iteration, k):
-    """Return whether the iteration of a lane ends; DONE becomes 1 if it has converged."""
+    """Return whether the iteration of lane k ends; set DONE to 1 if it has converged, otherwise to 0."""
     x, tolerance = work[X * LANES + k], options[N_HEAD + OUTER_TOL]
     floor = STAGNATION * options[LEAST]
     fast = x * work[(memory + LARGEST_V) * LANES + k] / work[(memory + SCALE_V) * LANES + k]
@@ -351,7 +359,7 @@ def _end_iteration(options, work, memory, iteration, k):
 
 @compiled
 def solve_stages(code, settings, control, options, own, A, A2, c, work):
-    """Solve for the stages of a step X from their prediction, in lanes that are FINE; FINE remains 1 on convergence."""
+    """Solve for the stages of a step X from their prediction, in lanes with FINE = 1; clear FINE on divergence."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     to_go, done = memory + ITERATING, memory + DONE
@@ -378,7 +386,7 @@ def solve_stages(code, settings, control, options, own, A, A2, c, work):
 
 @compiled
 def end_of_stages(settings, b, bA, work):
-    """Compute NEW, the state X after the beginning of the step, from the stages."""
+    """Compute NEW, the state at the time X after the beginning of the step, from the stages."""
     n = settings[N]
     _, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     s = b.size
@@ -395,18 +403,18 @@ def end_of_stages(settings, b, bA, work):
 
 
 @merged
-def _allowed(control, work, state, new, j, place, k):
-    """Return the allowed error of entry `place` of a state, which belongs to coordinate j."""
-    size = max(abs(work[(state + place) * LANES + k]), abs(work[(new + place) * LANES + k]))
+def _allowed(control, work, state, new, j, entry, k):
+    """Return the allowed error of entry `entry` of a state [q, v], which belongs to coordinate j."""
+    size = max(abs(work[(state + entry) * LANES + k]), abs(work[(new + entry) * LANES + k]))
     return control[ATOL + j] + control[RTOL] * size
 
 
 @compiled
 def _embedded_estimate(settings, own, A, work, memory):
-    """Compute the embedded estimate of the error, unfiltered, into E_Q and E_V."""
+    """Compute the embedded error estimate, unfiltered, into E_Q and E_V."""
     n, s = settings[N], A.shape[0]
-    place = eigen_offset(s)
-    gamma0, e = own[place + GAMMA0], own[place + N_EIGEN_SCALARS : place + N_EIGEN_SCALARS + s]
+    offset = eigen_offset(s)
+    gamma0, e = own[offset + GAMMA0], own[offset + N_EIGEN_SCALARS : offset + N_EIGEN_SCALARS + s]
     known, begin = table(work, block_at(memory, n, s, STAGES), s, n), vector_at(memory, n, BEGIN_V)
     e_q, e_v, sums = vector_at(memory, n, E_Q), vector_at(memory, n, E_V), vector_at(memory, n, SUMS)
     total = 0.0
@@ -427,7 +435,7 @@ def _embedded_estimate(settings, own, A, work, memory):
 
 @compiled
 def _filter(settings, own, s, work, memory):
-    """Apply (I - z J)^-1 to (E_Q, E_V), z = gamma0 H, J being the Jacobian of (v, F)."""
+    """Replace (E_Q, E_V) by (I - z J)^-1 (E_Q, E_V), z = gamma0 H, where J is the Jacobian of (v, F)."""
     n = settings[N]
     gamma0 = own[eigen_offset(s) + GAMMA0]
     e_q, e_v, one = vector_at(memory, n, E_Q), vector_at(memory, n, E_V), vector_at(memory, n, COMPLEX)
@@ -447,7 +455,7 @@ def _filter(settings, own, s, work, memory):
 
 @compiled
 def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
-    """Return the error of positions that an error of velocities causes, over the tolerances, see velocity_errors.py."""
+    """Return the error over the tolerances that a velocity error causes in lane k, see velocity_errors.py."""
     raw, once, twice = vector_at(memory, n, UNFILTERED), vector_at(memory, n, FILTERED_ONCE), vector_at(memory, n, E_V)
     begin = vector_at(memory, n, BEGIN_V)
     largest = turn = fastest = change = 0.0
@@ -467,7 +475,7 @@ def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
 
 @compiled
 def _velocity_error(control, work, n, error_v, duration, state, new, k):
-    """Return the largest component of an error of the velocities that lasts for `duration`, over the tolerances."""
+    """Return the largest component of a velocity error that lasts for `duration`, s, over the tolerances, in lane k."""
     error = 0.0
     for j in range(n):
         share_q = duration / _allowed(control, work, state, new, j, j, k)
@@ -478,7 +486,7 @@ def _velocity_error(control, work, n, error_v, duration, state, new, k):
 
 @merged
 def _motion_time(control, work, n, memory, k):
-    """Return the time in which the motion changes its velocities, s, see velocity_errors.py."""
+    """Return the time, s, in which accelerations change velocities by their size, see velocity_errors.py."""
     begin = vector_at(memory, n, BEGIN_V)
     fastest = change = 0.0
     for j in range(n):
@@ -490,7 +498,7 @@ def _motion_time(control, work, n, memory, k):
 
 @compiled
 def _slow_error(settings, control, own, s, work):
-    """Raise ERROR to the error that velocity errors (E_V) leave in slow directions, as in newton_step.py."""
+    """Set ERROR to the error that E_V causes in slow directions, if this is larger, see newton_step.py."""
     n = settings[N]
     state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     e_v, most, fine = vector_at(memory, n, E_V), memory + LARGEST_V, memory + ITERATING
@@ -516,7 +524,7 @@ def _slow_error(settings, control, own, s, work):
     solve_lanes(work, matrix, pivots, n, 0, e_v)
     for k in range(LANES):
         error = work[most * LANES + k]
-        if work[FINE * LANES + k] == 1.0:  # where the motion is unstable the solution may be too large
+        if work[FINE * LANES + k] == 1.0:  # if the motion is unstable, the solution may be too large
             long = _motion_time(control, work, n, memory, k)
             error = min(error, _velocity_error(control, work, n, e_v, long, state, new, k))
         work[FINE * LANES + k] = work[fine * LANES + k]
@@ -526,15 +534,15 @@ def _slow_error(settings, control, own, s, work):
 
 @compiled
 def _estimate(settings, control, own, A, work):
-    """Compute ERROR: the embedded estimate, filtered for stiff components, over the tolerances."""
+    """Compute ERROR, the embedded error estimate over the tolerances, filtered to suppress stiff components."""
     n, s = settings[N], A.shape[0]
     state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
-    place = eigen_offset(s)
+    offset = eigen_offset(s)
     e_q, e_v = vector_at(memory, n, E_Q), vector_at(memory, n, E_V)
     _embedded_estimate(settings, own, A, work, memory)
     copy_vectors(work, e_v, vector_at(memory, n, UNFILTERED), n)
     _filter(settings, own, s, work, memory)
-    tests_velocities = own[place + VELOCITIES] == 1.0
+    tests_velocities = own[offset + VELOCITIES] == 1.0
     fill_field(work, ERROR, 0.0)
     for j in range(n):
         atol, rtol = control[ATOL + j], control[RTOL]
@@ -546,7 +554,7 @@ def _estimate(settings, control, own, A, work):
     copy_vectors(work, e_v, vector_at(memory, n, FILTERED_ONCE), n)
     _filter(settings, own, s, work, memory)
     for k in range(LANES):
-        z = own[place + GAMMA0] * work[H * LANES + k]
+        z = own[offset + GAMMA0] * work[H * LANES + k]
         error = _filtered_velocity_error(control, work, n, memory, z, state, new, k)
         work[ERROR * LANES + k] = max(work[ERROR * LANES + k], error)
     _slow_error(settings, control, own, s, work)
@@ -554,7 +562,7 @@ def _estimate(settings, control, own, A, work):
 
 @compiled
 def _keep_stages(work, memory, n, s):
-    """Store the stages of accepted steps, which predict the next ones and states within the step."""
+    """Store the stages of accepted steps, which predict those of the next step, and states within this step."""
     stages, previous = block_at(memory, n, s, STAGES), block_at(memory, n, s, PREVIOUS)
     for k in range(LANES):
         if work[ACCEPTED * LANES + k] == 1.0:
@@ -565,7 +573,10 @@ def _keep_stages(work, memory, n, s):
 
 @kernel(STEP, vectorized=True)
 def step_by_newton(code, settings, control, options, work, status, n_steps, within):
-    """Take a step, at most GAP long; or compute the states X seconds after its beginning (`within`)."""
+    """Take a step of at most control[GAP] in each lane.
+
+    With `within`, compute instead the states at the time X after the beginning of the last accepted step.
+    """
     n = settings[N]
     state, _, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     own = options[N_HEAD:]

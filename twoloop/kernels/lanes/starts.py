@@ -1,12 +1,14 @@
-"""Project initial states onto the constraints by the least change, in lanes, and check for a second assembly as near.
+"""Project initial states onto the constraints by the least change, in lanes; check whether another assembly is as near.
 
 The least change follows from the Cholesky factors of G G^T, with the rows of G scaled to length 1. Redundant rows are
-dependent on the constraints, but only nearly so beside them. Eigenvectors z of G G^T, combinations of rows that vanish
-on the constraints, are therefore removed: the sum of z z^T is added to G G^T. Lanes are independent of one another.
+linearly dependent at positions that satisfy the constraints, and nearly so at others. The rows of Z are eigenvectors of
+G G^T: combinations of rows that vanish on the constraints. They are removed from right-hand sides, and Z^T Z is added
+to G G^T, so that it is not singular. Lanes are independent of one another.
 
-`pattern` gives the columns of the entries of each row: first where they begin and end in `pattern`, then the columns.
+`pattern` is the sparsity pattern of G. It begins with n_rows + 1 indices in `pattern`, at which the columns of each row
+begin and the last ones end; then follow the columns. Matrices and vectors in `work` are given by offsets, in vectors.
 
-Residuals of the constraints and of the equations of motion, which check runs in lanes, are computed by the callbacks.
+Two further kernels check the results of runs in lanes: they evaluate the callbacks, and return residuals.
 """
 
 import numpy as np
@@ -31,16 +33,18 @@ from twoloop.kernels.lanes.layout import (
     places_of,
 )
 
-LEAST = 1e-15  # added to the diagonal of G G^T, so that it has an inverse ...
-ITERATION_SHIFT = 1e-8  # ... and for inverse iteration, when some of its eigenvalues vanish
-WEAK = 1e-4  # relative to the largest eigenvalue: redundant rows have a smaller one
-# number of inverse iterations for eigenvectors of redundant rows, whose eigenvalues are far smaller
+LEAST = 1e-15  # added to the diagonal of G G^T, so that it is not singular
+ITERATION_SHIFT = 1e-8  # added instead of LEAST for the inverse iteration, where some eigenvalues are zero
+WEAK = 1e-4  # eigenvalue of G G^T below which a combination of rows is redundant
+# number of inverse iterations for eigenvectors of redundant rows; few, as their eigenvalues are much smaller than
+# others
 REDUNDANT_ITERATIONS = 5
-GOLDEN = 0.6180339887498949
+GOLDEN = 0.6180339887498949  # fractional parts of its multiples serve as start values without regularity
 
 
 @merged
 def _subtract_four(work, target, x, dx, y, dy, count):
+    """Subtract products in four adjacent lanes, see `subtract_products`; all arguments are indices in `work`."""
     t0, t1, t2, t3 = work[target], work[target + 1], work[target + 2], work[target + 3]
     for _ in range(count):
         t0 -= work[x] * work[y]
@@ -54,27 +58,31 @@ def _subtract_four(work, target, x, dx, y, dy, count):
 
 @compiled
 def subtract_products(work, target, x, dx, y, dy, count):
-    """Subtract from target the sum of products of vectors that are dx and dy apart, in each lane."""
+    """Subtract the scalar product of two lists of `count` vectors from `target`; vectors are dx and dy apart."""
     for k in range(0, LANES, 4):
         _subtract_four(work, target * LANES + k, x * LANES + k, dx * LANES, y * LANES + k, dy * LANES, count)
 
 
 @merged
 def subtract_row(work, target, entries, pattern, i, y):
-    """Subtract row i of G times y from target; the entries of all rows follow one another."""
+    """Subtract the product of row i of G and y from `target`; `entries` are those of all rows of G, row by row."""
     for e in range(pattern[i], pattern[i + 1]):
         subtract_products(work, target, entries + e - pattern[0], 1, y + pattern[e], 1, 1)
 
 
 @compiled
 def _scale(work, target, factor):
+    """Multiply the vector `target` by the vector `factor` in each lane."""
     for k in range(LANES):
         work[target * LANES + k] *= work[factor * LANES + k]
 
 
 @compiled
 def _cholesky(work, pattern, n_rows, n_redundant, row, factors, shift):
-    """Factor G G^T + shift + Z Z^T by Cholesky in each lane; the diagonal is stored inverted."""
+    """Compute the Cholesky factor of G G^T + shift I + Z^T Z in each lane, with the inverse of its diagonal.
+
+    `factors` begins with the scaled entries of G; the factor is stored after them. `row` (n) is scratch full of zeros.
+    """
     n_entries = pattern[n_rows] - pattern[0]
     gram = factors + n_entries + n_rows
     Z = gram + n_rows * n_rows
@@ -100,7 +108,10 @@ def _cholesky(work, pattern, n_rows, n_redundant, row, factors, shift):
 
 @compiled
 def factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors):
-    """Scale the rows, without fixed coordinates, to length 1; compute 1 / lengths, the factors of G G^T, and Z."""
+    """Compute the parts of `factors`: scaled entries of G, 1 / lengths of its rows, Cholesky factor of G G^T, and Z.
+
+    Columns of fixed coordinates (`moves` = 0) are set to zero; then the rows are scaled to length 1.
+    """
     n_entries = pattern[n_rows] - pattern[0]
     for i in range(n_rows):
         length = factors + n_entries + i
@@ -124,7 +135,7 @@ def factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors):
 
 @compiled
 def _find_redundant(work, pattern, n_rows, n_redundant, row, factors):
-    """Compute Z, eigenvectors of the smallest eigenvalues of G G^T; NaN where these are not small."""
+    """Compute Z, the eigenvectors of the n_redundant smallest eigenvalues of G G^T; NaN if these are not below WEAK."""
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
     Z = gram + n_rows * n_rows
     spare = Z + n_redundant * n_rows
@@ -139,13 +150,13 @@ def _find_redundant(work, pattern, n_rows, n_redundant, row, factors):
             _remove_redundant(work, n_rows, w, Z, z, spare)
         normalise(work, z, n_rows, spare)
         for k in range(LANES):
-            if not work[spare * LANES + k] < WEAK:  # `spare` is the eigenvalue plus ITERATION_SHIFT
+            if not work[spare * LANES + k] < WEAK:  # now `spare` is the eigenvalue plus ITERATION_SHIFT
                 work[z * LANES + k] = np.nan
 
 
 @compiled
 def normalise(work, x, n_rows, spare):
-    """Scale x to length 1; `spare` becomes 1 over its length before."""
+    """Scale x (n_rows) to length 1; `spare` becomes the reciprocal of its previous length."""
     fill_field(work, spare, 0.0)
     subtract_products(work, spare, x, 1, x, 1, n_rows)
     for k in range(LANES):
@@ -156,7 +167,7 @@ def normalise(work, x, n_rows, spare):
 
 @compiled
 def _remove_redundant(work, n_rows, n_redundant, Z, x, spare):
-    """Remove the components along Z from x."""
+    """Remove the components of x (n_rows) along the rows of Z; `spare` is scratch."""
     for w in range(n_redundant):
         z = Z + w * n_rows
         fill_field(work, spare, 0.0)
@@ -169,7 +180,7 @@ def _remove_redundant(work, n_rows, n_redundant, Z, x, spare):
 
 @compiled
 def _solve(work, n_rows, gram, x):
-    """Replace x by the solution y of the factored matrix, G G^T y = x."""
+    """Replace x by the solution y of G G^T y = x, with the Cholesky factor `gram`."""
     for i in range(n_rows):
         subtract_products(work, x + i, gram + i * n_rows, 1, x, 1, i)
         _scale(work, x + i, gram + i * n_rows + i)
@@ -180,7 +191,10 @@ def _solve(work, n_rows, gram, x):
 
 @compiled
 def along_rows(work, pattern, n, n_rows, n_redundant, factors, x, out):
-    """Replace x by y with G G^T y = x, for rows of length 1 and without redundant components; out = -G^T y."""
+    """Replace x (n_rows) by y with G G^T y = x, and compute out (n) = -G^T y.
+
+    Rows of G have length 1; redundant components of x are removed first.
+    """
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
     Z = gram + n_rows * n_rows
     _remove_redundant(work, n_rows, n_redundant, Z, x, Z + n_redundant * n_rows)
@@ -194,58 +208,62 @@ def along_rows(work, pattern, n, n_rows, n_redundant, factors, x, out):
 
 @compiled
 def least_change(work, pattern, n, n_rows, n_redundant, factors, x, change):
-    """Compute the smallest change with G change = -x; not finite where rows are dependent. x is overwritten."""
+    """Compute the smallest change (n) with G change = -x, not finite in lanes with dependent rows; overwrites x."""
     for i in range(n_rows):
         _scale(work, x + i, factors + pattern[n_rows] - pattern[0] + i)
     along_rows(work, pattern, n, n_rows, n_redundant, factors, x, change)
 
 
-MOST_ITERATIONS = 12
-AT_ROUNDING = 64.0  # largest residual of a constraint, in rounding errors of its terms
-MAX_CURVATURE = 0.25  # relative to a displacement: largest distance of its projection from the prediction by C_q
-SINGULAR = 1e-12  # smallest eigenvalue of G G^T, rows of length 1, of independent rows
-# number of inverse iterations for the eigenvector of the smallest eigenvalue of independent rows
+MOST_ITERATIONS = 12  # largest number of steps of the Gauss-Newton iteration
+AT_ROUNDING = 64.0  # residual of a constraint that counts as a rounding error, in rounding errors of its terms
+# largest difference of the projection of a displaced state and its prediction by C_q, relative to the displacement
+MAX_CURVATURE = 0.25
+SINGULAR = 1e-12  # smallest eigenvalue of G G^T at which rows of length 1 count as independent
+# number of inverse iterations for the eigenvector of the smallest eigenvalue, if all rows are independent
 WEAKEST_ITERATIONS = 10
-N_REDUNDANT = 5  # index in `settings`, after those of layout.py: number of redundant rows
-# other guesses: factors of the way from the guess to the state found, and of the weakest direction, for their distances
+N_REDUNDANT = 5  # index in `settings` of the number of redundant rows; runs have N_EVALUATIONS there
+# other guesses for the comparison: their displacements from the state found are these multiples of the change that the
+# projection has made, and of the weakest direction
 OTHER_GUESSES = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
 
 def places_of_starts(n, n_rows, n_entries, n_redundant):
-    """Return the offsets of the parts of `work`, from the memory of the method on, and its length.
+    """Return the offsets of the parts of `work`, in vectors after the beginning of the method's memory, and its length.
 
-    The parts are: C, C_t and the entries of G, as generated code writes them; numbers of rows; changes of positions or
-    velocities; positions found; the way to them; the direction that the rows determine least; a displacement; a row;
-    the results of `factor_gram` at the positions found, and at NEW.
+    The generated code writes C, C_t (n_rows each) and the entries of G. Then follow a vector of the rows (n_rows);
+    changes of positions or velocities, the positions found, the change from the guess to them, the weakest direction,
+    the displacement of another guess, and a row of G (n each); and the results of `factor_gram` at the positions found,
+    and at NEW. The weakest direction is that which the rows determine least.
     """
     G = 2 * n_rows
     x = G + n_entries
     change = x + n_rows
     found = change + n
-    moved = found + n
-    weakest = moved + n
-    way = weakest + n
-    row = way + n
-    there = row + n
+    correction = found + n
+    weakest = correction + n
+    displacement = weakest + n
+    row = displacement + n
+    at_found = row + n
     size = n_entries + n_rows * (1 + n_rows + n_redundant) + 1
-    return G, x, change, found, moved, weakest, way, row, there, there + size, there + 2 * size
+    return G, x, change, found, correction, weakest, displacement, row, at_found, at_found + size, at_found + 2 * size
 
 
 _places = merged(places_of_starts)
 
 
 @merged
-def _largest(work, place, count, k):
+def _largest(work, offset, count, k):
+    """Return the largest absolute value of `count` numbers in lane k; NaN if one of them is NaN."""
     largest = 0.0
     for j in range(count):
-        size = abs(work[(place + j) * LANES + k])
-        largest = largest if size <= largest else size  # keeps NaN
+        size = abs(work[(offset + j) * LANES + k])
+        largest = largest if size <= largest else size  # NaN remains NaN
     return largest
 
 
 @merged
 def _constraints_hold(work, pattern, n, n_rows, C, G, new, k):
-    """Return whether each constraint holds up to the rounding of its terms."""
+    """Return whether every constraint holds in lane k, up to rounding errors of its terms."""
     allowed = AT_ROUNDING * np.finfo(np.float64).eps * _largest(work, new, n, k)
     for i in range(n_rows):
         off, terms = abs(work[(C + i) * LANES + k]), 0.0
@@ -258,11 +276,11 @@ def _constraints_hold(work, pattern, n, n_rows, C, G, new, k):
 
 @compiled
 def _gauss_newton(code, settings, control, pattern, moves, work):
-    """Move NEW onto the constraints by steps of least change; RUNNING remains 1 in lanes where that converges."""
+    """Project the positions of NEW onto the constraints by steps of least change; clear RUNNING on divergence."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = places_of(n, n_rows, settings[N_NUMBERS])
-    G, x, change, _, _, _, _, row, _, here, _ = _places(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
-    G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + here
+    G, x, change, _, _, _, _, row, _, at_new, _ = _places(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
+    G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + at_new
     for k in range(LANES):
         work[LEFT_TO_MOVE * LANES + k] = work[RUNNING * LANES + k]
     for _ in range(MOST_ITERATIONS):
@@ -280,7 +298,7 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
                 continue
             for j in range(n):
                 work[(new + j) * LANES + k] += work[(change + j) * LANES + k]
-            # check after the change, so that it is applied to the last bit
+            # the last change is applied, too, so that the result is as accurate as possible
             if _constraints_hold(work, pattern, n, n_rows, memory, G, new, k):
                 work[LEFT_TO_MOVE * LANES + k] = 0.0
             else:
@@ -294,11 +312,11 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
 
 @compiled
 def _change_velocities(code, settings, control, pattern, moves, work):
-    """Project velocities of NEW onto the rows at its positions; the factors of the rows are kept."""
+    """Project the velocities of NEW, so that C_q v + C_t = 0; store the factors for its positions."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = places_of(n, n_rows, settings[N_NUMBERS])
-    G, x, change, _, _, _, _, row, there, _, _ = _places(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
-    G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + there
+    G, x, change, _, _, _, _, row, at_found, _, _ = _places(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
+    G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + at_found
     fill_field(work, FINE, 1.0)
     code.rows(0, control, work)
     factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors)
@@ -317,8 +335,11 @@ def _change_velocities(code, settings, control, pattern, moves, work):
 
 
 @compiled
-def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, moved, weakest):
-    """Find the direction that rows determine least, as long as the way of the guess; clear RUNNING if rows depend."""
+def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, correction, weakest):
+    """Compute the direction that the rows determine least, as long as the change that the projection has made.
+
+    Clear RUNNING in lanes with dependent rows.
+    """
     spare = factors + pattern[n_rows] - pattern[0] + n_rows * (1 + n_rows + n_redundant)
     for i in range(n_rows):
         fill_field(work, x + i, 0.5 + (GOLDEN * (i + 1)) % 1.0)
@@ -328,41 +349,41 @@ def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, m
     normalise(work, x, n_rows, spare)
     least = SINGULAR if n_redundant == 0 else WEAK * n_rows
     for k in range(LANES):
-        if not work[spare * LANES + k] > least:  # `spare` is the smallest eigenvalue
+        if not work[spare * LANES + k] > least:  # now `spare` is the smallest eigenvalue
             work[RUNNING * LANES + k] = 0.0
-        share = _largest(work, moved, n, k) / max(_largest(work, weakest, n, k), LEAST)
+        share = _largest(work, correction, n, k) / max(_largest(work, weakest, n, k), LEAST)
         for j in range(n):
             work[(weakest + j) * LANES + k] *= share
 
 
 @compiled
 def _compare_with_other_starts(code, settings, control, pattern, moves, work):
-    """Clear RUNNING where other guesses, about as far away, do not end where C_q at FOUND predicts."""
+    """Clear RUNNING in lanes in which the projections of other, similarly distant guesses are not as C_q predicts."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = places_of(n, n_rows, settings[N_NUMBERS])
-    _, x, change, found, moved, weakest, way, _, there, _, _ = _places(
+    _, x, change, found, correction, weakest, displacement, _, at_found, _, _ = _places(
         n, n_rows, pattern[n_rows] - pattern[0], n_redundant
     )
-    x, change, found, moved = memory + x, memory + change, memory + found, memory + moved
-    weakest, way, factors = memory + weakest, memory + way, memory + there
-    _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, moved, weakest)
+    x, change, found, correction = memory + x, memory + change, memory + found, memory + correction
+    weakest, displacement, factors = memory + weakest, memory + displacement, memory + at_found
+    _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, correction, weakest)
     for own, other in OTHER_GUESSES:
         for j in range(n * LANES):
-            off = own * work[moved * LANES + j] + other * work[weakest * LANES + j]
-            work[way * LANES + j], work[new * LANES + j] = off, work[found * LANES + j] + off
+            off = own * work[correction * LANES + j] + other * work[weakest * LANES + j]
+            work[displacement * LANES + j], work[new * LANES + j] = off, work[found * LANES + j] + off
         _gauss_newton(code, settings, control, pattern, moves, work)
         for i in range(n_rows):
             fill_field(work, x + i, 0.0)
-            subtract_row(work, x + i, factors, pattern, i, way)
-        # the part of the way that is normal to the constraints
+            subtract_row(work, x + i, factors, pattern, i, displacement)
+        # the component of the displacement that is normal to the constraints
         along_rows(work, pattern, n, n_rows, n_redundant, factors, x, change)
         for k in range(LANES):
             apart, rounding = 0.0, AT_ROUNDING * np.finfo(np.float64).eps * _largest(work, found, n, k)
             for j in range(n):
                 m = j * LANES + k
-                expected = work[found * LANES + m] + work[way * LANES + m] - work[change * LANES + m]
+                expected = work[found * LANES + m] + work[displacement * LANES + m] - work[change * LANES + m]
                 apart = max(apart, abs(work[new * LANES + m] - expected))
-            if not apart <= MAX_CURVATURE * _largest(work, way, n, k) + rounding:
+            if not apart <= MAX_CURVATURE * _largest(work, displacement, n, k) + rounding:
                 work[RUNNING * LANES + k] = 0.0
 
 
@@ -371,13 +392,14 @@ _START = types.void(CODE, INTEGERS, VECTOR, *[INTEGERS] * 2, *[types.float64[:, 
 
 @kernel(_START, vectorized=True)
 def start_lanes(code, settings, control, pattern, moves, numbers, q, v, fine, work):
-    """Project states, one for each row of `numbers`, onto the constraints at t0, in place; `fine`: 1 on success.
+    """Project states (q, v), one for each row of `numbers`, onto the constraints at t0.
 
-    pattern : columns of the entries of G, see above. moves : (n,) 1 for coordinates that may move.
+    Overwrites q and v (n_runs, n); `fine` (n_runs,) becomes 1 where this succeeds, otherwise 0. pattern : see above;
+    moves : (n,) 1 for coordinates that may change; numbers : data of the generated code.
     """
     n, n_rows, n_redundant, n_runs = settings[N], settings[N_ROWS], settings[N_REDUNDANT], numbers.shape[0]
     _, new, _, _, _, _, own, memory = places_of(n, n_rows, numbers.shape[1])
-    _, _, _, found, moved, _, _, row, _, _, _ = _places(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
+    _, _, _, found, correction, _, _, row, _, _, _ = _places(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
     fill_field(work, AHEAD, control[T0])
     for j in range(n):
         fill_field(work, memory + row + j, 0.0)
@@ -395,7 +417,7 @@ def start_lanes(code, settings, control, pattern, moves, numbers, q, v, fine, wo
         for k in range(LANES):
             run = min(first + k, n_runs - 1)
             for j in range(n):
-                work[(memory + moved + j) * LANES + k] = work[(new + j) * LANES + k] - q[run, j]
+                work[(memory + correction + j) * LANES + k] = work[(new + j) * LANES + k] - q[run, j]
         _compare_with_other_starts(code, settings, control, pattern, moves, work)
         for k in range(min(LANES, n_runs - first)):
             fine[first + k] = int(work[RUNNING * LANES + k])
@@ -409,7 +431,7 @@ TABLE, STATES = types.float64[:, ::1], types.float64[:, :, ::1]
 
 @compiled
 def _relative_residual(value, allowed):
-    """Return a residual relative to its allowed size."""
+    """Return |value| / allowed; 0 if the value is zero, infinity if it is not finite or nothing is allowed."""
     if not np.isfinite(value):
         return np.inf
     if value == 0.0:
@@ -418,33 +440,39 @@ def _relative_residual(value, allowed):
 
 
 @kernel(types.void(KIT, INTEGERS, f8, f8, f8, INTEGERS, TABLE, STATES, STATES, TABLE, VECTOR, VECTOR))
-def motion_residuals(f, sizes, t, share, atol, runs, parameters, states_q, states_v, ends, room, worst):
-    """Compute each run's largest residual of C = 0, C_q v + C_t = 0, C_q a = gamma, M a + C_q^T lam = Q over `share`.
+def motion_residuals(f, sizes, t, share, atol, runs, parameters, states_q, states_v, ends, scratch, worst):
+    """Compute the largest residual of the equations at the end of each run, relative to the allowed residual.
 
-    `share` is relative to the terms of a row; positions and velocities may also be off by `atol`.
-    runs : index of the run of each row, -1: the row is left out; parameters : of all runs, (., n_p), stored in p from
-    index sizes[2] on; states_q, states_v : (n_rows, n, n_t), of which the last time counts; ends : (n_rows, n + n_c), a
-    and lam; room : (n (n + 3) + n_c (n + 3),).
+    The equations are C = 0, C_q v + C_t = 0, C_q a = gamma and M a + C_q^T lam = Q. The allowed residual is `share`
+    times the terms of the equation, and for the constraints also the effect of errors `atol` of coordinates and
+    velocities. runs : (n_rows,) index of the run of each row, or -1 to omit the row; parameters : (n_runs, n_p) those
+    of all runs, which are stored in p from index sizes[2] on; states_q, states_v : (n_rows, n, n_t), of which the last
+    time is used; ends : (n_rows, n + n_c) a and lam; scratch : (n (n + 3) + n_c (n + 3),) overwritten; worst :
+    (n_rows,) results.
     """
     n, n_c, first = sizes[0], sizes[1], sizes[2]
-    M, Q = room[: n * n].reshape((n, n)), room[n * n : n * n + n]
-    place = n * n + n
-    G = room[place : place + n_c * n].reshape((n_c, n))
-    place += n_c * n
-    C, rate, gamma = room[place : place + n_c], room[place + n_c : place + 2 * n_c], room[place + 2 * n_c :][:n_c]
-    place += 3 * n_c
-    q, v, last = room[place : place + n], room[place + n : place + 2 * n], states_q.shape[2] - 1
+    M, Q = scratch[: n * n].reshape((n, n)), scratch[n * n : n * n + n]
+    offset = n * n + n
+    G = scratch[offset : offset + n_c * n].reshape((n_c, n))
+    offset += n_c * n
+    C, rate, gamma = (
+        scratch[offset : offset + n_c],
+        scratch[offset + n_c : offset + 2 * n_c],
+        scratch[offset + 2 * n_c :][:n_c],
+    )
+    offset += 3 * n_c
+    q, v, last = scratch[offset : offset + n], scratch[offset + n : offset + 2 * n], states_q.shape[2] - 1
     gamma_given = f.flags[GAMMA_GIVEN] == 1
     for k in range(runs.size):
         if runs[k] < 0:
             continue
-        room[:] = 0.0
+        scratch[:] = 0.0
         for j in range(parameters.shape[1]):
             f.p[first + j] = parameters[runs[k], j]
-        far, fast, largest = 0.0, 0.0, 0.0
+        largest_q, largest_v, largest = 0.0, 0.0, 0.0
         for j in range(n):
             q[j], v[j] = states_q[k, j, last], states_v[k, j, last]
-            far, fast = max(far, abs(q[j])), max(fast, abs(v[j]))
+            largest_q, largest_v = max(largest_q, abs(q[j])), max(largest_v, abs(v[j]))
         a, lam = ends[k, :n], ends[k, n:]
         f.mass(t, q, f.p, M)
         f.force(t, q, v, f.p, Q)
@@ -460,8 +488,8 @@ def motion_residuals(f, sizes, t, share, atol, runs, parameters, states_q, state
                 faster += G[i, j] * v[j]
                 off += G[i, j] * a[j]
                 terms += abs(G[i, j] * a[j])
-            largest = max(largest, _relative_residual(C[i], row * (share * far + atol)))
-            largest = max(largest, _relative_residual(faster, row * (share * fast + atol) + share * abs(rate[i])))
+            largest = max(largest, _relative_residual(C[i], row * (share * largest_q + atol)))
+            largest = max(largest, _relative_residual(faster, row * (share * largest_v + atol) + share * abs(rate[i])))
             if gamma_given:
                 largest = max(largest, _relative_residual(off, share * terms + row * atol))
         size, apart = 0.0, 0.0
@@ -480,28 +508,31 @@ def motion_residuals(f, sizes, t, share, atol, runs, parameters, states_q, state
 
 
 @kernel(types.void(KIT, INTEGERS, f8, f8, TABLE, TABLE, TABLE, VECTOR, VECTOR))
-def constraint_residuals(f, sizes, t, slow, parameters, q, v, room, worst):
-    """Compute each state's largest |C| and |C_q v + C_t|, relative to the row of |C_q| and the largest entry of q or v.
+def constraint_residuals(f, sizes, t, slow, parameters, q, v, scratch, worst):
+    """Compute the largest relative residual of C = 0 and C_q v + C_t = 0 for each state (row of q and v), into `worst`.
 
-    slow : smallest speed by which velocities are divided, so that a state at rest has a scale; room : (n_c (n + 2),).
+    Residuals are relative to the sum of a row of |C_q| times the largest entry of q or v. slow : lower bound of the
+    largest velocity in this scale, for states at rest; scratch : (n_c (n + 2),) overwritten.
     """
     n, n_c, first = sizes[0], sizes[1], sizes[2]
-    C, rate, G = room[:n_c], room[n_c : 2 * n_c], room[2 * n_c :].reshape((n_c, n))
+    C, rate, G = scratch[:n_c], scratch[n_c : 2 * n_c], scratch[2 * n_c :].reshape((n_c, n))
     for k in range(q.shape[0]):
-        room[:] = 0.0
+        scratch[:] = 0.0
         for j in range(parameters.shape[1]):
             f.p[first + j] = parameters[k, j]
         f.constraint(t, q[k], f.p, C)
         f.jacobian(t, q[k], f.p, G)
         f.constraint_rate(t, q[k], f.p, rate)
-        far, fast, worst[k] = 0.0, slow, 0.0
+        largest_q, largest_v, worst[k] = 0.0, slow, 0.0
         for j in range(n):
-            far, fast = max(far, abs(q[k, j])), max(fast, abs(v[k, j]))
+            largest_q, largest_v = max(largest_q, abs(q[k, j])), max(largest_v, abs(v[k, j]))
         for i in range(n_c):
             row, faster = 0.0, rate[i]
             for j in range(n):
                 row += abs(G[i, j])
                 faster += G[i, j] * v[k, j]
             worst[k] = max(
-                worst[k], _relative_residual(C[i], row * far), _relative_residual(faster, row * fast + abs(rate[i]))
+                worst[k],
+                _relative_residual(C[i], row * largest_q),
+                _relative_residual(faster, row * largest_v + abs(rate[i])),
             )
