@@ -58,9 +58,9 @@ def read_trusted(path: Path) -> bytes:
         If there is no file. `Untrusted`, with a warning on stderr, if another user could have written the file.
     """
     with path.open("rb") as file:
-        if why := _reason_of_mode(os.fstat(file.fileno())):
-            _warn_first(f"twoloop: {path} {why}, and is not loaded but compiled again. {ADVICE}")
-            raise Untrusted(f"{path} {why}")
+        if reason := _reason_of_mode(os.fstat(file.fileno())):
+            _warn_first(f"twoloop: {path} {reason}, and is not loaded but compiled again. {ADVICE}")
+            raise Untrusted(f"{path} {reason}")
         return file.read()
 
 
@@ -84,14 +84,14 @@ def trusted_folder(folder: Path) -> Path:
     The replacement is in the user's cache folder. If others can write this folder, too, it is a temporary folder of
     this process.
     """
-    why = reason_to_distrust(folder)
-    if not why:
+    reason = reason_to_distrust(folder)
+    if not reason:
         return folder
     subfolder = f"{folder.name}_{hashlib.sha256(str(folder).encode()).hexdigest()[:16]}"
     replacement = Path(AppDirs(appname="twoloop", appauthor=False).user_cache_dir) / "code" / subfolder
     if reason_to_distrust(replacement):
         replacement = Path(_temporary_folder()) / subfolder
-    _warn_first(f"twoloop: no code is loaded from {folder}: {why}. It is kept in {replacement} instead. {ADVICE}")
+    _warn_first(f"twoloop: no code is loaded from {folder}: {reason}. It is kept in {replacement} instead. {ADVICE}")
     return replacement
 
 
@@ -109,9 +109,9 @@ def reason_to_distrust(folder: Path) -> str:
             return f"{each} cannot be examined ({error.strerror})"
         # in a sticky folder only the owner of an entry can replace it
         sticky = each != real and status.st_mode & stat.S_ISVTX
-        why = _reason_of_owner(status) if sticky else _reason_of_mode(status)
-        if why:
-            return f"{each} {why}"
+        reason = _reason_of_owner(status) if sticky else _reason_of_mode(status)
+        if reason:
+            return f"{each} {reason}"
     return ""
 
 
@@ -119,8 +119,8 @@ def _reason_of_mode(status: os.stat_result) -> str:
     """Return why another user can write a file or folder with this status, or "" if nobody can."""
     if os.name != "posix":
         return ""
-    if why := _reason_of_owner(status):
-        return why
+    if reason := _reason_of_owner(status):
+        return reason
     if status.st_mode & stat.S_IWOTH:
         return f"can be written by everybody (mode {stat.S_IMODE(status.st_mode):o})"
     if status.st_mode & stat.S_IWGRP and not _is_private_group(status.st_gid):
@@ -143,8 +143,8 @@ def _is_private_group(gid: int) -> bool:
         user, group = pwd.getpwuid(os.geteuid()), grp.getgrgid(gid)
     except KeyError:  # a user without an entry, as in containers
         return False
-    own = gid == 0 or (gid == user.pw_gid and group.gr_name == user.pw_name)
-    return own and set(group.gr_mem) <= {"root", user.pw_name}
+    is_own = gid == 0 or (gid == user.pw_gid and group.gr_name == user.pw_name)
+    return is_own and set(group.gr_mem) <= {"root", user.pw_name}
 
 
 _temporary: list[tempfile.TemporaryDirectory[str]] = []
@@ -194,7 +194,7 @@ class CodeFiles:
         finally:
             unfinished.unlink(missing_ok=True)
         if self.limited:
-            for old in sorted(self._all(), key=_time_written)[:-MAX_ON_DISK]:
+            for old in sorted(self._all_files(), key=_time_written)[:-MAX_ON_DISK]:
                 old.unlink(missing_ok=True)
 
     def has(self, key: Any) -> bool:
@@ -214,10 +214,10 @@ class CodeFiles:
 
     def flush(self) -> None:
         """Remove the files of all keys."""
-        for path in self._all():
+        for path in self._all_files():
             path.unlink(missing_ok=True)
 
-    def _all(self) -> list[Path]:
+    def _all_files(self) -> list[Path]:
         """Return the files of all keys."""
         return list(self.folder.glob(f"{glob.escape(self.name)}.*.nbc"))
 
@@ -355,9 +355,9 @@ class _Cache(FunctionCache):
                 make_trusted_folder(Path(chosen, _LOCATOR.get_suitable_cache_subpath(inspect.getfile(function))))
         super().__init__(function)
         source = self._cache_file._source_stamp
-        own = trusted_folder(Path(self._cache_path))
-        self._cache_path = str(own)
-        self._cache_file = CodeFiles(own, self._impl.filename_base, (source, stamp))
+        folder = trusted_folder(Path(self._cache_path))
+        self._cache_path = str(folder)
+        self._cache_file = CodeFiles(folder, self._impl.filename_base, (source, stamp))
         self._key, self._announcement = key, announcement
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:

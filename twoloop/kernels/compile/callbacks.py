@@ -174,7 +174,7 @@ class Kind:
         return self._signature(VECTOR)
 
     @property
-    def reading(self) -> Any:
+    def read_only_signature(self) -> Any:
         """Return the signature that numba compiles, in which all arrays except for the outputs are read-only."""
         return self._signature(READ)
 
@@ -352,11 +352,11 @@ def callback(kind: str, allocates: bool = True) -> Callable[[Callable[..., None]
         raise ValueError(f"kind must be one of {', '.join(KINDS)}; given {kind!r}")
 
     def decorate(function: Callable[..., None]) -> Dispatcher:
-        wanted, given = KINDS[kind].arguments, tuple(inspect.signature(function).parameters)
-        if given != wanted:
+        expected, given = KINDS[kind].arguments, tuple(inspect.signature(function).parameters)
+        if given != expected:
             raise TypeError(
                 f"{function.__name__} is declared as the callback {kind!r}, whose arguments are "
-                f"({', '.join(wanted)}); it has ({', '.join(given)})"
+                f"({', '.join(expected)}); it has ({', '.join(given)})"
             )
         return compile_callback(kind, function, digests_of(function), allocates=allocates)
 
@@ -390,16 +390,16 @@ def compile_callback(
     if watched is not None:
         watched = f"{watched[0]} {options}", watched[1]
     try:
-        made = compile_cached(compiled, KINDS[kind].reading, watched, **options)
+        dispatcher = compile_cached(compiled, KINDS[kind].read_only_signature, watched, **options)
     except Exception as error:  # numba lets some of its own assertions through
-        made = _compile_writable(kind, compiled, watched, named or function, error, options)
+        dispatcher = _compile_writable(kind, compiled, watched, named or function, error, options)
     else:
-        add_signature(made, KINDS[kind].signature)
+        add_signature(dispatcher, KINDS[kind].signature)
     if watched is not None:
         # the digest of this compilation: values that the function uses may change later
-        register_digest(made, f"{kind} {watched}")
-    frozen_values(made, function)
-    return made
+        register_digest(dispatcher, f"{kind} {watched}")
+    frozen_values(dispatcher, function)
+    return dispatcher
 
 
 def _compile_writable(
@@ -412,13 +412,13 @@ def _compile_writable(
 ) -> Dispatcher:
     """Compile a function whose helpers require writable arrays; raise TypeError if it writes to its own arguments."""
     try:
-        made = compile_cached(function, KINDS[kind].signature, watched, **options)
+        dispatcher = compile_cached(function, KINDS[kind].signature, watched, **options)
     except Exception as second_error:
         raise TypeError(_failure_message(kind, named, second_error)) from None
     if _ONLY_A_HELPER.search(plain := _without_colours(error)) and "setitem" not in plain:
-        return made
+        return dispatcher
     raise TypeError(
-        f"{kind}: the function {_described(named)} must not change the arrays that it is given "
+        f"{kind}: the function {_describe(named)} must not change the arrays that it is given "
         f"({', '.join([*KINDS[kind].state, 'p'])}), which are those of the run. Copy first\n"
         f"Numba says: {_informative_line(error)}"
     ) from None
@@ -448,13 +448,13 @@ def zero_callback(kind: str) -> Dispatcher:
 def _failure_message(kind: str, function: Callable[..., Any], error: Exception) -> str:
     """Return the message for a function that numba cannot compile, with a line of numba's message."""
     return (
-        f"{kind}: numba cannot compile the function {_described(function)}; it must use numbers, numpy arrays of one "
+        f"{kind}: numba cannot compile the function {_describe(function)}; it must use numbers, numpy arrays of one "
         f"type and of the shape that {kind} asks for, and functions that numba knows (helpers need numba.njit)\n"
         f"Numba says: {_informative_line(error)}"
     )
 
 
-def _described(function: Callable[..., Any]) -> str:
+def _describe(function: Callable[..., Any]) -> str:
     """Return the name of a function with its file and line."""
     name, code = getattr(function, "__name__", "?"), getattr(function, "__code__", None)
     return f"{name!r} ({code.co_filename}, line {code.co_firstlineno})" if code else repr(name)

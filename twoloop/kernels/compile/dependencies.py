@@ -153,7 +153,7 @@ def names_of_code(code: types.CodeType) -> set[str]:
 
 def globals_of(function: Any) -> dict[str, Any]:
     """Return the globals that a function and functions within it load, by name; of `math.log` this is `math` only."""
-    names = {each.name for each in _loads(function.__code__) if not each.free} & set(function.__globals__)
+    names = {each.name for each in _loaded_names(function.__code__) if not each.free} & set(function.__globals__)
     return {name: function.__globals__[name] for name in sorted(names)}
 
 
@@ -209,7 +209,7 @@ class FrozenValue(NamedTuple):
     value: Any
 
 
-class _Loaded(NamedTuple):
+class _LoadedName(NamedTuple):
     """Global or closure variable (`free`) that a code object loads, and the attributes then loaded from its value."""
 
     free: bool
@@ -225,12 +225,12 @@ def frozen_values(compiled: Any, function: Any = None) -> list[tuple[FrozenValue
     """
     found: list[tuple[FrozenValue, bytes | None]] | None = getattr(compiled, FROZEN_VALUES, None)
     if found is None:
-        found = [(each, _content(each.value)) for each in frozen_locations(function or compiled.py_func)]
+        found = [(each, _array_bytes(each.value)) for each in frozen_locations(function or compiled.py_func)]
         setattr(compiled, FROZEN_VALUES, found)
     return found
 
 
-def _content(value: Any) -> bytes | None:
+def _array_bytes(value: Any) -> bytes | None:
     """Return the bytes of an array, None for other values."""
     return value.tobytes() if isinstance(value, (np.ndarray, np.void)) else None
 
@@ -244,10 +244,10 @@ def frozen_locations(function: Any, seen: set[int] | None = None) -> Iterator[Fr
     if id(function) in seen:
         return
     seen.add(id(function))
-    ours = is_twoloop(function.__globals__.get("__name__", ""))
+    is_ours = is_twoloop(function.__globals__.get("__name__", ""))
     for found in _direct_locations(function):
-        for location in _with_items(found, seen):
-            if not ours and _is_frozen(location.value):
+        for location in _value_and_items(found, seen):
+            if not is_ours and _is_frozen(location.value):
                 yield location
             helper = python_function(location.value)
             if helper is not None:
@@ -276,7 +276,7 @@ def _is_frozen(value: Any) -> bool:
     return isinstance(value, kinds) or callable(value)
 
 
-def _with_items(location: FrozenValue, seen: set[int]) -> Iterator[FrozenValue]:
+def _value_and_items(location: FrozenValue, seen: set[int]) -> Iterator[FrozenValue]:
     """Yield a value, and if it is a tuple, the items in it that can change."""
     yield location
     if not isinstance(location.value, tuple) or id(location.value) in seen:
@@ -286,20 +286,20 @@ def _with_items(location: FrozenValue, seen: set[int]) -> Iterator[FrozenValue]:
     for k, value in enumerate(location.value):
         if isinstance(value, (tuple, np.ndarray, np.void)) or callable(value):  # other items cannot change
             name = f"{location.name}[{k}]" if fields is None else f"{location.name}.{fields[k]}"
-            yield from _with_items(FrozenValue(None, "", name, value), seen)
+            yield from _value_and_items(FrozenValue(None, "", name, value), seen)
 
 
 def _direct_locations(function: FunctionType) -> Iterator[FrozenValue]:
     """Yield the defaults of a function, and its globals and closure variables, with the attributes used of modules."""
-    code, space = function.__code__, function.__globals__
-    last = code.co_varnames[: code.co_argcount][::-1]
-    for name, value in zip(last, (function.__defaults__ or ())[::-1], strict=False):
+    code, namespace = function.__code__, function.__globals__
+    last_arguments = code.co_varnames[: code.co_argcount][::-1]
+    for name, value in zip(last_arguments, (function.__defaults__ or ())[::-1], strict=False):
         yield FrozenValue(None, "", name, value)
     cells: dict[str, CellType] = dict(zip(code.co_freevars, function.__closure__ or (), strict=True))
-    for free, name, attributes in _loads(code):
-        if not free and name not in space:  # a built-in function
+    for free, name, attributes in _loaded_names(code):
+        if not free and name not in namespace:  # a built-in function
             continue
-        holder, value = (cells[name], cells[name].cell_contents) if free else (space, space[name])
+        holder, value = (cells[name], cells[name].cell_contents) if free else (namespace, namespace[name])
         location = FrozenValue(holder, name, name, value)
         yield location
         if isinstance(value, ModuleType) and not is_library(value.__name__):
@@ -314,18 +314,18 @@ def _locations_in_module(location: FrozenValue, attributes: tuple[str, ...], nam
     """
     if not isinstance(location.value, ModuleType) or is_library(location.value.__name__):
         return
-    space = vars(location.value)
-    for attribute in attributes[:1] or sorted(names & set(space)):
-        if attribute in space:
-            inner = FrozenValue(space, attribute, f"{location.name}.{attribute}", space[attribute])
+    namespace = vars(location.value)
+    for attribute in attributes[:1] or sorted(names & set(namespace)):
+        if attribute in namespace:
+            inner = FrozenValue(namespace, attribute, f"{location.name}.{attribute}", namespace[attribute])
             yield inner
             yield from _locations_in_module(inner, attributes[1:], names - {attribute})
 
 
 @lru_cache(MAX_CODES)
-def _loads(code: CodeType) -> tuple[_Loaded, ...]:
+def _loaded_names(code: CodeType) -> tuple[_LoadedName, ...]:
     """Return the globals and closure variables that a code object and the functions within it load."""
-    found: dict[_Loaded, None] = {}
+    found: dict[_LoadedName, None] = {}
     loaded = None
     for each in dis.get_instructions(code):
         if loaded is not None and each.opname in LOADS_ATTRIBUTE:
@@ -334,8 +334,10 @@ def _loads(code: CodeType) -> tuple[_Loaded, ...]:
             if loaded is not None:
                 found[loaded] = None
             free = each.opname == "LOAD_DEREF" and each.argval in code.co_freevars
-            loaded = _Loaded(free, each.argval, ()) if free or each.opname in LOADS_GLOBAL else None
-    inner = [entry for constant in code.co_consts if isinstance(constant, CodeType) for entry in _loads(constant)]
+            loaded = _LoadedName(free, each.argval, ()) if free or each.opname in LOADS_GLOBAL else None
+    inner = [
+        entry for constant in code.co_consts if isinstance(constant, CodeType) for entry in _loaded_names(constant)
+    ]
     found.update((entry, None) for entry in inner if not entry.free or entry.name in code.co_freevars)
     return tuple(found)
 
@@ -354,19 +356,19 @@ class FunctionCopier:
         """Return the replacement of a value, or the value itself; `names` are the attributes replaced in a module."""
         if self.is_copied(value):
             if id(value) not in self.known:
-                self._rewrite(value)
+                self._add_copy(value)
             return self.known[id(value)]
         if type(value) is tuple:
             return tuple(self.value(each, names) for each in value)
         if isinstance(value, types.ModuleType) and not is_library(value.__name__):
-            return self._module(value, names)
+            return self._copy_module(value, names)
         return value
 
     def is_copied(self, value: Any) -> bool:
         """Return whether a value has to be replaced: here, whether it is a compiled helper."""
         return isinstance(value, Dispatcher) or bool(jitable_templates(value))
 
-    def _module(self, module: types.ModuleType, names: frozenset[str]) -> types.ModuleType:
+    def _copy_module(self, module: types.ModuleType, names: frozenset[str]) -> types.ModuleType:
         """Return a copy of a module with replacements of the attributes listed in `names`."""
         key = (id(module), names)
         if key not in self.known:
@@ -377,10 +379,10 @@ class FunctionCopier:
 
     def copy_of(self, function: Any) -> Any:
         """Return the replacement of a function that is not a compiled helper itself."""
-        self._rewrite(function)
+        self._add_copy(function)
         return self.known[id(function)]
 
-    def _rewrite(self, helper: Any) -> None:
+    def _add_copy(self, helper: Any) -> None:
         """Add the replacement of a helper or function to `known`."""
         function = getattr(helper, "py_func", helper)
         own, names = names_of_code(function.__code__), frozenset(reachable_names(function))

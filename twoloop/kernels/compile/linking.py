@@ -55,9 +55,9 @@ def jitable_templates(function: Any) -> list[Any]:
         templates = list(getattr(context.resolve_value_type(function), "templates", ()))
     except ValueError:  # no function that numba supports
         return []
-    sources = [getattr(getattr(each, "_overload_func", None), "__closure__", None) for each in templates]
-    own = [any(cell.cell_contents is function for cell in source or ()) for source in sources]
-    return templates if all(own) else []  # not all: another implementation may replace the function
+    closures = [getattr(getattr(each, "_overload_func", None), "__closure__", None) for each in templates]
+    owned = [any(cell.cell_contents is function for cell in source or ()) for source in closures]
+    return templates if all(owned) else []  # not all: another implementation may replace the function
 
 
 def add_signature(function: Dispatcher, signature: Any) -> None:
@@ -65,13 +65,13 @@ def add_signature(function: Dispatcher, signature: Any) -> None:
 
     The arguments of both signatures must have the same layout in memory.
     """
-    own: Any = function
-    (compiled,) = own.overloads.values()
-    own._insert([each._code for each in signature.args], compiled.entry_point, False)
-    own.overloads[signature.args] = compiled._replace(signature=signature)
-    described = copy(compiled.fndesc)  # read by compiled callers
-    described.argtypes = signature.args
-    own.targetctx.insert_user_function(compiled.entry_point, described, [compiled.library])
+    dispatcher: Any = function
+    (compiled,) = dispatcher.overloads.values()
+    dispatcher._insert([each._code for each in signature.args], compiled.entry_point, False)
+    dispatcher.overloads[signature.args] = compiled._replace(signature=signature)
+    description = copy(compiled.fndesc)  # read by compiled callers
+    description.argtypes = signature.args
+    dispatcher.targetctx.insert_user_function(compiled.entry_point, description, [compiled.library])
 
 
 def options_of(helper: Any) -> dict[str, Any]:
@@ -98,13 +98,15 @@ def _resolve_index(context: Any, builder: Any, kind: Any, index: Any, size: Any)
 _numba_indexing: Any = arrayobj.basic_indexing
 
 
-def _indexing(context: Any, builder: Any, kind: Any, array: Any, index_types: Any, indices: Any, **options: Any) -> Any:
+def _element_address(
+    context: Any, builder: Any, kind: Any, array: Any, index_types: Any, indices: Any, **options: Any
+) -> Any:
     """Emit code for the address of an element of a contiguous array, without the code that only slices need.
 
     All other indexing is left to numba.
     """
-    of_element = len(indices) == kind.ndim and all(isinstance(each, types.Integer) for each in index_types)
-    if kind.layout != "C" or not of_element or options.get("boundscheck"):
+    is_element = len(indices) == kind.ndim and all(isinstance(each, types.Integer) for each in index_types)
+    if kind.layout != "C" or not is_element or options.get("boundscheck"):
         return _numba_indexing(context, builder, kind, array, index_types, indices, **options)
     sizes = cgutils.unpack_tuple(builder, array.shape, kind.ndim)
     given = zip(index_types, indices, sizes, strict=True)
@@ -118,20 +120,20 @@ _call_types: dict[Any, tuple[Any, Any]] = {}
 _options: dict[int, tuple[Any, str]] = {}
 
 
-def _text_of(options: Any) -> str:
+def _options_text(options: Any) -> str:
     """Return numba's options of a compilation as text, cached."""
     if id(options) not in _options:
         _options[id(options)] = options, repr(options and options._values)
     return _options[id(options)][1]
 
 
-def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
+def _cached_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
     """Return the signature of a call of a function that numba implements, cached by types and options.
 
     Without this cache, numba tries all implementations of an operator at each call, which takes a tenth of a
     compilation.
     """
-    key = self, args, tuple(kws.items()), _text_of(ConfigStack.top_or_none())
+    key = self, args, tuple(kws.items()), _options_text(ConfigStack.top_or_none())
     if key not in _call_types:
         signature = _numba_call_type(self, context, args, kws)
         _call_types[key] = signature, self._impl_keys[signature.args]
@@ -143,7 +145,7 @@ _numba_size: Any = BaseContext.get_abi_sizeof
 _sizes: dict[str, int] = {}
 
 
-def _size_of(self: Any, kind: Any) -> Any:
+def _cached_size(self: Any, kind: Any) -> Any:
     """Return the size of a type, cached; numba would let LLVM parse a module for each variable."""
     name = str(kind)
     if name not in _sizes:
@@ -155,7 +157,7 @@ _numba_inlined_passes: Any = InlineWorker.run_untyped_passes
 _inlined: dict[Any, Any] = {}
 
 
-def _inlined_code(self: Any, function: Any, enable_ssa: bool = False) -> Any:
+def _cached_inlined_code(self: Any, function: Any, enable_ssa: bool = False) -> Any:
     """Return the intermediate code of an inlined function, cached; numba would analyse the function at each call."""
     if (function, enable_ssa) not in _inlined:
         _inlined[function, enable_ssa] = _numba_inlined_passes(self, function, enable_ssa)
@@ -202,22 +204,22 @@ def _load_registries_once(self: Any) -> None:
 _LOCKS = ("numba:llvm_lock", "numba:compiler_lock")
 
 
-def _ignoring_locks(report: Any) -> Any:
+def _without_lock_events(report: Any) -> Any:
     """Return a function that reports events, except for those of locks: there are thousands of them for each kernel."""
     return lambda kind, *args, **named: None if kind in _LOCKS else report(kind, *args, **named)
 
 
 # numba's functions that are replaced: owner, name and replacement
 _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
-    (Function, "get_call_type", _call_type),
+    (Function, "get_call_type", _cached_call_type),
     (arrayobj, "fix_integer_index", _resolve_index),
-    (arrayobj, "basic_indexing", _indexing),
-    (BaseContext, "get_abi_sizeof", _size_of),
-    (InlineWorker, "run_untyped_passes", _inlined_code),
+    (arrayobj, "basic_indexing", _element_address),
+    (BaseContext, "get_abi_sizeof", _cached_size),
+    (InlineWorker, "run_untyped_passes", _cached_inlined_code),
     (ir.Inst, "_rec_list_vars", _variables),
     (CPUContext, "load_additional_registries", _load_registries_once),
-    (event, "start_event", _ignoring_locks(event.start_event)),
-    (event, "end_event", _ignoring_locks(event.end_event)),
+    (event, "start_event", _without_lock_events(event.start_event)),
+    (event, "end_event", _without_lock_events(event.end_event)),
 ]
 _NONE = object()  # stands for an attribute that an owner does not have
 _depth = [0]  # number of nested compilations of kernels

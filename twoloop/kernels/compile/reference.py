@@ -25,7 +25,7 @@ from twoloop.kernels.compile.linking import machine_code
 _REFERENCES: dict[str, Any] = {}  # all references by name
 
 
-def _reference(name: str) -> Any:
+def _reference_named(name: str) -> Any:
     """Return the only `Reference` of this name; pickle calls this function, so that it never creates a second one."""
     return _REFERENCES[name]
 
@@ -60,7 +60,7 @@ class Reference(types.Type):
             self.n_words += 1 + kind.ndim
 
     def __reduce__(self) -> Any:
-        return _reference, (self.name,)
+        return _reference_named, (self.name,)
 
     def __repr__(self) -> str:
         """Return the name and a digest of the layout; the keys of machine code on disk contain this text."""

@@ -80,19 +80,19 @@ def _history(work, k):
 @compiled
 def _first_step(options, control, work, n, state, a, k):
     """Return the first step, s: options[FIRST] times the shortest time scale of the motion of lane k at t0."""
-    far, fast, sharp, least = 0.0, 0.0, 0.0, np.inf
+    largest_q, largest_v, largest_a, least = 0.0, 0.0, 0.0, np.inf
     for j in range(n):
-        far = max(far, abs(work[(state + j) * LANES + k]))
-        fast = max(fast, abs(work[(state + n + j) * LANES + k]))
-        sharp = max(sharp, abs(work[(a + j) * LANES + k]))
+        largest_q = max(largest_q, abs(work[(state + j) * LANES + k]))
+        largest_v = max(largest_v, abs(work[(state + n + j) * LANES + k]))
+        largest_a = max(largest_a, abs(work[(a + j) * LANES + k]))
         least = min(least, control[ATOL + j])
-    far, scale = max(far, least), control[T1] - control[T0]
-    if fast > 0.0:
-        scale = min(scale, far / fast)
-    if sharp > 0.0:
-        scale = min(scale, np.sqrt(far / sharp))
-    if fast > 0.0 and sharp > 0.0 and fast / sharp > options[FIRST] * scale:
-        scale = min(scale, fast / sharp)
+    largest_q, scale = max(largest_q, least), control[T1] - control[T0]
+    if largest_v > 0.0:
+        scale = min(scale, largest_q / largest_v)
+    if largest_a > 0.0:
+        scale = min(scale, np.sqrt(largest_q / largest_a))
+    if largest_v > 0.0 and largest_a > 0.0 and largest_v / largest_a > options[FIRST] * scale:
+        scale = min(scale, largest_v / largest_a)
     return max(options[FIRST] * scale, RESOLVED * abs(control[T0]))
 
 
@@ -117,8 +117,8 @@ def choose_steps(work, control, status, n_steps):
     for k in range(LANES):
         work[H * LANES + k], t = 0.0, work[T * LANES + k]
         if work[RUNNING * LANES + k] == 1.0:
-            wanted = min(work[H_NEXT * LANES + k], work[H_LIMIT * LANES + k], control[GAP])
-            h, left = wanted, t1 - t
+            h_wanted = min(work[H_NEXT * LANES + k], work[H_LIMIT * LANES + k], control[GAP])
+            h, left = h_wanted, t1 - t
             if h >= left * (1.0 - ROUNDING_OF_END):
                 h = left
             elif h > 0.5 * left:
@@ -126,7 +126,7 @@ def choose_steps(work, control, status, n_steps):
             if n_steps[int(work[RUN * LANES + k])] >= MOST_STEPS:
                 leave_run(work, status, k, MANY_STEPS)
             elif h > SHORTEST * max(abs(t), abs(t1)):
-                work[H * LANES + k], work[H_FREE * LANES + k] = h, wanted
+                work[H * LANES + k], work[H_FREE * LANES + k] = h, h_wanted
             else:
                 failed = work[H_LIMIT * LANES + k] < np.inf and work[LIMIT_AGE * LANES + k] == 0.0
                 leave_run(work, status, k, NO_VALUES if failed else OFTEN_REFUSED)

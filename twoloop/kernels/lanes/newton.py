@@ -182,16 +182,16 @@ def find_derivatives(code, settings, control, c, work):
 
 
 @compiled
-def factor_systems_of_lanes(settings, own, s, work):
-    """Factor I - (X l)^2 J_q - X l J_v for each eigenvalue l, or pair, of A; `own`: the options of the method."""
+def factor_systems_of_lanes(settings, method_options, s, work):
+    """Factor I - (X l)^2 J_q - X l J_v for each eigenvalue l of A, or pair of eigenvalues."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
-    n_systems, offset = count_eigenvalues(own, s), eigen_offset(s)
-    n_real = int(own[offset + N_REAL])
+    n_systems, offset = count_eigenvalues(method_options, s), eigen_offset(s)
+    n_real = int(method_options[offset + N_REAL])
     offset += N_EIGEN_SCALARS + s
     by_q, by_v = matrix_at(memory, n, s, BY_Q), matrix_at(memory, n, s, BY_V)
     for system in range(n_systems):
-        re, im = own[offset], own[offset + 1]
+        re, im = method_options[offset], method_options[offset + 1]
         offset += 2 + 4 * s
         matrix, apart = matrix_at(memory, n, s, SYSTEMS + 2 * system), n * n * LANES
         for i in range(n * n):
@@ -220,12 +220,12 @@ def predict_stages(settings, c, work, begins):
     for k in range(LANES):
         before = work[(memory + H_PREVIOUS) * LANES + k]
         ratio = work[X * LANES + k] / before if before > 0.0 else np.inf
-        known = 1.0 if ratio <= MAX_STEP_RATIO else 0.0
-        work[(memory + CONSTANT) * LANES + k] = 1.0 - known
+        has_previous = 1.0 if ratio <= MAX_STEP_RATIO else 0.0
+        work[(memory + CONSTANT) * LANES + k] = 1.0 - has_previous
         for j in range(s):
-            theta = begins + ratio * c[j] if known == 1.0 else 0.0
+            theta = begins + ratio * c[j] if has_previous == 1.0 else 0.0
             for i in range(s):
-                product = known
+                product = has_previous
                 for l in range(s):
                     if l != i:
                         product *= (theta - c[l]) / (c[i] - c[l])
@@ -241,24 +241,24 @@ def predict_stages(settings, c, work, begins):
 
 
 @compiled
-def _residuals(code, settings, control, A, A2, c, work):
+def _compute_residuals(code, settings, control, A, A2, c, work):
     """Compute RESIDUAL, SCALE_Q and SCALE_V for the present stages; clear FINE in lanes with invalid values."""
     n, order = settings[N], settings[ORDER]
     _, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     s = c.size
     stages, sums = block_at(memory, n, s, STAGES), vector_at(memory, n, SUMS)
     begin, residual = vector_at(memory, n, BEGIN_Q), block_at(memory, n, s, RESIDUAL)
-    known, total = table(work, stages, s, n), vectors(work, sums, n)
+    stage_rows, total = table(work, stages, s, n), vectors(work, sums, n)
     fill_field(work, memory + SCALE_Q, 1.0)
     fill_field(work, memory + SCALE_V, 1.0)
     for j in range(s):
-        sum_rows(A2[j], known, total)
+        sum_rows(A2[j], stage_rows, total)
         for m in range(n):
             for k in range(LANES):
                 x, at = work[X * LANES + k], (begin + m) * LANES + k
-                way = x * c[j] * work[at + n * LANES] + x * x * work[(sums + m) * LANES + k]
-                work[(new + m) * LANES + k] = work[at] + way
-        sum_rows(A[j], known, total)
+                displacement = x * c[j] * work[at + n * LANES] + x * x * work[(sums + m) * LANES + k]
+                work[(new + m) * LANES + k] = work[at] + displacement
+        sum_rows(A[j], stage_rows, total)
         for m in range(n):
             for k in range(LANES):
                 v = work[(begin + n + m) * LANES + k] + work[X * LANES + k] * work[(sums + m) * LANES + k]
@@ -274,29 +274,29 @@ def _residuals(code, settings, control, A, A2, c, work):
 
 
 @compiled
-def _correct(settings, own, s, work):
+def _correct(settings, method_options, s, work):
     """Compute the corrections of the stages into CHANGES; add them to STAGES in lanes with ITERATING = 1."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
-    n_systems, offset = count_eigenvalues(own, s), eigen_offset(s)
-    n_real = int(own[offset + N_REAL])
+    n_systems, offset = count_eigenvalues(method_options, s), eigen_offset(s)
+    n_real = int(method_options[offset + N_REAL])
     offset += N_EIGEN_SCALARS + s
     one, changes = vector_at(memory, n, COMPLEX), block_at(memory, n, s, CHANGES)
     residual, stages = block_at(memory, n, s, RESIDUAL), block_at(memory, n, s, STAGES)
-    left, width = table(work, residual, s, n), n * LANES
+    residual_rows, width = table(work, residual, s, n), n * LANES
     for i in range(s * width):
         work[changes * LANES + i] = 0.0
     for system in range(n_systems):
         row, column = offset + 2, offset + 2 + 2 * s
         offset += 2 + 4 * s
-        sum_rows(own[row : row + s], left, vectors(work, one, n))
-        sum_rows(own[row + s : row + 2 * s], left, vectors(work, one + n, n))
+        sum_rows(method_options[row : row + s], residual_rows, vectors(work, one, n))
+        sum_rows(method_options[row + s : row + 2 * s], residual_rows, vectors(work, one + n, n))
         matrix, pivots = matrix_at(memory, n, s, SYSTEMS + 2 * system), pivots_at(memory, n, s, n_systems, system)
         imaginary = 0 if system < n_real else n * n
         solve_lanes(work, matrix, pivots, n, imaginary, one)
         twice = 1.0 if system < n_real else 2.0
         for j in range(s):
-            re, im = twice * own[column + j], twice * own[column + s + j]
+            re, im = twice * method_options[column + j], twice * method_options[column + s + j]
             for i in range(width):
                 change = re * work[one * LANES + i] - im * work[one * LANES + width + i]
                 work[(changes + j * n) * LANES + i] += change
@@ -320,13 +320,13 @@ def _largest_corrections(settings, A, A2, work):
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     s = A.shape[0]
-    sums, known = vector_at(memory, n, SUMS), table(work, block_at(memory, n, s, CHANGES), s, n)
+    sums, stage_rows = vector_at(memory, n, SUMS), table(work, block_at(memory, n, s, CHANGES), s, n)
     fill_field(work, memory + LARGEST_Q, 0.0)
     fill_field(work, memory + LARGEST_V, 0.0)
     for j in range(s):
-        sum_rows(A2[j], known, vectors(work, sums, n))
+        sum_rows(A2[j], stage_rows, vectors(work, sums, n))
         _enlarge(work, memory + LARGEST_Q, sums, n)
-        sum_rows(A[j], known, vectors(work, sums, n))
+        sum_rows(A[j], stage_rows, vectors(work, sums, n))
         _enlarge(work, memory + LARGEST_V, sums, n)
 
 
@@ -341,7 +341,7 @@ def _end_iteration(options, work, memory, iteration, k):
     work[(memory + CHANGE_BEFORE) * LANES + k] = change
     if not np.isfinite(fast + far) or work[FINE * LANES + k] == 0.0:
         return True
-    left = MAX_ITERATIONS - 1 - iteration
+    n_left = MAX_ITERATIONS - 1 - iteration
     contraction = change / before if iteration > 0 and before > 0.0 else 0.0
     if iteration == 0:
         converged = change <= 1e-3 * tolerance
@@ -351,35 +351,35 @@ def _end_iteration(options, work, memory, iteration, k):
     elif contraction / (1.0 - contraction) * change <= tolerance:
         converged, ended = True, True
     else:
-        late = change * contraction**left / (1.0 - contraction) > max(tolerance, floor)
-        converged, ended = left == 0 and not late and change <= floor, late or left == 0
+        too_slow = change * contraction**n_left / (1.0 - contraction) > max(tolerance, floor)
+        converged, ended = n_left == 0 and not too_slow and change <= floor, too_slow or n_left == 0
     work[(memory + DONE) * LANES + k] = 1.0 if converged else 0.0
     return ended
 
 
 @compiled
-def solve_stages(code, settings, control, options, own, A, A2, c, work):
+def solve_stages(code, settings, control, options, method_options, A, A2, c, work):
     """Solve for the stages of a step X from their prediction, in lanes with FINE = 1; clear FINE on divergence."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
-    to_go, done = memory + ITERATING, memory + DONE
+    iterating, done = memory + ITERATING, memory + DONE
     for k in range(LANES):
-        work[to_go * LANES + k] = work[FINE * LANES + k]
+        work[iterating * LANES + k] = work[FINE * LANES + k]
         work[done * LANES + k] = 0.0
     for iteration in range(MAX_ITERATIONS):
-        left = 0.0
+        n_left = 0.0
         for k in range(LANES):
-            work[FINE * LANES + k] = work[to_go * LANES + k]
-            left += work[to_go * LANES + k]
-            work[EVALUATED * LANES + k] += c.size * work[to_go * LANES + k]
-        if left == 0.0:
+            work[FINE * LANES + k] = work[iterating * LANES + k]
+            n_left += work[iterating * LANES + k]
+            work[EVALUATED * LANES + k] += c.size * work[iterating * LANES + k]
+        if n_left == 0.0:
             break
-        _residuals(code, settings, control, A, A2, c, work)
-        _correct(settings, own, c.size, work)
+        _compute_residuals(code, settings, control, A, A2, c, work)
+        _correct(settings, method_options, c.size, work)
         _largest_corrections(settings, A, A2, work)
         for k in range(LANES):
-            if work[to_go * LANES + k] == 1.0 and _end_iteration(options, work, memory, iteration, k):
-                work[to_go * LANES + k] = 0.0
+            if work[iterating * LANES + k] == 1.0 and _end_iteration(options, work, memory, iteration, k):
+                work[iterating * LANES + k] = 0.0
     for k in range(LANES):
         work[FINE * LANES + k] = work[done * LANES + k]
 
@@ -391,12 +391,12 @@ def end_of_stages(settings, b, bA, work):
     _, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     s = b.size
     begin, sums = vector_at(memory, n, BEGIN_Q), vector_at(memory, n, SUMS)
-    known, total = table(work, block_at(memory, n, s, STAGES), s, n), vectors(work, sums, n)
-    sum_rows(bA, known, total)
+    stage_rows, total = table(work, block_at(memory, n, s, STAGES), s, n), vectors(work, sums, n)
+    sum_rows(bA, stage_rows, total)
     for i in range(n * LANES):
         x, at = work[X * LANES + i % LANES], begin * LANES + i
         work[new * LANES + i] = work[at] + (x * work[at + n * LANES] + x * x * work[sums * LANES + i])
-    sum_rows(b, known, total)
+    sum_rows(b, stage_rows, total)
     for i in range(n * LANES):
         x, at = work[X * LANES + i % LANES], (begin + n) * LANES + i
         work[(new + n) * LANES + i] = work[at] + x * work[sums * LANES + i]
@@ -410,12 +410,12 @@ def _allowed(control, work, state, new, j, entry, k):
 
 
 @compiled
-def _embedded_estimate(settings, own, A, work, memory):
+def _embedded_estimate(settings, method_options, A, work, memory):
     """Compute the embedded error estimate, unfiltered, into E_Q and E_V."""
     n, s = settings[N], A.shape[0]
     offset = eigen_offset(s)
-    gamma0, e = own[offset + GAMMA0], own[offset + N_EIGEN_SCALARS : offset + N_EIGEN_SCALARS + s]
-    known, begin = table(work, block_at(memory, n, s, STAGES), s, n), vector_at(memory, n, BEGIN_V)
+    gamma0, e = method_options[offset + GAMMA0], method_options[offset + N_EIGEN_SCALARS : offset + N_EIGEN_SCALARS + s]
+    stage_rows, begin = table(work, block_at(memory, n, s, STAGES), s, n), vector_at(memory, n, BEGIN_V)
     e_q, e_v, sums = vector_at(memory, n, E_Q), vector_at(memory, n, E_V), vector_at(memory, n, SUMS)
     total = 0.0
     for i in range(s):
@@ -423,10 +423,10 @@ def _embedded_estimate(settings, own, A, work, memory):
     for i in range(n * LANES):
         work[e_q * LANES + i] = (gamma0 + total) * work[begin * LANES + i]
     for j in range(s):  # velocities of the stages
-        sum_rows(A[j], known, vectors(work, sums, n))
+        sum_rows(A[j], stage_rows, vectors(work, sums, n))
         for i in range(n * LANES):
             work[e_q * LANES + i] += e[j] * work[H * LANES + i % LANES] * work[sums * LANES + i]
-    sum_rows(e, known, vectors(work, sums, n))
+    sum_rows(e, stage_rows, vectors(work, sums, n))
     for i in range(n * LANES):
         h = work[H * LANES + i % LANES]
         work[e_q * LANES + i] *= h
@@ -434,10 +434,10 @@ def _embedded_estimate(settings, own, A, work, memory):
 
 
 @compiled
-def _filter(settings, own, s, work, memory):
+def _filter(settings, method_options, s, work, memory):
     """Replace (E_Q, E_V) by (I - z J)^-1 (E_Q, E_V), z = gamma0 H, where J is the Jacobian of (v, F)."""
     n = settings[N]
-    gamma0 = own[eigen_offset(s) + GAMMA0]
+    gamma0 = method_options[eigen_offset(s) + GAMMA0]
     e_q, e_v, one = vector_at(memory, n, E_Q), vector_at(memory, n, E_V), vector_at(memory, n, COMPLEX)
     by_q = matrix_at(memory, n, s, BY_Q)
     for i in range(n):
@@ -446,7 +446,7 @@ def _filter(settings, own, s, work, memory):
             for j in range(n):
                 total += work[(by_q + i * n + j) * LANES + k] * work[(e_q + j) * LANES + k]
             work[(one + i) * LANES + k] = work[(e_v + i) * LANES + k] + gamma0 * work[H * LANES + k] * total
-    pivots = pivots_at(memory, n, s, count_eigenvalues(own, s), 0)
+    pivots = pivots_at(memory, n, s, count_eigenvalues(method_options, s), 0)
     solve_lanes(work, matrix_at(memory, n, s, SYSTEMS), pivots, n, 0, one)
     copy_vectors(work, one, e_v, n)
     for i in range(n * LANES):
@@ -458,15 +458,17 @@ def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
     """Return the error over the tolerances that a velocity error causes in lane k, see velocity_errors.py."""
     raw, once, twice = vector_at(memory, n, UNFILTERED), vector_at(memory, n, FILTERED_ONCE), vector_at(memory, n, E_V)
     begin = vector_at(memory, n, BEGIN_V)
-    largest = turn = fastest = change = 0.0
+    largest = curvature = fastest = change = 0.0
     for j in range(n):
         fastest = max(fastest, abs(work[(begin + j) * LANES + k]))
         change = max(change, abs(work[(begin + n + j) * LANES + k]))
         largest = max(largest, abs(work[(twice + j) * LANES + k]))
-        bend = work[(twice + j) * LANES + k] - 2.0 * work[(once + j) * LANES + k] + work[(raw + j) * LANES + k]
-        turn = max(turn, abs(bend))  # (z J)^2 e
+        second_difference = (
+            work[(twice + j) * LANES + k] - 2.0 * work[(once + j) * LANES + k] + work[(raw + j) * LANES + k]
+        )
+        curvature = max(curvature, abs(second_difference))  # (z J)^2 e
     if largest > 0.0:
-        work[(memory + DURATION) * LANES + k] = z * np.sqrt(largest / turn)
+        work[(memory + DURATION) * LANES + k] = z * np.sqrt(largest / curvature)
     duration = work[(memory + DURATION) * LANES + k]
     if duration * change * SLOW_FACTOR > fastest:
         duration *= min(SLOW_FACTOR, duration * change * SLOW_FACTOR / fastest) if fastest > 0.0 else SLOW_FACTOR
@@ -497,20 +499,20 @@ def _motion_time(control, work, n, memory, k):
 
 
 @compiled
-def _slow_error(settings, control, own, s, work):
+def _slow_error(settings, control, method_options, s, work):
     """Set ERROR to the error that E_V causes in slow directions, if this is larger, see newton_step.py."""
     n = settings[N]
     state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     e_v, most, fine = vector_at(memory, n, E_V), memory + LARGEST_V, memory + ITERATING
-    anywhere = False
+    any_slow = False
     for k in range(LANES):
         error = 0.0
         if work[ERROR * LANES + k] <= 1.0:
-            long = _motion_time(control, work, n, memory, k)
-            error = _velocity_error(control, work, n, e_v, long, state, new, k)
+            longest = _motion_time(control, work, n, memory, k)
+            error = _velocity_error(control, work, n, e_v, longest, state, new, k)
         work[most * LANES + k], work[fine * LANES + k] = error, work[FINE * LANES + k]
-        anywhere = anywhere or error > 1.0
-    if not anywhere:
+        any_slow = any_slow or error > 1.0
+    if not any_slow:
         return
     by_q, by_v = matrix_at(memory, n, s, BY_Q), matrix_at(memory, n, s, BY_V)
     matrix = matrix_at(memory, n, s, SYSTEMS)
@@ -519,30 +521,30 @@ def _slow_error(settings, control, own, s, work):
             z = STEPS_TO_DECAY * work[H * LANES + k]
             entry = -z * z * work[(by_q + i) * LANES + k] - z * work[(by_v + i) * LANES + k]
             work[(matrix + i) * LANES + k] = entry + (1.0 if i % (n + 1) == 0 else 0.0)
-    pivots = pivots_at(memory, n, s, count_eigenvalues(own, s), 0)
+    pivots = pivots_at(memory, n, s, count_eigenvalues(method_options, s), 0)
     factor_lanes(work, matrix, pivots, n, 0)
     solve_lanes(work, matrix, pivots, n, 0, e_v)
     for k in range(LANES):
         error = work[most * LANES + k]
         if work[FINE * LANES + k] == 1.0:  # if the motion is unstable, the solution may be too large
-            long = _motion_time(control, work, n, memory, k)
-            error = min(error, _velocity_error(control, work, n, e_v, long, state, new, k))
+            longest = _motion_time(control, work, n, memory, k)
+            error = min(error, _velocity_error(control, work, n, e_v, longest, state, new, k))
         work[FINE * LANES + k] = work[fine * LANES + k]
         if work[most * LANES + k] > 1.0:
             work[ERROR * LANES + k] = max(work[ERROR * LANES + k], error)
 
 
 @compiled
-def _estimate(settings, control, own, A, work):
+def _estimate(settings, control, method_options, A, work):
     """Compute ERROR, the embedded error estimate over the tolerances, filtered to suppress stiff components."""
     n, s = settings[N], A.shape[0]
     state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     offset = eigen_offset(s)
     e_q, e_v = vector_at(memory, n, E_Q), vector_at(memory, n, E_V)
-    _embedded_estimate(settings, own, A, work, memory)
+    _embedded_estimate(settings, method_options, A, work, memory)
     copy_vectors(work, e_v, vector_at(memory, n, UNFILTERED), n)
-    _filter(settings, own, s, work, memory)
-    tests_velocities = own[offset + VELOCITIES] == 1.0
+    _filter(settings, method_options, s, work, memory)
+    tests_velocities = method_options[offset + VELOCITIES] == 1.0
     fill_field(work, ERROR, 0.0)
     for j in range(n):
         atol, rtol = control[ATOL + j], control[RTOL]
@@ -552,16 +554,16 @@ def _estimate(settings, control, own, A, work):
     if tests_velocities:
         return
     copy_vectors(work, e_v, vector_at(memory, n, FILTERED_ONCE), n)
-    _filter(settings, own, s, work, memory)
+    _filter(settings, method_options, s, work, memory)
     for k in range(LANES):
-        z = own[offset + GAMMA0] * work[H * LANES + k]
+        z = method_options[offset + GAMMA0] * work[H * LANES + k]
         error = _filtered_velocity_error(control, work, n, memory, z, state, new, k)
         work[ERROR * LANES + k] = max(work[ERROR * LANES + k], error)
-    _slow_error(settings, control, own, s, work)
+    _slow_error(settings, control, method_options, s, work)
 
 
 @compiled
-def _keep_stages(work, memory, n, s):
+def _store_stages(work, memory, n, s):
     """Store the stages of accepted steps, which predict those of the next step, and states within this step."""
     stages, previous = block_at(memory, n, s, STAGES), block_at(memory, n, s, PREVIOUS)
     for k in range(LANES):
@@ -579,8 +581,8 @@ def step_by_newton(code, settings, control, options, work, status, n_steps, with
     """
     n = settings[N]
     state, _, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
-    own = options[N_HEAD:]
-    s, A, A2, b, bA, c = tableau_of(own)
+    method_options = options[N_HEAD:]
+    s, A, A2, b, bA, c = tableau_of(method_options)
     start, begin = vector_at(memory, n, START), vector_at(memory, n, BEGIN_Q)
     if not within:
         begin_control(options, control, work, n, state, a, start)
@@ -591,13 +593,13 @@ def step_by_newton(code, settings, control, options, work, status, n_steps, with
         copy_vectors(work, state, begin, 2 * n)
         copy_vectors(work, start, begin + 2 * n, n)
         find_derivatives(code, settings, control, c, work)
-    factor_systems_of_lanes(settings, own, s, work)
+    factor_systems_of_lanes(settings, method_options, s, work)
     predict_stages(settings, c, work, 0.0 if within else 1.0)
-    solve_stages(code, settings, control, options, own, A, A2, c, work)
+    solve_stages(code, settings, control, options, method_options, A, A2, c, work)
     end_of_stages(settings, b, bA, work)
     set_end(work, control)
     if not within:
-        _estimate(settings, control, own, A, work)
+        _estimate(settings, control, method_options, A, work)
         end_steps(code, settings, control, work, vector_at(memory, n, SUMS))
         judge_steps(options, work, n, a, start, status)
-        _keep_stages(work, memory, n, s)
+        _store_stages(work, memory, n, s)

@@ -83,9 +83,9 @@ def _blocks(memory, n):
 def settle_bdf(f, w, options, memory, tolerances, accepted):
     """After an accepted attempt, make the trial differences the history; after either, adopt the order chosen."""
     differences, trial, _, _, _ = _blocks(memory, w.Q.size)
-    left = memory[HAS_TRIAL]
+    has_trial = memory[HAS_TRIAL]
     memory[HAS_TRIAL] = 0.0
-    if left == 0.0:
+    if has_trial == 0.0:
         return
     if not accepted:
         memory[ORDER] = memory[NEXT_ORDER]
@@ -100,7 +100,7 @@ def settle_bdf(f, w, options, memory, tolerances, accepted):
 
 
 @compiled
-def _begin(memory, differences, state, h, order):
+def _begin_history(memory, differences, state, h, order):
     """Start the history from the state and, if `order` is 1, its derivative."""
     size = differences.shape[1]
     for m in range(size):
@@ -200,7 +200,7 @@ def _norm(tolerances, y, y1, d, sign, difference):
 
 
 @compiled
-def _judge(options, memory, tolerances, trial, y, y1, d):
+def _choose_order(options, memory, tolerances, trial, y, y1, d):
     """Return the error, from d = y1 - prediction, and the ratio of the next step size to h; set NEXT_ORDER."""
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, constants = _coefficients(memory, NEW_SPANS), _coefficients(memory, ERROR_CONSTANTS)
@@ -237,7 +237,7 @@ def _judge(options, memory, tolerances, trial, y, y1, d):
 
 
 @compiled
-def _extend(memory, trial, y1, d):
+def _update_differences(memory, trial, y1, d):
     """Replace the scaled differences in `trial` by those at the end of the step, (t + h, y1)."""
     k = int(memory[ORDER])
     memory[NEXT_DEPTH] = k + 1
@@ -293,7 +293,7 @@ def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
     differences, trial, prediction, rate, scratch = _blocks(memory, n)
     fixed = tolerances[ESTIMATE] == 0.0
     if memory[DEPTH] == 0.0:
-        _begin(memory, differences, state, h, 0.0 if fixed else 1.0)
+        _begin_history(memory, differences, state, h, 0.0 if fixed else 1.0)
     _predict(memory, differences, trial, h, prediction, rate)
     k = int(memory[ORDER])
     if fixed and k < options[HIGHEST]:
@@ -309,13 +309,13 @@ def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if fixed:
         memory[NEXT_ORDER] = min(memory[ORDER] + 1.0, options[HIGHEST])
     else:
-        error, factor = _judge(options, memory, tolerances, trial, y, y1, d)
-        off = departure(w, tolerances, h, y[:n], y[n:], y1[:n])
-        if off > 0.0:
-            factor = min(factor, max(SAFETY / off, LEAST_FACTOR))
-        error = max(error, off)
+        error, factor = _choose_order(options, memory, tolerances, trial, y, y1, d)
+        distance = departure(w, tolerances, h, y[:n], y[n:], y1[:n])
+        if distance > 0.0:
+            factor = min(factor, max(SAFETY / distance, LEAST_FACTOR))
+        error = max(error, distance)
     memory[HAS_TRIAL] = 1.0
-    _extend(memory, trial, y1, d)
+    _update_differences(memory, trial, y1, d)
     return Attempt(DONE, error, factor)
 
 

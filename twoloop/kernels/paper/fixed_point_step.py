@@ -70,7 +70,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
             interpolate(c, 1.0 + ratio * c[j], previous, weights, trial[j])
         else:
             copy(a, trial[j])
-    code, off = iterate_accelerations(f, w, options, tolerances, t, h, q, v, trial, Q_stage, V_stage, q1, v1, rest)
+    code, distance = iterate_accelerations(f, w, options, tolerances, t, h, q, v, trial, Q_stage, V_stage, q1, v1, rest)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
     error = 0.0
@@ -80,19 +80,19 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
         for j in range(s):
             interpolate(c, 0.5 * c[j], trial, weights, half[j])
         g = 0.5 * h
-        code, off_mid = iterate_accelerations(
+        code, distance_mid = iterate_accelerations(
             f, w, options, tolerances, t, g, q, v, half, Q_stage, V_stage, q_mid, v_mid, rest
         )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
         for j in range(s):
             interpolate(c, 0.5 + 0.5 * c[j], trial, weights, half[j])
-        code, off = iterate_accelerations(
+        code, distance = iterate_accelerations(
             f, w, options, tolerances, t + g, g, q_mid, v_mid, half, Q_stage, V_stage, q1, v1, rest
         )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
-        off = max(off, off_mid)  # the run continues from the half steps
+        distance = max(distance, distance_mid)  # the run continues from the half steps
         code, error = estimate_and_extrapolate(
             f, w, options[EXTRAPOLATION], options[INNER_TOL], t + h, tolerances, q, v, q_full, v_full, q1, v1
         )
@@ -103,7 +103,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     memory[at.H_TRIAL] = h
     if code == DONE and tolerances[ESTIMATE] == 1.0:
         error = max(error, END_ERROR_WEIGHT * end_error(tolerances, options, h, state, new_state, trial))
-    return Attempt(code, max(error, off), 0.0)
+    return Attempt(code, max(error, distance), 0.0)
 
 
 RUNGE_KUTTA = Step(runge_kutta_step, settle_runge_kutta)
@@ -111,7 +111,7 @@ RUNGE_KUTTA = Step(runge_kutta_step, settle_runge_kutta)
 
 # value of `end_error` times END_ERROR_WEIGHT above which a step is rejected; this test is not part of the paper's
 # procedure
-SUDDEN = 10.0
+SUDDEN_ERROR = 10.0
 
 
 @kernel(ATTEMPT)
@@ -155,9 +155,9 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
             return Attempt(code, np.inf, 0.0)
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
     if code == DONE and tolerances[ESTIMATE] == 1.0:
-        beside = END_ERROR_WEIGHT * end_error(tolerances, options, h, state, new_state, A_full)
-        if error <= 1.0 and beside > SUDDEN:
-            error = beside
+        jump_error = END_ERROR_WEIGHT * end_error(tolerances, options, h, state, new_state, A_full)
+        if error <= 1.0 and jump_error > SUDDEN_ERROR:
+            error = jump_error
     return Attempt(code, error, 0.0)
 
 

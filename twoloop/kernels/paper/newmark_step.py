@@ -21,7 +21,7 @@ BETA, GAMMA, INNER_TOL, OUTER_TOL, ERROR_TOL, N_OPTIONS = range(6)
 
 
 @merged
-def _largest(x, at_least):
+def _largest_abs(x, at_least):
     """Return the largest absolute value in x, or `at_least` if this is larger."""
     for m in range(x.size):
         at_least = max(at_least, abs(x[m]))
@@ -29,20 +29,20 @@ def _largest(x, at_least):
 
 
 @compiled
-def _rate(memory, gap, q, v, a, q1, v1, a1):
+def _motion_rate(memory, gap, q, v, a, q1, v1, a1):
     """Return the reciprocal, 1/s, of the time in which velocities and accelerations change coordinates by their size.
 
     Sizes are the largest absolute values so far, because all coordinates may be near zero at a single time, depending
     on the origin. If the size of the coordinates is mainly due to this step, as after rest at the origin, the time is
     at least `gap`, s.
     """
-    memory[SIZE] = _largest(q, memory[SIZE])
-    memory[SPEED] = _largest(v, memory[SPEED])
-    memory[ACCELERATION] = _largest(a, memory[ACCELERATION])
-    size = _largest(q1, memory[SIZE])
+    memory[SIZE] = _largest_abs(q, memory[SIZE])
+    memory[SPEED] = _largest_abs(v, memory[SPEED])
+    memory[ACCELERATION] = _largest_abs(a, memory[ACCELERATION])
+    size = _largest_abs(q1, memory[SIZE])
     if size == 0.0:
         return 0.0
-    rate = max(_largest(v1, memory[SPEED]) / size, np.sqrt(_largest(a1, memory[ACCELERATION]) / size))
+    rate = max(_largest_abs(v1, memory[SPEED]) / size, np.sqrt(_largest_abs(a1, memory[ACCELERATION]) / size))
     return min(rate, 1.0 / gap) if size > GROWN * memory[SIZE] else rate
 
 
@@ -92,7 +92,7 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if change <= options[OUTER_TOL] or (change >= before and change <= rounding_floor(q)):
             error = 0.0
             if tolerances[ESTIMATE] == 1.0:
-                rate = _rate(memory, tolerances[GAP], q, v, a, q1, v1, a1)
+                rate = _motion_rate(memory, tolerances[GAP], q, v, a, q1, v1, a1)
                 error = _error(options, tolerances, rate, h, q, v, a, a1)
                 if options[ERROR_TOL] == 0.0:  # not in the paper
                     for k in range(w.dependent.size):

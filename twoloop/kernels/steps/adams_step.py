@@ -63,7 +63,7 @@ THETA, N_OPTIONS = range(2)
     N_SCALARS,
 ) = range(8)
 # numbers of the rows of coefficients: psi(n), psi(n+1), beta, g, G, and c_i at NODES
-PSI, NEW_PSI, BETA, SPEED, PLACE, NODE, N_ROWS = range(7)
+PSI, NEW_PSI, BETA, G_VELOCITY, G_POSITION, C_AT_NODES, N_ROWS = range(7)
 
 
 def memory_size(n_q: int) -> int:
@@ -122,7 +122,7 @@ def settle_adams(f, w, options, memory, tolerances, accepted):
 
 
 @merged
-def _begin(memory, n, state):
+def _begin_history(memory, n, state):
     """Start a history that contains only the accelerations of `state`."""
     table = _table(memory, n, memory[WHICH])
     table[:, :] = 0.0
@@ -135,10 +135,10 @@ def _begin(memory, n, state):
 
 
 @merged
-def _coefficients(memory, h, k):
+def _compute_coefficients(memory, h, k):
     """Compute psi(n+1), beta_1 to beta_{k+1}, g_1 to g_{k+2} and G_1 to G_{k+2} for a step of h, in `memory`."""
     psi, new_psi, beta = _row(memory, PSI), _row(memory, NEW_PSI), _row(memory, BETA)
-    g, G, c = _row(memory, SPEED), _row(memory, PLACE), _row(memory, NODE)
+    g, G, c = _row(memory, G_VELOCITY), _row(memory, G_POSITION), _row(memory, C_AT_NODES)
     new_psi[0] = h
     for i in range(N_TERMS):
         new_psi[i + 1] = psi[i] + h
@@ -151,12 +151,12 @@ def _coefficients(memory, h, k):
         c[m] = 1.0
     before = 0.0  # psi_0
     for i in range(k + 2):
-        speed = 0.0
-        place = 0.0
+        velocity_integral = 0.0
+        position_integral = 0.0
         for m in range(8):
-            speed += WEIGHTS[m] * c[m]
-            place += REST[m] * c[m]
-        g[i], G[i] = speed, place
+            velocity_integral += WEIGHTS[m] * c[m]
+            position_integral += REST[m] * c[m]
+        g[i], G[i] = velocity_integral, position_integral
         inverse = 1.0 / new_psi[i]
         for m in range(8):
             c[m] *= (NODES[m] * h + before) * inverse
@@ -166,7 +166,7 @@ def _coefficients(memory, h, k):
 @merged
 def _predict(memory, h, k, old, new, state, q1, v1, n):
     """Compute the prediction (q1, v1), and the differences that an exact prediction would have into the table `new`."""
-    beta, g, G = _row(memory, BETA), _row(memory, SPEED), _row(memory, PLACE)
+    beta, g, G = _row(memory, BETA), _row(memory, G_VELOCITY), _row(memory, G_POSITION)
     in_v, in_q = _scratch(memory, n)
     for m in range(0, old.shape[1], 4):
         d0, d1, d2, d3 = old[N_TERMS, m], old[N_TERMS, m + 1], old[N_TERMS, m + 2], old[N_TERMS, m + 3]
@@ -235,7 +235,7 @@ def _choose_order(memory, h, k, table, d, n):
     The rules are those of STEP. The order decreases if this does not increase the error. It increases after k + 1 steps
     at order k if this decreases the error, and while the method starts, with every step.
     """
-    g, G = _row(memory, SPEED), _row(memory, PLACE)
+    g, G = _row(memory, G_VELOCITY), _row(memory, G_POSITION)
     per_v, per_q = _scratch(memory, n)
     v0 = v1 = v2 = v3 = q0 = q1 = q2 = q3 = 0.0
     lower, lowest = max(k - 1, 0), max(k - 2, 0)
@@ -283,11 +283,11 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
     q, v = state[:n], state[n : 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
     if memory[DEPTH] == 0.0:
-        _begin(memory, n, state)
+        _begin_history(memory, n, state)
     k = int(memory[ORDER])
     w.counters[N_OUTER] += 1
     old, new = _table(memory, n, memory[WHICH]), _table(memory, n, 1.0 - memory[WHICH])
-    _coefficients(memory, h, k)
+    _compute_coefficients(memory, h, k)
     _predict(memory, h, k, old, new, state, q1, v1, n)
     memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # remains if an evaluation fails
     code = evaluate_as_given(f, w, t + h, q1, v1, a1)
@@ -305,7 +305,7 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
     error, factor = _choose_order(memory, h, k, new, d, n)
     if not error <= 1.0:
         return Attempt(DONE, error, factor)
-    g, G = _row(memory, SPEED)[k], _row(memory, PLACE)[k]
+    g, G = _row(memory, G_VELOCITY)[k], _row(memory, G_POSITION)[k]
     for m in range(n):
         q1[m] += h * h * G * d[m]
         v1[m] += h * g * d[m]
@@ -315,10 +315,10 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
         return Attempt(code, np.inf, 0.0)
     for m in range(n):
         d[m] = a1[m] - new[0, m]
-    off = departure(w, tolerances, h, q, v, q1)
-    if off > 0.0:
-        factor = min(factor, max(SAFETY / off, LEAST_FACTOR))
-    return Attempt(DONE, max(error, off), factor)
+    distance = departure(w, tolerances, h, q, v, q1)
+    if distance > 0.0:
+        factor = min(factor, max(SAFETY / distance, LEAST_FACTOR))
+    return Attempt(DONE, max(error, distance), factor)
 
 
 ADAMS = Step(adams_step, settle_adams)

@@ -49,7 +49,7 @@ from twoloop.kernels.steps.newton_systems import (
     factor_filter,
     factor_systems,
     filter_error,
-    reduce,
+    reduce_to_independents,
     tangent_by_q,
     tangent_by_v,
 )
@@ -78,14 +78,14 @@ ASYMMETRY = 1e-12
 
 
 @compiled
-def _symmetric(A):
+def _is_symmetric(A):
     """Return whether A is symmetric but for rounding errors."""
-    largest, off = 0.0, 0.0
+    largest, asymmetry = 0.0, 0.0
     for i in range(A.shape[0]):
         largest = max(largest, abs(A[i, i]))
         for j in range(i):
-            off = max(off, abs(A[i, j] - A[j, i]))
-    return off <= ASYMMETRY * largest
+            asymmetry = max(asymmetry, abs(A[i, j] - A[j, i]))
+    return asymmetry <= ASYMMETRY * largest
 
 
 @compiled
@@ -102,7 +102,7 @@ def _fill_matrix(w, memory, n, m, z, H):
 
 
 @compiled
-def factor_for(w, memory, z):
+def factor_matrix(w, memory, z):
     """Factor the matrix of an iteration for z, with the tangents computed last; return a code."""
     n, m = w.Q.size, w.independent.size
     numbers = matrix_storage(w, n, at.FILTER)
@@ -110,7 +110,7 @@ def factor_for(w, memory, z):
     w.counters[N_FACTORIZATIONS] += 1
     _fill_matrix(w, memory, n, m, z, numbers)
     memory[at.SYMMETRIC] = 0.0
-    if _symmetric(H):
+    if _is_symmetric(H):
         if ldl_factor(H):
             memory[at.SYMMETRIC] = 1.0
             return DONE
@@ -135,15 +135,15 @@ def factor_iteration(f, w, memory, t, q, v, z):
         code = find_tangents(f, w, t, q)
     if code != DONE:
         return code
-    reduce(w, K, AT, as_matrix(matrix_storage(w, n, at.BY_Q), m))
+    reduce_to_independents(w, K, AT, as_matrix(matrix_storage(w, n, at.BY_Q), m))
     memory[at.DAMPED] = f.flags[FORCE_BY_V_GIVEN]
     code = tangent_by_v(f, t, q, v, n - 1, K)
     if code != DONE:
         return code
     if memory[at.DAMPED] == 1.0:
-        reduce(w, K, AT, as_matrix(matrix_storage(w, n, at.BY_V), m))
-    reduce(w, w.M, AT, as_matrix(matrix_storage(w, n, at.SYSTEMS), m))
-    return factor_for(w, memory, z)
+        reduce_to_independents(w, K, AT, as_matrix(matrix_storage(w, n, at.BY_V), m))
+    reduce_to_independents(w, w.M, AT, as_matrix(matrix_storage(w, n, at.SYSTEMS), m))
+    return factor_matrix(w, memory, z)
 
 
 @compiled
@@ -362,12 +362,12 @@ def _filter(f, w, options, memory, h, e_q, e_v):
 def _factor_filter(f, w, options, memory, h):
     """Factor the matrix that `_filter` uses for steps of size h; return a code."""
     if has_dense_tangents(f, w):
-        return factor_for(w, memory, h * gamma_of(options))
+        return factor_matrix(w, memory, h * gamma_of(options))
     return factor_filter(f, w, options, memory, one_stage_of(options), h)
 
 
 @compiled
-def _difference(w, h, V_stage, A_stage, weights, share, e_q, e_v):
+def _weighted_difference(w, h, V_stage, A_stage, weights, share, e_q, e_v):
     """Compute `share` times h times the weighted sum of the stage velocities into e_q, of accelerations into e_v.
 
     The first n_dof numbers of e_q and e_v are for the independent coordinates.
@@ -413,20 +413,20 @@ def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A
     n = w.Q.size
     q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
     e_q, e_v = vector(memory, 1, n, at.E_Q), vector(memory, 1, n, at.E_V)
-    raw, once = vector(memory, 1, n, at.A_NEW), vector(memory, 1, n, at.A_MID)
+    unfiltered, filtered_once = vector(memory, 1, n, at.A_NEW), vector(memory, 1, n, at.A_MID)
     count = w.independent.size
     z = h * gamma_of(options)
-    _difference(w, h, V_stage, A_stage, weights, share, e_q, e_v)
-    copy(e_v, raw)
+    _weighted_difference(w, h, V_stage, A_stage, weights, share, e_q, e_v)
+    copy(e_v, unfiltered)
     _filter(f, w, options, memory, h, e_q, e_v)
     if f.flags[FORCE_BY_Q_GIVEN] == 0 and not derivatives_agree(
-        f, w, options, memory, 1, t + h, z, tolerances, raw, e_q, e_v, state, new_state, A_stage[-1]
+        f, w, options, memory, 1, t + h, z, tolerances, unfiltered, e_q, e_v, state, new_state, A_stage[-1]
     ):
         memory[at.CHANGED] = 1.0
         if _renew_derivatives(f, w, options, memory, t + h, h, new_state) != DONE:
             return np.inf
-        _difference(w, h, V_stage, A_stage, weights, share, e_q, e_v)
-        copy(e_v, raw)
+        _weighted_difference(w, h, V_stage, A_stage, weights, share, e_q, e_v)
+        copy(e_v, unfiltered)
         _filter(f, w, options, memory, h, e_q, e_v)
     error = 0.0
     for i in range(count):
@@ -436,9 +436,14 @@ def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A
         if options[NEWTON_OFFSET + at.VELOCITIES] == 1.0:
             scale = allowed(tolerances, j, v[j], v1[j])
             error = max(error, abs(e_v[i]) / scale)
-    copy(e_v, once)
+    copy(e_v, filtered_once)
     _filter(f, w, options, memory, h, e_q, e_v)
-    return max(error, filtered_velocity_error(w, memory, tolerances, z, raw, once, e_v, state, new_state, A_stage[-1]))
+    return max(
+        error,
+        filtered_velocity_error(
+            w, memory, tolerances, z, unfiltered, filtered_once, e_v, state, new_state, A_stage[-1]
+        ),
+    )
 
 
 @compiled
@@ -471,9 +476,9 @@ def _slow_error(f, w, options, memory, h, tolerances, state, new_state, A_stage)
         return 0.0
     for i in range(w.independent.size):
         e_q[i] = 0.0
-    longer = STEPS_TO_DECAY * h / gamma_of(options)
-    if _factor_filter(f, w, options, memory, longer) == DONE:
-        _filter(f, w, options, memory, longer, e_q, e_v)
+    h_longer = STEPS_TO_DECAY * h / gamma_of(options)
+    if _factor_filter(f, w, options, memory, h_longer) == DONE:
+        _filter(f, w, options, memory, h_longer, e_q, e_v)
         # if the motion is unstable, the system may be nearly singular, and its solution too large
         error = min(error, velocity_error(w, tolerances, e_v, longest, state, new_state))
     memory[at.H_FACTORED] = 0.0
@@ -490,19 +495,19 @@ def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V
     ratio of this sum to the range is a factor of the estimate, which raises its order above that of the first estimate.
     """
     n = w.Q.size
-    missed, widest = 0.0, 0.0
+    deviation, widest = 0.0, 0.0
     for j in w.independent:
         low, high, total = A_stage[0, j], A_stage[0, j], 0.0
         for k in range(lower.size):
             low, high = min(low, A_stage[k, j]), max(high, A_stage[k, j])
             total += lower[k] * A_stage[k, j]
         scale = allowed(tolerances, j, state[n + j], new_state[n + j])
-        missed, widest = max(missed, abs(total) / scale), max(widest, (high - low) / scale)
-    if missed == 0.0:
+        deviation, widest = max(deviation, abs(total) / scale), max(widest, (high - low) / scale)
+    if deviation == 0.0:
         return 0.0
     if memory[at.H_FACTORED] == 0.0 and _factor_filter(f, w, options, memory, h) != DONE:
         return np.inf
-    share = min(1.0, missed / (MAX_JUMP_RATIO * widest))
+    share = min(1.0, deviation / (MAX_JUMP_RATIO * widest))
     error = _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, lower, share)
     if error <= 1.0:
         error = max(error, _slow_error(f, w, options, memory, h, tolerances, state, new_state, A_stage))

@@ -139,8 +139,8 @@ def largest_error(tolerances, y, y1, one, other, strict):
     e, d = max(e, e_v), max(d, d_v)
     if e == 0.0:
         return 0.0
-    fall = e / np.hypot(e, d)
-    return e * (np.sqrt(fall) if strict else fall)
+    ratio = e / np.hypot(e, d)
+    return e * (np.sqrt(ratio) if strict else ratio)
 
 
 @compiled
@@ -165,11 +165,11 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     slopes = _slopes(memory, s, n)
     # near a singular position stages are projected: it matters on which side of this position a stage is, and how
     # accurate its velocities are
-    near = options[FREE] == 1.0 and w.notes[NEARLY_SINGULAR] != 0.0
-    free = options[FREE] == 1.0 and not near
-    longer = gap_ratio(tolerances, h)
-    if longer > 0.0 and not free:
-        return Attempt(DONE, longer, 1.0 / longer)
+    is_near = options[FREE] == 1.0 and w.notes[NEARLY_SINGULAR] != 0.0
+    free = options[FREE] == 1.0 and not is_near
+    ratio_to_gap = gap_ratio(tolerances, h)
+    if ratio_to_gap > 0.0 and not free:
+        return Attempt(DONE, ratio_to_gap, 1.0 / ratio_to_gap)
     w.counters[N_OUTER] += 1
     copy(state[n : 3 * n], slopes[0])
     for j in range(1, s):
@@ -185,8 +185,8 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     _move(y, h, b, slopes, stage, y1)
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
-        error = _error(tolerances, h, fine, coarse, y, y1, slopes, one, other, near)
-        if near:
+        error = _error(tolerances, h, fine, coarse, y, y1, slopes, one, other, is_near)
+        if is_near:
             error *= min(max(tolerances[LEAST] / LEAST_STRICT, 1.0), STRICT)
         if not error <= 1.0:
             return Attempt(DONE, error, 0.0)

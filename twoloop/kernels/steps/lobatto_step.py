@@ -115,64 +115,64 @@ def _collocate(f, w, options, data, tolerances, t, h, state):
     The result is CONVERGED, REFUSED, GUESSED or NOT_COMPUTED, see data/collocation.py.
     """
     first, estimated = data[field.PREDICTS] == 0.0, tolerances[ESTIMATE] == 1.0
-    longest = tolerances[LOOK] / CHECKED_GAP
-    if estimated and h > longest * (1.0 + SLACK):
-        return REFUSED, h / longest, longest / h
+    h_max = tolerances[LOOK] / CHECKED_GAP
+    if estimated and h > h_max * (1.0 + SLACK):
+        return REFUSED, h / h_max, h_max / h
     data[field.T], data[field.H], data[field.DEFECT] = t, h, -1.0
     data[field.MAY_GUESS] = 0.0
     if first:
         data[field.H_BEFORE], data[field.DEGREE], data[field.RHO] = h, 0.0, START_CONTRACTION
         data[field.MAY_GUESS] = 1.0 if estimated and data[field.STARTS] < MAX_STARTS else 0.0
-    ended = int(f.attempt_nodes(data, state, tolerances, f.own_numbers))
+    result = int(f.attempt_nodes(data, state, tolerances, f.own_numbers))
     m = int(data[field.SWEEPS])
     w.counters[N_OUTER] += m
     w.counters[N_EVALUATIONS] += LANES * m
     w.counters[N_FACTORIZATIONS] += LANES * m
-    if ended == GUESSED:
+    if result == GUESSED:
         data[field.STARTS] += 1.0
-        return ended, 2.0, min(max(START_CONTRACTION / data[field.RHO], 0.05), 30.0)
-    if ended != CONVERGED:
+        return result, 2.0, min(max(START_CONTRACTION / data[field.RHO], 0.05), 30.0)
+    if result != CONVERGED:
         data[field.FAILURES] += 2.0
-        return ended, 2.0, DIVERGED_FACTOR
+        return result, 2.0, DIVERGED_FACTOR
     if not estimated:
         return CONVERGED, 0.0, 1.0
     error = data[field.ERROR]
     if not error <= 1.0:
         _predict_from_rejected(f, data, state)
         return REFUSED, error, min(max(0.9 * data[field.FACTOR_OF_ERROR], 0.3), 0.9)
-    most = GROWTH_EARLY if data[field.N_STEPS] < N_EARLY else GROWTH
-    if most > GROWTH and m == 1:
-        most = GROWTH_AT_ONCE
+    max_factor = GROWTH_EARLY if data[field.N_STEPS] < N_EARLY else GROWTH
+    if max_factor > GROWTH and m == 1:
+        max_factor = GROWTH_AT_ONCE
     if h > options[FREE] * tolerances[LOOK] * (1.0 + SLACK):
         w.counters[N_EVALUATIONS] += LANES
         defect = f.audit_nodes(data, state, f.own_numbers)
         if defect < 0.0:
             return NOT_COMPUTED, 2.0, DIVERGED_FACTOR
-        of_defect = 0.9 * data[field.FACTOR_OF_DEFECT]
+        factor_by_defect = 0.9 * data[field.FACTOR_OF_DEFECT]
         if defect > 1.0:
             _predict_from_rejected(f, data, state)
-            return REFUSED, defect, max(0.3, of_defect)
+            return REFUSED, defect, max(0.3, factor_by_defect)
         data[field.DEFECT] = defect
-        most = min(most, of_defect)
-    most = min(most, longest / h)
-    beyond = data[field.SWEEPS] - data[field.TARGETED]
+        max_factor = min(max_factor, factor_by_defect)
+    max_factor = min(max_factor, h_max / h)
+    extra_sweeps = data[field.SWEEPS] - data[field.TARGETED]
     # the motion may be stiff: accelerations hardly vary, and yet the step took almost its target number of sweeps
-    limited = data[field.CURVED] < MIN_CURVED and beyond >= -1.0
+    limited = data[field.CURVED] < MIN_CURVED and extra_sweeps >= -1.0
     data[field.LIMITED] = max(0.0, data[field.LIMITED] + (1.0 if limited else -1.0))
     factor = data[field.FACTOR]
     # extrapolate the step size that the error allows: its ratio from step to step mostly changes little
-    allowed_h = h * min(data[field.FACTOR_OF_ERROR], MAX_EXTRAPOLATION)
+    h_allowed = h * min(data[field.FACTOR_OF_ERROR], MAX_EXTRAPOLATION)
     if error > 1e-6 and data[field.CURVED] >= MIN_CURVED:
-        trend = 1.0 if first else min(max(allowed_h / data[field.ALLOWED_H], LEAST_TREND), 1.0)
+        trend = 1.0 if first else min(max(h_allowed / data[field.ALLOWED_H], LEAST_TREND), 1.0)
         factor = min(factor, SAFETY * trend * data[field.FACTOR_OF_ERROR])
-    data[field.ALLOWED_H] = allowed_h
-    if beyond > 1.0:
-        most = min(most, 0.9)
-    return CONVERGED, error, min(max(factor, 0.4), most)
+    data[field.ALLOWED_H] = h_allowed
+    if extra_sweeps > 1.0:
+        max_factor = min(max_factor, 0.9)
+    return CONVERGED, error, min(max(factor, 0.4), max_factor)
 
 
 @merged
-def _accept(data):
+def _accept_polynomial(data):
     """Let the polynomial of an accepted step predict the next step."""
     if data[field.KEPT_DEGREE] > 0.0:
         data[field.NEXT_DEGREE], data[field.KEPT_DEGREE] = data[field.KEPT_DEGREE], 0.0
@@ -191,7 +191,7 @@ def _is_unsuited(w, data, tolerances):
 
 
 @compiled
-def _passes_singular(f, w, t, h, state, new_state):
+def _comes_near_singular(f, w, t, h, state, new_state):
     """Return whether C_q is much closer to a loss of rank within a step than at its beginning.
 
     Then other steps have to cross the singular position: near it, stages that violate the constraints have wrong
@@ -214,7 +214,7 @@ def settle_lobatto(f, w, options, memory, tolerances, accepted):
     """Let the polynomial of an accepted attempt predict the next step, or discard the attempt."""
     data = _aligned(memory)
     if accepted and data[field.TRIED] == 1.0:
-        _accept(data)
+        _accept_polynomial(data)
     data[field.TRIED] = 0.0
 
 
@@ -225,10 +225,10 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
     data[field.TRIED] = 0.0
     if tolerances[ESTIMATE] == 1.0 and _is_unsuited(w, data, tolerances):
         return Attempt(UNSUITED, math.inf, 0.0)
-    ended, error, factor = _collocate(f, w, options, data, tolerances, t, h, state)
-    if ended == NOT_COMPUTED or (ended == REFUSED and tolerances[ESTIMATE] == 0.0):
+    result, error, factor = _collocate(f, w, options, data, tolerances, t, h, state)
+    if result == NOT_COMPUTED or (result == REFUSED and tolerances[ESTIMATE] == 0.0):
         return Attempt(OUTER_DIVERGED, math.inf, 0.0)
-    if ended != CONVERGED:
+    if result != CONVERGED:
         return Attempt(DONE, error, factor)
     w.notes[DEFECT] = data[field.DEFECT]
     f.end_nodes(data, state, new_state)
@@ -240,7 +240,7 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
         error = max(error, departure(w, tolerances, h, state[:n], state[n : 2 * n], q1))
     if code == DONE and error <= 1.0 and w.notes[NEARLY_SINGULAR] == 1.0 and tolerances[ESTIMATE] == 1.0:
         w.notes[NEAR_NOW] = 2.0  # pivots are checked after the step, too
-        if _passes_singular(f, w, t, h, state, new_state):
+        if _comes_near_singular(f, w, t, h, state, new_state):
             code = SINGULAR
     return Attempt(code, error, factor if error <= 1.0 else 0.0)
 
@@ -258,7 +258,7 @@ def _project_all(f, w, options, data, n, n_ends, out_t, out_state):
         for i in range(2 * n):
             data[ends + LANES * (1 + i) + k] = out_state[row, i]
         data[field.FINE + k] = 1.0
-    least = max(options[THETA], MIN_CORRECTION * w.notes[ROUNDED])
+    tolerance = max(options[THETA], MIN_CORRECTION * w.notes[ROUNDED])
     f.correct_ends(data, f.own_numbers)
     for _ in range(4):
         f.project_ends(data, f.own_numbers)
@@ -267,10 +267,10 @@ def _project_all(f, w, options, data, n, n_ends, out_t, out_state):
         moved = 0.0
         for k in range(n_ends):
             moved = max(moved, data[field.MOVED + k])
-        if moved <= least:
+        if moved <= tolerance:
             break
     for k in range(n_ends):
-        if not data[field.MOVED + k] <= least:
+        if not data[field.MOVED + k] <= tolerance:
             data[field.FINE + k] = 0.0
 
 
@@ -305,41 +305,41 @@ def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, sta
 
 
 @merged
-def _may_follow(w, data, tolerances, control, clock, h):
+def _may_continue(w, data, tolerances, control, clock, h):
     """Return whether a step of size h may be taken before the integrator has checked the step before."""
-    long = clock[at.H_LONG]
-    if h <= control[at.SHORTEST] or h < COLLAPSED * long or _is_unsuited(w, data, tolerances):
+    h_long = clock[at.H_LONG]
+    if h <= control[at.SHORTEST] or h < COLLAPSED * h_long or _is_unsuited(w, data, tolerances):
         return False
     near = control[at.BRIDGE] == 1.0 and w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]
-    return not (near and h < SHORT_STEP * long)
+    return not (near and h < SHORT_STEP * h_long)
 
 
 @merged
-def _advance(f, w, options, data, tolerances, control, clock, goal, state, n_most, out_t, out_state, out_steps):
+def _take_steps(f, w, options, data, tolerances, control, clock, goal, state, n_most, out_t, out_state, out_steps):
     """Take at most n_most steps in a row, without a projection of their ends; return their number."""
     n, t, n_ends = w.Q.size, clock[at.T], 0
     while n_ends < n_most and t < goal:
-        wanted = min(clock[at.H_NEXT], control[at.MAX_STEP])
-        if not _may_follow(w, data, tolerances, control, clock, wanted):
+        h_wanted = min(clock[at.H_NEXT], control[at.MAX_STEP])
+        if not _may_continue(w, data, tolerances, control, clock, h_wanted):
             break
-        h, reaches = off_grid(control, t, wanted, goal - t, False)
+        h, reaches = off_grid(control, t, h_wanted, goal - t, False)
         if reaches:
             h = goal - t
-        ended, _, factor = _collocate(f, w, options, data, tolerances, t, h, state)
-        if ended == NOT_COMPUTED:
+        result, _, factor = _collocate(f, w, options, data, tolerances, t, h, state)
+        if result == NOT_COMPUTED:
             break
-        if ended != CONVERGED:
+        if result != CONVERGED:
             clock[at.H_NEXT] = h * factor
-            w.counters[N_REJECTED_ERROR] += 1 if ended == REFUSED else 0
+            w.counters[N_REJECTED_ERROR] += 1 if result == REFUSED else 0
             continue
         f.end_nodes(data, state, state)
-        _accept(data)
+        _accept_polynomial(data)
         t = goal if reaches else t + h
         out_t[n_ends], out_steps[n_ends, at.H] = t, h
         data[field.DEFECTS + n_ends] = data[field.DEFECT]
         copy(state[: 2 * n], out_state[n_ends, : 2 * n])
         # if the step was shortened to reach `goal`, the next one may have the size that this one was to have
-        clock[at.H_NEXT] = max(h * factor, wanted) if h < wanted else h * factor
+        clock[at.H_NEXT] = max(h * factor, h_wanted) if h < h_wanted else h * factor
         n_ends += 1
     return n_ends
 
@@ -363,7 +363,9 @@ def lobatto_steps(
         n_most = int(control[at.MAX_STEPS]) - w.counters[N_ACCEPTED]
     copy(state, new_state)
     driven = control[at.DRIVEN] == 1.0
-    n_ends = _advance(f, w, options, data, tolerances, control, clock, goal, state, n_most, out_t, out_state, out_steps)
+    n_ends = _take_steps(
+        f, w, options, data, tolerances, control, clock, goal, state, n_most, out_t, out_state, out_steps
+    )
     if n_ends == 0:
         return 0
     _project_all(f, w, options, data, n, n_ends, out_t, out_state)

@@ -59,7 +59,7 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
     residual = block(memory, s, n, at.RESIDUAL)
     Q_stage, V_stage = block(memory, s, n, at.Q_STAGE), block(memory, s, n, at.V_STAGE)
     a_new = vector(memory, s, n, at.A_NEW)
-    before = 0.0
+    previous_change = 0.0
     floor = STAGNATION_FIXED
     if tolerances[ESTIMATE] == 1.0:
         floor = STAGNATION * tolerances[LEAST]
@@ -106,20 +106,20 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
         if not np.isfinite(change):
             return OUTER_DIVERGED
         if iteration > 0:
-            contraction = change / before if before > 0.0 else 0.0
+            contraction = change / previous_change if previous_change > 0.0 else 0.0
             memory[at.CONTRACTION] = contraction
             if contraction >= 0.9:
                 return DONE if change <= floor else OUTER_DIVERGED
             if contraction / (1.0 - contraction) * change <= options[OUTER_TOL]:
                 return DONE
             # fail early if the remaining iterations cannot reach the tolerance
-            left = MAX_ITERATIONS - 1 - iteration
-            if change * contraction**left / (1.0 - contraction) > max(options[OUTER_TOL], floor):
+            n_left = MAX_ITERATIONS - 1 - iteration
+            if change * contraction**n_left / (1.0 - contraction) > max(options[OUTER_TOL], floor):
                 return OUTER_DIVERGED
         elif change <= 1e-3 * options[OUTER_TOL]:
             return DONE
-        before = change
-    return DONE if before <= floor else OUTER_DIVERGED
+        previous_change = change
+    return DONE if previous_change <= floor else OUTER_DIVERGED
 
 
 @compiled
@@ -145,20 +145,20 @@ def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
     gamma0 = options[offset + at.GAMMA0]
     e = options[offset + at.N_EIGEN_SCALARS : offset + at.N_EIGEN_SCALARS + s]
     e_q, e_v = vector(memory, s, n, at.E_Q), vector(memory, s, n, at.E_V)
-    raw, once = vector(memory, s, n, at.A_NEW), vector(memory, s, n, at.A_MID)
+    unfiltered, filtered_once = vector(memory, s, n, at.A_NEW), vector(memory, s, n, at.A_MID)
     for i in range(w.independent.size):
         j = w.independent[i]
         in_q = gamma0 * v[j]
         in_v = gamma0 * a[j]
         for k in range(s):
-            speed = v[j]
+            velocity = v[j]
             for l in range(s):
-                speed += h * A[k, l] * A_stage[l, j]
-            in_q += e[k] * speed
+                velocity += h * A[k, l] * A_stage[l, j]
+            in_q += e[k] * velocity
             in_v += e[k] * A_stage[k, j]
         e_q[i] = h * in_q
         e_v[i] = h * in_v
-    copy(e_v, raw)
+    copy(e_v, unfiltered)
     _filter(f, w, options, memory, h, e_q, e_v)
     error = 0.0
     for i in range(w.independent.size):
@@ -168,9 +168,12 @@ def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
             error = max(error, abs(e_v[i]) / allowed(tolerances, j, v[j], v1[j]))
     if options[offset + at.VELOCITIES] == 1.0:
         return error
-    copy(e_v, once)
+    copy(e_v, filtered_once)
     _filter(f, w, options, memory, h, e_q, e_v)
-    error = max(error, filtered_velocity_error(w, memory, tolerances, h * gamma0, raw, once, e_v, state, new_state, a))
+    error = max(
+        error,
+        filtered_velocity_error(w, memory, tolerances, h * gamma0, unfiltered, filtered_once, e_v, state, new_state, a),
+    )
     if error <= 1.0:
         error = max(error, _slow_error(f, w, options, memory, h, tolerances, state, new_state))
     return error
@@ -279,13 +282,13 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             in_v += b[k] * trial[k, m]
         q1[m] = q[m] + h * v[m] + h * h * in_q
         v1[m] = v[m] + h * in_v
-    code, off = project_prediction(f, w, tolerances, t + h, h, q, v, q1, v1, options[INNER_TOL])
+    code, distance = project_prediction(f, w, tolerances, t + h, h, q, v, q1, v1, options[INNER_TOL])
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
         error = _estimate(f, w, options, memory, h, tolerances, state, new_state, trial)
-        error = max(error, off)
+        error = max(error, distance)
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
     memory[at.HAS_TRIAL] = 1.0
     memory[at.H_TRIAL] = h

@@ -113,7 +113,7 @@ def displace_unequally(value, index):
 
 
 @compiled
-def _clear(A, b):
+def _clear_band(A, b):
     """Set the band |i - j| <= b of A to zero."""
     for i in range(A.shape[0]):
         for j in range(max(0, i - b), min(A.shape[0], i + b + 1)):
@@ -121,7 +121,7 @@ def _clear(A, b):
 
 
 @compiled
-def _finite(A, b):
+def _check_band_finite(A, b):
     """Return DONE, or NOT_FINITE if an entry in the band |i - j| <= b of A is not finite."""
     for i in range(A.shape[0]):
         for j in range(max(0, i - b), min(A.shape[0], i + b + 1)):
@@ -131,7 +131,7 @@ def _finite(A, b):
 
 
 @compiled
-def _constraints_bend(f, w, t, q):
+def _jacobian_differs(f, w, t, q):
     """Return whether C_q at q differs from w.G. Overwrites w.Gx with C_q at q."""
     w.Gx[:, :] = 0.0
     constraint_rows(f, w, t, q, w.Gx)
@@ -151,14 +151,14 @@ def _subtract_reaction_differences(f, w, t, q, moved, b, K):
     n = q.size
     for j in range(n):
         moved[j] = displace_unequally(q[j], j)
-    if not _constraints_bend(f, w, t, moved):
+    if not _jacobian_differs(f, w, t, moved):
         return
     width = min(n, 2 * b + 1)
     for group in range(width):
         copy(q, moved)
         for j in range(group, n, width):
             moved[j] += DIFFERENCE * max(1.0, abs(q[j]))
-        if not _constraints_bend(f, w, t, moved):
+        if not _jacobian_differs(f, w, t, moved):
             continue
         for j in range(group, n, width):
             size = moved[j] - q[j]
@@ -173,17 +173,17 @@ def tangent_by_q(f, w, t, q, v, b, moved, K, R):
 
     `moved` (n_q) and R (n_q, n_q) are scratch.
     """
-    _clear(K, b)
+    _clear_band(K, b)
     f.force_by_q(t, q, v, f.p, K)
     if f.flags[REACTION_BY_Q_GIVEN] == 1:
-        _clear(R, b)
+        _clear_band(R, b)
         f.reaction_by_q(t, q, w.lam, f.p, R)
         for i in range(q.size):
             for j in range(max(0, i - b), min(q.size, i + b + 1)):
                 K[i, j] -= R[i, j]
     else:
         _subtract_reaction_differences(f, w, t, q, moved, b, K)
-    return _finite(K, b)
+    return _check_band_finite(K, b)
 
 
 @compiled
@@ -191,16 +191,16 @@ def tangent_by_v(f, t, q, v, b, D):
     """Compute the band |i - j| <= b of D (n_q, n_q) if the system provides it; return a code."""
     if f.flags[FORCE_BY_V_GIVEN] == 0:
         return DONE
-    _clear(D, b)
+    _clear_band(D, b)
     f.force_by_v(t, q, v, f.p, D)
-    return _finite(D, b)
+    return _check_band_finite(D, b)
 
 
 # --- dense storage
 
 
 @compiled
-def reduce(w, A, AT, B):
+def reduce_to_independents(w, A, AT, B):
     """Compute B (n_dof, n_dof) = T^T A T with T = [I; w.D^T], and AT (n_q, n_dof) = A T."""
     n, m = AT.shape
     columns = columns_of(w.index)
@@ -239,15 +239,15 @@ def _dense_from_tangents(f, w, memory, s, t, q, v):
         return code
     Jq, Jv = as_matrix(matrix_storage(w, n, BY_Q), m), as_matrix(matrix_storage(w, n, BY_V), m)
     N = as_matrix(matrix_storage(w, n, SYSTEMS), m)
-    reduce(w, w.M, AT, N)
+    reduce_to_independents(w, w.M, AT, N)
     if not ldl_factor(N):
         return SINGULAR
-    reduce(w, K, AT, Jq)
+    reduce_to_independents(w, K, AT, Jq)
     ldl_solve_rows(N, Jq)
     memory[DAMPED] = f.flags[FORCE_BY_V_GIVEN]
     code = tangent_by_v(f, t, q, v, n - 1, K)
     if code == DONE and memory[DAMPED] == 1.0:
-        reduce(w, K, AT, Jv)
+        reduce_to_independents(w, K, AT, Jv)
         ldl_solve_rows(N, Jv)
     return code
 
@@ -380,17 +380,17 @@ def _difference_groups(f, w, t, q, v, by_v, base, moved, b, band):
     (n_q) is scratch.
     """
     n = q.size
-    given = v if by_v else q
+    base_point = v if by_v else q
     for group in range(2 * b + 1):
-        copy(given, moved)
+        copy(base_point, moved)
         for j in range(group, n, 2 * b + 1):
-            moved[j] += DIFFERENCE * max(1.0, abs(given[j]))
+            moved[j] += DIFFERENCE * max(1.0, abs(base_point[j]))
         if by_v:
             _banded_residual(f, w, t, q, moved)
         else:
             _banded_residual(f, w, t, moved, v)
         for j in range(group, n, 2 * b + 1):
-            size = moved[j] - given[j]
+            size = moved[j] - base_point[j]
             for i in range(max(0, j - b), min(n, j + b + 1)):
                 band[i, b + j - i] = (w.Q[i] - base[i]) / size
                 if not np.isfinite(band[i, b + j - i]):
@@ -549,8 +549,8 @@ def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_eigenvalu
     """Return the length of w.matrices for sparse storage: see _sparse_state, _sparse_vectors and _sparse_factors."""
     n = int(program[N_PIVOTS])
     n_tangents = int(program[N_OF_MASS]) - n_mass
-    one = n + 2 * int(program[N_OFF])
-    return n_mass + n_jacobian + 2 * n_tangents + (N_SPARSE_VECTORS + 7) * n + (1 + 2 * n_eigenvalues) * one
+    n_factors = n + 2 * int(program[N_OFF])
+    return n_mass + n_jacobian + 2 * n_tangents + (N_SPARSE_VECTORS + 7) * n + (1 + 2 * n_eigenvalues) * n_factors
 
 
 @inlined
@@ -592,12 +592,12 @@ def _sparse_vectors(f, w):
 def _sparse_factors(f, w, k):
     """Return a real view of the factors for gamma0 (k = 0), or of the complex ones for eigenvalue k - 1."""
     n = f.newton_program[N_PIVOTS]
-    one = n + 2 * f.newton_program[N_OFF]
+    n_factors = n + 2 * f.newton_program[N_OFF]
     begin = w.mass_values.size + w.jacobian_values.size + (N_SPARSE_VECTORS + 7) * n
     begin += 2 * (mass_of(f.newton_program)[0].size - w.mass_values.size)
     if k == 0:
-        return w.matrices[begin : begin + one]
-    return w.matrices[begin + (2 * k - 1) * one : begin + (2 * k + 1) * one]
+        return w.matrices[begin : begin + n_factors]
+    return w.matrices[begin + (2 * k - 1) * n_factors : begin + (2 * k + 1) * n_factors]
 
 
 @compiled
@@ -616,9 +616,9 @@ def _sparse_residual(f, w, t, q, v, moved, out):
         largest = max(largest, abs(out[j]))
     rows, columns, _ = jacobian_of(f.newton_program)
     for k in range(rows.size):
-        part = w.jacobian_values[k] * w.lam[rows[k]]
-        largest = max(largest, abs(part))
-        out[columns[k]] -= part
+        term = w.jacobian_values[k] * w.lam[rows[k]]
+        largest = max(largest, abs(term))
+        out[columns[k]] -= term
     return largest
 
 
@@ -629,40 +629,40 @@ def _sparse_differences(f, w, t, q, v, by_v, base, other, moved, entries):
     All columns of a group are displaced at once. `base` is the residual at (q, v); overwrites `other` and `moved`.
     """
     rows, columns, begins = tangents_of(f.newton_program)
-    given = v if by_v else q
+    base_point = v if by_v else q
     for group in range(begins.size - 1):
-        copy(given, moved)
+        copy(base_point, moved)
         first, last = begins[group], begins[group + 1]
         for k in range(first, last):
             j = columns[k]
-            moved[j] = given[j] + DIFFERENCE * max(1.0, abs(given[j]))
+            moved[j] = base_point[j] + DIFFERENCE * max(1.0, abs(base_point[j]))
         if by_v:
             _sparse_residual(f, w, t, q, moved, False, other)
         else:
             _sparse_residual(f, w, t, moved, v, True, other)
         for k in range(first, last):
             i, j = rows[k], columns[k]
-            entries[k] = (other[i] - base[i]) / (moved[j] - given[j])
+            entries[k] = (other[i] - base[i]) / (moved[j] - base_point[j])
     return DONE if finite_vector(entries) else NOT_FINITE
 
 
 @compiled
-def _entries_are_complete(f, base, other, given, moved, largest, entries, predicted):
+def _entries_are_complete(f, base, other, base_point, moved, largest, entries, predicted):
     """Return whether the entries (of K or D) account for the change of the residual.
 
-    The residual changes from `base` to `other` as `given` changes to `moved`. Overwrites `other` and `predicted`.
+    The residual changes from `base` to `other` as `base_point` changes to `moved`. Overwrites `other` and `predicted`.
     """
     rows, columns, _ = tangents_of(f.newton_program)
     predicted[:] = 0.0
     for k in range(rows.size):
         i, j = rows[k], columns[k]
-        part = entries[k] * (moved[j] - given[j])
-        other[i] -= part
-        predicted[i] += abs(part)
-    worst = 0.0
+        term = entries[k] * (moved[j] - base_point[j])
+        other[i] -= term
+        predicted[i] += abs(term)
+    largest_excess = 0.0
     for i in range(base.size):
-        worst = max(worst, abs(other[i] - base[i]) - MAX_DEVIATION * predicted[i])
-    return worst <= NOISE * largest
+        largest_excess = max(largest_excess, abs(other[i] - base[i]) - MAX_DEVIATION * predicted[i])
+    return largest_excess <= NOISE * largest
 
 
 @compiled
@@ -886,11 +886,11 @@ def correct(f, w, options, memory, s, residual, A_stage):
                 total += complex(options[row + j], options[row + s + j]) * residual[j, w.independent[i]]
             x[i] = total
         solve_system(f, w, options, memory, s, k, x)
-        twice = 1.0 if k < n_real else 2.0
+        multiplicity = 1.0 if k < n_real else 2.0
         for j in range(s):
             re, im = options[column + j], options[column + s + j]
             for i in range(m):
-                d[j, w.independent[i]] += twice * (re * x[i].real - im * x[i].imag)
+                d[j, w.independent[i]] += multiplicity * (re * x[i].real - im * x[i].imag)
     for j in range(s):
         for i in w.independent:
             residual[j, i] = d[j, i]

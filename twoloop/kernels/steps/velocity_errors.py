@@ -25,34 +25,36 @@ from twoloop.kernels.steps.stages import INNER_TOL, block, vector
 SLOW_FACTOR = 10.0
 LONGEST_GAPS = 10.0  # longest duration of an error, in units of GAP
 STEPS_TO_DECAY = 10.0  # number of steps after which a fast error has decayed
-FAST = 20.0  # duration over z = h gamma below which a velocity error counts as fast
+FAST_DURATION = 20.0  # duration over z = h gamma below which a velocity error counts as fast
 # relative change of J above which it counts as outdated
-UNLIKE = 0.3
+OUTDATED_CHANGE = 0.3
 
 
 @compiled
-def filtered_velocity_error(w, memory, tolerances, z, raw, once, twice, state, new_state, a_end):
+def filtered_velocity_error(
+    w, memory, tolerances, z, unfiltered, filtered_once, filtered_twice, state, new_state, a_end
+):
     """Return the error over the tolerances that a velocity error (n_dof) causes, see `velocity_error`.
 
-    `raw` is the velocity error, `once` and `twice` are its results after one and two filters (I - z J)^-1. `a_end`
-    are the accelerations at the end of the step, which show how fast the motion changes if a contact began. Stores the
-    duration of the error in `memory`.
+    `unfiltered` is the velocity error, `filtered_once` and `filtered_twice` are its results after one and two filters
+    (I - z J)^-1. `a_end` are the accelerations at the end of the step, which show how fast the motion changes if a
+    contact began. Stores the duration of the error in `memory`.
     """
     n = w.Q.size
     v, a = state[n : 2 * n], state[2 * n : 3 * n]
     count = w.independent.size
-    largest, turn, fastest, change = 0.0, 0.0, 0.0, 0.0
+    largest, curvature, largest_v, largest_a = 0.0, 0.0, 0.0, 0.0
     for i in range(count):
-        fastest = max(fastest, abs(v[w.independent[i]]))
-        change = max(change, abs(a[w.independent[i]]), abs(a_end[w.independent[i]]))
-        largest = max(largest, abs(twice[i]))
-        turn = max(turn, abs(twice[i] - 2.0 * once[i] + raw[i]))  # (z J)^2 e
+        largest_v = max(largest_v, abs(v[w.independent[i]]))
+        largest_a = max(largest_a, abs(a[w.independent[i]]), abs(a_end[w.independent[i]]))
+        largest = max(largest, abs(filtered_twice[i]))
+        curvature = max(curvature, abs(filtered_twice[i] - 2.0 * filtered_once[i] + unfiltered[i]))  # (z J)^2 e
     if largest > 0.0:
-        memory[at.DURATION] = z * np.sqrt(largest / turn)
+        memory[at.DURATION] = z * np.sqrt(largest / curvature)
     duration = memory[at.DURATION]
-    if duration * change * SLOW_FACTOR > fastest:
-        duration *= min(SLOW_FACTOR, duration * change * SLOW_FACTOR / fastest) if fastest > 0.0 else SLOW_FACTOR
-    return velocity_error(w, tolerances, twice, duration, state, new_state)
+    if duration * largest_a * SLOW_FACTOR > largest_v:
+        duration *= min(SLOW_FACTOR, duration * largest_a * SLOW_FACTOR / largest_v) if largest_v > 0.0 else SLOW_FACTOR
+    return velocity_error(w, tolerances, filtered_twice, duration, state, new_state)
 
 
 @compiled
@@ -76,38 +78,42 @@ def velocity_error(w, tolerances, e_v, duration, state, new_state):
 def motion_time(w, tolerances, state, a):
     """Return the time, s, in which accelerations a (n_q) change velocities by their size; at most LONGEST_GAPS GAP."""
     n = w.Q.size
-    fastest = change = 0.0
+    largest_v = largest_a = 0.0
     for j in w.independent:
-        fastest = max(fastest, abs(state[n + j]))
-        change = max(change, abs(a[j]))
+        largest_v = max(largest_v, abs(state[n + j]))
+        largest_a = max(largest_a, abs(a[j]))
     longest = LONGEST_GAPS * tolerances[GAP]
-    return fastest / change if fastest < longest * change else longest
+    return largest_v / largest_a if largest_v < longest * largest_a else longest
 
 
 @compiled
-def _derivatives_matter(w, memory, tolerances, z, raw, longest, state, new_state):
+def _derivatives_matter(w, memory, tolerances, z, unfiltered, longest, state, new_state):
     """Return whether the error estimate might be wrong if J is outdated.
 
-    This is so if the velocity error `raw` would exceed the tolerances if it lasted for `longest`, s. It is also so if J
-    shows a short duration, and Newton's method converges so slowly that J must have changed by more than UNLIKE.
+    This is so if the velocity error `unfiltered` would exceed the tolerances if it lasted for `longest`, s. It is also
+    so if J shows a short duration, and Newton's method converges so slowly that J must have changed by more than
+    UNLIKE.
     """
     duration = memory[at.DURATION]
-    if duration < min(longest, FAST * z) and memory[at.CONTRACTION] * duration * duration > UNLIKE * z * z:
+    if (
+        duration < min(longest, FAST_DURATION * z)
+        and memory[at.CONTRACTION] * duration * duration > OUTDATED_CHANGE * z * z
+    ):
         return True
-    return velocity_error(w, tolerances, raw, longest, state, new_state) > 1.0
+    return velocity_error(w, tolerances, unfiltered, longest, state, new_state) > 1.0
 
 
 @compiled
-def derivatives_agree(f, w, options, memory, s, t, z, tolerances, raw, e_q, e_v, state, new_state, a_end):
+def derivatives_agree(f, w, options, memory, s, t, z, tolerances, unfiltered, e_q, e_v, state, new_state, a_end):
     """Return whether J agrees with the equations at the end of the step, at time t, or does not change the estimate.
 
-    (e_q, e_v) is (I - z J)^-1 times an error whose velocities are `raw`, so that (e_v - raw) / z is a product with J.
-    This product is compared with a difference of accelerations for a displacement by (e_q, e_v). `longest`: see
+    (e_q, e_v) is (I - z J)^-1 times an error whose velocities are `unfiltered`, so that (e_v - raw) / z is a product
+    with J. This product is compared with a difference of accelerations for a displacement by (e_q, e_v). `longest`: see
     `motion_time`.
     """
     n = w.Q.size
     longest = max(motion_time(w, tolerances, state, state[2 * n :]), motion_time(w, tolerances, state, a_end))
-    if not _derivatives_matter(w, memory, tolerances, z, raw, longest, state, new_state):
+    if not _derivatives_matter(w, memory, tolerances, z, unfiltered, longest, state, new_state):
         return True
     q1, v1 = new_state[:n], new_state[n : 2 * n]
     Q, V = vector(memory, s, n, at.Q_MOVED), vector(memory, s, n, at.V_MOVED)
@@ -130,12 +136,12 @@ def derivatives_agree(f, w, options, memory, s, t, z, tolerances, raw, e_q, e_v,
         V[w.independent[i]] += factor * e_v[i]
     if evaluate(f, w, t, Q, V, options[INNER_TOL], a_moved) != DONE:
         return False
-    apart, widest, fastest = 0.0, 0.0, 0.0
+    largest_difference, largest_product, largest_v = 0.0, 0.0, 0.0
     for i in range(w.independent.size):
         j = w.independent[i]
         scale = allowed(tolerances, j, state[n + j], new_state[n + j])
-        product, difference = (e_v[i] - raw[i]) / z, (a_moved[j] - a_base[j]) / factor
-        apart = max(apart, abs(product - difference) / scale)
-        widest = max(widest, abs(product) / scale, abs(difference) / scale)
-        fastest = max(fastest, abs(e_v[i]) / scale)
-    return apart <= UNLIKE * widest or widest * longest <= fastest
+        product, difference = (e_v[i] - unfiltered[i]) / z, (a_moved[j] - a_base[j]) / factor
+        largest_difference = max(largest_difference, abs(product - difference) / scale)
+        largest_product = max(largest_product, abs(product) / scale, abs(difference) / scale)
+        largest_v = max(largest_v, abs(e_v[i]) / scale)
+    return largest_difference <= OUTDATED_CHANGE * largest_product or largest_product * longest <= largest_v
