@@ -396,7 +396,7 @@ def compile_callback(
     else:
         add_signature(dispatcher, KINDS[kind].signature)
     if watched is not None:
-        # the digest of this compilation: values that the function uses may change later
+        # register the digest of this compilation, because values that the function uses may change later
         register_digest(dispatcher, f"{kind} {watched}")
     frozen_values(dispatcher, function)
     return dispatcher

@@ -136,7 +136,7 @@ class Digest:
         self.hash.update(f"{module}.{name}".encode())
 
     def _is_new(self, value: Any, name: str = "") -> bool:
-        """Return whether a value was not added before, and register it; if it was, add its number."""
+        """Return whether a value is new, and register it; if it is not, add its number to the hash."""
         key = (id(value), name)
         if key in self.seen:
             self.hash.update(f"<again {self.seen[key]}>".encode())
@@ -158,7 +158,7 @@ def globals_of(function: Any) -> dict[str, Any]:
 
 
 def reachable_names(function: Any, seen: set[int] | None = None) -> set[str]:
-    """Return the names in a function and in its compiled helpers: attributes of a module that it may pass to them."""
+    """Return the names used in a function and in its compiled helpers, such as those of attributes of modules."""
     seen = set() if seen is None else seen
     seen.add(id(function))
     names = names_of_code(function.__code__)
@@ -390,7 +390,7 @@ class FunctionCopier:
         own_globals = dict(function.__globals__)
         copy = types.FunctionType(function.__code__, own_globals, function.__name__, function.__defaults__, cells)
         copy.__kwdefaults__, copy.__qualname__ = function.__kwdefaults__, function.__qualname__
-        self.known[id(helper)] = self.wrap(copy, helper)  # before its values are replaced, as it may use itself
+        self.known[id(helper)] = self.wrap(copy, helper)  # before its values are replaced: they may include it
         for name in own & set(own_globals):
             own_globals[name] = self.value(own_globals[name], names)
         if function.__defaults__ is not None:

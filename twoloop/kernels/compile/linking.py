@@ -57,7 +57,7 @@ def jitable_templates(function: Any) -> list[Any]:
         return []
     closures = [getattr(getattr(each, "_overload_func", None), "__closure__", None) for each in templates]
     owned = [any(cell.cell_contents is function for cell in source or ()) for source in closures]
-    return templates if all(owned) else []  # not all: another implementation may replace the function
+    return templates if all(owned) else []  # otherwise, another implementation may replace the function
 
 
 def add_signature(function: Dispatcher, signature: Any) -> None:

@@ -87,29 +87,29 @@ def _refill(code, order, control, work, n, n_rows, numbers, q0, v0, next_run, st
 def _write_within_steps(code, settings, control, options, work, n, new, times, out_q, out_v, status, n_steps):
     """Compute the states at output times within the accepted steps, into out_q and out_v; NaN where this fails."""
     while True:
-        n_wanted = 0
+        n_requested = 0
         for k in range(LANES):
-            wanted = int(work[REACHED * LANES + k])
+            next_time = int(work[REACHED * LANES + k])
             work[FINE * LANES + k] = work[X * LANES + k] = 0.0
-            if work[ACCEPTED * LANES + k] == 1.0 and wanted < times.size:
+            if work[ACCEPTED * LANES + k] == 1.0 and next_time < times.size:
                 end = work[T * LANES + k] + work[H * LANES + k]
-                if times[wanted] < end and times[wanted] < control[T1]:
-                    work[FINE * LANES + k], n_wanted = 1.0, n_wanted + 1
-                    work[X * LANES + k] = times[wanted] - work[T * LANES + k]
-                    work[AHEAD * LANES + k] = times[wanted]
+                if times[next_time] < end and times[next_time] < control[T1]:
+                    work[FINE * LANES + k], n_requested = 1.0, n_requested + 1
+                    work[X * LANES + k] = times[next_time] - work[T * LANES + k]
+                    work[AHEAD * LANES + k] = times[next_time]
             work[REQUESTED * LANES + k] = work[FINE * LANES + k]
-        if n_wanted == 0:
+        if n_requested == 0:
             return
         code.step(code, settings, control, options, work, status, n_steps, True)
         project_lanes(code, settings[ORDER], control, work)
         for k in range(LANES):
             if work[REQUESTED * LANES + k] == 1.0:
-                run, wanted = int(work[RUN * LANES + k]), int(work[REACHED * LANES + k])
+                run, next_time = int(work[RUN * LANES + k]), int(work[REACHED * LANES + k])
                 work[REACHED * LANES + k] += 1.0
                 for j in range(n):
                     fine = work[FINE * LANES + k] == 1.0
-                    out_q[run, j, wanted] = work[(new + j) * LANES + k] if fine else np.nan
-                    out_v[run, j, wanted] = work[(new + n + j) * LANES + k] if fine else np.nan
+                    out_q[run, j, next_time] = work[(new + j) * LANES + k] if fine else np.nan
+                    out_v[run, j, next_time] = work[(new + n + j) * LANES + k] if fine else np.nan
 
 
 @compiled
@@ -146,10 +146,12 @@ def _advance_time(work, control, n_steps):
             work[REFUSED * LANES + k] = 0.0
 
 
-_ADVANCE = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[TABLE] * 3, *[STATES] * 2, TABLE, *[INTEGERS] * 3, VECTOR)
+_ADVANCE_SIGNATURE = types.void(
+    CODE, INTEGERS, *[VECTOR] * 3, *[TABLE] * 3, *[STATES] * 2, TABLE, *[INTEGERS] * 3, VECTOR
+)
 
 
-@kernel(_ADVANCE)
+@kernel(_ADVANCE_SIGNATURE)
 def advance_lanes(
     code, settings, control, options, times, numbers, q0, v0, out_q, out_v, out_a, status, n_steps, n_evaluations, work
 ):

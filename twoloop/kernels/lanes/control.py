@@ -67,7 +67,7 @@ ROUGH, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
 SUDDEN_ERROR, AFTER_REJECTION, ROUNDING_OF_END = 10.0, 0.95, 1e-10
 LIMIT_FACTOR, LIMIT_MEMORY = 0.7, 10.0  # the values in methods/plan.py
 RESOLVED = 20.0 * SHORTEST  # lower bound of the first step, relative to t0
-MOST_REFUSED = 30  # largest number of successive rejected steps: of stiff steps, estimates may be far too large
+MOST_REFUSED = 30  # largest number of successive rejected steps: in stiff motion, these steps may remain far too long
 MOST_STEPS = 100_000  # largest number of steps of a run in lanes, because the user cannot interrupt it
 
 
@@ -218,7 +218,10 @@ def memory_size(s: int, n: int) -> int:
 
 @kernel(STEP)
 def step_by_dop853(code, settings, control, options, work, status, n_steps, within):
-    """Take a step, at most GAP long; or compute the states X seconds after its beginning (`within`)."""
+    """Take a step of at most control[GAP] in each lane.
+
+    With `within`, compute instead the states at the time X after the beginning of the last accepted step.
+    """
     n = settings[N]
     state, _, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     start = memory + START * n
@@ -246,7 +249,7 @@ def step_by_series(code, settings, control, options, work, status, n_steps, with
             work[X * LANES + k] = work[X * LANES + k] / work[UNIT * LANES + k]
         code.evaluate(order, control, work)
         return
-    for k in range(LANES):  # of stiff motion, the tolerance does not limit the number of steps
+    for k in range(LANES):  # in stiff motion, no tolerance limits the number of steps
         if work[RUNNING * LANES + k] == 1.0 and n_steps[int(work[RUN * LANES + k])] >= MOST_STEPS:
             leave_run(work, status, k, MANY_STEPS)
     code.series(order, control, work)

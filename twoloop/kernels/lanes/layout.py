@@ -30,7 +30,7 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: that of double
     H,  # size of the step, s
     X,  # time of a state to compute, after the beginning of the step, s
     FINE,  # 1 in lanes for which a task is to run; it remains 1 if the task succeeds
-    DEFECT,
+    DEFECT,  # defect at the end of the step, over its allowed size
     OFF,  # departure of the step, see control/step_size.py
     LENGTH,  # size of the step that a series allows, in units
     LONGEST,  # longest step allowed, s

@@ -499,7 +499,7 @@ def _motion_time(control, work, n, memory, k):
 
 
 @compiled
-def _slow_error(settings, control, method_options, s, work):
+def _error_in_slow_directions(settings, control, method_options, s, work):
     """Set ERROR to the error that E_V causes in slow directions, if this is larger, see newton_step.py."""
     n = settings[N]
     state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
@@ -559,7 +559,7 @@ def _estimate(settings, control, method_options, A, work):
         z = method_options[offset + GAMMA0] * work[H * LANES + k]
         error = _filtered_velocity_error(control, work, n, memory, z, state, new, k)
         work[ERROR * LANES + k] = max(work[ERROR * LANES + k], error)
-    _slow_error(settings, control, method_options, s, work)
+    _error_in_slow_directions(settings, control, method_options, s, work)
 
 
 @compiled

@@ -39,7 +39,7 @@ WEAK = 1e-4  # eigenvalue of G G^T below which a combination of rows is redundan
 # number of inverse iterations for eigenvectors of redundant rows; few, as their eigenvalues are much smaller than
 # others
 REDUNDANT_ITERATIONS = 5
-GOLDEN = 0.6180339887498949  # fractional parts of its multiples serve as start values without regularity
+GOLDEN = 0.6180339887498949  # fractional parts of its multiples are irregular start values of inverse iterations
 
 
 @merged
@@ -387,10 +387,10 @@ def _compare_with_other_starts(code, settings, control, pattern, moves, work):
                 work[RUNNING * LANES + k] = 0.0
 
 
-_START = types.void(CODE, INTEGERS, VECTOR, *[INTEGERS] * 2, *[types.float64[:, ::1]] * 3, INTEGERS, VECTOR)
+_START_SIGNATURE = types.void(CODE, INTEGERS, VECTOR, *[INTEGERS] * 2, *[types.float64[:, ::1]] * 3, INTEGERS, VECTOR)
 
 
-@kernel(_START, vectorized=True)
+@kernel(_START_SIGNATURE, vectorized=True)
 def start_lanes(code, settings, control, pattern, moves, numbers, q, v, fine, work):
     """Project states (q, v), one for each row of `numbers`, onto the constraints at t0.
 

@@ -22,8 +22,8 @@ MAX_ORDER = 5
 N_DIFFERENCES = MAX_ORDER + 2  # differences of orders 0 to MAX_ORDER + 1
 STARTER_STAGES = 3  # number of stages of the Gauss steps that begin a run of fixed steps
 MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
-SAFETY = 0.9  # factor on the step size for which the estimated error would be 1, after a rejected step
-LEAST_FACTOR = 0.2  # smallest ratio of successive step sizes after a rejected step
+SAFETY = 0.9  # safety factor on the step size after a rejected step; smallest ratio of step sizes after an accepted one
+LEAST_FACTOR = 0.2  # smallest ratio of step sizes after a rejected step, or one far from its prediction
 STRICT = 10.0  # factor on the error estimate: errors of many short steps add up, and then come close to the tolerance
 BIAS = 6.0  # factor on the error estimate in the choice of the step size, as in VODE; a smaller one causes rejections
 OTHER_ORDER = 1.4  # factor on the error estimates of other orders, so that the order rarely changes back and forth
@@ -143,7 +143,7 @@ def _predict(memory, differences, trial, h, prediction, rate):
 
 
 @merged
-def _corrector_length(h, k):
+def _corrector_coefficient(h, k):
     """Return the coefficient c of the corrector, h / (1 + 1/2 + ... + 1/k), s."""
     leading = 0.0
     for j in range(k):
@@ -299,7 +299,7 @@ def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if fixed and k < options[HIGHEST]:
         code = _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch)
     else:
-        code = _correct(f, w, options, t + h, _corrector_length(h, k), prediction, rate, new_state, scratch[:n])
+        code = _correct(f, w, options, t + h, _corrector_coefficient(h, k), prediction, rate, new_state, scratch[:n])
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
     y, y1, d = state[: 2 * n], new_state[: 2 * n], prediction

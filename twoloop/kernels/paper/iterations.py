@@ -61,8 +61,10 @@ def store_rest(rest):
 
 
 MAX_ITERATIONS = 60  # number of iterations after which `iterate_accelerations` has failed
-MAX_ITERATIONS_PAPER = 200  # that of `iterate_first_order`; in the paper there is none, but (33) ends divergent loops
-GROWTH = 1e3  # ratio of a change to the first one that means divergence: as the matrix is not normal, changes may grow
+MAX_ITERATIONS_PAPER = 200  # limit in `iterate_first_order`; in the paper there is none, but (33) ends divergent loops
+# ratio of a change to the first one above which the iteration diverges; smaller growth is possible, because the matrix
+# of the iteration is not normal
+GROWTH = 1e3
 PATIENCE = 8  # number of iterations after which a change larger than the previous one means divergence
 UNDECIDED, CONVERGED, DIVERGED = range(3)
 
@@ -107,7 +109,7 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
 
     A_stage (s, n) is the prediction of the accelerations on entry, and the result on return; (q1, v1) becomes the end
     of the step, on the constraints. The stages Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk
-    a_k are the solution of (17). For undamped systems the rate of convergence is the square of that of the first-order
+    a_k then satisfy (17). For undamped systems the rate of convergence is the square of that of the first-order
     iteration. Sums are compensated if `rest` has rows. `departure` is explained in step_size.py.
     """
     s, A, A2, b, bA, c = tableau_of(options)

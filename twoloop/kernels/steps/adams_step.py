@@ -45,8 +45,8 @@ def _error_constants():
     return np.abs(coefficients)
 
 
-# lower bounds of the error constants: after a decrease of h those of the actual steps are smaller, and too small if the
-# force jumps
+# error constants at equal steps, used as lower bounds: after a decrease of h, the actual constants are smaller, which
+# is wrong if the force jumps
 EQUAL_STEPS = _error_constants()
 
 # indices in `options`. THETA: limit of the last correction of a projection, see `project` in inner_loop.py
@@ -170,7 +170,7 @@ def _predict(memory, h, k, old, new, state, q1, v1, n):
     in_v, in_q = _scratch(memory, n)
     for m in range(0, old.shape[1], 4):
         d0, d1, d2, d3 = old[N_TERMS, m], old[N_TERMS, m + 1], old[N_TERMS, m + 2], old[N_TERMS, m + 3]
-        # the row holds phi_{k+2} - d: phi_{k+2} = d - beta_{k+1} phi_{k+1}
+        # this row is phi_{k+2} less d, because phi_{k+2} = d - beta_{k+1} phi_{k+1}
         b = beta[k]
         new[k + 1, m] = -b * (old[k, m] + d0)
         new[k + 1, m + 1] = -b * (old[k, m + 1] + d1)
@@ -289,7 +289,7 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
     old, new = _table(memory, n, memory[WHICH]), _table(memory, n, 1.0 - memory[WHICH])
     _compute_coefficients(memory, h, k)
     _predict(memory, h, k, old, new, state, q1, v1, n)
-    memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # remains if an evaluation fails
+    memory[NEXT_ORDER] = max(k - 1.0, 1.0)  # the next order if an evaluation fails
     code = evaluate_as_given(f, w, t + h, q1, v1, a1)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)

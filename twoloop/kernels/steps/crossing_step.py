@@ -58,7 +58,7 @@ SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2
 UNSEEN = 0.0767
 BACK = 0.4  # fraction of the polynomial that lies before the beginning of the step
 ORDER, SHARE = 12.0, 0.5  # order of the estimated error; factor on the estimate
-MOVED = 0.5  # weight in the error of the step of the largest correction of a stage by its projection
+MOVED = 0.5  # factor of the largest correction of a stage by its projection, in the error of the step
 ROUNDING = 1e-13  # relative tolerance of the iteration in fixed steps, and of comparisons of times
 NEARER = 0.5  # smallest allowed ratio of the pivot at the end of a step to that at the beginning; see also ENDS
 ENDS = 4.0  # the pivot at the end is also allowed if it is this many times the pivot below which nodes are left out
@@ -358,7 +358,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if estimated:
             whole = h + max(0.0, min(h * BACK / (1.0 - BACK), t - earliest))
     begin, c0 = t + h - whole, (whole - h) / whole
-    c_base = 0.0 if time_of_base <= t else c0  # where the polynomial has the state of the base
+    c_base = 0.0 if time_of_base <= t else c0  # time of the state `base`, relative to the polynomial
     _weights_to_start(b, c, c_base, to_v, to_q)
     n_back = 0  # number of nodes before the state from which the step begins
     while n_back < S and c[n_back] < c_base:

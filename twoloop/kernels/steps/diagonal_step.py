@@ -461,7 +461,7 @@ def _extrapolate(f, w, options, memory, h, q1, v1):
 
 
 @compiled
-def _slow_error(f, w, options, memory, h, tolerances, state, new_state, A_stage):
+def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state, A_stage):
     """Return the position error over the tolerances that E_V causes in slow directions, as in newton_step.py.
 
     It is 0 where E_V is too small to matter. Overwrites E_Q, E_V and the factors.
@@ -510,7 +510,7 @@ def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V
     share = min(1.0, deviation / (MAX_JUMP_RATIO * widest))
     error = _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, lower, share)
     if error <= 1.0:
-        error = max(error, _slow_error(f, w, options, memory, h, tolerances, state, new_state, A_stage))
+        error = max(error, _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state, A_stage))
     return error
 
 
@@ -520,7 +520,7 @@ def settle_diagonal(f, w, options, memory, tolerances, accepted):
     if accepted:
         s = int(options[DIAGONAL_OFFSET])
         _, A_stage, a_end = stages_of(memory, s, w.Q.size)
-        copy(A_stage[s - 1], a_end)  # F there would contain Newton's residual times the stiffness
+        copy(A_stage[s - 1], a_end)  # F at this state would contain the stiffness times Newton's residual
         memory[at.FRESH] = 0.0
 
 
@@ -578,7 +578,7 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
             return Attempt(DONE, error, 0.0)
         if options[options.size - 1] == 1.0:
             _extrapolate(f, w, options, memory, h, q1, v1)
-        error = max(error, _slow_error(f, w, options, memory, h, tolerances, state, new_state, A_stage))
+        error = max(error, _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state, A_stage))
         if error <= 1.0 and options[options.size - 1] == 0.0:
             jumps = _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, lower)
             error = max(error, jumps)

@@ -22,8 +22,8 @@ STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)
 # padded to a multiple of BLOCK
 STAGE, FINE, COARSE, N_VECTORS = range(4)
 BLOCK = 8  # number of sums that `_weighted` accumulates in registers
-# factor on errors once the run has come near a singular position, because errors in time grow with each singular
-# position passed; the factor makes no tolerance smaller than LEAST_STRICT
+# factor on errors once the run has come near a singular position, because phase errors grow at each such position; the
+# factor makes no tolerance smaller than LEAST_STRICT
 STRICT, LEAST_STRICT = 10.0, 1e-11
 
 

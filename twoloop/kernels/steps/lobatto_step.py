@@ -68,12 +68,10 @@ START_CONTRACTION = 0.12  # target of the contraction rho in the first step, wit
 MAX_STARTS = 4  # largest number of guesses of the first step size
 DIVERGED_FACTOR = 0.6  # ratio of the next step size to that of a step that did not converge
 SAFETY = 0.75  # safety factor on the step size that the error allows
-# value of the field LIMITED, steps limited by convergence less others, at which another method takes over: the motion
-# is stiff
-MAX_LIMITED = 24.0
+MAX_LIMITED = 24.0  # value of the field LIMITED at which another method takes over, because the motion is stiff
 MIN_CURVED = 0.1  # value of the field CURVED below which accelerations hardly vary within a step
 N_PARTS = 4  # number of equal parts of a step; at the points between them, pivots of C_q are checked
-MIN_PIVOT_RATIO = 0.4  # ratio of these pivots to that at the beginning below which a singular position is near
+MIN_PIVOT_RATIO = 0.4  # ratio of a pivot within a step to that at its beginning below which a singular position is near
 # tolerance below which another method takes over after a singular position: with this method, five more runs of A02
 # were wrong
 TIGHT_TOLERANCE = 1e-8
@@ -83,8 +81,8 @@ MAX_FAILURES = 12.0
 CHECKED_GAP = 0.0908  # longest time between evaluations if the defect is evaluated between nodes, relative to the step
 N_EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3  # largest ratio of step sizes in the first N_EARLY steps, and after them
 GROWTH_AT_ONCE = 30.0  # largest ratio of step sizes after one of the first N_EARLY steps that took a single sweep
-LEAST_TREND = 0.4  # smallest factor for the trend of the step size that the error allows
-MAX_EXTRAPOLATION = 3.0  # largest ratio of the step size that the error allows to the actual one, in that trend
+LEAST_TREND = 0.4  # lower bound of the ratio of successive step sizes that the error allows, used to extrapolate them
+MAX_EXTRAPOLATION = 3.0  # upper bound of the step size that the error allows, relative to the actual step size
 _places = merged(places)
 
 
@@ -338,7 +336,7 @@ def _take_steps(f, w, options, data, tolerances, control, clock, goal, state, n_
         out_t[n_ends], out_steps[n_ends, at.H] = t, h
         data[field.DEFECTS + n_ends] = data[field.DEFECT]
         copy(state[: 2 * n], out_state[n_ends, : 2 * n])
-        # if the step was shortened to reach `goal`, the next one may have the size that this one was to have
+        # a step shortened to reach `goal` does not limit the size of the next step
         clock[at.H_NEXT] = max(h * factor, h_wanted) if h < h_wanted else h * factor
         n_ends += 1
     return n_ends

@@ -175,12 +175,12 @@ def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
         filtered_velocity_error(w, memory, tolerances, h * gamma0, unfiltered, filtered_once, e_v, state, new_state, a),
     )
     if error <= 1.0:
-        error = max(error, _slow_error(f, w, options, memory, h, tolerances, state, new_state))
+        error = max(error, _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state))
     return error
 
 
 @compiled
-def _slow_error(f, w, options, memory, h, tolerances, state, new_state):
+def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state):
     """Return the position error over the tolerances that the velocity error E_V causes in slow directions.
 
     The duration in `filtered_velocity_error` is that of the fastest component. The component that remains after

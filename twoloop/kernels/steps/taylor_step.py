@@ -59,10 +59,10 @@ from twoloop.kernels.linalg.saddle_point import solve_both
 # as bit patterns. ORDER: order of the series of q; KEEP: 1 if consecutive steps evaluate the series about the first
 # state, to interpolate within a step
 ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, N_SCALARS = range(7)
-# arrays of a table; arrays of sums as twoloop.generate.series.Sums has them
+# numbers of the arrays of a table of operations, and of a list of sums, see `Sums` in twoloop.generate.series
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
-PLACES = N_SUMS  # behind the arrays of sums: the entries that they compute
+PLACES = N_SUMS  # number of the array after those of a list of sums: indices of the entries in which sums are stored
 EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
 BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
 KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns of GROUPS
@@ -80,7 +80,7 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns o
     TARGET,  # index of the series that is computed
     # last ratio of a step size to LENGTH that the distance of its end from the constraints allowed; 0: not known
     SHORTER,
-    ATTEMPTS,  # number of attempts: each one evaluates the defect at other times
+    ATTEMPTS,  # number of attempts, from which the times at which the defect is evaluated follow
     SUSPECTED,  # 1: a step was rejected because of its defect at the time SUSPECT, s, which the run has not passed yet
     SUSPECT,
     N_MEMORY_SCALARS,
