@@ -119,7 +119,7 @@ def set_sizes(control, tolerances, state, n, t, t1, smallest, longest, within):
 
 @merged
 def _all_within(t, rows, box):
-    """Return whether all [t, q, v] are within `box`: its rows are lower and upper bounds of the first entries."""
+    """Return whether all rows [t, q, v] are within `box`: lower and upper bounds of the first entries of a row."""
     for k in range(t.size):
         if not box[0, 0] <= t[k] <= box[1, 0]:
             return False

@@ -29,12 +29,12 @@ CHECKED_AT = (0.3, 0.7)  # where polynomials are checked: time since the beginni
 N_CHECKED = len(CHECKED_AT)
 EPS = 2.0**-52
 MAX_GAP_RATIO = 8.0  # largest ratio of the longest to the shortest of neighbouring steps that count as equally long
-NOISY = 10.0  # rounding of q over the length of an interval, in tolerances of v: above this, v gets its own polynomial
+NOISY = 10.0  # rounding of q divided by the interval, in tolerances of v: above this, v gets a polynomial of its own
 # largest pivot of a singular position within an interval, relative to the larger of the pivots at the ends
 SINGULAR_SHARE = 0.01
 SINGULAR_PIVOT = 1e-5  # largest pivot of a singular position, see least_pivot in partition.py
-# a pivot below WEAK_PIVOT is singular, too, if it times the change of velocities by the projection, about the violation
-# of the rows, is below RESIDUAL tolerances
+# a position is singular, too, if its pivot is below WEAK_PIVOT, and pivot times change of velocities by the projection,
+# which is about the violation of the rows, is below RESIDUAL tolerances
 RESIDUAL, WEAK_PIVOT = 10.0, 0.05
 
 

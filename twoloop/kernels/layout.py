@@ -29,10 +29,10 @@ class Static(NamedTuple):
     dense_jacobian: bool  # whether C_q is given as a full matrix, from which its values are copied
 
 
-# n_q, n_c, n_a, ranks of C_q and of all rows, whether T^T M T and whether the augmented matrix is used, numbers of
-# nodes of programs, sizes of the static form, numbers in the matrices of Newton's method
+# n_q, n_c, n_a, ranks of C_q and of all rows, whether T^T M T is used, whether the augmented matrix is used, number of
+# nodes of the traced programs, sizes of the static form (None: another form), length of the array `matrices`
 Sizes = tuple[int, int, int, int, int, bool, bool, int, Static | None, int]
-Places = list[tuple[str, int, int, tuple[int, ...]]]  # arrays in a piece of memory: name, begin, end, shape
+Places = list[tuple[str, int, int, tuple[int, ...]]]  # arrays in one piece of memory: name, begin, end, shape
 
 
 class Layout(NamedTuple):

@@ -33,12 +33,12 @@ SHRINKAGE = 0.8  # ratio of the size of such a repeated step to that of the one 
 GIVE_UP_BELOW = 0.001  # relative to the longest of the last steps: smallest size of a step near a singular position
 # pivot relative to its largest value so far: below this, rounding determines accelerations, and short steps must stop
 UNDETERMINED = 1e-6
-CHECK_INTERVAL = 16  # accepted steps from one check of the partition to the next, if steps do not use it
+CHECK_INTERVAL = 16  # number of accepted steps between two checks of a partition that steps do not use
 # with k times this number of freedoms, a partition is checked every k + 1 steps, because T is a full matrix
 FREEDOMS_PER_CHECK = 32
 N_CHECKED = 8  # number of parts of an accepted step at whose ends the smallest pivot of C_q is computed
 CHECKED_BELOW = 0.5  # pivot over its largest value so far: steps that begin or end with a smaller one are checked
-# pivot relative to its largest change between these samples: a smaller one passes zero within the step
+# smallest pivot within a step, relative to its largest change between samples: a smaller one passes through zero
 PASSED_SHARE = 0.6
 # numbers in near_share: lower and upper bound of the result, rounding errors relative to tolerances, unit roundoff
 NEAR_LEAST, NEAR_MOST, SHARE_OF_NOISE, EPS = 0.02, 0.1, 0.2, 2.0**-53
@@ -97,7 +97,7 @@ def retry_projected(f, w, control, clock, size):
 
 @merged
 def near_share(tolerances):
-    """Return the share of the largest pivot below which rounding of accelerations exceeds a part of the tolerances."""
+    """Return the pivot, over the largest, below which rounding of accelerations exceeds SHARE_OF_NOISE tolerances."""
     return min(max(NEAR_LEAST, (EPS / (SHARE_OF_NOISE * tolerances[LEAST])) ** (1.0 / 3.0)), NEAR_MOST)
 
 
@@ -185,7 +185,7 @@ def check_partition(f, w, control, clock, size, lands, state):
         find_tangents(f, w, clock[at.T], state[:n])
     if looked and partition_is_poor(w) and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
-    # only a renewed partition shows whether the position is left behind: these steps do not use partitions
+    # steps of generated code do not use the partition: only a new one shows whether the run leaves the position
     if f.flags[STRAIGHT] == 1 and w.notes[NEAR_NOW] == 2.0 and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
     clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.notes[PIVOT])
@@ -200,9 +200,9 @@ def check_partition(f, w, control, clock, size, lands, state):
         if w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
             w.notes[NEARLY_SINGULAR] = w.notes[NEAR_NOW] = 1.0
     if short and size < GIVE_UP_BELOW * clock[at.H_LONG] and w.notes[NEARLY_SINGULAR] == 1.0:
-        # an implicit method can still use a partition chosen far away: choose one here before giving up
+        # the partition may have been chosen far away: an implicit method may still continue with one chosen here
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
         if control[at.BRIDGE] != 1.0 and w.notes[PIVOT] < UNDETERMINED * clock[at.LARGEST_PIVOT]:
-            return at.RANK_LOST  # no step leads across the position, and rounding would determine velocities
+            return at.RANK_LOST  # no step can cross the position, and rounding would determine velocities
     return at.NEAR_SINGULAR if short and near_singular(f, w, control, clock, clock[at.T], state[:n]) else at.CONTINUE

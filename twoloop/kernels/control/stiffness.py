@@ -126,7 +126,7 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
     HISTORY,  # history of the steps of this phase, see loop_state.py
     _HISTORY_ERROR,
     H_TRIED,  # size of the last attempted step, s
-    ERROR_TRIED,  # its error
+    ERROR_TRIED,  # error of the last attempted step, in tolerances
     N_TRIALS,
     N_ABOVE_LIMIT,  # number of estimates in a row with h rho above LIMIT
     N_SCALARS,
@@ -250,7 +250,7 @@ def _motion_rate(f, w, t, state, rate, Q, V, A):
 
 @compiled
 def _is_quiet(w, tolerances, state, rate):
-    """Return whether accelerations belong to motion at this rate with velocities of about the tolerances only."""
+    """Return whether a vibration at this rate with these accelerations has velocities of a few tolerances at most."""
     n = w.Q.size
     for i in w.independent_v:
         v = state[n + i]
@@ -333,7 +333,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
     # show the largest rate, and the cost of a run is known only after the short steps of its start
     costs_enough = cheap and cost > afforded and paid > COST_OF_ANY_TRIAL * afforded * (1.0 + memory[N_TRIALS])
     due = share > STABILITY_LIMIT or hidden or costs_enough or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and cheap)
-    if cheap and share <= 1.0:  # while a trial is too expensive, N_ABOVE_LIMIT remembers that one is due
+    if cheap and share <= 1.0:  # while a trial is too expensive, N_ABOVE_LIMIT is kept
         memory[N_ABOVE_LIMIT] = 0.0
     expensive = price > MIN_GAIN * memory[COST_PER_SECOND]  # compared with the explicit method before it was left
     if (memory[PHASE] == EXPLICIT and due) or (memory[PHASE] == IMPLICIT and (share < RETURN_BELOW or expensive)):
@@ -352,7 +352,7 @@ def _restart(memory):
 
 @kernel(SETTLE)
 def settle_switching(f, w, options, memory, tolerances, accepted):
-    """Commit or discard the attempt in the memory of the method that made it, and count its accepted steps."""
+    """Commit or discard the attempted step in the memory of its method, and count accepted steps."""
     first, second = _memories(memory, w.Q.size)
     begin = N_OPTIONS + int(options[SIZE_1])
     memory[MAY_ESTIMATE] = 0.0
@@ -375,7 +375,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """
     n = w.Q.size
     first, second = _memories(memory, n)
-    if np.isnan(memory[T_BEGIN]):  # at the start of a run, or of its part behind a singular position
+    if np.isnan(memory[T_BEGIN]):  # at the start of a run, and after a singular position
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
         memory[NEXT_ESTIMATE] = w.counters[N_EVALUATIONS] + EARLY * options[COST_RATIO]
     if memory[MAY_ESTIMATE] == 1.0 and tolerances[ESTIMATE] == 1.0:

@@ -103,9 +103,9 @@ class Work(NamedTuple):
     jacobian_values: Any  # entries of G
     counts: Any  # (n_c) 1 for independent rows, else 0
     factors: Any  # numbers of the factors, in the slots of the program
-    pivot_sizes: Any  # (N) scratch: sizes of the rows, to which pivots are compared
+    pivot_sizes: Any  # (N) squared lengths of the rows, to which pivots are compared, see linalg/sparse_ldl.py
     unknowns: Any  # (N) right-hand side and solution
-    solutions: Any  # (3 N) scratch, and (n_c) the stiffening of M along rows, see linalg/sparse_ldl.py
+    solutions: Any  # (3 N) scratch, then (n_c) factors by which rows stiffen M, see linalg/sparse_ldl.py
 
     sizes: Any = None  # the Sizes of layout.py for which the arrays are allocated
     address: Any = 0  # address of `table`

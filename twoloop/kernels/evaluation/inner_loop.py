@@ -1,7 +1,7 @@
 """Compile the inner loop once, as one function that all steps call, so that no step compiles it again.
 
-A step gets a `Kit`, the callbacks and this function; the helpers here name its tasks. Accelerations and multipliers are
-those of eqs. (6)-(8) of the paper.
+A step gets a `Kit`, which has the callbacks and this function; helpers in this file call it, one helper for each task.
+Accelerations and multipliers are those of eqs. (6)-(8) of the paper.
 
 If a step integrates all coordinates, its states are off the constraints by the error of the formula. One pass computes
 the accelerations there and moves positions and velocities to the nearest state on the constraints, in the metric of M,
@@ -80,7 +80,7 @@ def acceleration_constraint(f, w, t, q, v):
     if w.notes[KNOWN] == 1.0 and n_rows == n_c:
         return DONE
     given, given_a = f.flags[GAMMA_GIVEN] == 1, f.flags[NONHOLONOMIC_GAMMA_GIVEN] == 1
-    first, last = 0, n_rows  # range of the rows that no callback gives
+    first, last = 0, n_rows  # range of the rows of Gamma that no callback computes
     w.Gamma[:] = 0.0
     if given:
         f.gamma(t, q, v, f.p, w.Gamma[:n_c])
@@ -105,7 +105,7 @@ def mass_matrix(f, w, t, q):
 
 @merged
 def factor_mass_at(f, w, t, q):
-    """Evaluate M(t, q), and factor it if the form needs its factors."""
+    """Evaluate M(t, q), and factor M if the form of the equations needs the factors; return a code."""
     w.notes[FACTORED] = 0.0
     mass_matrix(f, w, t, q)
     code = factor_mass(f, w) if f.flags[FORM] == MULTIPLIERS or banded_mass(f) else DONE
@@ -114,7 +114,7 @@ def factor_mass_at(f, w, t, q):
 
 @merged
 def factor_at(f, w, t, q):
-    """Factor the linear problem at a state whose rows, factors and w.D stand in w."""
+    """Factor the linear problem at a state whose rows, factors and null space are in w; return a code."""
     if f.flags[CONSTANT_MASS] == 0:
         w.notes[FACTORED] = 0.0
         mass_matrix(f, w, t, q)
@@ -126,7 +126,7 @@ def factor_at(f, w, t, q):
 
 @merged
 def accelerate(f, w, t, q, v, a):
-    """Compute the accelerations at a state whose rows, factors and w.D stand in w."""
+    """Compute the accelerations at a state whose rows, factors and null space are in w; return a code."""
     w.counters[N_EVALUATIONS] += 1
     code = factor_at(f, w, t, q)
     if code == DONE:
@@ -216,11 +216,11 @@ def _correct_both(f, w, q, v):
 def project_state(f, w, t, q, v, theta, a, lam):
     """Project (q, v) onto the constraints, then compute accelerations and multipliers there.
 
-    Rows of A hold for velocities only; positions move in directions that these rows allow.
+    Rows of A constrain velocities only; positions move in directions that these rows allow.
 
-    Positions are corrected until a correction is at most theta, velocities likewise, relative to the largest. If the
-    correction is at most theta times the smallest pivot, whose inverse bounds how tangents turn, velocities are right
-    after the same pass.
+    Positions are corrected until a correction is at most theta, and velocities until it is at most theta times the
+    largest velocity. If the correction of positions is at most theta times the smallest pivot, whose inverse bounds how
+    tangents turn, velocities are accurate after the same pass.
     """
     before = np.inf
     theta = max(theta, MIN_CORRECTION * w.notes[ROUNDED])
@@ -234,7 +234,7 @@ def project_state(f, w, t, q, v, theta, a, lam):
             w.C[:] = 0.0
             f.constraint(t, q, f.p, w.C)
         w.counters[N_INNER] += 1
-        # the tangents of NULL_SPACE have already evaluated the rates
+        # with NULL_SPACE, find_null_space has already evaluated the rates
         if f.flags[KINEMATICS_GIVEN] == 0 and f.flags[FORM] != NULL_SPACE:
             constraint_rates(f, w, t, q, w.Rate)
         moved, faster = _correct_both(f, w, q, v)
@@ -262,7 +262,7 @@ ROUNDING_OF_Q = 2e-14  # about a hundred times the rounding of q, see rounding_f
 
 @merged
 def _verify_pattern(w):
-    """Write new programs if the Jacobian has a new entry: results without this entry are wrong."""
+    """Write new programs, and return a failure, if the Jacobian has a new entry, which results do not include yet."""
     if not record_entries(w):
         return DONE
     return INNER_DIVERGED if write_programs(w) else SINGULAR
@@ -293,7 +293,7 @@ def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
         return _other_task(f, w, task, t, q, v)
     if task in (tasks.EVALUATE, tasks.EVALUATE_AS_GIVEN) and w.notes[TIME_IS_UP] == 1.0:
         return STOPPED
-    if task == tasks.EVALUATE_AS_GIVEN:  # this task and PROJECT serve methods that integrate all coordinates
+    if task == tasks.EVALUATE_AS_GIVEN:  # this task and PROJECT are for methods that integrate all coordinates
         return accelerate_at(f, w, t, q, v, a)
     if task == tasks.PROJECT:
         return project_state(f, w, t, q, v, tolerance, a, lam)
@@ -378,7 +378,7 @@ def prepare_mass(f, w, t, q):
 
 @merged
 def renew_partition(f, w, t, q):
-    """Choose a partition at an accepted state, and record the sign of det C_qd that its motion has to keep."""
+    """Choose a partition at an accepted state, and record the sign of det C_qd, which later states must have, too."""
     return f.inner(f, w, tasks.RENEW_PARTITION, t, q, q, 0.0, w.x, w.lam)
 
 
@@ -390,7 +390,7 @@ def adopt_midpoint_partition(f, w, t_mid, state, new_state):
 
 @merged
 def check_redundant(f, w, t, q, v):
-    """Check whether the redundant rows hold at an accepted state."""
+    """Return DONE if an accepted state satisfies the redundant rows, else ROWS_CONTRADICT."""
     return f.inner(f, w, tasks.CHECK_REDUNDANT, t, q, v, 0.0, w.x, w.lam)
 
 
@@ -433,7 +433,7 @@ def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
     elif task == tasks.CHECK_REDUNDANT and w.notes[BY_GENERAL] == 0.0:
         if f.own_redundant(t, q, v, f.numbers, a):
             return DONE
-        f.general(f, w, tasks.FIND_NULL_SPACE, t, q, v, theta, a, lam)  # leaves the rows there in w
+        f.general(f, w, tasks.FIND_NULL_SPACE, t, q, v, theta, a, lam)  # evaluates the rows at q into w
     elif task <= tasks.MULTIPLIERS:  # tasks of methods that need a good partition at every step
         w.notes[BY_GENERAL] = 1.0
     return f.general(f, w, task, t, q, v, theta, a, lam)

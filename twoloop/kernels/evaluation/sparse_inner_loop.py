@@ -1,21 +1,22 @@
 """Inner loop of large systems, by sparse factors whose order of elimination is chosen once.
 
 There is no partition: all coordinates are integrated, and evaluated without a projection. Tasks for which other forms
-restore dependent coordinates move all coordinates to the nearest state on the constraints, in the metric of M. If these
-factors cannot decide, a task returns NEEDS_DENSE: the run then continues with the forms of saddle_point.py, as it does
-for methods that need a partition. Nothing here has the size of n_c times n_q if callbacks give values of entries. Dense
-callbacks fill dense arrays, from which the entries are taken.
+restore dependent coordinates move all coordinates to the nearest state on the constraints, in the metric of M. If
+sparse factors do not show which rows are independent, a task returns NEEDS_DENSE: the run then continues with the forms
+of saddle_point.py, which methods with a partition always use. If callbacks return values of entries, no array has n_c
+times n_q numbers. Dense callbacks fill dense arrays, from which the entries are copied.
 
-Multipliers of least norm, where rows are redundant: of all lam with the same G^T lam = b, the least is G x for some x.
-It solves
+If rows are redundant, multipliers have the least norm. Of all lam with G^T lam = b, that of least norm is G x for some
+x, and both solve
 
     [0  G^T] [ x ]   [b]
     [G  -1 ] [lam] = [0]
 
-which is singular in x, as not all motion is held. With W in the place of 0, a small diagonal positive matrix, it is
-quasi-definite, and has factors in any order (Vanderbei 1995, doi 10.1137/0805005): those of the same program. As b is a
-sum of rows of G, refined solutions come to the lam that is looked for: a part of b along a direction in which G is
-small by s, over the columns' own size, loses the factor 1 + s^2 / SHARE each time.
+This matrix is singular, because the constraints leave some motion free. With a small positive diagonal matrix W in
+place of 0 it is quasi-definite, and can be factored in any order (Vanderbei 1995, doi 10.1137/0805005), so also by the
+program for M and G. Refined solutions converge to the same lam, because b is a combination of rows of G: along a
+direction in which G x is s, relative to the sizes of its columns, each refinement divides the error by
+1 + s^2 / REGULARIZATION.
 """
 
 import numpy as np
@@ -75,17 +76,17 @@ from twoloop.kernels.linalg.dense import copy, has_new_entries, largest_of
 from twoloop.kernels.linalg.sparse_ldl import factor, load, solve, solve_refined
 from twoloop.kernels.linalg.symbolic_factorization import N_OFF, N_PIVOTS, jacobian_of, mass_of, order_of
 
-SUSPECT_PIVOT = 1e-6  # relative to the size of a row: a smaller pivot is checked, because it may be rounding
-MIN_PIVOT = 1e-10  # ... and below this the factorization fails, as its pivots are single rows
+SUSPECT_PIVOT = 1e-6  # pivot over the size of its row: a smaller one is checked, because it may be a rounding error
+MIN_PIVOT = 1e-10  # pivot over the size of its row: below this the factorization fails, as pivots are single rows
 DEPENDENT = 1e-11  # sine of the angle to the other rows, computed without cancellation, up to which a row is redundant
 PROJECT_STAGES = 2.0  # value of NEARLY_SINGULAR: stages have to be projected, because their errors matter there
-# ratio of the smallest pivot to its row below which solutions are refined once, and twice
+# smallest pivot over the size of its row: below these limits solutions are refined once, or twice
 REFINED_ONCE, REFINED_TWICE = 1e-3, 1e-7
 
 
 @compiled
 def fill_mass_values(f, w, t, q):
-    """Evaluate the entries of M into w.mass_values; those of a constant dense M are there from the beginning."""
+    """Evaluate the entries of M into w.mass_values, which already has those of a constant dense M."""
     if f.flags[MASS_VALUES_GIVEN] == 1:
         w.mass_values[:] = 0.0
         f.mass_values(t, q, f.p, w.mass_values)
@@ -260,9 +261,9 @@ def choose_rows(f, w, t, q):
     return _adopt_rows(w)
 
 
-REGULARIZATION = 1e-11  # W, relative to the squares of a column of G
-CONVERGED_RESIDUAL = 1e-14  # relative to the largest force: residual at which the refinement ends ...
-MAX_RESIDUAL = 1e-9  # ... and largest residual that is accepted if it no longer shrinks
+REGULARIZATION = 1e-11  # diagonal entries of W, relative to the sum of squares of a column of G
+CONVERGED_RESIDUAL = 1e-14  # residual at which the refinement ends, relative to the largest force
+MAX_RESIDUAL = 1e-9  # largest residual, relative to the largest force, that is accepted if it no longer decreases
 MAX_SOLUTIONS = 30  # largest number of solutions, i.e. refinements
 
 
@@ -414,7 +415,7 @@ def _move(f, w, x):
 
 @compiled
 def _rows_hold(f, w, q):
-    """Return whether w.C is rounding: |C_i| at most a few roundings of the largest |G_ij q_j|."""
+    """Return whether w.C are rounding errors: |C_i| at most CLOSED times the largest |G_ij q_j|."""
     rows, columns, _ = jacobian_of(f.static_program)
     size = w.solutions[: w.g.size]
     size[:] = 0.0
@@ -464,13 +465,13 @@ def _to_constraints(f, w, t, q, v, theta):
 
 @compiled
 def _mass_pattern_holds(w):
-    """Return whether a dense mass matrix has its entries where the program expects them."""
+    """Return whether a dense mass matrix has entries only where the program expects them."""
     return w.M.size == 0 or not has_new_entries(w.M, w.mass_pattern)
 
 
 @compiled
 def _redundant_rows_hold(f, w, t, q, v):
-    """Check whether the redundant rows hold at an accepted state, whose entries are in w."""
+    """Return DONE if an accepted state, whose entries are in w, satisfies all rows, else ROWS_CONTRADICT."""
     w.C[:] = 0.0
     f.constraint(t, q, f.p, w.C)
     size, speed = max(1.0, largest_of(q)), max(1.0, largest_of(v))
@@ -490,7 +491,7 @@ def _redundant_rows_hold(f, w, t, q, v):
 
 @compiled
 def _solve(f, w, r, c, a, lam):
-    """Solve for any right-hand side by the current factors."""
+    """Solve for `a` and lam with any right-hand side (r, c), by the current factors."""
     n = r.size
     copy(r, w.unknowns[:n])
     copy(c, w.unknowns[n:])

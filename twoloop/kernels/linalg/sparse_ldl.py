@@ -77,7 +77,7 @@ def factor(program, counts, values, sizes, least):
 
     The ratio is that to the squared length of the row. Returns NOT_DEFINITE if M is not positive definite on the
     velocities that the rows allow. `counts` is 0 for redundant rows, and becomes 0 for rows with a ratio up to `least`,
-    which the result excludes. `sizes` is scratch: the squared lengths.
+    which the result excludes. `sizes` becomes the squared lengths.
     """
     (n_q, n) = program[N_COORDINATES], program[N_PIVOTS]
     order, runs = order_of(program), runs_of(program)
