@@ -41,7 +41,7 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     MAX_STEPS,  # largest number of accepted steps
     STORE_ALL,  # 1: every accepted step is stored; 0: output times only
     SYMMETRIC,  # 1: each step uses the partition chosen at its midpoint; 0: a partition is used until it is poor
-    MAX_ATTEMPTS,  # largest number of attempts in one call, so that the caller can watch the run
+    MAX_ATTEMPTS,  # largest number of attempts in one call, after which the caller can check progress and time
     # 1: stop with NEAR_SINGULAR near a singular position; SUSPENDED: only after the present one is left behind
     BRIDGE,
     SHORTEST,  # shortest step, s; steps of at most EQUAL_SPACINGS spacings of t are too short as well
@@ -71,7 +71,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     T,
     H_NEXT,
     H_LIMIT,  # largest step size after a step that did not converge, s
-    LIMIT_AGE,  # number of accepted steps since then
+    LIMIT_AGE,  # number of accepted steps since that step
     NEXT_OUTPUT,  # index of the next output time
     T_START,
     N_FIXED,  # number of steps of the fixed grid so far

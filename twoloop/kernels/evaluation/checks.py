@@ -110,7 +110,8 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
     """Compute the linear range of each row: the radius if this is at most 1, or at most the largest coordinate.
 
     Otherwise it is the lower median of the coordinates that are not negligible, which an offset does not affect; or 1
-    if all are negligible. `coordinates_in_units`: coordinates of each row, 0 where the row is 0.
+    if all are negligible. `coordinates_in_units`: coordinates of each row, 0 where the row is 0; `radius`: length of
+    each row over its change when a coordinate moves by a unit.
     """
     for i in range(ranges.size):
         largest, n = 0.0, 0
@@ -132,8 +133,8 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
 # state satisfies the constraints up to rounding. DEFINITE, INDEFINITE: M varies, and is positive definite, or not
 # positive definite, by a margin
 IN_ORDER, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
-NEAR_SHARE = 0.5  # relative to the sizes of the coordinates: within this distance the sizes count as equal
-ROUNDING_OF_ZERO = 2.0**-52  # relative to the largest coordinate: a smaller one is a rounded zero
+NEAR_SHARE = 0.5  # largest distance of two positions whose coordinates have equal sizes, relative to these sizes
+ROUNDING_OF_ZERO = 2.0**-52  # relative to the largest coordinate: a smaller coordinate may be a rounding error of zero
 EIGENVALUE_MARGIN = 2.0  # factor on the limit below which an eigenvalue counts as zero: rounding changes it by less
 
 
@@ -151,7 +152,7 @@ def _clear(A):
 
 @exact
 def _has_empty_row(rows):
-    """Return whether there is a row without entries."""
+    """Return whether a row has only zeros."""
     empty = False
     for i in range(len(rows)):
         empty = empty or largest_of(rows[i]) == 0.0

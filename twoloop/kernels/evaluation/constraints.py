@@ -104,7 +104,8 @@ def gather_independent_columns(G, rate, rows, independent, D):
         D[independent.size, k] = -rate[rows[k]]
 
 
-MAX_DIFFERENCE, MIN_SHARE = 2e-4, 1e-4  # see longest_difference
+# largest time of a difference, s, and largest relative change of q in it; smallest such time over the largest one
+MAX_DIFFERENCE, MIN_SHARE = 2e-4, 1e-4
 LEVELS = 12  # number of lengths that _choose_length tries, each a quarter of the length before
 ROUNDING_DISAGREEMENT = 1e-9  # disagreement of both differences, relative to Gamma, that rounding alone may cause
 # disagreement, relative to Gamma, below which the length is doubled: this loses no accuracy and reduces rounding
@@ -126,9 +127,9 @@ def representable_step(t, h):
 
 @merged
 def longest_difference(q, v):
-    """Return the longest time over which to difference, s: MAX_DIFFERENCE, or less if q moves fast.
+    """Return the largest time e of a difference, s: MAX_DIFFERENCE, or less if q moves fast.
 
-    Within it q moves by at most MAX_DIFFERENCE times max|q|; its lower bound is MIN_SHARE times MAX_DIFFERENCE.
+    In this time q moves by at most MAX_DIFFERENCE times max|q|; the time is at least MIN_SHARE times MAX_DIFFERENCE.
     """
     size, speed = largest_of(q), largest_of(v)
     if speed <= size:
@@ -237,7 +238,7 @@ def gamma_by_differences(f, w, t, q, v, first, last):
     if e > 0.0:
         largest, disagreement, terms = _differences(f, w, t, q, v, e, first, last)
         if np.isnan(largest) or disagreement == 0.0 or w.notes[GAMMA_SCALE] == 0.0:
-            return DONE  # other code reports values that are not finite; without a scale nothing can be judged
+            return DONE  # the caller reports values that are not finite; without a scale, no error can be judged
         rounding = ROUNDING_OF_TERMS * terms / longest
         w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], largest, rounding / w.notes[GAMMA_REQUIRED])
         if disagreement < LENGTHENING_DISAGREEMENT * w.notes[GAMMA_SCALE]:

@@ -355,7 +355,7 @@ def _largest_coefficient(w):
 
 @compiled
 def partition_is_poor(w):
-    """Return whether dependent coordinates move much faster, relative to independent ones, than under a new partition.
+    """Return whether dependent coordinates move much faster, per independent one, than when the partition was chosen.
 
     The measure is max|C_qd^-1 C_qi|, from w.D. It is near 1 after full pivoting, and grows without bound where the
     independent coordinates stop being valid. The coefficients of independent rows in a redundant row grow in the same
@@ -384,7 +384,7 @@ ROUNDING_OF_CORRECTIONS = 1e-12  # relative to the largest coordinate: correctio
 # rod of 1 mm by 1e-13, and a chain of 1,000 such rods by more
 AMPLIFIED = 1e3
 CLOSED = 2e-15  # violation of a row that is a rounding error, relative to the largest term of the row
-MIN_CORRECTION = 10.0  # smallest tolerance of corrections, in roundings of positions
+MIN_CORRECTION = 10.0  # smallest tolerance of corrections, relative to ROUNDED, the rounding of positions
 MAX_VIOLATION = 1e-7  # largest violation of a redundant row, relative to the size of the mechanism
 
 

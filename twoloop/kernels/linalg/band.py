@@ -44,7 +44,7 @@ def lapack_addresses() -> list[int]:
 
 @intrinsic
 def call_lapack(typing_context, address, arguments):
-    """Call the LAPACK routine at `address` with Fortran's conventions; add its last argument, `info`, and return that.
+    """Call the LAPACK routine at `address` with Fortran's conventions; append the argument `info`, and return its value.
 
     `arguments` is a tuple of arrays, passed by the address of their first element, and of integers, passed by that of
     a 32-bit copy. Integers also serve as characters: the machines that numba supports have the low byte first.
@@ -76,7 +76,7 @@ BANDED_FROM = 56
 
 
 def banded_pays(n_q: int, n_c: int, bandwidth: int) -> bool:
-    """Return whether banded linear algebra is faster than dense, and fits into the memory of the dense matrices."""
+    """Return whether banded linear algebra is faster than dense, and its matrices fit into memory of the dense ones."""
     return n_q >= max(BANDED_FROM, 3 * bandwidth + 2 + 2 * n_c)
 
 

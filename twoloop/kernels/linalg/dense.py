@@ -8,14 +8,14 @@ from twoloop.kernels.data.common import compiled, merged
 
 @merged
 def copy(source, target):
-    """Copy element by element, because numba's slice assignment allocates."""
+    """Copy `source` to `target` element by element, because numba's slice assignment allocates."""
     for i in range(source.size):
         target[i] = source[i]
 
 
 @merged
 def copy_matrix(source, target):
-    """Copy row by row, up to the smaller number of rows."""
+    """Copy the rows of `source` to those of `target`, as many as both have."""
     for i in range(min(source.shape[0], target.shape[0])):
         for j in range(source.shape[1]):
             target[i, j] = source[i, j]
@@ -93,7 +93,7 @@ def lu_sign(A, pivots):
 
 @merged
 def lu_solve(A, pivots, x):
-    """Solve with the factors of `lu_factor`; x is overwritten."""
+    """Solve with the factors of `lu_factor`; x, the right-hand side, becomes the solution."""
     n = A.shape[0]
     for k in range(n):
         p = pivots[k]
@@ -156,7 +156,7 @@ def invert_definite(A):
 
 @merged
 def ldl_solve(A, x):
-    """Solve with the factors of `ldl_factor`; x is overwritten."""
+    """Solve with the factors of `ldl_factor`; x, the right-hand side, becomes the solution."""
     n = A.shape[0]
     for k in range(n):
         if x[k] != 0.0:
@@ -172,7 +172,7 @@ def ldl_solve(A, x):
 
 @merged
 def ldl_solve_rows(A, B):
-    """Solve with the factors of `ldl_factor` for all columns of B at once, row by row; B is overwritten."""
+    """Solve with the factors of `ldl_factor` for all columns of B at once; they become the solutions."""
     n, m = B.shape
     for k in range(n):
         for i in range(k + 1, n):
@@ -191,7 +191,7 @@ def ldl_solve_rows(A, B):
 
 @merged
 def has_new_entries(G, pattern):
-    """Return whether G has an entry, not zero, where `pattern` is 0."""
+    """Return whether G has a nonzero entry where `pattern` is 0."""
     entries, seen = G.reshape(G.size), pattern.reshape(pattern.size)
     unseen = 0.0  # a sum without a branch, because new entries are rare
     for i in range(seen.size):
