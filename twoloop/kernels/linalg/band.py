@@ -44,7 +44,7 @@ def lapack_addresses() -> list[int]:
 
 @intrinsic
 def call_lapack(typing_context, address, arguments):
-    """Call the LAPACK routine at `address` with Fortran's conventions; append the argument `info`, and return its value.
+    """Call the LAPACK routine at `address` with Fortran's conventions and the added argument `info`; return its value.
 
     `arguments` is a tuple of arrays, passed by the address of their first element, and of integers, passed by that of
     a 32-bit copy. Integers also serve as characters: the machines that numba supports have the low byte first.
