@@ -103,15 +103,15 @@ def _locate_kink(f, w, t, size, tolerances, accepted, state, new_state):
 
 
 @merged
-def _attempt(f, w, options, memory, tolerances, control, clock, t, size, jumps, state, new_state):
+def _attempt(f, w, options, memory, tolerances, control, clock, t, size, crosses_jump, state, new_state):
     """Attempt a step; return its code, its error in tolerances, and the ratio of the next step size to this one.
 
-    With `jumps`, the step crosses a jump of C_t or b: the caller has already computed `new_state`.
+    With `crosses_jump`, the step crosses a jump of C_t or b: the caller has already computed `new_state`.
     """
     w.notes[ORIENTATION_NEW] = 0.0
     if clock[at.FAILURE_CODE] == DONE:
         w.notes[FAULT_KIND] = -1.0
-    if jumps:
+    if crosses_jump:
         w.notes[DEFECT] = 0.0
         w.notes[ORIENTATION_NEW] = w.notes[ORIENTATION]
         return DONE, 0.0, 0.0
@@ -146,14 +146,14 @@ def _ends_at_kink(f, w, tolerances, control, clock, t, size, accepted, state, ne
 
 
 @merged
-def _handle_failure(f, w, control, clock, t, size, code, retried, state):
+def _handle_failure(f, w, control, clock, t, size, code, t_repeated, state):
     """Handle a step that failed: shorten it, renew the partition, or return the code that ends the loop.
 
-    A step of fixed size cannot become shorter: only the partition is renewed. `retried` is the time at which a step of
-    fixed size was last repeated.
+    A step of fixed size cannot become shorter: only the partition is renewed. `t_repeated` is the time at which a step
+    of fixed size was last repeated.
     """
     n = w.Q.size
-    poor = code in (SINGULAR, INNER_DIVERGED)
+    needs_partition = code in (SINGULAR, INNER_DIVERGED)
     if code == NEEDS_DENSE or fails_at_singular(f, clock, size):
         return at.NEEDS_DENSE
     w.counters[N_REJECTED_CONVERGENCE] += 1
@@ -164,7 +164,7 @@ def _handle_failure(f, w, control, clock, t, size, code, retried, state):
     if code in (NOT_FINITE, UNSUITED) and control[at.MAY_SWITCH] == 1.0:
         return at.SWITCH_METHOD
     if control[at.FIXED_STEP] > 0.0:
-        if not poor or t == retried:
+        if not needs_partition or t == t_repeated:
             return at.NEAR_SINGULAR if near_singular(f, w, control, clock, t, state[:n]) else at.FIXED_STEP_FAILED
     else:
         if size < SHORT_STEP * clock[at.H_LONG] and near_singular(f, w, control, clock, t, state[:n]):
@@ -172,7 +172,7 @@ def _handle_failure(f, w, control, clock, t, size, code, retried, state):
         clock[at.H_LIMIT] = control[at.LIMIT_FACTOR] * size
         clock[at.LIMIT_AGE] = 0.0
         clock[at.H_NEXT] = 0.5 * size
-    if poor and renew_partition(f, w, t, state[:n]) != DONE:
+    if needs_partition and renew_partition(f, w, t, state[:n]) != DONE:
         return at.NEEDS_DENSE if f.flags[FORM] == STATIC else at.RANK_LOST
     return at.CONTINUE
 
@@ -225,9 +225,9 @@ def advance(
     With STORE_ALL = 1 every accepted state is stored, otherwise the states at output times. `filled` becomes two
     numbers of rows: those written to out_t and out_state, and those written to out_steps, one for each accepted step.
     """
-    fixed = control[at.FIXED_STEP] > 0.0
+    fixed_size = control[at.FIXED_STEP] > 0.0
     n = w.Q.size
-    retried = np.inf  # time at which a step of fixed size was repeated with a new partition
+    t_repeated = np.inf  # time at which a step of fixed size was repeated with a new partition
     filled[0] = 0
     filled[1] = 0
     attempts = 0.0
@@ -244,48 +244,48 @@ def advance(
             rows = out_t[first:], out_state[first:], out_steps[filled[1] :]
             n_taken = f.attempt_many(f, w, options, memory, tolerances, control, clock, goal, state, new_state, *rows)
             if n_taken > 0:
-                lands = clock[at.T] == target
+                at_output = clock[at.T] == target
                 if control[at.STORE_ALL] == 1.0:
                     filled[0] += n_taken
-                elif lands:
+                elif at_output:
                     out_t[first] = target
                     copy(state, out_state[first])
                     filled[0] += 1
                 filled[1] += n_taken
                 attempts += n_taken
-                if lands and _pass_output_time(f, w, clock, outputs, state):
+                if at_output and _pass_output_time(f, w, clock, outputs, state):
                     return at.ALL_OUTPUT_DONE
-                end = check_partition(f, w, control, clock, out_steps[filled[1] - 1, at.H], lands, state)
+                end = check_partition(f, w, control, clock, out_steps[filled[1] - 1, at.H], at_output, state)
                 if end != at.CONTINUE:
                     return end
                 continue
         attempts += 1.0
         t = clock[at.T]
-        jumps = clock[at.APPLIES_JUMP] == 1.0
-        if t == clock[at.JUMP_FROM] and not jumps:
+        crosses_jump = clock[at.APPLIES_JUMP] == 1.0
+        if t == clock[at.JUMP_FROM] and not crosses_jump:
             return at.AT_DISCONTINUITY
         target = outputs[int(clock[at.NEXT_OUTPUT])]
-        goal = min(target, clock[at.JUMP_TO] if jumps else clock[at.JUMP_FROM])
-        h = control[at.FIXED_STEP] if fixed else min(clock[at.H_NEXT], clock[at.H_LIMIT], control[at.MAX_STEP])
-        in_grid = 1.0  # number of steps of the fixed grid that this step covers
-        if fixed:
-            size, in_grid, reaches = on_grid(clock, t, h, target, goal)
+        goal = min(target, clock[at.JUMP_TO] if crosses_jump else clock[at.JUMP_FROM])
+        h = control[at.FIXED_STEP] if fixed_size else min(clock[at.H_NEXT], clock[at.H_LIMIT], control[at.MAX_STEP])
+        n_grid_steps = 1.0  # number of steps of the fixed grid that this step covers
+        if fixed_size:
+            size, n_grid_steps, reaches_goal = on_grid(clock, t, h, target, goal)
         else:
-            size, reaches = off_grid(control, t, h, goal - t, jumps)
-        shortened = reaches or (h > 0.5 * (goal - t) and not fixed)
-        lands = reaches and goal == target
-        if reaches:
+            size, reaches_goal = off_grid(control, t, h, goal - t, crosses_jump)
+        shortened = reaches_goal or (h > 0.5 * (goal - t) and not fixed_size)
+        at_output = reaches_goal and goal == target
+        if reaches_goal:
             size = goal - t
         may_sample = control[at.SPACING] > 0.0 and (control[at.BY_TIME] == 1.0 or size > control[at.SPACING])
-        if (may_sample or t < clock[at.DISCONTINUITY_OF_MOTION] < t + size) and not jumps:
+        if (may_sample or t < clock[at.DISCONTINUITY_OF_MOTION] < t + size) and not crosses_jump:
             whole, last = size, outputs[outputs.size - 1]
             size = limit_to_discontinuity(f, w, tolerances, control, clock, t, whole, last, state, new_state)
             if size < whole:
-                reaches, lands, shortened = False, False, True
-        if not reaches and size <= max(EQUAL_SPACINGS * np.spacing(abs(t)), control[at.SHORTEST]):
+                reaches_goal, at_output, shortened = False, False, True
+        if not reaches_goal and size <= max(EQUAL_SPACINGS * np.spacing(abs(t)), control[at.SHORTEST]):
             return at.STEP_TOO_SMALL
         code, error, factor = _attempt(
-            f, w, options, memory, tolerances, control, clock, t, size, jumps, state, new_state
+            f, w, options, memory, tolerances, control, clock, t, size, crosses_jump, state, new_state
         )
         if code == NOT_LOADED:
             return at.NEEDS_COMPILATION
@@ -295,31 +295,35 @@ def advance(
         # where a force jumps, an estimated error may be small by chance: until ROUGH_TO it is multiplied by `strict`
         strict = control[at.ROUGH] if t < clock[at.ROUGH_TO] else 1.0
         accepted = code == DONE and error * strict <= 1.0
-        if accepted and not reaches and ends_at_singular(f, w, control, clock):
+        if accepted and not reaches_goal and ends_at_singular(f, w, control, clock):
             f.settle(f, w, options, memory, tolerances, False)
             w.counters[N_REJECTED_ERROR] += 1
             if not retry_projected(f, w, control, clock, size):
                 clock[at.H_NEXT], clock[at.PIVOT_HERE] = 0.5 * size, w.notes[PIVOT]
             continue
-        if accepted and not jumps and comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_state):
+        if (
+            accepted
+            and not crosses_jump
+            and comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_state)
+        ):
             f.settle(f, w, options, memory, tolerances, False)
             w.counters[N_REJECTED_ERROR] += 1
             clock[at.FAILURE_CODE] = SINGULAR
             return at.NEAR_SINGULAR
-        driven = control[at.DRIVEN] == 1.0 and not jumps
+        driven = control[at.DRIVEN] == 1.0 and not crosses_jump
         if driven and _ends_at_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
             f.settle(f, w, options, memory, tolerances, False)
             w.counters[N_REJECTED_ERROR] += 1
             clock[at.FAILURE_CODE] = DONE
             continue
-        if not jumps:
+        if not crosses_jump:
             f.settle(f, w, options, memory, tolerances, accepted)
         if code != DONE:
-            end = _handle_failure(f, w, control, clock, t, size, code, retried, state)
+            end = _handle_failure(f, w, control, clock, t, size, code, t_repeated, state)
             if end != at.CONTINUE:
                 return end
-            if fixed:
-                retried = t
+            if fixed_size:
+                t_repeated = t
             continue
         if error > SUDDEN_ERROR and not accepted:
             clock[at.ROUGH_TO] = t + size
@@ -343,15 +347,15 @@ def advance(
         count_step(w, tolerances, control, clock, size, out_steps[filled[1]])
         filled[1] += 1
         record_accepted(control, clock, size, error)
-        clock[at.N_FIXED] += in_grid
-        if reaches:
+        clock[at.N_FIXED] += n_grid_steps
+        if reaches_goal:
             clock[at.T] = goal
         else:
-            clock[at.T] = clock[at.T_START] + clock[at.N_FIXED] * h if fixed else t + size
-        if jumps:
+            clock[at.T] = clock[at.T_START] + clock[at.N_FIXED] * h if fixed_size else t + size
+        if crosses_jump:
             clock[at.JUMP_FROM], clock[at.APPLIES_JUMP] = np.inf, 0.0
         copy(new_state, state)
-        if lands or control[at.STORE_ALL] == 1.0:
+        if at_output or control[at.STORE_ALL] == 1.0:
             out_t[filled[0]] = clock[at.T]
             copy(state, out_state[filled[0]])
             filled[0] += 1
@@ -361,16 +365,16 @@ def advance(
         if clock[at.LIMIT_AGE] > control[at.LIMIT_MEMORY]:
             clock[at.H_LIMIT] = control[at.LIMIT_START]
             clock[at.FAILURE_CODE] = DONE  # no longer the reason for short steps
-        if lands and _pass_output_time(f, w, clock, outputs, state):
+        if at_output and _pass_output_time(f, w, clock, outputs, state):
             return at.ALL_OUTPUT_DONE
-        if fixed and not lands:
+        if fixed_size and not at_output:
             record_pivot_at_output(f, w, clock, state)
         if FIRST_JUDGED <= w.counters[N_ACCEPTED] <= control[at.TRIAL_STEPS] and clock[at.H_NEXT] <= tolerances[GAP]:
             clock[at.H_FAILED] = clock[at.H_NEXT]
             return at.SWITCH_METHOD
-        if jumps:
+        if crosses_jump:
             return at.PAUSED
         if control[at.SYMMETRIC] == 0.0:
-            end = check_partition(f, w, control, clock, size, lands, state)
+            end = check_partition(f, w, control, clock, size, at_output, state)
             if end != at.CONTINUE:
                 return end

@@ -82,18 +82,19 @@ def _first_step(state, n, t, span, smallest):
     That size is max|q|, or `smallest` if this is larger. The result is at most a fraction of `span`, and at least
     MIN_FIRST_STEP spacings of floating-point numbers, however small the coordinates are.
     """
-    far, fast, sharp = smallest, 0.0, 0.0
+    distance, speed, acceleration = smallest, 0.0, 0.0
     for j in range(n):
-        far, fast = max(far, abs(state[j])), max(fast, abs(state[n + j]))
-        sharp = max(sharp, abs(state[2 * n + j]))
-    scale = span
-    if fast > 0.0:
-        scale = min(scale, far / fast)
-    if sharp > 0.0:
-        scale = min(scale, math.sqrt(far / sharp))
-    if fast > 0.0 and sharp > 0.0 and fast / sharp > FIRST_STEP * scale:  # unless the motion is almost at rest
-        scale = min(scale, fast / sharp)
-    return max(FIRST_STEP * scale, MIN_FIRST_STEP * np.spacing(abs(t)))
+        distance, speed = max(distance, abs(state[j])), max(speed, abs(state[n + j]))
+        acceleration = max(acceleration, abs(state[2 * n + j]))
+    time_scale = span
+    if speed > 0.0:
+        time_scale = min(time_scale, distance / speed)
+    if acceleration > 0.0:
+        time_scale = min(time_scale, math.sqrt(distance / acceleration))
+    # unless the motion is almost at rest
+    if speed > 0.0 and acceleration > 0.0 and speed / acceleration > FIRST_STEP * time_scale:
+        time_scale = min(time_scale, speed / acceleration)
+    return max(FIRST_STEP * time_scale, MIN_FIRST_STEP * np.spacing(abs(t)))
 
 
 @exact
@@ -118,25 +119,25 @@ def set_sizes(control, tolerances, state, n, t, t1, smallest, longest, within):
 
 
 @merged
-def _all_within(t, rows, box):
-    """Return whether all rows [t, q, v] are within `box`: lower and upper bounds of the first entries of a row."""
+def _all_within(t, rows, bounds):
+    """Return whether all rows [t, q, v] are within `bounds`: lower and upper bounds of the first entries of a row."""
     for k in range(t.size):
-        if not box[0, 0] <= t[k] <= box[1, 0]:
+        if not bounds[0, 0] <= t[k] <= bounds[1, 0]:
             return False
-        for j in range(1, box.shape[1]):
-            if not box[0, j] <= rows[k, j - 1] <= box[1, j]:
+        for j in range(1, bounds.shape[1]):
+            if not bounds[0, j] <= rows[k, j - 1] <= bounds[1, j]:
                 return False
     return True
 
 
 @kernel(types.void(MATRIX, INTEGERS, VECTOR, types.int64[:, ::1], types.boolean[::1]))
-def split_steps(steps, counts, h, changes, untested):
+def split_steps(steps, counts, h, changes, used_newton):
     """Split the rows of steps into step sizes `h`, `changes` of the counters, and whether Newton's method was used.
 
     `counts` are the rejections and partitions before these steps on entry, and after these steps on return.
     """
     for k in range(h.size):
-        h[k], untested[k] = steps[k, at.H], steps[k, at.JACOBIANS] > 0.0
+        h[k], used_newton[k] = steps[k, at.H], steps[k, at.JACOBIANS] > 0.0
         for i in range(counts.size):
             count = int(steps[k, at.ERRORS + i])
             changes[i, k], counts[i] = count - counts[i], count
@@ -189,13 +190,13 @@ PLACE, N_KEPT, N_ADDED, KEPT = range(4)
 def _has_same_choices(b):
     """Return whether independent rows, rows added to M and dependent coordinates are those of the generated code."""
     b.scratch[0] = 0.0
-    place = b.choose(b.mass, b.rows, b.constants[RANK], b.constants[WEAK], b.bounds, b.scratch, b.chosen)
+    first_bound = b.choose(b.mass, b.rows, b.constants[RANK], b.constants[WEAK], b.bounds, b.scratch, b.chosen)
     n_kept, n_added = b.expected[N_KEPT], b.expected[N_ADDED]
     if b.chosen[0] != n_kept:
         return False
     if n_kept == 0:
         return True
-    if place != b.expected[PLACE] or b.chosen[1] != n_added or b.scratch[0] != b.constants[SCALE]:
+    if first_bound != b.expected[PLACE] or b.chosen[1] != n_added or b.scratch[0] != b.constants[SCALE]:
         return False
     same = True
     for k in range(n_kept):
@@ -222,20 +223,20 @@ def _redundant_rows_hold(w, b, n):
     if w.rows_v.size == len(b.rows):
         return True
     for i in range(len(b.rows)):
-        off, size = -w.Gamma[i], abs(w.Gamma[i])
+        residual, sum_of_terms = -w.Gamma[i], abs(w.Gamma[i])
         for j in range(n):
-            off += b.rows[i, j] * b.state[2 * n + j]
-            size += abs(b.rows[i, j] * b.state[2 * n + j])
-        if not abs(off) <= b.constants[CONTRADICTS] * max(size, 1.0):
+            residual += b.rows[i, j] * b.state[2 * n + j]
+            sum_of_terms += abs(b.rows[i, j] * b.state[2 * n + j])
+        if not abs(residual) <= b.constants[CONTRADICTS] * max(sum_of_terms, 1.0):
             return False
     return True
 
 
 @merged
-def _check_start(given, b, t, q, v, sizes, shifts):
+def _check_start(checked_kit, b, t, q, v, sizes, shifts):
     for k in range(b.start_values.size):
         b.start_values[k] = 0.0
-    return b.evaluate_start(given, t, q, v, sizes, b.lam, b.room, b.mass, b.rows, shifts, b.pattern, b.roundings)
+    return b.evaluate_start(checked_kit, t, q, v, sizes, b.lam, b.room, b.mass, b.rows, shifts, b.pattern, b.roundings)
 
 
 @merged
@@ -248,21 +249,22 @@ def _has_all_entries(b):
 
 
 @merged
-def _start_run(f, given, w, b, t, t1, q, v, sizes, sure):
+def _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, is_consistent):
     """Start a run from t to t1 with the choices of the previous run; return 0, REFUSED or IN_DOUBT.
 
-    `given`: the system that is checked, `sizes`: see `evaluate_start`. `sure`: the state is known to be consistent.
+    `checked_kit`: kit of the system that is checked; `sizes`: see `evaluate_start`; `is_consistent`: the state is known
+    to be consistent.
     """
     n = q.size
     if not (finite_vector(q) and finite_vector(v)):
         return REFUSED
     all_entries = b.constants[HAS_ALL_ENTRIES] > 0.0
-    flags = _check_start(given, b, t, q, v, sizes, b.shifts[: 0 if all_entries else len(b.shifts)])
+    flags = _check_start(checked_kit, b, t, q, v, sizes, b.shifts[: 0 if all_entries else len(b.shifts)])
     if all_entries and not _has_all_entries(b):
-        flags = _check_start(given, b, t, q, v, sizes, b.shifts)
+        flags = _check_start(checked_kit, b, t, q, v, sizes, b.shifts)
     if flags & IN_ORDER == 0 or flags & (DEFINITE | INDEFINITE) != int(b.constants[MASS_FLAG]):
         return REFUSED
-    if flags & CONSISTENT == 0 and not sure:
+    if flags & CONSISTENT == 0 and not is_consistent:
         return IN_DOUBT
     if b.expected.size > 0 and not _has_same_choices(b):
         return REFUSED
@@ -332,7 +334,7 @@ N_HEAD = N_REPORT + N_COUNTERS
 
 
 @merged
-def _velocities_turned(b, k, n):
+def _velocities_jumped(b, k, n):
     """Return whether velocities change in the last step by more than the accelerations at its ends explain."""
     change, first, last = 0.0, 0.0, 0.0
     for j in range(n):
@@ -342,20 +344,20 @@ def _velocities_turned(b, k, n):
 
 
 @merged
-def _write_report(w, b, box, n_rows, n_steps, code, is_new):
+def _write_report(w, b, region, n_rows, n_steps, code, is_new):
     """Write the report of a run with n_rows states after the first, and n_steps steps.
 
-    Returns n_steps if nothing has to be checked, else UNUSUAL. `box`: bounds of [t, q, v], as in `_all_within`.
+    Returns n_steps if nothing has to be checked, else UNUSUAL. `region`: bounds of [t, q, v], as in `_all_within`.
     """
-    turned = n_rows > 0 and _velocities_turned(b, n_rows, w.Q.size)
-    inside = box.shape[1] > 0 and _all_within(b.t[: 1 + n_rows], b.states, box)
-    near = b.clock[at.PIVOT_AT_OUTPUT] < b.constants[NEAR]
-    missed = b.clock[at.SHORTEST_CHANGE] < b.constants[MIN_SAMPLES] * b.clock[at.WIDEST_SAMPLING]
-    plain, width = not (turned or near or missed), b.steps.shape[1]
+    jumped = n_rows > 0 and _velocities_jumped(b, n_rows, w.Q.size)
+    inside = region.shape[1] > 0 and _all_within(b.t[: 1 + n_rows], b.states, region)
+    near_singular = b.clock[at.PIVOT_AT_OUTPUT] < b.constants[NEAR]
+    undersampled = b.clock[at.SHORTEST_CHANGE] < b.constants[MIN_SAMPLES] * b.clock[at.WIDEST_SAMPLING]
+    no_remark, width = not (jumped or near_singular or undersampled), b.steps.shape[1]
     begin = b.report.size - N_HEAD - 1 - n_rows - width * n_steps
     report = b.report[begin:]
-    report[N_STATES], report[N_STEPS], report[NO_REMARK] = 1 + n_rows, n_steps, plain
-    report[JUMPED], report[IN_CHECKED_REGION], report[END_CODE], report[IS_NEW] = turned, inside, code, is_new
+    report[N_STATES], report[N_STEPS], report[NO_REMARK] = 1 + n_rows, n_steps, no_remark
+    report[JUMPED], report[IN_CHECKED_REGION], report[END_CODE], report[IS_NEW] = jumped, inside, code, is_new
     report[HAS_DEFECTS] = w.counters[N_ACCEPTED] > 0 and w.notes[indices.UNCHECKED] == 0.0
     report[DEFECT], report[LONGEST_GAP] = w.notes[indices.LARGEST_DEFECT], w.notes[indices.WIDEST_GAP]
     for k in range(N_COUNTERS):
@@ -363,27 +365,27 @@ def _write_report(w, b, box, n_rows, n_steps, code, is_new):
     _copy(b.t[: 1 + n_rows], report[N_HEAD : N_HEAD + 1 + n_rows])
     for k in range(n_steps):
         _copy(b.steps[k], report[N_HEAD + 1 + n_rows + k * width : N_HEAD + 1 + n_rows + (k + 1) * width])
-    well = code == at.ALL_OUTPUT_DONE and plain and inside and n_rows == n_steps
+    as_usual = code == at.ALL_OUTPUT_DONE and no_remark and inside and n_rows == n_steps
     b.filled[0], b.filled[1] = n_rows, n_steps
-    return n_steps if well else UNUSUAL
+    return n_steps if as_usual else UNUSUAL
 
 
 @kernel(i8(KIT, KIT, WORK, RUN_ARRAYS, f8, f8, VECTOR, VECTOR, VECTOR, MATRIX, types.boolean), vectorized=True)
-def start_and_advance(f, given, w, b, t, t1, q, v, sizes, box, sure):
+def start_and_advance(f, checked_kit, w, b, t, t1, q, v, sizes, region, is_consistent):
     """Start a run to t1 and take the first steps; return their number, or a code if Python has to check something.
 
     If a start is repeated bit for bit, the second run still checks it and saves the state of the started run; from the
     third run on, that state is restored without a check.
     """
     f.flags[FORM] = int(b.constants[EQUATION_FORM])  # a run may have changed it
-    same, often = _is_last_start(b.last_start, t, t1, q, v), b.last_start[N_EQUAL]
-    if same and often == IS_SAVED:
+    same, n_equal = _is_last_start(b.last_start, t, t1, q, v), b.last_start[N_EQUAL]
+    if same and n_equal == IS_SAVED:
         _restore_start(b)
     else:
         b.last_start[N_EQUAL] = NEVER
-        refused = _start_run(f, given, w, b, t, t1, q, v, sizes, sure or same)
-        if refused != 0:
-            return refused
+        code_of_start = _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, is_consistent or same)
+        if code_of_start != 0:
+            return code_of_start
         if same:
             _save_start(b)
         b.last_start[N_EQUAL] = IS_SAVED if same else 1.0
@@ -395,4 +397,4 @@ def start_and_advance(f, given, w, b, t, t1, q, v, sizes, box, sure):
     _copy(b.state, b.states[0])
     arrays = b.tolerances, b.control, b.clock, b.state, b.new_state
     code = b.advance(f, w, b.options, b.memory, *arrays, b.end, b.t[1:], b.states[1:], b.steps, b.filled)
-    return _write_report(w, b, box, b.filled[0], b.filled[1], code, not same)
+    return _write_report(w, b, region, b.filled[0], b.filled[1], code, not same)

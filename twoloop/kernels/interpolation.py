@@ -49,10 +49,10 @@ def _window(low, high, i, last):
 
 
 @compiled
-def _divided_differences(t, states, lo, hi, i, h, place, order, z, c):
+def _divided_differences(t, states, lo, hi, i, h, column, order, z, c):
     """Compute the Hermite polynomial through rows lo to hi in Newton's form; return the number of coefficients.
 
-    It interpolates n columns of `states` from `place` on, less the values in row i; its variable is (time - t[i]) / h.
+    It interpolates n columns of `states` from `column` on, less the values in row i; its variable is (time - t[i]) / h.
     The columns behind these are their derivatives: `order` values are used at each node. `z` becomes the nodes, `c` the
     coefficients.
     """
@@ -62,14 +62,14 @@ def _divided_differences(t, states, lo, hi, i, h, place, order, z, c):
         row = lo + r // order
         z[r] = (t[row] - t[i]) / h
         for m in range(n):
-            c[r, m] = states[row, place + m] - states[i, place + m]
+            c[r, m] = states[row, column + m] - states[i, column + m]
     for j in range(1, size):
         for r in range(size - 1, j - 1, -1):
             row, gap = lo + r // order, z[r] - z[r - j]
             if (r - j) // order == r // order:
                 scale = h if j == 1 else 0.5 * h * h
                 for m in range(n):
-                    c[r, m] = scale * states[row, place + j * n + m]
+                    c[r, m] = scale * states[row, column + j * n + m]
             else:
                 for m in range(n):
                     c[r, m] = (c[r, m] - c[r - 1, m]) / gap
@@ -95,7 +95,7 @@ def _interpolate(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
 
 
 @merged
-def _kind(kind, tolerances, h, states, i):
+def _kind_by_length(kind, tolerances, h, states, i):
     """Return `kind`, or APART for an interval so short that rounding of q would spoil the slope of its polynomial."""
     n = tolerances.size - ATOL
     for m in range(n):
@@ -106,11 +106,11 @@ def _kind(kind, tolerances, h, states, i):
 
 
 @merged
-def _change(tolerances, v_0, v):
-    """Return the largest change of a velocity by the projection, from v_0 to v, in tolerances."""
-    speed, largest = largest_of(v_0), 0.0
+def _change(tolerances, v_before, v):
+    """Return the largest change of a velocity by the projection, from v_before to v, in tolerances."""
+    speed, largest = largest_of(v_before), 0.0
     for m in range(v.size):
-        change = abs(v[m] - v_0[m]) / (tolerances[ATOL + m] + tolerances[RTOL] * speed)
+        change = abs(v[m] - v_before[m]) / (tolerances[ATOL + m] + tolerances[RTOL] * speed)
         if not change <= largest:  # NaN, too
             largest = change
     return largest
@@ -150,13 +150,13 @@ def between(f, w, tolerance, tolerances, t, states, groups, times, z, room, out)
     for g in range(groups.shape[0]):
         i, last, kind = groups[g, kinds.FIRST_OWN], groups[g, kinds.LAST_OWN], groups[g, kinds.KIND]
         h = t[last] - t[i]
-        kind = kind if kind == kinds.JUMP else _kind(kind, tolerances, h, states, i)
+        kind = kind if kind == kinds.JUMP else _kind_by_length(kind, tolerances, h, states, i)
         lo, hi = _window(groups[g, kinds.LOW], groups[g, kinds.HIGH], i, last)
         order = 3 if kind >= kinds.ACCELERATIONS else 2
         size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
         size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == kinds.APART else 0
         # choose independent coordinates for each interval anew: results must not depend on other output times
-        chosen = False
+        has_partition = False
         for p in range(groups[g, kinds.FIRST_TIME], groups[g, kinds.END_TIME]):
             q, v = out[p, :n], out[p, n : 2 * n]
             if times[p] == t[i] or times[p] == t[last]:
@@ -169,11 +169,13 @@ def between(f, w, tolerance, tolerances, t, states, groups, times, z, room, out)
             _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
             copy(q, q_0)
             copy(v, v_0)
-            code = DONE if chosen else renew_partition(f, w, t[i], states[i, :n])
+            code = DONE if has_partition else renew_partition(f, w, t[i], states[i, :n])
             if code == DONE:
                 code = restore(f, w, times[p], q, v, tolerance)
-            chosen = code == DONE and not (reduced and partition_is_poor(w)) and _change(tolerances, v_0, v) <= UNTRUE
-            if not chosen:
+            has_partition = (
+                code == DONE and not (reduced and partition_is_poor(w)) and _change(tolerances, v_0, v) <= UNTRUE
+            )
+            if not has_partition:
                 copy(q_0, q)
                 copy(v_0, v)
                 code = renew_partition(f, w, times[p], q)
@@ -246,7 +248,7 @@ def judge(f, w, tolerance, tolerances, t, states, groups, z, room, rows, out):
     for g in range(groups.shape[0]):
         i, last, kind = groups[g, kinds.FIRST_OWN], groups[g, kinds.LAST_OWN], groups[g, kinds.KIND]
         h = t[last] - t[i]
-        kind = kind if kind == kinds.JUMP else _kind(kind, tolerances, h, states, i)
+        kind = kind if kind == kinds.JUMP else _kind_by_length(kind, tolerances, h, states, i)
         lo, hi = _window(groups[g, kinds.LOW], groups[g, kinds.HIGH], i, last)
         order = 3 if kind >= kinds.ACCELERATIONS else 2
         size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
@@ -284,8 +286,8 @@ def judge(f, w, tolerance, tolerances, t, states, groups, z, room, rows, out):
             if code != DONE:
                 out[g] = np.inf
                 break
-            turn = h / size
-            out[g] = max(out[g], _difference(tolerances, turn * turn, turn, states, i, v_1, v_1, q_1, q_1))
+            dt = h / size
+            out[g] = max(out[g], _difference(tolerances, dt * dt, dt, states, i, v_1, v_1, q_1, q_1))
         if not np.isfinite(out[g]):
             out[g] = np.inf
     return DONE
@@ -339,14 +341,14 @@ def fill(f, w, options, memory, initial_memory, tolerances, state, new_state, t,
         copy(states[i + 1], out[last])
         code = renew_partition(f, w, t[i], state[:n])
         for r in range(first + 1, last):
-            before = out_t[r - 1]
+            t_before = out_t[r - 1]
             out_t[r] = t[i] + (t[i + 1] - t[i]) * (r - first) / (rows - 1)
             if code == DONE:
-                size = out_t[r] - before
-                code, _, _ = f.attempt(f, w, options, memory, before, size, tolerances, state, new_state)
-                if code != DONE and renew_partition(f, w, before, state[:n]) == DONE:
+                size = out_t[r] - t_before
+                code, _, _ = f.attempt(f, w, options, memory, t_before, size, tolerances, state, new_state)
+                if code != DONE and renew_partition(f, w, t_before, state[:n]) == DONE:
                     copy(initial_memory, memory)
-                    code, _, _ = f.attempt(f, w, options, memory, before, size, tolerances, state, new_state)
+                    code, _, _ = f.attempt(f, w, options, memory, t_before, size, tolerances, state, new_state)
                 f.settle(f, w, options, memory, tolerances, True)
             copy(new_state, state)
             copy(new_state[: 3 * n], out[r])

@@ -32,7 +32,7 @@ class Static(NamedTuple):
 # n_q, n_c, n_a, ranks of C_q and of all rows, whether T^T M T is used, whether the augmented matrix is used, number of
 # nodes of the traced programs, sizes of the static form (None: another form), length of the array `matrices`
 Sizes = tuple[int, int, int, int, int, bool, bool, int, Static | None, int]
-Places = list[tuple[str, int, int, tuple[int, ...]]]  # arrays in one piece of memory: name, begin, end, shape
+ArrayRanges = list[tuple[str, int, int, tuple[int, ...]]]  # arrays in one piece of memory: name, begin, end, shape
 
 
 class Layout(NamedTuple):
@@ -43,8 +43,8 @@ class Layout(NamedTuple):
     one step to the next; a step fills all others before it reads them.
     """
 
-    numbers: Places
-    integers: Places
+    numbers: ArrayRanges
+    integers: ArrayRanges
     n_numbers: int
     n_integers: int
     n_lasting: int
@@ -56,18 +56,18 @@ class Layout(NamedTuple):
 
 def empty(sizes: Sizes) -> Work:
     """Return a workspace in its initial state: a cleared unused one of these sizes, or else a newly allocated one."""
-    given_back = _take_unused(sizes)
-    return _allocate(sizes) if given_back is None else cleared(given_back)
+    unused = _take_unused(sizes)
+    return _allocate(sizes) if unused is None else cleared(unused)
 
 
 def copy_of(work: Work) -> Work:
     """Return a copy of a workspace."""
     sizes = work.sizes
-    other = _take_unused(sizes) or _allocate(sizes)
-    for mine, given in zip(lasting(other), lasting(work), strict=True):
-        mine[:] = given
-    other.changes[:] = 0.0
-    return other
+    copied = _take_unused(sizes) or _allocate(sizes)
+    for target, source in zip(lasting(copied), lasting(work), strict=True):
+        target[:] = source
+    copied.changes[:] = 0.0
+    return copied
 
 
 def lasting(work: Work) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -125,7 +125,7 @@ def cached_run() -> Any:
     return cached_run
 
 
-def _of_static_form(n_q: int, n_c: int, rank: int, static: Static) -> tuple[dict[str, tuple[int, ...]], ...]:
+def _static_shapes(n_q: int, n_c: int, rank: int, static: Static) -> tuple[dict[str, tuple[int, ...]], ...]:
     """Return the shapes of the arrays (numbers, integers) that differ in the static form, which has no partition.
 
     All coordinates count as dependent, because the predictions of all are compared, and also as independent.
@@ -134,11 +134,11 @@ def _of_static_form(n_q: int, n_c: int, rank: int, static: Static) -> tuple[dict
     n_rows = n_c if static.dense_jacobian else 0
     side = n_q if static.dense_mass else 0
     matrices = dict.fromkeys(("L", "S", "W", "A", "MT", "Gx", "G_of_S"), (0, 0))
-    nothing = dict.fromkeys(("values", "values_v", "values_a", "right"), (0,))
+    empty_vectors = dict.fromkeys(("values", "values_v", "values_a", "right"), (0,))
     numbers: dict[str, tuple[int, ...]] = {
         "augmented": ((n_rows + 1) * n_q * static.dense_jacobian + side * side,),
         **matrices,
-        **nothing,
+        **empty_vectors,
         "D": (n_q + 1, 0),
         "pattern": (n_rows, n_q),
         "mass_pattern": (side, side),
@@ -224,9 +224,9 @@ def _layout(
     }
     rows_of_G, side = n_rows + 1, n_q
     if static is not None:
-        changed = _of_static_form(n_q, n_c, r, static)
-        numbers |= changed[0]
-        integers |= changed[1]
+        static_shapes = _static_shapes(n_q, n_c, r, static)
+        numbers |= static_shapes[0]
+        integers |= static_shapes[1]
         rows_of_G, side = (n_rows + 1) * static.dense_jacobian, n_q * static.dense_mass
         n_entries = rows_of_G * n_q
     # arrays of positions that velocities share if there are no rows of A
@@ -235,32 +235,34 @@ def _layout(
         del integers[f"{name}_v"]
     if n_a == 0:
         del numbers["values_v"]
-    of_numbers, n_numbers = _place_arrays(numbers)
-    of_integers, n_integers = _place_arrays(integers)
+    of_numbers, n_numbers = _array_ranges(numbers)
+    of_integers, n_integers = _array_ranges(integers)
     of_numbers["entries"], of_numbers["G"] = (0, n_entries, (n_entries,)), (0, n_entries, (rows_of_G, n_q))
     of_numbers["M"] = n_entries, n_entries + side * side, (side, side)
     # number of integers at the end of `index` that are used only while an order of elimination is chosen
-    lists = (N_COUNTS + N_LISTS * min(r, MAX_ENTRIES_PER_LINE)) * r if static is None else 0
-    lasting = of_numbers["matrices"][0], of_integers["index"][1] - lists
+    n_ordering = (N_COUNTS + N_LISTS * min(r, MAX_ENTRIES_PER_LINE)) * r if static is None else 0
+    n_lasting = of_numbers["matrices"][0], of_integers["index"][1] - n_ordering
     if n_a == 0:
         of_numbers["values_v"] = of_numbers["values"]
         of_integers |= {f"{name}_v": of_integers[name] for name in of_positions}
     table = np.zeros(WORK.n_words, dtype=np.int64)
     masks = np.zeros((2, WORK.n_words), dtype=np.int64)
-    for mask, places in zip(masks, (of_numbers, of_integers), strict=True):
-        for name, (begin, _, shape) in places.items():
+    for mask, ranges in zip(masks, (of_numbers, of_integers), strict=True):
+        for name, (begin, _, shape) in ranges.items():
             word = WORK.offsets[name]
             table[word], mask[word] = WORD * begin, 1
             table[word + 1 : word + 1 + len(shape)] = shape
-    named = [[(name, *place) for name, place in places.items()] for places in (of_numbers, of_integers)]
-    return Layout(named[0], named[1], n_numbers, n_integers, *lasting, table, masks[0], masks[1])
+    named_ranges = [
+        [(name, *begin_end_shape) for name, begin_end_shape in ranges.items()] for ranges in (of_numbers, of_integers)
+    ]
+    return Layout(named_ranges[0], named_ranges[1], n_numbers, n_integers, *n_lasting, table, masks[0], masks[1])
 
 
-def _place_arrays(shapes: Mapping[str, tuple[int, ...]]) -> tuple[dict[str, tuple[int, int, tuple[int, ...]]], int]:
+def _array_ranges(shapes: Mapping[str, tuple[int, ...]]) -> tuple[dict[str, tuple[int, int, tuple[int, ...]]], int]:
     """Return (begin, end, shape) of each array, which begins at the start of a cache line, and the total length."""
-    places, end = {}, 0
+    ranges, end = {}, 0
     for name, shape in shapes.items():
         size = math.prod(shape)
-        places[name] = end, end + size, shape
+        ranges[name] = end, end + size, shape
         end += -(-size // LINE) * LINE
-    return places, end
+    return ranges, end

@@ -43,12 +43,12 @@ SMOOTH, RAMP, JUMP = range(3)
 
 
 @compiled
-def _sample_rates(f, w, t, q, way, begin, end):
-    """Evaluate C_t and b at thirteen times from begin to end into w.rates; the position is q + way (time - t)."""
+def _sample_rates(f, w, t, q, velocity, begin, end):
+    """Evaluate C_t and b at thirteen times from begin to end into w.rates; positions are q + velocity (time - t)."""
     for k in range(N_PARTS + 1):
         time = end if k == N_PARTS else begin + (end - begin) * (k / N_PARTS)
         for m in range(q.size):
-            w.x[m] = q[m] + (time - t) * way[m]
+            w.x[m] = q[m] + (time - t) * velocity[m]
         constraint_rates(f, w, time, w.x, w.rates[k])
         if not finite_vector(w.rates[k]):  # such as the derivative of |t| at 0: use the next floating-point time
             constraint_rates(f, w, time + np.spacing(abs(time)), w.x, w.rates[k])
@@ -102,27 +102,27 @@ def unexplained_velocity_change(tolerances, h, state, new_state, n):
 
 
 @compiled
-def locate_discontinuity(f, w, t, end, q, v, way, tolerances):
+def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
     """Return SMOOTH, RAMP or JUMP for the row of C_t and b that is least smooth from t to `end`, and where it changes.
 
     The second and third result are beginning and end of the jump or ramp, or t and `end` if the row is smooth. A ramp
     that is as long as the step counts as one of half this length: accelerations may be zero at both of its ends, and a
-    method that evaluates only there would miss it. `way`: velocity along which positions are extrapolated.
+    method that evaluates only there would miss it. `velocity`: velocity along which positions are extrapolated.
     """
     begin = t
     h = end - t
-    _sample_rates(f, w, t, q, way, begin, end)
-    row, limit, mean, most = -1, 0.0, 0.0, 1.0
+    _sample_rates(f, w, t, q, velocity, begin, end)
+    row, limit, mean, largest = -1, 0.0, 0.0, 1.0
     for i in range(w.Rate.size):
-        bend = _twelfth_difference(w, i)
-        if bend == 0.0:  # a row that does not depend on time
+        difference = _twelfth_difference(w, i)
+        if difference == 0.0:  # a row that does not depend on time
             continue
         slope, size = _slope_and_size(w, i, h)
-        least = max(
+        allowed_error = max(
             _allowed_error(f, w, tolerances, v, i), RATE_ROUNDING * size, TIME_ROUNDING * slope * np.spacing(abs(end))
         )
-        if bend > most * least:
-            row, limit, mean, most = i, least, slope, bend / least
+        if difference > largest * allowed_error:
+            row, limit, mean, largest = i, allowed_error, slope, difference / allowed_error
     if row < 0:
         return SMOOTH, t, end
     steepest, low, high = 0.0, begin, end
@@ -130,22 +130,22 @@ def locate_discontinuity(f, w, t, end, q, v, way, tolerances):
         if end - begin <= MIN_SPACINGS * np.spacing(abs(end)):
             break
         middle = begin + 0.5 * (end - begin)
-        _sample_rates(f, w, t, q, way, middle, end)
+        _sample_rates(f, w, t, q, velocity, middle, end)
         above = _twelfth_difference(w, row)
-        _sample_rates(f, w, t, q, way, begin, middle)
+        _sample_rates(f, w, t, q, velocity, begin, middle)
         below = _twelfth_difference(w, row)
         if not max(above, below) > limit:
             break
         if above > below:
             begin = middle
-            _sample_rates(f, w, t, q, way, begin, end)
+            _sample_rates(f, w, t, q, velocity, begin, end)
         else:
             end = middle
         slope, _ = _slope_and_size(w, row, end - begin)
         if slope > steepest and end - begin <= MAX_RAMP_SHARE * h and slope * (end - begin) > limit:
             steepest, low, high = slope, begin, end
     if end - begin <= MIN_SPACINGS * np.spacing(abs(end)):
-        _sample_rates(f, w, t, q, way, begin, end)
+        _sample_rates(f, w, t, q, velocity, begin, end)
         if abs(w.rates[N_PARTS, row] - w.rates[0, row]) > limit:
             return JUMP, begin, end
     if steepest > STEEPNESS * mean:
@@ -182,14 +182,14 @@ N_CHANGES = N_SAMPLES + 3  # number of rows of w.changes
 
 
 @compiled
-def _sample(f, w, time, since, q, v, a, now):
-    """Evaluate forces, C_t and b into `now` at `time` and the state `since` seconds after (q, v), if a is constant."""
+def _sample(f, w, time, elapsed, q, v, a, values):
+    """Evaluate forces, C_t and b into `values` at `time` and the state `elapsed` s after (q, v), if a is constant."""
     for m in range(q.size):
-        w.x[m] = q[m] + since * (v[m] + 0.5 * since * a[m])
-        w.y[m] = v[m] + since * a[m]
-    now[: q.size] = 0.0
-    f.force(time, w.x, w.y, f.p, now[: q.size])
-    constraint_rates(f, w, time, w.x, now[q.size :])
+        w.x[m] = q[m] + elapsed * (v[m] + 0.5 * elapsed * a[m])
+        w.y[m] = v[m] + elapsed * a[m]
+    values[: q.size] = 0.0
+    f.force(time, w.x, w.y, f.p, values[: q.size])
+    constraint_rates(f, w, time, w.x, values[q.size :])
 
 
 @compiled
@@ -239,13 +239,13 @@ def _first_sudden_bend(values, n, along, least):
     With `along` = 1 the straight line from the first to the last value is subtracted first. The search is repeated
     among the values before the bend, until there is no earlier bend.
     """
-    place, limit = _find_bend(values, n, along * (values[n] - values[0]) / max(n, 1), least, False)
-    while place > 1:  # few values of a smooth curve may bend as much: _find_bend excludes these with `within`
-        before, share = _find_bend(values, place, along * (values[place] - values[0]) / place, least, True)
-        if before == 0:
+    index, limit = _find_bend(values, n, along * (values[n] - values[0]) / max(n, 1), least, False)
+    while index > 1:  # few values of a smooth curve may bend as much: _find_bend excludes these with `within`
+        earlier, earlier_limit = _find_bend(values, index, along * (values[index] - values[0]) / index, least, True)
+        if earlier == 0:
             break
-        place, limit = before, share
-    return place, limit
+        index, limit = earlier, earlier_limit
+    return index, limit
 
 
 @compiled
@@ -274,14 +274,14 @@ def _locate_change(f, w, low, high, k, j, q, v, a):
 
 
 @compiled
-def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, place, column, limit, q, v, a):
-    """Record when values of a column change next to the bend at index `place`, and how long after the last change."""
-    values, apart = w.changes[:, column], max(AT_CHANGE * spacing, SAME_CHANGE * clock[at.WIDEST_SAMPLING])
+def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column, limit, q, v, a):
+    """Record when values of a column change next to the bend at `index`, and how long after the last change."""
+    values, margin = w.changes[:, column], max(AT_CHANGE * spacing, SAME_CHANGE * clock[at.WIDEST_SAMPLING])
     soonest = clock[at.T_START] + SOONEST * tolerances[GAP]
-    for k in range(place - 1, place + 1):
+    for k in range(index - 1, index + 1):
         low, high = begin + k * spacing, begin + (k + 1) * spacing
-        known = low - apart <= clock[at.LAST_CHANGE] <= high + apart
-        if known or k + 2 > n or low - spacing < soonest:  # a change needs samples on both sides
+        is_recorded = low - margin <= clock[at.LAST_CHANGE] <= high + margin
+        if is_recorded or k + 2 > n or low - spacing < soonest:  # a change needs samples on both sides
             continue
         if k == 0:
             _sample(f, w, low - spacing, 0.0, q, v, a, w.changes[MIDDLE])
@@ -293,18 +293,18 @@ def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, place, column
 
 
 @compiled
-def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, along, q, v, a):
+def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follows_motion, q, v, a):
     """Return the time of the first sample at which a value changes suddenly, or infinity; and the end of the samples.
 
-    (q, v, a) is the state at t; samples begin at `begin` and end at `last` or earlier. With `along` = 1 they follow the
-    motion, with 0 they stay at the state.
+    (q, v, a) is the state at t; samples begin at `begin` and end at `last` or earlier. With `follows_motion` = 1 they
+    follow the motion, with 0 they stay at the state.
     """
     changes, n, first = w.changes, 0, np.inf
     for k in range(N_SAMPLES + 1):
         time = begin + k * spacing
         if time > last:
             break
-        _sample(f, w, time, along * (time - t), q, v, a, changes[k])
+        _sample(f, w, time, follows_motion * (time - t), q, v, a, changes[k])
         for j in range(changes.shape[1]):
             if np.isfinite(changes[k, j]):
                 changes[LARGEST, j] = max(changes[LARGEST, j], abs(changes[k, j]))
@@ -319,12 +319,12 @@ def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, along,
     bend, column, limit = n, -1, 0.0
     for j in range(changes.shape[1]):
         values = changes[:, j]
-        place, least = _first_sudden_bend(values, n, along, of_forces if j < q.size else of_rates)
-        if 0 < place < bend:
-            bend, column, limit = place, j, least
+        index, least = _first_sudden_bend(values, n, follows_motion, of_forces if j < q.size else of_rates)
+        if 0 < index < bend:
+            bend, column, limit = index, j, least
     if column >= 0:
         first = min(first, begin + bend * spacing)
-        if along == 0.0:
+        if follows_motion == 0.0:
             _record_changes(f, w, tolerances, clock, t, begin, spacing, n, bend, column, limit, q, v, a)
     return first, min(first, begin + N_SAMPLES * spacing if n == N_SAMPLES else last)
 
@@ -332,11 +332,11 @@ def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, along,
 @compiled
 def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, a):
     """Record for how long a value within a short step differs from values around it: samples ahead have missed this."""
-    changes, wide, begin, end = w.changes, control[at.APART], clock[at.T_START], t + size
+    changes, spacing, begin, end = w.changes, control[at.APART], clock[at.T_START], t + size
     clock[at.COMPARED] = t
-    if end + wide > last or (t - 2.0 * wide < begin and end + 2.0 * wide > last):
+    if end + spacing > last or (t - 2.0 * spacing < begin and end + 2.0 * spacing > last):
         return
-    for k, time in enumerate((t - 2.0 * wide, t - wide, end + wide, end + 2.0 * wide)):
+    for k, time in enumerate((t - 2.0 * spacing, t - spacing, end + spacing, end + 2.0 * spacing)):
         _sample(f, w, min(max(time, begin), last), 0.0, q, v, a, changes[k + (k > 1)])
     least = LEAST_RANGE * tolerances[RTOL]
     of_forces = max(LEAST_VALUE, least * _largest(changes[LARGEST, : q.size]))
@@ -348,21 +348,21 @@ def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, 
             values = changes[:, j]
             low = min(min(values[0], values[1]), min(values[3], values[4]))
             high = max(max(values[0], values[1]), max(values[3], values[4]))
-            beyond = max(values[2] - high, low - values[2])
-            if beyond > max(STEEPER * (high - low), of_forces if j < q.size else of_rates):
-                first = _locate_change(f, w, max(t - wide, begin), time, 1, j, q, v, a)
-                second = _locate_change(f, w, time, end + wide, 2, j, q, v, a)
+            excess = max(values[2] - high, low - values[2])
+            if excess > max(STEEPER * (high - low), of_forces if j < q.size else of_rates):
+                first = _locate_change(f, w, max(t - spacing, begin), time, 1, j, q, v, a)
+                second = _locate_change(f, w, time, end + spacing, 2, j, q, v, a)
                 clock[at.SHORTEST_CHANGE] = min(clock[at.SHORTEST_CHANGE], second - first)
 
 
 @compiled
-def _acceleration_lasts(f, w, tolerances, t, way, q, v, a, Q, V, A):
+def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
     """Return whether accelerations hardly change until they have changed a velocity by its tolerance.
 
     They do change if stiff friction keeps a body at rest: its acceleration is then a rounding error of balanced forces,
     and a parabola with this acceleration would lead far away from the state of rest. (Q, V, A) is scratch.
     """
-    n, time, largest, change = w.Q.size, way, 0.0, 0.0
+    n, time, largest, change = w.Q.size, duration, 0.0, 0.0
     for m in range(n):
         largest = max(largest, abs(a[m]))
         if a[m] != 0.0:
@@ -383,46 +383,46 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
     """Sample along the motion of a step, and of later ones that end within LEAST_DISTANCE spacings; store results."""
     if clock[at.MOTION_SAMPLED_TO] >= t + (1.0 - AT_CHANGE) * size:
         return
-    way = min(max(size, LEAST_DISTANCE * spacing), last - t)
+    duration = min(max(size, LEAST_DISTANCE * spacing), last - t)
     clock[at.SAMPLES_MOTION] = 1.0
     first, clock[at.MOTION_SAMPLED_TO] = first_discontinuity(
-        f, w, tolerances, clock, t, t, way / N_SAMPLES, last, 1.0, q, v, a
+        f, w, tolerances, clock, t, t, duration / N_SAMPLES, last, 1.0, q, v, a
     )
-    if first < np.inf and not _acceleration_lasts(f, w, tolerances, t, way, q, v, a, Q, V, A):
+    if first < np.inf and not _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
         A[:] = 0.0
         first, clock[at.MOTION_SAMPLED_TO] = first_discontinuity(
-            f, w, tolerances, clock, t, t, way / N_SAMPLES, last, 1.0, q, v, A
+            f, w, tolerances, clock, t, t, duration / N_SAMPLES, last, 1.0, q, v, A
         )
     clock[at.SAMPLES_MOTION] = 0.0
     # if the last samples in time found a change, the next samples in time begin there, with their own spacing
-    known = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t
-    if not known and way <= N_SAMPLES * min(control[at.APART], size / N_IN_STEP):  # spacing as of samples in time alone
-        clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], way / N_SAMPLES)
+    change_found = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t
+    if not change_found and duration <= N_SAMPLES * min(control[at.APART], size / N_IN_STEP):
+        clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], duration / N_SAMPLES)
         if clock[at.MOTION_SAMPLED_TO] > clock[at.SAMPLED_TO]:
-            clock[at.SAMPLED_TO], clock[at.SAMPLED_EVERY] = clock[at.MOTION_SAMPLED_TO], way / N_SAMPLES
+            clock[at.SAMPLED_TO], clock[at.SAMPLED_EVERY] = clock[at.MOTION_SAMPLED_TO], duration / N_SAMPLES
             clock[at.DISCONTINUITY] = first
     if first < clock[at.DISCONTINUITY_OF_MOTION] or clock[at.DISCONTINUITY_OF_MOTION] <= t + AT_CHANGE * spacing:
         clock[at.DISCONTINUITY_OF_MOTION] = first
 
 
 @compiled
-def _sample_ahead(f, w, tolerances, control, clock, known, t, size, last, q, v, a):
-    """Return when a value next changes suddenly with time, or `known` (infinite: no time) if that is earlier."""
+def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, q, v, a):
+    """Return when a value next changes suddenly with time, or `next_change` (infinite: no time) if that is earlier."""
     every = max(min(control[at.APART], size / N_IN_STEP), LEAST_APART * np.spacing(abs(t)))
     # samples need not be taken again for multistep methods (ROUGH = 1), which no jump deceives, and which restart only
     # after a rejected step, or if C_t or b may jump: steps find these jumps themselves, unless they end next to one
-    closer = control[at.ROUGH] > 1.0 and control[at.DRIVEN] == 0.0
-    if closer and every < RESAMPLE_BELOW * clock[at.SAMPLED_EVERY]:
+    may_resample = control[at.ROUGH] > 1.0 and control[at.DRIVEN] == 0.0
+    if may_resample and every < RESAMPLE_BELOW * clock[at.SAMPLED_EVERY]:
         clock[at.SAMPLED_TO] = t
     begin = max(t, clock[at.SAMPLED_TO])
     at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # samples from here on have to find the change again
-    while begin < min(t + size, last, known):
-        apart, at_change = min(every, clock[at.SAMPLED_EVERY]) if at_change else every, False
-        clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], apart)
-        first, begin = first_discontinuity(f, w, tolerances, clock, t, begin, apart, last, 0.0, q, v, a)
-        known = min(known, first)
-        clock[at.SAMPLED_TO], clock[at.SAMPLED_EVERY] = begin, apart
-    return known
+    while begin < min(t + size, last, next_change):
+        present_spacing, at_change = min(every, clock[at.SAMPLED_EVERY]) if at_change else every, False
+        clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], present_spacing)
+        first, begin = first_discontinuity(f, w, tolerances, clock, t, begin, present_spacing, last, 0.0, q, v, a)
+        next_change = min(next_change, first)
+        clock[at.SAMPLED_TO], clock[at.SAMPLED_EVERY] = begin, present_spacing
+    return next_change
 
 
 @compiled
@@ -434,15 +434,15 @@ def limit_to_discontinuity(f, w, tolerances, control, clock, t, size, last, stat
     shortest = (1.0 if control[at.BY_STATE] == 1.0 else LEAST_DISTANCE) * spacing
     if control[at.SAMPLE_MOTION] == 1.0 and shortest < size < (N_SAMPLES + AT_CHANGE) * spacing:
         _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a, Q, V, A)
-    near = t + AT_CHANGE * min(spacing, size / N_IN_STEP)
-    known = clock[at.DISCONTINUITY] if clock[at.DISCONTINUITY] > near else np.inf
-    along = clock[at.DISCONTINUITY_OF_MOTION] if clock[at.DISCONTINUITY_OF_MOTION] > near else np.inf
-    at_change = known == np.inf and clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO] > -np.inf
+    t_near = t + AT_CHANGE * min(spacing, size / N_IN_STEP)
+    next_change = clock[at.DISCONTINUITY] if clock[at.DISCONTINUITY] > t_near else np.inf
+    next_of_motion = clock[at.DISCONTINUITY_OF_MOTION] if clock[at.DISCONTINUITY_OF_MOTION] > t_near else np.inf
+    at_change = next_change == np.inf and clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO] > -np.inf
     # do not sample again near the end of a run: samples of ever shorter spans would find the same change again
     if control[at.BY_TIME] == 1.0 and not (at_change and size <= (1.0 + AT_CHANGE) * clock[at.SAMPLED_EVERY]):
-        known = _sample_ahead(f, w, tolerances, control, clock, known, t, size, last, q, v, a)
-        clock[at.DISCONTINUITY] = known
-    size = min(size, representable_step(t, min(known, along) - t))
+        next_change = _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, q, v, a)
+        clock[at.DISCONTINUITY] = next_change
+    size = min(size, representable_step(t, min(next_change, next_of_motion) - t))
     is_short = size < SHORT_STEP * clock[at.H_LONG] or t < clock[at.T_START] + 2.0 * control[at.APART]
     if control[at.BY_TIME] == 1.0 and is_short and size < control[at.APART] and clock[at.COMPARED] < t:
         _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, a)

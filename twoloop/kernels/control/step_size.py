@@ -104,31 +104,31 @@ def on_grid(clock, t, h, target, goal):
     Grid times are multiples of h, not sums; an output time within a millionth of h from a grid point counts as equal.
     """
     rounding = EQUAL_SPACINGS * np.spacing(max(abs(t), abs(target)))
-    near = max(1e-6 * h, rounding)
-    in_grid = 1.0
-    if target <= clock[at.T_START] + clock[at.N_FIXED] * h + near:
-        in_grid = 0.0  # a second output time close to the grid point reached before
-    end = clock[at.T_START] + (clock[at.N_FIXED] + in_grid) * h
-    reaches = goal <= end + near
+    margin = max(1e-6 * h, rounding)
+    n_grid_steps = 1.0
+    if target <= clock[at.T_START] + clock[at.N_FIXED] * h + margin:
+        n_grid_steps = 0.0  # a second output time close to the grid point reached before
+    end = clock[at.T_START] + (clock[at.N_FIXED] + n_grid_steps) * h
+    reaches_goal = goal <= end + margin
     size = h
     if abs(t + h - end) > rounding:
         size = end - t  # back to the grid after an output time off the grid
-    if reaches and goal < target and abs(goal - end) > rounding:
-        in_grid = 0.0
-    return size, in_grid, reaches
+    if reaches_goal and goal < target and abs(goal - end) > rounding:
+        n_grid_steps = 0.0
+    return size, n_grid_steps, reaches_goal
 
 
 @merged
-def off_grid(control, t, h, left, jumps):
+def off_grid(control, t, h, left, crosses_jump):
     """Return the size of a step under step-size control, and whether it reaches the goal, `left` seconds ahead."""
-    reaches = jumps or h >= left * (1.0 - 1e-10)
+    reaches_goal = crosses_jump or h >= left * (1.0 - 1e-10)
     size = h
-    if h > 0.5 * left and not reaches:
+    if h > 0.5 * left and not reaches_goal:
         size = 0.5 * left  # two equal steps rather than a long and a tiny one
     size = representable_step(t, size)
     if size > control[at.MAX_STEP]:
         size = representable_step(t, size - np.spacing(abs(t + size)))
-    return size, reaches
+    return size, reaches_goal
 
 
 FADING = 0.98  # factor on H_LONG, the longest recent step, at each accepted step

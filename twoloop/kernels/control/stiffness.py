@@ -180,25 +180,25 @@ def _power_iteration(f, w, t, state, direction, by_v, Q, V, A):
     """
     n = Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
-    places = w.independent_v if by_v else w.independent
+    columns = w.independent_v if by_v else w.independent
     largest = 1.0
     for m in range(n):
         largest = max(largest, abs(v[m]) if by_v else abs(q[m]))
     size = DISPLACEMENT * largest
     copy(q, Q)
     copy(v, V)
-    moved = V if by_v else Q
-    for i in places:
-        moved[i] += size * direction[i]
+    displaced = V if by_v else Q
+    for i in columns:
+        displaced[i] += size * direction[i]
     if evaluate_near(f, w, t, Q, V, A) != DONE:
         return 0.0
     image, size = 0.0, 0.0
-    for i in places:
+    for i in columns:
         image = max(image, abs(A[i] - a[i]))
         size = max(size, abs(V[i] - v[i]) if by_v else abs(Q[i] - q[i]))
     if not (image > 0.0 and np.isfinite(image) and size > 0.0):
         return 0.0
-    for i in places:
+    for i in columns:
         direction[i] = (A[i] - a[i]) / image
     return image / size
 
@@ -232,12 +232,12 @@ def _largest_rate(f, w, memory, t, state, new_state):
 def _motion_rate(f, w, t, state, rate, Q, V, A):
     """Return the rate, 1/s, at which velocities or accelerations change; infinite if it cannot be computed."""
     n = Q.size
-    instant = INSTANT / rate
+    dt = INSTANT / rate
     fastest = largest = change = 0.0
     for m in range(n):
-        Q[m] = state[m] + instant * state[n + m]
-        V[m] = state[n + m] + instant * state[2 * n + m]
-    if evaluate_near(f, w, t + instant, Q, V, A) != DONE:
+        Q[m] = state[m] + dt * state[n + m]
+        V[m] = state[n + m] + dt * state[2 * n + m]
+    if evaluate_near(f, w, t + dt, Q, V, A) != DONE:
         return np.inf
     for i in w.independent_v:
         fastest = max(fastest, abs(state[n + i]))
@@ -245,7 +245,7 @@ def _motion_rate(f, w, t, state, rate, Q, V, A):
         change = max(change, abs(A[i] - state[2 * n + i]))
     if fastest == 0.0 or largest == 0.0:
         return np.inf
-    return max(largest / fastest, change / (instant * largest))
+    return max(largest / fastest, change / (dt * largest))
 
 
 @compiled
@@ -268,12 +268,12 @@ def _cost(w, options):
 @compiled
 def _cost_per_second(w, options, memory, t):
     """Return the cost of a second of motion since T_BEGIN, in evaluations of the first method."""
-    price = (_cost(w, options) - memory[COST_BEGIN]) / (t - memory[T_BEGIN])
-    return price if _is_explicit(memory) else options[COST_RATIO] * price
+    cost_per_second = (_cost(w, options) - memory[COST_BEGIN]) / (t - memory[T_BEGIN])
+    return cost_per_second if _is_explicit(memory) else options[COST_RATIO] * cost_per_second
 
 
 @compiled
-def _interval(options, memory):
+def _evaluations_between_estimates(options, memory):
     """Return the number of evaluations, until the next estimate, that cost as much as INTERVAL general ones."""
     return INTERVAL * options[COST_RATIO] if _is_explicit(memory) else INTERVAL
 
@@ -285,7 +285,7 @@ def _begin_phase(w, options, memory, phase, t):
     memory[STEPS] = 0.0
     memory[HISTORY + ERROR_BEFORE] = 0.0
     memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
-    memory[NEXT_ESTIMATE] = w.counters[N_EVALUATIONS] + _interval(options, memory)
+    memory[NEXT_ESTIMATE] = w.counters[N_EVALUATIONS] + _evaluations_between_estimates(options, memory)
 
 
 @compiled
@@ -295,13 +295,13 @@ def _judge_trial(w, options, memory, t):
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
     if memory[STEPS] < SETTLED + WINDOW:
         return -1
-    price = _cost_per_second(w, options, memory, t)
-    keeps = price * MIN_GAIN <= memory[COST_PER_SECOND]
-    memory[WAIT] = PATIENCE if keeps else 2.0 * memory[WAIT]
+    cost_per_second = _cost_per_second(w, options, memory, t)
+    is_kept = cost_per_second * MIN_GAIN <= memory[COST_PER_SECOND]
+    memory[WAIT] = PATIENCE if is_kept else 2.0 * memory[WAIT]
     memory[ESTIMATES_TO_WAIT] = memory[WAIT]
     if memory[PHASE] == ON_TRIAL:
-        return IMPLICIT if keeps else EXPLICIT
-    return EXPLICIT if keeps else IMPLICIT
+        return IMPLICIT if is_kept else EXPLICIT
+    return EXPLICIT if is_kept else IMPLICIT
 
 
 @compiled
@@ -309,42 +309,51 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
     """Estimate the rate and decide whether to try the other method; return the phase to begin, or -1."""
     n = w.Q.size
     memory[RATE] = _largest_rate(f, w, memory, t, state, new_state)
-    price, cost = _cost_per_second(w, options, memory, t), _cost(w, options)
+    cost_per_second, cost = _cost_per_second(w, options, memory, t), _cost(w, options)
     memory[T_BEGIN], memory[COST_BEGIN] = t, cost
-    memory[NEXT_ESTIMATE] = w.counters[N_EVALUATIONS] + _interval(options, memory)
+    memory[NEXT_ESTIMATE] = w.counters[N_EVALUATIONS] + _evaluations_between_estimates(options, memory)
     memory[ESTIMATES_TO_WAIT] -= 1.0
-    share = memory[H_MEAN] * memory[RATE] / options[LIMIT]
-    if share > 1.0:
+    h_rho = memory[H_MEAN] * memory[RATE] / options[LIMIT]
+    if h_rho > 1.0:
         memory[N_ABOVE_LIMIT] += 1.0
     if memory[ESTIMATES_TO_WAIT] > 0.0:
         return -1
     # a trial that may be in vain, or that needs finite differences, has to cost little compared with the run so far
-    paid, afforded = cost, AFFORDED * TRIAL * options[COST_RATIO]
+    counted_cost, least_cost = cost, AFFORDED * TRIAL * options[COST_RATIO]
     if np.isfinite(tolerances[GAP]):
-        paid = max(paid, OF_RUN * tolerances[GAP] / LONGEST_UNSEEN * price)
-    cheap = paid > afforded and (f.flags[FORCE_BY_Q_GIVEN] == 1 or paid > MIN_COST * w.independent.size)
+        counted_cost = max(counted_cost, OF_RUN * tolerances[GAP] / LONGEST_UNSEEN * cost_per_second)
+    is_cheap = counted_cost > least_cost and (
+        f.flags[FORCE_BY_Q_GIVEN] == 1 or counted_cost > MIN_COST * w.independent.size
+    )
     hidden = False
-    if memory[PHASE] == EXPLICIT and cheap and share > HIDDEN_FROM:
+    if memory[PHASE] == EXPLICIT and is_cheap and h_rho > HIDDEN_FROM:
         Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
         hidden = _is_quiet(w, tolerances, state, memory[RATE])
         if not hidden:
             hidden = memory[RATE] > HIDDEN_RATIO * _motion_rate(f, w, t, state, memory[RATE], Q, V, A)
     # a run that has cost this much starts a trial whatever the rate is: where friction is about to reverse, few states
     # show the largest rate, and the cost of a run is known only after the short steps of its start
-    costs_enough = cheap and cost > afforded and paid > COST_OF_ANY_TRIAL * afforded * (1.0 + memory[N_TRIALS])
-    due = share > STABILITY_LIMIT or hidden or costs_enough or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and cheap)
-    if cheap and share <= 1.0:  # while a trial is too expensive, N_ABOVE_LIMIT is kept
+    costs_enough = (
+        is_cheap and cost > least_cost and counted_cost > COST_OF_ANY_TRIAL * least_cost * (1.0 + memory[N_TRIALS])
+    )
+    is_due = (
+        h_rho > STABILITY_LIMIT
+        or hidden
+        or costs_enough
+        or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and is_cheap)
+    )
+    if is_cheap and h_rho <= 1.0:  # while a trial is too expensive, N_ABOVE_LIMIT is kept
         memory[N_ABOVE_LIMIT] = 0.0
-    expensive = price > MIN_GAIN * memory[COST_PER_SECOND]  # compared with the explicit method before it was left
-    if (memory[PHASE] == EXPLICIT and due) or (memory[PHASE] == IMPLICIT and (share < RETURN_BELOW or expensive)):
-        memory[COST_PER_SECOND] = price
+    expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # compared with the explicit method before
+    if (memory[PHASE] == EXPLICIT and is_due) or (memory[PHASE] == IMPLICIT and (h_rho < RETURN_BELOW or expensive)):
+        memory[COST_PER_SECOND] = cost_per_second
         memory[N_TRIALS] += 1.0
         return ON_TRIAL if memory[PHASE] == EXPLICIT else BACK_ON_TRIAL
     return -1
 
 
 @compiled
-def _restart(memory):
+def _clear(memory):
     """Clear a method's memory, as at the beginning of a run."""
     for i in range(memory.size):
         memory[i] = 0.0
@@ -388,25 +397,25 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
             was_explicit = _is_explicit(memory)
             _begin_phase(w, options, memory, phase, t)
             if was_explicit != _is_explicit(memory):
-                _restart(second if was_explicit else first)
+                _clear(second if was_explicit else first)
     explicit = _is_explicit(memory)
     w.notes[EXPLICIT_STEP] = 1.0 if explicit else 0.0
     begin = N_OPTIONS + int(options[SIZE_1])
-    each = options[N_PAIR : N_PAIR + N_OF_EACH] if explicit else options[N_PAIR + N_OF_EACH : N_OPTIONS]
-    w.notes[REUSE] = max(each[REUSE_OF], w.notes[ROUNDED])
+    rule = options[N_PAIR : N_PAIR + N_OF_EACH] if explicit else options[N_PAIR + N_OF_EACH : N_OPTIONS]
+    w.notes[REUSE] = max(rule[REUSE_OF], w.notes[ROUNDED])
     if explicit:
         code, error, factor = f.attempt_first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
         # a step of fixed size cannot become shorter
         if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.flags[FORM] != STATIC:
             _begin_phase(w, options, memory, IMPLICIT, t)
-            _restart(second)
+            _clear(second)
             w.notes[EXPLICIT_STEP] = 0.0
             code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     else:
         # only the first method may take steps longer than GAP: it also evaluates the equations between their ends
-        longer = gap_ratio(tolerances, h)
-        if longer > 0.0:
-            return Attempt(DONE, longer, 1.0 / longer)
+        ratio = gap_ratio(tolerances, h)
+        if ratio > 0.0:
+            return Attempt(DONE, ratio, 1.0 / ratio)
         code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     if code == NOT_LOADED:
         return Attempt(code, error, 0.0)
@@ -415,9 +424,9 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
         return Attempt(code, error, 0.0)
     if memory[PHASE] == ON_TRIAL:
         error *= STRICT
-    memory[H_TRIED], memory[ERROR_TRIED] = h, max(error, each[LEAST_ERROR])
+    memory[H_TRIED], memory[ERROR_TRIED] = h, max(error, rule[LEAST_ERROR])
     if factor == 0.0:
-        factor = factor_of(each, _history(memory), h, error)
+        factor = factor_of(rule, _history(memory), h, error)
     if not explicit:
         factor = min(factor, max(tolerances[GAP] / h, 1.0))
     return Attempt(DONE, error, factor)
