@@ -313,7 +313,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
     memory[T_BEGIN], memory[COST_BEGIN] = t, cost
     memory[NEXT_ESTIMATE] = w.counters[N_EVALUATIONS] + _evaluations_between_estimates(options, memory)
     memory[ESTIMATES_TO_WAIT] -= 1.0
-    h_rho = memory[H_MEAN] * memory[RATE] / options[LIMIT]
+    h_rho = memory[H_MEAN] * memory[RATE] / options[LIMIT]  # relative to LIMIT
     if h_rho > 1.0:
         memory[N_ABOVE_LIMIT] += 1.0
     if memory[ESTIMATES_TO_WAIT] > 0.0:

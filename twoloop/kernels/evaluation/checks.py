@@ -70,14 +70,14 @@ def _fit_rows(columns, rows, counts, logs):
 
 
 @kernel(types.void(MATRIX, VECTOR, VECTOR, MATRIX, MATRIX, VECTOR, VECTOR))
-def column_units(matrix, typical, columns, counts, logs, rows, room):
+def column_units(matrix, typical, columns, counts, logs, rows, scratch):
     """Estimate the units of the coordinates from a constraint Jacobian, so that lengths and angles can be compared.
 
     |entry (i, j)| is about unit of row i / unit of coordinate j: the sum of squares of log|entry| + log(unit of j) -
     log(unit of i) is least. The free common factor follows from the units `typical`: the median ratio to them is 1.
     Coordinates without entries get their typical units. `columns` becomes the result; the last four arrays are scratch.
     """
-    n_used, shift = 0, 0.0
+    n_used, log_factor = 0, 0.0
     for i in range(rows.size):
         largest = largest_of(matrix[i])
         for j in range(columns.size):
@@ -94,15 +94,15 @@ def column_units(matrix, typical, columns, counts, logs, rows, room):
         for i in range(rows.size):
             used = used or counts[i, j] != 0.0
         if used:
-            room[n_used] = math.log(typical[j]) - columns[j]
+            scratch[n_used] = math.log(typical[j]) - columns[j]
             n_used += 1
         else:
             columns[j] = math.nan
     if n_used > 0:
-        _sort(room[:n_used])
-        shift = 0.5 * (room[(n_used - 1) // 2] + room[n_used // 2])
+        _sort(scratch[:n_used])
+        log_factor = 0.5 * (scratch[(n_used - 1) // 2] + scratch[n_used // 2])
     for j in range(columns.size):
-        columns[j] = typical[j] if math.isnan(columns[j]) else math.exp(columns[j] + shift)
+        columns[j] = typical[j] if math.isnan(columns[j]) else math.exp(columns[j] + log_factor)
 
 
 @kernel(types.void(MATRIX, VECTOR, f8, VECTOR, VECTOR))
@@ -162,7 +162,7 @@ def _has_empty_row(rows):
 @exact
 def _is_symmetric(mass, allowed):
     """Return whether no entry differs from its transposed entry by more than `allowed` times the largest entry."""
-    largest, off, same = 0.0, 0.0, True
+    largest, asymmetry, same = 0.0, 0.0, True
     for i in range(len(mass)):
         for j in range(i):
             same = same and mass[i, j] == mass[j, i]
@@ -170,8 +170,8 @@ def _is_symmetric(mass, allowed):
         return True
     for i in range(len(mass)):
         for j in range(len(mass)):
-            largest, off = max(largest, abs(mass[i, j])), max(off, abs(mass[i, j] - mass[j, i]))
-    return off <= allowed * largest
+            largest, asymmetry = max(largest, abs(mass[i, j])), max(asymmetry, abs(mass[i, j] - mass[j, i]))
+    return asymmetry <= allowed * largest
 
 
 @exact
@@ -187,11 +187,11 @@ def _is_rounding(value, row, state, sizes, least, rate, allowed):
 
 
 @exact
-def _is_near(q, sizes, place):
-    """Return whether q is so near the position `place` that the sizes of the coordinates at `place` apply to q, too."""
+def _is_near(q, sizes, stored_q):
+    """Return whether q is so near `stored_q` that the sizes of the coordinates at that position apply to q, too."""
     near = True
     for j in range(q.size):
-        near = near and abs(q[j] - place[j]) <= NEAR_SHARE * sizes[j]
+        near = near and abs(q[j] - stored_q[j]) <= NEAR_SHARE * sizes[j]
     return near
 
 
@@ -210,9 +210,11 @@ def _has_entries(rows, entries):
 def _find_known_sizes(q, rows, n_c, sizes):
     """Return the index in `sizes` of the sizes stored for a position near q; -1: there are none."""
     n = q.size
-    width = 2 * n + n_c * n
-    for k in range(0, sizes.size, width):
-        if _is_near(q, sizes[k : k + n], sizes[k + n : k + 2 * n]) and _has_entries(rows, sizes[k + 2 * n : k + width]):
+    n_numbers = 2 * n + n_c * n
+    for k in range(0, sizes.size, n_numbers):
+        if _is_near(q, sizes[k : k + n], sizes[k + n : k + 2 * n]) and _has_entries(
+            rows, sizes[k + 2 * n : k + n_numbers]
+        ):
             return k
     return -1
 
@@ -225,16 +227,16 @@ def _is_consistent(C, rate, rows, q, v, sizes, allowed):
     coordinate: if the coordinates of a constraint are zero but for rounding, as out of the plane of a motion, the value
     of the constraint is not small relative to its terms.
     """
-    fastest, nothing = largest_of(v), ROUNDING_OF_ZERO * largest_of(q)
+    fastest, rounding = largest_of(v), ROUNDING_OF_ZERO * largest_of(q)
     begin = _find_known_sizes(q, rows, C.size, sizes)
-    known = q if begin < 0 else sizes[begin : begin + q.size]
+    known_sizes = q if begin < 0 else sizes[begin : begin + q.size]
     for i in range(len(rows)):
         speed = 0.0
         for j in range(q.size):
             speed += rows[i, j] * v[j]
         if not _is_rounding(speed + rate[i], rows[i], v, v, fastest, rate[i], allowed):
             return False
-        if i < C.size and not _is_rounding(C[i], rows[i], q, known, nothing, 0.0, allowed):
+        if i < C.size and not _is_rounding(C[i], rows[i], q, known_sizes, rounding, 0.0, allowed):
             return False
     return True
 
@@ -248,28 +250,28 @@ def _record_entries(rows, pattern):
 
 
 @exact
-def _record_entries_near(f, t, q, shifts, place, rows, n_c, pattern):
+def _record_entries_near(f, t, q, shifts, position, rows, n_c, pattern):
     """Add to `pattern` where rows are nonzero at positions that differ from q by `shifts` times the size of q."""
     largest = largest_of(q)
     for k in range(len(shifts)):
         for j in range(q.size):
-            place[j] = q[j] + max(abs(q[j]), largest) * shifts[k, j]
+            position[j] = q[j] + max(abs(q[j]), largest) * shifts[k, j]
         _clear(rows)
-        f.jacobian(t, place, f.p, rows[:n_c])
-        f.nonholonomic(t, place, f.p, rows[n_c:])
+        f.jacobian(t, position, f.p, rows[:n_c])
+        f.nonholonomic(t, position, f.p, rows[n_c:])
         _record_entries(rows, pattern)
 
 
 @exact
-def _is_definite(mass, least, factors):
-    """Return whether all eigenvalues of a symmetric matrix are at least `least` times its largest entry."""
+def _is_definite(mass, min_eigenvalue, factors):
+    """Return whether all eigenvalues of a symmetric matrix are at least `min_eigenvalue` times its largest entry."""
     n, largest = len(mass), 0.0
     for i in range(n):
         for j in range(n):
             factors[i, j] = mass[i, j]
             largest = max(largest, abs(mass[i, j]))
     for i in range(n):
-        factors[i, i] -= least * largest
+        factors[i, i] -= min_eigenvalue * largest
     return ldl_factor(factors)
 
 
@@ -300,9 +302,11 @@ def evaluate_start(f, t, q, v, sizes, lam, room, mass, rows, shifts, pattern, ro
     if flags[NONHOLONOMIC_GAMMA_GIVEN] == 1:
         f.nonholonomic_gamma(t, q, v, f.p, room[rate + n_c : gamma])
     if flags[KINEMATICS_GIVEN] == 1:
-        others = room[gamma : gamma + n_c * (n + 3)]
-        matrix = others[3 * n_c :].reshape((n_c, n))
-        f.kinematics(t, q, v, f.p, others[:n_c], matrix, others[n_c : 2 * n_c], others[2 * n_c : 3 * n_c])
+        fused_results = room[gamma : gamma + n_c * (n + 3)]
+        matrix = fused_results[3 * n_c :].reshape((n_c, n))
+        f.kinematics(
+            t, q, v, f.p, fused_results[:n_c], matrix, fused_results[n_c : 2 * n_c], fused_results[2 * n_c : 3 * n_c]
+        )
     end = gamma + n_c * (n + 3)
     if not (finite(mass) and finite(rows) and finite_vector(room[:end])):
         return 0
@@ -321,67 +325,69 @@ def evaluate_start(f, t, q, v, sizes, lam, room, mass, rows, shifts, pattern, ro
         f.reaction_by_q(t, q, lam, f.p, scratch)
         if not finite(scratch):
             return 0
-    bits = 0
+    result_flags = 0
     if _is_symmetric(mass, roundings[1]) and not _has_empty_row(rows):
-        bits = IN_ORDER
+        result_flags = IN_ORDER
         if _is_consistent(room[force:C], room[C:rate], rows, q, v, sizes, roundings[0]):
-            bits |= CONSISTENT
+            result_flags |= CONSISTENT
     if flags[CONSTANT_MASS] == 0:  # neither flag is set if the smallest eigenvalue is between the two margins
         if _is_definite(mass, EIGENVALUE_MARGIN * roundings[2], scratch):
-            bits |= DEFINITE
+            result_flags |= DEFINITE
         elif not _is_definite(mass, roundings[2] / EIGENVALUE_MARGIN, scratch):
-            bits |= INDEFINITE
+            result_flags |= INDEFINITE
     _record_entries(rows, pattern)
-    near = room[end : end + n_rows * n].reshape((n_rows, n))
-    _record_entries_near(f, t, q, shifts, room[end + n_rows * n : end + n_rows * n + n], near, n_c, pattern)
-    return bits
+    rows_nearby = room[end : end + n_rows * n].reshape((n_rows, n))
+    _record_entries_near(f, t, q, shifts, room[end + n_rows * n : end + n_rows * n + n], rows_nearby, n_c, pattern)
+    return result_flags
 
 
 @kernel(types.void(KIT, f8, MATRIX, i8, MATRIX))
-def rows_at(f, t, places, n_c, rows):
-    """Evaluate C_q (n_c rows) and A at the positions `places` into `rows`, full of zeros, one below the other."""
-    n_rows = len(rows) // len(places)
-    for k in range(len(places)):
+def rows_at(f, t, positions, n_c, rows):
+    """Evaluate C_q (n_c rows) and A at the positions `positions` into `rows`, full of zeros, one below the other."""
+    n_rows = len(rows) // len(positions)
+    for k in range(len(positions)):
         begin = k * n_rows
-        f.jacobian(t, places[k], f.p, rows[begin : begin + n_c])
-        f.nonholonomic(t, places[k], f.p, rows[begin + n_c : begin + n_rows])
+        f.jacobian(t, positions[k], f.p, rows[begin : begin + n_c])
+        f.nonholonomic(t, positions[k], f.p, rows[begin + n_c : begin + n_rows])
 
 
 @exact
-def _agrees(fused, given, allowed, more):
+def _agrees(fused, separate, allowed, rounding_errors):
     """Return whether numbers of row i differ by at most more[i], plus `allowed` times the largest number of all."""
     largest = 0.0
-    for i in range(given.shape[0]):
-        for j in range(given.shape[1]):
-            largest = max(largest, abs(given[i, j]))
-    for i in range(given.shape[0]):
-        for j in range(given.shape[1]):
-            if abs(fused[i, j] - given[i, j]) > allowed * largest + more[i]:
+    for i in range(separate.shape[0]):
+        for j in range(separate.shape[1]):
+            largest = max(largest, abs(separate[i, j]))
+    for i in range(separate.shape[0]):
+        for j in range(separate.shape[1]):
+            if abs(fused[i, j] - separate[i, j]) > allowed * largest + rounding_errors[i]:
                 return False
     return True
 
 
 @kernel(types.boolean(KIT, f8, VECTOR, VECTOR, MATRIX, MATRIX, VECTOR, f8, f8))
-def kinematics_agree(f, t, q, v, fused, given, more, allowed, rounding):
+def kinematics_agree(f, t, q, v, fused, separate, rounding_errors, allowed, rounding):
     """Return whether the fused callback agrees with the separate ones, up to `allowed` times the largest number.
 
-    Constraints may also differ by `rounding` times the sizes of their terms. `fused` and `given`, (3 + n_q, n_c),
-    become C, C_t, gamma and the numbers of C_q; `more`, (n_c), is scratch. All three are full of zeros on entry.
+    Constraints may also differ by `rounding` times the sizes of their terms. `fused` and `separate`, (3 + n_q, n_c),
+    become C, C_t, gamma and the numbers of C_q; `rounding_errors`, (n_c), is scratch. All three are zero on entry.
     """
-    n, n_c = q.size, more.size
-    by_one, by_others = fused[3:].reshape((n_c, n)), given[3:].reshape((n_c, n))
-    f.kinematics(t, q, v, f.p, fused[0], by_one, fused[1], fused[2])
-    f.constraint(t, q, f.p, given[0])
-    f.jacobian(t, q, f.p, by_others)
-    f.constraint_rate(t, q, f.p, given[1])
-    f.gamma(t, q, v, f.p, given[2])
-    agree = _agrees(by_one, by_others, allowed, more)
+    n, n_c = q.size, rounding_errors.size
+    fused_rows, separate_rows = fused[3:].reshape((n_c, n)), separate[3:].reshape((n_c, n))
+    f.kinematics(t, q, v, f.p, fused[0], fused_rows, fused[1], fused[2])
+    f.constraint(t, q, f.p, separate[0])
+    f.jacobian(t, q, f.p, separate_rows)
+    f.constraint_rate(t, q, f.p, separate[1])
+    f.gamma(t, q, v, f.p, separate[2])
+    agree = _agrees(fused_rows, separate_rows, allowed, rounding_errors)
     for k in range(1, 3):
-        agree = agree and _agrees(fused[k : k + 1].reshape((n_c, 1)), given[k : k + 1].reshape((n_c, 1)), allowed, more)
+        agree = agree and _agrees(
+            fused[k : k + 1].reshape((n_c, 1)), separate[k : k + 1].reshape((n_c, 1)), allowed, rounding_errors
+        )
     for i in range(n_c):
         for j in range(n):
-            more[i] += rounding * abs(by_others[i, j]) * abs(q[j])
-    return agree and _agrees(fused[:1].reshape((n_c, 1)), given[:1].reshape((n_c, 1)), allowed, more)
+            rounding_errors[i] += rounding * abs(separate_rows[i, j]) * abs(q[j])
+    return agree and _agrees(fused[:1].reshape((n_c, 1)), separate[:1].reshape((n_c, 1)), allowed, rounding_errors)
 
 
 VALUE, BOUND = range(2)  # rows of `nodes`: values of the nodes of a program, and bounds of their rounding errors
@@ -456,11 +462,14 @@ def _count_differences(called, traced, bounds):
 @kernel(
     i8(KIT, INTEGERS, INTEGERS, MATRIX, types.int64[:, ::1], INTEGERS, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, MATRIX)
 )
-def compare_traces(f, sizes, which, states, program, columns, coefficients, constants, nodes, called, traced, bounds):
+def compare_traces(
+    f, sizes, is_compared, states, program, columns, coefficients, constants, nodes, called, traced, bounds
+):
     """Compare callbacks at states [t, q, v], one a row, with their traces; return how many numbers differ.
 
     Two numbers differ if their difference exceeds SAME times the largest value at these states, plus ROUNDED times the
-    bound. `sizes`: n_q, n_c and n_a; `which`: 1 for each of KINDS in traced_values.py to be compared; `called`: zeros.
+    bound. `sizes`: n_q, n_c and n_a; `is_compared`: 1 for each of KINDS in traced_values.py that is to be compared;
+    `called`: zeros.
     """
     n, n_c, n_a = sizes[0], sizes[1], sizes[2]
     for k in range(len(states)):
@@ -468,31 +477,31 @@ def compare_traces(f, sizes, which, states, program, columns, coefficients, cons
         for i in range(1 + 2 * n):
             nodes[VALUE, i], nodes[BOUND, i] = states[k, i], 0.0
         _run_trace(program, columns, coefficients, constants, nodes, traced[k], bounds[k])
-        place = 0
-        if which[0]:
+        begin = 0
+        if is_compared[0]:
             f.mass(t, q, f.p, out[: n * n].reshape((n, n)))
-            place += n * n
-        if which[1]:
-            f.force(t, q, v, f.p, out[place : place + n])
-            place += n
-        if which[2]:
-            f.constraint(t, q, f.p, out[place : place + n_c])
-            place += n_c
-        if which[3]:
-            f.jacobian(t, q, f.p, out[place : place + n_c * n].reshape((n_c, n)))
-            place += n_c * n
-        if which[4]:
-            f.constraint_rate(t, q, f.p, out[place : place + n_c])
-            place += n_c
-        if which[5]:
-            f.gamma(t, q, v, f.p, out[place : place + n_c])
-            place += n_c
-        if which[6]:
-            f.nonholonomic(t, q, f.p, out[place : place + n_a * n].reshape((n_a, n)))
-            place += n_a * n
-        if which[7]:
-            f.nonholonomic_rate(t, q, f.p, out[place : place + n_a])
-            place += n_a
-        if which[8]:
-            f.nonholonomic_gamma(t, q, v, f.p, out[place : place + n_a])
+            begin += n * n
+        if is_compared[1]:
+            f.force(t, q, v, f.p, out[begin : begin + n])
+            begin += n
+        if is_compared[2]:
+            f.constraint(t, q, f.p, out[begin : begin + n_c])
+            begin += n_c
+        if is_compared[3]:
+            f.jacobian(t, q, f.p, out[begin : begin + n_c * n].reshape((n_c, n)))
+            begin += n_c * n
+        if is_compared[4]:
+            f.constraint_rate(t, q, f.p, out[begin : begin + n_c])
+            begin += n_c
+        if is_compared[5]:
+            f.gamma(t, q, v, f.p, out[begin : begin + n_c])
+            begin += n_c
+        if is_compared[6]:
+            f.nonholonomic(t, q, f.p, out[begin : begin + n_a * n].reshape((n_a, n)))
+            begin += n_a * n
+        if is_compared[7]:
+            f.nonholonomic_rate(t, q, f.p, out[begin : begin + n_a])
+            begin += n_a
+        if is_compared[8]:
+            f.nonholonomic_gamma(t, q, v, f.p, out[begin : begin + n_a])
     return _count_differences(called, traced, bounds)

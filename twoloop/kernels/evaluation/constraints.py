@@ -149,7 +149,7 @@ def _one_sided_direction(notes, t, e):
 @compiled
 def _differences(f, w, t, q, v, e, first, last):
     """Compute Gamma by differences over e and 2 e; return its largest entry, disagreement, and term of G v."""
-    twice = w.Gamma_tried[0]
+    Gamma_twice = w.Gamma_tried[0]
     side = _one_sided_direction(w.notes, t, e)
     shorter = representable_step(t, ONE_SIDED_LENGTH * e)
     if side != 0.0 and shorter > 0.0:
@@ -157,7 +157,7 @@ def _differences(f, w, t, q, v, e, first, last):
     terms = 0.0
     for i in range(first, last):
         w.Gamma[i] = 0.0
-        twice[i] = 0.0
+        Gamma_twice[i] = 0.0
     for k in range(4):
         shift = (-2.0, -1.0, 1.0, 2.0)[k] * e if side == 0.0 else (0.0, 1.0, 2.0, 4.0)[k] * side * e
         for j in range(q.size):
@@ -171,16 +171,16 @@ def _differences(f, w, t, q, v, e, first, last):
                 terms = max(terms, abs(w.Gx[i, j] * v[j]))
             if side != 0.0:
                 w.Gamma[i] -= ONE_SIDED[k] * w.g[i] / (side * e)
-                twice[i] -= ONE_SIDED_TWICE[k] * w.g[i] / (side * e)
+                Gamma_twice[i] -= ONE_SIDED_TWICE[k] * w.g[i] / (side * e)
             elif k == 0 or k == 3:
-                twice[i] -= w.g[i] / (2.0 * shift)
+                Gamma_twice[i] -= w.g[i] / (2.0 * shift)
             else:
                 w.Gamma[i] -= w.g[i] / (2.0 * shift)
     largest = 0.0
     disagreement = 0.0
     for i in range(first, last):
-        disagreement = max(disagreement, abs(w.Gamma[i] - twice[i]))
-        w.Gamma[i] = (4.0 * w.Gamma[i] - twice[i]) / 3.0
+        disagreement = max(disagreement, abs(w.Gamma[i] - Gamma_twice[i]))
+        w.Gamma[i] = (4.0 * w.Gamma[i] - Gamma_twice[i]) / 3.0
         largest = max(largest, abs(w.Gamma[i]))
         if not np.isfinite(w.Gamma[i]):
             return np.nan, np.nan, terms
@@ -199,7 +199,7 @@ def _choose_length(f, w, t, q, v, longest, first, last):
 
     Stores the length as GAMMA_SHARE. Returns GAMMA_INACCURATE if the change exceeds the required accuracy, else DONE.
     """
-    best = np.inf
+    least_change = np.inf
     share = 1.0
     for level in range(LEVELS):
         e = representable_step(t, share * longest)
@@ -213,13 +213,13 @@ def _choose_length(f, w, t, q, v, longest, first, last):
         change = 0.0
         for i in range(first, last):
             change = max(change, abs(w.Gamma[i] - w.Gamma_tried[1, i]))
-        if level > 0 and change < best and disagreement <= _max_disagreement(w.notes):
-            best = change
+        if level > 0 and change < least_change and disagreement <= _max_disagreement(w.notes):
+            least_change = change
             w.notes[GAMMA_SHARE] = share
             if change <= CONVERGED_SHARE * w.notes[GAMMA_REQUIRED] * w.notes[GAMMA_SCALE]:
                 break
         share *= 0.25
-    w.notes[GAMMA_ACCURACY] = best / w.notes[GAMMA_SCALE]
+    w.notes[GAMMA_ACCURACY] = least_change / w.notes[GAMMA_SCALE]
     _differences(f, w, t, q, v, representable_step(t, w.notes[GAMMA_SHARE] * longest), first, last)
     return DONE if w.notes[GAMMA_ACCURACY] <= w.notes[GAMMA_REQUIRED] else GAMMA_INACCURATE
 

@@ -94,11 +94,11 @@ def gamma_by_program(f, w, t, q, v):
     if program.size == 0:
         return False
     _run(program, f.gamma_numbers, w.nodes, t, q, v)
-    n, first, places = _results(program)
+    n, first, indices = _results(program)
     for k in range(n):
         if not math.isfinite(w.nodes[first + k]):
             return False
-        w.Gamma[program[places + k]] = w.nodes[first + k]
+        w.Gamma[program[indices + k]] = w.nodes[first + k]
     return True
 
 
@@ -109,11 +109,11 @@ def jacobian_by_program(f, w, t, q, G):
     if program.size == 0:
         return False
     _run(program, f.jacobian_numbers, w.nodes, t, q, q)
-    n, first, places = _results(program)
+    n, first, indices = _results(program)
     for k in range(n):
         if not math.isfinite(w.nodes[first + k]):
             return False
     for k in range(n):
-        place = program[places + k]
-        G[place // q.size, place % q.size] = w.nodes[first + k]
+        index = program[indices + k]
+        G[index // q.size, index % q.size] = w.nodes[first + k]
     return True

@@ -228,26 +228,26 @@ def _adopt_order(w):
 @compiled
 def write_programs(w):
     """Write the programs that factor the dependent columns of w.G; return False if these are singular."""
-    _record_places(w)
+    _record_columns(w)
     w.notes[FACTORED] = 0.0
-    done = make_program(w.G, w.pattern, w.rows, w.dependent, w.index, w.values)
-    if done and w.Rate.size > w.C.size:
-        done = make_program(w.G, w.pattern, w.rows_v, w.dependent_v, w.index_v, w.values_v)
-    return done
+    is_regular = make_program(w.G, w.pattern, w.rows, w.dependent, w.index, w.values)
+    if is_regular and w.Rate.size > w.C.size:
+        is_regular = make_program(w.G, w.pattern, w.rows_v, w.dependent_v, w.index_v, w.values_v)
+    return is_regular
 
 
 @compiled
-def _record_places(w):
+def _record_columns(w):
     """Record in w.places (see Work) in which columns each row has entries."""
     n_rows = w.Rate.size
-    place = n_rows + 1
+    index = n_rows + 1
     for i in range(n_rows):
-        w.places[i] = place
+        w.places[i] = index
         for j in range(w.pattern.shape[1]):
             if w.pattern[i, j] != 0.0:
-                w.places[place] = j
-                place += 1
-    w.places[n_rows] = place
+                w.places[index] = j
+                index += 1
+    w.places[n_rows] = index
 
 
 @compiled
@@ -340,16 +340,16 @@ def _largest_coefficient(w):
     """Return the largest coefficient, from w.minimum, of an independent row in a redundant one (rows scaled to 1)."""
     rows = rows_of(w.index_v)
     largest = 0.0
-    place = 0
+    begin = 0
     for row in range(w.Rate.size):
         if contains(w.rows_v, row):
             continue
         size = _largest_from(w.G[row], 0)
         for k in range(rows.size):
-            scaled = abs(w.minimum[place + k]) * _largest_from(w.G[rows[k]], 0)
+            scaled = abs(w.minimum[begin + k]) * _largest_from(w.G[rows[k]], 0)
             if scaled > largest * size:
                 largest = scaled / size
-        place += rows.size
+        begin += rows.size
     return largest
 
 
@@ -389,7 +389,7 @@ MAX_VIOLATION = 1e-7  # largest violation of a redundant row, relative to the si
 
 
 @compiled
-def _factor_anew(w, t, q):
+def _factor_in_new_order(w, t, q):
     """Factor the dependent columns in a new order of elimination; return DONE, SINGULAR or NOT_FINITE."""
     record_entries(w)
     if not finite(w.G):
@@ -410,7 +410,7 @@ def factor_rows(w, t, q):
         ratio = min(ratio, factor(w.entries, w.index_v, w.values_v))
         w.counters[N_FACTORIZATIONS] += 1
     # after a small pivot, the order of elimination no longer suits the numbers; after NaN, they are not finite
-    return DONE if ratio > RANK_TOLERANCE else _factor_anew(w, t, q)
+    return DONE if ratio > RANK_TOLERANCE else _factor_in_new_order(w, t, q)
 
 
 @merged
@@ -441,7 +441,7 @@ def restore_positions(f, w, t, q, v, tolerance, reuse):
     Rows and factors remain in w: those at q, or those before a last correction of at most `reuse`. With the fused
     callback w.Rate and w.Gamma remain, too, for the velocities v before these are restored.
     """
-    before = np.inf
+    last_correction = np.inf
     converged = w.C.size == 0
     fused = f.flags[KINEMATICS_GIVEN] == 1
     for _ in range(MAX_ITERATIONS):
@@ -469,14 +469,14 @@ def restore_positions(f, w, t, q, v, tolerance, reuse):
         if correction <= reuse:
             return DONE
         converged = correction <= tolerance
-        if not converged and correction > CONTRACTION * before:
+        if not converged and correction > CONTRACTION * last_correction:
             # accept if rounding of large coordinates exceeds the tolerance; otherwise Newton's method has left its
             # region of convergence, and could converge to another assembly of the mechanism
             limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
             converged = correction <= limit or (correction <= AMPLIFIED * limit and rows_hold(w, q))
             if not converged:
                 return INNER_DIVERGED
-        before = correction
+        last_correction = correction
     return INNER_DIVERGED
 
 
@@ -529,11 +529,11 @@ def redundant_rows_hold(f, w, t, q, v):
     f.constraint(t, q, f.p, w.C)
     size, speed = max(1.0, largest_of(q)), max(1.0, largest_of(v))
     for i in range(w.Rate.size):
-        largest, total = largest_of(w.G[i]), w.Rate[i]
+        largest, velocity_violation = largest_of(w.G[i]), w.Rate[i]
         for j in range(q.size):
-            total += w.G[i, j] * v[j]
-        off = abs(w.C[i]) > MAX_VIOLATION * size * largest if i < w.C.size else False
-        if off or abs(total) > MAX_VIOLATION * speed * largest:
+            velocity_violation += w.G[i, j] * v[j]
+        is_violated = abs(w.C[i]) > MAX_VIOLATION * size * largest if i < w.C.size else False
+        if is_violated or abs(velocity_violation) > MAX_VIOLATION * speed * largest:
             w.notes[CONTRADICTION] = i
             return ROWS_CONTRADICT
     return DONE

@@ -46,7 +46,7 @@ def _find_constant_pivot(R, K, row_left, row_sizes, column_sizes):
 
 
 @compiled
-def _is_pivot_block(R, column_left, squares, i, k, j, l, largest, parallel):
+def _is_pivot_block(R, column_left, squares, i, k, j, l, max_squares, min_sine_square):
     """Return whether the entries of rows i and k, or of row i alone, in columns j and l, may be pivots."""
     n, total = R.shape[1], 0.0
     if i == k:
@@ -54,17 +54,17 @@ def _is_pivot_block(R, column_left, squares, i, k, j, l, largest, parallel):
         for c in range(n):
             if column_left[c] and c != j:
                 total += R[i, c] * R[i, c]
-        return square > parallel * squares[j] and total < largest * square
+        return square > min_sine_square * squares[j] and total < max_squares * square
     a, b, c, d = R[i, j], R[i, l], R[k, j], R[k, l]
     determinant = a * d - b * c
-    if not determinant * determinant > parallel * (a * a + c * c) * (b * b + d * d):
+    if not determinant * determinant > min_sine_square * (a * a + c * c) * (b * b + d * d):
         return False
     for column in range(n):
         if column_left[column] and column != j and column != l:
             x, y = R[i, column], R[k, column]
             first, second = d * x - b * y, a * y - c * x
             total += first * first + second * second
-    return total < largest * determinant * determinant
+    return total < max_squares * determinant * determinant
 
 
 @compiled
@@ -84,11 +84,11 @@ def _find_varying_pivots(R, K, row_left, column_left, squares, rows, column_size
                 if column_left[j] and K[i, j] != NONE:
                     size += 1
                     column_sizes[j] += 1
-            place = n_rows
-            while place > 0 and rows[m + place - 1] > size:
-                rows[place], rows[m + place] = rows[place - 1], rows[m + place - 1]
-                place -= 1
-            rows[place], rows[m + place] = i, size
+            position = n_rows
+            while position > 0 and rows[m + position - 1] > size:
+                rows[position], rows[m + position] = rows[position - 1], rows[m + position - 1]
+                position -= 1
+            rows[position], rows[m + position] = i, size
             n_rows += 1
     n_searched = min(n_rows, ROWS_SEARCHED)
     for tier in range(len(MAX_SQUARES)):
@@ -134,11 +134,11 @@ def _subtract(R, K, column_left, row_sizes, column_sizes, r, j, i):
     for c in range(R.shape[1]):
         if column_left[c] and K[i, c] != NONE:
             change = factor * R[i, c]
-            left, had_one = R[r, c] - change, K[r, c] != NONE
+            remainder, had_one = R[r, c] - change, K[r, c] != NONE
             K[r, c] = max(K[r, c], kind, K[i, c])
-            if K[r, c] == NUMBER and abs(left) <= CANCELLATION * abs(change):
-                left, K[r, c] = 0.0, NONE
-            R[r, c] = left
+            if K[r, c] == NUMBER and abs(remainder) <= CANCELLATION * abs(change):
+                remainder, K[r, c] = 0.0, NONE
+            R[r, c] = remainder
             more = (K[r, c] != NONE) - had_one
             row_sizes[r], column_sizes[c] = row_sizes[r] + more, column_sizes[c] + more
 
@@ -177,22 +177,22 @@ def _eliminate(R, K, row_left, column_left, row_sizes, column_sizes, i, k, j, l)
 
 
 @kernel(i8(MATRIX, INTEGERS, INTEGERS, i8, VECTOR, INTEGERS, INTEGERS))
-def choose_dependent_columns(G, kinds, rows, n_kept, room, work, out):
+def choose_dependent_columns(G, kinds, rows, n_kept, numbers, integers, out):
     """Choose dependent columns for the first `n_kept` of the rows `rows` of G; return the number of blocks (0: failed).
 
     kinds : kind of each entry of G, row by row. out : becomes, for each block, its two rows, as indices in `rows`, and
-    its two columns, or one row and one column, each twice. room, work : scratch, see `room_size`.
+    its two columns, or one row and one column, each twice. numbers, integers : scratch, see `room_size`.
     """
     n = G.shape[1]
     if n_kept > n:
         return 0
-    R, K = room[: n_kept * n].reshape((n_kept, n)), work[: n_kept * n].reshape((n_kept, n))
+    R, K = numbers[: n_kept * n].reshape((n_kept, n)), integers[: n_kept * n].reshape((n_kept, n))
     end = n_kept * n
-    squares = room[end : end + n]
+    squares = numbers[end : end + n]
     squares[:] = 0.0
-    row_left, both = work[end : end + n_kept], work[end + n_kept : end + 3 * n_kept]
-    row_sizes, end = both[:n_kept], end + 3 * n_kept
-    column_left, column_sizes = work[end : end + n], work[end + n : end + 2 * n]
+    row_left, row_scratch = integers[end : end + n_kept], integers[end + n_kept : end + 3 * n_kept]
+    row_sizes, end = row_scratch[:n_kept], end + 3 * n_kept
+    column_left, column_sizes = integers[end : end + n], integers[end + n : end + 2 * n]
     column_left[:] = 1
     column_sizes[:] = 0
     for i in range(n_kept):
@@ -200,21 +200,21 @@ def choose_dependent_columns(G, kinds, rows, n_kept, room, work, out):
         for j in range(n):
             R[i, j], K[i, j] = G[rows[i], j], kinds[rows[i] * n + j]
             squares[j] += R[i, j] * R[i, j]
-            there = K[i, j] != NONE
-            row_sizes[i], column_sizes[j] = row_sizes[i] + there, column_sizes[j] + there
+            is_entry = K[i, j] != NONE
+            row_sizes[i], column_sizes[j] = row_sizes[i] + is_entry, column_sizes[j] + is_entry
     n_left, n_blocks = n_kept, 0
     while n_left > 0:
         block = out[4 * n_blocks : 4 * n_blocks + 4]
-        place = _find_constant_pivot(R, K, row_left, row_sizes, column_sizes)
-        if place < 0:
+        index = _find_constant_pivot(R, K, row_left, row_sizes, column_sizes)
+        if index < 0:
             break
-        block[0] = block[1] = place // n
-        block[2] = block[3] = place % n
+        block[0] = block[1] = index // n
+        block[2] = block[3] = index % n
         _eliminate(R, K, row_left, column_left, row_sizes, column_sizes, block[0], block[1], block[2], block[3])
         n_left, n_blocks = n_left - 1, n_blocks + 1
     while n_left > 0:
         block = out[4 * n_blocks : 4 * n_blocks + 4]
-        if not _find_varying_pivots(R, K, row_left, column_left, squares, both, column_sizes, block):
+        if not _find_varying_pivots(R, K, row_left, column_left, squares, row_scratch, column_sizes, block):
             return 0
         _eliminate(R, K, row_left, column_left, row_sizes, column_sizes, block[0], block[1], block[2], block[3])
         n_left, n_blocks = n_left - (1 if block[0] == block[1] else 2), n_blocks + 1

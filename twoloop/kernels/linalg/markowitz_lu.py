@@ -142,36 +142,36 @@ def _choose_pivot(matrix, rows, columns, k):
     """
     counts, lists, numbers = matrix
     r = rows.size
-    least = r
+    min_entries = r
     for p in range(k, r):
-        least = min(least, counts[ROW_LEFT, rows[p]])
-    best_cost, best_size, best_place, row, column = r * r + 1, 0.0, r * r, -1, -1
+        min_entries = min(min_entries, counts[ROW_LEFT, rows[p]])
+    best_cost, best_size, best_position, row, column = r * r + 1, 0.0, r * r, -1, -1
     for p in range(k, r):
         j = columns[p]
-        others = counts[COLUMN_SIZE, j] - 1
-        if others * (least - 1) > best_cost:
+        n_others = counts[COLUMN_SIZE, j] - 1
+        if n_others * (min_entries - 1) > best_cost:
             continue
         largest = 0.0
-        for m in range(others + 1):
+        for m in range(n_others + 1):
             largest = max(largest, abs(numbers[j, m]))
-        for m in range(others + 1):
+        for m in range(n_others + 1):
             i, size = lists[ROWS, j, m], abs(numbers[j, m])
             if size > 0.0 and size >= THRESHOLD * largest:
-                cost = (counts[ROW_LEFT, i] - 1) * others
-                place = counts[ROW_POSITION, i] * r + p
+                cost = (counts[ROW_LEFT, i] - 1) * n_others
+                position = counts[ROW_POSITION, i] * r + p
                 better = cost < best_cost or (cost == best_cost and size > best_size)
-                if better or (cost == best_cost and size == best_size and place < best_place):
-                    best_cost, best_size, best_place, row, column = cost, size, place, i, j
+                if better or (cost == best_cost and size == best_size and position < best_position):
+                    best_cost, best_size, best_position, row, column = cost, size, position, i, j
     return row, column
 
 
 @merged
-def _exchange(order, place, k, chosen):
+def _exchange(order, position, k, chosen):
     """Move `chosen` to position k; return the sign of the permutation: -1, or 1 if `chosen` is already there."""
-    p, other = place[chosen], order[k]
-    order[k], order[p] = chosen, other
-    place[chosen], place[other] = k, p
-    return 1 if p == k else -1
+    previous, exchanged = position[chosen], order[k]
+    order[k], order[previous] = chosen, exchanged
+    position[chosen], position[exchanged] = k, previous
+    return 1 if previous == k else -1
 
 
 @compiled
@@ -180,9 +180,9 @@ def _subtract(matrix, row, column, pivot, j, zero_source):
     counts, lists, numbers = matrix
     for m in range(counts[COLUMN_SIZE, j]):
         counts[WHERE, lists[ROWS, j, m]] = m + 1
-    place = counts[WHERE, row] - 1
-    number = numbers[j, place]
-    done = True
+    index = counts[WHERE, row] - 1
+    number = numbers[j, index]
+    fits = True
     for m in range(counts[COLUMN_SIZE, column]):
         i = lists[ROWS, column, m]
         if i == row:
@@ -191,13 +191,13 @@ def _subtract(matrix, row, column, pivot, j, zero_source):
         if entry > 0:
             numbers[j, entry - 1] -= change
         else:
-            done = done and put_entry(matrix, i, j, -change, zero_source)
+            fits = fits and put_entry(matrix, i, j, -change, zero_source)
     last = counts[COLUMN_SIZE, j] - 1
     for m in range(last + 1):
         counts[WHERE, lists[ROWS, j, m]] = 0
-    lists[ROWS, j, place], numbers[j, place] = lists[ROWS, j, last], numbers[j, last]
+    lists[ROWS, j, index], numbers[j, index] = lists[ROWS, j, last], numbers[j, last]
     counts[COLUMN_SIZE, j] = last
-    return done
+    return fits
 
 
 @compiled
@@ -235,11 +235,11 @@ def order(index, matrix, zero_source, zero_share):
 
 
 @compiled
-def _sort(columns, sources, size, place):
+def _sort(columns, sources, size, position):
     """Sort the first `size` entries of a row, in place, by the order of elimination of their columns."""
     for n in range(1, size):
         column, source, k = columns[n], sources[n], n
-        while k > 0 and place[columns[k - 1]] > place[column]:
+        while k > 0 and position[columns[k - 1]] > position[column]:
             columns[k], sources[k] = columns[k - 1], sources[k - 1]
             k -= 1
         columns[k], sources[k] = column, source
@@ -251,15 +251,15 @@ def _size_of_program(rows, counts, lists):
 
     Leaves the number of entries of each row of U, in elimination order, in counts[ROW_LEFT].
     """
-    place = counts[COLUMN_POSITION]
+    position = counts[COLUMN_POSITION]
     entries, subtractions = 0, 0
     for k in range(rows.size):
         i = rows[k]
-        _sort(lists[COLUMNS, i], lists[SOURCES, i], counts[ROW_SIZE, i], place)
+        _sort(lists[COLUMNS, i], lists[SOURCES, i], counts[ROW_SIZE, i], position)
         entries += counts[ROW_SIZE, i]
         lower = 0
-        while place[lists[COLUMNS, i, lower]] < k:
-            subtractions += counts[ROW_LEFT, place[lists[COLUMNS, i, lower]]]
+        while position[lists[COLUMNS, i, lower]] < k:
+            subtractions += counts[ROW_LEFT, position[lists[COLUMNS, i, lower]]]
             lower += 1
         counts[ROW_LEFT, k] = counts[ROW_SIZE, i] - lower - 1
     return entries, subtractions
@@ -271,8 +271,8 @@ def _store_program(index, counts, lists):
     r = index[SIZE]
     rows = rows_of(index)
     n_slots, subtractions = _size_of_program(rows, counts, lists)
-    full = (r * (r - 1) * (2 * r - 1)) / 6.0
-    if subtractions > MIN_SUBTRACTIONS + PER_ROW * r or (r > SMALL_SIZE and subtractions > DENSE_SHARE * full):
+    n_dense = (r * (r - 1) * (2 * r - 1)) / 6.0
+    if subtractions > MIN_SUBTRACTIONS + PER_ROW * r or (r > SMALL_SIZE and subtractions > DENSE_SHARE * n_dense):
         return False
     in_row, in_column = begin_entries(r), begin_entries(r) + n_slots
     source, target = in_column + n_slots, in_column + 2 * n_slots

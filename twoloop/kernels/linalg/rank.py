@@ -34,10 +34,10 @@ def _orthogonalise(basis, n, rest, parts):
 
 
 @merged
-def select_rows(G, least, basis, factors, kept):
+def select_rows(G, min_share, basis, factors, kept):
     """Select each row that is independent of those selected before; write indices to `kept`; return their number.
 
-    A row is independent if the part of it that is orthogonal to the selected rows is longer than `least` times the row.
+    A row is independent if the part of it that is orthogonal to the selected rows exceeds `min_share` of its length.
     The part is computed by Gram-Schmidt orthogonalisation, repeated if most of the row is lost. `basis` becomes
     orthonormal rows, and `factors` the lower triangle whose product with `basis` is the selected rows. Both have as
     many rows as can be independent, and one more for scratch.
@@ -52,11 +52,11 @@ def select_rows(G, least, basis, factors, kept):
         for i in range(n_kept):
             parts[i] = 0.0
         length = _dot(G[k], G[k])
-        square = _orthogonalise(basis, n_kept, rest, parts)
-        if square < MOST_OF_SQUARE * length:
-            square = _orthogonalise(basis, n_kept, rest, parts)
-        if square > least**2 * length:
-            parts[n_kept] = math.sqrt(square)
+        rest_square = _orthogonalise(basis, n_kept, rest, parts)
+        if rest_square < MOST_OF_SQUARE * length:
+            rest_square = _orthogonalise(basis, n_kept, rest, parts)
+        if rest_square > min_share**2 * length:
+            parts[n_kept] = math.sqrt(rest_square)
             for j in range(rest.size):
                 rest[j] /= parts[n_kept]
             kept[n_kept] = k
@@ -65,20 +65,20 @@ def select_rows(G, least, basis, factors, kept):
 
 
 @kernel(i8(MATRIX, f8, MATRIX, MATRIX, INTEGERS), vectorized=True)
-def independent_rows(G, least, basis, factors, kept):
+def independent_rows(G, min_share, basis, factors, kept):
     """Call `select_rows` from Python."""
-    return select_rows(G, least, basis, factors, kept)
+    return select_rows(G, min_share, basis, factors, kept)
 
 
 @merged
-def _find_coefficients(n, basis, factors, row, shares):
-    """Express `row` as a combination of the n selected rows, by least squares; `shares` become the coefficients."""
+def _find_coefficients(n, basis, factors, row, coefficients):
+    """Compute the `coefficients` of `row` as a combination of the n selected rows, by least squares."""
     for k in range(n):
-        shares[k] = _dot(basis[k], row)
+        coefficients[k] = _dot(basis[k], row)
     for k in range(n - 1, -1, -1):
         for j in range(k + 1, n):
-            shares[k] -= factors[j, k] * shares[j]
-        shares[k] /= factors[k, k]
+            coefficients[k] -= factors[j, k] * coefficients[j]
+        coefficients[k] /= factors[k, k]
 
 
 @kernel(types.float64(MATRIX, i8, VECTOR))
@@ -100,52 +100,52 @@ def size_of_inverse(factors, n, column):
 
 
 @kernel(types.boolean(MATRIX, INTEGERS, f8, MATRIX, MATRIX, MATRIX, INTEGERS, MATRIX, VECTOR), vectorized=True)
-def shares_of_others(rows, order, least, others, basis, factors, kept, shares, lengths):
+def shares_of_others(rows, order, min_share, chosen_rows, basis, factors, kept, coefficients, lengths):
     """Return whether the first n of `rows` in `order` are independent; then express the following rows by these.
 
-    `others`, (n, n_q), becomes the first n rows in `order`; `shares` become the coefficients of the following rows in
+    `chosen_rows`, (n, n_q), becomes the first n rows in `order`, and `coefficients` those of the following rows in
     these, by least squares; `lengths` become the lengths of all `rows`. For other arguments see `select_rows`.
     """
-    n = len(others)
+    n = len(chosen_rows)
     for i in range(len(rows)):
         lengths[i] = math.sqrt(_dot(rows[i], rows[i]))
     for k in range(n):
         for j in range(rows.shape[1]):
-            others[k, j] = rows[order[k], j]
-    if select_rows(others, least, basis, factors, kept) < n:
+            chosen_rows[k, j] = rows[order[k], j]
+    if select_rows(chosen_rows, min_share, basis, factors, kept) < n:
         return False
-    for i in range(len(shares)):
-        _find_coefficients(n, basis, factors, rows[order[n + i]], shares[i])
+    for i in range(len(coefficients)):
+        _find_coefficients(n, basis, factors, rows[order[n + i]], coefficients[i])
     return True
 
 
 @kernel(i8(MATRIX, VECTOR, f8, MATRIX, MATRIX, INTEGERS, MATRIX, MATRIX, MATRIX, VECTOR), vectorized=True)
-def least_solution(rows, values, least, basis, factors, kept, shares, gram, parts, x):
+def least_solution(rows, values, min_share, basis, factors, kept, coefficients, gram, parts, x):
     """Compute the x of least norm for which rows @ x is nearest to `values`; return the number of independent rows.
 
     `x` is zero on entry, `values` become the residuals. Let y be the values of the independent rows, b those of the
     other rows, and S the coefficients of the independent rows in the other ones. Then x gives the independent rows the
     values y + S^T z, with (1 + S S^T) z = b - S y. `parts` is scratch for y and z.
     """
-    n, m = select_rows(rows, least, basis, factors, kept), 0
+    n, n_others = select_rows(rows, min_share, basis, factors, kept), 0
     y, z = parts[0], parts[1]
     for i in range(len(rows)):
-        if i - m < n and kept[i - m] == i:
-            y[i - m] = values[i]
+        if i - n_others < n and kept[i - n_others] == i:
+            y[i - n_others] = values[i]
             continue
-        _find_coefficients(n, basis, factors, rows[i], shares[m])
-        z[m] = values[i]
-        m += 1
-    for i in range(m):
+        _find_coefficients(n, basis, factors, rows[i], coefficients[n_others])
+        z[n_others] = values[i]
+        n_others += 1
+    for i in range(n_others):
         for k in range(n):
-            z[i] -= shares[i, k] * y[k]
-        for j in range(m):
-            gram[i, j] = _dot(shares[i], shares[j]) + (1.0 if i == j else 0.0)
-    ldl_factor(gram[:m, :m])
-    ldl_solve(gram[:m, :m], z[:m])
+            z[i] -= coefficients[i, k] * y[k]
+        for j in range(n_others):
+            gram[i, j] = _dot(coefficients[i], coefficients[j]) + (1.0 if i == j else 0.0)
+    ldl_factor(gram[:n_others, :n_others])
+    ldl_solve(gram[:n_others, :n_others], z[:n_others])
     for k in range(n):
-        for i in range(m):
-            y[k] += shares[i, k] * z[i]
+        for i in range(n_others):
+            y[k] += coefficients[i, k] * z[i]
         for j in range(k):
             y[k] -= factors[k, j] * y[j]
         y[k] /= factors[k, k]
@@ -189,8 +189,8 @@ MAX_COEFFICIENT = 1.5
 
 def room_size(n_rows: int, n: int) -> int:
     """Return the length of the scratch `room` of `choose_rows`."""
-    most = min(n_rows, n) + 1
-    return most * (n + most) + 2 * n * n + n_rows * (2 * n + 2 * n_rows + 1) + n
+    n_max = min(n_rows, n) + 1
+    return n_max * (n + n_max) + 2 * n * n + n_rows * (2 * n + 2 * n_rows + 1) + n
 
 
 @merged
@@ -212,7 +212,7 @@ def _factor_and_count_negative(A):
 
 
 @compiled
-def _count_weak(mass, weak, A):
+def _count_weak_eigenvalues(mass, weak, A):
     """Count the eigenvalues of M below b, `weak` times a bound of the largest; A becomes the factors of M - b I."""
     largest = 0.0
     for i in range(len(mass)):
@@ -231,15 +231,15 @@ def _has_similar_eigenvalues(mass):
     """Return whether Gershgorin's circles show that all eigenvalues of M exceed SIMILAR_EIGENVALUES of the largest."""
     least, largest = math.inf, 0.0
     for i in range(len(mass)):
-        beside = 0.0
+        row_sum = 0.0
         for j in range(len(mass)):
-            beside += abs(mass[i, j])
-        least, largest = min(least, 2.0 * mass[i, i] - beside), max(largest, beside)
+            row_sum += abs(mass[i, j])
+        least, largest = min(least, 2.0 * mass[i, i] - row_sum), max(largest, row_sum)
     return least > SIMILAR_EIGENVALUES * largest
 
 
 @merged
-def _scale(mass, G):
+def _scale_of_added_rows(mass, G):
     """Return the power of two that scales G^T G to the size of M."""
     largest, longest = 0.0, 0.0
     for i in range(len(mass)):
@@ -286,7 +286,7 @@ def _stiffen_mass(mass, G, weak, scale, A, x, order, added):
     `added` becomes the indices of these rows. Returns their number, or STAYS_SINGULAR.
     """
     n_added = 0
-    while _count_weak(mass, weak, A) > 0:
+    while _count_weak_eigenvalues(mass, weak, A) > 0:
         position = -1
         for k in range(len(G)):
             if order[k] >= 0 and _removes_weak_eigenvalue(A, G[order[k]], scale, x):
@@ -305,43 +305,43 @@ def _stiffen_mass(mass, G, weak, scale, A, x, order, added):
 
 
 @compiled
-def _exchange_rows(G, n_kept, basis, factors, kept, order, shares, others):
+def _exchange_rows(G, n_kept, basis, factors, kept, order, coefficients, rows_kept):
     """Exchange independent rows for redundant rows in which they have coefficients above MAX_COEFFICIENT.
 
     An exchange multiplies the volume that the independent rows span by the coefficient. `basis`, `factors` and `kept`
-    are results of `select_rows`, and are updated; `order`, `shares` (n_rows each) and `others` (n, n) are scratch.
+    are results of `select_rows`, and are updated; `order`, `coefficients` (n_rows) and `rows_kept` (n, n) are scratch.
     """
     for _ in range(2 * (len(G) - n_kept)):
-        largest, leaves, enters, place = MAX_COEFFICIENT, -1, -1, 0
+        largest, leaving, entering, position = MAX_COEFFICIENT, -1, -1, 0
         for i in range(len(G)):
-            if place < n_kept and kept[place] == i:
-                place += 1
+            if position < n_kept and kept[position] == i:
+                position += 1
                 continue
-            _find_coefficients(n_kept, basis, factors, G[i], shares)
+            _find_coefficients(n_kept, basis, factors, G[i], coefficients)
             length = _dot(G[i], G[i])
             for k in range(n_kept):
                 square = _dot(G[kept[k]], G[kept[k]])
-                coefficient = abs(shares[k]) * math.sqrt(square / max(length, TINY))
+                coefficient = abs(coefficients[k]) * math.sqrt(square / max(length, TINY))
                 if coefficient > largest:
-                    largest, leaves, enters = coefficient, k, i
-        if leaves < 0:
+                    largest, leaving, entering = coefficient, k, i
+        if leaving < 0:
             return
-        k = leaves  # move the rows between both, so that `kept` stays sorted
-        while k + 1 < n_kept and kept[k + 1] < enters:
+        k = leaving  # move the rows between both, so that `kept` stays sorted
+        while k + 1 < n_kept and kept[k + 1] < entering:
             kept[k] = kept[k + 1]
             k += 1
-        while k > 0 and kept[k - 1] > enters:
+        while k > 0 and kept[k - 1] > entering:
             kept[k] = kept[k - 1]
             k -= 1
-        kept[k] = enters
+        kept[k] = entering
         for i in range(n_kept):
             for j in range(G.shape[1]):
-                others[i, j] = G[kept[i], j]
-        select_rows(others[:n_kept], 0.0, basis, factors, order)
+                rows_kept[i, j] = G[kept[i], j]
+        select_rows(rows_kept[:n_kept], 0.0, basis, factors, order)
 
 
 @merged
-def _first_bound_kept(mass, G, kept, n_rows, bounds, factors, solved_room, S_room, sizes):
+def _first_bound_below_pivots(mass, G, kept, n_rows, bounds, factors, solved_scratch, S_scratch, sizes):
     """Return the index of the first of `bounds` that is below all pivots, which are relative to their rows alone.
 
     No pivot is below the least eigenvalue of S = G M^-1 G^T, scaled to a diagonal of 1. This eigenvalue exceeds a bound
@@ -350,8 +350,8 @@ def _first_bound_kept(mass, G, kept, n_rows, bounds, factors, solved_room, S_roo
     copy_matrix(mass, factors)
     if not ldl_factor(factors):
         return NOT_DEFINITE
-    solved = solved_room[: len(mass) * n_rows].reshape((len(mass), n_rows))
-    S = S_room[: 2 * n_rows * n_rows].reshape((2 * n_rows, n_rows))
+    solved = solved_scratch[: len(mass) * n_rows].reshape((len(mass), n_rows))
+    S = S_scratch[: 2 * n_rows * n_rows].reshape((2 * n_rows, n_rows))
     for k in range(n_rows):
         for i in range(len(mass)):
             solved[i, k] = G[kept[k], i]
@@ -367,55 +367,55 @@ def _first_bound_kept(mass, G, kept, n_rows, bounds, factors, solved_room, S_roo
     for i in range(n_rows):
         for k in range(i, n_rows):
             S[i, k] *= sizes[i] * sizes[k]
-    less = S[n_rows:]
-    for place in range(bounds.size):
+    shifted = S[n_rows:]
+    for index in range(bounds.size):
         for i in range(n_rows):
             for k in range(i, n_rows):  # only its upper triangle is used
-                less[i, k] = S[i, k]
-            less[i, i] -= bounds[place] * (1.0 - BOUND_ROUNDING)
-        if ldl_factor(less):
-            return place
+                shifted[i, k] = S[i, k]
+            shifted[i, i] -= bounds[index] * (1.0 - BOUND_ROUNDING)
+        if ldl_factor(shifted):
+            return index
     return bounds.size
 
 
 @kernel(i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS), vectorized=True)
-def choose_rows(given, G, least, weak, bounds, room, chosen):
-    """Choose the independent rows of G, and the rows that make M = `given` invertible; return an index or a code.
+def choose_rows(original_mass, G, min_share, weak_share, bounds, room, chosen):
+    """Choose the independent rows of G, and rows that make M (`original_mass`) invertible; return an index or a code.
 
-    Rows of G are independent as in `select_rows` for `least`, except for exchanges. Rows are added to M if it has
-    eigenvalues below `weak` times the largest; weak = 0: no rows. `chosen`, of 2 + 3 n_rows numbers, becomes the number
+    Rows of G are independent as in `select_rows` for `min_share`, except for exchanges. Rows are added to M if it has
+    eigenvalues below `weak_share` times the largest; 0: no rows. `chosen`, of 2 + 3 n_rows numbers, becomes the number
     of independent rows, that of added rows, and a list of each, of length n_rows. `room` is scratch, of `room_size`
-    numbers; room[0] becomes the factor of the added rows. The result is that of `_first_bound_kept`, or STAYS_SINGULAR.
-    See generate/elimination.py.
+    numbers; room[0] becomes the factor of the added rows. Returns the result of `_first_bound_below_pivots`, or
+    STAYS_SINGULAR. See generate/elimination.py.
     """
     n_rows, n = G.shape
-    most = min(n_rows, n) + 1
+    n_max = min(n_rows, n) + 1
     kept, added, order = chosen[2 : 2 + n_rows], chosen[2 + n_rows : 2 + 2 * n_rows], chosen[2 + 2 * n_rows :]
-    end = most * n
-    basis, factors = room[:end].reshape((most, n)), room[end : end + most * most].reshape((most, most))
+    end = n_max * n
+    basis, factors = room[:end].reshape((n_max, n)), room[end : end + n_max * n_max].reshape((n_max, n_max))
     mass, end = room[end : end + n * n].reshape((n, n)), end + n * n
     A, end = room[end : end + n * n].reshape((n, n)), end + n * n
     x, end = room[end : end + n], end + n
     sizes, end = room[end : end + n_rows], end + n_rows
     solved, S = room[end : end + n * n_rows], room[end + n * n_rows :]
-    if n_rows <= n and _has_similar_eigenvalues(given):
+    if n_rows <= n and _has_similar_eigenvalues(original_mass):
         for k in range(n_rows):
             kept[k] = k
-        place = _first_bound_kept(given, G, kept, n_rows, bounds, A, solved, S, sizes)
-        if 0 <= place < bounds.size:  # all rows are independent, and M is invertible
+        first_bound = _first_bound_below_pivots(original_mass, G, kept, n_rows, bounds, A, solved, S, sizes)
+        if 0 <= first_bound < bounds.size:  # all rows are independent, and M is invertible
             chosen[0], chosen[1], room[0] = n_rows, 0, 1.0
-            return place
-    n_kept = select_rows(G, least, basis, factors, kept)
+            return first_bound
+    n_kept = select_rows(G, min_share, basis, factors, kept)
     if n_kept < n_rows:
         _exchange_rows(G, n_kept, basis, factors, kept, order, sizes, A)
-    copy_matrix(given, mass)
+    copy_matrix(original_mass, mass)
     n_added, scale = 0, 1.0
-    if n_kept > 0 and weak > 0.0 and _count_weak(mass, weak, A) > 0:
-        scale = _scale(mass, G)
+    if n_kept > 0 and weak_share > 0.0 and _count_weak_eigenvalues(mass, weak_share, A) > 0:
+        scale = _scale_of_added_rows(mass, G)
         _sort_by_entries(G, order, sizes)
-        n_added = _stiffen_mass(mass, G, weak, scale, A, x, order, added)
-    chosen[0], chosen[1], place = n_kept, max(n_added, 0), n_added
+        n_added = _stiffen_mass(mass, G, weak_share, scale, A, x, order, added)
+    chosen[0], chosen[1], first_bound = n_kept, max(n_added, 0), n_added
     if n_added >= 0:
-        place = _first_bound_kept(mass, G, kept, n_kept, bounds, A, solved, S, sizes)
+        first_bound = _first_bound_below_pivots(mass, G, kept, n_kept, bounds, A, solved, S, sizes)
     room[0] = scale
-    return place
+    return first_bound

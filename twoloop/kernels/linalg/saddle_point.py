@@ -209,8 +209,8 @@ def _equal(A, B):
 @merged
 def factor_schur(f, w):
     """Compute and factor S = G M^-1 G^T of the independent rows; with a constant M only if G has changed."""
-    keep = f.flags[CONSTANT_MASS] == 1
-    if keep and _equal(w.G, w.G_of_S):
+    is_constant = f.flags[CONSTANT_MASS] == 1
+    if is_constant and _equal(w.G, w.G_of_S):
         return DONE
     rows = w.rows_v
     S, solved = w.S, w.W
@@ -227,7 +227,7 @@ def factor_schur(f, w):
         w.G_of_S[0, 0] = np.nan
     if not ldl_factor(S):
         return SINGULAR if finite(S) else NOT_FINITE
-    if keep:
+    if is_constant:
         copy_matrix(w.G, w.G_of_S)
     return DONE
 
@@ -412,7 +412,7 @@ def least_norm(w, lam):
     r, n_red = rows.size, lam.size - rows.size
     Z = w.minimum[: n_red * r].reshape((n_red, r))
     gram = w.minimum[n_red * r : n_red * (r + n_red)].reshape((n_red, n_red))
-    part = w.minimum[n_red * (r + n_red) :]
+    components = w.minimum[n_red * (r + n_red) :]
     i = 0
     for row in range(lam.size):
         if contains(w.rows_v, row):
@@ -420,9 +420,9 @@ def least_norm(w, lam):
         for k in range(r):
             Z[i, k] = w.G[row, columns[k]]
         solve_transposed(w.index_v, w.values_v, Z[i])
-        part[i] = lam[row]
+        components[i] = lam[row]
         for k in range(r):
-            part[i] -= Z[i, k] * lam[rows[k]]
+            components[i] -= Z[i, k] * lam[rows[k]]
         i += 1
     for i in range(n_red):
         for j in range(i, n_red):
@@ -431,11 +431,11 @@ def least_norm(w, lam):
                 total += Z[i, k] * Z[j, k]
             gram[i, j] = total
     ldl_factor(gram)
-    ldl_solve(gram, part)
+    ldl_solve(gram, components)
     i = 0
     for row in range(lam.size):
         if not contains(w.rows_v, row):
-            lam[row] -= part[i]
+            lam[row] -= components[i]
             for k in range(r):
-                lam[rows[k]] += part[i] * Z[i, k]
+                lam[rows[k]] += components[i] * Z[i, k]
             i += 1

@@ -138,25 +138,25 @@ def factor(program, counts, values, sizes):
         inverse = 1.0 / values[k]
         values[k] = inverse
         for s in range(first, last):
-            one, other = values[s] * inverse, values[s + off] * inverse
+            lower, upper = values[s] * inverse, values[s + off] * inverse
             target = row_of[s - n]
-            change = one * values[s + off]
+            change = lower * values[s + off]
             values[target] -= change
             sizes[target] += abs(change)
             r = s + 1
             while r < last:
                 size, target = runs[u], runs[u + 1]
-                if other != 0.0:
+                if upper != 0.0:
                     into, own = values[target : target + size], values[r : r + size]
                     for i in range(size):
-                        into[i] -= own[i] * other
-                if one != 0.0:
+                        into[i] -= own[i] * upper
+                if lower != 0.0:
                     into, own = values[target + off : target + off + size], values[r + off : r + off + size]
                     for i in range(size):
-                        into[i] -= one * own[i]
+                        into[i] -= lower * own[i]
                 r += size
                 u += 2
-            values[s] = one
+            values[s] = lower
     return True
 
 

@@ -124,10 +124,10 @@ def elimination_order(
     touched: list[set[int]] = [set() for _ in range(n_rows)]
     for i, j in zip(*(each.tolist() for each in jacobian_entries), strict=True):
         touched[i].add(body_of[j])
-    early = set(first)
+    first_rows = set(first)
     rows_of: dict[frozenset[int], list[int]] = {}
     for i, bodies in enumerate(touched):
-        if i not in early:
+        if i not in first_rows:
             rows_of.setdefault(frozenset(bodies), []).append(i)
     joints = list(rows_of)
     joints_of: list[list[int]] = [[] for _ in range(n_q)]  # by body
@@ -142,11 +142,11 @@ def elimination_order(
         coordinates.setdefault(body, []).append(j)
     order = [j for j in range(n_q) if body_of[j] not in hubs]
     order += [n_q + i for i in first if not touched[i] & hubs]
-    late = [n_q + i for i in first if touched[i] & hubs]
+    late_rows = [n_q + i for i in first if touched[i] & hubs]
     if couplings is not None:
         for i in first:
             coordinates[next(iter(touched[i]))].append(n_q + i)
-        late = []
+        late_rows = []
     nodes = [[n_q + i for i in rows_of[joint]] for joint in joints] + [coordinates[hub] for hub in sorted(hubs)]
     pairs: set[tuple[int, int]] = set()
     lone: set[int] = set()
@@ -156,7 +156,7 @@ def elimination_order(
     sizes = [len(node) for node in nodes]
     for node in _minimum_degree(joints, joints_of, sorted(hubs), sizes, n_q, pairs, lone):
         order += nodes[node]
-    order += late
+    order += late_rows
     return np.array(order, dtype=np.int64)
 
 
@@ -189,46 +189,46 @@ def _minimum_degree(
     coupled other than by joints. `lone`: see `_Supports`.
     """
     n_joints = len(joints)
-    place = {hub: n_joints + k for k, hub in enumerate(hubs)}
-    near: list[set[int]] = [set() for _ in sizes]
+    node_of = {hub: n_joints + k for k, hub in enumerate(hubs)}
+    neighbours: list[set[int]] = [set() for _ in sizes]
     for body, numbers in enumerate(joints_of):
-        if body in place:
-            near[place[body]].update(numbers)
+        if body in node_of:
+            neighbours[node_of[body]].update(numbers)
             for k in numbers:
-                near[k].add(place[body])
+                neighbours[k].add(node_of[body])
         else:
             for k in numbers:
-                near[k].update(numbers)
+                neighbours[k].update(numbers)
     for one, other in pairs:
-        near[place[one]].add(place[other])
-        near[place[other]].add(place[one])
-    for k, others in enumerate(near):
+        neighbours[node_of[one]].add(node_of[other])
+        neighbours[node_of[other]].add(node_of[one])
+    for k, others in enumerate(neighbours):
         others.discard(k)
     supports = _Supports(joints, n_bodies, set(hubs), lone)
 
     def degree(node: int) -> int:
-        return sum(sizes[other] for other in near[node])
+        return sum(sizes[other] for other in neighbours[node])
 
     heap = [(degree(node), node) for node in range(len(sizes))]
     heapq.heapify(heap)
     done, order = [False] * len(sizes), []
     while heap:
-        known, node = heapq.heappop(heap)
-        if done[node] or known != degree(node):
+        degree_on_heap, node = heapq.heappop(heap)
+        if done[node] or degree_on_heap != degree(node):
             continue  # the heap has a newer entry
         if node < n_joints and not supports.may_eliminate(node):
             continue  # the hub that supports its parts is a neighbour: its elimination puts the joint on the heap again
         done[node] = True
         order.append(node)
-        changed = near[node]
-        for other in changed:
-            near[other] |= changed
-            near[other] -= {node, other}
+        affected = neighbours[node]
+        for other in affected:
+            neighbours[other] |= affected
+            neighbours[other] -= {node, other}
         if node < n_joints:
             supports.eliminate(node)
         else:
             supports.eliminate_hub(hubs[node - n_joints])
-        for other in changed:
+        for other in affected:
             heapq.heappush(heap, (degree(other), other))
     return order
 
@@ -276,12 +276,12 @@ def program_in_order(
     rows = np.concatenate([position[mass[0]], position[n_q + jacobian[0]]])
     columns = np.concatenate([position[mass[1]], position[jacobian[1]]])
     low, high = np.minimum(rows, columns), np.maximum(rows, columns)
-    below = _columns_of_factors(n, low, high)
-    sizes = np.array([len(each) for each in below], dtype=np.int64)
+    rows_below = _columns_of_factors(n, low, high)
+    sizes = np.array([len(each) for each in rows_below], dtype=np.int64)
     if (sizes * (sizes + 1) // 2).sum() > max(ALWAYS_ALLOWED_UPDATES, min(MAX_UPDATES, MAX_UPDATE_SHARE * n**3)):
         return None
     begin = np.concatenate([[0], np.cumsum(sizes)])
-    row_of = np.concatenate([np.zeros(0, np.int64), *below])
+    row_of = np.concatenate([np.zeros(0, np.int64), *rows_below])
     column_of = np.repeat(np.arange(n), sizes)
     keys = column_of * n + row_of  # ascending
 
@@ -290,7 +290,7 @@ def program_in_order(
         return np.where(column == row, column, positions)
 
     firsts, seconds = [row_of[:0]], [row_of[:0]]
-    for each in below:
+    for each in rows_below:
         i, j = _pairs(len(each))
         firsts.append(each[i])
         seconds.append(each[j])
@@ -324,12 +324,12 @@ def _runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
 def _products(rows: Integers, chosen: Sequence[int]) -> tuple[Integers, Integers, Integers]:
     """Return all products of two entries in one of the rows `chosen`: the row, and the indices of both entries."""
     parts: list[tuple[Integers, Integers, Integers]] = [(rows[:0], rows[:0], rows[:0])]
-    where = np.argsort(rows, kind="stable")
-    ordered = rows[where]
+    sequence = np.argsort(rows, kind="stable")
+    ordered = rows[sequence]
     for row in chosen:
-        here = where[np.searchsorted(ordered, row) : np.searchsorted(ordered, row + 1)]
-        one, other = _pairs(len(here))
-        parts.append((np.full(len(one), row), here[one], here[other]))
+        entries = sequence[np.searchsorted(ordered, row) : np.searchsorted(ordered, row + 1)]
+        one, other = _pairs(len(entries))
+        parts.append((np.full(len(one), row), entries[one], entries[other]))
     which, first, second = (np.concatenate(each) for each in zip(*parts, strict=True))
     return which, first, second
 
@@ -349,17 +349,17 @@ def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]
 
     If i is the first row of a column, elimination adds all rows of the column to column i.
     """
-    below: list[set[int]] = [set() for _ in range(n)]
+    rows_below: list[set[int]] = [set() for _ in range(n)]
     for column, row in zip(low.tolist(), high.tolist(), strict=True):
-        below[column].add(row)
+        rows_below[column].add(row)
     patterns = []
     for column in range(n):
-        below[column].discard(column)
-        rows = sorted(below[column])
+        rows_below[column].discard(column)
+        rows = sorted(rows_below[column])
         if rows:
-            below[rows[0]].update(rows[1:])
+            rows_below[rows[0]].update(rows[1:])
         patterns.append(np.array(rows, dtype=np.int64))
-        below[column] = set()
+        rows_below[column] = set()
     return patterns
 
 
