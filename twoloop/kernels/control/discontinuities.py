@@ -299,7 +299,7 @@ def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follow
     (q, v, a) is the state at t; samples begin at `begin` and end at `last` or earlier. With `follows_motion` = 1 they
     follow the motion, with 0 they stay at the state.
     """
-    changes, n, first = w.changes, 0, np.inf
+    changes, n, t_first = w.changes, 0, np.inf
     for k in range(N_SAMPLES + 1):
         time = begin + k * spacing
         if time > last:
@@ -309,8 +309,8 @@ def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follow
             if np.isfinite(changes[k, j]):
                 changes[LARGEST, j] = max(changes[LARGEST, j], abs(changes[k, j]))
             elif k > 0:
-                first = time
-        if first < np.inf:
+                t_first = time
+        if t_first < np.inf:
             break
         n = k
     least = LEAST_RANGE * tolerances[RTOL]
@@ -323,10 +323,10 @@ def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follow
         if 0 < index < bend:
             bend, column, limit = index, j, least
     if column >= 0:
-        first = min(first, begin + bend * spacing)
+        t_first = min(t_first, begin + bend * spacing)
         if follows_motion == 0.0:
             _record_changes(f, w, tolerances, clock, t, begin, spacing, n, bend, column, limit, q, v, a)
-    return first, min(first, begin + N_SAMPLES * spacing if n == N_SAMPLES else last)
+    return t_first, min(t_first, begin + N_SAMPLES * spacing if n == N_SAMPLES else last)
 
 
 @compiled

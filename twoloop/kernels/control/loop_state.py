@@ -34,7 +34,7 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
 # `control`, after the rule
 (
     MAX_STEP,  # largest step, s
-    FIXED_STEP,  # s; 0: step-size control
+    FIXED_STEP,  # fixed step size, s; 0: step-size control
     LIMIT_START,  # value of H_LIMIT without a recent failure
     LIMIT_FACTOR,  # after a step that did not converge: ratio of H_LIMIT to the size of that step
     LIMIT_MEMORY,  # number of accepted steps for which H_LIMIT then applies
@@ -46,7 +46,7 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     BRIDGE,
     SHORTEST,  # shortest step, s; steps of at most EQUAL_SPACINGS spacings of t are too short as well
     MAY_SWITCH,  # 1: stop with SWITCH_METHOD at a value that is not finite, or if the method is unsuited
-    TRIAL_STEPS,  # within this number of accepted steps, a next step of at most GAP also stops with SWITCH_METHOD
+    TRIAL_STEPS,  # number of accepted steps in which a next step of at most GAP also stops with SWITCH_METHOD
     DRIVEN,  # 1: C_t or b may jump
     ROUGH,  # factor by which errors may exceed their estimates near a jump of a force, see SUDDEN_ERROR in advance.py
     SPACING,  # spacing of samples of the forces ahead of a step, s, see discontinuities.py; 0: no samples
@@ -94,7 +94,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     SHORTEST_CHANGE,  # s, shortest time between two sudden changes
     MOTION_SAMPLED_TO,  # time of the last sample along the motion
     SAMPLES_MOTION,  # 1 during samples along the motion, at states that the motion may not reach
-    # smallest pivot at output times and grid points, which steps cannot avoid; see least_pivot in partition.py
+    # smallest least_pivot (see partition.py) at output times and grid points, where steps have to end
     PIVOT_AT_OUTPUT,
     PIVOT_PASSED,  # smallest pivot within steps over LARGEST_PIVOT, while BRIDGE is SUSPENDED; 0: none yet
     N_CLOCK,

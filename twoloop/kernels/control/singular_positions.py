@@ -97,7 +97,7 @@ def retry_projected(f, w, control, clock, size):
 
 @merged
 def near_share(tolerances):
-    """Return the pivot, over the largest, below which rounding of accelerations exceeds SHARE_OF_NOISE tolerances."""
+    """Return the pivot over the largest one below which rounding disturbs results by SHARE_OF_NOISE tolerances."""
     return min(max(NEAR_LEAST, (EPS / (SHARE_OF_NOISE * tolerances[LEAST])) ** (1.0 / 3.0)), NEAR_MOST)
 
 

@@ -173,9 +173,10 @@ def store_prediction(w, q1):
 
 @merged
 def departure(w, tolerances, h, q, v, q1):
-    """Return the largest distance of the stored prediction from q1, in tolerances or stricter fractions of the motion.
+    """Return the largest distance of the stored prediction from q1, over the allowed distance.
 
-    Needs the factors of C_qd at q1, which the inner loop stores in `w`. With fixed steps the result is 0.
+    Allowed are the tolerance, or a fraction of the motion in the step if this is smaller. Needs the factors of C_qd at q1,
+    which the inner loop stores in `w`. With fixed steps the result is 0.
     """
     if tolerances[ESTIMATE] == 0.0:
         return 0.0

@@ -127,7 +127,7 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
     _HISTORY_ERROR,
     H_TRIED,  # size of the last attempted step, s
     ERROR_TRIED,  # error of the last attempted step, in tolerances
-    N_TRIALS,
+    N_TRIALS,  # number of trials so far
     N_ABOVE_LIMIT,  # number of estimates in a row with h rho above LIMIT
     N_SCALARS,
 ) = range(19)
@@ -230,7 +230,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
 
 @compiled
 def _motion_rate(f, w, t, state, rate, Q, V, A):
-    """Return the rate, 1/s, at which velocities or accelerations change; infinite if it cannot be computed."""
+    """Return the largest relative rate of change of velocities or accelerations, 1/s; infinite if it is unknown."""
     n = Q.size
     dt = INSTANT / rate
     fastest = largest = change = 0.0
@@ -274,7 +274,7 @@ def _cost_per_second(w, options, memory, t):
 
 @compiled
 def _evaluations_between_estimates(options, memory):
-    """Return the number of evaluations, until the next estimate, that cost as much as INTERVAL general ones."""
+    """Return the number of evaluations until the next estimate: COST_RATIO INTERVAL for the explicit method."""
     return INTERVAL * options[COST_RATIO] if _is_explicit(memory) else INTERVAL
 
 

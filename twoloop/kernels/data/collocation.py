@@ -41,7 +41,8 @@ CONVERGED, REFUSED, GUESSED, NOT_COMPUTED = range(4)
     SIZE,  # size of velocities and of their changes, over the tolerances
     STRICTER,  # ratio by which the tolerances of other coordinates are stricter than those of the iterated ones
 ) = range(28)
-POWERS = 32  # lanes: powers 1 to 8 of the ratio of the step size to the one before
+# offsets of the arrays behind the scalars
+POWERS = 32  # lanes: powers 1 to 8 of the ratio of the step size to the previous step size
 SCALED = 40  # lanes: coefficients of a polynomial times these powers
 MOVED = 48  # lanes: largest change of a coordinate by the last projection
 FINE = 56  # lanes: 1 where the projection succeeded

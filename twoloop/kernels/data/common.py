@@ -283,7 +283,7 @@ OPTIONS: dict[str, Any] = {
 
 
 def _helper(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
-    """Return a decorator for functions that only kernels call, never Python."""
+    """Return a decorator that compiles a function which only kernels call, not Python."""
     wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return njit(**{**OPTIONS, **wrappers, "pipeline_class": HelperCompiler, **options})
 

@@ -111,6 +111,6 @@ WINDOW = 4  # number of states that a polynomial goes through
     JUMP,  # no polynomial: velocities jump within a few spacings of floating-point numbers
 ) = range(5)
 # columns of the table of intervals, a row of which describes one interval with output times: FIRST_OWN and LAST_OWN are
-# the states at its ends, FIRST_TIME and END_TIME the first output time within it and the end of these times. No
-# polynomial extends beyond the states LOW and HIGH, at which velocities jump
+# the states at its ends, and the output times with indices from FIRST_TIME to END_TIME - 1 are within it. No polynomial
+# extends beyond the states LOW and HIGH, at which velocities jump
 FIRST_OWN, LAST_OWN, KIND, FIRST_TIME, END_TIME, LOW, HIGH, N_COLUMNS = range(8)

@@ -152,7 +152,7 @@ def _clear(A):
 
 @exact
 def _has_empty_row(rows):
-    """Return whether a row has only zeros."""
+    """Return whether any of the rows contains only zeros."""
     empty = False
     for i in range(len(rows)):
         empty = empty or largest_of(rows[i]) == 0.0

@@ -114,7 +114,7 @@ LENGTHENING_DISAGREEMENT = 1e-11
 ONE_SIDED, ONE_SIDED_TWICE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
 # length of one-sided differences relative to two-sided ones: their order is lower, and a shorter length saves a search
 ONE_SIDED_LENGTH = 1.0 / 16.0
-# rounding error of Gamma relative to the largest term of G v over longest_difference, for terms that cancel
+# rounding error of Gamma if the terms of G v cancel, relative to the largest term over longest_difference
 ROUNDING_OF_TERMS = 1e-14
 CONVERGED_SHARE = 0.01  # relative to the required accuracy: a smaller change ends the search for a length
 

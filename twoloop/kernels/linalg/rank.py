@@ -195,7 +195,7 @@ def room_size(n_rows: int, n: int) -> int:
 
 @merged
 def _factor_and_count_negative(A):
-    """Factor a symmetric A as `ldl_factor` does, but also if indefinite; return its number of negative eigenvalues."""
+    """Factor a symmetric A, definite or not, as `ldl_factor` does; return the number of negative eigenvalues."""
     n, count = len(A), 0
     for k in range(n):
         if not A[k, k] > 0.0:

@@ -103,10 +103,10 @@ def load(program, mass, jacobian, K, D, z, stiffness, values):
         values[slots[k] + off] += jacobian[k]
     which, first, second, slots = stiffened_of(program)
     for u in range(which.size):
-        share = stiffness[which[u]] * jacobian[first[u]] * jacobian[second[u]]
-        values[slots[u]] += share
+        product = stiffness[which[u]] * jacobian[first[u]] * jacobian[second[u]]
+        values[slots[u]] += product
         if slots[u] >= program[N_PIVOTS]:
-            values[slots[u] + off] += share
+            values[slots[u] + off] += product
 
 
 @compiled
