@@ -94,7 +94,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     SHORTEST_CHANGE,  # s, shortest time between two sudden changes
     MOTION_SAMPLED_TO,  # time of the last sample along the motion
     SAMPLES_MOTION,  # 1 during samples along the motion, at states that the motion may not reach
-    # smallest least_pivot (see partition.py) at output times and grid points, where steps have to end
+    # smallest result of least_pivot (partition.py) at output times and grid points, where steps have to end
     PIVOT_AT_OUTPUT,
     PIVOT_PASSED,  # smallest pivot within steps over LARGEST_PIVOT, while BRIDGE is SUSPENDED; 0: none yet
     N_CLOCK,

@@ -25,11 +25,11 @@ SHORT_STEP = 0.5  # relative to the longest of the last steps: a shorter step ma
 COLLAPSED = 0.2  # relative to the longest of the last steps: after a shorter one the pivots of C_q are computed again
 # smallest pivot of C_q relative to its largest value so far: a position with a smaller one is near a singular position
 SINGULAR_PIVOT = 0.2
-STATIC_SINGULAR = 0.01  # the same limit for the static form, whose pivots are sines of angles between rows
+STATIC_SINGULAR = 0.01  # SINGULAR_PIVOT of the static form, whose pivots are sines of angles between rows
 # smallest pivot relative to its largest value so far: near a smaller one, a rejected step of the static form is
 # repeated with projected stages
 REPEAT_BELOW = 0.05
-SHRINKAGE = 0.8  # ratio of the size of such a repeated step to that of the one before
+SHRINKAGE = 0.8  # size of a step repeated with projected stages, relative to the rejected step
 GIVE_UP_BELOW = 0.001  # relative to the longest of the last steps: smallest size of a step near a singular position
 # pivot relative to its largest value so far: below this, rounding determines accelerations, and short steps must stop
 UNDETERMINED = 1e-6

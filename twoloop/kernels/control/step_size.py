@@ -159,7 +159,7 @@ def count_step(w, tolerances, control, clock, size, out_step):
 
 # largest error of a prediction at any tolerance, relative to the largest motion of a coordinate in the step
 SHARE_OF_MOTION = 0.1
-SHARE_THROUGH_ZERO = 1e-6  # the same limit if the sign of det C_qd changes in the step
+SHARE_THROUGH_ZERO = 1e-6  # replaces SHARE_OF_MOTION if the sign of det C_qd changes in the step
 LEAST = 1e-300  # lower bound of a scale, which avoids a division by zero
 FLOOR = 0.01  # in tolerances: distance that is added to the limit SHARE_OF_MOTION, for steps with hardly any motion
 
@@ -175,8 +175,8 @@ def store_prediction(w, q1):
 def departure(w, tolerances, h, q, v, q1):
     """Return the largest distance of the stored prediction from q1, over the allowed distance.
 
-    Allowed are the tolerance, or a fraction of the motion in the step if this is smaller. Needs the factors of C_qd at q1,
-    which the inner loop stores in `w`. With fixed steps the result is 0.
+    Allowed are the tolerance, or a fraction of the motion in the step if this is smaller. Needs the factors of C_qd at
+    q1, which the inner loop stores in `w`. With fixed steps the result is 0.
     """
     if tolerances[ESTIMATE] == 0.0:
         return 0.0

@@ -205,7 +205,7 @@ def _power_iteration(f, w, t, state, direction, by_v, Q, V, A):
 
 @compiled
 def _largest_rate(f, w, memory, t, state, new_state):
-    """Return the largest rate at a state, 1/s; `new_state` is scratch."""
+    """Return rho, the largest rate of the motion at a state, 1/s; `new_state` is scratch."""
     n = w.Q.size
     by_q, by_v = memory[N_SCALARS : N_SCALARS + n], memory[N_SCALARS + n : N_SCALARS + 2 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]

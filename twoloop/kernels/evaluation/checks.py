@@ -44,7 +44,7 @@ def _sort(values):
 @exact
 def _fit_columns(rows, columns, counts, logs):
     """Compute the logarithms of the units of columns that best fit those of the rows; return whether none changed."""
-    same = True
+    unchanged = True
     for j in range(columns.size):
         total, n = 0.0, 0
         for i in range(rows.size):
@@ -52,9 +52,9 @@ def _fit_columns(rows, columns, counts, logs):
                 total += rows[i] - logs[i, j]
                 n += 1
         new = total / n if n > 0 else 0.0
-        same = same and new == columns[j]
+        unchanged = unchanged and new == columns[j]
         columns[j] = new
-    return same
+    return unchanged
 
 
 @exact

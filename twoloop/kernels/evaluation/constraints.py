@@ -226,7 +226,7 @@ def _choose_length(f, w, t, q, v, longest, first, last):
 
 @compiled
 def gamma_by_differences(f, w, t, q, v, first, last):
-    """Compute rows first to last of Gamma by differences; return GAMMA_INACCURATE if no length is accurate enough.
+    """Compute Gamma[first:last] by differences; return GAMMA_INACCURATE if no length is accurate enough, else DONE.
 
     Gamma = -d/de [G v + (C_t, b)](t + e, q + e v) at e = 0.
 

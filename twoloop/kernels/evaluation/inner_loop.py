@@ -434,6 +434,6 @@ def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
         if f.own_redundant(t, q, v, f.numbers, a):
             return DONE
         f.general(f, w, tasks.FIND_NULL_SPACE, t, q, v, theta, a, lam)  # evaluates the rows at q into w
-    elif task <= tasks.MULTIPLIERS:  # tasks of methods that need a good partition at every step
+    elif task <= tasks.MULTIPLIERS:  # tasks with a partition, for which there is no generated code
         w.notes[BY_GENERAL] = 1.0
     return f.general(f, w, task, t, q, v, theta, a, lam)

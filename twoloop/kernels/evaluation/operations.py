@@ -73,7 +73,7 @@ def run_table(table, rows, n_rows, columns, numbers, coefficients, constants, no
 
 
 @exact
-def _run(program, numbers, nodes, t, q, v):
+def _run_program(program, numbers, nodes, t, q, v):
     """Compute all nodes of a system's program."""
     n_rows = program[N_ROWS]
     columns = HEAD + N_COLUMNS * n_rows
@@ -93,7 +93,7 @@ def gamma_by_program(f, w, t, q, v):
     program = f.gamma_program
     if program.size == 0:
         return False
-    _run(program, f.gamma_numbers, w.nodes, t, q, v)
+    _run_program(program, f.gamma_numbers, w.nodes, t, q, v)
     n, first, indices = _results(program)
     for k in range(n):
         if not math.isfinite(w.nodes[first + k]):
@@ -108,7 +108,7 @@ def jacobian_by_program(f, w, t, q, G):
     program = f.jacobian_program
     if program.size == 0:
         return False
-    _run(program, f.jacobian_numbers, w.nodes, t, q, q)
+    _run_program(program, f.jacobian_numbers, w.nodes, t, q, q)
     n, first, indices = _results(program)
     for k in range(n):
         if not math.isfinite(w.nodes[first + k]):

@@ -291,7 +291,7 @@ def program_in_order(
 
     firsts, seconds = [row_of[:0]], [row_of[:0]]
     for each in rows_below:
-        i, j = _pairs(len(each))
+        i, j = _index_pairs(len(each))
         firsts.append(each[i])
         seconds.append(each[j])
     first_of, second_of = np.concatenate(firsts), np.concatenate(seconds)
@@ -301,7 +301,7 @@ def program_in_order(
     # entries of the other triangle: without U, they get a slot that is never read
     above = rows[:n_mass] < columns[:n_mass]
     source[:n_mass][above] = source[:n_mass][above] + len(keys) if both else n + len(keys)
-    which, first, second = _products(jacobian[0], stiff_rows)
+    which, first, second = _products_of_entries(jacobian[0], stiff_rows)
     one, other = (position[jacobian[1][each]] for each in (first, second))
     stiffened = [which, first, second, slots(np.minimum(one, other), np.maximum(one, other))]
     head = [n_q, n, len(keys), len(first_of), len(runs), n_mass, len(jacobian[0]), len(which)]
@@ -321,27 +321,27 @@ def _runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
     return np.stack([lengths, targets[off][begins]], axis=1).ravel()
 
 
-def _products(rows: Integers, chosen: Sequence[int]) -> tuple[Integers, Integers, Integers]:
+def _products_of_entries(rows: Integers, chosen: Sequence[int]) -> tuple[Integers, Integers, Integers]:
     """Return all products of two entries in one of the rows `chosen`: the row, and the indices of both entries."""
     parts: list[tuple[Integers, Integers, Integers]] = [(rows[:0], rows[:0], rows[:0])]
     sequence = np.argsort(rows, kind="stable")
     ordered = rows[sequence]
     for row in chosen:
         entries = sequence[np.searchsorted(ordered, row) : np.searchsorted(ordered, row + 1)]
-        one, other = _pairs(len(entries))
+        one, other = _index_pairs(len(entries))
         parts.append((np.full(len(one), row), entries[one], entries[other]))
     which, first, second = (np.concatenate(each) for each in zip(*parts, strict=True))
     return which, first, second
 
 
-_PAIRS: dict[int, Entries] = {}
+_INDEX_PAIRS: dict[int, Entries] = {}
 
 
-def _pairs(m: int) -> Entries:
+def _index_pairs(m: int) -> Entries:
     """Return first and second index of all unordered pairs of m items, including each item with itself."""
-    if m not in _PAIRS:
-        _PAIRS[m] = tuple(each.astype(np.int64) for each in np.triu_indices(m))  # type: ignore[assignment]
-    return _PAIRS[m]
+    if m not in _INDEX_PAIRS:
+        _INDEX_PAIRS[m] = tuple(each.astype(np.int64) for each in np.triu_indices(m))  # type: ignore[assignment]
+    return _INDEX_PAIRS[m]
 
 
 def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]:
