@@ -157,7 +157,7 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
 
 N_SAMPLES = 20  # number of sample times ahead that are compared
 LEAST_DISTANCE = 12.0  # shortest time ahead over which the motion is sampled, in spacings of samples
-SUDDEN_SHARE = 0.1  # smallest second difference of a sudden change, relative to the range: a bell four spacings wide
+SUDDEN_SHARE = 0.1  # second difference of a sudden change over the range: at least that of a bell four spacings wide
 LEAST_RANGE = 0.1  # smallest range of samples that matters, relative to rtol times the largest value so far
 # absolute lower bound of that range, in any units: squares of smaller values underflow, and subnormal numbers are too
 # coarsely spaced to look smooth

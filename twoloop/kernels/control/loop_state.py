@@ -19,7 +19,7 @@ from numpy.typing import NDArray
     NEAR_SINGULAR,
     SWITCH_METHOD,
     AT_DISCONTINUITY,  # C_t or b jumps here: the caller writes the state after the jump to new_state
-    NEEDS_DENSE,  # the sparse form cannot decide whether rows are independent
+    NEEDS_DENSE,  # the static form cannot decide whether rows are independent: the caller continues with a dense one
     NEEDS_COMPILATION,  # the step is not compiled: the caller compiles it and repeats the call
 ) = range(12)
 SUSPENDED = 0.5  # value of BRIDGE after all special steps across a singular position have failed
@@ -83,7 +83,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     JUMP_TO,  # end of that interval
     APPLIES_JUMP,  # 1: the next step crosses that interval; new_state is the state after the jump
     ROUGH_TO,  # end of the last step that was rejected with an error above SUDDEN_ERROR
-    PIVOT_HERE,  # sparse form: the smallest pivot at the end of the last step
+    PIVOT_HERE,  # static form: value of PIVOT in Work.notes at the end of the last step
     SAMPLED_TO,  # time of the last sample in time alone
     SAMPLED_EVERY,  # s, spacing of the last samples in time
     WIDEST_SAMPLING,  # s, the widest spacing of samples so far

@@ -61,7 +61,7 @@ def near_singular(f, w, control, clock, t, q):
 
 @merged
 def ends_at_singular(f, w, control, clock):
-    """Return whether a step of the sparse form ends so near a singular position that the next one would begin there.
+    """Return whether a step of the static form ends so near a singular position that the next one would begin there.
 
     A singular position well between the ends of a step does no harm.
     """

@@ -79,7 +79,7 @@ STABILITY_LIMIT = 3.0  # h rho relative to LIMIT: above this, stability limits t
 MIN_COST = 64.0
 TRIAL = 300.0  # approximate number of evaluations that a trial of the implicit method takes
 AFFORDED = 3.0  # cost of the run, in costs of a trial, before a trial that may be in vain
-OF_RUN = 0.3  # fraction of the expected cost of the whole run: the cost so far counts as at least this
+SHARE_OF_RUN = 0.3  # fraction of the expected cost of the whole run that counts as spent from the beginning
 # cost of the run, relative to AFFORDED trials, at which a trial begins whatever the rates are; it doubles after one
 # trial, triples after two, and so on
 COST_OF_ANY_TRIAL = 100.0
@@ -321,7 +321,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
     # a trial that may be in vain, or that needs finite differences, has to cost little compared with the run so far
     counted_cost, least_cost = cost, AFFORDED * TRIAL * options[COST_RATIO]
     if np.isfinite(tolerances[GAP]):
-        counted_cost = max(counted_cost, OF_RUN * tolerances[GAP] / LONGEST_UNSEEN * cost_per_second)
+        counted_cost = max(counted_cost, SHARE_OF_RUN * tolerances[GAP] / LONGEST_UNSEEN * cost_per_second)
     is_cheap = counted_cost > least_cost and (
         f.flags[FORCE_BY_Q_GIVEN] == 1 or counted_cost > MIN_COST * w.independent.size
     )

@@ -17,7 +17,7 @@ from twoloop.kernels.compile.callbacks import OPTIONAL
     GAMMA_INACCURATE,
     RANK_DIFFERS,
     ROWS_CONTRADICT,
-    NEEDS_DENSE,  # the sparse form cannot decide whether rows are independent
+    NEEDS_DENSE,  # the static form cannot decide whether rows are independent: the caller continues with a dense one
     NOT_LOADED,  # the caller has to load the machine code of the step
     UNSUITED,  # the method does not suit the motion here: the caller continues with another one
     STOPPED,  # the time limit has passed, see TIME_IS_UP

@@ -133,7 +133,7 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
 # state satisfies the constraints up to rounding. DEFINITE, INDEFINITE: M varies, and is positive definite, or not
 # positive definite, by a margin
 IN_ORDER, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
-NEAR_SHARE = 0.5  # largest distance of two positions whose coordinates have equal sizes, relative to these sizes
+NEAR_SHARE = 0.5  # largest distance from a position at which the stored sizes apply, relative to these sizes
 ROUNDING_OF_ZERO = 2.0**-52  # relative to the largest coordinate: a smaller coordinate may be a rounding error of zero
 EIGENVALUE_MARGIN = 2.0  # factor on the limit below which an eigenvalue counts as zero: rounding changes it by less
 

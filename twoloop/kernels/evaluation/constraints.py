@@ -112,7 +112,7 @@ ROUNDING_DISAGREEMENT = 1e-9  # disagreement of both differences, relative to Ga
 LENGTHENING_DISAGREEMENT = 1e-11
 # weights of values at 0, e, 2 e and 4 e: first derivatives of order 2, over e and over 2 e
 ONE_SIDED, ONE_SIDED_TWICE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
-# length of one-sided differences relative to two-sided ones: their order is lower, and a shorter length saves a search
+# length of one-sided differences relative to two-sided ones: their order is lower, so that a shorter length is better
 ONE_SIDED_LENGTH = 1.0 / 16.0
 # rounding error of Gamma if the terms of G v cancel, relative to the largest term over longest_difference
 ROUNDING_OF_TERMS = 1e-14

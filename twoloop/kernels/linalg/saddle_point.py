@@ -248,14 +248,14 @@ def solve_schur(f, w, r, c, a):
             a[j] -= solved[i, j] * w.z[i]
 
 
-MIN_ROWS = 8  # smallest number of rows, and of freedoms, for which the sparse form is the fastest (on chains: 7)
-# smallest number of coordinates for which the sparse form is the fastest with few freedoms, too, unless M is diagonal
+MIN_ROWS = 8  # smallest number of rows, and of freedoms, for which the augmented form is the fastest (on chains: 7)
+# smallest number of coordinates for which the augmented form is the fastest with few freedoms, too, unless M is diagonal
 # (measured: about 30)
 MIN_COORDINATES = 32
 
 
 def sparse_pays(n_q: int, n_rows: int, diagonal: bool) -> bool:
-    """Return whether the sparse form is faster than dense ones for a sparse pattern; `diagonal`: M is diagonal."""
+    """Return whether the augmented form is faster than dense ones for a sparse pattern; `diagonal`: M is diagonal."""
     return n_rows >= MIN_ROWS and (n_q - n_rows >= MIN_ROWS or (n_q >= MIN_COORDINATES and not diagonal))
 
 
