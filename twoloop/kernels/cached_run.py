@@ -99,7 +99,7 @@ def _first_step(state, n, t, span, smallest):
 
 @exact
 def _limit_steps(control, tolerances, span, longest, within):
-    """Limit the time between two evaluations of the equations to a hundredth of the run.
+    """Limit the time between two evaluations of the equations to a hundredth of the run's duration `span`.
 
     `within`: steps evaluate the equations at interior points as well, so that only `longest` (s) limits the step size.
     """
@@ -314,7 +314,7 @@ NEVER, IS_SAVED = 0.0, 2.0
 
 @exact
 def _is_last_start(last_start, t, t1, q, v):
-    """Return whether a start equals the last one bit for bit; it becomes the last one."""
+    """Return whether a start equals the one in `last_start` bit for bit; write it to `last_start`."""
     n, same = q.size, last_start[N_EQUAL] > NEVER
     for k in range(2 + 2 * n):
         x = t if k == 0 else t1 if k == 1 else q[k - 2] if k < 2 + n else v[k - 2 - n]

@@ -20,7 +20,7 @@ WORD, LINE = 8, 8  # bytes of a number; numbers in a cache line: each array begi
 
 
 class Static(NamedTuple):
-    """Sizes that the static form needs in addition to those of other forms."""
+    """Sizes that only the static form needs."""
 
     n_factors: int
     n_mass_values: int
@@ -209,7 +209,7 @@ def _layout(
         "nodes": (n_nodes,),
         **dict.fromkeys(("mass_values", "jacobian_values", "counts", "factors", "pivot_sizes"), (0,)),
         **dict.fromkeys(("unknowns", "solutions"), (0,)),
-        "matrices": (n_matrices,),  # the last array, the only one whose data do not last
+        "matrices": (n_matrices,),  # must be the last array: a step fills it before it reads it
     }
     integers: dict[str, tuple[int, ...]] = {
         "places": (n_rows + 1 + n_rows * n_q,),
@@ -220,7 +220,7 @@ def _layout(
         "row_order": (n_rows,),
         "counters": (N_COUNTERS,),
         "lapack": (N_ROUTINES,),
-        "index": (index_size(r),),  # the last array: data at its end do not last
+        "index": (index_size(r),),  # must be the last array: a step fills its end before it reads it
     }
     rows_of_G, side = n_rows + 1, n_q
     if static is not None:

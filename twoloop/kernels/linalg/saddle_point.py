@@ -249,8 +249,8 @@ def solve_schur(f, w, r, c, a):
 
 
 MIN_ROWS = 8  # smallest number of rows, and of freedoms, for which the augmented form is the fastest (on chains: 7)
-# smallest number of coordinates for which the augmented form is the fastest with few freedoms, too, unless M is diagonal
-# (measured: about 30)
+# smallest number of coordinates for which the augmented form is the fastest even with few freedoms (measured: about
+# 30); not if M is diagonal
 MIN_COORDINATES = 32
 
 
