@@ -409,8 +409,8 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
 def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, q, v, a):
     """Return when a value next changes suddenly with time, or `next_change` (infinite: no time) if that is earlier."""
     every = max(min(control[at.APART], size / N_IN_STEP), LEAST_APART * np.spacing(abs(t)))
-    # samples need not be taken again for multistep methods (ROUGH = 1), which no jump deceives, and which restart only
-    # after a rejected step, or if C_t or b may jump: steps find these jumps themselves, unless they end next to one
+    # multistep methods (ROUGH = 1) do not need closer samples: no jump deceives them, and they restart only after a
+    # rejected step. Nor do steps that find jumps of C_t and b themselves, which they do unless they end next to one
     may_resample = control[at.ROUGH] > 1.0 and control[at.DRIVEN] == 0.0
     if may_resample and every < RESAMPLE_BELOW * clock[at.SAMPLED_EVERY]:
         clock[at.SAMPLED_TO] = t

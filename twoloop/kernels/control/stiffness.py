@@ -261,7 +261,7 @@ def _is_quiet(w, tolerances, state, rate):
 
 @compiled
 def _cost(w, options):
-    """Return the cost of the run so far, in evaluations."""
+    """Return the cost of the run so far, in evaluations; a Jacobian counts as MATRIX_COST evaluations."""
     return w.counters[N_EVALUATIONS] + options[MATRIX_COST] * w.counters[N_JACOBIANS]
 
 
@@ -274,7 +274,7 @@ def _cost_per_second(w, options, memory, t):
 
 @compiled
 def _evaluations_between_estimates(options, memory):
-    """Return the number of evaluations until the next estimate: COST_RATIO INTERVAL for the explicit method."""
+    """Return the number of evaluations until the next estimate: INTERVAL, times COST_RATIO for the explicit method."""
     return INTERVAL * options[COST_RATIO] if _is_explicit(memory) else INTERVAL
 
 

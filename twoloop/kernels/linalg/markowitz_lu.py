@@ -78,25 +78,25 @@ def pivots_of(index):
 
 @merged
 def begin_upper(r):
-    """Return where in `index` the list begins that tells where the rows of U begin."""
+    """Return the position in `index` of the list of the first entries of the rows of U."""
     return N_HEAD + 3 * r
 
 
 @merged
 def end_upper(r):
-    """Return where in `index` the list begins that tells where the rows of U end."""
+    """Return the position in `index` of the list of the ends of the rows of U."""
     return N_HEAD + 4 * r
 
 
 @merged
 def begin_lower(r):
-    """Return where in `index` the list begins that tells where the rows of L begin, and the last one ends."""
+    """Return the position in `index` of the list of the first entries of the rows of L, and the end of the last row."""
     return N_HEAD + 5 * r
 
 
 @merged
 def begin_entries(r):
-    """Return where in `index` the lists of rows, columns and sources of the entries begin."""
+    """Return the position in `index` of the lists of rows, columns and sources of the entries."""
     return N_HEAD + 6 * r + 1
 
 
@@ -176,7 +176,7 @@ def _exchange(order, position, k, chosen):
 
 @compiled
 def _subtract(matrix, row, column, pivot, j, zero_source):
-    """Subtract multiples of the pivot's row from others in column j, then remove it; return False if a list is full."""
+    """In column j, subtract multiples of the pivot's row from others, and remove it; return False if a list is full."""
     counts, lists, numbers = matrix
     for m in range(counts[COLUMN_SIZE, j]):
         counts[WHERE, lists[ROWS, j, m]] = m + 1
