@@ -26,8 +26,8 @@ def form(monkeypatch):
         change(run)
 
     monkeypatch.setattr(Run, "change_form", noted)
-    monkeypatch.setattr(static_module, "SPARSE", 1e9)
-    monkeypatch.setattr(static_module, "NEWTON_SPARSE", 1e9)
+    monkeypatch.setattr(static_module, "MAX_STATIC_SHARE", 1e9)
+    monkeypatch.setattr(static_module, "MAX_NEWTON_SHARE", 1e9)
 
     def choose(static):
         monkeypatch.setattr(static_module, "LARGE", 0 if static else 10**9)

@@ -52,7 +52,7 @@ def compare(assembly):
 @pytest.fixture
 def any_size(large, monkeypatch):
     """The static form also for what is too small for it to pay."""
-    monkeypatch.setattr(static_module, "SPARSE", 1e9)
+    monkeypatch.setattr(static_module, "MAX_STATIC_SHARE", 1e9)
 
 
 @pytest.mark.parametrize(

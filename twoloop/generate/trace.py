@@ -123,8 +123,8 @@ class _CallbackCopier(FunctionCopier):
                 return value
         return super().value(value, names)
 
-    def _rewrite(self, helper: Any) -> None:
-        super()._rewrite(helper)
+    def _add_copy(self, helper: Any) -> None:
+        super()._add_copy(helper)
         self.known[id(helper)].__globals__.setdefault("type", _type)
 
 
