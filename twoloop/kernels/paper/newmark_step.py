@@ -8,12 +8,14 @@ from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, GAP, N_OUTER, OUT
 from twoloop.kernels.evaluation.inner_loop import evaluate_state, rounding_floor
 from twoloop.kernels.linalg.dense import copy
 
-MAX_ITERATIONS = 60  # number of iterations after which a step has failed
-# ratio of the largest coordinate after the step to that before the step, above which it is mainly due to this step
+MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
+# ratio of the largest coordinate so far after a step to that before the step, above which the coordinates count as
+# caused by this step
 GROWN = 2.0
-TINY = 1e-300  # added to a tolerance that is zero for a mechanism at rest at the origin
+TINY = 1e-300  # added to the tolerance, which is zero for a mechanism at rest at the origin
 
-# indices in `memory`, before the new accelerations (n_q): largest coordinate, velocity and acceleration so far
+# indices of the scalars in `memory`: largest coordinate, velocity and acceleration so far. The scalars are followed by
+# the new accelerations (n_q)
 SIZE, SPEED, ACCELERATION, N_MEMORY_SCALARS = range(4)
 
 # indices in `options`
@@ -30,11 +32,11 @@ def _largest_abs(x, at_least):
 
 @compiled
 def _motion_rate(memory, gap, q, v, a, q1, v1, a1):
-    """Return the reciprocal, 1/s, of the time in which velocities and accelerations change coordinates by their size.
+    """Return the reciprocal, 1/s, of the time in which the largest coordinate changes by its own value.
 
-    Sizes are the largest absolute values so far, because all coordinates may be near zero at a single time, depending
-    on the origin. If the size of the coordinates is mainly due to this step, as after rest at the origin, the time is
-    at least `gap`, s.
+    The time follows from the largest absolute coordinate, velocity and acceleration so far, because all coordinates may
+    be near zero at a single time, depending on the origin. If the largest coordinate is mainly caused by this step, as
+    after rest at the origin, the time is at least `gap`, s.
     """
     memory[SIZE] = _largest_abs(q, memory[SIZE])
     memory[SPEED] = _largest_abs(v, memory[SPEED])
@@ -48,10 +50,11 @@ def _motion_rate(memory, gap, q, v, a, q1, v1, a1):
 
 @compiled
 def _error(options, tolerances, rate, h, q, v, a, a1):
-    """Return the error from e = |beta - 1/6| h^2 |a1 - a|, the leading local error of q for gamma = 1/2.
+    """Return the estimated error of a step, in units of the tolerances.
 
-    It is the largest component of e / h over rate * atol + rtol |v|. This error per unit step is of order h^2, as is
-    the error of the run. If ERROR_TOL > 0, it is the 2-norm of e over ERROR_TOL (err_out in the paper).
+    The leading local error of q for gamma = 1/2 is e = |beta - 1/6| h^2 |a1 - a|. The result is the largest component
+    of (e / h) / (rate atol + rtol |v|). This error per unit step is of order h^2, as is the error of the run. If
+    ERROR_TOL > 0, the result is the 2-norm of e divided by ERROR_TOL (err_out in the paper).
     """
     factor = abs(options[BETA] - 1.0 / 6.0) * h
     total = 0.0
@@ -65,7 +68,7 @@ def _error(options, tolerances, rate, h, q, v, a, a1):
 
 @kernel(ATTEMPT)
 def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step: repeat (12) for independent coordinates, inner loop and accelerations until these converge."""
+    """Attempt a step: iterate (12) for independent coordinates and the inner loop until the accelerations converge."""
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]

@@ -22,12 +22,12 @@ from twoloop.kernels.evaluation.inner_loop import evaluate_as_given, project
 
 HIGHEST = 12  # largest order; above 13 the quadrature with NODES would not be exact
 N_TERMS = HIGHEST + 2  # number of differences of a step, of coefficients g and of coefficients G
-STRICT = 5.0  # factor on the error estimate: errors of many short steps add up, and then come close to the tolerance
-SAFETY = 0.8  # factor on the step size for which the estimated error would be 1
+ERROR_FACTOR = 5.0  # factor on the error estimate, because the errors of many short steps add up
+SAFETY = 0.8  # factor on the step size for which the estimated error would equal the tolerance
 GROWTH, SHRINKAGE = 1.2, 0.5  # largest and smallest ratio of successive step sizes
 START_GROWTH = 2.0  # largest ratio of successive step sizes while the order still rises with every step
-LEAST_FACTOR = 0.1  # smallest ratio of step sizes after a step whose dependent positions differ from the prediction
-RESTART_AFTER = 3  # number of successive failures after which the method restarts with order 1
+LEAST_FACTOR = 0.1  # smallest ratio of successive step sizes if dependent positions differ from their prediction
+RESTART_AFTER = 3  # number of successive rejected steps after which the method restarts with order 1
 
 # eight Gauss nodes on [0, 1] and their weights: exact for c_i and (1 - s) c_i up to i = 15
 NODES, WEIGHTS = (0.5 * (1.0 + x) if k == 0 else 0.5 * x for k, x in enumerate(np.polynomial.legendre.leggauss(8)))
@@ -35,9 +35,9 @@ REST = WEIGHTS * (1.0 - NODES)  # weights of c_i in the integral of (1 - s) c_i
 
 
 def _error_constants():
-    """Return |g_k - g_{k+1}| at equal steps for each order k.
+    """Return |g_k - g_{k+1}| at equal steps for each order k from 0 to HIGHEST.
 
-    It is the factor of h times the difference, in the estimated error of the velocities.
+    The error of velocities is estimated as h |g_k - g_{k+1}| d, where d is the error of the predicted accelerations.
     """
     coefficients = np.ones(HIGHEST + 1)
     for k in range(1, HIGHEST + 1):
@@ -45,15 +45,16 @@ def _error_constants():
     return np.abs(coefficients)
 
 
-# error constants at equal steps, used as lower bounds: after a decrease of h, the actual constants are smaller, which
-# is wrong if the force jumps
+# error constants at equal steps, lower bounds of the constants in use: after a decrease of h, constants of unequal
+# steps are smaller, and the error would be underestimated if the force jumps
 EQUAL_STEPS = _error_constants()
 
-# indices in `options`. THETA: limit of the last correction of a projection, see `project` in inner_loop.py
+# indices in `options`. THETA: largest last correction of a projection that has converged, see `project`
 THETA, N_OPTIONS = range(2)
-# indices of the scalars in `memory`; then follow rows of N_TERMS + 2 coefficients, and tables, see _table
+# indices of the scalars in `memory`. The scalars are followed by rows of N_TERMS + 2 coefficients, two tables of
+# differences, see _table, and two scratch rows
 (
-    WHICH,  # index of the table of the last accepted step
+    WHICH,  # index, 0 or 1, of the table of differences at the last accepted step
     ORDER,
     DEPTH,  # number of accelerations in the history, at most N_TERMS
     AGE,  # number of steps accepted since the order changed or a step was rejected
@@ -62,7 +63,7 @@ THETA, N_OPTIONS = range(2)
     NEXT_ORDER,
     N_SCALARS,
 ) = range(8)
-# numbers of the rows of coefficients: psi(n), psi(n+1), beta, g, G, and c_i at NODES
+# indices of the rows of coefficients: psi(n), psi(n+1), beta, g, G, and c_i at NODES
 PSI, NEW_PSI, BETA, G_VELOCITY, G_POSITION, C_AT_NODES, N_ROWS = range(7)
 
 
@@ -78,14 +79,14 @@ def _padded(n_q: int) -> int:
 
 @inlined
 def _row(memory, which):
-    """Return a view (N_TERMS + 2) of row number `which`, such as PSI, of the coefficients."""
+    """Return a view (N_TERMS + 2) of row `which`, such as PSI, of the coefficients in `memory`."""
     start = N_SCALARS + which * (N_TERMS + 2)
     return memory[start : start + N_TERMS + 2]
 
 
 @inlined
 def _table(memory, n, which):
-    """Return table 0 or 1 (N_TERMS + 1, n padded). The differences are phi_i = row i - 1 + d; d is the last row."""
+    """Return a view (N_TERMS + 1, n padded) of table `which`: phi_i is the sum of row i - 1 and the last row, d."""
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + int(which) * (N_TERMS + 1) * width
     return memory[start : start + (N_TERMS + 1) * width].reshape((N_TERMS + 1, width))
@@ -93,7 +94,7 @@ def _table(memory, n, which):
 
 @inlined
 def _scratch(memory, n):
-    """Return two rows (n padded), for velocities and positions: mean accelerations, later reciprocal tolerances."""
+    """Return views of two rows (n padded), for velocities and positions: mean accelerations, then 1 / tolerances."""
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + 2 * (N_TERMS + 1) * width
     return memory[start : start + width], memory[start + width : start + 2 * width]
@@ -101,7 +102,7 @@ def _scratch(memory, n):
 
 @kernel(SETTLE)
 def settle_adams(f, w, options, memory, tolerances, accepted):
-    """Add an accepted attempt to the history, or count a rejected one."""
+    """Add an accepted attempt to the history in `memory`, or count a rejected attempt."""
     if not accepted:
         memory[FAILED] += 1.0
         memory[AGE] = 0.0
@@ -123,7 +124,7 @@ def settle_adams(f, w, options, memory, tolerances, accepted):
 
 @merged
 def _begin_history(memory, n, state):
-    """Start a history that contains only the accelerations of `state`."""
+    """Reset `memory` to order 1 and a history that contains only the accelerations of `state`."""
     table = _table(memory, n, memory[WHICH])
     table[:, :] = 0.0
     for m in range(n):
@@ -136,7 +137,7 @@ def _begin_history(memory, n, state):
 
 @merged
 def _compute_coefficients(memory, h, k):
-    """Compute psi(n+1), beta_1 to beta_{k+1}, g_1 to g_{k+2} and G_1 to G_{k+2} for a step of h, in `memory`."""
+    """Store psi(n+1), beta_1 to beta_{k+1}, g_1 to g_{k+2} and G_1 to G_{k+2} for a step of size h in `memory`."""
     psi, new_psi, beta = _row(memory, PSI), _row(memory, NEW_PSI), _row(memory, BETA)
     g, G, c = _row(memory, G_VELOCITY), _row(memory, G_POSITION), _row(memory, C_AT_NODES)
     new_psi[0] = h
@@ -165,9 +166,9 @@ def _compute_coefficients(memory, h, k):
 
 @merged
 def _predict(memory, h, k, old, new, state, q1, v1, n):
-    """Compute the prediction (q1, v1), and the differences that an exact prediction would have into the table `new`."""
+    """Store the predicted state in q1 and v1, and in the table `new` the differences for an exact prediction."""
     beta, g, G = _row(memory, BETA), _row(memory, G_VELOCITY), _row(memory, G_POSITION)
-    in_v, in_q = _scratch(memory, n)
+    mean_v, mean_q = _scratch(memory, n)
     for m in range(0, old.shape[1], 4):
         d0, d1, d2, d3 = old[N_TERMS, m], old[N_TERMS, m + 1], old[N_TERMS, m + 2], old[N_TERMS, m + 3]
         # this row is phi_{k+2} less d, because phi_{k+2} = d - beta_{k+1} phi_{k+1}
@@ -205,42 +206,43 @@ def _predict(memory, h, k, old, new, state, q1, v1, n):
             new[i, m + 1] = e1
             new[i, m + 2] = e2
             new[i, m + 3] = e3
-        in_v[m] = x0
-        in_v[m + 1] = x1
-        in_v[m + 2] = x2
-        in_v[m + 3] = x3
-        in_q[m] = y0
-        in_q[m + 1] = y1
-        in_q[m + 2] = y2
-        in_q[m + 3] = y3
+        mean_v[m] = x0
+        mean_v[m + 1] = x1
+        mean_v[m + 2] = x2
+        mean_v[m + 3] = x3
+        mean_q[m] = y0
+        mean_q[m + 1] = y1
+        mean_q[m + 2] = y2
+        mean_q[m + 3] = y3
     for m in range(n):
         v0 = state[n + m]
-        v1[m] = v0 + h * in_v[m]
-        q1[m] = state[m] + h * (v0 + h * in_q[m])
+        v1[m] = v0 + h * mean_v[m]
+        q1[m] = state[m] + h * (v0 + h * mean_q[m])
 
 
 @merged
 def _error(g, G, h, order, largest_v, largest_q):
-    """Return the local error at `order`, over the tolerances.
+    """Return the estimated error of a step at `order`, in units of the tolerances.
 
-    `largest_v`, `largest_q`: the largest difference over the tolerances of velocities and of positions.
+    `largest_v` and `largest_q` are the largest difference divided by the tolerances of velocities and of positions.
     """
     return max(h * abs(g[order - 1] - g[order]) * largest_v, h * h * abs(G[order - 1] - G[order]) * largest_q)
 
 
 @merged
 def _choose_order(memory, h, k, table, d, n):
-    """Return the error of the attempt over the tolerances, and the ratio of the next step size to h; set NEXT_ORDER.
+    """Store NEXT_ORDER; return the error in units of the tolerances, and the ratio of the next step size to h.
 
-    The rules are those of STEP. The order decreases if this does not increase the error. It increases after k + 1 steps
-    at order k if this decreases the error, and while the method starts, with every step.
+    The rules are those of Shampine and Gordon's STEP. The order decreases if the error at lower orders is not larger.
+    It increases after k + 1 steps at order k if the error at order k + 1 is smaller. While STARTING is 1, it increases
+    with every step.
     """
     g, G = _row(memory, G_VELOCITY), _row(memory, G_POSITION)
-    per_v, per_q = _scratch(memory, n)
+    weight_v, weight_q = _scratch(memory, n)
     v0 = v1 = v2 = v3 = q0 = q1 = q2 = q3 = 0.0
     lower, lowest = max(k - 1, 0), max(k - 2, 0)
     for m in range(n):
-        a, b = per_v[m], per_q[m]
+        a, b = weight_v[m], weight_q[m]
         x = abs(d[m])
         v0, q0 = max(v0, x * a), max(q0, x * b)
         x = abs(table[lower, m] + d[m])
@@ -278,7 +280,7 @@ def _choose_order(memory, h, k, table, d, n):
 
 @kernel(ATTEMPT, vectorized=True)
 def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step, and choose the order and the size of the next step."""
+    """Attempt a step of size h; choose the order and the size of the next step."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
@@ -293,15 +295,15 @@ def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
     code = evaluate_as_given(f, w, t + h, q1, v1, a1)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
-    per_v, per_q = _scratch(memory, n)
+    weight_v, weight_q = _scratch(memory, n)
     d = new[N_TERMS]
     rtol = tolerances[RTOL]
     for m in range(n):
         d[m] = a1[m] - new[0, m]
     for m in range(n):
-        per_v[m] = STRICT / (tolerances[ATOL + m] + rtol * max(abs(v[m]), abs(v1[m])))
+        weight_v[m] = ERROR_FACTOR / (tolerances[ATOL + m] + rtol * max(abs(v[m]), abs(v1[m])))
     for m in range(n):
-        per_q[m] = STRICT / (tolerances[ATOL + m] + rtol * max(abs(q[m]), abs(q1[m])))
+        weight_q[m] = ERROR_FACTOR / (tolerances[ATOL + m] + rtol * max(abs(q[m]), abs(q1[m])))
     error, factor = _choose_order(memory, h, k, new, d, n)
     if not error <= 1.0:
         return Attempt(DONE, error, factor)

@@ -73,8 +73,8 @@ from twoloop.kernels.steps.velocity_errors import (
     velocity_error,
 )
 
-# largest difference of entries (i, j) and (j, i) of a matrix that counts as symmetric, over its largest diagonal entry
-ASYMMETRY = 1e-12
+# largest |A_ij - A_ji| of a matrix A that counts as symmetric, relative to its largest diagonal entry
+MAX_ASYMMETRY = 1e-12
 
 
 @compiled
@@ -85,12 +85,12 @@ def _is_symmetric(A):
         largest = max(largest, abs(A[i, i]))
         for j in range(i):
             asymmetry = max(asymmetry, abs(A[i, j] - A[j, i]))
-    return asymmetry <= ASYMMETRY * largest
+    return asymmetry <= MAX_ASYMMETRY * largest
 
 
 @compiled
 def _fill_matrix(w, memory, n, m, z, H):
-    """Compute T^T M T - z^2 T^T K T - z T^T D T into H (m^2), m being the number of independent coordinates."""
+    """Store T^T (M - z^2 K - z D) T in H (m^2), where m is the number of independent coordinates."""
     N, Kr, Dr = matrix_storage(w, n, at.SYSTEMS), matrix_storage(w, n, at.BY_Q), matrix_storage(w, n, at.BY_V)
     z2 = z * z
     if memory[at.DAMPED] == 1.0:
@@ -103,7 +103,7 @@ def _fill_matrix(w, memory, n, m, z, H):
 
 @compiled
 def factor_matrix(w, memory, z):
-    """Factor the matrix of an iteration for z, with the tangents computed last; return a code."""
+    """Factor T^T (M - z^2 K - z D) T, where z is gamma times a step size, with the latest tangents; return a code."""
     n, m = w.Q.size, w.independent.size
     numbers = matrix_storage(w, n, at.FILTER)
     H = as_matrix(numbers, m)
@@ -120,9 +120,9 @@ def factor_matrix(w, memory, z):
 
 @compiled
 def factor_iteration(f, w, memory, t, q, v, z):
-    """Compute the tangents at (t, q, v), the state evaluated last, and factor the matrix for z; return a code.
+    """Compute the tangents at (t, q, v), the state evaluated last, and call `factor_matrix`; return a code.
 
-    w.lam are the multipliers of this state.
+    w.lam must be the multipliers at this state.
     """
     n = q.size
     m = w.independent.size
@@ -148,7 +148,7 @@ def factor_iteration(f, w, memory, t, q, v, z):
 
 @compiled
 def _solve_iteration(w, memory, x):
-    """Solve the factored system for the right-hand side x (n_dof), which becomes the solution."""
+    """Replace the right-hand side x (n_dof) by the solution of the system that `factor_matrix` has factored."""
     m = x.size
     H = as_matrix(matrix_storage(w, w.Q.size, at.FILTER), m)
     if memory[at.SYMMETRIC] == 1.0:
@@ -159,7 +159,7 @@ def _solve_iteration(w, memory, x):
 
 @compiled
 def solve_iteration(w, memory, residual, a):
-    """Add the correction to the independent accelerations in a (n_q); it also replaces the `residual` (n_q) there."""
+    """Solve for the correction of the independent accelerations; store it in `residual` (n_q); add it to a (n_q)."""
     n = w.Q.size
     m = w.independent.size
     N, x = as_matrix(matrix_storage(w, n, at.SYSTEMS), m), vector(memory, 1, n, at.V_MOVED)[:m]
@@ -176,7 +176,7 @@ def solve_iteration(w, memory, residual, a):
 
 @compiled
 def filter_by_iteration(w, memory, z, e_q, e_v):
-    """Replace e_v (n_dof) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with the factors computed last."""
+    """Replace e_v (n_dof) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with the factors of `factor_matrix`."""
     n = w.Q.size
     m = e_q.size
     N, Kr = as_matrix(matrix_storage(w, n, at.SYSTEMS), m), as_matrix(matrix_storage(w, n, at.BY_Q), m)
@@ -191,17 +191,17 @@ def filter_by_iteration(w, memory, z, e_q, e_v):
 
 
 MAX_ITERATIONS = 8  # number of Newton iterations after which a stage has failed
-GROWTH = 2.0  # ratio of successive corrections above which the iteration fails
-LINEAR_FACTOR = 0.01  # factor on the tolerance of the outer loop for iterations that do not converge quadratically
-MAX_CONTRACTION = 0.1  # ratio of successive corrections up to which derivatives computed by differences are reused
-VELOCITY_WEIGHT = 0.1  # weight, in the convergence test, of the position error that the correction of a velocity causes
+GROWTH = 2.0  # largest ratio of successive corrections with which Newton's method goes on
+LINEAR_FACTOR = 0.01  # factor on the tolerance of Newton's method with derivatives by differences: linear convergence
+MAX_CONTRACTION = 0.1  # largest ratio of successive corrections with which derivatives by differences are reused
+VELOCITY_WEIGHT = 0.1  # weight of the position error that a correction of velocities causes, in the convergence test
 
 
 @inlined
 def stages_of(memory, s, n):
-    """Return views of `memory`: velocities and accelerations of the stages (s, n), accelerations (n) of the last one.
+    """Return views of `memory`: velocities (s, n) and accelerations (s, n) of the stages, and accelerations (n).
 
-    The last one is the last stage of the last accepted step.
+    The last array contains the accelerations at the last stage of the last accepted step.
     """
     last = memory.size - n
     return (
@@ -220,9 +220,9 @@ def gamma_of(options):
 
 @merged
 def _set_stage_state(z, q_bar, v_bar, a, Q, V):
-    """Compute the positions Q and velocities V of a stage from its accelerations a, all (n_q).
+    """Store the positions and velocities of a stage with accelerations a (n_q) in Q and V (n_q).
 
-    For dependent coordinates these are start values of Newton's method.
+    The entries of dependent coordinates are start values for the inner loop.
     """
     for m in range(Q.size):
         V[m] = v_bar[m] + z * a[m]
@@ -231,7 +231,7 @@ def _set_stage_state(z, q_bar, v_bar, a, Q, V):
 
 @merged
 def has_dense_tangents(f, w):
-    """Return whether every iteration computes and factors its own matrix T^T (M - z^2 K - z D) T, from tangents."""
+    """Return whether every iteration of Newton's method factors a new dense matrix T^T (M - z^2 K - z D) T."""
     return (
         f.flags[FORCE_BY_Q_GIVEN] == 1
         and f.flags[BANDWIDTH] < 0
@@ -242,15 +242,15 @@ def has_dense_tangents(f, w):
 
 @merged
 def one_stage_of(options):
-    """Return 1, the number of stages solved at once; for a literal 1, newton_systems.py would be compiled again."""
+    """Return 1, the number of stages solved at once; with a literal 1, numba would compile newton_systems.py again."""
     return int(options[STAGES])
 
 
 @compiled
 def _prepare(f, w, options, memory, t, h, Q, V, F):
-    """Compute or reuse the derivatives and factors for an iteration; return a code.
+    """Update the derivatives and factors for an iteration, unless they can be reused; return a code.
 
-    (Q, V) is the state evaluated last, with accelerations F.
+    (Q, V) is the state evaluated last, and F are its accelerations.
     """
     if f.flags[FORCE_BY_Q_GIVEN] == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
@@ -271,7 +271,8 @@ def _prepare(f, w, options, memory, t, h, Q, V, F):
 def solve_stage(f, w, options, memory, t, h, A_stage):
     """Solve for the accelerations A_stage (1, n_q) of a stage at t by Newton's method; return a code.
 
-    A_stage is their prediction on entry. The vectors Q_MID and V_MID of `memory` become positions and velocities.
+    On entry, A_stage contains predicted accelerations. The positions and velocities of the stage are stored in the
+    vectors Q_MID and V_MID of `memory`.
     """
     n = w.Q.size
     z = h * gamma_of(options)
@@ -305,9 +306,9 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
         else:
             correct(f, w, options, memory, one_stage_of(options), residual, A_stage)
         change = 0.0
-        share = max(z / scale_q, VELOCITY_WEIGHT * min(memory[at.DURATION] / scale_q, 1.0 / scale_v))
+        weight = max(z / scale_q, VELOCITY_WEIGHT * min(memory[at.DURATION] / scale_q, 1.0 / scale_v))
         for m in w.independent:
-            change = max(change, z * abs(residual[0, m]) * share)
+            change = max(change, z * abs(residual[0, m]) * weight)
         if not np.isfinite(change):
             return OUTER_DIVERGED
         contraction = 0.0
@@ -319,8 +320,8 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
         if iteration > 0:
             if contraction > GROWTH:
                 return OUTER_DIVERGED
-            share = 1.0 if tangents_given else LINEAR_FACTOR
-            if contraction < 1.0 and contraction / (1.0 - contraction) * change <= share * options[OUTER_TOL]:
+            factor = 1.0 if tangents_given else LINEAR_FACTOR
+            if contraction < 1.0 and contraction / (1.0 - contraction) * change <= factor * options[OUTER_TOL]:
                 break
             if contraction > MAX_CONTRACTION and memory[at.FRESH] == 0.0:
                 memory[at.HAS_JACOBIAN] = 0.0
@@ -333,20 +334,20 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
     return DONE
 
 
-# number of filters of the difference of the two formulas before it is subtracted: with fewer, the method is unstable
-# for vibrations, see tests/kernels/test_diagonal.py
+# number of times that the difference of the two formulas is filtered before it is subtracted: with fewer filters, the
+# method is unstable for vibrations, see tests/kernels/test_diagonal.py
 N_FILTERS = 3
 
-# largest sum of `lower` times the stage accelerations at a jump, relative to their range: `_error_at_jumps` then does
-# not reduce its estimate
+# sum of `lower` times the stage accelerations, relative to the range of these accelerations, above which
+# `_error_at_jumps` does not reduce its estimate; largest value at a jump
 MAX_JUMP_RATIO = 0.174
 
 
 @compiled
 def _filter(f, w, options, memory, h, e_q, e_v):
-    """Replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), z = h gamma, with the last factors.
+    """Replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), z = h gamma, with the latest factors.
 
-    J is the Jacobian of (v, F); the vectors are the first n_dof numbers of the arrays.
+    J is the Jacobian of (v, F). Only the first n_dof numbers of the arrays e_q and e_v (n_q) are read and changed.
     """
     z = h * gamma_of(options)
     count = w.independent.size
@@ -360,31 +361,31 @@ def _filter(f, w, options, memory, h, e_q, e_v):
 
 @compiled
 def _factor_filter(f, w, options, memory, h):
-    """Factor the matrix that `_filter` uses for steps of size h; return a code."""
+    """Factor the matrix with which `_filter` filters errors of steps of size h; return a code."""
     if has_dense_tangents(f, w):
         return factor_matrix(w, memory, h * gamma_of(options))
     return factor_filter(f, w, options, memory, one_stage_of(options), h)
 
 
 @compiled
-def _weighted_difference(w, h, V_stage, A_stage, weights, share, e_q, e_v):
-    """Compute `share` times h times the weighted sum of the stage velocities into e_q, of accelerations into e_v.
+def _weighted_difference(w, h, V_stage, A_stage, weights, factor, e_q, e_v):
+    """Store `factor` h sum_k weights[k] V_stage[k] in e_q, and `factor` h sum_k weights[k] A_stage[k] in e_v.
 
-    The first n_dof numbers of e_q and e_v are for the independent coordinates.
+    Only the entries of the independent coordinates are computed, and stored as the first n_dof numbers.
     """
     for i in range(w.independent.size):
         j = w.independent[i]
-        in_q, in_v = 0.0, 0.0
+        sum_q, sum_v = 0.0, 0.0
         for k in range(weights.size):
-            in_q += weights[k] * V_stage[k, j]
-            in_v += weights[k] * A_stage[k, j]
-        e_q[i] = share * h * in_q
-        e_v[i] = share * h * in_v
+            sum_q += weights[k] * V_stage[k, j]
+            sum_v += weights[k] * A_stage[k, j]
+        e_q[i] = factor * h * sum_q
+        e_v[i] = factor * h * sum_v
 
 
 @compiled
 def _renew_derivatives(f, w, options, memory, t, h, new_state):
-    """Compute the derivatives at the end of the step, and factor the systems for steps of size h; return a code."""
+    """Compute the derivatives at `new_state`, and factor the systems for steps of size h; return a code."""
     n = w.Q.size
     Q, V, F = vector(memory, 1, n, at.Q_MID), vector(memory, 1, n, at.V_MID), vector(memory, 1, n, at.A_MID)
     copy(new_state[:n], Q)
@@ -404,11 +405,12 @@ def _renew_derivatives(f, w, options, memory, t, h, new_state):
 
 
 @compiled
-def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, weights, share):
-    """Return the largest component of an error estimate over the tolerances, `share` times the weighted sum of stages.
+def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, weights, factor):
+    """Return the largest component of an error estimate, in units of the tolerances.
 
-    The sum is filtered with the factors computed last (Hosea and Shampine 1996), so that stiff components do not count.
-    Outdated derivatives are first computed anew, if they matter. E_Q and E_V become the sum, E_V filtered twice.
+    The estimate is that of `_weighted_difference`. It is filtered with the latest factors (Hosea and Shampine 1996), so
+    that stiff components do not count. If outdated derivatives would change the result, they are computed anew. On
+    return, the vectors E_Q and E_V of `memory` contain the estimate, filtered twice.
     """
     n = w.Q.size
     q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
@@ -416,7 +418,7 @@ def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A
     unfiltered, filtered_once = vector(memory, 1, n, at.A_NEW), vector(memory, 1, n, at.A_MID)
     count = w.independent.size
     z = h * gamma_of(options)
-    _weighted_difference(w, h, V_stage, A_stage, weights, share, e_q, e_v)
+    _weighted_difference(w, h, V_stage, A_stage, weights, factor, e_q, e_v)
     copy(e_v, unfiltered)
     _filter(f, w, options, memory, h, e_q, e_v)
     if f.flags[FORCE_BY_Q_GIVEN] == 0 and not derivatives_agree(
@@ -425,7 +427,7 @@ def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A
         memory[at.CHANGED] = 1.0
         if _renew_derivatives(f, w, options, memory, t + h, h, new_state) != DONE:
             return np.inf
-        _weighted_difference(w, h, V_stage, A_stage, weights, share, e_q, e_v)
+        _weighted_difference(w, h, V_stage, A_stage, weights, factor, e_q, e_v)
         copy(e_v, unfiltered)
         _filter(f, w, options, memory, h, e_q, e_v)
     error = 0.0
@@ -448,9 +450,9 @@ def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A
 
 @compiled
 def _extrapolate(f, w, options, memory, h, q1, v1):
-    """Replace (q1, v1), the end of the step, by that of the embedded formula.
+    """Replace (q1, v1), the end of the step, by the result of the embedded formula.
 
-    (E_Q, E_V) is the difference of the two formulas, which `_error` has filtered twice.
+    (E_Q, E_V) must be the difference of the two formulas, which `_error` has filtered twice.
     """
     e_q, e_v = vector(memory, 1, w.Q.size, at.E_Q), vector(memory, 1, w.Q.size, at.E_V)
     for _ in range(2, N_FILTERS):
@@ -462,9 +464,9 @@ def _extrapolate(f, w, options, memory, h, q1, v1):
 
 @compiled
 def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state, A_stage):
-    """Return the position error over the tolerances that E_V causes in slow directions, as in newton_step.py.
+    """Return the position error, in units of the tolerances, that the velocity error E_V causes in slow directions.
 
-    It is 0 where E_V is too small to matter. Overwrites E_Q, E_V and the factors.
+    Returns 0 if E_V is too small to matter; see newton_step.py. Overwrites E_Q, E_V and the factors.
     """
     n = w.Q.size
     e_q, e_v = vector(memory, 1, n, at.E_Q), vector(memory, 1, n, at.E_V)
@@ -487,12 +489,12 @@ def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_s
 
 @compiled
 def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, lower):
-    """Return a second error estimate over the tolerances, for accelerations that jump within the step.
+    """Return a second error estimate, in units of the tolerances, for accelerations that jump within the step.
 
     A jump in the first half of the step hardly changes the first estimate, which has small weights there. `lower`
     (s) are weights of another embedded formula. The sum of `lower` times the accelerations of the stages is zero if the
     accelerations are quadratic in time, small relative to their range if they are smooth, and large if they jump. The
-    ratio of this sum to the range is a factor of the estimate, which raises its order above that of the first estimate.
+    second estimate is multiplied by the ratio of this sum to the range, so that its order exceeds that of the first.
     """
     n = w.Q.size
     deviation, widest = 0.0, 0.0
@@ -507,8 +509,8 @@ def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V
         return 0.0
     if memory[at.H_FACTORED] == 0.0 and _factor_filter(f, w, options, memory, h) != DONE:
         return np.inf
-    share = min(1.0, deviation / (MAX_JUMP_RATIO * widest))
-    error = _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, lower, share)
+    factor = min(1.0, deviation / (MAX_JUMP_RATIO * widest))
+    error = _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, lower, factor)
     if error <= 1.0:
         error = max(error, _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state, A_stage))
     return error
@@ -516,7 +518,7 @@ def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V
 
 @kernel(SETTLE)
 def settle_diagonal(f, w, options, memory, tolerances, accepted):
-    """Store the last stage of an accepted step, which is the first stage of the next step."""
+    """Store the accelerations of the last stage of an accepted step, which is the first stage of the next step."""
     if accepted:
         s = int(options[DIAGONAL_OFFSET])
         _, A_stage, a_end = stages_of(memory, s, w.Q.size)
@@ -526,7 +528,7 @@ def settle_diagonal(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT, vectorized=True)
 def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step: solve the stages one after another, the last of which is the end of the step."""
+    """Attempt a step: solve for the stages one after another; the last stage is the end of the step."""
     s = int(options[DIAGONAL_OFFSET])
     o = DIAGONAL_OFFSET + 1
     A = options[o : o + s * s].reshape((s, s))
@@ -549,12 +551,12 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
     Q, V = vector(memory, 1, n, at.Q_MID), vector(memory, 1, n, at.V_MID)
     for j in range(1, s):
         for m in range(n):
-            in_q, in_v = 0.0, 0.0
+            sum_q, sum_v = 0.0, 0.0
             for k in range(j):
-                in_q += A[j, k] * V_stage[k, m]
-                in_v += A[j, k] * A_stage[k, m]
-            q_bar[m] = q[m] + h * in_q
-            v_bar[m] = v[m] + h * in_v
+                sum_q += A[j, k] * V_stage[k, m]
+                sum_v += A[j, k] * A_stage[k, m]
+            q_bar[m] = q[m] + h * sum_q
+            v_bar[m] = v[m] + h * sum_v
         copy(A_stage[j - 1], A_stage[j])
         code = solve_stage(f, w, options, memory, t + c[j] * h, h, A_stage[j : j + 1])
         if code != DONE and memory[at.FRESH] == 0.0:

@@ -43,8 +43,9 @@ from twoloop.kernels.steps.stages import (
 )
 from twoloop.kernels.steps.velocity_errors import STEPS_TO_DECAY, filtered_velocity_error, motion_time, velocity_error
 
-SLOW = 0.05  # ratio of the last two corrections above which the derivatives are computed anew for the next step
-# largest correction taken for a rounding error in fixed steps, relative to max(1, |value|)
+# ratio of the last two corrections of Newton's method above which the next step computes new derivatives
+SLOW_CONTRACTION = 0.05
+# largest correction that counts as a rounding error in steps of fixed size, relative to max(1, |value|)
 STAGNATION_FIXED = 1e-9
 
 
@@ -52,7 +53,8 @@ STAGNATION_FIXED = 1e-9
 def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
     """Solve for the stage accelerations A_stage (s, n) by Newton's method; return a code.
 
-    A_stage is their prediction on entry. Stores the last contraction in `memory`.
+    On entry, A_stage contains predicted accelerations. Stores CONTRACTION, the ratio of the last two corrections, in
+    `memory`.
     """
     s, A, A2, _, _, c = tableau_of(options)
     n = q.size
@@ -70,10 +72,10 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
                 Q_stage[j, m] = q[m] + c[j] * h * v[m]
                 V_stage[j, m] = v[m]
             for k in range(s):
-                in_q, in_v = h * h * A2[j, k], h * A[j, k]
+                weight_q, weight_v = h * h * A2[j, k], h * A[j, k]
                 for m in range(n):
-                    Q_stage[j, m] += in_q * A_stage[k, m]
-                    V_stage[j, m] += in_v * A_stage[k, m]
+                    Q_stage[j, m] += weight_q * A_stage[k, m]
+                    V_stage[j, m] += weight_v * A_stage[k, m]
         for j in range(s):
             code = evaluate(f, w, t + c[j] * h, Q_stage[j], V_stage[j], options[INNER_TOL], a_new)
             if code != DONE:
@@ -91,17 +93,17 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
         correct(f, w, options, memory, s, residual, A_stage)
         largest_q, largest_v = 0.0, 0.0
         for j in range(s):
-            in_q, in_v = Q_stage[j], V_stage[j]  # reused as scratch
+            change_q, change_v = Q_stage[j], V_stage[j]  # reused as scratch
             for m in range(n):
-                in_q[m] = 0.0
-                in_v[m] = 0.0
+                change_q[m] = 0.0
+                change_v[m] = 0.0
             for k in range(s):
                 for m in range(n):
-                    in_q[m] += A2[j, k] * residual[k, m]
-                    in_v[m] += A[j, k] * residual[k, m]
+                    change_q[m] += A2[j, k] * residual[k, m]
+                    change_v[m] += A[j, k] * residual[k, m]
             for m in w.independent:
-                largest_q = max(largest_q, abs(in_q[m]))
-                largest_v = max(largest_v, abs(in_v[m]))
+                largest_q = max(largest_q, abs(change_q[m]))
+                largest_v = max(largest_v, abs(change_v[m]))
         change = max(h * largest_v / scale_v, h * h * largest_q / scale_q)
         if not np.isfinite(change):
             return OUTER_DIVERGED
@@ -126,7 +128,7 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
 def _filter(f, w, options, memory, h, e_q, e_v):
     """Replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), z = h gamma0, where J is the Jacobian of (v, F).
 
-    The vectors are the first n_dof numbers of the arrays.
+    Only the first n_dof numbers of the arrays e_q and e_v (n_q) are read and changed.
     """
     s = int(options[STAGES])
     m = w.independent.size
@@ -137,7 +139,7 @@ def _filter(f, w, options, memory, h, e_q, e_v):
 
 @compiled
 def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
-    """Return the largest component of the embedded error estimate, filtered, over the tolerances."""
+    """Return the largest component of the filtered error estimate of a step, in units of the tolerances."""
     s, A, _, _, _, _ = tableau_of(options)
     n = w.Q.size
     q, v, a, q1, v1 = state[:n], state[n : 2 * n], state[2 * n : 3 * n], new_state[:n], new_state[n : 2 * n]
@@ -148,16 +150,16 @@ def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
     unfiltered, filtered_once = vector(memory, s, n, at.A_NEW), vector(memory, s, n, at.A_MID)
     for i in range(w.independent.size):
         j = w.independent[i]
-        in_q = gamma0 * v[j]
-        in_v = gamma0 * a[j]
+        sum_q = gamma0 * v[j]
+        sum_v = gamma0 * a[j]
         for k in range(s):
             velocity = v[j]
             for l in range(s):
                 velocity += h * A[k, l] * A_stage[l, j]
-            in_q += e[k] * velocity
-            in_v += e[k] * A_stage[k, j]
-        e_q[i] = h * in_q
-        e_v[i] = h * in_v
+            sum_q += e[k] * velocity
+            sum_v += e[k] * A_stage[k, j]
+        e_q[i] = h * sum_q
+        e_v[i] = h * sum_v
     copy(e_v, unfiltered)
     _filter(f, w, options, memory, h, e_q, e_v)
     error = 0.0
@@ -181,11 +183,11 @@ def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
 
 @compiled
 def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state):
-    """Return the position error over the tolerances that the velocity error E_V causes in slow directions.
+    """Return the position error, in units of the tolerances, that the velocity error E_V causes in slow directions.
 
-    The duration in `filtered_velocity_error` is that of the fastest component. The component that remains after
-    STEPS_TO_DECAY steps is assumed to last as long as the motion. Returns 0 if E_V is too small to matter. Overwrites
-    E_Q, E_V and the factors of the filter.
+    In `filtered_velocity_error`, errors last as long as their fastest component. Here, a filter keeps the component
+    that remains after STEPS_TO_DECAY steps, and this component lasts for `motion_time`. Returns 0 if E_V is too small
+    to matter. Overwrites E_Q, E_V and the factors of the filter.
     """
     s, n = int(options[STAGES]), w.Q.size
     z = STEPS_TO_DECAY * h / options[eigen_offset(s) + at.GAMMA0]
@@ -207,7 +209,7 @@ def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_s
 
 @kernel(SETTLE)
 def settle_newton(f, w, options, memory, tolerances, accepted):
-    """Store the stages of an accepted step, which predict those of the next step."""
+    """Store the stage accelerations of an accepted step, from which the next step predicts its own."""
     s, n = int(options[STAGES]), w.Q.size
     if accepted:
         memory[at.FRESH] = 0.0
@@ -232,13 +234,13 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if memory[at.PARTITION_NUMBER] != w.notes[GENERATION]:
         memory[at.HAS_JACOBIAN] = 0.0
         memory[at.PARTITION_NUMBER] = w.notes[GENERATION]
-    if memory[at.FRESH] == 0.0 and memory[at.CONTRACTION] > SLOW:
+    if memory[at.FRESH] == 0.0 and memory[at.CONTRACTION] > SLOW_CONTRACTION:
         memory[at.HAS_JACOBIAN] = 0.0
     node = middle_node(c)
     while True:
         if memory[at.HAS_JACOBIAN] == 0.0:
-            # stiff directions turn as the bodies move: at a stage in the middle of the step they differ least from
-            # those of the other stages. At the time of a stage, the derivatives contain no force that no stage has
+            # derivatives at the middle stage: stiff directions turn as the bodies move, and differ least from those of
+            # the other stages there. Between two stages, a force might act that acts at no stage
             x = node * h
             for m in range(n):
                 q_mid[m] = q[m] + x * (v[m] + 0.5 * x * a[m])
@@ -269,19 +271,19 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             break
         if memory[at.FRESH] == 1.0 and (node == 0.0 or code != OUTER_DIVERGED):
             return Attempt(code, np.inf, 0.0)
-        # the extrapolated state in the middle may be wrong, for example where friction is no longer stiff: next, use
-        # the beginning of the step
+        # the state extrapolated to the middle stage may be wrong, for example if friction is no longer stiff there:
+        # repeat with derivatives at the beginning of the step
         if memory[at.FRESH] == 1.0:
             node = 0.0
         memory[at.HAS_JACOBIAN] = 0.0
     for m in range(n):
-        in_q = 0.0
-        in_v = 0.0
+        sum_q = 0.0
+        sum_v = 0.0
         for k in range(s):
-            in_q += bA[k] * trial[k, m]
-            in_v += b[k] * trial[k, m]
-        q1[m] = q[m] + h * v[m] + h * h * in_q
-        v1[m] = v[m] + h * in_v
+            sum_q += bA[k] * trial[k, m]
+            sum_v += b[k] * trial[k, m]
+        q1[m] = q[m] + h * v[m] + h * h * sum_q
+        v1[m] = v[m] + h * sum_v
     code, distance = project_prediction(f, w, tolerances, t + h, h, q, v, q1, v1, options[INNER_TOL])
     if code != DONE:
         return Attempt(code, np.inf, 0.0)

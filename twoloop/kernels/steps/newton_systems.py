@@ -95,12 +95,13 @@ from twoloop.kernels.steps.stages import (
 MAX_ITERATIONS = 15  # number of Newton iterations after which a step has failed
 # relative difference up to which step sizes count as equal: they are differences of times, with rounding errors
 SAME_STEP = 1e-9
-# over the step tolerance: up to this size, corrections that no longer decrease are taken for rounding errors
+# largest correction that counts as a rounding error once corrections no longer decrease, in units of the smallest
+# tolerance
 STAGNATION = 0.1
 
-DIFFERENCE = 1e-7  # displacement for differences, relative to max(1, |value|)
-# where all coordinates are displaced at once, that of index i is displaced by 1 + UNEQUAL (i mod N_UNEQUAL) times
-# DIFFERENCE: effects of equal displacements might cancel
+DIFFERENCE = 1e-7  # displacement of a coordinate or velocity for finite differences, relative to max(1, |value|)
+# displacements of all coordinates at once are DIFFERENCE (1 + UNEQUAL (i mod N_UNEQUAL)) for coordinate i, because the
+# effects of equal displacements might cancel
 UNEQUAL, N_UNEQUAL = 0.37, 7
 
 # --- tangents K and D, of which only the band |i - j| <= b is computed and read
@@ -108,13 +109,13 @@ UNEQUAL, N_UNEQUAL = 0.37, 7
 
 @inlined
 def displace_unequally(value, index):
-    """Return a coordinate or velocity, displaced by an amount that depends on its index, see UNEQUAL."""
+    """Return a coordinate or velocity, `value`, displaced by an amount that depends on its `index`, see UNEQUAL."""
     return value + DIFFERENCE * max(1.0, abs(value)) * (1.0 + UNEQUAL * (index % N_UNEQUAL))
 
 
 @compiled
 def _clear_band(A, b):
-    """Set the band |i - j| <= b of A to zero."""
+    """Set the entries of A with |i - j| <= b to zero."""
     for i in range(A.shape[0]):
         for j in range(max(0, i - b), min(A.shape[0], i + b + 1)):
             A[i, j] = 0.0
@@ -122,7 +123,7 @@ def _clear_band(A, b):
 
 @compiled
 def _check_band_finite(A, b):
-    """Return DONE, or NOT_FINITE if an entry in the band |i - j| <= b of A is not finite."""
+    """Return DONE, or NOT_FINITE if an entry of A with |i - j| <= b is not finite."""
     for i in range(A.shape[0]):
         for j in range(max(0, i - b), min(A.shape[0], i + b + 1)):
             if not np.isfinite(A[i, j]):
@@ -132,7 +133,7 @@ def _check_band_finite(A, b):
 
 @compiled
 def _jacobian_differs(f, w, t, q):
-    """Return whether C_q at q differs from w.G. Overwrites w.Gx with C_q at q."""
+    """Store C_q at q in w.Gx; return whether it differs from w.G."""
     w.Gx[:, :] = 0.0
     constraint_rows(f, w, t, q, w.Gx)
     for i in range(w.C.size):
@@ -144,9 +145,10 @@ def _jacobian_differs(f, w, t, q):
 
 @compiled
 def _subtract_reaction_differences(f, w, t, q, moved, b, K):
-    """Subtract d(Cq^T lam)/dq from the band of K, by differences; w.G is C_q at q.
+    """Subtract d(C_q^T lam)/dq, computed by differences, from the entries of K with |i - j| <= b.
 
-    Coordinates j, j + 2 b + 1, j + 2 (2 b + 1), ... are displaced at once. `moved` (n_q) is scratch.
+    w.G must be C_q at q. Coordinates j, j + 2 b + 1, j + 2 (2 b + 1), ... are displaced at once. `moved` (n_q) is
+    scratch.
     """
     n = q.size
     for j in range(n):
@@ -161,15 +163,15 @@ def _subtract_reaction_differences(f, w, t, q, moved, b, K):
         if not _jacobian_differs(f, w, t, moved):
             continue
         for j in range(group, n, width):
-            size = moved[j] - q[j]
+            displacement = moved[j] - q[j]
             for i in range(max(0, j - b), min(n, j + b + 1)):
                 for k in range(w.C.size):
-                    K[i, j] -= (w.Gx[k, i] - w.G[k, i]) * w.lam[k] / size
+                    K[i, j] -= (w.Gx[k, i] - w.G[k, i]) * w.lam[k] / displacement
 
 
 @compiled
 def tangent_by_q(f, w, t, q, v, b, moved, K, R):
-    """Compute the band |i - j| <= b of K (n_q, n_q) at the state evaluated last; return a code.
+    """Store in K (n_q, n_q) its entries with |i - j| <= b at (t, q, v), the state evaluated last; return a code.
 
     `moved` (n_q) and R (n_q, n_q) are scratch.
     """
@@ -188,7 +190,7 @@ def tangent_by_q(f, w, t, q, v, b, moved, K, R):
 
 @compiled
 def tangent_by_v(f, t, q, v, b, D):
-    """Compute the band |i - j| <= b of D (n_q, n_q) if the system provides it; return a code."""
+    """Store in D (n_q, n_q) its entries with |i - j| <= b, if the system provides them; return a code."""
     if f.flags[FORCE_BY_V_GIVEN] == 0:
         return DONE
     _clear_band(D, b)
@@ -201,7 +203,7 @@ def tangent_by_v(f, t, q, v, b, D):
 
 @compiled
 def reduce_to_independents(w, A, AT, B):
-    """Compute B (n_dof, n_dof) = T^T A T with T = [I; w.D^T], and AT (n_q, n_dof) = A T."""
+    """Store A T in AT (n_q, n_dof) and T^T A T in B (n_dof, n_dof), with T = [I; w.D^T]."""
     n, m = AT.shape
     columns = columns_of(w.index)
     for i in range(n):
@@ -224,7 +226,7 @@ def reduce_to_independents(w, A, AT, B):
 
 @compiled
 def _dense_from_tangents(f, w, memory, s, t, q, v):
-    """Compute J_q and J_v from the tangents of the system at the state evaluated last; return a code."""
+    """Store J_q and J_v, computed from the tangents of the system at the state evaluated last; return a code."""
     n = q.size
     m = w.independent.size
     w.counters[N_JACOBIANS] += 1
@@ -254,7 +256,7 @@ def _dense_from_tangents(f, w, memory, s, t, q, v):
 
 @compiled
 def _dense_derivatives(f, w, options, memory, s, t, q, v, a):
-    """Compute J_q and J_v at (t, q, v), the state evaluated last, with accelerations a; return a code."""
+    """Store J_q and J_v at (t, q, v), the state evaluated last, whose accelerations are a; return a code."""
     if f.flags[FORCE_BY_Q_GIVEN] == 1 and w.Rate.size == w.C.size:
         return _dense_from_tangents(f, w, memory, s, t, q, v)
     n = q.size
@@ -268,13 +270,13 @@ def _dense_derivatives(f, w, options, memory, s, t, q, v, a):
         copy(q, q_moved)
         copy(v, v_moved)
         q_moved[j] += DIFFERENCE * max(1.0, abs(q[j]))
-        size = q_moved[j] - q[j]
+        displacement = q_moved[j] - q[j]
         code = evaluate(f, w, t, q_moved, v_moved, options[INNER_TOL], a_new)
         if code != DONE:
             return code
         for row in range(m):
             i = w.independent[row]
-            Jq[row, column] = (a_new[i] - a[i]) / size
+            Jq[row, column] = (a_new[i] - a[i]) / displacement
     # displace all velocities at once: if nothing changes, no differences are needed
     copy(q, q_moved)
     for column in range(m):
@@ -294,19 +296,19 @@ def _dense_derivatives(f, w, options, memory, s, t, q, v, a):
         copy(q, q_moved)
         copy(v, v_moved)
         v_moved[j] += DIFFERENCE * max(1.0, abs(v[j]))
-        size = v_moved[j] - v[j]
+        displacement = v_moved[j] - v[j]
         code = evaluate(f, w, t, q_moved, v_moved, options[INNER_TOL], a_new)
         if code != DONE:
             return code
         for row in range(m):
             i = w.independent[row]
-            Jv[row, column] = (a_new[i] - a[i]) / size
+            Jv[row, column] = (a_new[i] - a[i]) / displacement
     return DONE
 
 
 @compiled
 def _factor_dense(w, memory, s, which, z, matrix):
-    """Factor I - z^2 J_q - z J_v into `matrix`; return a code. `which`: number of the pivots, see `pivots_of`."""
+    """Store the factors of I - z^2 J_q - z J_v in `matrix`, and its pivots at `which` of `pivots_of`; return a code."""
     n, m = w.Q.size, w.independent.size
     Jq, Jv = as_matrix(matrix_storage(w, n, BY_Q), m), as_matrix(matrix_storage(w, n, BY_V), m)
     damped = memory[DAMPED] == 1.0
@@ -321,7 +323,7 @@ def _factor_dense(w, memory, s, which, z, matrix):
 
 @compiled
 def _filter_dense(w, options, memory, s, h, e_q, e_v):
-    """Replace e_v by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0; e_q and e_v have n_dof numbers."""
+    """Replace e_v (n_dof) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with z = h gamma0."""
     n = w.Q.size
     m = e_q.size
     gamma0 = options[eigen_offset(s) + GAMMA0]
@@ -339,16 +341,16 @@ def _filter_dense(w, options, memory, s, h, e_q, e_v):
 
 @inlined
 def _band(numbers, n, b):
-    """Return a view (n, 2 b + 1) of the storage of K or D, as a band: entry (i, j) is at [i, b + j - i]."""
+    """Return a view (n, 2 b + 1) of `numbers`, the storage of K or D: [i, b + j - i] is the entry (i, j)."""
     return numbers[: n * (2 * b + 1)].reshape((n, 2 * b + 1))
 
 
 @inlined
 def _border(w, n, r, b):
-    """Return views of the arrays stored after K, for the state of K.
+    """Return views of three arrays that are stored after K, and belong to the state at which K was computed.
 
-    They are the r independent rows of C_q (r, n), a copy of w.D (n - r + 1, r), and the dependent coordinates (r) to
-    which its columns belong.
+    They are the r independent rows of C_q (r, n), a copy of w.D (n - r + 1, r), and the r dependent coordinates to
+    which the columns of w.D belong.
     """
     numbers = matrix_storage(w, n, BY_Q)
     start = n * (2 * b + 1)
@@ -361,7 +363,7 @@ def _border(w, n, r, b):
 
 @compiled
 def _banded_residual(f, w, t, q, v):
-    """Compute Q - C_q^T lam at (t, q, v) into w.Q, with the multipliers of w.lam. Overwrites w.Gx with C_q."""
+    """Store Q - C_q^T lam at (t, q, v) in w.Q, with lam = w.lam. Overwrites w.Gx with C_q."""
     w.counters[N_EVALUATIONS] += 1
     w.Q[:] = 0.0
     f.force(t, q, v, f.p, w.Q)
@@ -374,7 +376,7 @@ def _banded_residual(f, w, t, q, v):
 
 @compiled
 def _difference_groups(f, w, t, q, v, by_v, base, moved, b, band):
-    """Compute K, or D if `by_v`, into `band` by differences; return DONE, or NOT_FINITE.
+    """Store K, or D if `by_v`, in `band` (n_q, 2 b + 1), computed by differences; return DONE, or NOT_FINITE.
 
     Columns j, j + 2 b + 1, j + 2 (2 b + 1), ... are computed at once. `base` (n_q) is the residual at (q, v); `moved`
     (n_q) is scratch.
@@ -390,9 +392,9 @@ def _difference_groups(f, w, t, q, v, by_v, base, moved, b, band):
         else:
             _banded_residual(f, w, t, moved, v)
         for j in range(group, n, 2 * b + 1):
-            size = moved[j] - base_point[j]
+            displacement = moved[j] - base_point[j]
             for i in range(max(0, j - b), min(n, j + b + 1)):
-                band[i, b + j - i] = (w.Q[i] - base[i]) / size
+                band[i, b + j - i] = (w.Q[i] - base[i]) / displacement
                 if not np.isfinite(band[i, b + j - i]):
                     return NOT_FINITE
     return DONE
@@ -400,7 +402,7 @@ def _difference_groups(f, w, t, q, v, by_v, base, moved, b, band):
 
 @compiled
 def _copy_band(A, b, band):
-    """Copy the band of A (n, n) to `band` (n, 2 b + 1), see `_band`."""
+    """Copy the entries of A (n, n) with |i - j| <= b to `band` (n, 2 b + 1), see `_band`."""
     n = A.shape[0]
     for i in range(n):
         for j in range(max(0, i - b), min(n, i + b + 1)):
@@ -409,7 +411,7 @@ def _copy_band(A, b, band):
 
 @compiled
 def _band_from_tangents(f, w, memory, s, t, q, v, b):
-    """Store K and D, which the system provides, as bands, at the state evaluated last; return a code."""
+    """Store K and D as bands, from the tangents of the system at the state evaluated last; return a code."""
     n = q.size
     K, R = matrix_storage(w, n, FILTER).reshape((n, n)), matrix_storage(w, n, SYSTEMS).reshape((n, n))
     code = tangent_by_q(f, w, t, q, v, b, vector(memory, s, n, Q_MOVED), K, R)
@@ -425,7 +427,7 @@ def _band_from_tangents(f, w, memory, s, t, q, v, b):
 
 @compiled
 def _banded_derivatives(f, w, memory, s, t, q, v):
-    """Compute K and D as bands, and the border, at the state (t, q, v) evaluated last; return a code."""
+    """Store K and D as bands, and the border, at (t, q, v), the state evaluated last; return a code."""
     n = q.size
     b = f.flags[BANDWIDTH]
     w.counters[N_JACOBIANS] += 1
@@ -460,9 +462,9 @@ def _banded_derivatives(f, w, memory, s, t, q, v):
 
 @compiled
 def _factor_banded(w, memory, s, b, which, z, numbers, factorize, substitute):
-    """Factor M - z^2 K - z D with its border into `numbers`; return a code.
+    """Store the factors of M - z^2 K - z D with its border in `numbers`; return a code.
 
-    `which`: number of the pivots, see `pivots_of`; `factorize`, `substitute`: LAPACK routines, real or complex.
+    `which` is the argument k of `pivots_of`; `factorize` and `substitute` are LAPACK routines, real or complex.
     """
     n = w.Q.size
     K, D = _band(matrix_storage(w, n, BY_Q), n, b), _band(matrix_storage(w, n, BY_V), n, b)
@@ -479,8 +481,8 @@ def _factor_banded(w, memory, s, b, which, z, numbers, factorize, substitute):
 
 
 @compiled
-def _all_coordinates(w, b, x, X):
-    """Compute X (n_q) = T x from the first n_dof numbers of x (n_q)."""
+def _multiply_by_T(w, b, x, X):
+    """Store T x in X (n_q), where only the first n_dof numbers of x (n_q) are read."""
     n_dof = w.independent.size
     _, D, columns = _border(w, w.Q.size, w.rows.size, b)
     for i in columns:
@@ -492,10 +494,10 @@ def _all_coordinates(w, b, x, X):
 
 
 @compiled
-def _solve_for_independents(w, b, numbers, pivots, substitute, x):
-    """Solve the bordered system with the right-hand side x (n_q) for all coordinates.
+def _solve_and_keep_independents(w, b, numbers, pivots, substitute, x):
+    """Solve the bordered system with the right-hand side x (n_q), and keep only the independent coordinates.
 
-    Overwrites the first n_dof numbers of x with the independent coordinates of the solution.
+    On return, the first n_dof numbers of x are the independent coordinates of the solution; the others are scratch.
     """
     Cq, _, _ = _border(w, x.size, w.rows.size, b)
     solve_bordered(w, b, Cq, numbers, pivots, substitute, x)
@@ -505,14 +507,14 @@ def _solve_for_independents(w, b, numbers, pivots, substitute, x):
 
 @compiled
 def _solve_banded(f, w, b, numbers, pivots, substitute, X, x):
-    """Solve (I - z^2 J_q - z J_v) y = x, and overwrite x with y, by the bordered matrix.
+    """Replace x by the solution y of (I - z^2 J_q - z J_v) y = x, with the factors of the bordered matrix.
 
-    x and y are the first n_dof numbers of the array x (n_q); its other numbers and X (n_q) are scratch.
+    The vectors x and y are the first n_dof numbers of the array x (n_q); its other numbers and X (n_q) are scratch.
     """
-    _all_coordinates(w, b, x, X)
+    _multiply_by_T(w, b, x, X)
     x[:] = 0.0
     add_banded_mass_times(f, w, X, x)
-    _solve_for_independents(w, b, numbers, pivots, substitute, x)
+    _solve_and_keep_independents(w, b, numbers, pivots, substitute, x)
 
 
 @compiled
@@ -525,24 +527,24 @@ def _filter_banded(f, w, options, memory, s, h, e_q, e_v):
     b = f.flags[BANDWIDTH]
     z = h * options[eigen_offset(s) + GAMMA0]
     K, X = _band(matrix_storage(w, n, BY_Q), n, b), vector(memory, s, n, Q_MOVED)
-    _all_coordinates(w, b, e_v, X)
+    _multiply_by_T(w, b, e_v, X)
     e_v[:] = 0.0
     add_banded_mass_times(f, w, X, e_v)
-    _all_coordinates(w, b, e_q, X)
+    _multiply_by_T(w, b, e_q, X)
     for i in range(n):
         for j in range(max(0, i - b), min(n, i + b + 1)):
             e_v[i] += z * K[i, b + j - i] * X[j]
     pivots = pivots_of(memory, s, n, 0)
-    _solve_for_independents(w, b, matrix_storage(w, n, FILTER), pivots, DGBTRS, e_v)
+    _solve_and_keep_independents(w, b, matrix_storage(w, n, FILTER), pivots, DGBTRS, e_v)
 
 
 # --- sparse storage, for all coordinates
 
-# largest difference of the predicted and the actual change of a residual, relative to the sum of the absolute terms of
-# the prediction: a larger difference shows that entries are missing
+# largest difference between the predicted and the actual change of a residual, relative to the sum of the absolute
+# terms of the prediction: a larger difference shows that the sparsity pattern lacks entries
 MAX_DEVIATION = 0.2
-NOISE = 1e-13  # rounding errors of a difference of residuals, relative to the largest force
-N_SPARSE_VECTORS = 3  # number of real vectors that _sparse_vectors returns first: `base`, `other` and `moved`
+NOISE = 1e-13  # rounding error of a difference of residuals, relative to the largest term of a residual
+N_SPARSE_VECTORS = 3  # number of real scratch vectors, which _sparse_vectors returns first
 
 
 def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_eigenvalues: int) -> int:
@@ -555,7 +557,7 @@ def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_eigenvalu
 
 @inlined
 def _sparse_state(f, w):
-    """Return views of the entries of M, G, K and D, and of w.counts and the stiffening of M for each row of G."""
+    """Return views of w.matrices: entries of M, G, K and D; w.counts and factors by which rows of G stiffen M."""
     n_mass, n_jacobian, n_rows = w.mass_values.size, w.jacobian_values.size, w.counts.size
     a = n_mass + n_jacobian
     b = a + mass_of(f.newton_program)[0].size - n_mass
@@ -573,7 +575,7 @@ def _sparse_state(f, w):
 
 @inlined
 def _sparse_vectors(f, w):
-    """Return views of scratch: three vectors (n_q), the sizes of pivots (N), and two complex vectors (N)."""
+    """Return views of scratch in w.matrices: three vectors (n_q), pivot sizes (N), and two complex vectors (N)."""
     n, begin = f.newton_program[N_PIVOTS], w.mass_values.size + w.jacobian_values.size
     begin += 2 * (mass_of(f.newton_program)[0].size - w.mass_values.size) + 2 * n
     n_q, numbers = w.Q.size, w.matrices
@@ -590,7 +592,7 @@ def _sparse_vectors(f, w):
 
 @inlined
 def _sparse_factors(f, w, k):
-    """Return a real view of the factors for gamma0 (k = 0), or of the complex ones for eigenvalue k - 1."""
+    """Return a real view of the real factors for gamma0 (k = 0), or of the complex factors for eigenvalue k - 1."""
     n = f.newton_program[N_PIVOTS]
     n_factors = n + 2 * f.newton_program[N_OFF]
     begin = w.mass_values.size + w.jacobian_values.size + (N_SPARSE_VECTORS + 7) * n
@@ -601,15 +603,15 @@ def _sparse_factors(f, w, k):
 
 
 @compiled
-def _sparse_residual(f, w, t, q, v, moved, out):
-    """Compute Q - G^T lam at (t, q, v) into `out`; return the largest term of this sum.
+def _sparse_residual(f, w, t, q, v, renews_G, out):
+    """Store Q - G^T lam at (t, q, v) in `out` (n_q); return the largest absolute term of this sum.
 
-    If `moved`, q has changed, and G is evaluated first, into w.jacobian_values.
+    The entries of G are w.jacobian_values; if `renews_G`, they are first evaluated at q.
     """
     w.counters[N_EVALUATIONS] += 1
     out[:] = 0.0
     f.force(t, q, v, f.p, out)
-    if moved:
+    if renews_G:
         fill_jacobian_values(f, w, t, q)
     largest = 0.0
     for j in range(out.size):
@@ -624,9 +626,10 @@ def _sparse_residual(f, w, t, q, v, moved, out):
 
 @compiled
 def _sparse_differences(f, w, t, q, v, by_v, base, other, moved, entries):
-    """Compute the entries of K, or of D if `by_v`, by differences; return DONE, or NOT_FINITE.
+    """Store K, or D if `by_v`, in `entries`, computed by differences; return DONE, or NOT_FINITE.
 
-    All columns of a group are displaced at once. `base` is the residual at (q, v); overwrites `other` and `moved`.
+    The coordinates of a group of columns are displaced at once. `base` is the residual at (q, v). Overwrites `other`
+    and `moved`.
     """
     rows, columns, begins = tangents_of(f.newton_program)
     base_point = v if by_v else q
@@ -648,9 +651,10 @@ def _sparse_differences(f, w, t, q, v, by_v, base, other, moved, entries):
 
 @compiled
 def _entries_are_complete(f, base, other, base_point, moved, largest, entries, predicted):
-    """Return whether the entries (of K or D) account for the change of the residual.
+    """Return whether `entries`, those of K or D, predict the change of the residual from `base` to `other`.
 
-    The residual changes from `base` to `other` as `base_point` changes to `moved`. Overwrites `other` and `predicted`.
+    The change is that from `base_point`, q or v, to `moved`. `largest`: largest term of the residual. Overwrites
+    `other` and `predicted`.
     """
     rows, columns, _ = tangents_of(f.newton_program)
     predicted[:] = 0.0
@@ -667,9 +671,9 @@ def _entries_are_complete(f, base, other, base_point, moved, largest, entries, p
 
 @compiled
 def _sparse_derivatives(f, w, memory, t, q, v):
-    """Compute the entries of K and D at the state evaluated last; return a code.
+    """Store the entries of K and D at (t, q, v), the state evaluated last; return a code.
 
-    The code is NEEDS_DENSE if there is no program for sparse storage, or if entries are missing in its pattern.
+    The code is NEEDS_DENSE if there is no program for sparse storage, or if its sparsity pattern lacks entries.
     """
     if f.newton_program.size == 0:
         return NEEDS_DENSE
@@ -711,7 +715,7 @@ def _sparse_derivatives(f, w, memory, t, q, v):
 
 @compiled
 def _factor_sparse(f, w, z, values):
-    """Factor the bordered matrix for z into `values`, real or complex; return a code."""
+    """Store the factors of the bordered matrix for z, real or complex, in `values`; return a code."""
     mass, jacobian, K, D, counts, stiffness = _sparse_state(f, w)
     _, _, _, sizes, _, _ = _sparse_vectors(f, w)
     load(f.newton_program, mass, jacobian, K, D, z, stiffness, values)
@@ -720,7 +724,7 @@ def _factor_sparse(f, w, z, values):
 
 @compiled
 def _sparse_right_side(f, w, r, right):
-    """Compute the right-hand side [M r; G r] into `right`; M includes the stiffening by redundant rows."""
+    """Store the right-hand side [M r; G r] in `right`, where M includes the stiffness that redundant rows add."""
     mass, jacobian, _, _, counts, stiffness = _sparse_state(f, w)
     right[:] = 0.0
     rows, columns, _ = mass_of(f.newton_program)
@@ -734,7 +738,7 @@ def _sparse_right_side(f, w, r, right):
 
 @compiled
 def _filter_sparse(f, w, options, s, h, e_q, e_v):
-    """Replace e_v (n_q) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0."""
+    """Replace e_v (n_q) by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with z = h gamma0."""
     _, _, K, _, _, _ = _sparse_state(f, w)
     _, _, _, _, right, y = _sparse_vectors(f, w)
     z, n = h * options[eigen_offset(s) + GAMMA0], y.size
@@ -752,7 +756,7 @@ def _filter_sparse(f, w, options, s, h, e_q, e_v):
 
 @compiled
 def derivatives_at(f, w, options, memory, s, t, q, v, a):
-    """Compute the derivatives at (t, q, v), the state evaluated last, with accelerations a; return a code."""
+    """Store the derivatives at (t, q, v), the state evaluated last, whose accelerations are a; return a code."""
     if f.flags[FORM] == STATIC:
         return _sparse_derivatives(f, w, memory, t, q, v)
     if f.flags[BANDWIDTH] >= 0:
@@ -762,7 +766,7 @@ def derivatives_at(f, w, options, memory, s, t, q, v, a):
 
 @compiled
 def factor_filter(f, w, options, memory, s, h):
-    """Factor the system for z = h gamma0, which is real; return a code."""
+    """Factor the real system for z = h gamma0, with which `filter_error` filters errors; return a code."""
     n, z = w.Q.size, h * options[eigen_offset(s) + GAMMA0]
     w.counters[N_FACTORIZATIONS] += 1
     if f.flags[FORM] == STATIC:
@@ -774,7 +778,7 @@ def factor_filter(f, w, options, memory, s, h):
 
 @compiled
 def _factor_system(f, w, memory, s, k, z):
-    """Factor the complex system of eigenvalue k for z = h l; return a code."""
+    """Factor the complex system of eigenvalue number k, l, for z = h l; return a code."""
     n = w.Q.size
     w.counters[N_FACTORIZATIONS] += 1
     if f.flags[FORM] == STATIC:
@@ -786,7 +790,7 @@ def _factor_system(f, w, memory, s, k, z):
 
 @compiled
 def factor_systems(f, w, options, memory, s, h):
-    """Factor the systems of gamma0 and of every eigenvalue for steps of size h; return a code."""
+    """Factor the systems of gamma0 and of every eigenvalue of A for steps of size h; return a code."""
     offset = eigen_offset(s)
     n_eigen, n_real = count_eigenvalues(options, s), int(options[offset + N_REAL])
     code = factor_filter(f, w, options, memory, s, h)
@@ -801,7 +805,7 @@ def factor_systems(f, w, options, memory, s, h):
 
 @compiled
 def _solve_real(f, w, memory, s, x):
-    """Solve the system of gamma0; overwrite the first n_dof numbers of x (n_q) by the solution."""
+    """Solve the system of gamma0; replace the first n_dof numbers of x (n_q) by the solution."""
     n, m = w.Q.size, w.independent.size
     if f.flags[FORM] == STATIC:
         _, _, _, _, right, y = _sparse_vectors(f, w)
@@ -818,7 +822,7 @@ def _solve_real(f, w, memory, s, x):
 
 @compiled
 def _solve_complex(f, w, options, memory, s, k, x):
-    """Solve the complex system of eigenvalue k; overwrite the first n_dof numbers of x (n_q) by the solution."""
+    """Solve the complex system of eigenvalue number k; replace the first n_dof numbers of x (n_q) by the solution."""
     n, m = w.Q.size, w.independent.size
     if f.flags[FORM] == STATIC:
         _, _, _, _, right, y = _sparse_vectors(f, w)
@@ -834,7 +838,7 @@ def _solve_complex(f, w, options, memory, s, k, x):
 
 @compiled
 def solve_system(f, w, options, memory, s, k, x):
-    """Solve the system of eigenvalue k; overwrite the first n_dof numbers of x (n_q, complex) by the solution."""
+    """Solve the system of eigenvalue number k; replace the first n_dof numbers of x (n_q), complex, by the solution."""
     if k == 0 and options[eigen_offset(s) + N_REAL] > 0.0:  # a real eigenvalue equals gamma0
         real = vector(memory, s, w.Q.size, V_MOVED)
         for i in range(x.size):
@@ -848,9 +852,9 @@ def solve_system(f, w, options, memory, s, k, x):
 
 @compiled
 def filter_error(f, w, options, memory, s, h, e_q, e_v):
-    """Replace e_v by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0.
+    """Replace e_v by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with z = h gamma0.
 
-    The vectors are the first n_dof numbers of the arrays e_q and e_v (n_q).
+    Only the first n_dof numbers of the arrays e_q and e_v (n_q) are read and changed.
     """
     m = w.independent.size
     if f.flags[FORM] == STATIC:
@@ -863,9 +867,9 @@ def filter_error(f, w, options, memory, s, h, e_q, e_v):
 
 @compiled
 def correct(f, w, options, memory, s, residual, A_stage):
-    """Solve for the corrections of the stage accelerations, add them to A_stage, and store them in `residual`.
+    """Solve for the corrections of the stage accelerations, store them in `residual`, and add them to A_stage.
 
-    Only the entries of independent coordinates in these arrays (s, n_q) are read and changed.
+    Only the entries of independent coordinates in `residual` and A_stage, (s, n_q) each, are read and changed.
     """
     n = w.Q.size
     m = w.independent.size

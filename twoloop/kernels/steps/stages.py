@@ -13,14 +13,14 @@ from twoloop.kernels.control.step_size import commit_nothing
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed, compiled, inlined, kernel, merged
 from twoloop.kernels.data.indices import NOT_LOADED
 
-# largest ratio of a step to the previous one at which the stage polynomial of the previous step predicts the stages
+# largest ratio of successive step sizes at which the polynomial of the previous step predicts the stages of a step
 MAX_STEP_RATIO = 3.0
-# factor on `end_error` where Richardson's estimate is used, too: `end_error` then serves for jumps only, between an end
-# of the step and the nearest stage
+# factor on `end_error` in methods that also have Richardson's estimate: they need `end_error` only for jumps between an
+# end of the step and the nearest stage
 END_ERROR_WEIGHT = 0.01
 
-# indices of the scalars in `options`; then follow A (s, s), A A (s, s), b (s), b A (s), c (s) and two rows (s) for
-# `end_error`. EXTRAPOLATION: 1 / (2^order - 1), or 0 for no extrapolation; POWER: order - 1
+# indices of the scalars in `options`. The scalars are followed by A (s, s), A A (s, s), b (s), b A (s), c (s) and two
+# rows (s) for `end_error`. EXTRAPOLATION: 1 / (2^order - 1), or 0 for no extrapolation; POWER: order - 1
 STAGES, INNER_TOL, OUTER_TOL, EXTRAPOLATION, OUTER_TEST, POWER, N_SCALARS = range(7)
 
 
@@ -45,7 +45,7 @@ def options_array(
 
 
 def _lagrange(nodes: NDArray[np.float64], x: float) -> NDArray[np.float64]:
-    """Return the values at x of the Lagrange polynomials of distinct nodes, (s)."""
+    """Return the values (s) at x of the s Lagrange polynomials of distinct nodes (s)."""
     factors = (x - nodes[None, :]) / (nodes[:, None] - nodes[None, :] + np.eye(len(nodes)))
     np.fill_diagonal(factors, 1.0)
     return np.asarray(factors.prod(axis=1))
@@ -74,7 +74,7 @@ def middle_node(c):
 
 @compiled
 def interpolate(c, theta, A_stage, weights, a):
-    """Evaluate the polynomial through the points (c_j, A_stage[j]) at theta into a (n); `weights` (s) is scratch."""
+    """Store in a (n) the value at theta of the polynomial through the points (c_j, A_stage[j]); overwrite `weights`."""
     s = c.size
     for j in range(s):
         product = 1.0
@@ -91,19 +91,20 @@ def interpolate(c, theta, A_stage, weights, a):
 
 @compiled
 def end_error(tolerances, options, h, state, new_state, A_stage):
-    """Return an estimate of the error of a step over the tolerances (26), from the stage accelerations (s, n).
+    """Return an estimate, in units of the tolerances (26), of the error of a step with stage accelerations (s, n).
 
-    The stage accelerations have a range w of order h. At the ends of the step, the polynomial through them differs from
-    the accelerations there by e, of order h^s. If successive orders decrease by a constant factor f, then e = w
-    f^(s - 1), and the error of the method is h w f^(order - 1). If the force jumps, also between an end and the nearest
-    stage, orders do not decrease: the estimate is h w, and steps shrink until the jump does not matter. The estimate
-    must not be used alone: e may pass through zero, and errors of single steps of pendulums then were 100 tolerances.
+    The stage accelerations have a range w of order h. At the ends of the step, the polynomial through the stages
+    differs from the accelerations by e, of order h^s. If terms of successive orders decrease by a constant factor f,
+    then e = w f^(s - 1), and the error of the method is h w f^(order - 1). If the force jumps, also between an end and
+    the nearest stage, the terms do not decrease: the estimate is h w, and steps shrink until the jump does not matter.
+    The estimate must not be used alone, because e may pass through zero: errors of single steps of pendulums then were
+    100 tolerances.
     """
     s, n = A_stage.shape
     offset = N_SCALARS + 2 * s * s + 3 * s
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
-    top = 0.0
+    largest = 0.0
     for m in range(n):
         low, high = A_stage[0, m], A_stage[0, m]
         start, end = -a[m], -a1[m]
@@ -112,20 +113,20 @@ def end_error(tolerances, options, h, state, new_state, A_stage):
             low, high = min(low, value), max(high, value)
             start += options[offset + j] * value
             end += options[offset + s + j] * value
-        width, missed = high - low, max(abs(start), abs(end))
-        error = h * max(width, missed)
-        if missed < width:
-            error *= (missed / width) ** (options[POWER] / (s - 1.0))
+        width, mismatch = high - low, max(abs(start), abs(end))
+        error = h * max(width, mismatch)
+        if mismatch < width:
+            error *= (mismatch / width) ** (options[POWER] / (s - 1.0))
         scale = allowed(tolerances, m, v[m], v1[m])
-        top = max(top, error / scale)
+        largest = max(largest, error / scale)
         scale = allowed(tolerances, m, q[m], q1[m])
-        top = max(top, h * error / scale)
-    return top
+        largest = max(largest, h * error / scale)
+    return largest
 
 
-# indices of further scalars in `options` of Newton's method, after the entries above. Then follow the weights e (s) of
-# the error estimate, and for each eigenvalue of A: its real and imaginary part, its row of T^-1 and its column of T (s
-# real, then s imaginary parts each). VELOCITIES: 1 if the error of velocities is tested, too
+# indices of the further scalars in `options` of Newton's method, counted from `eigen_offset`. The scalars are followed
+# by the weights e (s) of the error estimate, and for each eigenvalue of A, its real and imaginary part, its row of T^-1
+# and its column of T (s real, then s imaginary parts each). VELOCITIES: 1 if the error of velocities is tested, too
 N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
 
 # indices of the scalars in `memory`
@@ -135,7 +136,7 @@ N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
     HAS_PREVIOUS,
     H_PREVIOUS,
     HAS_JACOBIAN,
-    FRESH,  # 1: the derivatives were computed for this step; 0: before it, or at its end
+    FRESH,  # 1: the derivatives were computed for this step; 0: for an earlier step, or at the end of this one
     PARTITION_NUMBER,
     H_FACTORED,
     CONTRACTION,  # ratio of the last two corrections of Newton's method
@@ -145,10 +146,10 @@ N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
     CHANGED,  # 1: diagonal_step.py has computed new derivatives at the end of the step
     N_MEMORY_SCALARS,
 ) = range(14)
-# numbers of the blocks (s, n_q) in `memory`, and of the vectors (n_q) after them
+# indices of the blocks (s, n_q) in `memory`, and of the vectors (n_q) after the blocks
 PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
-# numbers of the parts of w.matrices, of n_q^2 entries each; from SYSTEMS on, two parts for each eigenvalue hold a
+# indices of the parts of w.matrices, of n_q^2 entries each; from SYSTEMS on, two parts for each eigenvalue contain a
 # complex matrix
 BY_Q, BY_V, FILTER, SYSTEMS = range(4)
 
@@ -156,9 +157,9 @@ BY_Q, BY_V, FILTER, SYSTEMS = range(4)
 def newton_options(
     A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], velocities: bool
 ) -> NDArray[np.float64]:
-    """Return the options of Newton's method, which follow those of `options_array` in `options`.
+    """Return the entries of `options` for Newton's method, which follow those of `options_array`.
 
-    A must be diagonalizable. `velocities`: whether the error of velocities is tested.
+    A must be diagonalizable. `velocities`: whether the error of velocities is tested, too.
     """
     values, T = np.linalg.eig(A)
     inverse = np.linalg.inv(T)
@@ -176,7 +177,7 @@ def _estimate_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: fl
     """Return the weights e (s) of the error estimate h (gamma0 f(y_n) + sum_j e_j f(Y_j)).
 
     The estimate is the difference of an embedded quadrature of order s and the method (Hairer & Wanner II, (IV.8.16)).
-    If c_1 = 0, stage 1 already is f(y_n), and the embedded quadrature omits the last stage.
+    If c_1 = 0, f(Y_1) is f(y_n), and the embedded quadrature omits the last stage.
     """
     s = len(b)
     moments = 1.0 / np.arange(1.0, s + 1.0)
@@ -200,9 +201,9 @@ def n_matrices(n_eigenvalues: int) -> int:
     return SYSTEMS + 2 * n_eigenvalues
 
 
-# `options` of a diagonally implicit method begin with those of a Newton method of one stage, A = [[gamma]], whose
-# eigenvalue scalars are at NEWTON_OFFSET. From DIAGONAL_OFFSET on follow the number of stages, A, c, b - b^, `lower`,
-# and 1 if steps with an error estimate continue from the embedded formula
+# `options` of a diagonally implicit method begin with those of Newton's method for one stage, A = [[gamma]]; N_REAL and
+# the scalars after it begin at NEWTON_OFFSET. At DIAGONAL_OFFSET begin the number of stages, A, c, b - b^, `lower`, and
+# 1 if steps with an error estimate continue from the embedded formula, otherwise 0
 NEWTON_OFFSET = N_SCALARS + 2 + 5
 DIAGONAL_OFFSET = NEWTON_OFFSET + N_EIGEN_SCALARS + 1 + 2 + 4
 
@@ -219,9 +220,9 @@ def diagonal_options(
 ) -> NDArray[np.float64]:
     """Return the array `options` of a diagonally implicit method.
 
-    The first row of A (s, s) is zero, the other diagonal entries are gamma, and the last row is b. `weights`: b - b^ of
-    the embedded formula. `lower`: weights of the error estimate where accelerations jump. `embedded`: whether steps
-    continue from the embedded formula, which then has the higher order.
+    The first row of A (s, s) is zero, the other diagonal entries are gamma, and the last row is b. `weights` (s): b -
+    b^, where b^ are the weights of the embedded formula. `lower` (s): weights of the error estimate for accelerations
+    that jump. `embedded`: whether steps continue from the embedded formula, which then has the higher order.
     """
     A, c, weights, lower = (np.asarray(x, dtype=np.float64) for x in (A, c, weights, lower))
     gamma = A[-1, -1]
@@ -233,15 +234,15 @@ def diagonal_options(
 def diagonal_memory(s: int, n_q: int) -> NDArray[np.float64]:
     """Allocate `memory` of a diagonally implicit method.
 
-    It begins with the memory of a Newton method of one stage. Then follow the velocities and the accelerations of the
-    stages (s, n_q each), and the accelerations (n_q) of the last stage of the last accepted step.
+    `memory` begins with the memory of Newton's method for one stage, followed by the velocities and the accelerations
+    of the stages (s, n_q each), and the accelerations (n_q) of the last stage of the last accepted step.
     """
     return np.zeros(memory_size(1, 1, n_q) + (2 * s + 1) * n_q)
 
 
 @merged
 def eigen_offset(s):
-    """Return the offset of the scalars N_REAL, ... of Newton's method in `options`."""
+    """Return the index in `options` of N_REAL, the first of the further scalars of Newton's method with s stages."""
     return N_SCALARS + 2 * s * s + 5 * s
 
 
@@ -254,59 +255,59 @@ def count_eigenvalues(options, s):
 
 @inlined
 def block(memory, s, n, which):
-    """Return a view (s, n) of block number `which`, such as PREVIOUS, of `memory`."""
+    """Return a view (s, n) of block `which`, such as PREVIOUS, of `memory`."""
     start = N_MEMORY_SCALARS + which * s * n
     return memory[start : start + s * n].reshape((s, n))
 
 
 @inlined
 def vector(memory, s, n, which):
-    """Return a view (n) of vector number `which`, such as A_NEW, of `memory`."""
+    """Return a view (n) of vector `which`, such as A_NEW, of `memory`."""
     start = N_MEMORY_SCALARS + (N_BLOCKS * s + which) * n
     return memory[start : start + n]
 
 
 @inlined
 def matrix_storage(w, n, which):
-    """Return a view (n^2) of part number `which`, such as BY_Q, of w.matrices."""
+    """Return a view (n^2) of part `which`, such as BY_Q, of w.matrices."""
     return w.matrices[which * n * n : (which + 1) * n * n]
 
 
 @inlined
 def as_matrix(numbers, m):
-    """Return a view (m, m) of the first m^2 numbers."""
+    """Return a view (m, m) of the first m^2 entries of the vector `numbers`."""
     return numbers[: m * m].reshape((m, m))
 
 
 @inlined
 def system_storage(w, n, k):
-    """Return a complex view (n^2) of the part of w.matrices for the system of eigenvalue k."""
+    """Return a complex view (n^2) of the two parts of w.matrices for the system of eigenvalue number k."""
     start = (SYSTEMS + 2 * k) * n * n
     return w.matrices[start : start + 2 * n * n].view(np.complex128)
 
 
 @inlined
 def _tail(memory, s, n, k):
-    """Return a view (2 n) of `memory` from k n numbers behind its vectors on."""
+    """Return a view (2 n) of `memory` that begins k n numbers after the end of its vectors."""
     start = N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + k) * n
     return memory[start : start + 2 * n]
 
 
 @inlined
 def pivots_of(memory, s, n, k):
-    """Return a view of the pivots (n integers) of the filter's matrix (k = 0), or of the system of eigenvalue k - 1."""
+    """Return a view of the pivots (n integers) of the filter (k = 0), or of the system of eigenvalue number k - 1."""
     return _tail(memory, s, n, k)[:n].view(np.int64)
 
 
 @inlined
 def complex_vector(memory, s, n, n_eigen, which):
-    """Return a complex scratch vector (n), number 0 or 1."""
+    """Return a view of complex scratch vector `which` (n), 0 or 1, of `memory`."""
     return _tail(memory, s, n, 1 + n_eigen + 2 * which).view(np.complex128)
 
 
 @kernel(ATTEMPT)
 def stop_to_load(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Return an attempt with the code NOT_LOADED: the run pauses until its caller has loaded the real step."""
+    """Return an attempt with the code NOT_LOADED, so that the caller of the kernel loads the real step."""
     return Attempt(NOT_LOADED, np.inf, 0.0)
 
 
@@ -314,7 +315,7 @@ PLACEHOLDER = Step(stop_to_load, commit_nothing)
 
 
 class LazyStep(NamedTuple):
-    """Reference to a step that need not be imported yet: its module, such as "steps.newton_step", and name there."""
+    """Name of a step that need not be imported yet: `name` in `module`, such as "steps.newton_step"."""
 
     module: str
     name: str
@@ -324,12 +325,12 @@ LOADED: dict[LazyStep, Step] = {}  # steps imported so far
 
 
 def loaded(step: Any) -> Any:
-    """Return the step itself; for a LazyStep, import its module if it is not imported yet."""
+    """Return a step; for a LazyStep, import its module if necessary, and return the imported step."""
     if isinstance(step, LazyStep) and step not in LOADED:
         LOADED[step] = getattr(import_module(f"twoloop.kernels.{step.module}"), step.name)
     return without_loading(step)
 
 
 def without_loading(step: Any) -> Any:
-    """Return the step itself; for a LazyStep that is not imported yet, return PLACEHOLDER."""
+    """Return a step; for a LazyStep, return the imported step, or PLACEHOLDER if it is not imported yet."""
     return LOADED.get(step, PLACEHOLDER) if isinstance(step, LazyStep) else step

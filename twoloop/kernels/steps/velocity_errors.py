@@ -1,13 +1,13 @@
 """Estimate the position errors that velocity errors cause, for methods whose steps are longer than vibrations.
 
-A velocity error e changes the positions until e changes its sign or decays. It lasts for sqrt(|e| / |J J e|), where J
-is the Jacobian of (v, F). So the error due to a force that jumps within a step has an effect, and the error of fast
+A velocity error e changes the positions until e changes its sign or decays. Its duration is sqrt(|e| / |J J e|), where
+J is the Jacobian of (v, F). So the error due to a force that jumps within a step has an effect, and the error of fast
 vibrations has none. There are two exceptions:
 
 - The duration is that of the fastest component of e. If a stiff damper acts beside a contact, the component in slow
-  directions lasts much longer. A filter with the length of several steps leaves only this component.
-- If J was computed by differences before a contact began or ended, it shows a wrong duration, though Newton's method
-  still converges. `derivatives_agree` detects this.
+  directions lasts much longer. A filter with the time constant of several steps leaves only this component.
+- If J was computed by differences before a contact began or ended, the duration is wrong, though Newton's method still
+  converges. `derivatives_agree` detects this.
 """
 
 import numpy as np
@@ -20,25 +20,24 @@ from twoloop.kernels.steps import stages as at
 from twoloop.kernels.steps.newton_systems import DIFFERENCE
 from twoloop.kernels.steps.stages import INNER_TOL, block, vector
 
-# factor on the duration of an error that changes as slowly as the motion: such an error is no vibration, and the errors
-# of the next steps have the same sign
+# largest factor on the duration of a velocity error that changes as slowly as the motion: such an error is no
+# vibration, and the errors of the next steps have the same sign
 SLOW_FACTOR = 10.0
-LONGEST_GAPS = 10.0  # longest duration of an error, in units of GAP
-STEPS_TO_DECAY = 10.0  # number of steps after which a fast error has decayed
-FAST_DURATION = 20.0  # duration over z = h gamma below which a velocity error counts as fast
-# relative change of J above which it counts as outdated
-OUTDATED_CHANGE = 0.3
+LONGEST_GAPS = 10.0  # longest assumed duration of a velocity error, in units of tolerances[GAP]
+STEPS_TO_DECAY = 10.0  # number of steps after which the fast components of a velocity error have decayed
+FAST_DURATION = 20.0  # duration of a velocity error, in units of z = h gamma, below which the error counts as fast
+OUTDATED_CHANGE = 0.3  # relative change of J above which J counts as outdated
 
 
 @compiled
 def filtered_velocity_error(
     w, memory, tolerances, z, unfiltered, filtered_once, filtered_twice, state, new_state, a_end
 ):
-    """Return the error over the tolerances that a velocity error (n_dof) causes, see `velocity_error`.
+    """Return the error, in units of the tolerances, that a velocity error causes, see `velocity_error`.
 
-    `unfiltered` is the velocity error, `filtered_once` and `filtered_twice` are its results after one and two filters
-    (I - z J)^-1. `a_end` are the accelerations at the end of the step, which show how fast the motion changes if a
-    contact began. Stores the duration of the error in `memory`.
+    `unfiltered` (n_dof) is the velocity error; `filtered_once` and `filtered_twice` (n_dof) are this error after one
+    and two filters (I - z J)^-1. `a_end` are the accelerations at the end of the step, which show how fast the motion
+    changes if a contact began. Stores DURATION, the duration of the error, in `memory`.
     """
     n = w.Q.size
     v, a = state[n : 2 * n], state[2 * n : 3 * n]
@@ -59,10 +58,10 @@ def filtered_velocity_error(
 
 @compiled
 def velocity_error(w, tolerances, e_v, duration, state, new_state):
-    """Return the largest component of a velocity error e_v (n_dof) that lasts for `duration`, s, over the tolerances.
+    """Return the largest effect of a velocity error e_v (n_dof) that lasts for `duration`, s, in units of tolerances.
 
-    The component is the smaller of two ratios: of the velocity error to the tolerance of the velocity, and of the
-    position error that it causes in that time to the tolerance of the position.
+    The effect on a coordinate is the smaller of two ratios: of the velocity error to the tolerance of the velocity, and
+    of the position error that e_v causes in this time to the tolerance of the position.
     """
     n = w.Q.size
     error = 0.0
@@ -76,7 +75,7 @@ def velocity_error(w, tolerances, e_v, duration, state, new_state):
 
 @compiled
 def motion_time(w, tolerances, state, a):
-    """Return the time, s, in which accelerations a (n_q) change velocities by their size; at most LONGEST_GAPS GAP."""
+    """Return the largest velocity in `state` over the largest acceleration in a (n_q), s; at most LONGEST_GAPS GAP."""
     n = w.Q.size
     largest_v = largest_a = 0.0
     for j in w.independent:
@@ -88,11 +87,11 @@ def motion_time(w, tolerances, state, a):
 
 @compiled
 def _derivatives_matter(w, memory, tolerances, z, unfiltered, longest, state, new_state):
-    """Return whether the error estimate might be wrong if J is outdated.
+    """Return whether the error estimate might be wrong because J is outdated.
 
-    This is so if the velocity error `unfiltered` would exceed the tolerances if it lasted for `longest`, s. It is also
-    so if J shows a short duration, and Newton's method converges so slowly that J must have changed by more than
-    UNLIKE.
+    This is possible in two cases. First, the velocity error `unfiltered` would exceed the tolerances if it lasted for
+    `longest`, s. Second, the duration computed with J is short, and Newton's method converges so slowly that J must
+    have changed by more than OUTDATED_CHANGE.
     """
     duration = memory[at.DURATION]
     if (
@@ -105,11 +104,11 @@ def _derivatives_matter(w, memory, tolerances, z, unfiltered, longest, state, ne
 
 @compiled
 def derivatives_agree(f, w, options, memory, s, t, z, tolerances, unfiltered, e_q, e_v, state, new_state, a_end):
-    """Return whether J agrees with the equations at the end of the step, at time t, or does not change the estimate.
+    """Return whether J agrees with the equations at the end of the step, at time t, or whether J does not matter.
 
-    (e_q, e_v) is (I - z J)^-1 times an error whose velocities are `unfiltered`, so that (e_v - raw) / z is a product
-    with J. This product is compared with a difference of accelerations for a displacement by (e_q, e_v). `longest`: see
-    `motion_time`.
+    (e_q, e_v) is (I - z J)^-1 times an error whose velocities are `unfiltered`, so that (e_v - unfiltered) / z is the
+    part of J (e_q, e_v) for velocities. This product is compared with the difference of accelerations between the end
+    of the step and a state displaced by (e_q, e_v).
     """
     n = w.Q.size
     longest = max(motion_time(w, tolerances, state, state[2 * n :]), motion_time(w, tolerances, state, a_end))
