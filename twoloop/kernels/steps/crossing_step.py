@@ -6,12 +6,12 @@ collocation at Gauss nodes whose stages are projected onto the constraints. Then
 motion, and the fixed-point iteration converges as it does elsewhere.
 
 - At a relative distance s from the position (a ratio of pivots), rounding errors are eps/s in positions, eps/s^2 in
-  velocities and eps/s^3 in accelerations. Nodes with too large rounding errors are left out. Their accelerations are
-  those of the polynomial through the other nodes on both sides, because the motion through the position is analytic.
+  velocities and eps/s^3 in accelerations. Nodes with too large rounding errors are left out: their accelerations are
+  interpolated from the nodes on both sides, because the motion through the position is analytic.
 - The result depends on q and v at the beginning only: the accelerations there may consist of rounding errors.
 - The end of the step is projected onto the constraints with a partition chosen there.
 - The generated code of the mechanism projects the stages. If there is no generated code, or if its pivots are too
-  small, the general code does so, with a partition chosen at the stage.
+  small, the general code projects them, with a partition chosen at the stage.
 - The step is rejected if the projection changes a stage by more than the tolerances: the stage is on another branch of
   the motion, or the polynomial is inaccurate.
 """
@@ -39,35 +39,38 @@ from twoloop.kernels.data.indices import (
 from twoloop.kernels.evaluation.inner_loop import evaluate_state, project, renew_partition
 from twoloop.kernels.linalg.dense import copy
 
-# indices of the scalars in `options`; then follow A, A A, Legendre coefficients (S, S each), and b, b A, c (S each)
+# indices of the scalars in `options`. The scalars are followed by A, A A and Legendre coefficients (S, S each), and by
+# b, b A and c (S each)
 INNER_TOL, THETA, N_SCALARS = range(3)
 S = 20  # number of nodes
-LEFT = 0.01  # over the tolerances: change of the accelerations by a sweep at which the iteration has converged
-# over the tolerances: the iteration has also converged if the change is at most NOISE, and at least STAGNANT times the
-# previous change
-STAGNANT, NOISE = 0.5, 0.3
-MOST, FEW = 40, 12  # largest number of sweeps, and number of sweeps after which more nodes are left out
-FARTHER = 2.0  # factor by which the distance from the position in which nodes are left out grows after FEW sweeps
-MOST_LEFT_OUT = 9  # largest number of nodes that may be left out
-# indices of the scalars at the end of `memory`: the arguments of `begin`, with the time of `base`; then first time,
-# length and end, s, of the polynomial of the last converged attempt (END = -inf: none)
-LARGEST_PIVOT, EARLIEST, BASE, BEGIN, WHOLE, END, N_STORED = range(7)
-# limits of the length of a piece of the polynomial, which is accepted as a step, relative to the whole polynomial
+# change of the accelerations by a sweep, in units of the tolerances, up to which the iteration has converged
+CONVERGED_CHANGE = 0.01
+# a change up to STALL_CHANGE, in units of the tolerances, also counts as converged if it is at least
+# STALL_RATIO times the change by the sweep before
+STALL_RATIO, STALL_CHANGE = 0.5, 0.3
+MAX_SWEEPS, FEW_SWEEPS = 40, 12  # largest number of sweeps, and number of sweeps after which more nodes are left out
+DISTANCE_FACTOR = 2.0  # factor, after FEW_SWEEPS sweeps, on the pivot below which nodes are left out
+MAX_LEFT_OUT = 9  # largest number of nodes that may be left out
+# indices of the scalars at the end of `memory`: largest_pivot, earliest and the time of `base`, see `begin`; beginning,
+# duration and end, s, of the polynomial of the last converged attempt (END = -inf: no polynomial)
+LARGEST_PIVOT, EARLIEST, BASE, BEGIN, DURATION, END, N_STORED = range(7)
+# smallest and largest fraction of the polynomial that is accepted as a step
 SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2
-# longest time between evaluations if all nodes are evaluated, relative to the step
+# longest time between evaluations if all nodes are evaluated, relative to the polynomial
 UNSEEN = 0.0767
 BACK = 0.4  # fraction of the polynomial that lies before the beginning of the step
-ORDER, SHARE = 12.0, 0.5  # order of the estimated error; factor on the estimate
-MOVED = 0.5  # factor of the largest correction of a stage by its projection, in the error of the step
-ROUNDING = 1e-13  # relative tolerance of the iteration in fixed steps, and of comparisons of times
-NEARER = 0.5  # smallest allowed ratio of the pivot at the end of a step to that at the beginning; see also ENDS
-ENDS = 4.0  # the pivot at the end is also allowed if it is this many times the pivot below which nodes are left out
-FOUND = 2.0  # error and factor returned with a new polynomial: the step is repeated, and takes a piece of it
-SMALL = 1e-300  # replaces a coefficient of zero
+ORDER, ERROR_FACTOR = 12.0, 0.5  # order of the estimated error, and factor on the estimate
+MOVED_WEIGHT = 0.5  # factor on the largest change of a stage by its projection, which counts as an error of the step
+ROUNDING = 1e-13  # relative tolerance of the iteration in steps of fixed size, and of comparisons of times
+# smallest allowed ratio of the pivot at the end of a step to the pivot at the beginning. A pivot at the end that is
+# smaller than at the beginning must also be at least END_MARGIN times the pivot below which nodes are left out
+MIN_PIVOT_RATIO, END_MARGIN = 0.5, 4.0
+REPEAT = 2.0  # error and factor returned with a new polynomial, so that the step is repeated: it takes a piece of it
+TINY = 1e-300  # lower bound of divisors that may be zero
 
 
 def options_array(A, b, c, inner_tol, theta):
-    """Return the array `options` for a Gauss tableau of S stages."""
+    """Return the array `options` of `crossing_step` for the Gauss tableau A, b, c of S stages."""
     degrees = np.arange(S)
     legendre = np.polynomial.legendre.legvander(2.0 * c - 1.0, S - 1).T * b * (2 * degrees + 1)[:, None]
     return np.concatenate([[inner_tol, theta], *map(np.ravel, [A, A @ A, legendre, b, b @ A, c])])
@@ -79,7 +82,7 @@ def memory_size(n):
 
 
 def begin(memory, largest_pivot, earliest, base=None):
-    """Store the conditions for the next polynomial in `memory`, and discard the last polynomial.
+    """Store the conditions for the next polynomial in `memory`, and discard the stored polynomial.
 
     Parameters
     ----------
@@ -90,8 +93,8 @@ def begin(memory, largest_pivot, earliest, base=None):
     earliest : float
         Earliest time at which nodes may lie, s.
     base : (float, ndarray), optional
-        Time, s, and state [q, v, ...] of an earlier step, farther from the singular position. The polynomial then goes
-        through q and v of this state. None: through those at the beginning of the step.
+        Time, s, and state [q, v, ...] of an earlier step, farther from the singular position, through whose q and v the
+        polynomial goes. None: it goes through q and v at the beginning of the step.
     """
     stored = memory[-N_STORED:]
     stored[:] = np.nan
@@ -104,23 +107,23 @@ def begin(memory, largest_pivot, earliest, base=None):
 def piece_ends(memory, c, t):
     """Return the times after t, s, at which the pieces of the polynomial in `memory` end.
 
-    They are END and the times of evaluated nodes, if the node is next to one that is left out, or if the piece would
-    otherwise be longer than LONGEST_PIECE.
+    Pieces end at END, at evaluated nodes next to a node that is left out, and at evaluated nodes where the piece would
+    otherwise be longer than LONGEST_PIECE. No piece is shorter than SHORTEST_PIECE.
     """
     stored = memory[-N_STORED:]
     left_out = memory[-N_STORED - 3 * S : -N_STORED - 2 * S] == 1.0
-    least, ends = (t - stored[BEGIN]) / stored[WHOLE], []
+    least, ends = (t - stored[BEGIN]) / stored[DURATION], []
     for j in range(1, S - 1):
         since = c[j] - (ends[-1] if ends else least)
         beside = left_out[j - 1] or left_out[j + 1] or since > LONGEST_PIECE
         if not left_out[j] and beside and since > SHORTEST_PIECE and 1.0 - c[j] > SHORTEST_PIECE:
             ends.append(c[j])
-    return [float(stored[BEGIN] + end * stored[WHOLE]) for end in ends] + [float(stored[END])]
+    return [float(stored[BEGIN] + end * stored[DURATION]) for end in ends] + [float(stored[END])]
 
 
 @compiled
-def _combined(weights, a, total):
-    """Compute the weighted sum of the accelerations a (S, n) at the nodes into `total` (n)."""
+def _weighted_sum(weights, a, total):
+    """Store the sum of weights[k] a[k] over the nodes k in `total` (n); a (S, n) are the accelerations at the nodes."""
     total[:] = 0.0
     for k in range(S):
         for m in range(total.size):
@@ -129,18 +132,18 @@ def _combined(weights, a, total):
 
 @compiled
 def _weight(tolerances, m, n, h, state):
-    """Return the reciprocal of the allowed error of velocity m in a step of h."""
+    """Return the reciprocal of the allowed error of velocity number m in a step of size h from `state`."""
     q, v = abs(state[m]), abs(state[n + m])
     if tolerances[ESTIMATE] == 0.0:
         return 1.0 / (ROUNDING * (1.0 + v))
     atol, rtol = tolerances[ATOL + m], tolerances[RTOL]
     of_v = atol + rtol * max(v, 0.5 * h * abs(state[2 * n + m]))
-    return 1.0 / max(min(of_v, (atol + rtol * max(q, 0.5 * h * v)) / h), SMALL)
+    return 1.0 / max(min(of_v, (atol + rtol * max(q, 0.5 * h * v)) / h), TINY)
 
 
 @compiled
 def _error(tolerances, h, state, legendre, a, n_kept):
-    """Return the error over the tolerances, from the decay of the Legendre coefficients of a.
+    """Return the error of a step, in units of the tolerances, from the decay of the Legendre coefficients of a.
 
     The estimate is that of collocation_code.py. `n_kept`: number of nodes that are not left out; coefficients of
     degrees from `n_kept` on are rounding errors.
@@ -158,22 +161,22 @@ def _error(tolerances, h, state, legendre, a, n_kept):
                 before = max(before, abs(value))
             else:
                 top = max(top, abs(value))
-        before = max(before, top, SMALL)
+        before = max(before, top, TINY)
         decay, far = top / before, top / max(first, before)
         if n_kept == S:
             decay *= np.sqrt(decay)
         largest = max(largest, top * max(decay, far) * h * _weight(tolerances, m, n, h, state))
-    return SHARE * largest
+    return ERROR_FACTOR * largest
 
 
 @merged
 def _integrate(h, c, A, AA, a, q, v, q_end, v_end):
-    """Set q_end and v_end to the state at the time c h after (q, v), where the polynomial begins.
+    """Set q_end and v_end to the state at the time c h after the beginning of the polynomial, where it is (q, v).
 
     A and AA (S) are the weights of the accelerations in their integral and double integral.
     """
-    _combined(A, a, v_end)
-    _combined(AA, a, q_end)
+    _weighted_sum(A, a, v_end)
+    _weighted_sum(AA, a, q_end)
     for m in range(q.size):
         q_end[m] = q[m] + h * (c * v[m] + h * q_end[m])
         v_end[m] = v[m] + h * v_end[m]
@@ -181,7 +184,7 @@ def _integrate(h, c, A, AA, a, q, v, q_end, v_end):
 
 @compiled
 def _interpolate(j, c, left_out, a):
-    """Set the accelerations at node j to those of the polynomial through the nodes that are not left out."""
+    """Set a[j] to the value at node j of the polynomial through the accelerations at nodes that are not left out."""
     a[j, :] = 0.0
     for k in range(S):
         if left_out[k] == 0.0:
@@ -195,7 +198,7 @@ def _interpolate(j, c, left_out, a):
 
 @compiled
 def _widest_gap(c, c0, left_out):
-    """Return the longest part of [c0, 1] without an evaluated node; the polynomial extends over [0, 1]."""
+    """Return the length of the longest part of [c0, 1] without an evaluated node; the polynomial covers [0, 1]."""
     widest, before = 0.0, c0
     for k in range(S):
         if left_out[k] == 0.0 and c[k] > c0:
@@ -205,36 +208,40 @@ def _widest_gap(c, c0, left_out):
 
 @merged
 def _choose_partition_at_end(f, w, t, q, pivot, near):
-    """Choose the partition at the end of a step; return a code, SINGULAR if the end is too close to the position.
+    """Choose the partition at the end (t, q) of a step; return a code.
 
-    `pivot` is the smallest pivot at the beginning; `near` is the pivot below which nodes are left out.
+    The code is SINGULAR if the end is too close to the singular position. `pivot` is the smallest pivot at the
+    beginning of the step; `near` is the pivot below which nodes are left out.
     """
     code = renew_partition(f, w, t, q)
-    if code == DONE and w.notes[PIVOT] < max(NEARER * pivot, min(ENDS * near, pivot)):
+    if code == DONE and w.notes[PIVOT] < max(MIN_PIVOT_RATIO * pivot, min(END_MARGIN * near, pivot)):
         return SINGULAR
     return code
 
 
 @compiled
-def _weights_to_start(b, c, c0, to_v, to_q):
-    """Compute the weights (S) of the accelerations in their integral, to_v, and double integral, to_q, from 0 to c0."""
-    to_v[:] = 0.0
-    to_q[:] = 0.0
+def _weights_to_start(b, c, c0, weights_v, weights_q):
+    """Store the weights (S) of the accelerations in their integral from 0 to c0, and in their double integral.
+
+    The weights are stored in weights_v and weights_q.
+    """
+    weights_v[:] = 0.0
+    weights_q[:] = 0.0
     for i in range(S):
         for j in range(S):
             value = c0 * b[i]
             for k in range(S):
                 if k != j:
                     value *= (c0 * c[i] - c[k]) / (c[j] - c[k])
-            to_v[j] += value
-            to_q[j] += value * c0 * (1.0 - c[i])
+            weights_v[j] += value
+            weights_q[j] += value * c0 * (1.0 - c[i])
 
 
 @merged
-def _set_base(h, c0, to_v, to_q, a, q, v, q_0, v_0):
-    """Set q_0 and v_0 to the state at the beginning of the polynomial, whose state at c0 is q, v."""
-    _combined(to_v, a, v_0)
-    _combined(to_q, a, q_0)
+def _set_base(h, c0, weights_v, weights_q, a, q, v, q_0, v_0):
+    """Set q_0 and v_0 to the state at the beginning of the polynomial, so that its state at c0 is (q, v)."""
+    _weighted_sum(weights_v, a, v_0)
+    _weighted_sum(weights_q, a, q_0)
     for m in range(q.size):
         v_0[m] = v[m] - h * v_0[m]
         q_0[m] = q[m] - h * (c0 * v_0[m] + h * q_0[m])
@@ -242,7 +249,7 @@ def _set_base(h, c0, to_v, to_q, a, q, v, q_0, v_0):
 
 @compiled
 def _extrapolate(j, c, last, a):
-    """Set the accelerations at node j by extrapolation of the polynomial through the nodes `last` (-1: no node)."""
+    """Set a[j] to the value at node j of the polynomial through the accelerations at nodes `last` (-1: no node)."""
     a[j, :] = 0.0
     for k in last:
         if k >= 0:
@@ -255,30 +262,30 @@ def _extrapolate(j, c, last, a):
 
 
 @compiled
-def _evaluate(time, whole, b, c, a, q_0, v_0, to_v, to_q, q, v, acceleration):
-    """Set q, v and `acceleration` to those of the polynomial at `time`, s, after its beginning."""
-    place = time / whole
-    _weights_to_start(b, c, place, to_v, to_q)
-    _combined(to_v, a, v)
-    _combined(to_q, a, q)
+def _evaluate(time, duration, b, c, a, q_0, v_0, weights_v, weights_q, q, v, acceleration):
+    """Set q, v and `acceleration` to the values of the polynomial at `time`, s, after its beginning."""
+    fraction = time / duration
+    _weights_to_start(b, c, fraction, weights_v, weights_q)
+    _weighted_sum(weights_v, a, v)
+    _weighted_sum(weights_q, a, q)
     for m in range(q.size):
-        q[m] = q_0[m] + whole * (place * v_0[m] + whole * q[m])
-        v[m] = v_0[m] + whole * v[m]
+        q[m] = q_0[m] + duration * (fraction * v_0[m] + duration * q[m])
+        v[m] = v_0[m] + duration * v[m]
     acceleration[:] = 0.0
     for k in range(S):
         weight = 1.0
         for i in range(S):
             if i != k:
-                weight *= (place - c[i]) / (c[k] - c[i])
+                weight *= (fraction - c[i]) / (c[k] - c[i])
         for m in range(q.size):
             acceleration[m] += weight * a[k, m]
 
 
 @merged
 def _end_of_piece(f, w, t, near, options, tolerances, stage, state, new_state):
-    """Return the attempt that ends with the state [q, v, a] of `stage`, and compute `new_state`.
+    """Store the state [q, v, a] of `stage` in `new_state`, as the end of a step; return the attempt.
 
-    The state is projected onto the constraints, unless pivots there are below `near`.
+    The state is first projected onto the constraints, unless its smallest pivot is below `near`.
     """
     n = w.Q.size
     q, q1, v1 = state[:n], new_state[:n], new_state[n : 2 * n]
@@ -311,18 +318,18 @@ def state_at(memory, options, t):
     stored, n = memory[-N_STORED:], (memory.size - 3 * S - N_STORED) // (S + 7)
     b, _, c = options[N_SCALARS + 3 * S * S :].reshape((3, S))
     a, stage = memory[: S * n].reshape((S, n)), memory[S * n : (S + 5) * n].reshape((5, n))
-    place, whole, (q_0, v_0) = (t - stored[BEGIN]) / stored[WHOLE], stored[WHOLE], stage[3:]
+    fraction, duration, (q_0, v_0) = (t - stored[BEGIN]) / stored[DURATION], stored[DURATION], stage[3:]
     weights = np.array(
-        [_lagrange(c, x) for x in (*(place * c), place)]
+        [_lagrange(c, x) for x in (*(fraction * c), fraction)]
     )  # at Gauss nodes of the part before t, and at t
-    to_v = place * b @ weights[:-1]
-    to_q = place**2 * (b * (1.0 - c)) @ weights[:-1]
-    q, v = q_0 + whole * (place * v_0 + whole * (to_q @ a)), v_0 + whole * (to_v @ a)
+    weights_v = fraction * b @ weights[:-1]
+    weights_q = fraction**2 * (b * (1.0 - c)) @ weights[:-1]
+    q, v = q_0 + duration * (fraction * v_0 + duration * (weights_q @ a)), v_0 + duration * (weights_v @ a)
     return np.concatenate([q, v, weights[-1] @ a])
 
 
 def _lagrange(c, x):
-    """Return the values at x of the Lagrange polynomials of the nodes, (S)."""
+    """Return the values (S) at x of the Lagrange polynomials of the nodes c (S)."""
     factors = (x - c) / (c[:, None] - c + np.eye(S))
     np.fill_diagonal(factors, 1.0)
     return factors.prod(axis=1)
@@ -330,37 +337,37 @@ def _lagrange(c, x):
 
 @kernel(ATTEMPT)
 def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step: take a piece of the polynomial in `memory`, or if there is none, compute a polynomial."""
+    """Attempt a step: take a piece of the polynomial in `memory`, or if there is no polynomial, compute it."""
     n = w.Q.size
     q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
     A, AA, legendre = options[N_SCALARS : N_SCALARS + 3 * S * S].reshape((3, S, S))
     b, bA, c = options[N_SCALARS + 3 * S * S :].reshape((3, S))
-    a, stage, place = memory[: S * n].reshape((S, n)), memory[S * n : (S + 5) * n].reshape((5, n)), (S + 7) * n
+    a, stage, offset = memory[: S * n].reshape((S, n)), memory[S * n : (S + 5) * n].reshape((5, n)), (S + 7) * n
     q_stage, v_stage, a_stage, q_0, v_0 = stage[0], stage[1], stage[2], stage[3], stage[4]
-    left_out, to_v, to_q = memory[place : place + 3 * S].reshape((3, S))
-    stored = memory[place + 3 * S :]
+    left_out, weights_v, weights_q = memory[offset : offset + 3 * S].reshape((3, S))
+    stored = memory[offset + 3 * S :]
     largest_pivot, earliest, time_of_base = stored[LARGEST_PIVOT], stored[EARLIEST], stored[BASE]
     estimated, generated = tolerances[ESTIMATE] == 1.0, f.flags[STRAIGHT] == 1
-    near, whole = NEAR_LEAST, h
+    near, duration = NEAR_LEAST, h
     q_base, v_base = memory[(S + 5) * n : (S + 6) * n], memory[(S + 6) * n : (S + 7) * n]
     if estimated:
         near = near_share(tolerances)
-    if t + h <= stored[END] + ROUNDING * stored[WHOLE] + 4.0 * np.spacing(abs(t)):
-        begin, whole = stored[BEGIN], stored[WHOLE]
-        _evaluate(t + h - begin, whole, b, c, a, q_0, v_0, to_v, to_q, q_stage, v_stage, a_stage)
+    if t + h <= stored[END] + ROUNDING * stored[DURATION] + 4.0 * np.spacing(abs(t)):
+        begin, duration = stored[BEGIN], stored[DURATION]
+        _evaluate(t + h - begin, duration, b, c, a, q_0, v_0, weights_v, weights_q, q_stage, v_stage, a_stage)
         return _end_of_piece(f, w, t + h, near * largest_pivot, options, tolerances, stage, state, new_state)
     stored[END] = -np.inf
     if time_of_base <= t:
-        whole = t + h - time_of_base
+        duration = t + h - time_of_base
     else:
         copy(q, q_base)
         copy(v, v_base)
         if estimated:
-            whole = h + max(0.0, min(h * BACK / (1.0 - BACK), t - earliest))
-    begin, c0 = t + h - whole, (whole - h) / whole
+            duration = h + max(0.0, min(h * BACK / (1.0 - BACK), t - earliest))
+    begin, c0 = t + h - duration, (duration - h) / duration
     c_base = 0.0 if time_of_base <= t else c0  # time of the state `base`, relative to the polynomial
-    _weights_to_start(b, c, c_base, to_v, to_q)
-    n_back = 0  # number of nodes before the state from which the step begins
+    _weights_to_start(b, c, c_base, weights_v, weights_q)
+    n_back = 0  # number of nodes before the state `base`
     while n_back < S and c[n_back] < c_base:
         n_back += 1
     w.counters[N_OUTER] += 1
@@ -371,13 +378,13 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     left_out[:] = 0.0
     change_before, converged, moved, n_kept = np.inf, False, 0.0, S
     last_0, last_1, last_2 = -1, -1, -1  # nodes from which the first sweep extrapolates
-    for sweep in range(MOST):
+    for sweep in range(MAX_SWEEPS):
         change, moved = 0.0, 0.0
-        chooses = sweep in (0, 2, FEW)  # whether to choose anew which nodes are left out
-        if estimated and chooses and sweep == FEW:
-            near = min(FARTHER * near, NEAR_MOST)
+        chooses = sweep in (0, 2, FEW_SWEEPS)  # whether to choose anew which nodes are left out
+        if estimated and chooses and sweep == FEW_SWEEPS:
+            near = min(DISTANCE_FACTOR * near, NEAR_MOST)
         for i in range(S):
-            # in both directions from the beginning of the step, first backwards in time
+            # nodes in both directions from the state `base`, first backwards in time
             j = n_back - 1 - i if i < n_back else i
             if sweep == 0:
                 if i == n_back:
@@ -389,9 +396,9 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
                     for k in range(S):
                         if k >= j if i >= n_back else k <= j or k >= n_back:
                             _extrapolate(k, c, (last_0, last_1, last_2), a)
-            time = begin + c[j] * whole
-            _set_base(whole, c_base, to_v, to_q, a, q_base, v_base, q_0, v_0)
-            _integrate(whole, c[j], A[j], AA[j], a, q_0, v_0, q_stage, v_stage)
+            time = begin + c[j] * duration
+            _set_base(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
+            _integrate(duration, c[j], A[j], AA[j], a, q_0, v_0, q_stage, v_stage)
             code = DONE
             renews = not generated or chooses
             if chooses:
@@ -413,13 +420,13 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
                 if renews or w.notes[BY_GENERAL] == 0.0:
                     break
                 # pivots of the generated code were too small, and the general code used the partition of another
-                # stage: repeat the projection with a partition chosen here
+                # stage: repeat the projection with a partition chosen at this stage
                 renews, generated = True, False
-                _integrate(whole, c[j], A[j], AA[j], a, q_0, v_0, q_stage, v_stage)
+                _integrate(duration, c[j], A[j], AA[j], a, q_0, v_0, q_stage, v_stage)
                 code = renew_partition(f, w, time, q_stage)
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
-            _integrate(whole, c[j], A[j], AA[j], a, q_0, v_0, q1, v1)
+            _integrate(duration, c[j], A[j], AA[j], a, q_0, v_0, q1, v1)
             for m in range(n):
                 weight = _weight(tolerances, m, n, h, state)
                 change = max(change, h * abs(a_stage[m] - a[j, m]) * weight)
@@ -430,20 +437,20 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             return Attempt(OUTER_DIVERGED, np.inf, 0.0)
         if chooses:
             n_kept = S - int(left_out.sum())
-            if n_kept < S - MOST_LEFT_OUT:
+            if n_kept < S - MAX_LEFT_OUT:
                 return Attempt(SINGULAR, np.inf, 0.0)
-            if estimated and _widest_gap(c, c0, left_out) * whole > tolerances[GAP] * (1.0 + ROUNDING):
+            if estimated and _widest_gap(c, c0, left_out) * duration > tolerances[GAP] * (1.0 + ROUNDING):
                 return Attempt(OUTER_DIVERGED, np.inf, 0.0)
             for j in range(S):
                 if left_out[j] == 1.0:
                     _interpolate(j, c, left_out, a)
-        elif change <= LEFT or (sweep > 3 and STAGNANT * change_before <= change <= NOISE):
+        elif change <= CONVERGED_CHANGE or (sweep > 3 and STALL_RATIO * change_before <= change <= STALL_CHANGE):
             converged = True
             break
-        _set_base(whole, c_base, to_v, to_q, a, q_base, v_base, q_0, v_0)
-        # most rejections are due to this test of the end of the step, which is accurate enough after two sweeps
+        _set_base(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
+        # most rejected steps fail this test of their end, which is accurate enough after two sweeps
         if sweep == 1 and estimated:
-            _integrate(whole, 1.0, b, bA, a, q_0, v_0, q1, v1)
+            _integrate(duration, 1.0, b, bA, a, q_0, v_0, q1, v1)
             code = _choose_partition_at_end(f, w, t + h, q1, pivot, near * largest_pivot)
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
@@ -452,17 +459,17 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         return Attempt(OUTER_DIVERGED, np.inf, 0.0)
     error = 0.0
     if estimated:
-        error = max(_error(tolerances, h, state, legendre, a, n_kept), MOVED * moved)
+        error = max(_error(tolerances, h, state, legendre, a, n_kept), MOVED_WEIGHT * moved)
         if not error <= 1.0:
             return Attempt(DONE, error, 0.0)
-    _set_base(whole, c_base, to_v, to_q, a, q_base, v_base, q_0, v_0)
-    _integrate(whole, 1.0, b, bA, a, q_0, v_0, q1, v1)
+    _set_base(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
+    _integrate(duration, 1.0, b, bA, a, q_0, v_0, q1, v1)
     code = _choose_partition_at_end(f, w, t + h, q1, pivot, near * largest_pivot)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
-    if estimated:  # pieces of the polynomial are the steps that follow
-        stored[BEGIN], stored[WHOLE], stored[END] = begin, whole, t + h
-        return Attempt(DONE, FOUND, FOUND)
+    if estimated:  # the steps that follow are pieces of the polynomial
+        stored[BEGIN], stored[DURATION], stored[END] = begin, duration, t + h
+        return Attempt(DONE, REPEAT, REPEAT)
     copy(q1, q_stage)
     copy(v1, v_stage)
     return _end_of_piece(f, w, t + h, 0.0, options, tolerances, stage, state, new_state)

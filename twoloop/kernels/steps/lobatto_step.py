@@ -60,46 +60,47 @@ from twoloop.kernels.evaluation.inner_loop import check_redundant, project, rene
 from twoloop.kernels.evaluation.partition import MIN_CORRECTION
 from twoloop.kernels.linalg.dense import copy
 
-# indices in `options`. FREE: largest step size, in units of LOOK, at which nodes are close enough to detect short
-# forces; the defect of larger steps is evaluated between nodes
+# indices in `options`. FREE: step size, in units of tolerances[LOOK], above which the nodes are too far apart to detect
+# short forces, and the defect is evaluated between nodes
 THETA, N_ITERATED, N_ROWS, FREE, N_OPTIONS = range(5)
 
 START_CONTRACTION = 0.12  # target of the contraction rho in the first step, within the limits of collocation_code.py
 MAX_STARTS = 4  # largest number of guesses of the first step size
-DIVERGED_FACTOR = 0.6  # ratio of the next step size to that of a step that did not converge
-SAFETY = 0.75  # safety factor on the step size that the error allows
+DIVERGED_FACTOR = 0.6  # ratio of the next step size to the size of a step whose iteration did not converge
+SAFETY = 0.75  # factor on the step size that the error allows
 MAX_LIMITED = 24.0  # value of the field LIMITED at which another method takes over, because the motion is stiff
 MIN_CURVED = 0.1  # value of the field CURVED below which accelerations hardly vary within a step
-N_PARTS = 4  # number of equal parts of a step; at the points between them, pivots of C_q are checked
-MIN_PIVOT_RATIO = 0.4  # ratio of a pivot within a step to that at its beginning below which a singular position is near
-# tolerance below which another method takes over after a singular position: with this method, five more runs of A02
-# were wrong
+N_PARTS = 4  # number of equal parts of a step, between which the pivots of C_q are compared with those at its beginning
+MIN_PIVOT_RATIO = 0.4  # smallest ratio of these pivots; below it, a singular position is near
+# smallest tolerance with which this method goes on after a singular position: with smaller ones, five more runs of the
+# benchmark A02 were wrong, so another method takes over
 TIGHT_TOLERANCE = 1e-8
-# value of the field FAILURES at which another method takes over: a step that does not converge adds 2, an accepted step
-# subtracts 1
+# value of the field FAILURES at which another method takes over: a step whose iteration does not converge adds 2, an
+# accepted step subtracts 1
 MAX_FAILURES = 12.0
 CHECKED_GAP = 0.0908  # longest time between evaluations if the defect is evaluated between nodes, relative to the step
-N_EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3  # largest ratio of step sizes in the first N_EARLY steps, and after them
-GROWTH_AT_ONCE = 30.0  # largest ratio of step sizes after one of the first N_EARLY steps that took a single sweep
-LEAST_TREND = 0.4  # lower bound of the ratio of successive step sizes that the error allows, used to extrapolate them
-MAX_EXTRAPOLATION = 3.0  # upper bound of the step size that the error allows, relative to the actual step size
+# largest ratio of successive step sizes: GROWTH_EARLY in the first N_EARLY steps of a run, GROWTH in later steps
+N_EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
+GROWTH_ONE_SWEEP = 30.0  # replaces GROWTH_EARLY after a step that took only one sweep
+LEAST_TREND = 0.4  # smallest ratio of the step sizes that the errors of two successive steps allow, in extrapolations
+MAX_EXTRAPOLATION = 3.0  # largest ratio of the step size that the error allows to the actual step size
 _places = merged(places)
 
 
 def memory_size(n, n_iterated, n_rows):
-    """Return the length of `memory`, including LANES numbers for its alignment."""
+    """Return the length of `memory`, including LANES numbers for the alignment by `_aligned`."""
     return places(n, n_iterated, n_rows)[-1] + LANES
 
 
 @inlined
 def _aligned(memory):
-    """Return a view of `memory` from the first address on that is a multiple of the size of LANES numbers."""
+    """Return a view of `memory` that begins at the first address that is a multiple of the size of LANES numbers."""
     return memory[(-(memory.ctypes.data >> 3)) & (LANES - 1) :]
 
 
 @merged
 def _predict_from_rejected(f, data, state):
-    """After a step whose error was too large, let its polynomial predict the shorter step that replaces it."""
+    """Make the polynomial of a step whose error was too large predict the shorter step that replaces this step."""
     f.retry_nodes(data, state)
     if data[field.KEPT_DEGREE] == 0.0:
         data[field.KEPT_DEGREE] = max(data[field.DEGREE], 3.0)
@@ -108,9 +109,10 @@ def _predict_from_rejected(f, data, state):
 
 @compiled
 def _collocate(f, w, options, data, tolerances, t, h, state):
-    """Iterate the stages of a step; return the result of the iteration, the error, and the ratio of the next step to h.
+    """Solve for the stages of a step of size h; return a result, the error, and the ratio of the next step size to h.
 
-    The result is CONVERGED, REFUSED, GUESSED or NOT_COMPUTED, see data/collocation.py.
+    The result is CONVERGED, REFUSED, GUESSED or NOT_COMPUTED, see data/collocation.py. The error is in units of the
+    tolerances.
     """
     first, estimated = data[field.PREDICTS] == 0.0, tolerances[ESTIMATE] == 1.0
     h_max = tolerances[LOOK] / CHECKED_GAP
@@ -140,7 +142,7 @@ def _collocate(f, w, options, data, tolerances, t, h, state):
         return REFUSED, error, min(max(0.9 * data[field.FACTOR_OF_ERROR], 0.3), 0.9)
     max_factor = GROWTH_EARLY if data[field.N_STEPS] < N_EARLY else GROWTH
     if max_factor > GROWTH and m == 1:
-        max_factor = GROWTH_AT_ONCE
+        max_factor = GROWTH_ONE_SWEEP
     if h > options[FREE] * tolerances[LOOK] * (1.0 + SLACK):
         w.counters[N_EVALUATIONS] += LANES
         defect = f.audit_nodes(data, state, f.own_numbers)
@@ -154,7 +156,7 @@ def _collocate(f, w, options, data, tolerances, t, h, state):
         max_factor = min(max_factor, factor_by_defect)
     max_factor = min(max_factor, h_max / h)
     extra_sweeps = data[field.SWEEPS] - data[field.TARGETED]
-    # the motion may be stiff: accelerations hardly vary, and yet the step took almost its target number of sweeps
+    # accelerations hardly vary, but the step took at least its target number of sweeps less one: motion may be stiff
     limited = data[field.CURVED] < MIN_CURVED and extra_sweeps >= -1.0
     data[field.LIMITED] = max(0.0, data[field.LIMITED] + (1.0 if limited else -1.0))
     factor = data[field.FACTOR]
@@ -171,7 +173,7 @@ def _collocate(f, w, options, data, tolerances, t, h, state):
 
 @merged
 def _accept_polynomial(data):
-    """Let the polynomial of an accepted step predict the next step."""
+    """Make the polynomial of an accepted step predict the next step."""
     if data[field.KEPT_DEGREE] > 0.0:
         data[field.NEXT_DEGREE], data[field.KEPT_DEGREE] = data[field.KEPT_DEGREE], 0.0
     data[field.WHICH] = 1.0 - data[field.WHICH]
@@ -190,10 +192,10 @@ def _is_unsuited(w, data, tolerances):
 
 @compiled
 def _comes_near_singular(f, w, t, h, state, new_state):
-    """Return whether C_q is much closer to a loss of rank within a step than at its beginning.
+    """Return whether C_q is much closer to a loss of rank within a step than at the beginning of the step.
 
-    Then other steps have to cross the singular position: near it, stages that violate the constraints have wrong
-    accelerations. Positions within the step are those of the cubic through the states at its ends.
+    If it is, another method has to cross the singular position, near which stages that violate the constraints have
+    wrong accelerations. Positions within the step are those of the cubic through the states at both ends.
     """
     n, pivot = w.Q.size, w.notes[PIVOT]
     for k in range(1, N_PARTS):
@@ -209,7 +211,7 @@ def _comes_near_singular(f, w, t, h, state, new_state):
 
 @kernel(SETTLE)
 def settle_lobatto(f, w, options, memory, tolerances, accepted):
-    """Let the polynomial of an accepted attempt predict the next step, or discard the attempt."""
+    """Make the polynomial of an accepted attempt predict the next step, or discard a rejected attempt."""
     data = _aligned(memory)
     if accepted and data[field.TRIED] == 1.0:
         _accept_polynomial(data)
@@ -218,7 +220,7 @@ def settle_lobatto(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt one step and project its end onto the constraints."""
+    """Attempt one step, whose end is projected onto the constraints."""
     data, n = _aligned(memory), w.Q.size
     data[field.TRIED] = 0.0
     if tolerances[ESTIMATE] == 1.0 and _is_unsuited(w, data, tolerances):
@@ -245,9 +247,10 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
 
 @merged
 def _project_all(f, w, options, data, n, n_ends, out_t, out_state):
-    """Project the first n_ends states in `out_state` onto the constraints, one in each lane, in `data`.
+    """Copy the first n_ends rows of `out_state` to one lane each of `data`, and project them onto the constraints.
 
-    Also compute their accelerations and multipliers. FINE is 1 in lanes whose projection converged.
+    The accelerations and multipliers of the projected states are computed, too. FINE becomes 1 in lanes whose
+    projection converges, otherwise 0.
     """
     ends = _places(n, int(options[N_ITERATED]), int(options[N_ROWS]))[5]
     for k in range(LANES):
@@ -274,10 +277,11 @@ def _project_all(f, w, options, data, n, n_ends, out_t, out_state):
 
 @merged
 def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, state):
-    """Replace `row` and `state` by the projection in lane k; return whether it changed them within the tolerances.
+    """Copy the projection in lane k to `row` and `state`; return False instead if it is invalid.
 
-    If constraints depend on time (`driven`), the change of velocities is checked, too: a large one may be due to a
-    discontinuity of the drive between the nodes, see discontinuities.py.
+    It is invalid if it failed, if it changes positions in `row` by more than the tolerances, or if redundant rows do
+    not hold. If constraints depend on time (`driven`), the change of velocities is checked, too: a large one may be due
+    to a discontinuity of the drive between the nodes, see discontinuities.py.
     """
     _, _, _, _, _, ends, end_a, lam, _ = _places(n, int(options[N_ITERATED]), int(options[N_ROWS]))
     if data[field.FINE + k] == 0.0:
@@ -314,7 +318,10 @@ def _may_continue(w, data, tolerances, control, clock, h):
 
 @merged
 def _take_steps(f, w, options, data, tolerances, control, clock, goal, state, n_most, out_t, out_state, out_steps):
-    """Take at most n_most steps in a row, without a projection of their ends; return their number."""
+    """Take at most n_most steps in a row without projecting their ends; return the number of steps.
+
+    Stores the ends in out_t and out_state, the step sizes in out_steps, and the last end in `state`.
+    """
     n, t, n_ends = w.Q.size, clock[at.T], 0
     while n_ends < n_most and t < goal:
         h_wanted = min(clock[at.H_NEXT], control[at.MAX_STEP])
@@ -348,8 +355,8 @@ def lobatto_steps(
 ):
     """Take at most LANES steps in a row, and project their ends together; return the number of accepted steps.
 
-    A group of steps ends when the number of accepted steps of the run is a multiple of LANES. So the groups, and the
-    results, do not depend on where the integrator pauses.
+    A group of steps ends when the number of accepted steps of the run is a multiple of LANES. So the groups and the
+    results do not depend on the times at which the integrator pauses.
     """
     data, n = _aligned(memory), w.Q.size
     if out_t.size < LANES or w.notes[NEARLY_SINGULAR] == 1.0:
