@@ -62,9 +62,10 @@ BACK = 0.4  # fraction of the polynomial that lies before the beginning of the s
 ORDER, ERROR_FACTOR = 12.0, 0.5  # order of the estimated error, and factor on the estimate
 MOVED_WEIGHT = 0.5  # factor on the largest change of a stage by its projection, which counts as an error of the step
 ROUNDING = 1e-13  # relative tolerance of the iteration in steps of fixed size, and of comparisons of times
-# smallest allowed ratio of the pivot at the end of a step to the pivot at the beginning. A pivot at the end that is
-# smaller than at the beginning must also be at least END_MARGIN times the pivot below which nodes are left out
-MIN_PIVOT_RATIO, END_MARGIN = 0.5, 4.0
+MIN_PIVOT_RATIO = 0.5  # smallest allowed ratio of the pivot at the end of a step to the pivot at the beginning
+# smallest allowed ratio of the pivot at the end of a step to the pivot below which nodes are left out; the pivot may be
+# smaller if it is not smaller than at the beginning
+END_MARGIN = 4.0
 REPEAT = 2.0  # error and factor returned with a new polynomial, so that the step is repeated: it takes a piece of it
 TINY = 1e-300  # lower bound of divisors that may be zero
 

@@ -1,4 +1,4 @@
-"""Step of an explicit Runge-Kutta method for (q_i, v_i): each stage is one evaluation, and there is no outer loop.
+"""Step of an explicit Runge-Kutta method for (q_i, v_i): each stage is fine_error evaluation, and there is no outer loop.
 
 The first stage is the state at the beginning of the step, and two embedded formulas estimate the error. By default, the
 inner loop computes the dependent coordinates of every stage, so that all stages satisfy the constraints. With FREE,
@@ -15,15 +15,15 @@ from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, LEAST, N_OUTER, N
 from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_as_given, evaluate_state, project
 from twoloop.kernels.linalg.dense import copy
 
-# indices of the scalars in `options`; then follow A (s, s), b (s), c (s) and the weights of the two error estimates (s
-# each). FREE: 1 if stages are not projected
+# indices of the scalars in `options`. The scalars are followed by A (s, s), b (s), c (s) and the weights of the two
+# error estimates (s each). FREE: 1 if stages are not projected
 STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)
-# numbers of the vectors in `memory`; then follow the slopes of the stages. Vectors and slopes have 2 n_q numbers each,
-# padded to a multiple of BLOCK
+# indices of the vectors in `memory`. The vectors are followed by the slopes of the stages. A vector or slope has 2 n_q
+# numbers, padded to a multiple of BLOCK
 STAGE, FINE, COARSE, N_VECTORS = range(4)
-BLOCK = 8  # number of sums that `_weighted` accumulates in registers
-# factor on errors once the run has come near a singular position, because phase errors grow at each such position; the
-# factor makes no tolerance smaller than LEAST_STRICT
+BLOCK = 8  # number of sums that `_weighted_sum` accumulates in registers
+# factor on the error estimate once the run has come near a singular position, because phase errors grow at each such
+# position; the factor is reduced if the smallest tolerance over the factor would be below LEAST_STRICT
 STRICT, LEAST_STRICT = 10.0, 1e-11
 
 
@@ -58,7 +58,7 @@ def memory_size(s: int, n_q: int) -> int:
 
 @inlined
 def _width(n):
-    """Return the padded length of a vector of 2 n numbers."""
+    """Return 2 n, rounded up to a multiple of BLOCK."""
     return (2 * n + BLOCK - 1) // BLOCK * BLOCK
 
 
@@ -74,20 +74,20 @@ def tableau_of(options):
 
 @inlined
 def _vector(memory, n, which):
-    """Return a view of vector number `which`, such as STAGE, of `memory`."""
+    """Return a view (2 n padded) of vector `which`, such as STAGE, of `memory`."""
     return memory[which * _width(n) : (which + 1) * _width(n)]
 
 
 @inlined
 def _slopes(memory, s, n):
-    """Return a view (s, 2 n padded) of the slopes: velocities, then accelerations, of each stage."""
+    """Return a view (s, 2 n padded) of the slopes in `memory`: the velocities and the accelerations of each stage."""
     begin = N_VECTORS * _width(n)
     return memory[begin : begin + s * _width(n)].reshape((s, _width(n)))
 
 
 @compiled
-def _weighted(weights, slopes, total):
-    """Compute the sum of weights[k] slopes[k] over k into `total`, BLOCK entries at a time."""
+def _weighted_sum(weights, slopes, total):
+    """Store the sum of weights[k] slopes[k] over k in `total`, BLOCK entries at a time."""
     for m in range(0, total.size, BLOCK):
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
         for k in range(weights.size):
@@ -111,31 +111,31 @@ def _weighted(weights, slopes, total):
 
 
 @compiled
-def _move(y, h, weights, slopes, total, y1):
-    """Compute y1 = y + h sum_k weights[k] slopes[k]; `total` is scratch. Adding y last rounds it only once."""
-    _weighted(weights, slopes, total)
+def _advance(y, h, weights, slopes, total, y1):
+    """Set y1 to y + h sum_k weights[k] slopes[k]; `total` is scratch. Adding y last leads to a single rounding."""
+    _weighted_sum(weights, slopes, total)
     for m in range(y.size):
         y1[m] = y[m] + h * total[m]
 
 
 @compiled
-def largest_error(tolerances, y, y1, one, other, strict):
-    """Return the error e^2 / sqrt(e^2 + d^2), where e and d are the largest components of the two estimates.
+def largest_error(tolerances, y, y1, fine_error, coarse_error, strict):
+    """Return the error e^2 / sqrt(e^2 + d^2) of a step, in units of the tolerances.
 
-    The estimates `one` and `other` (2 n) are for all positions and velocities, and relative to atol + rtol |y|. Formed
-    for each component, the expression would be e, of low order, where d passes through zero: up to 30 % more
-    evaluations. If `strict`, return e^(3/2) / (e^2 + d^2)^(1/4): near a singular position terms of high order are not
-    small (an error of 47 tolerances was estimated as 1.4).
+    e and d are the largest components of the estimates `fine_error` and `coarse_error` (2 n) of positions and
+    velocities, relative to atol + rtol |y|. For each component separately, the error would be e, of low order, where d
+    passes through zero, at the cost of up to 30 % more evaluations. If `strict`, return e^(3/2) / (e^2 + d^2)^(1/4):
+    near a singular position, terms of high order are not small (an error of 47 tolerances was estimated as 1.4).
     """
-    n = one.size // 2
+    n = fine_error.size // 2
     rtol = tolerances[RTOL]
     e = e_v = d = d_v = 0.0
     for m in range(n):
         k, atol = n + m, tolerances[ATOL + m]
-        share = 1.0 / (atol + rtol * max(abs(y[m]), abs(y1[m])))
-        share_v = 1.0 / (atol + rtol * max(abs(y[k]), abs(y1[k])))
-        e, e_v = max(e, abs(one[m] * share)), max(e_v, abs(one[k] * share_v))
-        d, d_v = max(d, abs(other[m] * share)), max(d_v, abs(other[k] * share_v))
+        weight = 1.0 / (atol + rtol * max(abs(y[m]), abs(y1[m])))
+        weight_v = 1.0 / (atol + rtol * max(abs(y[k]), abs(y1[k])))
+        e, e_v = max(e, abs(fine_error[m] * weight)), max(e_v, abs(fine_error[k] * weight_v))
+        d, d_v = max(d, abs(coarse_error[m] * weight)), max(d_v, abs(coarse_error[k] * weight_v))
     e, d = max(e, e_v), max(d, d_v)
     if e == 0.0:
         return 0.0
@@ -144,27 +144,27 @@ def largest_error(tolerances, y, y1, one, other, strict):
 
 
 @compiled
-def _error(tolerances, h, fine, coarse, y, y1, slopes, one, other, strict):
-    """Return the error of a step from y to y1 over the tolerances; `one` and `other` are scratch."""
-    _weighted(fine, slopes, one)
-    _weighted(coarse, slopes, other)
+def _error(tolerances, h, fine, coarse, y, y1, slopes, fine_error, coarse_error, strict):
+    """Return the error of a step from y to y1, in units of the tolerances; overwrite `fine_error`, `coarse_error`."""
+    _weighted_sum(fine, slopes, fine_error)
+    _weighted_sum(coarse, slopes, coarse_error)
     for m in range(y.size):
-        one[m] *= h
-        other[m] *= h
-    return largest_error(tolerances, y, y1, one[: y.size], other[: y.size], strict)
+        fine_error[m] *= h
+        coarse_error[m] *= h
+    return largest_error(tolerances, y, y1, fine_error[: y.size], coarse_error[: y.size], strict)
 
 
 @kernel(ATTEMPT, vectorized=True)
 def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step; if its error is above 1, return without the accelerations at the end of the step."""
+    """Attempt a step; if its error is above 1, the accelerations at its end are not computed."""
     s, A, b, c, fine, coarse = tableau_of(options)
     n = w.Q.size
     q, v, y, y1 = state[:n], state[n : 2 * n], state[: 2 * n], new_state[: 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    stage, one, other = _vector(memory, n, STAGE), _vector(memory, n, FINE), _vector(memory, n, COARSE)
+    stage, fine_error, coarse_error = _vector(memory, n, STAGE), _vector(memory, n, FINE), _vector(memory, n, COARSE)
     slopes = _slopes(memory, s, n)
-    # near a singular position stages are projected: it matters on which side of this position a stage is, and how
-    # accurate its velocities are
+    # near a singular position stages are projected, because it matters on which side of this position a stage is, and
+    # how accurate its velocities are
     is_near = options[FREE] == 1.0 and w.notes[NEARLY_SINGULAR] != 0.0
     free = options[FREE] == 1.0 and not is_near
     ratio_to_gap = gap_ratio(tolerances, h)
@@ -173,7 +173,9 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.counters[N_OUTER] += 1
     copy(state[n : 3 * n], slopes[0])
     for j in range(1, s):
-        _move(y, h, A[j, :j], slopes, stage, stage)  # entries of dependent coordinates: start values of Newton's method
+        _advance(
+            y, h, A[j, :j], slopes, stage, stage
+        )  # entries of dependent coordinates: start values of Newton's method
         v_stage, a_stage = slopes[j, :n], slopes[j, n : 2 * n]
         copy(stage[n : 2 * n], v_stage)
         if free:
@@ -182,10 +184,10 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
             code = evaluate(f, w, t + c[j] * h, stage[:n], v_stage, options[INNER_TOL], a_stage)
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
-    _move(y, h, b, slopes, stage, y1)
+    _advance(y, h, b, slopes, stage, y1)
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
-        error = _error(tolerances, h, fine, coarse, y, y1, slopes, one, other, is_near)
+        error = _error(tolerances, h, fine, coarse, y, y1, slopes, fine_error, coarse_error, is_near)
         if is_near:
             error *= min(max(tolerances[LEAST] / LEAST_STRICT, 1.0), STRICT)
         if not error <= 1.0:

@@ -5,7 +5,7 @@ and of order k + 1 of v, follow from all lower ones: they solve
 
     M_0 a_k + G_0^T lam_k = r_k,    G_0 a_k = c_k,
 
-with the matrix of the accelerations at the beginning of the step. This matrix is factored already: each order takes one
+whose matrix has already been factored for the accelerations at the beginning of the step. Each order requires one
 solution, and no derivatives of the constraints beyond G (J. D. Pryce's structural analysis, BIT 41 (2001), 364-394,
 finds these orders for any equations). The parts of r and c that depend on G, M and Q are computed by a program, see
 `twoloop.generate.series`, with recurrences for Taylor coefficients (R. E. Moore, Interval Analysis (1966), ch. 11).
@@ -55,30 +55,31 @@ from twoloop.kernels.evaluation.tasks import EVALUATE_AS_GIVEN, SOLVE
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.linalg.saddle_point import solve_both
 
-# indices of the scalars in `options`; then follow the offsets of the arrays of the program, and these arrays, integers
-# as bit patterns. ORDER: order of the series of q; KEEP: 1 if consecutive steps evaluate the series about the first
-# state, to interpolate within a step
+# indices of the scalars in `options`. The scalars are followed by the offsets of the program's arrays, and by these
+# arrays, with integers as bit patterns. ORDER: order of the series of q; KEEP: 1 if consecutive steps evaluate the
+# series about the first state, to interpolate within a step
 ORDER, THETA, N_NODES, EARLY_WIDTH, LATE_WIDTH, KEEP, N_SCALARS = range(7)
-# numbers of the arrays of a table of operations, and of a list of sums, see `Sums` in twoloop.generate.series
+# indices of the arrays of a table of operations, and of a list of sums, see `Sums` in twoloop.generate.series
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
-PLACES = N_SUMS  # number of the array after those of a list of sums: indices of the entries in which sums are stored
+PLACES = N_SUMS  # index of the array, after those of a list of sums, with the indices at which the sums are stored
 EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
 BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
 KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)  # columns of GROUPS
 
-# indices of the scalars in `memory`; then follow two series of q (ORDER + 1, n_q), and scratch, see arrays_of
+# indices of the scalars in `memory`. The scalars are followed by two series of q (ORDER + 1, n_q each), and by the
+# arrays of `arrays_of`
 (
-    KNOWN,  # 1: series number WHICH has been computed
-    WHICH,  # index of the series about the state
-    UNIT,  # unit of time of each series, s
+    KNOWN,  # 1: series WHICH has been computed
+    WHICH,  # index, 0 or 1, of the series about the beginning of the step
+    UNIT,  # unit of time of series WHICH, s
     NEXT_UNIT,
-    LENGTH,  # length of the step that each series allows, in its unit
+    LENGTH,  # step size that series WHICH allows, in units of UNIT
     NEXT_LENGTH,
-    TRIED,  # 1: the last attempt stored a series, which replaces the other one if the attempt was accepted
-    PASSED,  # with KEEP: time since the state of the series, s
-    TARGET,  # index of the series that is computed
-    # last ratio of a step size to LENGTH that the distance of its end from the constraints allowed; 0: not known
+    TRIED,  # 1: the last attempt computed the other series, which becomes series WHICH if the attempt is accepted
+    PASSED,  # with KEEP = 1: time since the state about which the series is, s
+    TARGET,  # index of the series that `expand` computes
+    # ratio to LENGTH of the step size that the last distance of an end from the constraints allowed; 0: not known
     SHORTER,
     ATTEMPTS,  # number of attempts, from which the times at which the defect is evaluated follow
     SUSPECTED,  # 1: a step was rejected because of its defect at the time SUSPECT, s, which the run has not passed yet
@@ -95,8 +96,8 @@ def memory_size(order: int, n_q: int, n_rows: int, n_nodes: int, early: int, lat
 
 
 @inlined
-def accelerations_found(memory, n):
-    """Return a view (n) of the last numbers of `memory`: accelerations according to the series."""
+def series_accelerations(memory, n):
+    """Return a view of the last n numbers of `memory`, which contain accelerations computed from the series."""
     return memory[memory.size - n :]
 
 
@@ -113,14 +114,14 @@ def _numbers(options, which):
 
 @inlined
 def series_of(memory, order, n, which):
-    """Return series 0 or 1 of q as a vector, row by row; views of two dimensions would cost a function call each."""
+    """Return a flat view of series `which`, 0 or 1, of q; a view of two dimensions would cost a function call."""
     begin = N_MEMORY_SCALARS + int(which) * (order + 1) * n
     return memory[begin : begin + (order + 1) * n]
 
 
 @merged
 def interior(X, Y, K, total):
-    """Compute total[m] = sum over 0 < j < K of X[j, m] Y[K - j, m]."""
+    """Store the sum of X[j, m] Y[K - j, m] over 0 < j < K in total[m], for eight m at once."""
     for m in range(0, total.size, 8):
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
         for j in range(1, K):
@@ -145,7 +146,7 @@ def interior(X, Y, K, total):
 
 @merged
 def _gather(options, sums, groups, g, more, values, out):
-    """Compute the arguments of group g of operations, without their constants, from `values` into `out`."""
+    """Store the arguments, sums of `values`, of the operations of group g in `out`, without their constants."""
     column, coefficient = _integers(options, sums + COLUMN), _numbers(options, sums + COEFFICIENT)
     for o in range(groups[g + BEGIN], groups[g + END]):
         out[o] = coefficient[o] * values[column[o]]
@@ -157,7 +158,7 @@ def _gather(options, sums, groups, g, more, values, out):
 
 @merged
 def _sum(options, sums, scale, values, out):
-    """Compute `scale` times all sums of a list, without their constants, into the entries of `out` listed for them."""
+    """Store `scale` times all sums of `values` in a list, without their constants, in `out` at the indices PLACES."""
     column, coefficient = _integers(options, sums + COLUMN), _numbers(options, sums + COEFFICIENT)
     places = _integers(options, sums + PLACES)
     for o in range(column.size):
@@ -170,7 +171,7 @@ def _sum(options, sums, scale, values, out):
 
 @compiled
 def begin_operations(options, table, values, z, x, y):
-    """Compute order 0 of the results z and of the arguments x and y of the operations of a table.
+    """Store the Taylor coefficients of order 0 of the results z and the arguments x and y of a table of operations.
 
     Pending products, whose second factor depends on the accelerations, are set to zero.
     """
@@ -207,8 +208,11 @@ def begin_operations(options, table, values, z, x, y):
 
 
 @merged
-def _operate(options, table, K, values, z, x, y, x0, y0, total):
-    """Compute order K > 0 of the operations of a table; for pending products, only the part that is known already."""
+def _next_coefficients(options, table, K, values, z, x, y, x0, y0, total):
+    """Store the Taylor coefficients of order K > 0 of the results z and arguments of a table of operations.
+
+    The second factor of a pending product is not yet known to order K: the term with this coefficient is left out.
+    """
     groups = _integers(options, table + GROUPS)
     inverse = 1.0 / K
     for g in range(0, groups.size, N_GROUP):
@@ -249,14 +253,14 @@ def _operate(options, table, K, values, z, x, y, x0, y0, total):
 
 @merged
 def _complete(options, table, values, y):
-    """Compute the second factors of pending products."""
+    """Store the second factors of pending products in y, from `values` that include the accelerations."""
     groups = _integers(options, table + GROUPS)
     _gather(options, table + SECOND, groups, groups.size - N_GROUP, MORE_SECOND, values, y)
 
 
 @inlined
 def arrays_of(options, memory, n, n_rows):
-    """Return views of `memory`: coefficients of quantities and of arguments of operations, sums of products, r, c."""
+    """Return views of `memory`: coefficients N of quantities, X1 to Y2 of arguments, sums of products, r and c."""
     n_nodes, early, late = int(options[N_NODES]), int(options[EARLY_WIDTH]), int(options[LATE_WIDTH])
     order = int(options[ORDER])
     depth = order + 2
@@ -280,7 +284,7 @@ def arrays_of(options, memory, n, n_rows):
 
 @merged
 def begin_series(options, t, unit, state, N, series, first, x, y, r, c):
-    """Set orders 0 and 1 of t, q and v, compute order 0 of the early operations, and set r and c to zero."""
+    """Set the coefficients of t and q to order 1, of v and of early operations to order 0; set r and c to zero."""
     n = r.size
     r[:], c[:] = 0.0, 0.0
     N[0, 0], N[1, 0] = t, unit
@@ -293,7 +297,7 @@ def begin_series(options, t, unit, state, N, series, first, x, y, r, c):
 
 @merged
 def take_order(K, unit, N, series, a):
-    """Compute velocities of order K and positions of order K + 1 from accelerations of order K - 1."""
+    """Store the coefficients of order K of v and K + 1 of q, computed from those of order K - 1 of accelerations, a."""
     n = a.size
     per_v, per_q = unit / K, unit / (K + 1)
     for j in range(n):
@@ -315,7 +319,10 @@ def end_series(w, order, series):
 
 @compiled
 def expand(f, w, options, memory, t, state, unit):
-    """Compute the series about `state` at t in units of `unit`, s; return a code. w has the factors for this state."""
+    """Store series TARGET, about `state` at t, in units of `unit`, s; return a code.
+
+    `w` must contain the factors of the linear equations of accelerations at this state.
+    """
     n, n_rows, order = w.Q.size, w.Rate.size, int(options[ORDER])
     N, X1, Y1, X2, Y2, total1, total2, r, c = arrays_of(options, memory, n, n_rows)
     series = series_of(memory, order, n, memory[TARGET])
@@ -330,13 +337,13 @@ def expand(f, w, options, memory, t, state, unit):
         if K > 1:
             N[K, 0] = 0.0
         interior(X1, Y1, K, total1)
-        _operate(options, EARLY, K, N[K], N[K, first:], X1[K], Y1[K], X1[0], Y1[0], total1)
+        _next_coefficients(options, EARLY, K, N[K], N[K, first:], X1[K], Y1[K], X1[0], Y1[0], total1)
         _sum(options, ROWS, -K / unit, N[K], c)
         if k == 0:
             begin_operations(options, LATE, N[0], N[0, second:], X2[0], Y2[0])
         else:
             interior(X2, Y2, k, total2)
-            _operate(options, LATE, k, N[k], N[k, second:], X2[k], Y2[k], X2[0], Y2[0], total2)
+            _next_coefficients(options, LATE, k, N[k], N[k, second:], X2[k], Y2[k], X2[0], Y2[0], total2)
         _sum(options, BALANCE, 1.0, N[k], r)
         if k == 0:
             for o in range(places.size):
@@ -354,14 +361,15 @@ def expand(f, w, options, memory, t, state, unit):
     return end_series(w, order, series)
 
 
-# target of the distance of the end of a step from the constraints before its projection, over the tolerances
-ALLOWED = 0.3
-# a defect up to MAX_NOISE, over the tolerances, counts as a rounding error if it is at most NOISE_RATIO times the
-# defect near the beginning of the step, where the series is exact
+# distance of the end of a step from the constraints, before its projection, for which step sizes are chosen, in units
+# of what `departure` allows
+TARGET_DISTANCE = 0.3
+# a defect up to MAX_NOISE, in units of the allowed defect, counts as a rounding error if it is at most NOISE_RATIO
+# times the defect near the beginning of the step, where the series is exact
 MAX_NOISE, NOISE_RATIO = 1e4, 10.0
 NEAR_BEGIN = 1e-5  # time after the beginning of a step, relative to the step, within which no force changes
 GOLDEN = 0.6180339887498949  # fractional parts of its multiples are evenly distributed between 0 and 1
-MAX_DEFECT = 1e300  # replaces an infinite defect, if a function has no value within the step
+MAX_DEFECT = 1e300  # replaces an infinite defect, in a step within which a function has no value
 MIN_FACTOR = 0.1  # smallest ratio of the next step size to that of a step rejected because of its defect
 GROWTH = 5.0  # largest ratio of successive step sizes: the unit of the coefficients is the previous step size
 MAX_FIRST_FACTOR = 1e6  # largest ratio of the first step size to its guess, so that no power of it overflows
@@ -369,12 +377,12 @@ TOO_SHORT = 2.0  # error that rejects a first step because the series allows a l
 
 
 @merged
-def _find_series(f, w, options, memory, t, state, unit, which):
-    """Compute the series about `state` at t, which was projected last, as series number `which`; return a code."""
+def _compute_series(f, w, options, memory, t, state, unit, which):
+    """Store series `which`, about `state` at t, the state projected last; return a code."""
     n = w.Q.size
     memory[TARGET] = which
     if f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0:  # generated code leaves no factors in w
-        q, v, a = state[:n], state[n : 2 * n], accelerations_found(memory, n)
+        q, v, a = state[:n], state[n : 2 * n], series_accelerations(memory, n)
         code = f.general(f, w, EVALUATE_AS_GIVEN, t, q, v, 0.0, a, w.lam)
         if code != DONE:
             return code
@@ -382,7 +390,7 @@ def _find_series(f, w, options, memory, t, state, unit, which):
 
 
 @merged
-def _length(tolerances, series, unit, order, n):
+def _allowed_step(tolerances, series, unit, order, n):
     """Return the step size, in units of `unit`, at which the last two terms of the series equal the tolerances."""
     rtol, last, before = tolerances[RTOL], 0.0, 0.0
     row, row_before = order * n, (order - 1) * n
@@ -402,9 +410,9 @@ def _length(tolerances, series, unit, order, n):
 
 @merged
 def _evaluate(series, unit, order, x, q, v, a):
-    """Evaluate q, v and a (n each) at x units of time by Horner's scheme, four or two coordinates at a time.
+    """Set q, v and a (n each) to the values of a series after x units of time, by Horner's scheme.
 
-    The recurrence for the second derivative yields half of this derivative.
+    Four or two coordinates are evaluated at once. The recurrence for the second derivative yields half of it.
     """
     n, per_unit = q.size, 1.0 / unit
     twice = 2.0 * per_unit * per_unit
@@ -437,17 +445,17 @@ def _evaluate(series, unit, order, x, q, v, a):
 
 @compiled
 def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
-    """Return the defect at t + s h over the allowed defect, or infinity if it cannot be evaluated."""
-    found = accelerations_found(memory, q.size)
-    _evaluate(series, memory[UNIT], order, s * h / memory[UNIT], q, v, found)
+    """Return the ratio of the defect at t + s h to the allowed defect, or infinity if it cannot be evaluated."""
+    series_a = series_accelerations(memory, q.size)
+    _evaluate(series, memory[UNIT], order, s * h / memory[UNIT], q, v, series_a)
     if evaluate_as_given(f, w, t + s * h, q, v, a) != DONE:
         return np.inf
-    return defect_ratio(tolerances, h, order, found, a, q, v)
+    return defect_ratio(tolerances, h, order, series_a, a, q, v)
 
 
 @compiled
 def _is_noise(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
-    """Return whether a defect is a rounding error: it is as large near the beginning, where the series is exact."""
+    """Return whether `defect` is a rounding error: it is as large near the beginning, where the series is exact."""
     if defect > MAX_NOISE:
         return False
     noise = 0.0
@@ -458,16 +466,16 @@ def _is_noise(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
 
 @compiled
 def _defect_within(f, w, memory, t, h, tolerances, series, order, q, v, a):
-    """Return a defect within the step for which it has to be rejected, or 0; record the largest defect.
+    """Return the first defect within the step that is too large, or 0; store the largest allowed defect in w.notes.
 
     The defect is evaluated at times that differ from attempt to attempt, and at the time SUSPECT.
     """
     look, shift = tolerances[LOOK], memory[ATTEMPTS] * GOLDEN % 1.0
-    n_places = 0
+    n_points = 0
     if h > look:
-        n_places = int(np.ceil(h / look))
-    for k in range(-1, n_places):
-        s = (k + shift) / n_places if k >= 0 else (memory[SUSPECT] - t) / h
+        n_points = int(np.ceil(h / look))
+    for k in range(-1, n_points):
+        s = (k + shift) / n_points if k >= 0 else (memory[SUSPECT] - t) / h
         if k < 0 and not (memory[SUSPECTED] == 1.0 and 0.0 < s < 1.0):
             continue
         defect = _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a)
@@ -482,13 +490,13 @@ def _defect_within(f, w, memory, t, h, tolerances, series, order, q, v, a):
 
 @merged
 def _shrink_factor(defect, order):
-    """Return the ratio of the next step size to that of a step rejected because of its defect."""
+    """Return the ratio of the next step size to the size of a step rejected because of its defect."""
     return max(MIN_FACTOR, 0.9 * defect ** (-1.0 / order))
 
 
 @kernel(SETTLE)
 def settle_taylor(f, w, options, memory, tolerances, accepted):
-    """Make the series about the end of an accepted step that of the next step."""
+    """Make the series about the end of an accepted step series WHICH, with which the next step is taken."""
     if accepted and memory[TRIED] == 1.0:
         memory[WHICH] = 1.0 - memory[WHICH]
         memory[UNIT], memory[LENGTH] = memory[NEXT_UNIT], memory[NEXT_LENGTH]
@@ -497,7 +505,7 @@ def settle_taylor(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step by the series about its beginning; the series about its end determines the next step size."""
+    """Attempt a step by the series about its beginning; the series about its end limits the size of the next step."""
     n, order, estimated = w.Q.size, int(options[ORDER]), tolerances[ESTIMATE] == 1.0
     q, v = state[:n], state[n : 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
@@ -506,17 +514,17 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
         copy(state, new_state)
         code = project(f, w, t, q1, v1, options[THETA], a1, lam1)
         if code == DONE:
-            code = _find_series(f, w, options, memory, t, new_state, h, memory[WHICH])
+            code = _compute_series(f, w, options, memory, t, new_state, h, memory[WHICH])
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
         memory[KNOWN], memory[UNIT] = 1.0, h
         if estimated:
-            memory[LENGTH] = _length(tolerances, series_of(memory, order, n, memory[WHICH]), h, order, n)
+            memory[LENGTH] = _allowed_step(tolerances, series_of(memory, order, n, memory[WHICH]), h, order, n)
             if memory[LENGTH] > GROWTH:
                 return Attempt(DONE, TOO_SHORT, min(memory[LENGTH], MAX_FIRST_FACTOR))
     series, unit = series_of(memory, order, n, memory[WHICH]), memory[UNIT]
     x = (memory[PASSED] + h) / unit
-    error, checked, found = 0.0, False, accelerations_found(memory, n)
+    error, checked, series_a = 0.0, False, series_accelerations(memory, n)
     if estimated:
         error = x / memory[LENGTH]  # an upper limit: the estimated error is a power of this ratio
         if error > 1.0 + SLACK:
@@ -525,9 +533,9 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
         singular = w.notes[NEARLY_SINGULAR] != 0.0  # True from the first singular position on
         checked = w.notes[NEAR_NOW] == 0.0  # near a singular position, accelerations off the constraints are useless
         w.notes[NEAR_NOW] = 0.0 if checked else 2.0
-        longer = gap_ratio(tolerances, h)
-        if longer > 0.0 and singular:
-            return Attempt(DONE, longer, 1.0 / longer)
+        ratio_to_gap = gap_ratio(tolerances, h)
+        if ratio_to_gap > 0.0 and singular:
+            return Attempt(DONE, ratio_to_gap, 1.0 / ratio_to_gap)
         if checked:
             memory[ATTEMPTS] += 1.0
             if memory[SUSPECTED] == 1.0 and memory[SUSPECT] <= t:
@@ -536,7 +544,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
             defect = _defect_within(f, w, memory, t, h, tolerances, series, order, q1, v1, a1)
             if defect > 0.0:
                 return Attempt(DONE, min(defect, MAX_DEFECT), _shrink_factor(defect, order))
-    _evaluate(series, unit, order, x, q1, v1, found)
+    _evaluate(series, unit, order, x, q1, v1, series_a)
     store_prediction(w, q1)
     code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
     if code != DONE:
@@ -544,36 +552,36 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if options[KEEP] == 1.0:
         memory[PASSED] += h
         return Attempt(DONE, 0.0, 0.0)
-    off = departure(w, tolerances, h, q, v, q1)
+    distance = departure(w, tolerances, h, q, v, q1)
     memory[SHORTER], allowed = 1.0, np.inf
-    if off > 0.0:  # a step shorter than LENGTH, because of GROWTH or of a force ahead, counts as at least 1 / GROWTH
-        allowed = (ALLOWED / off) ** (1.0 / order)
+    if distance > 0.0:  # a step shorter than LENGTH, due to GROWTH or to a force ahead, counts as at least 1 / GROWTH
+        allowed = (TARGET_DISTANCE / distance) ** (1.0 / order)
         memory[SHORTER] = min(1.0, max(x / memory[LENGTH], 1.0 / GROWTH) * allowed)
-    if off > 1.0:
-        return Attempt(DONE, off, allowed)
+    if distance > 1.0:
+        return Attempt(DONE, distance, allowed)
     if checked:
-        defect = defect_ratio(tolerances, h, order, found, a1, q1, v1)
+        defect = defect_ratio(tolerances, h, order, series_a, a1, q1, v1)
         if defect > 1.0:
             noise = _is_noise(f, w, memory, t, h, tolerances, series, order, q1, v1, a1, defect)
             if not noise:
                 return Attempt(DONE, min(defect, MAX_DEFECT), _shrink_factor(defect, order))
-            _evaluate(series, unit, order, x, q1, v1, found)
+            _evaluate(series, unit, order, x, q1, v1, series_a)
             code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
         w.notes[DEFECT] = max(w.notes[DEFECT], defect)
     series = series_of(memory, order, n, 1.0 - memory[WHICH])
     unit = min(memory[LENGTH] * unit, GROWTH * h) if estimated else h
-    code = _find_series(f, w, options, memory, t + h, new_state, unit, 1.0 - memory[WHICH])
+    code = _compute_series(f, w, options, memory, t + h, new_state, unit, 1.0 - memory[WHICH])
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
     memory[TRIED], memory[NEXT_UNIT] = 1.0, unit
     factor = 0.0
     if estimated:
-        memory[NEXT_LENGTH] = _length(tolerances, series, unit, order, n)
+        memory[NEXT_LENGTH] = _allowed_step(tolerances, series, unit, order, n)
         shorter = memory[SHORTER] if memory[SHORTER] > 0.0 else 1.0
         factor = min(shorter * memory[NEXT_LENGTH] * unit / h, GROWTH)
-    return Attempt(DONE, max(error, off), factor)
+    return Attempt(DONE, max(error, distance), factor)
 
 
 TAYLOR = Step(taylor_step, settle_taylor)
