@@ -1,4 +1,4 @@
-"""Step of an explicit Runge-Kutta method for (q_i, v_i): each stage is fine_error evaluation, and there is no outer loop.
+"""Step of an explicit Runge-Kutta method for (q_i, v_i): each stage is one evaluation, and there is no outer loop.
 
 The first stage is the state at the beginning of the step, and two embedded formulas estimate the error. By default, the
 inner loop computes the dependent coordinates of every stage, so that all stages satisfy the constraints. With FREE,
@@ -173,9 +173,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.counters[N_OUTER] += 1
     copy(state[n : 3 * n], slopes[0])
     for j in range(1, s):
-        _advance(
-            y, h, A[j, :j], slopes, stage, stage
-        )  # entries of dependent coordinates: start values of Newton's method
+        _advance(y, h, A[j, :j], slopes, stage, stage)  # entries of dependent coordinates are start values
         v_stage, a_stage = slopes[j, :n], slopes[j, n : 2 * n]
         copy(stage[n : 2 * n], v_stage)
         if free:
