@@ -12,7 +12,7 @@ import numpy as np
 from twoloop.checks.arguments import Array, check_finite, check_real, shown
 from twoloop.generate.graph import Affine, Derivative, Graph, Untraceable, symbols
 from twoloop.generate.program import OperationTable
-from twoloop.generate.trace import as_forms, trace
+from twoloop.generate.trace import convert_to_expressions, trace
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class RowFunction:
         value = np.array(trace(lambda _, coordinates: self.function(coordinates), t, symbols(q)), dtype=object)
         if value.shape not in ((), (1,)):
             raise Untraceable(f"on symbols it returns shape {value.shape}")
-        row = as_forms(graph, value.reshape(1))[0]
+        row = convert_to_expressions(graph, value.reshape(1))[0]
         unit, inputs = Affine(graph, 1.0, {}), [next(iter(each.terms)) for each in q]
         along = dict(zip(inputs, v, strict=True))
         bend = Derivative(graph, along).of(Derivative(graph, along).of(row))
@@ -83,7 +83,7 @@ class RateFunction(RowFunction):
         """Return the results as symbols."""
         function: Callable[..., Any] = self.function
         value = trace(lambda _, coordinates, rates: function(coordinates, rates), t, symbols(q), symbols(v))
-        row, unit = as_forms(graph, np.array(value, dtype=object).reshape(1))[0], Affine(graph, 1.0, {})
+        row, unit = convert_to_expressions(graph, np.array(value, dtype=object).reshape(1))[0], Affine(graph, 1.0, {})
         along = {next(iter(each.terms)): rate for each, rate in zip(q, v, strict=True)}
         gradient = [Derivative(graph, {next(iter(v[j].terms)): unit}).of(row) for j in self.columns]
         return [Derivative(graph, along).of(row).times(-1.0), *gradient]
@@ -155,7 +155,7 @@ class Function:
             array = np.array(trace(each, *arguments), dtype=object)
             if array.shape != (self.size,) and not (self.size == 1 and array.shape == ()):
                 raise Untraceable(f"on symbols it returns shape {array.shape}")
-            results += as_forms(graph, array.reshape(self.size)).tolist()
+            results += convert_to_expressions(graph, array.reshape(self.size)).tolist()
         return results
 
 

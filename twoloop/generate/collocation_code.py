@@ -1,9 +1,9 @@
 """Generate code for collocation steps whose stages are evaluated side by side, one in each SIMD lane.
 
-Fixed-point iteration evaluates all stages of an implicit Runge-Kutta step anew in each sweep. No stage waits for
-another, so that a sweep takes little longer than one evaluation. Usually the accelerations depend on some of the
-coordinates only: only these coordinates are iterated, and the others follow from the final accelerations. The ends of
-eight steps are projected onto the constraints together, one in each lane.
+Fixed-point iteration evaluates all stages of an implicit Runge-Kutta step anew in each sweep. The stages do not depend
+on one another within a sweep, so that a sweep takes little longer than one evaluation. Usually the accelerations depend
+on some of the coordinates only: only these coordinates are iterated, and the others are computed from the final
+accelerations. The ends of eight steps are projected onto the constraints together, one in each lane.
 
 The functions share an array, `work`, whose layout is in kernels/data/collocation.py; kernels/steps/lobatto_step.py
 calls them.
@@ -50,20 +50,22 @@ N = 9  # number of nodes
 
 
 class Tables(NamedTuple):
-    """Coefficients for nodes c_0 = 0 < ... < c_8 = 1; row k of a table multiplies the value at node k.
+    """Linear maps of the polynomial through values at the nodes c_0 = 0 < ... < c_8 = 1.
+
+    A table (9, 8) maps values at the nodes to 8 results: its row k is multiplied by the value at node k.
 
     Attributes
     ----------
     nodes, between : (8,)
         Nodes 1 to 8, and the midpoints between neighbouring nodes.
     velocities, positions : (9, 8)
-        Single and double integrals from 0 to each of the nodes 1 to 8.
+        Single and double integrals of the polynomial from 0 to each of the nodes 1 to 8.
     values_between, velocities_between, positions_between : (9, 8)
         Values of the polynomial at the midpoints, and its single and double integrals from 0 to the midpoints.
     spectrum : (9, 8)
-        Coefficients of the polynomial in the Legendre polynomials 1 to 8 on [0, 1], which are 1 at its end.
+        Coefficients of the Legendre polynomials of degree 1 to 8 on [0, 1], which are 1 at the end.
     begin, end : (9, 8)
-        Coefficients of the polynomial in the powers 1 to 8 of the time from the beginning, and from the end.
+        Coefficients of the powers 1 to 8 of the time from the beginning, and of the time from the end.
     """
 
     nodes: Array
@@ -80,7 +82,7 @@ class Tables(NamedTuple):
 
 @cache
 def tables() -> Tables:
-    """Return the tables, computed in extended precision and rounded once."""
+    """Return the Tables, computed in extended precision and then rounded to double precision."""
     x = _nodes()
     between: Extended = (x[1:] + x[:-1]) / np.longdouble(2)
     values = _legendre(x)
@@ -117,7 +119,10 @@ def _legendre(z: Extended) -> Extended:
 
 
 def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended, Extended]:
-    """Return values, single and double integrals from 0 of the Lagrange polynomials on [0, 1]; a row for each node."""
+    """Return values, single and double integrals from 0 of the Lagrange polynomials, each an array (9, len(z)).
+
+    `coefficients`: Legendre coefficients of these polynomials. The points `z` are on [-1, 1], the integrals on [0, 1].
+    """
     values = _legendre(z)
     # the integral of P_k from -1 is (P_k+1 - P_k-1) / (2 k + 1)
     once = np.array([values[1] + 1, *((values[k + 1] - values[k - 1]) / (2 * k + 1) for k in range(1, N + 1))])
@@ -126,32 +131,33 @@ def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended,
 
 
 MOST_OPERATIONS = 5000  # largest number of operations of the equations: code of this length takes 2 s to compile
-SMALLEST = 1e-300  # replaces a divisor of zero
-FAILED = -1.0  # result of an audit that cannot evaluate the accelerations (defects are never negative)
+SMALLEST = 1e-300  # smallest divisor, and smallest allowed error: replaces 0
+FAILED = -1.0  # result of `audit` if the accelerations are invalid (defects are never negative)
 INFINITE = float("inf")
 # number of further steps that eliminate M first, after a step whose accelerations by the shorter program were invalid
 STEPS_BY_MASS_FIRST = 8.0
 FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the second step
 
-# the iteration
-# error of the stopped iteration, relative to the tolerance: with this value, total errors are no larger than those of
-# DOP853
+# the iteration; its contraction rho is the ratio of the changes of velocities in two successive sweeps
+# error at which the iteration stops, relative to the tolerance: with this value, total errors are no larger than those
+# of DOP853
 KAPPA = 0.02
-# number of sweeps that the step size aims at; one more if the prediction has degree 6, two more from degree 7 on,
-# because steps are long then
-TARGET = 6.0
-EXTRA_SWEEPS = 7  # number of sweeps beyond the target after which a step is rejected
-SLOW = 0.8  # contraction of the iteration above which a step is rejected after the third sweep
-MIN_RHO, MAX_RHO = 1e-3, 0.9  # limits to which the measured contraction of a sweep is cut
-SLOW_START, FAST_START = 0.3, 0.04  # limits of the contraction in the first step: outside, another step size is tried
-# ratio of two successive changes from which on the changes are rounding, if they are below NOISE relative to the values
-STAGNANT = 0.5
-# in steps of fixed size: KAPPA, NOISE (larger, as forces may have rounding errors), and the largest number of sweeps
-ROUNDING_OF_FIXED, NOISE_OF_FIXED, MOST_OF_FIXED = 1e-16, 1e-9, 60.0
-LEAST_CHANGE = 1e-30  # added to an error ratio, so that its logarithm exists
-ERROR_WEIGHT = 0.5  # weight of the error estimate
-# allowed defect between nodes, relative to the tolerances: most of it oscillates and does not last to the end
-ALLOWED = 16.0
+# number of sweeps for which the step size is chosen; one more if the prediction has degree 6, two more from degree 7
+# on, because such steps are long
+TARGET_SWEEPS = 6.0
+EXTRA_SWEEPS = 7  # number of sweeps beyond the target at which a step that has not converged is rejected
+MAX_CONTRACTION = 0.8  # contraction from which on a step is rejected in its fourth sweep, or later
+MIN_RHO, MAX_RHO = 1e-3, 0.9  # lower and upper bound that replace a measured contraction outside of them
+# smallest and largest contraction with which the guessed size of the first step is accepted
+FAST_START, SLOW_START = 0.04, 0.3
+# contraction from which on the changes are rounding errors if they are below NOISE, relative to the values
+STAGNATION_RATIO = 0.5
+# in steps of fixed size these replace KAPPA, NOISE (as forces may have rounding errors), and the limit of sweeps
+KAPPA_OF_FIXED, NOISE_OF_FIXED, MAX_SWEEPS_OF_FIXED = 1e-16, 1e-9, 60.0
+LEAST_CHANGE = 1e-30  # added to the ratio of the iteration's error to KAPPA before its logarithm is computed
+ERROR_WEIGHT = 0.5  # factor of the error estimate
+# allowed defect at the midpoints between nodes, relative to the tolerances: most of its effect averages out in a step
+ALLOWED_DEFECT = 16.0
 
 
 def compiles_quickly(own: SharedCode) -> bool:
@@ -172,7 +178,9 @@ class CollocationCode:
     Attributes
     ----------
     iterated : list of int
-        Coordinates on which accelerations depend.
+        Coordinates on whose positions or velocities the accelerations depend.
+    others : list of int
+        The other coordinates.
     numbers : Coefficients
         Coefficients that the functions read.
     structure : str
@@ -210,9 +218,9 @@ class CollocationCode:
     def attempt(self, emit: LaneEmitter, work: Value, state: Value, tolerances: Value, numbers: Value) -> Value:
         """Iterate the stages of a step; return a code for how the iteration ended, see data/collocation.py.
 
-        The accelerations come from the program with the fewest operations. Its conditions are checked once, after the
-        last sweep. If they fail, another function makes this step and the next STEPS_BY_MASS_FIRST steps with the
-        elimination that begins with M.
+        The accelerations are those of the program with the fewest operations. Its conditions are checked once, after
+        the last sweep. If they fail, the iteration is repeated with the elimination that begins with M; so are the next
+        STEPS_BY_MASS_FIRST steps.
         """
         builder, one = emit.builder, Emitter(emit.builder)
         emit.numbers = emit.constants = numbers
@@ -229,16 +237,16 @@ class CollocationCode:
             for quantity, value in enumerate(inputs):
                 lowering.define(quantity, value)
 
-            def store(coordinates: list[int]) -> None:
+            def store_accelerations(coordinates: list[int]) -> None:
                 for i, value in zip(coordinates, lowering.forms(graph, [forms[i] for i in coordinates]), strict=True):
                     store_lanes(emit, value, work, self.a + LANES * i)
 
             def finish() -> Value:
-                store(self.others)
+                store_accelerations(self.others)
                 lowering.forms(graph, [form for pair in outputs.conditions for form in pair])
                 return lowering.holds(outputs, self._accelerations(emit, work))
 
-            store(self.iterated)
+            store_accelerations(self.iterated)
             return finish
 
         def otherwise() -> Value:
@@ -256,7 +264,7 @@ class CollocationCode:
         return self._iterate(emit, work, state, tolerances, evaluate, otherwise)
 
     def _mass_first_function(self, emit: LaneEmitter, kinds: list[str]) -> str:
-        """Return the name of the function that iterates by eliminating M first; write it at the first call."""
+        """Return the name of the function that iterates and eliminates M first; write the function if it is missing."""
         module, name = emit.builder.module, "careful_nodes"
         if not module.defines(name):
             builder = module.function(name, DOUBLE, kinds, internal=True)
@@ -268,7 +276,7 @@ class CollocationCode:
         return name
 
     def _caller(self, emit: LaneEmitter, work: Value, index: int) -> Callable[[list[Value]], Callable[[], Value]]:
-        """Return a function `evaluate` for `_iterate` that calls `call_accelerations`."""
+        """Return the argument `evaluate` of `_iterate` for the program `index`, see `call_accelerations`."""
         filled = Emitter(emit.builder).pointer(work, self.a)
 
         def evaluate(inputs: list[Value]) -> Callable[[], Value]:
@@ -278,12 +286,12 @@ class CollocationCode:
         return evaluate
 
     def _accelerations(self, emit: LaneEmitter, work: Value) -> list[Value]:
-        """Load the accelerations from memory: values kept across the loop would be spilled to the stack."""
+        """Return the accelerations at the nodes, loaded from `work`: kept values would be spilled to the stack."""
         return [load_lanes(emit, work, self.a + LANES * i) for i in range(self.n)]
 
     @contextmanager
     def _returning_if(self, emit: LaneEmitter, condition: Value) -> Iterator[None]:
-        """Context of instructions that run only if a condition holds, and that must return from the function."""
+        """Return a context for instructions that run only if `condition` is true and return from the function."""
         builder = emit.builder
         leave, go_on = builder.append_block(), builder.append_block()
         builder.branch(condition, leave, go_on)
@@ -292,7 +300,7 @@ class CollocationCode:
         builder.position_at_end(go_on)
 
     def _call(self, emit: LaneEmitter, name: str, write: Callable[..., None], arguments: Sequence[Value]) -> None:
-        """Call a function of the module; `write` writes it at the first call."""
+        """Write a call of a function of the module that returns nothing; if it is missing, `write` writes its body."""
         module = emit.builder.module
         if not module.defines(name):
             builder = module.function(name, NOTHING, [each.type for each in arguments], internal=True)
@@ -301,10 +309,10 @@ class CollocationCode:
         emit.builder.run(name, arguments)
 
     def _begin_nodes(self, emit: LaneEmitter, work: Value, state: Value, tolerances: Value) -> None:
-        """Store the error weights, and predict positions and velocities at the nodes.
+        """Store WEIGHTS, STRICTER, SIZE and POWERS, and predicted positions and velocities at the nodes.
 
-        Errors are relative to the position (or velocity) at the beginning, or to its change in half a step if that is
-        larger. In steps of fixed size, which have no error estimate, rtol = atol = 1.
+        The size to which rtol applies is that of the position (or velocity) at the beginning, or its change in half a
+        step if that is larger. In steps of fixed size, which have no error estimate, rtol = atol = 1.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
         fixed = builder.compare("fcmp oeq", one.load(tolerances, ESTIMATE), llvm_code.ZERO)
@@ -375,11 +383,11 @@ class CollocationCode:
         evaluate: Callable[[list[Value]], Callable[[], Value]],
         otherwise: Callable[[], Value],
     ) -> Value:
-        """Sweep over the stages until they have converged, or the step is rejected; return the code of `attempt`.
+        """Sweep over the stages until they converge, or the step is rejected; return the code of `attempt`.
 
         `evaluate` stores the accelerations of the iterated coordinates at [t, q, v]; the function that it returns
-        stores the other accelerations and returns whether all accelerations are valid. If they are not, `otherwise`
-        makes the step.
+        stores the other accelerations, and returns whether all accelerations are valid. If they are not, the code is
+        that of `otherwise`.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
 
@@ -390,13 +398,15 @@ class CollocationCode:
         degree, stricter = one.load(work, at.DEGREE), one.load(work, at.STRICTER)
         target = builder.select(
             builder.compare("fcmp oge", degree, number(6.0)),
-            builder.select(builder.compare("fcmp oge", degree, number(7.0)), number(TARGET + 2), number(TARGET + 1)),
-            number(TARGET),
+            builder.select(
+                builder.compare("fcmp oge", degree, number(7.0)), number(TARGET_SWEEPS + 2), number(TARGET_SWEEPS + 1)
+            ),
+            number(TARGET_SWEEPS),
         )
-        max_sweeps = builder.select(estimated, one.add(target, number(EXTRA_SWEEPS)), number(MOST_OF_FIXED))
+        max_sweeps = builder.select(estimated, one.add(target, number(EXTRA_SWEEPS)), number(MAX_SWEEPS_OF_FIXED))
         kappa, noise = (
             builder.select(estimated, number(usual), number(fixed))
-            for usual, fixed in ((KAPPA, ROUNDING_OF_FIXED), (at.NOISE, NOISE_OF_FIXED))
+            for usual, fixed in ((KAPPA, KAPPA_OF_FIXED), (at.NOISE, NOISE_OF_FIXED))
         )
         noise = one.multiply(noise, one.multiply(one.load(work, at.SIZE), stricter))
         may_guess = builder.compare("fcmp ogt", one.load(work, at.MAY_GUESS), llvm_code.ZERO)
@@ -434,12 +444,12 @@ class CollocationCode:
         stagnant = builder.both(
             compare("ogt", m, 2.0),
             builder.both(
-                compare("oge", change, one.multiply(number(STAGNANT), change_before)),
+                compare("oge", change, one.multiply(number(STAGNATION_RATIO), change_before)),
                 compare("ole", change, noise),
             ),
         )
         converged = either(compare("ole", one.multiply(rho_now, change), kappa), stagnant)
-        slow = builder.both(builder.both(compare("ogt", m, 3.0), estimated), compare("oge", rho_now, SLOW))
+        slow = builder.both(builder.both(compare("ogt", m, 3.0), estimated), compare("oge", rho_now, MAX_CONTRACTION))
         refused = either(either(slow, compare("oge", m, max_sweeps)), compare("uge", change, INFINITE))
         stops = builder.operation("or", either(guessed, converged), refused)
         for phi, value in zip(carried, (m, change, rho_now), strict=True):
@@ -458,7 +468,7 @@ class CollocationCode:
         return code
 
     def _estimate_error(self, emit: LaneEmitter, work: Value, state: Value) -> None:
-        """Store ERROR and CURVED, and the factors of the next step size by convergence and by the error.
+        """Store ERROR and CURVED, and the ratios FACTOR and FACTOR_OF_ERROR of the next step size to this one.
 
         The error estimate extrapolates the decay of the Legendre coefficients of the accelerations. Let t be the larger
         coefficient of degrees 7 and 8, s the larger one of degrees 5 and 6, f the largest one from degree 3 on. The
@@ -502,9 +512,10 @@ class CollocationCode:
         one.store(builder.extract(factors, 1), work, at.FACTOR_OF_ERROR)
 
     def audit(self, emit: LaneEmitter, work: Value, state: Value, numbers: Value) -> Value:
-        """Evaluate the accelerations between the nodes; return the largest defect, relative to its limit.
+        """Return the largest defect of the accelerations at the midpoints between nodes, relative to its limit.
 
-        FACTOR_OF_DEFECT becomes the largest factor of the next step size that this defect allows.
+        Return FAILED if these accelerations are invalid. Store FACTOR_OF_DEFECT, the largest ratio of the next step
+        size to this one that the defect allows.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
         emit.numbers = emit.constants = numbers
@@ -529,7 +540,7 @@ class CollocationCode:
             worst = emit.larger(emit.multiply(emit.function("fabs", off), weight), worst)
             largest = emit.larger(emit.multiply(emit.function("fabs", value), weight), largest)
         beyond_noise = emit.fused(emit.constant(-at.NOISE), largest, worst)
-        scaled = emit.multiply(beyond_noise, emit.multiply(h, emit.constant(1.0 / ALLOWED)))
+        scaled = emit.multiply(beyond_noise, emit.multiply(h, emit.constant(1.0 / ALLOWED_DEFECT)))
         defect = one.larger(emit.largest_lane(scaled), llvm_code.ZERO)
         two = LaneEmitter(builder, 2)
         power = two.multiply(
@@ -540,7 +551,7 @@ class CollocationCode:
         return builder.select(all_hold, defect, constant(DOUBLE, FAILED))
 
     def retry(self, emit: LaneEmitter, work: Value, state: Value) -> None:
-        """Store the polynomial of a rejected step, so that it predicts the shorter step that replaces it."""
+        """Store the polynomial of a rejected step, so that it predicts the shorter step that replaces the step."""
         one, old = Emitter(emit.builder), self._polynomial(emit, work, other=False)
         with loop_over(emit, self.iterated) as (k, i, _, _):
             a0 = one.load(one.pointer(state, i), 2 * self.n)
@@ -549,9 +560,9 @@ class CollocationCode:
             )
 
     def end(self, emit: LaneEmitter, work: Value, state: Value, new_state: Value) -> None:
-        """Store [q, v, a] at the end of the step, and the polynomial that predicts the next step, with its degree.
+        """Store [q, v, a] at the end of the step in `new_state`, and the polynomial that predicts the next step.
 
-        The degree is the one that would have predicted the end of this step best; it changes by at most 2.
+        NEXT_DEGREE becomes the degree that would have predicted the end of this step best, see `_choose_degree`.
         """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
         last, h = LANES - 1, one.load(work, at.H)
@@ -592,7 +603,7 @@ class CollocationCode:
                 one.store(builder.extract(a, last), target, 2 * n)
 
     def _choose_degree(self, emit: LaneEmitter, work: Value, worst: Value) -> None:
-        """Store NEXT_DEGREE; `worst`: the errors of predictions of degree 1 to 8 at the end of the step."""
+        """Store NEXT_DEGREE, near DEGREE; `worst`: errors of predictions of degree 1 to 8 at the end of the step."""
         builder, one = emit.builder, Emitter(emit.builder)
         least = one.negative(emit.largest_lane(emit.negative(worst)))
         good = builder.compare("fcmp ole", worst, emit.splat(one.multiply(least, constant(DOUBLE, 1.2))))
@@ -606,14 +617,14 @@ class CollocationCode:
         one.store(builder.select(predicts, degree, constant(DOUBLE, FIRST_DEGREE)), work, at.NEXT_DEGREE)
 
     def project_positions(self, emit: LaneEmitter, work: Value, numbers: Value) -> None:
-        """Project the positions at the ends of eight steps; store FINE (success) and MOVED (the largest change)."""
+        """Project the positions at the ends of eight steps in place; store FINE (success) and MOVED, the changes."""
         if self.parts is None:
             self._project(emit, work, numbers, self.equations.position_projection)
         else:
             self._project_in_parts(emit, work, numbers, self.parts.project_position, ("moved", "q"))
 
     def project_states(self, emit: LaneEmitter, work: Value, numbers: Value) -> None:
-        """Project the states at the ends of eight steps; compute accelerations and multipliers there."""
+        """Project the states at the ends of eight steps in place; store accelerations, multipliers, FINE and MOVED."""
         if self.parts is None:
             self._project(emit, work, numbers, self.equations.projection)
         else:
@@ -635,7 +646,7 @@ class CollocationCode:
     def _project_in_parts(
         self, emit: LaneEmitter, work: Value, numbers: Value, write: Callable[..., Value], names: tuple[str, ...]
     ) -> None:
-        """Project the ends by a function of compile_equations.py, `write`, that fills the arrays `names`."""
+        """Project the ends of eight steps by `write`, a method of `parts`, that fills the arrays `names`."""
         one, moved = Emitter(emit.builder), emit.builder.room(DOUBLE, LANES * self.n)
         places = {name: one.pointer(work, place) for name, place in self._places_of_ends().items()} | {"moved": moved}
         state = load_lanes(emit, work, self.ends), places["q"], places["v"]
@@ -654,7 +665,7 @@ class CollocationCode:
         store_lanes(emit, emit.builder.select(holds, before, emit.constant(0.0)), work, at.FINE)
 
     def _integrate(self, emit: LaneEmitter, work: Value, state: Value) -> Value:
-        """Integrate the accelerations up to each node; return the largest change of a velocity since the last sweep."""
+        """Store positions and velocities at the nodes; return the largest change of a velocity since the last sweep."""
         one = Emitter(emit.builder)
         with loop_over(emit, self.iterated, [emit.constant(0.0)]) as (k, i, (largest,), new):
             before = load_lanes(emit, one.pointer(work, vector_index(emit, k)), self.v)
@@ -669,7 +680,7 @@ class CollocationCode:
     def _store_stages(
         self, emit: LaneEmitter, work: Value, state: Value, k: Value, i: Value, sums: Sequence[Value]
     ) -> Value:
-        """Store velocities and positions of coordinate i, the k-th iterated coordinate; return the velocities."""
+        """Store velocities and positions of coordinate i, the k-th iterated one, at nodes; return the velocities."""
         one = Emitter(emit.builder)
         h = emit.splat(one.load(work, at.H))
         place, begin = one.pointer(work, vector_index(emit, k)), one.pointer(state, i)
@@ -681,24 +692,24 @@ class CollocationCode:
         return v
 
     def _at_nodes(self, emit: LaneEmitter, first: Value, work: Value, i: Value) -> list[Value]:
-        """Return the accelerations of coordinate i at all nodes: `first` at the beginning, the others loaded."""
+        """Return the accelerations of coordinate i at all nodes: `first` at the first node, and eight loaded values."""
         one = Emitter(emit.builder)
         place = one.pointer(work, vector_index(emit, i))
         return [first, *(one.load(place, self.a + node) for node in range(LANES))]
 
     def _weighted_rows(self, emit: LaneEmitter, table: Array, first: Value, work: Value, i: Value) -> Value:
-        """Return the sum of the rows of a table, weighted by the accelerations of coordinate i (see `_at_nodes`)."""
+        """Return the sum of the rows of a table, multiplied by the accelerations of coordinate i (see `_at_nodes`)."""
         return self._weighted_sum(emit, table, self._at_nodes(emit, first, work, i))
 
     def _weighted_sum(self, emit: LaneEmitter, table: Array, terms: Sequence[Value]) -> Value:
-        """Return the sum of the rows of a table, weighted by `terms`; in two accumulators, which is faster."""
+        """Return the sum of the rows of a table, multiplied by `terms`; two accumulators make it faster."""
         sums = [emit.multiply(emit.splat(term), constants(row)) for term, row in zip(terms[:2], table[:2], strict=True)]
         for k, (term, row) in enumerate(zip(terms[2:], table[2:], strict=True)):
             sums[(k + 1) % 2] = emit.fused(emit.splat(term), constants(row), sums[(k + 1) % 2])
         return emit.add_sums(*sums)
 
     def _polynomial(self, emit: LaneEmitter, work: Value, other: bool) -> Value:
-        """Return a pointer to the polynomial of the last accepted step; with `other`, of the attempted step."""
+        """Return a pointer to the polynomial of the last accepted step or, if `other`, of the attempted step."""
         builder, one = emit.builder, Emitter(emit.builder)
         second = builder.compare("fcmp one" if not other else "fcmp oeq", one.load(work, at.WHICH), llvm_code.ZERO)
         size = LANES * len(self.iterated)
@@ -715,7 +726,7 @@ class Collocation(NamedTuple):
 
 
 def compiled_collocation(generated: GeneratedCode) -> Collocation:
-    """Return the functions of a mechanism, which are compiled at the first step and cached on disk."""
+    """Return the functions of a mechanism and their coefficients; the functions are compiled when first called."""
     code = generated.shared
     collocation: Collocation = code.cache.remembered(("collocation", code.equations.choice), lambda: _compiled(code))
     return collocation._replace(numbers=generated.evaluate(collocation.numbers))
@@ -751,5 +762,5 @@ def _compiled(own: SharedCode) -> Collocation:
 
 @cache
 def _stamp() -> str:
-    """Return a digest of the modules that write the functions; those of the equations are in `SharedCode.digest`."""
+    """Return a digest of the modules that write only these functions; `SharedCode.digest` covers the other modules."""
     return digest_of("", __file__, lane_series, at)

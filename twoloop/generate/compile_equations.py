@@ -3,13 +3,14 @@
 The operations of an elimination become LLVM instructions one by one, without numba, which would take seconds for a few
 hundred operations. The code is cached on disk like that of the kernels.
 
-**Accelerations** have two forms. The form with the fewest operations (null_space.py) divides by fixed pivots. If one of
-these pivots is small, a function of the module computes the same numbers by the elimination of M. In SIMD lanes it is
-called for all lanes if one lane needs it; the other lanes keep their results, so that no run depends on its neighbours.
+**Accelerations** are computed by one of two programs. The program with the fewest operations (null_space.py) divides by
+fixed pivots. If one of these pivots is small, a function of the module computes the accelerations by the elimination of
+M. In SIMD lanes this function is called for all lanes if one lane needs it; the other lanes keep their results, so that
+no run depends on its neighbours.
 
-**Long equations** are divided into functions that call one another, each written and compiled once. The time of LLVM
-grows faster than the length of a block, and the values of long equations pass through memory in any case. Accelerations
-and both projections share the factors of the matrix at a position, and the solution with these factors.
+**Long equations** are split into functions that call one another, each compiled once: the time that LLVM takes grows
+faster than the length of a block. The values of long equations are stored in memory in any case. Accelerations and both
+projections share the functions for the factors of the matrix at a position, and for the solution with these factors.
 """
 
 import hashlib
@@ -38,7 +39,7 @@ ARRAY = f"{DOUBLE}*"
 def write_accelerations(
     emit: Emitter, equations: Elimination, inputs: Sequence[Value], numbers: Coefficients
 ) -> tuple[list[Value], Value]:
-    """Write code for the accelerations at [t, q, v]; return their values, and whether they are valid.
+    """Write code for the accelerations at `inputs`, [t, q, v]; return their values, and whether they are valid.
 
     The builder may be in another block afterwards. `emit` must have the pointers to the coefficients.
     """
@@ -58,7 +59,7 @@ def write_accelerations(
 def write_acceleration_function(
     module: Module, name: str, kind: tuple[str, list[str]], equations: Elimination, numbers: Coefficients
 ) -> None:
-    """Write a function of t, q, v and the coefficients that fills an array a and returns whether a is valid."""
+    """Write a function of t, q, v and the coefficients that fills an array a, and returns whether a is valid."""
 
     def emit_all(emit: Emitter, t: Value, q: Value, v: Value, given: Value, filled: Value) -> Value:
         lowering, emit.numbers = Lowering(emit, numbers), given
@@ -75,9 +76,10 @@ def write_acceleration_function(
 def call_accelerations(
     emit: Emitter, equations: Elimination, index: int, inputs: Sequence[Value], numbers: Coefficients, filled: Value
 ) -> Value:
-    """Write a call of a function that fills an array with the accelerations at [t, q, v]; return whether it is valid.
+    """Write a call that fills the array `filled` with the accelerations at `inputs`; return whether they are valid.
 
-    `index`: index of a program in `equations.accelerations`: 0 has the fewest operations, -1 eliminates M.
+    `inputs`: [t, q, v]. `index`: index of a program in `equations.accelerations`: 0: the one with the fewest
+    operations; -1: the one that eliminates M first.
     """
     array = _stack_array(emit, 2 * equations.system.n_q)
     for i, value in enumerate(inputs[1:]):
@@ -91,7 +93,7 @@ def _accelerations(
 ) -> tuple[list[Value], Value]:
     """Write code for the accelerations; return their values and whether they are valid.
 
-    `state` writes code for t and pointers to q and v, the arguments of the function that eliminates M.
+    `state` returns t and pointers to q and v, the arguments of the function that eliminates M; it may write code.
     """
     outputs, *alternatives = equations.accelerations
     a, holds = _run_accelerations(emit, equations, lowering, outputs)
@@ -128,7 +130,7 @@ def _run_accelerations(
 
 
 def _acceleration_function(emit: Emitter, equations: Elimination, index: int, numbers: Coefficients) -> str:
-    """Return the name of the module's function for a program of accelerations; it is written at the first call."""
+    """Return the name of the function for a program of `equations.accelerations`; write it if the module has none."""
     outputs, mass_first = equations.accelerations[index], index in (-1, len(equations.accelerations) - 1)
     module, name = emit.builder.module, f"{'mass_first' if mass_first else 'quick'}_{emit.suffix}"
     if not module.defines(name):
@@ -155,7 +157,7 @@ def _acceleration_function(emit: Emitter, equations: Elimination, index: int, nu
 
 
 def _numbers(emit: Emitter) -> list[Value]:
-    """Return the pointers to the coefficients; in SIMD lanes also to those that all lanes share."""
+    """Return the pointer to the coefficients; in SIMD lanes, those to the varying and to the shared coefficients."""
     constants = getattr(emit, "constants", None)
     return [emit.numbers] if constants is None else [emit.numbers, constants]
 
@@ -164,13 +166,14 @@ def _stack_array(emit: Emitter, size: int) -> Value:
     return emit.builder.room(DOUBLE, size * width_of(emit.double))
 
 
-# numbers of operations from which on equations are split, which halves the time to compile. SPLIT_PROJECTIONS: if
-# accelerations have a reduced form, which is not split. SPLIT_ALL: else, as split accelerations take 50 % longer to run
+# numbers of operations above which equations are split into functions, which halves the time to compile.
+# SPLIT_PROJECTIONS: if there is a reduced program for the accelerations, which is not split. SPLIT_ALL: if there is
+# none; it is larger, because split accelerations take 50 % longer to run
 SPLIT_PROJECTIONS, SPLIT_ALL = 200, 500
 
 
 class SplitFunctions:
-    """Generator of long equations in parts: each part is a function of the module, which the others call.
+    """Generator that splits long equations into parts: functions of the module that other functions call.
 
     Parameters
     ----------
@@ -180,10 +183,10 @@ class SplitFunctions:
     Attributes
     ----------
     solution : Solution
-        Solution of the linear equations; it lists the quantities that are stored in memory, because parts share them.
+        Solution of the linear equations; `solution.stored` lists the quantities that the parts share in memory.
     at_position, with_factors : dict
-        Programs of parts by their names. Parts are functions of the stored quantities and of t, q, v (`at_position`) or
-        of r, c (`with_factors`).
+        Programs by names of parts. Their inputs are t, q, v (`at_position`), or r, c and the stored factors
+        (`with_factors`).
     """
 
     def __init__(self, equations: Elimination, numbers: Coefficients):
@@ -207,7 +210,7 @@ class SplitFunctions:
             self._parts[name] = partial(self._part, outputs, {})
 
     def structure(self) -> Iterable[Any]:
-        """List everything that the functions depend on, except the values of coefficients."""
+        """Yield everything that the functions depend on, except the values of coefficients."""
         solution, numbers = self.solution, self.numbers
         yield solution.kept.sizes, list(numbers.structure(solution.kept))
         for outputs in self.at_position.values():
@@ -216,7 +219,7 @@ class SplitFunctions:
             yield outputs.sizes, list(numbers.structure(outputs))
 
     def write(self, module: Module, kinds: Callable[[str], tuple[str, list[str]]]) -> list[str]:
-        """Write the functions that kernels call into a module and return their names; `kinds` returns their types."""
+        """Write the functions that kernels call; return their names. `kinds` returns the types of a function."""
         functions: dict[str, Callable[..., Any]]
         functions = {"own_correct_positions": self.project_position, "own_project": self.project}
         if self.equations.reduced is None:
@@ -225,10 +228,10 @@ class SplitFunctions:
             llvm_code.write(module, name, kinds(name), emit)
         return list(functions)
 
-    # functions of the module for the parts
+    # functions for the parts
 
     def _call(self, emit: Emitter, *calls: tuple[str, Sequence[Value]]) -> Value:
-        """Write calls of parts, each of which is written at its first call; return whether all results are valid."""
+        """Write calls (name, arguments) of parts, and parts that are missing; return whether all results are valid."""
         module, holds = emit.builder.module, None
         for part, arguments in calls:
             name = f"{part}_{emit.suffix}"
@@ -243,7 +246,7 @@ class SplitFunctions:
     def _lowering(
         self, emit: Emitter, graph: Graph, arguments: Sequence[Value], places: Mapping[int, Place]
     ) -> Lowering:
-        """Return a lowering for a part; its first arguments are the three inputs of its graph and the coefficients."""
+        """Return the Lowering that writes a part, whose arguments begin with three inputs and the coefficients."""
         *given, emit.numbers = arguments[:4]
         if width_of(emit.double) > 1:
             emit.constants = emit.numbers  # type: ignore[attr-defined]
@@ -252,7 +255,7 @@ class SplitFunctions:
         return lowering
 
     def _factors(self, emit: Emitter, *arguments: Value) -> Value:
-        """Write the part that computes the quantities to be stored; return whether the conditions hold."""
+        """Write the part that stores `solution.stored` in its fifth argument; return whether the conditions hold."""
         graph, solution, kept = self.equations.graph, self.solution, arguments[4]
         lowering = self._lowering(emit, graph, arguments, {})
         places = {i: (kept, place) for i, place in solution.stored.items()}
@@ -263,7 +266,7 @@ class SplitFunctions:
         return lowering.holds(solution.kept, [])
 
     def _part(self, program: Program, kept: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
-        """Write a part that fills arrays; return whether they are valid. `kept`: indices in the fifth argument."""
+        """Write the part that fills the arrays of a program; return whether they are valid. `kept`: see `_factors`."""
         places = {i: (arguments[4], place) for i, place in kept.items()}
         lowering = self._lowering(emit, program.graph, arguments, places)
         results = program.run(lowering)
@@ -275,7 +278,7 @@ class SplitFunctions:
     # functions for kernels, and for code in SIMD lanes
 
     def accelerations(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, a: Value) -> Value:
-        """Write the accelerations at (t, q, v) to `a`; return whether they are valid."""
+        """Write code that stores the accelerations at (t, q, v) in `a`; return whether they are valid."""
         kept, r, c, lam = self._stack_arrays(emit)
         at = [t, q, v, numbers, kept]
         return self._call(emit, ("factors", at), ("right", [*at, r, c]), ("solution", [r, c, kept, numbers, a, lam]))
@@ -283,7 +286,7 @@ class SplitFunctions:
     def project_position(
         self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, moved: Value, out: Value
     ) -> Value:
-        """Move positions towards the constraints by one Newton step; return whether the results are valid."""
+        """Store q after a Newton step in `out`, and its change in `moved`; return whether these results are valid."""
         kept, r, c, lam = self._stack_arrays(emit)
         at = [t, q, v, numbers, kept]
         _clear(emit, self.n, r)
@@ -305,9 +308,9 @@ class SplitFunctions:
         new_v: Value,
         lam: Value,
     ) -> Value:
-        """Project positions and velocities in the metric of M, and compute accelerations and multipliers.
+        """Project q and v in the metric of M, and store the results; return whether they are valid.
 
-        Return whether the results are valid.
+        The results are the change of q, the projected q and v, and the accelerations and multipliers at this v.
         """
         kept, r, c, change = self._stack_arrays(emit)
         u, at = self._stack_array(emit, self.n), [t, q, v, numbers, kept]
@@ -333,7 +336,7 @@ class SplitFunctions:
         return holds
 
     def _stack_arrays(self, emit: Emitter) -> list[Value]:
-        """Allocate memory on the stack for the stored quantities, r, c, and a solution; return pointers."""
+        """Return pointers to four arrays on the stack: for stored quantities, r, c, and one as long as a and lam."""
         sizes = self.solution.n_stored, self.n, self.n_rows, max(self.n, self.n_rows)
         return [self._stack_array(emit, size) for size in sizes]
 
@@ -342,7 +345,7 @@ class SplitFunctions:
 
 
 def _leave_unless(emit: Emitter, holds: Value) -> None:
-    """Return from the generated function before it changes an argument if results are invalid; not in SIMD lanes."""
+    """Write a return from the function if results are invalid, before it changes an argument; nothing in SIMD lanes."""
     if holds.type == BIT:
         emit.builder.leave_unless(holds)
 
@@ -364,9 +367,9 @@ Array = NDArray[np.float64]
 def write_function(
     module: Module, name: str, kind: tuple[str, list[str]], program: Program, numbers: Coefficients
 ) -> None:
-    """Write a function of inputs and coefficients that fills the arrays of a program.
+    """Write a function of the inputs of a program and of coefficients that fills the arrays of the program.
 
-    The function returns whether the conditions hold and the first array is finite; only then it fills the arrays.
+    The function returns whether the conditions hold and the first array is finite; if not, it changes no array.
     """
 
     def emit_all(emit: Emitter, *arguments: Value) -> Value:
@@ -386,20 +389,26 @@ def write_function(
 
 
 class SharedCode:
-    """Compiled functions for the equations that several systems share; read from the disk if they are cached.
+    """Compiled functions for the equations of one or more systems; they are read from the disk if they are cached.
 
     Parameters
     ----------
     equations : Elimination
     cache : TraceCache
+        Cache of the traces from which `equations` were generated.
 
     Attributes
     ----------
+    parts : SplitFunctions or None
+        Generator of the functions into which the equations are split; None: they are not split.
+    outputs : dict
+        Programs by names of functions, for those functions that are not split.
     numbers : Coefficients
         Coefficients that the functions read.
     digest : str
         Digest of everything that the functions depend on, except the values of coefficients.
-    functions : OwnFunctions
+    functions : GeneratedFunctions
+        The compiled functions.
     """
 
     def __init__(self, equations: Elimination, cache: TraceCache):
@@ -413,13 +422,13 @@ class SharedCode:
         self.functions = generated_functions("equations", _stamp(), self.digest, self._module_text, passes=False)
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "GeneratedCode":
-        """Return the code with coefficients for the parameters of one of the systems."""
+        """Return the GeneratedCode with coefficients for the parameters of one of the systems."""
         return GeneratedCode(
             self, evaluate(self.numbers.formulas), self.equations.traced.of(system, evaluate), evaluate
         )
 
     def _programs(self) -> dict[str, Program]:
-        """Return the programs of functions that are not split."""
+        """Return the programs, by names of functions, for functions that are not split."""
         equations = self.equations
         outputs = {"own_redundant": equations.redundant_rows}
         if self.parts is None:
@@ -453,9 +462,9 @@ class GeneratedCode(NamedTuple):
     """Compiled functions together with the coefficients of one system."""
 
     shared: SharedCode
-    numbers: Array  # coefficients that the code reads
+    numbers: Array  # values of the coefficients that the code reads
     traced: Traced
-    evaluate: Evaluator  # evaluates other expressions of the cache
+    evaluate: Evaluator  # evaluates arrays of expressions of the trace cache for this system
 
     @property
     def kinds(self) -> frozenset[str]:
@@ -463,7 +472,7 @@ class GeneratedCode(NamedTuple):
         return self.traced.kinds
 
     def is_valid_from(self, system: ConstrainedSystem, t0: float, q0: Array) -> bool:
-        """Return whether this code can be used for a run from (t0, q0): the same pivots would be chosen there."""
+        """Return whether this code can be used for a run from (t0, q0): whether the choice of pivots there is equal."""
         try:
             return PivotChoice.at(system, t0, q0) == self.shared.equations.choice
         except Untraceable:
@@ -471,12 +480,12 @@ class GeneratedCode(NamedTuple):
 
 
 def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = unchecked) -> GeneratedCode:
-    """Return the code for a system and a start, cached; `check` raises if calls of callbacks differ from their traces.
+    """Return the cached code for a system and a start; `check` raises if calls of callbacks differ from their traces.
 
     Raises
     ------
     ValueError
-        If code for its equations cannot be generated.
+        If code for the equations cannot be generated.
     """
     try:
         choice = system.remembered_at("choice", (t0, q0.tobytes()), lambda: PivotChoice.at(system, t0, q0))

@@ -1,7 +1,7 @@
 """Derive C_q, C_t and Gamma exactly from traced callbacks.
 
-Missing callbacks are replaced by programs. Given callbacks are compared with the exact derivatives instead of finite
-differences.
+Programs replace the callbacks that a system does not have. The callbacks that it has are compared with the exact
+derivatives, instead of finite differences.
 """
 
 import copy
@@ -20,7 +20,7 @@ from twoloop.generate.trace import OF_ROWS, Equations, Evaluator, TraceCache, de
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.problem.system import ConstrainedSystem
 
-# callbacks that are derived if they are not given, with the attributes of a system that count their rows
+# callbacks that are derived if a system does not have them, and the attributes of the system with their numbers of rows
 DERIVABLE = {"jacobian": "n_c", "gamma": "n_c", "nonholonomic_gamma": "n_a"}
 
 
@@ -30,9 +30,9 @@ class DerivedPrograms:
     Parameters
     ----------
     programs : dict
-        For each missing callback its program, and the flat indices of the array entries that the program computes.
+        By kind of callback: the program, and the flat indices, in the callback's array, of the results of the program.
     traced : Traced
-        The traces from which they were derived.
+        The traces from which the programs were derived.
     """
 
     def __init__(self, programs: dict[str, tuple[OperationTable, list[int]]], traced: Traced):
@@ -41,8 +41,8 @@ class DerivedPrograms:
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "DerivedSystem":
         """Return a system with these programs in place of its missing callbacks."""
         functions: dict[str, Any] = {}
-        for name, (program, places) in self.programs.items():
-            vectors = program.with_numbers(evaluate).packed(places)
+        for name, (program, indices) in self.programs.items():
+            vectors = program.with_numbers(evaluate).packed(indices)
             functions |= dict(zip((f"{name}_program", f"{name}_numbers"), vectors, strict=True))
         derived = copy.copy(system)
         derived.functions = system.functions._replace(**functions)
@@ -50,7 +50,7 @@ class DerivedPrograms:
 
 
 class DerivedSystem(NamedTuple):
-    """System with derived programs, and the traces from which the programs were derived."""
+    """Pair of a system with programs for missing callbacks, and the traces from which the programs were derived."""
 
     system: ConstrainedSystem
     traced: Traced
@@ -62,10 +62,10 @@ class DerivedSystem(NamedTuple):
 
 
 def with_derived_callbacks(system: ConstrainedSystem, check: Check) -> tuple[ConstrainedSystem, tuple[Traced, ...]]:
-    """Return a system with programs for C_q and Gamma in place of missing callbacks, and the traces of the programs.
+    """Return a system with programs in place of missing C_q and Gamma, and a tuple with the traces used for them.
 
-    If no callback is missing, or callbacks cannot be traced, return the system itself without traces: finite
-    differences then replace missing callbacks.
+    If no callback is missing, or callbacks cannot be traced, return the system itself and an empty tuple: finite
+    differences then replace missing callbacks. `check` raises Untraceable if the traces are wrong.
     """
     absent = [kind for kind, size in DERIVABLE.items() if getattr(system, size) and kind not in system.given]
     if not absent:
@@ -91,7 +91,10 @@ def _derive_programs(system: ConstrainedSystem, absent: Sequence[str], cache: Tr
 
 
 def _results(equations: Equations, absent: Sequence[str]) -> dict[str, dict[int, Affine]]:
-    """Return, for each missing callback, a dict of expressions by the flat indices of the array entries."""
+    """Return, by kind of missing callback, a dict of expressions by their flat indices in the callback's array.
+
+    Both gammas are rows of one array: `gamma` stands for both.
+    """
     system = equations.system
     gamma: dict[int, Affine] = {}
     for kind, first in (("gamma", 0), ("nonholonomic_gamma", system.n_c)):
@@ -105,15 +108,16 @@ def _results(equations: Equations, absent: Sequence[str]) -> dict[str, dict[int,
 
 Array = NDArray[np.float64]
 
-MOST_ENTRIES = 50_000  # largest number of entries of C_q that are derived for a comparison
-# displacements at which derivatives are compared, relative to the sizes of coordinates, and to FIRST_TIME_SCALE
+MOST_ENTRIES = 50_000  # largest number of entries of C_q for which derivatives are compared with exact ones
+# displacements of states from the start at which derivatives are compared: of coordinates, relative to their sizes, and
+# of the time, relative to FIRST_TIME_SCALE
 DISPLACEMENTS = (0.0, 1e-3, 0.03)
 
 
 def exact_derivatives(system: ConstrainedSystem, check: Check = unchecked) -> Traced | None:
-    """Return traces of the exact derivatives, with which the given derivatives of a system must agree.
+    """Return the exact derivatives as traces, to be compared with the callbacks of a system for these derivatives.
 
-    Return None if there are too many entries, callbacks cannot be traced, or `check` refuses the traces.
+    Return None if there are too many entries, callbacks cannot be traced, or `check` raises for the traces.
     """
     if system.n_q * (system.n_c + system.n_a) > MOST_ENTRIES:
         return None
@@ -134,20 +138,20 @@ def _trace_derivatives(system: ConstrainedSystem, cache: TraceCache) -> Traced:
 
 
 def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
-    """Return whether the given C_q, C_t and Gamma are the exact derivatives of the traced callbacks near a start.
+    """Return whether callbacks for C_q, C_t and Gamma agree with the exact derivatives at states near a start.
 
     Raises
     ------
     ValueError
-        If C_t is not given, but by its trace C depends on time, although not near the start.
+        If there is no callback for C_t, although C depends on time by its trace (but not near the start).
     """
     away = generic_factors(len(q)) * sizes(q)
-    places = [(t + share * FIRST_TIME_SCALE, q + share * away) for share in DISPLACEMENTS]
+    states = [(t + displacement * FIRST_TIME_SCALE, q + displacement * away) for displacement in DISPLACEMENTS]
 
     def check(traced: Traced) -> None:
         try:
             with np.errstate(all="ignore"):
-                difference = traced.difference(system, generic_states([(*place, v) for place in places]))
+                difference = traced.difference(system, generic_states([(*state, v) for state in states]))
         except Exception as error:  # outside the domain of the callbacks
             raise Untraceable(str(error)) from error
         if difference is not None:
@@ -163,7 +167,10 @@ def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
 
 
 def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
-    """Return rows [t, q, v] with random velocities, none of them zero, that are about as large as the given ones."""
+    """Return states, as rows [t, q, v], with their velocities replaced by random ones that are not zero.
+
+    The random velocities are proportional to the sizes of the coordinates, and about as large as those of the states.
+    """
     times, positions, velocities = (np.array(each, dtype=float) for each in zip(*states, strict=True))
     generic = np.array([sizes(q) for q in positions]) * _factors(*positions.shape)
     speed = max(1.0, float(np.abs(velocities).max()) / float(np.abs(generic).max()))
@@ -172,6 +179,6 @@ def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
 
 @cache
 def _factors(n_states: int, n_q: int) -> Array:
-    """Return fixed random factors between 0.5 and 1.5, of either sign."""
+    """Return an array (n_states, n_q) of random factors, the same in every call: 0.5 to 1.5 with random signs."""
     random = np.random.default_rng(1)
     return random.uniform(0.5, 1.5, (n_states, n_q)) * random.choice((-1.0, 1.0), (n_states, n_q))

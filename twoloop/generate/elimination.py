@@ -5,14 +5,15 @@ The matrix of
     [M  G^T] [a  ]   [Q    ]
     [G  0  ] [lam] = [Gamma]
 
-with G = [C_q; A] is eliminated without its structural zeros, in an order that is chosen once. Each row of G comes after
-all its coordinates. So the pivots are those of the definite matrices M and -G M^-1 G^T, and need no search.
+with G = [C_q; A] is eliminated without its structural zeros, in an order that is chosen once. Each row of G is
+eliminated after its coordinates. So the pivots are those of the definite matrices M and -G M^-1 G^T: no pivot search is
+necessary.
 
-- Where the pivot of a row is small compared with its pivot without the other rows, the row nearly depends on them. The
-  code then reports its results as invalid.
-- The same factors give the nearest position and velocity on the constraints, in the metric of M.
+- If a row of G has a much smaller pivot than it would have without the other rows, it nearly depends on these rows. The
+  generated code then reports that its results are invalid.
+- The same factors are used to compute the nearest position and velocity on the constraints, in the metric of M.
 - If M is singular, rows g of G are added to it: M + g^T g. This changes neither accelerations nor projections.
-- Of redundant rows, a subset of full rank is kept.
+- If rows of G are redundant, the equations contain only independent rows, as many as the rank of G.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,22 +37,24 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-SINGULAR_MASS = 1e-10  # smallest over largest eigenvalue of M; below, rows of G are added to M
-RANK = 1e-9  # relative norm of a row of G after elimination of the rows before; below, the row depends on them
-RELATIVE_BOUND = 0.01  # smallest allowed pivot, relative to the smallest pivot of a row of G at the start
-# possible values of the smallest allowed pivot; below the last one, rounding errors would dominate
+SINGULAR_MASS = 1e-10  # ratio of the smallest to the largest eigenvalue of M below which rows of G are added to M
+# a row of G counts as dependent if its part orthogonal to the other rows is shorter than this fraction of the row
+RANK = 1e-9
+RELATIVE_BOUND = 0.01  # smallest allowed pivot of a row of G in a run, relative to the smallest pivot at the start
+# possible values of the smallest allowed pivot; with pivots below the last value, rounding errors would dominate
 LEAST = 10.0 ** np.arange(-2, -9, -1)
-BOUNDS = LEAST[:-1] / RELATIVE_BOUND
-# Indices in BOUNDS: from this smallest pivot on, rows are added to M. POOR: for up to SMALL coordinates.
-# POOR_SINGULAR: if M is singular, because Euler parameters lose two digits in sound models. POOREST: for more
-# coordinates, because adding rows makes their code much longer.
-POOR, POOR_SINGULAR, POOREST, SMALL = 4, 5, 6, 24
-# ADDED_SIZE: size of the added rows relative to M. MIN_GAIN: number of BOUNDS by which the smallest pivot must improve;
-# otherwise the rows are nearly dependent for any M
-ADDED_SIZE, MIN_GAIN = 16.0, 2
-# ratio of rows of G to coordinates from which it pays to express some coordinates by the others; with fewer rows, the
-# linear system of the multipliers is the smaller one
-MOSTLY_ROWS = 2.0 / 3.0
+BOUNDS = LEAST[:-1] / RELATIVE_BOUND  # lower bounds of the smallest pivot at the start, for the values of LEAST
+N_FEW = 24  # largest number of coordinates for which FEW_FROM applies
+# All rows may be added to M if the first of BOUNDS below the smallest pivot has at least this index. FEW_FROM: for up
+# to N_FEW coordinates (pivots below 1e-3). FEW_SINGULAR_FROM: the same if M is singular, as Euler parameters lose two
+# digits in sound models. MANY_FROM: for more than N_FEW coordinates, as added rows make their code much longer.
+FEW_FROM, FEW_SINGULAR_FROM, MANY_FROM = 4, 5, 6
+ADDED_SIZE = 16.0  # largest entry of s G^T G, which is added to M, relative to the largest entry of M
+# decrease of the index in BOUNDS that added rows must achieve; otherwise the rows of G are nearly dependent for any M
+MIN_GAIN = 2
+# ratio of rows of G to coordinates from which on dependent coordinates are expressed by independent ones; with fewer
+# rows, the linear system for the multipliers is smaller
+MIN_ROW_RATIO = 2.0 / 3.0
 
 Blocks = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
 
@@ -63,15 +66,15 @@ class PivotChoice:
     Attributes
     ----------
     rows : tuple of int
-        Independent rows of G.
+        Indices of the independent rows of G.
     added, scale : tuple of int, float
-        Rows of G that make M definite when added to it, and their factor: a power of two that scales them to the size
-        of M.
+        Indices of the rows g of G with which M + scale g^T g is definite, and the factor `scale`: a power of two with
+        which the added terms are about as large as M.
     least : float
-        Smallest allowed pivot of a row, relative to its pivot without the other rows; a power of ten.
+        Smallest allowed pivot of a row of G, relative to its pivot without the other rows; a power of ten.
     blocks : tuple of (rows, columns)
-        Pivot blocks in the order of elimination: one or two indices in `rows`, and as many coordinates that these rows
-        determine. Empty if dependent coordinates save nothing, or if no coordinates are suitable.
+        Pivot blocks in the order of elimination: one or two indices in `rows`, and as many coordinates for which these
+        rows are solved. Empty if expressing dependent coordinates saves no operations, or no pivots are suitable.
     """
 
     rows: tuple[int, ...]
@@ -82,7 +85,7 @@ class PivotChoice:
 
     @classmethod
     def at(cls, system: ConstrainedSystem, t: float, q: Array) -> "PivotChoice":
-        """Return the choice at a position.
+        """Return the choice for the values of M and G at a position.
 
         Raises
         ------
@@ -95,34 +98,35 @@ class PivotChoice:
 
 
 class DependentColumns:
-    """Find the coordinates that rows of G determine; one object serves many positions of a system.
+    """Choice of dependent coordinates at positions of a system: pivot blocks by which rows of G determine them.
 
     Parameters
     ----------
     system : ConstrainedSystem
     rows : tuple of int
+        Indices of the independent rows of G.
 
     Attributes
     ----------
     find : callable or None
         Function of G and `arguments` that returns the number of blocks, see kernels/linalg/dependent_columns.py. None:
-        no coordinates are suitable at any position.
+        G has too few rows, or the kinds of its entries are unknown.
     """
 
     find: Any = None
 
     def __init__(self, system: ConstrainedSystem, rows: tuple[int, ...]):
-        kinds = _kinds_of_entries(system) if len(rows) >= MOSTLY_ROWS * system.n_q > 0 else None
+        kinds = _kinds_of_entries(system) if len(rows) >= MIN_ROW_RATIO * system.n_q > 0 else None
         if kinds is not None:
             from twoloop.kernels.linalg.dependent_columns import choose_dependent_columns, room_size
 
             numbers, integers = room_size(len(rows), system.n_q)
-            blocks, room, work = np.zeros(4 * len(rows), np.int64), np.zeros(numbers), np.zeros(integers, np.int64)
+            blocks, scratch, work = np.zeros(4 * len(rows), np.int64), np.zeros(numbers), np.zeros(integers, np.int64)
             self.find, self._blocks = entry_point(choose_dependent_columns), blocks
-            self.arguments = kinds, np.array(rows, np.int64), len(rows), room, work, blocks
+            self.arguments = kinds, np.array(rows, np.int64), len(rows), scratch, work, blocks
 
     def blocks(self, G: Array) -> Blocks:
-        """Return `PivotChoice.blocks` for the values of G at a position."""
+        """Return `blocks` of a PivotChoice for the values of G at a position."""
         if self.find is None:
             return ()
         n = self.find(G, *self.arguments)
@@ -131,8 +135,8 @@ class DependentColumns:
 
 
 def _kinds_of_entries(system: ConstrainedSystem) -> Any:
-    """Return the kind of each entry of G: 0 for zero, 1 for a constant, 2 if it varies; None if unknown."""
-    if system.called_in_python:  # such a function may store its arguments, so it is traced as late as possible
+    """Return the kind of each entry of G, row by row: 0: always zero, 1: constant, 2: varies; None if unknown."""
+    if system.called_in_python:  # a function called in Python may store its arguments: it is traced as late as possible
         return None
 
     def make(equations: Callable[[], Equations]) -> Any:
@@ -144,13 +148,13 @@ def _kinds_of_entries(system: ConstrainedSystem) -> Any:
 
     cache = shared_cache(system)
     kinds = cache.remembered("kinds of entries", partial(make, partial(cache.equations, system)))
-    if kinds is None:  # callbacks that branch on parameters can be traced for one system alone
+    if kinds is None:  # callbacks that branch on parameters can be traced for the parameters of one system only
         kinds = system.remembered("kinds of entries", partial(make, partial(Equations, system)))
     return kinds
 
 
 class PivotChooser:
-    """Make the choice for values of M and G at many positions of a system; equal choices are returned as one object."""
+    """Function object that returns the choice for values of M and G, at any number of positions of a system."""
 
     def __init__(self, system: ConstrainedSystem):
         from twoloop.kernels.linalg.rank import choose_rows, room_size
@@ -161,56 +165,57 @@ class PivotChooser:
         self._key, self._last = (0, b"", 0.0), PivotChoice((), (), 1.0, 0.0)
 
     def choice(self, mass: Array, G: Array) -> PivotChoice:
-        """Return the choice for an M and a G; raise like `PivotChoice.at`."""
-        system, room, chosen = self.system, self._room, self._chosen
+        """Return the choice for values of M and G (the last object if it is equal); raise as `PivotChoice.at`."""
+        system, scratch, chosen = self.system, self._room, self._chosen
         constant = system.constant_mass and system.derived.get("no weak mass", False)
-        room[0] = 0.0
-        place = self._choose(mass, G, RANK, 0.0 if constant else SINGULAR_MASS, BOUNDS, room, chosen)
-        decided = place, chosen.tobytes(), float(room[0])
-        if decided != self._key:
-            self._last, self._key = self._decode(place), decided
+        scratch[0] = 0.0
+        index = self._choose(mass, G, RANK, 0.0 if constant else SINGULAR_MASS, BOUNDS, scratch, chosen)
+        key = index, chosen.tobytes(), float(scratch[0])
+        if key != self._key:
+            self._last, self._key = self._decode(index), key
         singular = bool(self._last.added)
-        if place >= ((POOR_SINGULAR if singular else POOR) if len(mass) <= SMALL else POOREST + singular):
-            return self._with_added_rows(mass, G, place)
+        if index >= ((FEW_SINGULAR_FROM if singular else FEW_FROM) if len(mass) <= N_FEW else MANY_FROM + singular):
+            return self._with_added_rows(mass, G, index)
         return self._last
 
-    def _with_added_rows(self, mass: Array, G: Array, place: int) -> PivotChoice:
-        """Return the choice with all independent rows added to M, if that makes much larger pivots, else the last one.
+    def _with_added_rows(self, mass: Array, G: Array, index: int) -> PivotChoice:
+        """Return the choice with M + s G^T G instead of M if its smallest pivot is much larger, else the last choice.
 
-        Some bodies have little inertia about their joints, such as a rod with its mass in its middle. Then the rows are
-        nearly dependent in the metric of M, and accelerations lose up to twice the digits of the smallest pivot. In the
-        metric of M + s G^T G the rows are not nearly dependent. If M and s G^T G differ by a few powers of ten, only as
-        many digits are lost.
+        G: the independent rows. A body may have little inertia about its joints, as a rod with its mass in the middle.
+        Then the rows are nearly dependent in the metric of M: if the smallest pivot is 10^-k, accelerations lose up to
+        2 k digits. In the metric of M + s G^T G the rows are not nearly dependent. If s G^T G is 10^k times as large as
+        M, k digits are lost. `index`: of the smallest pivot in BOUNDS.
         """
         last = self._last
         rows = G[list(last.rows)]
         scale = 2.0 ** np.round(np.log2(ADDED_SIZE * np.abs(mass).max() / np.abs(rows).max() ** 2))
-        room, chosen = np.zeros_like(self._room), np.zeros_like(self._chosen)
-        new = self._choose(mass + scale * rows.T @ rows, G, RANK, 0.0, BOUNDS, room, chosen)
-        if not 0 <= new <= place - MIN_GAIN or chosen[2 : 2 + chosen[0]].tolist() != list(last.rows):
+        scratch, chosen = np.zeros_like(self._room), np.zeros_like(self._chosen)
+        new = self._choose(mass + scale * rows.T @ rows, G, RANK, 0.0, BOUNDS, scratch, chosen)
+        if not 0 <= new <= index - MIN_GAIN or chosen[2 : 2 + chosen[0]].tolist() != list(last.rows):
             return last
         return replace(last, added=last.rows, scale=float(scale), least=float(LEAST[new]))
 
-    def _decode(self, place: int) -> PivotChoice:
-        """Return the choice that the kernel wrote to `self._chosen`; `place`: index in LEAST, or negative."""
+    def _decode(self, index: int) -> PivotChoice:
+        """Return the choice in `self._chosen`; raise Untraceable if `index`, in LEAST, is negative: an error code."""
         from twoloop.kernels.linalg.rank import STAYS_SINGULAR
 
         system, n_rows = self.system, self.system.n_c + self.system.n_a
         n_independent, n_added, *places = self._chosen.tolist()
         if n_independent == 0:
             return PivotChoice((), (), 1.0, 0.0)
-        if place < 0:
-            stays = "stays singular with constraints added" if place == STAYS_SINGULAR else "is too nearly singular"
+        if index < 0:
+            stays = "stays singular with constraints added" if index == STAYS_SINGULAR else "is too nearly singular"
             raise Untraceable(f"the mass of {system.name!r} {stays}")
         if n_added == 0:
             system.derived["no weak mass"] = True
         added = tuple(places[n_rows : n_rows + n_added])
-        return PivotChoice(tuple(places[:n_independent]), added, float(self._room[0]), float(LEAST[place]))
+        return PivotChoice(tuple(places[:n_independent]), added, float(self._room[0]), float(LEAST[index]))
 
 
-MOST_ELIMINATED = 60_000  # largest number of operations with the elimination: enough for 40 bodies on hinges in space
-# `reduced` is used if its cost is less than this share of the cost of `mass_first`: both must be compiled, as small
-# pivots need `mass_first`. At a ratio of 0.68 (four-bar) a run gains 5 %.
+# largest number of operations of callbacks and elimination: enough for 40 bodies in space with hinges
+MOST_ELIMINATED = 60_000
+# cost of the program `reduced`, relative to that of `mass_first`, from which on it is not used: it is compiled in
+# addition to `mass_first`, which is needed if pivots become small. At a ratio of 0.68 (four-bar) it saves 5 % of a run.
 MAX_COST_RATIO = 0.75
 
 
@@ -230,29 +235,29 @@ class Elimination:
     graph : Graph
         Graph of the operations; its first inputs are t, q and v.
     mass_first : Program
-        "a" (n_q,), the accelerations at a state, by an elimination that begins with M.
+        Program for "a" (n_q,), the accelerations at a state, by an elimination that begins with M.
     reduced : Program or None
-        "a" by dependent coordinates, if that takes fewer operations. `mass_first` is valid at more positions.
+        Program for "a" by dependent coordinates, if it takes fewer operations; valid at fewer positions.
     right_sides : Program
-        "r" (n_q,) and "c" (n_c + n_a,): Q, and the right-hand sides of the rows of G in use; without conditions.
+        Program for "r" (n_q,), Q, and "c" (n_c + n_a,), the right-hand sides of the rows of G; 0 for unused rows.
     position_projection : Program
-        "q" (n_q,), the position after a Newton step towards the constraints, in directions that A allows, and "moved"
-        (n_q,), the change.
+        Program for "q" (n_q,), the position after one Newton step towards the constraints, in directions that A allows,
+        and "moved" (n_q,), the change of the position.
     projection : Program
-        The same and "v" (n_q,), the projected velocity, with "a" (n_q,) and "lam" (n_c + n_a,) for it. All rows are
-        those at the given position.
+        Program for "q", "moved", "v" (n_q,), the projected velocity, and "a" (n_q,) and "lam" (n_c + n_a,) at this
+        velocity. M, G and Q are evaluated at the position before the step.
     basic_projection : Program
-        The same, but with "lam" 0 for dependent rows.
+        As `projection`, but with "lam" 0 for dependent rows.
     position_errors, velocity_errors : Program
-        "c" (n_c + n_a,), the right-hand sides of the corrections of positions and of velocities.
+        Programs for "c" (n_c + n_a,), the right-hand sides of the corrections of positions, and of velocities.
     redundant_rows : Program
-        Program without arrays; its conditions are that the redundant constraints hold, too.
+        Program without arrays, whose conditions are that the redundant constraints are satisfied.
     parts : SplitFunctions or None
-        Generator of long equations in several functions, set by compile_equations.py.
+        Generator that splits long equations into several functions, set by compile_equations.py.
     n_operations : int
-        Number of operations of callbacks and factorization, without the solution of linear equations.
+        Number of operations of callbacks and factorization, without the solution with these factors.
     traced : Traced
-        The traced callbacks.
+        Traces of the callbacks.
 
     Raises
     ------
@@ -325,7 +330,7 @@ class Elimination:
         return matrix
 
     def _right_sides(self, v: Sequence[Affine]) -> tuple[list[Affine], list[Affine]]:
-        """Return Q, and the right-hand sides of all rows of G, at velocities v."""
+        """Return Q (n_q,), and the right-hand sides (n_c + n_a,) of all rows of G a = gamma, at velocities v."""
         return list(self._values_of("force", v)), [
             *self._values_of("gamma", v),
             *self._values_of("nonholonomic_gamma", v),
@@ -357,7 +362,7 @@ class Elimination:
 
     @property
     def accelerations(self) -> list[Program]:
-        """Return the programs for accelerations, `mass_first` last."""
+        """Return the programs for accelerations: `reduced`, if there is one, then `mass_first`."""
         return [self.mass_first] if self.reduced is None else [self.reduced, self.mass_first]
 
     @cached_property
@@ -370,7 +375,7 @@ class Elimination:
         )
 
     def _accelerations(self, v: Sequence[Affine]) -> list[Affine]:
-        """Return a and the multipliers of the independent rows, at velocities v."""
+        """Return a list of the accelerations and the multipliers of the independent rows, at velocities v."""
         right, gamma = self._right_sides(v)
         for k in self.choice.added:
             for i, entry in enumerate(self.all_rows[k]):
@@ -378,7 +383,7 @@ class Elimination:
         return self.factors.solve([*right, *(gamma[k] for k in self.choice.rows)])
 
     def _on_all_rows(self, independent: Sequence[Affine]) -> list[Affine]:
-        """Return the values of the independent rows as a list for all rows, with 0 for dependent ones."""
+        """Return a list with one value for each row of G: those of `independent`, and 0 for dependent rows."""
         numbers = [self.zero] * len(self.all_rows)
         for k, number in zip(self.choice.rows, independent, strict=True):
             numbers[k] = number
@@ -429,7 +434,7 @@ class Elimination:
         )
 
     def _correction(self, c: Program) -> list[Affine]:
-        """Return the smallest change x in the metric of M with G x = c."""
+        """Return the change x (n_q) of least norm, in the metric of M, with G x = c for the array "c" of a program."""
         n = self.system.n_q
         return self.factors.solve([*([self.zero] * n), *(c.arrays["c"][k] for k in self.choice.rows)])[:n]
 
@@ -441,10 +446,11 @@ def multipliers_of_least_norm(
     rows: Sequence[int],
     solve: Callable[[Sequence[Affine]], list[Affine]],
 ) -> list[Affine]:
-    """Return the multipliers of all rows that have least norm, given multipliers of the independent rows.
+    """Return the multipliers lam (one per row) of least norm with the same G^T lam as those of the independent rows.
 
-    Dependent row i is the combination sum_k Z_ik g_k of independent rows g_k. The null space of G^T is spanned by
-    e_i - sum_k Z_ik e_k. The component of lam in this space is removed.
+    `all_rows`: G. `rows`, `independent`: indices and multipliers of the independent rows. `solve`: solution with the
+    factors of [M G^T; G 0]. Dependent row i is a sum_k Z_ik g_k of independent rows g_k, so that the null space of G^T
+    is spanned by e_i - sum_k Z_ik e_k. The component of lam in this space is subtracted.
     """
     nothing = Affine(graph, 0.0, {})
     lam = [nothing] * len(all_rows)
@@ -466,26 +472,26 @@ def multipliers_of_least_norm(
 
 
 class Solution:
-    """Solution of M a + G^T lam = r with G a = c, by factors of the matrix at a position that are stored in memory.
+    """Programs that solve M a + G^T lam = r with G a = c in two parts: factors, stored in an array, and solution.
 
     Parameters
     ----------
     equations : Elimination
     more : sequence of Program
-        Programs of the equations; quantities that these programs share with the factors are stored, too.
+        Further programs at the same state; quantities that they share with the factors are stored, too.
 
     Attributes
     ----------
     stored : dict
-        Index in memory of each stored quantity.
+        Index in the array of stored quantities, by quantity of the graph of `equations`; the factors come first.
     kept : Program
         Program that computes the stored quantities.
     graph : Graph
-        Graph of the solution; its inputs are r (n_q,), c (n_c + n_a,) and the factors, which come first in memory.
+        Graph of the solution; its inputs are r (n_q,), c (n_c + n_a,) and the stored factors.
     solved : Program
         Program for "a" (n_q,) and "lam" (n_c + n_a,), which is 0 for dependent rows.
     least : Program
-        Program that turns the "lam" of `solved`, given as c, into "lam" (n_c,) of least norm.
+        Program for "lam" (n_c + n_a,) of least norm; its input c is the "lam" of `solved`.
     """
 
     def __init__(self, equations: Elimination, more: Sequence[Program] = ()):
@@ -550,7 +556,7 @@ class Solution:
 
 
 def _shared_quantities(graph: Graph, kept: Sequence[int], more: Sequence[Program]) -> list[int]:
-    """Return the quantities, other than `kept`, that are computed for `kept` and that the programs use, too."""
+    """Return the quantities on which `kept` depend, except `kept`, and which the programs `more` use, too."""
     computed = set(graph.needed_by(map(graph.quantity, kept)))
     used = {i for outputs in more for form in outputs.forms for i in form.terms}
     for outputs in more:

@@ -1,7 +1,7 @@
 """Record the operations of callbacks in a graph, and differentiate the recorded expressions.
 
-A value is an affine expression c + sum_i c_i x_i of quantities x_i: the time, coordinates, velocities, and the results
-of products and functions of such expressions. An operation that occurs twice is recorded once.
+A value is an affine expression c + sum_i c_i x_i of quantities x_i. Quantities are the time, coordinates, velocities,
+and the results of products and functions of affine expressions. An operation that occurs twice is recorded once.
 """
 
 import math
@@ -24,16 +24,17 @@ from twoloop.generate.parameter_expressions import (
 )
 from twoloop.kernels.evaluation import operations as op
 
-MOST_OPERATIONS = 20_000  # largest number of operations of a program; more would take longer to trace than a run takes
-# Constant factors are taken out of products. Two limits keep them from underflow and overflow: the smallest factor that
-# is taken out, and the exponent above which powers keep their factors, whatever the values of parameters are.
+# largest number of operations of a derived program or a series: tracing more would take longer than most runs
+MOST_OPERATIONS = 20_000
+# Constant factors are taken out of a product unless they might underflow or overflow: unless their product is below
+# LEAST_FACTOR or above its inverse, or the product is part of a power with an exponent above HIGH_POWER.
 LEAST_FACTOR, HIGH_POWER = 1e-100, 8
 BRANCHES = "it branches on, or converts to a number, what depends on t, q or v"
 
 # functions of `math` that also accept Parameters
 SIN, COS, EXP, LOG, ATAN, ROOT = map(function_of_number, ("sin", "cos", "exp", "log", "atan", "sqrt"))
 
-_equal = float.__eq__  # Parameters refuse ==, but not this function
+_equal = float.__eq__  # comparison of the current values of floats or Parameters, which refuse ==
 _size = float.__abs__  # absolute value as a plain float, also for a Parameter
 
 CONVERTS = "it converts what depends on t, q or v to a number, as functions of math do within methods (numpy's do not)"
@@ -45,12 +46,12 @@ class Graph(Symbolic):
     Attributes
     ----------
     operations : list
-        For each quantity its kind and one or two arguments; None for an input. The second argument of a logarithm or
-        an arctangent is the divisor of its derivative.
+        For each quantity the kind of operation and two arguments, of which the second may be None; None for an input.
+        The second argument of a logarithm or an arctangent is the divisor of its derivative.
     sizes : list of int
         Number of inputs added by each call of `inputs`.
     traced : dict
-        Results of callbacks for symbols: arrays of expressions by kind of callback.
+        Results of traced callbacks: arrays of expressions by kind of callback.
     """
 
     def __init__(self) -> None:
@@ -60,12 +61,13 @@ class Graph(Symbolic):
         self.inputs_of: list[int] = []  # bit masks of the inputs on which a quantity depends
         self.traced: dict[str, Any] = {}
         self._recorded: dict[tuple[int, int, int], int] = {}
-        self._order: dict[int, int] = {}  # rank of each factor by its first use: the same for all parameter values
-        self._numbers: dict[Any, int] = {}  # number of each key of an expression: keys take long to compare
+        # rank of each factor (by its identifier) in the order of first use, which is the same for all parameter values
+        self._order: dict[int, int] = {}
+        self._numbers: dict[Any, int] = {}  # identifier of each key of an expression: keys take long to compare
         self._quantities: dict[int, Affine] = {}
 
     def copy(self) -> "Graph":
-        """Copy the graph, so that the copy can be extended independently; `traced` is not copied."""
+        """Return a copy, which can be extended independently; `traced` is empty in the copy."""
         graph = Graph()
         graph.sizes, graph.late, graph.inputs_of = self.sizes.copy(), self.late.copy(), self.inputs_of.copy()
         graph._recorded, graph._order, graph._numbers = self._recorded.copy(), self._order.copy(), self._numbers.copy()
@@ -78,7 +80,7 @@ class Graph(Symbolic):
         return graph
 
     def inputs(self, n: int, late: bool) -> list["Affine"]:
-        """Add n inputs and return them; `late` is false for time and coordinates only."""
+        """Add n inputs and return them as expressions; `late`: false for time and coordinates, true for others."""
         first = len(self.operations)
         self.sizes.append(n)
         self.operations += [None] * n
@@ -87,20 +89,20 @@ class Graph(Symbolic):
         return [self.quantity(first + i) for i in range(n)]
 
     def quantity(self, i: int) -> "Affine":
-        """Return a quantity as an expression."""
+        """Return quantity i as an expression."""
         expression = self._quantities.get(i)
         if expression is None:
             self._quantities[i] = expression = Affine(self, 0.0, {i: 1.0})
         return expression
 
     def number(self, form: "Affine") -> int:
-        """Return an identifier; expressions that are equal up to rounding of their coefficients share it."""
+        """Return an identifier, which is equal for expressions whose coefficients are equal up to rounding."""
         if form.cached_number is None:
             form.cached_number = self._numbers.setdefault(form.key, len(self._numbers))
         return form.cached_number
 
     def operation(self, kind: int, first: "Affine", second: "Affine | None" = None) -> "Affine":
-        """Return the result of an operation; an operation that occurred before is not recorded again."""
+        """Return the result of an operation as a quantity; record the operation unless it is recorded already."""
         key = kind, self.number(first), -1 if second is None else self.number(second)
         quantity = self._recorded.get(key)
         if quantity is None:
@@ -114,7 +116,7 @@ class Graph(Symbolic):
         return self.quantity(quantity)
 
     def needed_by(self, forms: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
-        """List the quantities that expressions need, arguments first, except inputs and `available` quantities."""
+        """Return the quantities needed for expressions, in an order of computation, without inputs and `available`."""
         needed: set[int] = set()
         stack = [i for form in forms for i in form.terms]
         while stack:
@@ -136,14 +138,14 @@ class Graph(Symbolic):
         return [form for form in (self.operations[i] or ())[1:] if isinstance(form, Affine)]
 
     def in_order_of_use(self, forms: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
-        """List the quantities as in `needed_by`, but each just before its first use."""
+        """Return the quantities of `needed_by` in another order: each just before its first use."""
         order: list[int] = []
         needed: set[int] = set()
         stack = [i for form in forms for i in form.terms][::-1]
         while stack:
             i = stack.pop()
             operation = None if i < 0 else self.operations[i]
-            if i < 0:  # ~i was pushed below its arguments, which are in the list by now
+            if i < 0:  # the arguments of ~i, which were above it on the stack, are in `order` by now
                 order.append(~i)
             elif i not in needed and operation is not None and i not in available:
                 needed.add(i)
@@ -152,7 +154,7 @@ class Graph(Symbolic):
         return order
 
     def product(self, a: "Affine", b: "Affine") -> "Affine":
-        """Return a b; constant factors are taken out first, so that multiples of a product share one quantity."""
+        """Return a b as a multiple of a recorded product of normalized factors, which other multiples share."""
         if not a.terms:
             return b.times(a.constant)
         if not b.terms:
@@ -171,12 +173,12 @@ class Graph(Symbolic):
         return self.operation(op.PRODUCT, a, b)
 
     def square(self, form: "Affine", high: bool) -> "Affine":
-        """Return a square; `high`: for a high power, from which constant factors are not taken out (HIGH_POWER)."""
+        """Return the square of an expression; `high`: as part of a power with an exponent above HIGH_POWER."""
         return self._product(form, form) if high and form.terms else self.product(form, form)
 
 
 def rounded(value: float) -> Any:
-    """Round a number to 41 bits (12 digits). For a Parameter, return its expression instead, as its value varies."""
+    """Return a number rounded to 41 bits (12 digits); for a Parameter, its rounded scale and its Powers."""
     if type(value) is Parameter:
         return rounded(value.scale), value.powers
     value = float(value)
@@ -185,10 +187,10 @@ def rounded(value: float) -> Any:
 
 
 class Affine:
-    """Affine expression of quantities, with the arithmetic of a number.
+    """Affine expression of quantities, with the arithmetic of a number: a symbol for callbacks.
 
-    An expression cannot be compared, as it has no value. While a callback runs on expressions, all operations by which
-    the callback could distinguish them from numbers are refused.
+    An expression has no value to be compared. While a callback runs on expressions, operations by which the callback
+    could distinguish expressions from numbers raise an exception.
     """
 
     __slots__ = ("cached_key", "cached_number", "constant", "graph", "terms")
@@ -199,14 +201,14 @@ class Affine:
         self.cached_number: int | None = None  # see Graph.number
 
     def on(self, graph: Graph) -> "Affine":
-        """Return the same expression for a copy of its graph."""
+        """Return the same expression of the quantities of `graph`, a copy of its graph."""
         copy = Affine(graph, self.constant, self.terms)
         copy.cached_key = self.cached_key
         return copy
 
     @property
     def key(self) -> tuple[Any, ...]:
-        """Return a key; expressions that are equal up to rounding of their coefficients share it."""
+        """Return a key, equal for expressions whose coefficients are equal up to rounding."""
         if self.cached_key is None:
             self.cached_key = rounded(self.constant), *[(i, rounded(self.terms[i])) for i in sorted(self.terms)]
         return self.cached_key
@@ -225,7 +227,7 @@ class Affine:
         return Affine(self.graph, self.constant * factor, {i: c * factor for i, c in self.terms.items()})
 
     def normalised(self) -> tuple[float, "Affine"]:
-        """Return the coefficient of the first quantity, and the expression divided by it."""
+        """Return the coefficient of the quantity with the lowest index, and the expression divided by it."""
         first = min(self.terms)
         factor = self.terms[first]
         if type(factor) is float and factor == 1.0:
@@ -429,12 +431,12 @@ FUNCTIONS: dict[str, Callable[[Affine], Any]] = {
     "cosh": lambda x: (x.exponential() + (-x).exponential()) * 0.5,
     "tanh": lambda x: 1.0 - 2.0 / ((2.0 * x).exponential() + 1.0),
 }
-for _name, _function in FUNCTIONS.items():  # NumPy calls methods of these names on arrays of expressions
+for _name, _function in FUNCTIONS.items():  # NumPy functions call methods of these names for arrays of objects
     setattr(Affine, _name, _function)
 
 
 def symbols(forms: Iterable[Affine]) -> Any:
-    """Return an array of expressions, to be passed to callbacks."""
+    """Return an array (of objects) of expressions, to be passed to callbacks."""
     forms = list(forms)
     array = np.empty(len(forms), dtype=object)
     array[:] = forms
@@ -447,7 +449,7 @@ def is_zero(form: Affine) -> bool:
 
 
 class Derivative:
-    """Derivatives of expressions along a direction in the space of inputs, as expressions of the same graph."""
+    """Derivatives of expressions along a direction: a dict of its nonzero components by indices of inputs."""
 
     def __init__(self, graph: Graph, direction: dict[int, Affine]):
         self.graph = graph
@@ -463,7 +465,7 @@ class Derivative:
         return total
 
     def _of_quantity(self, i: int) -> Affine:
-        stack = [i]  # no recursion, as products may be nested a thousand deep
+        stack = [i]  # an explicit stack, as products may be nested more deeply than Python allows recursion
         while i not in self._derivatives:
             operation = self.graph.operations[stack[-1]]
             forms = () if operation is None else [form for form in operation[1:] if isinstance(form, Affine)]

@@ -1,8 +1,8 @@
-"""Generate code of one mechanism for many runs at once: every number is a vector, with one run in each of its lanes.
+"""Generate code for many runs of one mechanism at once: every number is a vector, with one run in each of its lanes.
 
-The operations come from `series`, `elimination` and `compile_equations`. Coefficients are read as vectors, so that each
-run may have its own parameters. The step-size control of Taylor series is generated, too. The layout of the memory is
-in kernels/lanes/layout.py. The code is cached on disk; its key is the structure of the equations.
+`series`, `elimination` and `compile_equations` write the operations. Coefficients are read as vectors, so that each run
+may have its own parameters. The step-size control of Taylor series is generated, too. The layout of the memory is in
+kernels/lanes/layout.py. The code is cached on disk; its key is the structure of the equations.
 """
 
 import hashlib
@@ -43,27 +43,29 @@ from twoloop.kernels.lanes.layout import CODE
 from twoloop.problem.system import ConstrainedSystem
 
 # constants of a step by series, as in kernels/steps/taylor_step.py
-ALLOWED = 0.3  # violation of the constraints that a step aims at before its projection, relative to the tolerances
-MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # factors of step sizes: the smallest, a safety factor, the largest
-MAX_REJECTIONS = 10  # largest number of rejections in a row
-FIRST_UNIT = 0.01  # first guess of the unit of time, relative to the length of the run
-# a projection has converged when a correction is below an absolute limit (unit of q), or this share of the largest
-# position
+# error of predicted positions, relative to its limit, for which the next step is chosen after one was rejected by it
+TARGET_ERROR = 0.3
+# ratio of the next step size to the last one: smallest value, safety factor, largest value
+MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0
+MAX_REJECTIONS = 10  # largest number of successive rejections; after more, a lane fails
+FIRST_UNIT = 0.01  # unit of time of the first series, relative to the time t1 - t0 of the run
+# a projection has converged if a correction is at most ABSOLUTE_CORRECTION (unit of q), or RELATIVE_CORRECTION times
+# the largest position
 ABSOLUTE_CORRECTION, RELATIVE_CORRECTION = 1e-14, 1e-14
-CONTRACTION = 0.5  # ratio of a correction to the one before, above which a projection does not converge
+CONTRACTION = 0.5  # ratio of two successive corrections above which a projection fails
 IN_PARALLEL = 3  # number of coordinates in one loop of Horner schemes: each needs 3 of the 16 vector registers
 
 
 class Places(NamedTuple):
-    """Order of the series, and pointers to `work` and to its parts, see kernels/lanes/layout.py."""
+    """Order of the series, and pointers to `work` and to the arrays in it, see kernels/lanes/layout.py."""
 
     order: Value
     work: Value
     state: Value
     new: Value
     predicted: Value
-    series_a: Value  # accelerations of the series; `a`: accelerations by the equations of motion
-    a: Value
+    series_a: Value  # accelerations as second derivatives of the series
+    a: Value  # accelerations that satisfy the equations of motion
     lam: Value
     series: Value
     scratch: Value
@@ -78,7 +80,10 @@ class LaneSteps:
         self.n, self.n_rows = n, n_rows
 
     def unit(self, emit: LaneEmitter, control: Value, work: Value) -> Value:
-        """Store and return UNIT, the unit of time of the series; new runs and accepted steps get a new one."""
+        """Store and return UNIT, the unit of time of the series, s; it changes in new runs and after accepted steps.
+
+        Reset LONGEST and SHIFT in new runs.
+        """
         select, unit = emit.builder.select, emit.load(work, lanes.UNIT)
         fresh, accepted = (is_set(emit, work, field) for field in (lanes.FRESH, lanes.ACCEPTED))
         span = emit.subtract(broadcast_entry(emit, control, lanes.T1), broadcast_entry(emit, control, lanes.T0))
@@ -94,7 +99,7 @@ class LaneSteps:
         return unit
 
     def lengths(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store step sizes, from the last two terms of positions and velocities, relative to the tolerances."""
+        """Store the step sizes H and X, computed from the last two terms of the series, and update RUNNING and FINE."""
         builder, n, at = emit.builder, self.n, self.places(emit, order, control, work)
         unit, (rtol, atol) = emit.load(work, lanes.UNIT), self.tolerances(emit, control)
         one, sizes = emit.constant(1.0), []
@@ -133,13 +138,13 @@ class LaneSteps:
             store_mask(emit, work, field, may_step)
 
     def evaluate(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Evaluate the series at X units of time; store NEW (positions, velocities), accelerations, predictions."""
+        """Evaluate the series at X units of time; store NEW, `series_a`, and the positions once more as `predicted`."""
         at = self.places(emit, order, control, work)
         for j, q in enumerate(self.positions(emit, at, emit.load(work, lanes.X))):
             emit.store(q, at.predicted, j)
 
     def positions(self, emit: LaneEmitter, at: Places, x: Value) -> list[Value]:
-        """Evaluate positions, velocities and accelerations by Horner's scheme, store them and return the positions."""
+        """Evaluate the series at x units of time; store NEW and `series_a`; return the positions."""
         positions: list[Value] = []
         builder, n, order = emit.builder, self.n, at.order
         unit, zero = emit.load(at.work, lanes.UNIT), emit.constant(0.0)
@@ -165,15 +170,15 @@ class LaneSteps:
         return positions
 
     def defect(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store DEFECT, the defect of a step at its end (see `defect_of`)."""
+        """Store DEFECT, the defect of a step at its end (see `defect_of`), for the accelerations in memory."""
         at = self.places(emit, order, control, work)
         a = [emit.load(at.a, j) for j in range(self.n)]
         emit.store(self.defect_of(emit, control, at, a), work, lanes.DEFECT)
 
     def defect_of(self, emit: LaneEmitter, control: Value, at: Places, a: list[Value]) -> Value:
-        """Return the defect of the accelerations of the series at NEW, relative to the tolerances.
+        """Return the defect at NEW, see control/step_size.py, relative to the tolerances.
 
-        `a`: the accelerations from the equations of motion. See control/step_size.py.
+        It is the difference between the accelerations of the series and `a`, those by the equations of motion.
         """
         n, (rtol, atol) = self.n, self.tolerances(emit, control)
         steps, h = emit.number(at.order), emit.load(at.work, lanes.H)
@@ -194,7 +199,7 @@ class LaneSteps:
         return emit.multiply(share, worst)
 
     def departure(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store OFF, the error of the predicted positions relative to its limit, see control/step_size.py."""
+        """Store OFF, the difference of predicted and projected positions over its limit, see control/step_size.py."""
         n, at, (rtol, atol) = self.n, self.places(emit, order, control, work), self.tolerances(emit, control)
         h = emit.load(work, lanes.H)
 
@@ -221,11 +226,11 @@ class LaneSteps:
         emit.store(off, work, lanes.OFF)
 
     def turned(self, emit: LaneEmitter, at: Places) -> Value | None:
-        """Return a mask of the lanes that may have passed a singular position from STATE to NEW; None: unchecked."""
+        """Return a mask of the lanes that may have passed a singular position in this step, or None: not checked."""
         return None
 
     def judge(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Accept steps, or reject and shorten them; a lane fails after too many rejections or a NaN."""
+        """Store ACCEPTED, and LONGEST, the limit of the next step; stop lanes after MAX_REJECTIONS or a NaN."""
         builder, one = emit.builder, emit.constant(1.0)
         select, per_order = builder.select, emit.divide(one, emit.number(order))
         off, *defects = (emit.load(work, field) for field in (lanes.OFF, lanes.WORST, lanes.DEFECT))
@@ -238,7 +243,7 @@ class LaneSteps:
         def root(x: Value) -> Value:
             return emit.exponential(emit.multiply(emit.logarithm(x), per_order))
 
-        by_departure = root(emit.divide(emit.constant(ALLOWED), off))
+        by_departure = root(emit.divide(emit.constant(TARGET_ERROR), off))
         factor = select(builder.compare("fcmp ogt", off, one), by_departure, one)
         by_defect = emit.multiply(emit.constant(SAFETY), root(emit.divide(one, defect)))
         by_defect = emit.smaller(factor, emit.larger(shortest, by_defect))
@@ -265,12 +270,12 @@ class LaneSteps:
             emit.store(emit.builder.select(accepted, emit.load(at.new, k), emit.load(at.state, k)), at.state, k)
 
     def tolerances(self, emit: LaneEmitter, control: Value) -> tuple[Value, list[Value]]:
-        """Return rtol, and a list with atol of each coordinate."""
+        """Return rtol, and a list with atol of each coordinate, broadcast to all lanes."""
         atol = [broadcast_entry(emit, control, lanes.ATOL + j) for j in range(self.n)]
         return broadcast_entry(emit, control, lanes.RTOL), atol
 
     def places(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> Places:
-        """Return the pointers to all parts of `work`; set the pointers to coefficients in `emit`, too."""
+        """Return the pointers to the arrays in `work`; store the pointers to coefficients in `emit`."""
         *fixed, series = lanes.places(self.n, self.n_rows, self.n_numbers)
         emit.numbers = emit.pointer(work, fixed.pop())
         emit.constants = emit.builder.gep(control, integer(lanes.ATOL + self.n))
@@ -311,10 +316,10 @@ Rows = list[dict[int, Value]]  # the nonzero entries of each row, by column
 def turned(emit: LaneEmitter, before: Rows, after: Rows) -> Value:
     """Return a mask of the lanes in which a step may have passed a singular position: det G1 G0^T is not positive.
 
-    G0 and G1 are the rows of the constraints at both ends of the step. By the Cauchy-Binet formula the determinant is
-    the inner product of the vectors of their maximal minors, which is positive if the two vectors are similar. A step
-    straight through a position at which the rows become dependent leads to another assembly: all minors pass through
-    zero and change their signs. Lanes in which the determinant would need a search for pivots are set in the mask, too.
+    G0 and G1 (`before`, `after`) are the rows of the constraints at both ends of the step. By the Cauchy-Binet formula
+    the determinant is the inner product of the vectors of their maximal minors, which is positive if the two vectors
+    are similar. A step through a position at which the rows become dependent may lead to another assembly: then all
+    minors pass through zero and change their signs. Lanes with a pivot of zero are set in the mask, too.
     """
     matrix: list[dict[int, Value]] = [{} for _ in before]
     for i, row in enumerate(after):
@@ -328,7 +333,7 @@ def turned(emit: LaneEmitter, before: Rows, after: Rows) -> Value:
     one, zero, select, compare = emit.constant(1.0), emit.constant(0.0), emit.builder.select, emit.builder.compare
     left, sign = set(range(len(matrix))), one
     while left:
-        # minimum degree: rows and columns have the same pattern
+        # minimum degree, counted in rows alone, because rows and columns have the same pattern
         i = min(left, key=lambda each: (len(matrix[each]), each))
         left.remove(i)
         pivot = matrix[i].pop(i)
@@ -350,15 +355,15 @@ Array = NDArray[np.float64]
 WEIGHT_ROUNDING = 1e-13  # smaller weights count as zero: in products such as A A they are rounding errors
 
 
-# A, b and c of an explicit method whose first stage is the state itself, and the weights of two error estimates
+# A, b, c of an explicit Runge-Kutta method whose first stage is the state itself, and weights of two error estimates
 Tableau = tuple[Array, Array, Array, Array, Array]
 
 
 class LaneStages:
     """Generator of the stages of an explicit Runge-Kutta method, and of its error estimates, for n coordinates.
 
-    Velocities of stages are weighted sums of accelerations, with weights A. Positions are such sums, too, with weights
-    A A, so that each acceleration is read once for both. Weights are literals in the code; zero terms are left out.
+    Velocities at stages are sums of accelerations weighted by A, positions are sums weighted by A A, so that each
+    acceleration is loaded once for both. Weights are literals in the code; terms with a weight of zero are left out.
     """
 
     def __init__(self, tableau: Tableau, n: int):
@@ -366,11 +371,11 @@ class LaneStages:
 
     @property
     def structure(self) -> list[bytes]:
-        """Return the tableau as bytes, as the code depends on nothing else."""
+        """Return the tableau as a list of bytes: the only data on which the code depends, besides n."""
         return [np.asarray(each).tobytes() for each in self.tableau]
 
     def write(self, emit: LaneEmitter, arguments: tuple[Value, Value, Value], at: Places) -> None:
-        """Store NEW, the state at time X after the beginning of the step, and ERROR, valid if X is the step size."""
+        """Store NEW, the state a time X after the beginning of the step; store ERROR, which is valid if X is H."""
         A, b, c, fine, coarse = self.tableau
         _, control, work = arguments
         x, t = emit.load(work, lanes.X), emit.load(work, lanes.T)
@@ -408,7 +413,7 @@ class LaneStages:
 
 
 class _Coordinate:
-    """Coordinate j in a loop over the coordinates: its state before the step, and accelerations at `count` stages."""
+    """Coordinate j in a loop over coordinates: its state before the step, and its accelerations at `count` stages."""
 
     def __init__(self, stages: LaneStages, emit: LaneEmitter, at: Places, j: Value, count: int):
         n, self.emit, self.new, self.n = stages.n, emit, emit.pointer(at.new, j), stages.n
@@ -432,13 +437,13 @@ class _Coordinate:
         return self.emit.constant(0.0) if total is None else total
 
     def error_weight(self, atol: Value, rtol: Value, before: Value, after: Value) -> Value:
-        """Return the reciprocal of the allowed error of a number that changed from `before` to `after`."""
+        """Return the reciprocal of the allowed error of a position or velocity with these values at the step's ends."""
         emit = self.emit
         size = emit.larger(emit.function("fabs", before), emit.function("fabs", after))
         return emit.divide(emit.constant(1.0), emit.add(atol, emit.multiply(rtol, size)))
 
     def move(self, weights: Array, twice: Array, x: Value) -> tuple[Value, Value]:
-        """Store position and velocity in NEW; return them. `weights`: of accelerations in v; `twice`: in q."""
+        """Return q and v at a stage, and store them in NEW; weights of accelerations: `weights` in v, `twice` in q."""
         emit, (q, v) = self.emit, self.before
         drift = emit.multiply(emit.constant(float(weights.sum())), v)
         q = emit.add(q, emit.multiply(x, emit.add(drift, emit.multiply(x, self.sum(twice)))))
@@ -448,9 +453,9 @@ class _Coordinate:
         return q, v
 
 
-GOLDEN = 0.6180339887498949  # golden section: its multiples modulo 1 are spread evenly
-MOST_PARTS = 1000.0  # largest number of parts into which a step is divided to check the defect
-MOST_OPERATIONS = 1500  # largest number of operations of a series: this many take some seconds to compile
+GOLDEN = 0.6180339887498949  # golden section: its multiples modulo 1 are spread evenly on [0, 1]
+MOST_PARTS = 1000.0  # largest number of parts into which times divide a step at which the defect is checked
+MOST_OPERATIONS = 1500  # largest number of operations of a series: as many take some seconds to compile
 
 
 class LaneCode(LaneSteps):
@@ -518,7 +523,7 @@ class LaneCode(LaneSteps):
         return *lanes.TASKS, *lanes.TASKS_OF_STAGES, *explicit
 
     def series_size(self, order: int) -> int:
-        """Return the length, in vectors, of the memory for a series of the given order and its intermediate results."""
+        """Return the number of vectors in memory for a series of an order, and for its intermediate results."""
         assert self.recurrences is not None
         return (order + 1) * self.n + self.recurrences.scratch_size(order)
 
@@ -535,7 +540,7 @@ class LaneCode(LaneSteps):
             description += list(self.recurrences.structure)
             parts.append(self.solution.kept)
         else:
-            parts.append(self._rows_at)  # its coefficients must be numbered even if the code comes from the disk
+            parts.append(self._rows_at)  # its coefficients must get indices even if the code is read from the disk
         for outputs in parts:
             description += [outputs.sizes, *numbers.structure(outputs)]
         if self.recurrences is not None:
@@ -567,10 +572,10 @@ class LaneCode(LaneSteps):
         store_mask(emit, work, lanes.FINE, holds)
 
     def check_within(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store WORST, the largest defect at times within the step, whose distances are at most GAP.
+        """Store WORST, the largest defect at equidistant times within the step, at most GAP apart.
 
-        AHEAD is set to each of the times in turn, and finally to the end of the step. SHIFT is a multiple of the golden
-        section modulo 1; it moves the times as far as GAP allows, so that they differ from step to step.
+        AHEAD becomes each of the times, and finally the end of the step. SHIFT is a multiple of the golden section
+        modulo 1; it moves the times as far as GAP allows, so that they differ from step to step.
         """
         builder, at = emit.builder, self.places(emit, order, control, work)
         h, gap = emit.load(work, lanes.H), broadcast_entry(emit, control, lanes.GAP)
@@ -600,7 +605,7 @@ class LaneCode(LaneSteps):
         emit.store(builder.select(last, t1, emit.add(t, h)), work, lanes.AHEAD)
 
     def approach(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Project the positions of the lanes in which FINE is set: the first correction."""
+        """Correct the positions NEW once in the lanes in which FINE is set; store FINE and LEFT_TO_MOVE."""
         active, _ = self._project(
             emit, self.equations.position_projection, lanes.FINE, self.places(emit, order, control, work)
         )
@@ -609,7 +614,10 @@ class LaneCode(LaneSteps):
         emit.store(emit.constant(math.inf), work, lanes.MOVED_BEFORE)
 
     def refine(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Project positions and velocities once more in the lanes that need it, with accelerations and multipliers."""
+        """Correct positions NEW and project velocities in the lanes in which LEFT_TO_MOVE is set.
+
+        Store accelerations and multipliers, FINE, and LEFT_TO_MOVE in the lanes that need a further correction.
+        """
         builder, at = emit.builder, self.places(emit, order, control, work)
         fine, left = (is_set(emit, work, field) for field in (lanes.FINE, lanes.LEFT_TO_MOVE))
         active, moved = self._project(emit, self.equations.basic_projection, lanes.LEFT_TO_MOVE, at)
@@ -628,9 +636,9 @@ class LaneCode(LaneSteps):
         store_mask(emit, work, lanes.FINE, builder.operation("or", unchanged, converged))
 
     def _project(self, emit: LaneEmitter, outputs: Program, which: int, at: Places) -> tuple[Value, Value]:
-        """Correct NEW in the lanes in which the field `which` is set.
+        """Correct NEW by a projection program, in the lanes in which the field `which` is set.
 
-        Return a mask of the lanes whose correction is valid, and the largest change of a position.
+        Return a mask of the lanes whose correction is valid, and the largest change of a position in each lane.
         """
         select, work = emit.builder.select, at.work
         inputs = self._new_state(emit, work, at)
@@ -648,7 +656,7 @@ class LaneCode(LaneSteps):
         return active, largest
 
     def accelerate(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Compute the accelerations at the state NEW and the time AHEAD; clear FINE where they are invalid."""
+        """Store the accelerations at the state NEW and the time AHEAD; clear FINE in lanes where they are invalid."""
         at = self.places(emit, order, control, work)
         holds, a = self._accelerations(emit, work, at)
         for k, value in enumerate(a):
@@ -660,7 +668,7 @@ class LaneCode(LaneSteps):
         return holds, a
 
     def turned(self, emit: LaneEmitter, at: Places) -> Value | None:
-        """Return the mask of the function `turned`; None for series, whose defects show a passed singular position."""
+        """Return the mask of the function `turned`; None for series, whose defects reveal passed singular positions."""
         if self.recurrences is not None or len(self.equations.rows) == 0:
             return None
         return turned(emit, *(self._rows(emit, at, time, base) for time, base in self._ends_of_step(at)))
@@ -669,7 +677,7 @@ class LaneCode(LaneSteps):
         return [(lanes.T, at.state), (lanes.AHEAD, at.new)]
 
     def _rows(self, emit: LaneEmitter, at: Places, time: int, base: Value) -> list[dict[int, Value]]:
-        """Return the nonzero entries of G at a state, row by row."""
+        """Return the nonzero entries of each row of G, by columns, at the time field `time` and the state at `base`."""
         inputs = [emit.load(at.work, time), *(emit.load(base, i) for i in range(2 * self.n))]
         _, (entries,) = lower(emit, self._rows_at, inputs, self.numbers)
         rows: list[dict[int, Value]] = [{} for _ in self.equations.rows]
@@ -683,7 +691,7 @@ class LaneCode(LaneSteps):
         self.explicit.write(emit, (order, control, work), self.places(emit, order, control, work))
 
     def redundant(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Clear FINE in the lanes in which a redundant row is violated."""
+        """Clear FINE in the lanes in which NEW violates a redundant constraint."""
         at, outputs = self.places(emit, order, control, work), self.equations.redundant_rows
         lowering, (no_values,) = lower(emit, outputs, self._new_state(emit, work, at), self.numbers)
         clear_fine_unless(emit, work, lowering.holds(outputs, no_values))
@@ -704,8 +712,8 @@ class LaneConstraints(LaneSteps):
     Attributes
     ----------
     pattern : ndarray of int
-        Sparsity pattern of C_q: for each row the index in `pattern` at which its columns begin, then the length of
-        `pattern`, then the columns of all rows.
+        Sparsity pattern of C_q: first, for each row, the index in `pattern` of its first column; then the length of
+        `pattern`; then the columns of the entries of all rows.
 
     Raises
     ------
@@ -730,7 +738,7 @@ class LaneConstraints(LaneSteps):
         self.n_numbers, self.n_quantities = self.numbers.n_varying, len(self._rows.quantities())
 
     def rows(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Compute C, C_t and the entries of C_q at the state NEW and the time AHEAD; store them at `Places.series`."""
+        """Store C, C_t and the entries of C_q, at the state NEW and the time AHEAD, in the memory `Places.series`."""
         at = self.places(emit, order, control, work)
         inputs = [emit.load(work, lanes.AHEAD), *(emit.load(at.new, i) for i in range(2 * self.n))]
         lowering, arrays = lower(emit, self._rows, inputs, self.numbers)
@@ -740,9 +748,9 @@ class LaneConstraints(LaneSteps):
         clear_fine_unless(emit, work, lowering.holds(self._rows, values))
 
 
-BUILD_SECONDS = 3e-4  # estimated time to compile one quantity, s
+BUILD_SECONDS = 3e-4  # estimated time to compile the operation of one quantity, s
 ELIMINATION = (elimination, null_space, compile_equations)
-# modules that write the code: a change of one makes cached code invalid
+# modules that write the code: cached code is invalid after a change of one of them
 WRITERS = (series, *ELIMINATION, program, lane_series, llvm_code, llvm_text)
 
 Code = TypeVar("Code", LaneCode, LaneConstraints)
@@ -750,7 +758,7 @@ KIND = "lanes"  # kind of the cached files
 
 
 class GeneratedLanes(Generic[Code]):
-    """Compiled code of a mechanism for SIMD lanes; it evaluates its coefficients for any parameters.
+    """Compiled code of a mechanism for SIMD lanes, with a method that evaluates its coefficients.
 
     Parameters
     ----------
@@ -776,13 +784,13 @@ class GeneratedLanes(Generic[Code]):
 
     @property
     def seconds_to_build(self) -> float:
-        """Estimate the time to compile the code, s; 0 if the code is in memory or on the disk."""
+        """Return the estimated time to compile the code, s; 0 if the code is in memory or on the disk."""
         if are_cached(KIND, _stamp(), self.code.structure):
             return 0.0
         return BUILD_SECONDS * self.code.n_quantities
 
     def numbers(self, parameters: Array) -> Array:
-        """Evaluate the coefficients that the code reads, for parameters (n_runs, n_p)."""
+        """Return the coefficients (n_runs, n_numbers) that vary, for parameters (n_runs, n_p)."""
         return self.code.numbers.for_parameters(self.record, parameters)
 
 

@@ -1,10 +1,10 @@
-"""Write programs as LLVM code (`Lowering`), and single operations (`Emitter`).
+"""Write LLVM code for programs (`Lowering`), and for single operations (`Emitter`).
 
-Numba takes milliseconds for a line of source, and LLVM well below a millisecond for an operation. So a long list of
-operations goes to LLVM directly, as functions that kernels call at their addresses. Sine and cosine are written inline,
-so that the processor computes those of several angles in parallel.
+Numba takes milliseconds to compile a line of source, and LLVM well below a millisecond for an operation. So long lists
+of operations are written as LLVM functions, which kernels call at their addresses. Sine and cosine are written inline,
+so that the processor computes the sines and cosines of several angles in parallel.
 
-Coefficients are read from memory: the code serves all mechanisms of the same structure.
+The code reads coefficients from memory: it can be used for all mechanisms with the same structure of the equations.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -38,21 +38,21 @@ from twoloop.kernels.evaluation.operations import (
     SQUARE_ROOT,
 )
 
-FLAGS = " ".join(sorted(OPTIONS["fastmath"]))
-LONG = 4  # number of terms from which on a sum is written as two sums
+FLAGS = " ".join(sorted(OPTIONS["fastmath"]))  # fast-math flags of floating-point instructions, as in kernels
+MIN_TERMS_SPLIT = 4  # number of terms from which on a sum is computed as the sum of two halves
 ZERO, ONE = constant(DOUBLE, 0.0), constant(DOUBLE, 1.0)
-# intrinsic functions of LLVM; other functions are called in libm
+# LLVM intrinsics by names of functions; functions without an intrinsic are called in libm
 INTRINSICS = {name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqrt", "rint", "ceil", "fabs")}
 
 
 class Emitter:
-    """Emitter that appends operations to an LLVM function.
+    """Emitter that appends operations on doubles to an LLVM function, and returns the values of their results.
 
-    Operands are doubles. Array indices count doubles. `numbers` points to the coefficients that the code reads.
+    Array indices count doubles. `numbers` points to the coefficients that the code reads.
     """
 
     double, whole_number, bit = DOUBLE, INTEGER, BIT
-    suffix = "f64"  # suffix of the names of intrinsic functions
+    suffix = "f64"  # last part of the names of LLVM intrinsics: the type of their arguments
 
     def __init__(self, builder: Builder):
         self.builder = builder
@@ -67,15 +67,15 @@ class Emitter:
         return constant(self.double, value)
 
     def far(self, value: float) -> Value:
-        """Write the load of a number that is stored in memory, see `Builder.far`."""
+        """Return a number that is loaded from memory where it is used, see `Builder.far`."""
         return self.builder.far(value)
 
     def whole(self, value: int) -> Value:
-        """Return a literal integer of the same width as the numbers."""
+        """Return a literal of 64 bits, an integer (or, in lanes, a vector of equal integers)."""
         return constant(self.whole_number, value)
 
     def coefficient(self, number: float) -> Value:
-        """Return a literal number, or the value of a Coefficient, which is loaded from memory that never changes."""
+        """Return a literal, or the value of a Coefficient, loaded from an array that does not change during a call."""
         if not isinstance(number, Coefficient):
             return self.constant(number)
         return self.load(self.numbers, number.place, constant=True)
@@ -85,7 +85,7 @@ class Emitter:
         return self.builder.operation(f"fadd {FLAGS}", a, b)
 
     def add_sums(self, a: Value, b: Value) -> Value:
-        """Add two sums without reassociation: LLVM would otherwise chain their terms, which is slower."""
+        """Return a + b for two sums without reassociation: LLVM would chain the terms of both, which is slower."""
         return self.builder.operation("fadd", a, b)
 
     def subtract(self, a: Value, b: Value) -> Value:
@@ -105,7 +105,7 @@ class Emitter:
         return self.builder.call(f"llvm.fma.{self.suffix}", a.type, [a, b, c])
 
     def polynomial(self, coefficients: Sequence[float], x: Value) -> Value:
-        """Evaluate a polynomial by pairs of terms, which are independent; its constant is the first coefficient."""
+        """Return the value of a polynomial, constant first, at x; pairs of terms can be computed in parallel."""
         square, terms = self.builder.operation("fmul", x, x), [self.far(each) for each in coefficients]
         pairs = [self.fused(second, x, first) for first, second in zip(terms[::2], terms[1::2], strict=False)]
         pairs += terms[2 * len(pairs) :]
@@ -148,7 +148,7 @@ class Emitter:
         return base
 
     def load(self, base: Value, place: int = 0, constant: bool = False) -> Value:
-        """Load the number at an index; `constant`: it never changes."""
+        """Return the number at an index, loaded from memory; `constant`: the number does not change during a call."""
         return self.builder.load(self.pointer(base, place), constant=constant)
 
     def store(self, value: Value, base: Value, place: int = 0) -> None:
@@ -156,20 +156,20 @@ class Emitter:
         self.builder.store(value, self.pointer(base, place))
 
     def load_vector(self, base: Value, place: int, width: int) -> Value:
-        """Load a vector; base + place must be aligned to the size of the vector.
+        """Return the vector at an index, whose address must be aligned to the size of the vector.
 
-        This is slow just after the elements were stored one by one: the processor waits until they are in its cache.
+        The load is slow just after the elements were stored one by one: the processor waits until all are stored.
         """
         pointer = self.builder.convert("bitcast", self.pointer(base, place), f"{vector_of(DOUBLE, width)}*")
         return self.builder.load(pointer, 8 * width)
 
     def store_vector(self, value: Value, base: Value, place: int) -> None:
-        """Store a vector; base + place must be aligned to the size of the vector."""
+        """Store a vector at an index, whose address must be aligned to the size of the vector."""
         pointer = self.builder.convert("bitcast", self.pointer(base, place), f"{value.type}*")
         self.builder.store(value, pointer, 8 * width_of(value.type))
 
     def vector(self, values: Sequence[Value]) -> Value:
-        """Combine numbers to a vector."""
+        """Return a vector with the given numbers as elements."""
         vector = undefined(vector_of(DOUBLE, len(values)))
         for place, value in enumerate(values):
             vector = self.builder.insert(vector, value, place)
@@ -206,10 +206,10 @@ class Emitter:
 
 
 class Quantities:
-    """Values of numbered quantities and of linear combinations of them; each is loaded, or summed, only once.
+    """Values of numbered quantities and of linear combinations of quantities; each is loaded or computed only once.
 
-    Each part of a divided function loads quantities again: otherwise the compiler would spill them to the stack. So the
-    memory from which they are loaded must not change.
+    Each part of a divided function loads the quantities that it needs again: otherwise the compiler would spill them to
+    the stack. So the memory from which quantities are loaded must not change.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ class Quantities:
     def __init__(self, emit: Emitter, load: Callable[[int], Value]):
         self._emit, self._load = emit, load
         self._values: dict[int, Value] = {}
-        self._loaded: dict[int, Value] = {}  # loaded values in the part of a divided function that is being written
+        self._loaded: dict[int, Value] = {}  # values loaded in the current part of a divided function
         self._part = emit.builder.part
         self._sums: dict[tuple[Terms, float], Value] = {}
 
@@ -230,7 +230,7 @@ class Quantities:
         self._values[quantity] = value
 
     def value(self, quantity: int) -> Value:
-        """Return the value of a quantity; load it if it was not defined."""
+        """Return the value of a quantity: the defined one, else one loaded in the current part of the function."""
         if quantity in self._values:
             return self._values[quantity]
         loaded = self._loaded_in_part()
@@ -239,11 +239,11 @@ class Quantities:
         return loaded[quantity]
 
     def mark_stored(self, quantity: int) -> None:
-        """Mark a quantity as stored in memory: this part of the function uses its value, later parts load it."""
+        """Mark a defined quantity as stored in memory: the current part uses its value, and later parts load it."""
         self._loaded_in_part()[quantity] = self._values.pop(quantity)
 
     def _loaded_in_part(self) -> dict[int, Value]:
-        """Return the values loaded in this part of the function."""
+        """Return the dict of values loaded in the current part of the function; it is empty in a new part."""
         if self._part != self._emit.builder.part:
             self._part, self._loaded = self._emit.builder.part, {}
         return self._loaded
@@ -252,11 +252,11 @@ class Quantities:
         """Return `constant` plus the sum of coefficient * quantity over the terms."""
         key = terms, constant
         if self._emit.builder.module.divided and len(terms) == 1 and constant == 0.0:
-            ((quantity, coefficient),) = terms  # a second multiplication takes no longer than to spill the product
+            ((quantity, coefficient),) = terms  # multiplying again takes no longer than loading a stored product
             return self._emit.times(coefficient, self.value(quantity))
         if key not in self._sums:
             total: Any = None if constant == 0.0 and terms else self._emit.coefficient(constant)
-            half = len(terms) // 2 if len(terms) >= LONG else 0
+            half = len(terms) // 2 if len(terms) >= MIN_TERMS_SPLIT else 0
             if half:  # the processor computes two independent chains of additions in parallel
                 self._sums[key] = self._emit.add_sums(self.sum(terms[:half], constant), self.sum(terms[half:]))
                 return self._sums[key]
@@ -286,7 +286,7 @@ def write(
 
 # sine and cosine on [-pi/4, pi/4]: coefficients of x^3, x^5, ... and of x^4, x^6, ... from S. Moshier's Cephes library,
 # sin.c; angles are reduced by multiples of pi/2, which is stored as the sum of two numbers
-LARGEST_ANGLE = 1e6  # largest angle, rad: for larger angles HALF_PI, the sum of two numbers, is not accurate enough
+LARGEST_ANGLE = 1e6  # largest accepted angle, rad: for larger angles, HALF_PI as a sum of two numbers is not accurate
 HALF_PI = (1.5707963267948966, 6.123233995736766e-17)
 SINES = (
     -1.66666666666666307295e-1,
@@ -307,7 +307,7 @@ COSINES = (
 
 
 def sine_and_cosine(emit: Emitter, x: Value) -> tuple[Value, Value]:
-    """Return sine and cosine of x, correct to rounding for angles up to LARGEST_ANGLE."""
+    """Return sine and cosine of x, accurate to rounding errors for |x| up to LARGEST_ANGLE."""
     builder, whole = emit.builder, emit.whole
     turns = emit.function("rint", builder.operation("fmul", x, emit.far(1.0 / HALF_PI[0])))
     remainder = x
@@ -335,20 +335,20 @@ NOWHERE: Mapping[int, Place] = {}
 
 
 class Lowering(Algebra[Value]):
-    """Algebra that writes an LLVM function: its values are the numbers or vectors of SIMD lanes of that function.
+    """Algebra that writes the operations of programs to an LLVM function; its values are values of this function.
 
     Parameters
     ----------
     emit : Emitter
     numbers : Coefficients
     places : dict, optional
-        Memory locations of quantities that are stored already.
+        Memory locations (array and index) of quantities that are stored already.
     """
 
     def __init__(self, emit: Emitter, numbers: Coefficients, places: Mapping[int, Place] = NOWHERE):
         super().__init__()
         self.emit, self.numbers, self._places = emit, numbers, dict(places)
-        self.angles: list[Value] = []  # arguments of sines and cosines: `holds` checks that they are not too large
+        self.angles: list[Value] = []  # arguments of sines and cosines, to be compared with LARGEST_ANGLE by `holds`
         self.functions = {kind: partial(emit.function, name) for kind, name in FUNCTIONS.items()}
         self.functions[RECIPROCAL] = lambda x: emit.divide(emit.constant(1.0), x)
         self._quantities = Quantities(emit, lambda quantity: emit.load(*self._places[quantity]))
@@ -360,7 +360,7 @@ class Lowering(Algebra[Value]):
         self._quantities.define(quantity, value)
 
     def define_inputs(self, graph: Graph, given: Sequence[Value]) -> None:
-        """Define the inputs of a graph, from arguments that are numbers, or arrays from which inputs are loaded."""
+        """Define the inputs of a graph by arguments of the function: numbers, or arrays to be loaded from."""
         first = 0
         for argument, size in zip(given, graph.sizes, strict=True):
             if argument.type == self.emit.double:
@@ -385,7 +385,7 @@ class Lowering(Algebra[Value]):
         return self.emit.multiply(a, b)
 
     def operation(self, kind: int, first: Affine, second: Affine | None) -> Value:
-        """Return the result of an operation; the sine of an angle is computed together with the cosine."""
+        """Return the result of an operation; the sine and the cosine of an angle are computed together."""
         if kind not in (SINE, COSINE):
             return super().operation(kind, first, second)
         angle = self.affine(first)
@@ -407,10 +407,10 @@ class Lowering(Algebra[Value]):
         return None
 
     def outputs(self, program: Program) -> list[list[Value]]:
-        """Compute the arrays of a program and the quantities of its conditions; return the arrays.
+        """Return the arrays of a program as values, after writing code for them and for the quantities of conditions.
 
-        In a divided function each number is computed just before it is used: few numbers stay in registers from one
-        part to the next, and LLVM reorders instructions only within a part.
+        In a divided function each number is computed just before its use, so that few numbers are in registers between
+        parts; LLVM reorders instructions only within a part.
         """
         graph = program.graph
         if not self.emit.builder.module.divided:
@@ -421,14 +421,14 @@ class Lowering(Algebra[Value]):
         return arrays
 
     def forms(self, graph: Graph, forms: Sequence[Affine]) -> list[Value]:
-        """Write code for expressions and return their values; quantities that were computed before are not repeated."""
+        """Return the values of expressions, after writing code for the quantities that were not computed before."""
         quantities = graph.in_order_of_use(forms, self._computed)
         self.run(graph, quantities)
         self._computed.update(quantities)
         return [self.affine(form) for form in forms]
 
     def holds(self, program: Program, values: Sequence[Value]) -> Value:
-        """Write code for whether the conditions hold, no angle is too large, and all `values` are finite."""
+        """Return whether the conditions of a program hold, all `values` are finite, and no angle is too large."""
         emit, builder, zero = self.emit, self.emit.builder, self.emit.constant(0.0)
         total = zero
         for value in values:  # values that are not finite make the sum NaN
@@ -444,6 +444,6 @@ class Lowering(Algebra[Value]):
 def lower(
     emit: Emitter, program: Program, inputs: Sequence[Value], numbers: Coefficients
 ) -> tuple[Lowering, list[list[Value]]]:
-    """Write code for a program; return its lowering and its arrays."""
+    """Write code for a program at `inputs`; return the Lowering that wrote the code, and the arrays of the program."""
     lowering = Lowering(emit, numbers)
     return lowering, program.run(lowering, inputs)

@@ -1,8 +1,8 @@
 """Write LLVM modules as text: functions, blocks and instructions.
 
 llvmlite builds modules from objects, which takes ten times as long as writing text, and longer than the compilation by
-LLVM. Types are represented by their text. The type of a pointer names the type to which it points, which all versions
-of LLVM read.
+LLVM. Types are represented by their text. Pointers have the type to which they point, such as double*, as all versions
+of LLVM accept this.
 """
 
 import struct
@@ -10,9 +10,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 DOUBLE, INTEGER, WORD, BIT, NOTHING = "double", "i64", "i32", "i1", "void"
-LINE = 8  # number of doubles in a cache line of the processor
-# largest number of lines in a block of a divided function: longer blocks take more than twice as long to compile
-LONGEST = 400
+DOUBLES_PER_CACHE_LINE = 8  # size of a cache line of the processor, in doubles
+# largest number of instructions in a block of a divided function: longer blocks take more than twice as long to compile
+MAX_BLOCK_LENGTH = 400
 
 
 class Value:
@@ -24,12 +24,12 @@ class Value:
         self.type, self.text = kind, text
 
     def __str__(self) -> str:
-        """Return the type and the text, as an argument of a call is written."""
+        """Return the type and the text, in the form of an argument of a call."""
         return f"{self.type} {self.text}"
 
 
 class Phi(Value):
-    """Phi node: a value that depends on the block from which the node's own block is entered."""
+    """Phi node: a value that depends on the block from which control enters the block of the node."""
 
     __slots__ = ("incoming",)
 
@@ -38,7 +38,7 @@ class Phi(Value):
         self.incoming: list[tuple[Value, Block]] = []
 
     def add_incoming(self, value: Value, block: "Block") -> None:
-        """Add the value for the case that the node's own block is entered from `block`."""
+        """Add the value that the node has if control enters its block from `block`."""
         self.incoming.append((value, block))
 
     def line(self) -> str:
@@ -61,7 +61,7 @@ class Block:
 
 
 def vector_of(kind: str, width: int) -> str:
-    """Return the type of a vector, or of a number if the width is 1."""
+    """Return the type of a vector of `width` elements of type `kind`; if `width` is 1, `kind` itself."""
     return kind if width == 1 else f"<{width} x {kind}>"
 
 
@@ -71,7 +71,7 @@ def width_of(kind: str) -> int:
 
 
 def element_of(kind: str) -> str:
-    """Return the type of the elements of a vector."""
+    """Return the type of the elements of a vector; for the type of a number, this type."""
     return kind[1:-1].split(" x ")[1] if kind.startswith("<") else kind
 
 
@@ -100,9 +100,9 @@ def undefined(kind: str) -> Value:
 
 
 class Module:
-    """Module: functions, and declarations of functions that they call.
+    """LLVM module: functions, and declarations of the other functions that they call.
 
-    `divided`: long blocks are divided, because LLVM's time grows faster than the length of a block.
+    `divided`: whether long blocks are divided, as the time that LLVM takes grows faster than the length of a block.
     """
 
     def __init__(self, divided: bool = False) -> None:
@@ -114,7 +114,7 @@ class Module:
         self._functions: list[Builder] = []
 
     def function(self, name: str, result: str, arguments: Sequence[str], internal: bool = False) -> "Builder":
-        """Add a function, and return its builder; `internal`: only functions of the module call it."""
+        """Add a function and return its Builder; `internal`: only functions of the module call it."""
         builder = Builder(self, name, result, arguments, internal)
         self._functions.append(builder)
         return builder
@@ -124,19 +124,19 @@ class Module:
         return any(function.name == name for function in self._functions)
 
     def table(self, places: Sequence[int]) -> Value:
-        """Add an array of constant integers, and return a pointer to it."""
+        """Add an array of constant integers to the module, and return a pointer to the array."""
         kind, name = f"[{len(places)} x {WORD}]", f"@table{len(self._tables)}"
         entries = ", ".join([f"{WORD} {place}" for place in places])
         self._tables.append(f"{name} = internal constant {kind} [{entries}]")
         return Value(f"{WORD}*", f"getelementptr inbounds ({kind}, {kind}* {name}, {INTEGER} 0, {INTEGER} 0)")
 
     def far_number(self, number: float) -> int:
-        """Add a number that `Builder.far` loads, and return its index."""
+        """Add a number to the array from which `Builder.far` loads, and return its index."""
         self._numbers.append(number)
         return len(self._numbers) - 1
 
     def declare(self, name: str, result: str, arguments: Iterable[str]) -> None:
-        """Declare a function of LLVM or of libm."""
+        """Add the declaration of a function that may be outside the module, such as one of libm."""
         self._declared[name] = f"declare {result} @{name}({', '.join(arguments)})"
 
     def __str__(self) -> str:
@@ -157,14 +157,14 @@ class Module:
 
 
 class Builder:
-    """Builder of a function: appends instructions to its blocks."""
+    """Builder of an LLVM function: its methods append instructions to the current block, and return their results."""
 
     def __init__(self, module: Module, name: str, result: str, arguments: Sequence[str], internal: bool = False):
         self.module, self.name, self.result, self.internal = module, name, result, internal
         self.arguments = [Value(kind, f"%a{k}") for k, kind in enumerate(arguments)]
         self._n = self._n_rooms = 0
         self._far: Value | None = None
-        self.part = 0  # index of the present part of a divided function
+        self.part = 0  # index of the current part of a divided function
         self._blocks: list[Block] = []
         self._n_blocks = 0
         self.position_at_end(self.append_block())
@@ -175,16 +175,16 @@ class Builder:
         body = "\n".join(block.text() for block in self._blocks)
         linkage = "internal " if self.internal else ""
         # without this alignment spilled vectors lie across two cache lines, and take twice as long to load and store
-        attributes = "noinline alignstack(64)" if f"<{LINE} x" in body else "noinline"
+        attributes = "noinline alignstack(64)" if f"<{DOUBLES_PER_CACHE_LINE} x" in body else "noinline"
         return f"define {linkage}{self.result} @{self.name}({arguments}) {attributes} {{\n{body}\n}}"
 
     def append_block(self) -> Block:
-        """Return a new block; `position_at_end` adds it to the text of the function."""
+        """Return a new block, which is not part of the function until `position_at_end` adds it."""
         self._n_blocks += 1
         return Block(f"b{self._n_blocks - 1}")
 
     def position_at_end(self, block: Block) -> None:
-        """Append a block to the function, and make it the block to which instructions are appended."""
+        """Append a block to the function, and make it the current block, to which instructions are appended."""
         self.block = block
         self._blocks.append(block)
 
@@ -192,7 +192,7 @@ class Builder:
         self.block.lines.append(text)
 
     def _value(self, kind: str, text: str) -> Value:
-        if self.module.divided and len(self.block.lines) >= LONGEST:
+        if self.module.divided and len(self.block.lines) >= MAX_BLOCK_LENGTH:
             self._divide()
         value = Value(kind, f"%{self._n}")  # LLVM reads numbers in a third less time than names
         self._n += 1
@@ -200,7 +200,7 @@ class Builder:
         return value
 
     def _divide(self) -> None:
-        """Continue in a new block, whose address is stored, so that LLVM does not merge it with the present block."""
+        """Continue in a new block; its address is stored, so that LLVM does not merge it with the current block."""
         block = self.append_block()
         self.go_to(block)
         self.module.kept_apart.append(f"i8* blockaddress(@{self.name}, %{block.name})")
@@ -208,7 +208,7 @@ class Builder:
         self.part += 1
 
     def operation(self, name: str, a: Value, b: Value) -> Value:
-        """Append an operation on two values of the same type, such as "add" or "fmul fast"."""
+        """Return the result of an operation, such as "add" or "fmul fast", on two values of the same type."""
         return self._value(a.type, f"{name} {a.type} {a.text}, {b.text}")
 
     def negative(self, flags: str, a: Value) -> Value:
@@ -232,20 +232,20 @@ class Builder:
         return self.operation("and", a, b)
 
     def convert(self, name: str, a: Value, kind: str) -> Value:
-        """Convert a value by an instruction such as "sitofp" or "bitcast"."""
+        """Return a value converted to another type by an instruction such as "sitofp" or "bitcast"."""
         return self._value(kind, f"{name} {a.type} {a.text} to {kind}")
 
     def compare(self, name: str, a: Value, b: Value) -> Value:
-        """Compare two values by an instruction such as "fcmp oeq" or "icmp slt"."""
+        """Return the result (BIT) of comparing two values by an instruction such as "fcmp oeq" or "icmp slt"."""
         kind = vector_of(BIT, width_of(a.type))
         return self._value(kind, f"{name} {a.type} {a.text}, {b.text}")
 
     def select(self, condition: Value, a: Value, b: Value) -> Value:
-        """Return the first of two values where the condition holds, else the second."""
+        """Return a if the condition is true, else b; for vectors, element by element."""
         return self._value(a.type, f"select {condition}, {a}, {b}")
 
     def call(self, name: str, kind: str, arguments: Sequence[Value], flags: str = "") -> Value:
-        """Call a function; declare it if the module does not define it. `flags`: of floating-point operations."""
+        """Return the result of a call; declare a function that the module does not define. `flags`: fast-math flags."""
         self.module.declare(name, kind, [value.type for value in arguments])
         return self._value(kind, f"call {flags} {kind} @{name}({', '.join(map(str, arguments))})")
 
@@ -254,7 +254,7 @@ class Builder:
         self._line(f"call {NOTHING} @{name}({', '.join(map(str, arguments))})")
 
     def room(self, kind: str, size: int) -> Value:
-        """Allocate memory on the stack, in the first block: within a loop, each iteration would enlarge the stack."""
+        """Return a pointer to stack memory, allocated in the first block: in a loop the stack would grow each time."""
         pointer = Value(f"{kind}*", f"%room{self._n_rooms}")
         self._blocks[0].lines.insert(
             self._n_rooms, f"{pointer.text} = alloca {kind}, {integer(max(size, 1))}, align 64"
@@ -263,7 +263,7 @@ class Builder:
         return pointer
 
     def far(self, number: float) -> Value:
-        """Load a number from memory where it is used: a literal would occupy a register or the stack for long."""
+        """Return a number loaded where it is used: a literal would occupy a register or the stack for long."""
         if self._far is None:
             self._far = Value(f"{DOUBLE}*", "%far")
             self._blocks[0].lines.insert(0, f"%far = load {DOUBLE}*, {DOUBLE}** @far")
@@ -271,7 +271,7 @@ class Builder:
         return self.load(self.gep(self._far, integer(self.module.far_number(number))))
 
     def leave_unless(self, condition: Value) -> None:
-        """Return false from the function if a condition does not hold."""
+        """Write a return from the function, with the result false, that is executed if a condition is false."""
         go_on, leave = self.append_block(), self.append_block()
         self.branch(condition, go_on, leave)
         self.position_at_end(leave)
@@ -279,16 +279,16 @@ class Builder:
         self.position_at_end(go_on)
 
     def gep(self, base: Value, place: Value) -> Value:
-        """Return a pointer advanced by a number of elements."""
+        """Return the pointer `base` advanced by `place` elements."""
         return self._value(base.type, f"getelementptr inbounds {base.type[:-1]}, {base}, {place}")
 
     def load(self, pointer: Value, align: int = 8, constant: bool = False) -> Value:
-        """Load a value; `constant`: it never changes."""
+        """Return the value to which a pointer points; `constant`: this value does not change during a call."""
         kind, never = pointer.type[:-1], ", !invariant.load !0" if constant else ""
         return self._value(kind, f"load {kind}, {pointer}, align {align}{never}")
 
     def store(self, value: Value, pointer: Value, align: int = 8) -> None:
-        """Store a value."""
+        """Store a value at the address `pointer`."""
         self._line(f"store {value}, {pointer}, align {align}")
 
     def insert(self, vector: Value, value: Value, place: int) -> Value:
@@ -300,7 +300,7 @@ class Builder:
         return self._value(element_of(vector.type), f"extractelement {vector}, {WORD} {place}")
 
     def shuffle(self, a: Value, b: Value, places: Sequence[int]) -> Value:
-        """Return a vector of elements of two vectors; the indices of b follow those of a."""
+        """Return a vector of the elements with the indices `places`, counted from a to b, of two vectors."""
         mask = f"<{len(places)} x {WORD}> <{', '.join(f'{WORD} {place}' for place in places)}>"
         return self._value(vector_of(element_of(a.type), len(places)), f"shufflevector {a}, {b}, {mask}")
 
@@ -310,23 +310,23 @@ class Builder:
         return self._value(vector.type, f"shufflevector {vector}, {vector}, {mask}")
 
     def phi(self, kind: str) -> Phi:
-        """Append a phi node, whose value depends on the block from which the present one is entered."""
+        """Append a phi node without values; `Phi.add_incoming` adds the value for each preceding block."""
         phi = Phi(kind, f"%{self._n}")
         self._n += 1
         self.block.lines.append(phi)
         return phi
 
     def go_to(self, block: Block) -> None:
-        """End the block by a jump."""
+        """End the current block by a jump to `block`."""
         self._line(f"br label %{block.name}")
 
     def branch(self, condition: Value, then: Block, otherwise: Block) -> None:
-        """End the block by a branch."""
+        """End the current block by a branch to `then` if the condition is true, else to `otherwise`."""
         self._line(f"br {condition}, label %{then.name}, label %{otherwise.name}")
 
     @contextmanager
     def if_then(self, condition: Value) -> Iterator[None]:
-        """Context of instructions that run only if a condition holds."""
+        """Return a context for instructions that run only if a condition is true."""
         then, after = self.append_block(), self.append_block()
         self.branch(condition, then, after)
         self.position_at_end(then)
@@ -335,5 +335,5 @@ class Builder:
         self.position_at_end(after)
 
     def ret(self, value: Value | None) -> None:
-        """Return from the function."""
+        """Write a return from the function with the result `value`; None: without a result."""
         self._line("ret void" if value is None else f"ret {value}")

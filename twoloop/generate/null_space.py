@@ -4,8 +4,8 @@ With G = [G_d G_i], a_d = g + B a_i for B = -G_d^-1 G_i and g = G_d^-1 gamma. Th
 a_i = T^T (Q - M g) with T = [B; 1]. This takes about half the operations of an elimination that begins with M, and M
 may be singular in directions that the constraints exclude.
 
-Pivots are chosen once. If one becomes small during a run, the conditions of the code fail, and a is computed by the
-elimination that begins with M.
+Pivots are chosen once. If a pivot becomes small during a run, a condition of the generated code fails, and a is
+computed by the elimination that begins with M.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,24 +15,25 @@ from twoloop.generate.graph import Affine, is_zero
 
 
 class Block(NamedTuple):
-    """Block of one or two rows that are eliminated together, with one division."""
+    """Block of one or two rows of the matrix that are eliminated together, with one division."""
 
     places: tuple[int, ...]  # indices of the rows
-    inverse: list[list[Affine]]  # inverse of the pivots
-    below: list[tuple[int, list[Affine]]]  # index and nonzero entries of each row of L below the pivots
+    inverse: list[list[Affine]]  # inverse of the 1x1 or 2x2 matrix of pivots
+    below: list[tuple[int, list[Affine]]]  # for each row of L below the block with nonzero entries: index, and entries
 
 
 class Factors:
-    """Factors L D L^T of a symmetric matrix [M G^T; G 0] of expressions, without a search for pivots.
+    """Factors L D L^T of a symmetric matrix [M G^T; G 0] of expressions; the pivots are its diagonal blocks.
 
     Attributes
     ----------
     blocks : list of Block
         Blocks in the order of elimination.
     conditions : list of (Affine, Affine)
-        For each row of G (index `n` and later) its pivot, and the pivot that it would have without the other rows of G.
+        Pairs, for rows of G (index `n` and later), of a pivot and the pivot without the other rows of G. The first
+        expression must be larger than a fraction of the second.
     positive : list of Affine
-        Pivots that are positive if M, the first `n` rows, is definite.
+        Pivots of M (index below `n`), which are positive if M is definite.
     """
 
     def __init__(self, matrix: dict[tuple[int, int], Affine], size: int, n: int):
@@ -62,7 +63,7 @@ class Factors:
             self.blocks.append(Block(places, inverse, below))
 
     def _inverse(self, pivots: list[list[Affine]], alone: list[Any]) -> list[list[Affine]]:
-        """Return the inverse of a block of pivots; add its conditions. `alone`: the pivots without other rows of G."""
+        """Return the inverse of a block of pivots; add its conditions. `alone`: pivots of G without other rows of G."""
         diagonal = [None if each is None else each.value() for each in alone]
         a = pivots[0][0]
         if diagonal[0] is None:
@@ -81,7 +82,7 @@ class Factors:
         return [[(c * inverse).value(), (-b * inverse).value()], [(-b * inverse).value(), (a * inverse).value()]]
 
     def solve(self, right: Sequence[Affine]) -> list[Affine]:
-        """Return the solution for a right-hand side."""
+        """Return the solution of the linear system for a right-hand side."""
         return solve(self.blocks, right)
 
 
@@ -93,7 +94,7 @@ def _dot(a: Sequence[Affine], b: Sequence[Affine]) -> Affine:
 
 
 def solve(blocks: Sequence[Block], right: Sequence[Affine]) -> list[Affine]:
-    """Return the solution for a right-hand side, given the blocks of `Factors`; products share common factors."""
+    """Return the solution of a linear system, given the blocks of its `Factors` and the right-hand side."""
     solution = list(right)
     pending: list[list[tuple[Affine, Affine]]] = [[] for _ in right]
     for places, _, below in blocks:
@@ -110,7 +111,7 @@ def solve(blocks: Sequence[Block], right: Sequence[Affine]) -> list[Affine]:
 
 
 def _collected_sum(products: Sequence[tuple[Affine, Affine]]) -> Any:
-    """Return the sum of products a b; products whose factors a are multiples of one expression are combined."""
+    """Return the sum of products a b; if factors a are multiples of one expression, first sum up the factors b."""
     total: Any = 0.0
     groups: dict[Any, tuple[Affine, Affine]] = {}
     for factor_a, factor_b in products:
@@ -127,10 +128,10 @@ def _collected_sum(products: Sequence[tuple[Affine, Affine]]) -> Any:
 
 
 def _pairs(rows: list[dict[int, Affine]], n: int) -> list[tuple[int, int]]:
-    """Return pairs of a coordinate and a row of G that can be eliminated first, without a condition or a division.
+    """Return pairs of a coordinate and a row of G that are eliminated first, without a condition or a division.
 
-    The coordinate occurs in no other row, and its mass and its entry of G are constants. The rank of G is the rank of
-    the remaining rows plus the number of pairs.
+    The coordinate occurs in no other row of [M G^T; G 0], and both of its entries, in M and in G, are constants. The
+    rank of G is the rank of the remaining rows plus the number of pairs.
     """
     pairs: dict[int, int] = {}  # coordinates by rows of G
     for i, row in enumerate(rows[:n]):
@@ -140,10 +141,11 @@ def _pairs(rows: list[dict[int, Affine]], n: int) -> list[tuple[int, int]]:
 
 
 def _order(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, ...]]:
-    """Order rows by minimum degree, in pairs where two rows have the same neighbours.
+    """Return the rows (indices) except those in `pairs`, ordered by minimum degree, as tuples of one or two rows.
 
-    A row of G (index n and later) comes after its coordinates. Among rows of equal degree, the row with the shortest
-    chain of divisions before it comes first, so that independent operations can overlap.
+    Two rows with the same neighbours are in one tuple. A row of G (index n and later) comes after its coordinates.
+    Among rows of equal degree, the one after the shortest chain of divisions comes first, so that independent
+    operations can overlap.
     """
     neighbours = [set(row) - {i} for i, row in enumerate(rows)]
     waiting_for = [{j for j in neighbours[i] if j < n} if i >= n else set() for i in range(len(rows))]
@@ -168,7 +170,7 @@ def _order(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int, int
 
 
 def _eliminate(neighbours: list[set[int]], places: Sequence[int]) -> set[int]:
-    """Eliminate rows from the graph of entries: connect their neighbours with one another; return the neighbours."""
+    """Eliminate rows from the graph of entries: connect the neighbours of the rows, and return these neighbours."""
     around = set().union(*(neighbours[i] for i in places)) - set(places)
     for j in around:
         neighbours[j] = (neighbours[j] | around) - {*places, j}
@@ -178,14 +180,14 @@ def _eliminate(neighbours: list[set[int]], places: Sequence[int]) -> set[int]:
 Blocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # rows and columns of the pivots, one or two each
 Terms = dict[int, Affine]  # nonzero entries of a row, by their columns
 
-# smallest allowed square of three ratios: of a pivot to the entries that it divides, of a pivot to its column, and the
-# sine of the angle between two columns. Accelerations lose up to three times the digits of the ratio. At a start the
-# limits are stricter, see linalg/dependent_columns.py.
-LEAST = 0.03**2
+# smallest allowed square of each of three ratios: of a pivot to the norm of the entries that it divides, of a pivot to
+# the norm of its column, and the sine of the angle between the two columns of a block. A ratio of 10^-k costs up to 3 k
+# digits of accelerations. At a start the limits are stricter, see linalg/dependent_columns.py.
+MIN_PIVOT_SQUARE = 0.03**2
 
 
 class NotReduced(Exception):
-    """Raised if a pivot is structurally zero, or if the elimination takes too many operations."""
+    """Exception if a pivot is always zero, or if the elimination takes too many operations."""
 
 
 class DependentCoordinates:
@@ -194,28 +196,28 @@ class DependentCoordinates:
     Parameters
     ----------
     rows : sequence of sequence of Affine
-        G, of full rank.
+        The matrix G, of full rank.
     gamma : sequence of Affine
     blocks : sequence of (rows, columns)
         Rows and columns of the pivots, in the order of elimination.
     most : int
-        Largest number of operations.
+        Largest number of operations that may be added to the graph.
 
     Attributes
     ----------
     independent : list of int
         Independent coordinates.
     T : list of dict
-        Nonzero entries of each row of T, by the independent coordinates that they multiply.
+        For each row of T, its nonzero entries by independent coordinate.
     g : list of Affine
-        The vector g; 0 for independent coordinates.
+        The vector g of length n_q; 0 for independent coordinates.
     conditions : list of (Affine, Affine)
-        Pairs; the first expression is larger than the second unless a pivot is too small.
+        Pairs of expressions: in each, the first is larger than the second unless a pivot is too small.
 
     Raises
     ------
     NotReduced
-        If a pivot is structurally zero, or if the elimination takes more than `most` operations.
+        If a pivot is always zero, or if the elimination takes more than `most` operations.
     """
 
     def __init__(self, rows: Sequence[Sequence[Affine]], gamma: Sequence[Affine], blocks: Blocks, most: int):
@@ -239,7 +241,7 @@ class DependentCoordinates:
                 self._substitute(j, self._rows[i])
 
     def _eliminate(self, places: tuple[int, ...], columns: tuple[int, ...]) -> None:
-        """Solve rows (`places`) for coordinates (`columns`), and eliminate the coordinates from the other rows."""
+        """Solve one or two rows (`places`) for as many coordinates (`columns`); eliminate these from the other rows."""
         self.check()
         block = [[self._rows[i].get(j, self._zero) for j in columns] for i in places]
         pivot, inverse = self._inverse(block)
@@ -264,7 +266,7 @@ class DependentCoordinates:
             self._add_conditions(block, columns, pivot, solved)
 
     def check(self, more: int = 0) -> None:
-        """Raise `NotReduced` if the elimination, with `more` further operations, takes more than `most`."""
+        """Raise `NotReduced` if the elimination takes more than `most` operations, including `more` later ones."""
         if len(self._graph.operations) + more > self._most:
             raise NotReduced
 
@@ -288,25 +290,25 @@ class DependentCoordinates:
     def _add_conditions(
         self, block: list[list[Affine]], columns: tuple[int, ...], pivot: Affine, solved: list[Terms]
     ) -> None:
-        """Add the conditions that a pivot is not small compared with the entries that it divides, and with its column.
+        """Add to `conditions` that a pivot is not small compared with the entries that it divides, or with its column.
 
-        For a block of two, the second condition means that the columns of the block are not nearly parallel. The sign
-        of a pivot may change: it does not matter in the formula for the accelerations.
+        `pivot`: determinant of `block`. For a block of two rows, the second condition is that the columns of the block
+        are not nearly parallel. A pivot may change its sign: the formula for the accelerations remains valid.
         """
         entries = [entry for row in solved for j, entry in row.items() if j < self._n]
         total = _add_products(self._zero, [(entry, entry) for entry in entries])
         if total.terms:
-            self.conditions.append((Affine(total.graph, 1.0 / LEAST, {}), total))
+            self.conditions.append((Affine(total.graph, 1.0 / MIN_PIVOT_SQUARE, {}), total))
         if len(block) == 1:
             (column,) = (self._columns[j] for j in columns)
             squares = _add_products(self._zero, [(entry, entry) for entry in column])
-            self.conditions.append((pivot * pivot, squares.times(LEAST)))
+            self.conditions.append((pivot * pivot, squares.times(MIN_PIVOT_SQUARE)))
         else:
             a, b = (_add_products(self._zero, [(x, x) for x in column]).value() for column in zip(*block, strict=True))
-            self.conditions.append((pivot * pivot, (a * b).times(LEAST)))
+            self.conditions.append((pivot * pivot, (a * b).times(MIN_PIVOT_SQUARE)))
 
     def _substitute(self, j: int, row: Terms) -> None:
-        """Compute T and g of a dependent coordinate j, after those of the coordinates that were eliminated later."""
+        """Store T[j] and g[j] of a dependent coordinate j, computed from those of the coordinates in its solved row."""
         self.check()
         right, entries = row.get(self._n, self._zero), dict[int, Affine]()
         for k, entry in row.items():
@@ -320,7 +322,7 @@ class DependentCoordinates:
 def reduced_accelerations(
     mass: Any, force: Sequence[Affine], coordinates: DependentCoordinates
 ) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-    """Return the accelerations, and the conditions under which T^T M T is not nearly singular."""
+    """Return the accelerations (n_q,) for M and Q, and conditions under which T^T M T is not nearly singular."""
     n, T, g, independent = len(mass), coordinates.T, coordinates.g, coordinates.independent
     zero = Affine(mass[0, 0].graph, 0.0, {})
     rows = [[(mass[i, j], j) for j in range(n) if not is_zero(mass[i, j])] for i in range(n)]
@@ -343,7 +345,7 @@ def reduced_accelerations(
 
 
 def _pivot_conditions(matrix: dict[tuple[int, int], Affine], factors: Factors) -> Iterator[tuple[Affine, Affine]]:
-    """Yield the conditions on the pivots of the reduced mass matrix, relative to its diagonal entries."""
+    """Yield pairs of a pivot of the reduced mass matrix `matrix` and its lower bound, relative to a diagonal entry."""
     pivots = iter(factors.positive)
     for places, _, _ in factors.blocks:
         alone: Affine | None = None
@@ -352,7 +354,7 @@ def _pivot_conditions(matrix: dict[tuple[int, int], Affine], factors: Factors) -
             scale = matrix[place, place] if alone is None else alone * matrix[place, place]
             alone = pivot
             if pivot.terms:
-                yield pivot, scale.times(0.0 if pivot.key == scale.key else LEAST)
+                yield pivot, scale.times(0.0 if pivot.key == scale.key else MIN_PIVOT_SQUARE)
 
 
 def _add_products(total: Affine, pairs: Any) -> Affine:

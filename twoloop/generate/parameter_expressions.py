@@ -1,7 +1,7 @@
 """Compute with numbers that record how they depend on parameters, so that one trace serves all parameter values.
 
-A `Parameter` is a float with which callbacks compute as with any other float; the result is a `Parameter` again.
-Tracing decides from the present values which terms cancel and which expressions are equal: values must be generic.
+A `Parameter` is a float: callbacks compute with it as with any other float, and results are Parameters, too. Whether
+terms cancel, and whether expressions are equal, is decided from the current values, which must be generic.
 """
 
 import math
@@ -16,15 +16,16 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-Powers = tuple[tuple[int, float], ...]  # product of powers of atoms: indices of the atoms, and exponents; empty for 1
+# product of powers of atoms, as pairs of the index of an atom and an exponent; the empty tuple is the number 1
+Powers = tuple[tuple[int, float], ...]
 
-MOST_TERMS = 200  # largest number of terms of a sum, because long keys take long to compare
+MOST_TERMS = 200  # largest number of terms of a sum of parameters: longer sums take long to compare
 _as_float = float.__pos__  # converts a Parameter to a float; float() would be refused
-CANCELLED = 8.0 * 2.0**-52  # sum of two terms, relative to one of them, up to which it counts as zero (rounding)
+CANCELLED = 8.0 * 2.0**-52  # a sum of two terms, relative to one of them, counts as zero (rounding) up to this value
 NUMBERS = (int, float, np.number)  # types of numbers; a Parameter is a float
 _UNARY = ("sin", "cos", "tan", "sqrt", "exp", "log", "arctan", "sinh", "cosh", "tanh", "absolute")
 FUNCTIONS = {name: getattr(np, name) for name in (*_UNARY, "hypot", "power")}
-OPERATORS: dict[str, Callable[..., Any]] = {  # NumPy's functions as Python operators
+OPERATORS: dict[str, Callable[..., Any]] = {  # by names of NumPy functions: the same in operators of Python
     "add": operator.add,
     "subtract": operator.sub,
     "multiply": operator.mul,
@@ -41,11 +42,11 @@ NAMES = {"atan": "arctan", "fabs": "absolute", "abs": "absolute", "pow": "power"
 
 
 class Untraceable(ValueError):
-    """Raised for a callback that cannot be traced on symbols; the message says why."""
+    """Exception for a callback that cannot be traced; the message says why."""
 
 
 class Refusal(BaseException):
-    """Exception that ends a callback that cannot be traced; the callback's `except Exception` does not catch it."""
+    """Exception that ends a callback that cannot be traced; `except Exception` in the callback does not catch it."""
 
 
 class Symbolic:
@@ -54,15 +55,15 @@ class Symbolic:
     Attributes
     ----------
     running : bool
-        Whether a callback is being traced with this object now.
+        Whether a callback is being traced with this object.
     refused : str
-        Reason why the callback cannot be traced; the callback may have caught the exception.
+        Reason why the callback cannot be traced, or "". It is stored because the callback may catch the exception.
     """
 
     running, refused = False, ""
 
     def refuse(self, reason: str) -> NoReturn:
-        """Raise an exception that ends the running callback, and store the reason."""
+        """Store the reason why a callback cannot be traced, and raise an exception that ends the callback."""
         if not self.running:
             raise Untraceable(reason)
         self.refused = self.refused or reason
@@ -70,7 +71,7 @@ class Symbolic:
 
     @contextmanager
     def watched(self) -> Iterator[None]:
-        """Context in which a callback runs; raise Untraceable if the callback caught a refusal."""
+        """Return a context in which a callback runs; on exit, raise Untraceable if the callback caught a Refusal."""
         self.running, self.refused = True, ""
         try:
             yield
@@ -83,13 +84,13 @@ class Symbolic:
 class ParameterTape(Symbolic):
     """Record of how numbers were computed from parameters.
 
-    Numbers are multiples of products of powers of atoms. An atom is a parameter, a sum of such numbers, or a function
-    of them. Callbacks must not branch on the present values of the numbers.
+    Numbers are multiples of products of powers of atoms. An atom is a parameter, a sum of numbers, or a function of
+    numbers. Callbacks must not branch on the current values of the numbers.
 
     Parameters
     ----------
     values : sequence of float
-        Values of all parameters; generic values for parameters that vary.
+        Current values of all parameters; they must be generic for parameters that vary.
     varying : sequence of int
         Indices of the parameters that vary.
     """
@@ -104,14 +105,14 @@ class ParameterTape(Symbolic):
             self.parameters[place] = Parameter(float(values[place]), self, 1.0, ((place, 1.0),))
 
     def atom(self, definition: Any) -> Powers:
-        """Return the Powers of the atom with this definition (sum or function); equal definitions share an atom."""
+        """Return the atom with a definition (sum or function) as Powers; add it unless an equal one exists."""
         if definition not in self._places:
             self._places[definition] = len(self.atoms)
             self.atoms.append(definition)
         return ((self._places[definition], 1.0),)
 
     def terms(self, number: float) -> dict[Powers, float]:
-        """Return the terms of a number, which may be a sum, as a dict of coefficients by Powers."""
+        """Return a number as a sum: a dict of the coefficients of its terms by their Powers."""
         if type(number) is not Parameter:
             return {(): number} if number else {}
         (place, exponent), *further = number.powers
@@ -121,7 +122,7 @@ class ParameterTape(Symbolic):
         return {powers: number.scale * c for powers, c in definition[1]}
 
     def on(self, parameters: Array) -> Callable[[float], Any]:
-        """Return a function that evaluates a number for other parameters, see `products`."""
+        """Return a function that evaluates numbers for other parameters; their shapes are those of `products`."""
         product = self.products(parameters)
         return lambda number: number.scale * product(number.powers) if type(number) is Parameter else number
 
@@ -156,7 +157,7 @@ class ParameterTape(Symbolic):
         return product
 
     def evaluate(self, numbers: Sequence["Parameter"], parameters: Array) -> Array:
-        """Evaluate numbers for other parameters (n_runs, n_p); return an array (n_runs, len(numbers))."""
+        """Return the values of numbers for other parameters (n_runs, n_p), as an array (n_runs, len(numbers))."""
         product = self.products(parameters)
         rows = {powers: k for k, powers in enumerate(dict.fromkeys(each.powers for each in numbers))}
         products = np.empty((len(rows), len(parameters)))
@@ -169,7 +170,7 @@ class ParameterTape(Symbolic):
 
 
 class Parameter(float):
-    """Float that records how it depends on parameters: `scale` times the product `powers` of atoms of a tape."""
+    """Float that knows how to compute it from parameters: `scale` times the product `powers` of atoms of a tape."""
 
     __slots__ = ("powers", "scale", "tape")
     tape: ParameterTape
@@ -191,13 +192,13 @@ class Parameter(float):
         return elementwise(lambda *given: apply_function(name, *given), inputs, out)
 
     def _refuse_decision(self, reason: str = "it branches on its parameters, or rounds them") -> None:
-        """Refuse an operation whose result depends on the present value, unless the tracer itself called it."""
+        """Refuse an operation whose result depends on the current value, unless a module of `generate` called it."""
         caller = sys._getframe(2).f_globals.get("__name__", "")
         if self.tape.running and not caller.startswith(__name__.rpartition(".")[0]):
             self.tape.refuse(reason)
 
     def to(self, exponent: float) -> "Parameter":
-        """Return this number to the power of a whole number other than 0."""
+        """Return this number to the power of `exponent`, a whole number other than 0."""
         powers = tuple([(place, exponent * power) for place, power in self.powers])
         return Parameter(_as_float(self) ** exponent, self.tape, self.scale**exponent, powers)
 
@@ -258,7 +259,7 @@ def _product(a: float, b: float) -> float:
 
 
 def _power(base: float, exponent: float) -> float:
-    # powers that are not whole numbers are functions, not Powers: as Powers, (x^2)^0.5 would become x instead of |x|
+    # a power whose exponent is no whole number is an atom: as Powers, (x^2)^0.5 would become x instead of |x|
     if type(exponent) is Parameter or not exponent.is_integer():
         return _function("power", base, exponent)
     assert isinstance(base, Parameter)
@@ -279,7 +280,7 @@ def _tape_of(*numbers: float) -> ParameterTape:
 
 
 def apply_function(name: str, *arguments: Any) -> Any:
-    """Apply a function of NumPy or `math`, given by its name; the result is a Parameter if an argument is one."""
+    """Return the value of a function of NumPy or `math`, given its name; a Parameter if an argument is one."""
     name = NAMES.get(name, name)
     if any(not issubclass(type(each), NUMBERS) for each in arguments):  # a symbol has its own operators
         return OPERATORS[name](*arguments)
@@ -333,12 +334,12 @@ for _symbol, _name in {"add": "add", "sub": "subtract", "mul": "multiply", "true
     setattr(Parameter, f"__{_symbol}__", _operator(_name, False))
     setattr(Parameter, f"__r{_symbol}__", _operator(_name, True))
 for _name in _UNARY:
-    # NumPy calls methods of these names on arrays of objects
+    # NumPy functions call methods of these names for arrays of objects
     setattr(Parameter, _name, lambda self, name=_name: apply_function(name, self))
 
 
 def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = None) -> Any:
-    """Apply a function to arrays of numbers and symbols, bypassing NumPy's call of their `__array_ufunc__`."""
+    """Return an array of function values at all entries of arrays, without calls of the entries' `__array_ufunc__`."""
     operands = list(map(_operand, inputs))
     results = np.frompyfunc(function, len(operands), 1)(*operands)
     if out is None:
@@ -348,7 +349,7 @@ def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = 
 
 
 def _operand(value: Any) -> Any:
-    """Convert an array, a number or a symbol to an array of objects; isinstance() would be refused by symbols."""
+    """Return an array, a number or a symbol as an array of objects; symbols refuse isinstance()."""
     if issubclass(type(value), np.ndarray):
         return value.astype(object)
     array = np.empty((), dtype=object)
@@ -363,11 +364,11 @@ def array_of(values: Iterable[float]) -> Any:
 
 
 def number(value: Any) -> float:
-    """Convert a number to a float, unless it is a Parameter."""
+    """Return a number as a float; a Parameter is returned unchanged."""
     return value if type(value) is Parameter else float(value)
 
 
 def function_of_number(name: str) -> Callable[[float], float]:
-    """Return a function of `math` that returns a Parameter if its argument is one."""
+    """Return a function of a float or Parameter, given its name in `math`; its result is of the same type."""
     function = getattr(math, name)
     return lambda x: apply_function(name, x) if type(x) is Parameter else function(x)

@@ -1,9 +1,9 @@
-"""Execute programs (selected outputs of a graph) in any algebra, and number the coefficients that they read.
+"""Execute programs (selected outputs of a graph) in any algebra, and assign array indices to their coefficients.
 
 - `Program.run` executes a program, or writes code for it. The algebra defines what values are: arrays (`Arrays`), LLVM
-  code (`llvm_code.Lowering`), degrees of growth (`time_dependence.Degrees`).
-- `OperationTable` lists the operations for compiled kernels, which interpret its rows.
-- Derivatives extend the graph (`graph.Derivative`). Expressions of parameters alone are coefficients
+  values (`llvm_code.Lowering`), degrees of growth (`time_dependence.Degrees`).
+- `OperationTable` lists the operations as arrays, which compiled kernels interpret row by row.
+- Derivatives are further quantities of the graph (`graph.Derivative`). Expressions of parameters alone are coefficients
   (`parameter_expressions`), which are computed before a program runs.
 """
 
@@ -24,22 +24,21 @@ from twoloop.kernels.evaluation.operations import KIND, N_COLUMNS, NODE, RESULT
 Array = NDArray[np.float64]
 T = TypeVar("T")
 
-# comparison of a program that was traced from a user's function with calls of the function
-N_COMPARED = 5  # number of states
-TIME_SPACING = 0.37  # time between the states, s, which is no usual period of a force
-MAX_TRACE_DIFFERENCE = 1e-10  # largest relative difference
+N_COMPARED = 5  # number of states at which a traced function of the user is compared with calls of the function
+TIME_SPACING = 0.37  # time between two of these states, s: no usual period of a force
+MAX_TRACE_DIFFERENCE = 1e-10  # largest relative difference between a trace and a call, for rounding errors
 
-# cost of operations, in multiplications; functions cost 0
+# cost of operations by kind, in multiplications; the cost of other operations is not counted
 COSTS = {op.PRODUCT: 1, op.RECIPROCAL: 4}
 
 
 class Algebra(Generic[T]):
-    """Arithmetic in which a program runs; subclasses define what values are, and the operations on values.
+    """Arithmetic in which a program runs; subclasses define the type of values T, and the operations on values.
 
     Attributes
     ----------
     functions : mapping
-        Functions that perform the operations of one argument, by the kinds of operations.
+        By kinds of operations with one argument: functions from value to value.
     values : dict
         Values of the quantities that were defined, by the indices of the quantities.
     """
@@ -70,14 +69,14 @@ class Algebra(Generic[T]):
         self.values[quantity] = value
 
     def run(self, graph: Graph, quantities: Iterable[int]) -> None:
-        """Compute quantities in the given order."""
+        """Compute and define quantities, in the given order."""
         for i in quantities:
             operation = graph.operations[i]
             assert operation is not None
             self.define(i, self.operation(*operation))
 
     def outputs(self, program: "Program") -> list[list[T]]:
-        """Compute and return the arrays of a program, after its inputs were defined.
+        """Return the arrays of a program, computed from its inputs, which must be defined.
 
         The quantities of its conditions are computed, too.
         """
@@ -95,7 +94,7 @@ class Program:
     arrays : dict
         Names of the arrays, and their entries: affine expressions.
     conditions : list of (Affine, Affine)
-        Pairs of which the first must be larger than the second.
+        Pairs of expressions: the arrays are valid if the first one is larger than the second in each pair.
     """
 
     graph: Graph
@@ -103,17 +102,17 @@ class Program:
     conditions: list[tuple[Affine, Affine]] = field(default_factory=list)
 
     def run(self, algebra: Algebra[T], inputs: Sequence[T] = ()) -> list[list[T]]:
-        """Run the program on values of the inputs, in their order; return its arrays."""
+        """Return the arrays of the program in an algebra; `inputs`: values of its inputs, unless they are defined."""
         for quantity, value in enumerate(inputs):
             algebra.define(quantity, value)
         return algebra.outputs(self)
 
     def quantities(self, available: Container[int] = ()) -> list[int]:
-        """List the quantities that the outputs need, see `Graph.needed_by`."""
+        """Return the quantities that must be computed for arrays and conditions, see `Graph.needed_by`."""
         return self.graph.needed_by(self.forms, available)
 
     def cost(self) -> int:
-        """Count the multiplications and additions of the program; a reciprocal counts as four, functions as none."""
+        """Return the number of multiplications and additions; a reciprocal counts as four, other functions as none."""
         forms, total = self.forms, 0
         for i in self.quantities():
             kind, *_ = self.graph.operations[i]  # type: ignore[misc]
@@ -128,18 +127,18 @@ class Program:
 
     @property
     def forms(self) -> list[Affine]:
-        """Return all expressions of arrays and conditions."""
+        """Return the list of all expressions in arrays and conditions."""
         forms = [form for array in self.arrays.values() for form in array]
         return [*forms, *(form for condition in self.conditions for form in condition)]
 
 
 class Arrays(Algebra[Any]):
-    """Algebra of NumPy arrays, which hold one number for each run.
+    """Algebra of NumPy arrays (n_runs,): a value is an array with one number for each run, or one number for all.
 
     Parameters
     ----------
     tape : ParameterTape
-        Record of the coefficients.
+        Tape of the coefficients that are Parameters.
     parameters : ndarray (n_runs, n_p)
     """
 
@@ -171,7 +170,7 @@ class Arrays(Algebra[Any]):
         return a * b
 
     def outputs(self, program: Program) -> list[list[Any]]:
-        """Compute the arrays of a program; undefined values are NaN or infinite."""
+        """Return the arrays of a program; values outside the domain of a function are NaN or infinite."""
         with np.errstate(all="ignore"):
             return super().outputs(program)
 
@@ -179,8 +178,9 @@ class Arrays(Algebra[Any]):
 class OperationTable(NamedTuple):
     """Operations of a program as arrays, for the kernels in kernels/evaluation/operations.py.
 
-    `rows` has a row for each operation, `columns` and `coefficients` the terms of all affine expressions, and
-    `constants` their constants, two for each row.
+    `rows` has a row for each operation, with its kind, its node, and the ranges of its arguments' terms. `columns` and
+    `coefficients` are the nodes and coefficients of all terms. `constants` has the constants of both arguments of each
+    operation. A node is the index of a value: inputs come first, then computed quantities.
     """
 
     rows: Any
@@ -191,7 +191,7 @@ class OperationTable(NamedTuple):
 
     @classmethod
     def of(cls, graph: Graph, n_inputs: int, results: Mapping[int, Affine]) -> "OperationTable":
-        """Create the table that computes `results`, expressions by index; the first quantities are the inputs."""
+        """Return the table that computes `results`, expressions by result index; `n_inputs`: number of its inputs."""
         needed = graph.needed_by(results.values())
         node = {i: i for i in range(n_inputs)} | {i: n_inputs + k for k, i in enumerate(needed)}
         operations: list[Any] = [(*graph.operations[i], node[i]) for i in needed]  # type: ignore[misc]
@@ -215,7 +215,7 @@ class OperationTable(NamedTuple):
         )
 
     def flat(self) -> list[float]:
-        """Return the table as a list of numbers, to be stored in the parameters of a model: results come first."""
+        """Return the table as a list of floats, to be stored in parameters of a model; results are the first nodes."""
         rows = self.rows.copy()
         is_result = rows[:, KIND] == RESULT
         n_results = int(is_result.sum())
@@ -233,20 +233,20 @@ class OperationTable(NamedTuple):
         return integers.astype(np.int64), np.concatenate([self.constants.ravel(), self.coefficients])
 
     def with_numbers(self, numbers_for: Callable[[Any], Array]) -> "OperationTable":
-        """Return a copy of the table in which `numbers_for` was applied to each array of coefficients."""
+        """Return a copy of the table with `numbers_for` applied to its two arrays of coefficients and constants."""
         return self._replace(constants=numbers_for(self.constants), coefficients=numbers_for(self.coefficients))
 
 
-Terms = tuple[tuple[int, float], ...]  # quantities and their coefficients
+Terms = tuple[tuple[int, float], ...]  # pairs of a quantity and its coefficient
 
-LITERALS = (0.0, 1.0, -1.0)  # coefficients that are literals in the code, as they need no multiplication
-ROUNDING = 8.0 * 2.0**-52  # relative difference from one of LITERALS up to which a coefficient is replaced by it
+LITERALS = (0.0, 1.0, -1.0)  # values of coefficients that are literals in the code, as they need no multiplication
+ROUNDING = 8.0 * 2.0**-52  # relative difference from one of LITERALS up to which a coefficient equals it (rounding)
 
 
 class Coefficient(float):
-    """Coefficient that the code reads from an array; it equals only itself, even if values are equal.
+    """Coefficient that the code reads from an array, at index `place`; it equals only itself, even if values are equal.
 
-    Coefficients that vary with parameters may be in an array of their own.
+    `varies`: whether it is in the array of those coefficients that vary with parameters.
     """
 
     __slots__ = ("place", "varies")
@@ -254,7 +254,7 @@ class Coefficient(float):
     varies: bool
 
     def __new__(cls, value: float, place: int, varies: bool = False) -> "Coefficient":
-        """Create the coefficient that is stored at the index `place`."""
+        """Create a coefficient; `value`: its current value, `place`: its index in the array."""
         coefficient = super().__new__(cls, value)
         coefficient.place, coefficient.varies = place, varies
         return coefficient
@@ -270,10 +270,10 @@ class Coefficient(float):
 
 
 class Coefficients:
-    """Assign array indices to the coefficients of expressions, in the order of their first use.
+    """Assignment of array indices to the coefficients of expressions, in the order of their first use.
 
-    Equal expressions share their indices. `apart`: coefficients that vary with parameters get an array of their own,
-    because their values differ between SIMD lanes.
+    Equal expressions have the same indices. `apart`: coefficients that vary with parameters are numbered separately,
+    for an array of their own, because their values differ between SIMD lanes.
     """
 
     def __init__(self, apart: bool = False) -> None:
@@ -286,7 +286,7 @@ class Coefficients:
 
     @property
     def values(self) -> NDArray[np.float64]:
-        """Return the values of the coefficients that the code reads."""
+        """Return the array of the coefficients' values; if `apart`, of those coefficients that do not vary."""
         return np.array(self._values, dtype=np.float64)
 
     @property
@@ -297,7 +297,7 @@ class Coefficients:
         return self._formulas
 
     def of(self, terms: Terms, constant: float = 0.0) -> tuple[Terms, float]:
-        """Replace the numbers of terms and a constant by coefficients."""
+        """Return terms and a constant with each number as a literal, or as a Coefficient that is read from an array."""
         key = tuple((i, rounded(c)) for i, c in terms), rounded(constant)
         numbers = self._numbered.get(key)
         if numbers is None:
@@ -305,7 +305,7 @@ class Coefficients:
         return numbers
 
     def of_form(self, form: Affine) -> tuple[Terms, float]:
-        """Replace the numbers of an affine expression by coefficients."""
+        """Return the terms and the constant of an affine expression, with literals and Coefficients as in `of`."""
         numbers = self._of_forms.get(form.key)
         if numbers is None:
             numbers = self._of_forms[form.key] = self.of(tuple(form.terms.items()), form.constant)
@@ -314,7 +314,7 @@ class Coefficients:
     def structure(self, program: Program, given: Mapping[int, int] = MappingProxyType({})) -> Iterable[Any]:
         """Yield everything that the code for a program depends on, except the values of coefficients.
 
-        `given` maps quantities that are read from memory to their indices.
+        `given`: indices in memory of the quantities that are loaded instead of computed.
         """
         graph, forms = program.graph, program.forms
         needed = graph.needed_by(forms, given)
@@ -337,11 +337,11 @@ class Coefficients:
         return len(self._varying)
 
     def for_parameters(self, record: ParameterTape, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Evaluate the coefficients that vary, for parameters (n_runs, n_p): one row for each run."""
+        """Return the values (n_runs, n_varying) of the coefficients that vary, for parameters (n_runs, n_p)."""
         return record.evaluate(list(self._varying.values()), parameters)
 
     def _number(self, value: float) -> float:
-        if type(value) is Parameter:  # no literal, even if its present value is 0 or 1
+        if type(value) is Parameter:  # no literal, even if its current value is 0 or 1
             if self._apart:
                 expression = value.scale, value.powers
                 self._varying.setdefault(expression, value)
@@ -353,7 +353,7 @@ class Coefficients:
 
 
 def literal(value: float) -> float | None:
-    """Return 0, 1 or -1 if a number equals it up to rounding; None if the number must be read as a coefficient."""
+    """Return 0, 1 or -1 if a number equals it up to rounding; None if the number must be read from an array."""
     if type(value) is Parameter or not math.isfinite(value):
         return None
     nearest = float(round(value))

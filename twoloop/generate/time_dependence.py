@@ -1,4 +1,4 @@
-"""Decide from traces whether forces or drives may be short, or vary much over a short distance."""
+"""Decide from traces whether forces or drives may act for a short time, or vary much over a short distance."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -26,43 +26,46 @@ from twoloop.problem.system import ConstrainedSystem
 BY_TIME = ("force", "constraint_rate", "nonholonomic_rate")  # callbacks whose dependence on time is analysed
 # callbacks whose dependence on the state is analysed
 BY_STATE = ("force", "mass", "constraint", "jacobian", "nonholonomic")
-SMOOTH = (PRODUCT, SUM, SINE, COSINE)  # operations whose results, up to MAX_DEGREE, have no short pulses
-MAX_DEGREE = 8  # largest degree, in time or in sines and cosines, that excludes pulses, such as cos(t)**100
+SMOOTH = (PRODUCT, SUM, SINE, COSINE)  # operations whose results have no short pulses up to MAX_DEGREE
+# largest degree of polynomials in time, or in sines and cosines, without short pulses; cos(t)**100 has pulses
+MAX_DEGREE = 8
 MAX_DEGREE_OF_STATE = 32  # largest degree of polynomials in q and v, and of their roots, without short pulses
-MAX_DEGREE_OF_DIVISOR = 4  # largest degree of the divisors of a quotient without short pulses
-# lowest power of x with which such a quotient may decay for large x: 1 / (1 + (x / w)**2) is allowed, its square is not
-SLOWEST_DECAY = -2.0
-MAX_RATE = 4.0  # largest rate of a vibration's angle, rad per unit of a coordinate or speed, that long steps resolve
-# largest number of coordinates for which callbacks are traced for this analysis: for more, tracing takes up to seconds,
-# and sampling the forces in a run a tenth of that
+MAX_DEGREE_OF_DIVISOR = 4  # largest total degree, in q and v, of the divisors of a quotient without short pulses
+# exponent of the fastest decay, for large x = q or v, of quotients without short pulses: 1 / (1 + (x / w)**2) has none,
+# its square may have one
+FASTEST_DECAY = -2.0
+# largest derivative of the argument of a sine, rad per unit of a coordinate or velocity, that long steps resolve
+MAX_RATE = 4.0
+# largest number of coordinates for which callbacks are traced for this analysis: with more, tracing may take seconds,
+# ten times as long as sampling the forces during a run
 MAX_COORDINATES = 300
 TIME = 1  # bit mask of t, the first input of a graph
 
 
 class ShortForces(NamedTuple):
-    """Whether forces or drives may act for a short time: at certain times; at certain positions or speeds."""
+    """Whether forces or drives may act for a short time: depending on time; depending on positions or velocities."""
 
-    by_time: bool
-    by_state: bool
+    by_time: bool  # a force, C_t or b may have short pulses as a function of time
+    by_state: bool  # a force may have short pulses as a function of q or v
 
 
 class Dependence(NamedTuple):
-    """Result of the analysis of callbacks that several systems share."""
+    """Result of the analysis of callbacks; the systems of a trace cache share it."""
 
     short: ShortForces
     steep: bool  # see `may_be_steep`
     kinds: frozenset[str]  # kinds of callbacks that were traced
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Dependence":
-        """Return this result for one of the systems: it is the same for all parameters."""
+        """Return this result, which is the same for all parameters, for one of the systems."""
         return self
 
 
 def may_be_short(system: ConstrainedSystem, force_was_traced: bool) -> ShortForces:
-    """Return whether forces, C_t or b may act for a short time; callbacks that cannot be traced may.
+    """Return whether forces, C_t or b may act for a short time; True for callbacks that cannot be traced.
 
-    Functions called in Python may store their arguments. They are traced only if the force was traced before
-    (`force_was_traced`).
+    Functions called in Python may store their arguments: they are traced only if the force was traced before
+    (`force_was_traced`). With more than MAX_COORDINATES coordinates, pulses by state are not considered.
     """
     if system.n_q > MAX_COORDINATES:
         return ShortForces(True, False)
@@ -71,10 +74,10 @@ def may_be_short(system: ConstrainedSystem, force_was_traced: bool) -> ShortForc
 
 
 def may_be_steep(system: ConstrainedSystem, force_was_traced: bool) -> bool:
-    """Return whether forces may be short, or may vary much over a distance shorter than a step.
+    """Return whether forces may act for a short time, or vary much over a distance shorter than a step.
 
-    Quotients and roots of the state may do so: a long step may pass over the peak of 1 / (1 + (x / w)**2), although
-    its flanks are noticed. The stages of a long step may sample a fast vibration at nearly the same phase.
+    Quotients and roots of the state may vary so: the stages of a long step may evaluate 1 / (1 + (x / w)**2) on its
+    flanks, but not at its peak. The stages of a long step may evaluate a fast vibration at nearly equal phases.
     """
     if any(may_be_short(system, force_was_traced)):
         return True
@@ -124,16 +127,16 @@ class Degrees(Algebra[float]):
         self.values = dict.fromkeys(inputs, 1.0)
 
     def affine(self, expression: Affine) -> float:
-        """Return the degree of a sum, the largest degree of its terms."""
+        """Return the degree of an affine expression, which is the largest degree of its terms."""
         return max((self.values.get(i, 0.0) for i in expression.terms), default=0.0)
 
     def product(self, a: float, b: float) -> float:
-        """Return the degree of a product, the sum of the degrees of its factors."""
+        """Return the degree of a product of factors of degrees a and b."""
         return a + b
 
 
 class Vibrations(Degrees):
-    """Algebra of degrees in sines and cosines, whose high powers are flat between pulses."""
+    """Algebra of degrees in sines and cosines; their high powers are nearly zero between short pulses."""
 
     functions = MappingProxyType(
         {**Degrees.functions, **dict.fromkeys((SINE, COSINE), lambda degree: max(degree, 1.0))}
@@ -141,7 +144,7 @@ class Vibrations(Degrees):
 
 
 class Growth(Degrees):
-    """Algebra of growth: power of x with which a quantity grows for large x; negative for reciprocals."""
+    """Algebra of growth: a value is the exponent p with which a quantity grows, like x^p, for large inputs x."""
 
     functions = MappingProxyType(
         {
@@ -153,26 +156,29 @@ class Growth(Degrees):
 
 
 class Divisors(Degrees):
-    """Algebra of divisors: total degree of all divisors in a quantity; an arctangent counts, as its slope is one."""
+    """Algebra of divisors: a value is the total degree of divisors in a quantity, and of arguments of arctangents.
+
+    The derivative of an arctangent is a quotient. `degrees`: the degrees of all quantities.
+    """
 
     def __init__(self, degrees: Degrees):
         super().__init__()
         self._degrees = degrees
 
     def operation(self, kind: int, first: Affine, second: Affine | None) -> float:
-        """Return the degree of the divisors in the result of an operation."""
+        """Return the total degree of the divisors in the result of an operation."""
         degree = super().operation(kind, first, second)
         return degree + self._degrees.affine(first) if kind in (RECIPROCAL, ARCTANGENT) else degree
 
 
 class Rates(Degrees):
-    """Algebra of rates: upper bound of the derivative of each quantity with respect to a coordinate or speed.
+    """Algebra of rates: a value bounds the derivative of a quantity with respect to any one coordinate or velocity.
 
-    The rate of a coordinate times a parameter is infinite, as the parameter may have any value.
+    If a parameter is a factor, the bound is infinite, because the parameter may have any value.
     """
 
     def affine(self, expression: Affine) -> float:
-        """Return the largest rate of the terms of a sum."""
+        """Return the largest rate of the terms of an affine expression."""
         return max(
             (
                 math.inf if type(c) is Parameter else abs(c) * self.values.get(i, 1.0)
@@ -200,14 +206,14 @@ def _is_short_in_state(graph: Graph, needed: list[int], n_q: int) -> bool:
         graph.kind(i) == EXPONENTIAL
         or degrees.values[i] > MAX_DEGREE_OF_STATE
         or divisors.values[i] > MAX_DEGREE_OF_DIVISOR
-        or growth.values[i] < SLOWEST_DECAY
+        or growth.values[i] < FASTEST_DECAY
         or vibrations.values[i] > MAX_DEGREE
         for i in depending
     )
 
 
 def _is_steep(graph: Graph, needed: list[int]) -> bool:
-    """Return whether a quantity is a quotient, a root, a vibration in time, or a fast vibration in the state."""
+    """Return whether a quantity in `needed` is a quotient, a root, a sine of time, or a fast sine of the state."""
     if any(graph.kind(i) not in SMOOTH for i in needed):
         return True
     rates = Rates()

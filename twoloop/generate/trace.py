@@ -4,13 +4,14 @@ A callback must do with symbols exactly what it does with numbers. So a function
 refused by name when it is called with one, even if the callback catches the exception. Differences that tracing cannot
 detect, such as a changed global variable, are found by comparing numbers (`traced_values.py`).
 
-`Equations` has the result of every callback of one system as an array of expressions; exact derivatives replace
-callbacks that are not given. Series, eliminations, references and derived callbacks are generated from these arrays.
+`Equations` returns the result of every callback of one system as an array of expressions; exact derivatives replace
+missing callbacks. Series, eliminations, references and derived callbacks are generated from these arrays.
 
-`TraceCache` keeps traces for all systems that share their callbacks: coefficients are expressions in the parameters.
+`TraceCache` stores traces for all systems that share their callbacks: coefficients are expressions in the parameters.
 
-- Whole numbers keep their values: they may be counts, indices or switches, and zeros and ones save operations.
-  Parameters of equal magnitude stay equal. So the systems of one cache differ only in the values of other parameters.
+- Parameters that are whole numbers are constants in the traces: they may be counts, indices or switches, and zeros and
+  ones save operations. Parameters of equal magnitude are one variable. So the systems of one cache have the same whole
+  numbers, and the same parameters of equal magnitude.
 - A callback that branches on its parameters, or rounds them, is traced for each system.
 """
 
@@ -59,12 +60,12 @@ CONVERSIONS = ("array", "asarray", "ascontiguousarray")
 
 
 def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
-    """Run a callback in Python on symbols and return its result; compiled callbacks fill arrays and return None.
+    """Run a callback in Python on symbols and return its result; compiled callbacks fill an array of `arguments`.
 
     Raises
     ------
     Untraceable
-        If the callback does not run on symbols, or treats them differently from numbers.
+        If the callback does not run on symbols, or may treat them differently from numbers; the message says why.
     """
     graph, value = t.graph, None
     with graph.watched():
@@ -80,28 +81,28 @@ def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
     return value
 
 
-def as_forms(graph: Graph, values: Any) -> Any:
+def convert_to_expressions(graph: Graph, values: Any) -> Any:
     """Convert the entries of an array that a callback filled or returned to expressions, in place; return the array."""
-    for place in np.ndindex(values.shape):
-        entry = values[place]
+    for index in np.ndindex(values.shape):
+        entry = values[index]
         if type(entry) is not Affine:
             try:
-                values[place] = Affine(graph, number(entry), {})
+                values[index] = Affine(graph, number(entry), {})
             except Exception as error:
-                raise Untraceable(f"on symbols its entry {place} is {entry!r}, which is not a number") from error
+                raise Untraceable(f"on symbols its entry {index} is {entry!r}, which is not a number") from error
         elif entry.graph is not graph:
             raise Untraceable("it returns t, q or v of another call, which it has kept")
     return values
 
 
 class _CallbackCopier(FunctionCopier):
-    """Copier of callbacks that replaces `math` and `numpy` by functions of expressions."""
+    """Copier of callbacks whose copies call substitutes for the functions of `math` and `numpy` (`_Mathematics`)."""
 
     def is_copied(self, value: Any) -> bool:
         return isinstance(value, Dispatcher | types.FunctionType)
 
     def callback(self, function: Any) -> Any:
-        """Copy a callback, which may be an object with `__call__`."""
+        """Return a copy of a callback, which may be an object with a method `__call__`."""
         method = next((vars(each)["__call__"] for each in type(function).__mro__ if "__call__" in vars(each)), None)
         if isinstance(method, types.FunctionType) and not isinstance(function, Dispatcher):
             return types.MethodType(self.value(method), function)
@@ -134,7 +135,7 @@ def _type(value: Any, *more: Any) -> Any:
 
 
 def _symbol_in(value: Any) -> Affine | None:
-    """Return the value if it is a symbol, or the first symbol in an array or a list; None if there is none."""
+    """Return the first symbol in a value (a symbol, an array, a list or a tuple); None if it contains none."""
     if type(value) is Affine:
         return value
     if isinstance(value, np.ndarray):
@@ -145,7 +146,7 @@ def _symbol_in(value: Any) -> Affine | None:
 
 
 def _has_parameters(value: Any) -> bool:
-    """Return whether a value is a Parameter, or an array or a list that contains one."""
+    """Return whether a value is a Parameter, or an array, list or tuple that contains one."""
     if isinstance(value, np.ndarray):
         value = value.ravel().tolist() if value.dtype == object else ()
     return any(map(_has_parameters, value)) if isinstance(value, list | tuple) else type(value) is Parameter
@@ -158,7 +159,7 @@ def _refuse(value: Any, does: str) -> None:
 
 
 def _for_numbers_only(function_of_numbers: Any, name: str) -> Callable[..., Any]:
-    """Wrap a function that may treat expressions differently from numbers: the wrapper refuses expressions."""
+    """Return a wrapper that calls a function, but refuses symbols, which the function may not treat like numbers."""
 
     @functools.wraps(function_of_numbers)
     def function(*arguments: Any, **options: Any) -> Any:
@@ -187,7 +188,7 @@ def _is_real(dtype: Any) -> bool:
 
 
 def _constructor(constructor: Any) -> Callable[..., Any]:
-    """Wrap `zeros`, `ones` or `empty` so that arrays of real numbers can hold expressions."""
+    """Return a substitute for `zeros`, `ones` or `empty` whose arrays of real numbers can contain expressions."""
 
     def function(shape: Any, dtype: Any = None, **options: Any) -> Any:
         if not _is_real(dtype):
@@ -198,7 +199,7 @@ def _constructor(constructor: Any) -> Callable[..., Any]:
 
 
 def _conversion(conversion: Any) -> Callable[..., Any]:
-    """Wrap `array`, `asarray` or `ascontiguousarray` so that arrays of real numbers can hold expressions."""
+    """Return a substitute for `array`, `asarray` or `ascontiguousarray` that also accepts expressions."""
 
     def function(value: Any, dtype: Any = None, **options: Any) -> Any:
         if _symbol_in(value) is None and not _has_parameters(value):
@@ -232,7 +233,7 @@ def _norm(x: Any, *more: Any, **options: Any) -> Any:
 
 
 class _Mathematics:
-    """Substitute for `math`, `numpy` or a submodule, whose functions and arrays also accept expressions."""
+    """Substitute for `math`, `numpy` or a submodule: its attributes are functions that also accept expressions."""
 
     def __init__(self, module: types.ModuleType):
         self._module = module
@@ -265,7 +266,7 @@ CALLBACKS = (
     *("constraint", "constraint_rate", "jacobian", "nonholonomic", "nonholonomic_rate", "mass", "force"),
     *("gamma", "nonholonomic_gamma"),
 )
-# right-hand sides of G a = gamma, and the callbacks (G, G_t) from which they are derived
+# callbacks that return gamma, the right-hand side of G a = gamma, and those for G and G_t, from which gamma is derived
 OF_ROWS = {"gamma": ("jacobian", "constraint_rate"), "nonholonomic_gamma": ("nonholonomic", "nonholonomic_rate")}
 
 
@@ -296,7 +297,7 @@ class Equations:
         self._copied: dict[str, Any] = {}  # results that were traced in the original of this graph
 
     def trace_all(self) -> "Equations":
-        """Trace all callbacks that can be traced, so that copies share the results; return self."""
+        """Trace the callbacks of the system that can be traced, so that copies share the results; return self."""
         for kind in CALLBACKS:
             if not self._is_derived(kind):
                 with suppress(Untraceable):  # `of` raises it again if the callback is needed
@@ -304,7 +305,7 @@ class Equations:
         return self
 
     def copy(self) -> "Equations":
-        """Return a copy with its own graph, which contains everything that was traced so far."""
+        """Return a copy with a copy of the graph; callbacks traced so far are not traced again in the copy."""
         equations = copy.copy(self)
         equations.graph = self.graph.copy()
         equations.t, equations.q, equations.v = (
@@ -315,9 +316,9 @@ class Equations:
         return equations
 
     def of(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
-        """Return the result of a callback as an array of expressions; zeros or derivatives if it is not given.
+        """Return the result of a callback as an array of expressions; if it is missing, derivatives or zeros.
 
-        `v`: expressions that replace the velocities.
+        `v`: expressions to be used as velocities, instead of the inputs `self.v`.
 
         Raises
         ------
@@ -331,7 +332,7 @@ class Equations:
         return self._forms[kind].copy()
 
     def derived(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
-        """Derive C_q, C_t or gamma by differentiation, even if there is a callback for it; return expressions."""
+        """Return C_q, C_t or gamma by differentiation, as an array of expressions, even if it has a callback."""
         if kind == "jacobian":
             return self._jacobian()
         return self._rate() if kind == "constraint_rate" else self._gamma(*OF_ROWS[kind], self.v if v is None else v)
@@ -360,7 +361,7 @@ class Equations:
                     elif kind in system.python_functions:
                         function, more = system.python_functions[kind], (p,) if system.takes_parameters(kind) else ()
                         out = np.array(trace(function, self.t, *arrays, *more), dtype=object)
-                    out = as_forms(graph, out)
+                    out = convert_to_expressions(graph, out)
                     if out.shape != shape:
                         raise Untraceable(f"on symbols it returns an array of shape {out.shape}, not {shape}")
             except Untraceable as error:
@@ -369,7 +370,7 @@ class Equations:
         return out
 
     def _jacobian(self) -> Any:
-        """Derive C_q from C."""
+        """Return C_q (n_c, n_q), the derivatives of C with respect to q."""
         constraint, unit = self.of("constraint"), Affine(self.graph, 1.0, {})
         jacobian = np.empty((self.system.n_c, self.system.n_q), dtype=object)
         for j, coordinate in enumerate(self.q):
@@ -378,7 +379,7 @@ class Equations:
         return jacobian
 
     def _rate(self) -> Any:
-        """Derive C_t from C."""
+        """Return C_t (n_c,), the derivatives of C with respect to t."""
         constraint, by_t = (
             self.of("constraint"),
             Derivative(self.graph, {only_quantity(self.t): Affine(self.graph, 1.0, {})}),
@@ -386,7 +387,10 @@ class Equations:
         return symbols(by_t.of(form) for form in constraint)
 
     def _gamma(self, rows: str, rates: str, v: Sequence[Affine]) -> Any:
-        """Return -(dG/dt v + dG_t/dt) at constant v, the right-hand side of G a = gamma."""
+        """Return -(dG/dt v + dG_t/dt), the right-hand side of G a = gamma, with total derivatives at constant v.
+
+        `rows`, `rates`: kinds of the callbacks for G and for G_t.
+        """
         moving = {only_quantity(coordinate): u for coordinate, u in zip(self.q, v, strict=True)}
         along = Derivative(self.graph, {only_quantity(self.t): Affine(self.graph, 1.0, {}), **moving})
         gamma = self.of(rates)
@@ -399,7 +403,7 @@ class Equations:
 
 
 def runs_on_symbols(system: ConstrainedSystem, kind: str, parameters: Any) -> bool:
-    """Return whether a compiled callback can be traced: it branches neither on its arguments nor on Parameters."""
+    """Return whether a compiled callback can be traced with these parameters, some of which may be Parameters."""
     equations = Equations(system, parameters)
     state = {"q": equations.q, "v": equations.v, "lam": equations.graph.inputs(system.n_c, True)}
     arrays = [symbols(state[name]) for name in KINDS[kind].state]
@@ -408,7 +412,7 @@ def runs_on_symbols(system: ConstrainedSystem, kind: str, parameters: Any) -> bo
         with equations.watched():
             trace(getattr(system.functions, kind), equations.t, *arrays, equations.parameters.copy(), *filled)
             for array in filled:
-                as_forms(equations.graph, array)
+                convert_to_expressions(equations.graph, array)
     except (Untraceable, ArithmeticError, RecursionError):
         return False
     return True
@@ -421,36 +425,37 @@ def only_quantity(form: Affine) -> int:
 
 
 Array = NDArray[np.float64]
-ScaledProducts = tuple[Array, NDArray[np.int64], list[Powers]]  # entry i is scales[i] * products[indices[i]]
-Evaluator = Callable[[Any], Array]  # computes the numbers of an array of expressions for one system
+# scales, indices, products: the entry with index i of an array of expressions is scales[i] * products[indices[i]]
+ScaledProducts = tuple[Array, NDArray[np.int64], list[Powers]]
+Evaluator = Callable[[Any], Array]  # evaluates an array of expressions for the parameters of one system
 
-# range of the random parameters with which callbacks are traced: similar sizes, so that rounding hides no term
+# smallest and largest random value of a parameter in traces: similar sizes, so that rounding hides no term of a sum
 GENERIC = 0.5, 1.5
-# parameters smaller than this, or larger than its inverse, keep their values: their powers would over- or underflow
+# magnitude below which (or above the inverse of which) a parameter is a constant: its powers would under- or overflow
 EXTREME = 1e-30
 
 _CACHES = BoundedCache()
 
 
 class TraceCache:
-    """Cache of the results derived from the callbacks that several systems share.
+    """Cache of traces, and of results derived from traces, for all systems that share their callbacks.
 
     Parameters
     ----------
     parameters : ndarray (n_p,)
         Parameters of one of the systems.
     classes : ndarray of int (n_p,)
-        Class of each parameter: 1, 2, ..., the same for equal magnitudes, with a minus sign for negative parameters.
-        0: the parameter keeps its value.
+        Class of each parameter: 1, 2, ..., the same number for equal magnitudes, with a minus sign for negative ones.
+        0: the parameter is a constant in the traces.
 
     Attributes
     ----------
     parameters : ndarray of float and Parameter (n_p,)
         Parameters with which callbacks are traced.
     traced : set of str
-        Kinds of callbacks that were traced: these callbacks write the same entries in all systems.
+        Kinds of callbacks that were traced; as they do not branch, they write to the same entries in all systems.
     within_bounds : set of str
-        Kinds of traced callbacks that `check_bounds` has checked in one of the systems.
+        Kinds of traced callbacks for which `check_bounds` succeeded in one of the systems.
     """
 
     def __init__(self, parameters: Array, classes: NDArray[np.int64]):
@@ -467,27 +472,27 @@ class TraceCache:
         self.traced: set[str] = set()
         self.within_bounds: set[str] = set()
         self._results: dict[Any, Any] = {}
-        # by id of an array; the array is stored as well, so that its id is not reused
+        # results of `_scaled_products` by id of the array; the array is stored, too, so that its id is not reused
         self._arrays: dict[int, tuple[Any, ScaledProducts]] = {}
-        self._tracing = RLock()  # one lock, as all traces record on one tape
+        self._tracing = RLock()  # one lock for all traces, as they record on one tape
 
     def equations(self, system: ConstrainedSystem) -> Equations:
-        """Return the traced callbacks, with a copy of the graph, which may be extended."""
-        if system.called_in_python:  # such a function may store its arguments, so it is traced as late as possible
+        """Return the traced callbacks of a system, with their own copy of the graph, which the caller may extend."""
+        if system.called_in_python:  # a function called in Python may store arguments: it is traced as late as possible
             return Equations(system, self.parameters)
         traced: Equations = self.remembered("equations", lambda: Equations(system, self.parameters).trace_all())
         return traced.copy()
 
     def numbers(self, parameters: Array) -> Array:
-        """Return the magnitude of each class of parameters, given the parameters of a system."""
+        """Return the magnitude of each class, an array by class - 1, given the parameters of a system."""
         return np.abs(parameters[self._first])
 
     def products(self, parameters: Array) -> Callable[[Powers], Any]:
-        """Return a function that evaluates Powers (products of atoms), given the parameters of a system."""
+        """Return a function that evaluates Powers (products of powers of atoms) for the parameters of a system."""
         return self._tape.products(self.numbers(parameters))
 
     def evaluator(self, parameters: Array) -> Evaluator:
-        """Return a function that evaluates arrays of expressions, stored in this cache, for a system's parameters."""
+        """Return a function that evaluates arrays of expressions (not to be changed) for the parameters of a system."""
         product = self.products(parameters)
 
         def evaluate(array: Any) -> Array:
@@ -503,7 +508,7 @@ class TraceCache:
         return evaluate
 
     def _scaled_products(self, array: Any) -> ScaledProducts:
-        """Return the scales of an array's entries, the indices of their products, and the products."""
+        """Return the ScaledProducts of an array of expressions, computed at the first call for this array object."""
         entry = self._arrays.get(id(array))
         if entry is None:
             powers = [each.powers if type(each) is Parameter else () for each in array.ravel()]
@@ -521,7 +526,7 @@ class TraceCache:
         if what not in self._results:
             with self._tracing:
                 if what not in self._results:
-                    with garbage_collection_off():  # no garbage arises, because everything stays in the cache
+                    with garbage_collection_off():  # there is no garbage, because all objects stay in the cache
                         self._results[what] = make()
         return self._results[what]
 
@@ -529,15 +534,16 @@ class TraceCache:
 def derive_cached(
     system: ConstrainedSystem, what: Any, make: Callable[[TraceCache], Any], check: Callable[[Any], None]
 ) -> Any:
-    """Return the object that `make` derives from shared traces, converted for one system by the object's method `of`.
+    """Return what `make` derives from a trace cache, converted by the method `of` of this result for one system.
 
-    If callbacks cannot be traced with variable parameters, or `check` refuses the result (a callback may treat variable
-    parameters differently from numbers), the callbacks are traced for this system alone.
+    The trace cache is the one that other systems use, too. If callbacks cannot be traced with variable parameters, or
+    `check` raises Untraceable (a callback may treat variable parameters differently from numbers), it is a cache for
+    this system alone. Results are cached by the key `what`.
 
     Raises
     ------
     Untraceable
-        If the result cannot be derived, or `check` refuses it.
+        If the result cannot be derived from either cache, or `check` raises for it.
     """
     for cache_for in (_own_cache,) if system.called_in_python else (trace_cache_of, _own_cache):
         cache = system.remembered(("family", cache_for), partial(cache_for, system))
@@ -554,7 +560,7 @@ def derive_cached(
 
 
 def _derive(system: ConstrainedSystem, cache: TraceCache, what: Any, make: Callable[[TraceCache], Any]) -> Any:
-    """Return the derived object for a system, or the exception that says why there is none."""
+    """Return the result of `derive_cached` from one trace cache, or the exception that says why there is none."""
     try:
         shared = cache.remembered(what, partial(make, cache))
         return shared.of(system, system.remembered(("numbers", cache), partial(cache.evaluator, system.parameters)))
@@ -565,25 +571,25 @@ def _derive(system: ConstrainedSystem, cache: TraceCache, what: Any, make: Calla
 
 
 def load_checked_bounds(system: ConstrainedSystem) -> None:
-    """Copy the results of `check_bounds` from systems with the same traces, as their callbacks do the same."""
+    """Add to `system.within_bounds` the kinds of callbacks that were checked in other systems with the same traces."""
     if not system.called_in_python:
         system.within_bounds |= shared_cache(system).within_bounds
 
 
 def share_checked_bounds(system: ConstrainedSystem) -> None:
-    """Share a system's results of `check_bounds` with the systems that have the same traces."""
+    """Add the traced kinds in `system.within_bounds` to the trace cache, for other systems with the same traces."""
     if not system.called_in_python:
         cache = shared_cache(system)
         cache.within_bounds |= cache.traced & system.within_bounds
 
 
 def shared_cache(system: ConstrainedSystem) -> TraceCache:
-    """Return the trace cache that a system of compiled callbacks shares with others, remembered by the system."""
+    """Return `trace_cache_of` a system, stored with the system at the first call."""
     return system.remembered(("family", trace_cache_of), partial(trace_cache_of, system))  # type: ignore[no-any-return]
 
 
 def trace_cache_of(system: ConstrainedSystem) -> TraceCache:
-    """Look up, or create, the trace cache that a system of compiled callbacks shares with others."""
+    """Return the trace cache that a system with compiled callbacks shares with others; create it if it is missing."""
     parameters = system.parameters
     classes = _classes(parameters)
     fixed = parameters[classes == 0] + 0.0  # without a sign of zero
@@ -595,7 +601,7 @@ def trace_cache_of(system: ConstrainedSystem) -> TraceCache:
 
 
 def _own_cache(system: ConstrainedSystem) -> TraceCache:
-    """Return a trace cache for one system alone, with its parameters as plain numbers."""
+    """Return a new trace cache for one system, all of whose parameters are constants in the traces."""
     return TraceCache(system.parameters, np.zeros(system.parameters.size, dtype=np.int64))
 
 
@@ -612,14 +618,12 @@ def _classes(parameters: Array) -> NDArray[np.int64]:
 
 
 class ParameterArrays:
-    """Arrays of numbers for arrays of expressions in parameters; `write` evaluates all of them at once.
-
-    The same array of expressions always gets the same array of numbers. An array of plain numbers is used as it is.
-    """
+    """Arrays of numbers for arrays of expressions in parameters; `write` fills them with values for new parameters."""
 
     def __init__(self) -> None:
-        # by id of an array; the array is stored as well, so that its id is not reused
+        # arrays of numbers by id of the expressions; these are stored, too, so that the id is not reused
         self._arrays: dict[int, tuple[Any, Array]] = {}
+        # flat array of numbers, indices of the entries that vary, and their slice in the values that `write` computes
         self._places: list[tuple[Array, NDArray[np.int64], slice]] = []
         self._products: dict[Powers, int] = {}
         self._scales: list[float] = []
@@ -627,7 +631,10 @@ class ParameterArrays:
         self._gathered: tuple[list[Powers], Array, NDArray[np.int64]] | None = None
 
     def array(self, expressions: Any) -> Array:
-        """Return the array of numbers for an array of expressions; the next `write` fills it."""
+        """Return the array of numbers for an array of expressions, to be filled by `write`; one per array object.
+
+        If the entries are plain numbers, return the given array.
+        """
         if expressions.dtype != object:
             return expressions  # type: ignore[no-any-return]
         if id(expressions) not in self._arrays:
@@ -647,7 +654,7 @@ class ParameterArrays:
         return numbers.reshape(expressions.shape)
 
     def write(self, product: Callable[[Powers], Any]) -> None:
-        """Fill all arrays; `product` evaluates Powers for the parameters of a system, see `TraceCache.products`."""
+        """Evaluate all expressions and write their values to the arrays; `product`: see `TraceCache.products`."""
         if self._gathered is None:
             return
         products, scales, product_of = self._gathered

@@ -1,8 +1,8 @@
 """Compare the values of traces with the values that calls of the callbacks return.
 
-A trace is wrong if the callback branches undetected, stores something from call to call, or reads changing data that
-are not its arguments (a global variable, whose value numba froze at compilation). Before a run, values are
-compared at states near the start and at times spread over the run; later at states of the run itself.
+A trace is wrong if tracing does not detect that the callback branches, if the callback stores data between calls, or if
+it reads changing data that are not its arguments (a global variable, whose value numba froze at compilation). Before a
+run, values are compared at states near the start, at times spread over the run; after a run, at states of the run.
 """
 
 import copy
@@ -29,22 +29,29 @@ KINDS = (
     *("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma"),
     *("nonholonomic", "nonholonomic_rate", "nonholonomic_gamma"),
 )
-N_NEARBY = 8  # number of random states near the start at which traces are compared, besides the start
-TIMES = np.linspace(0.0, 1.0, N_NEARBY)  # times of these states, as shares of the run
-DISTANCE = 0.3  # largest distance of these states from the start, relative to the sizes of coordinates
-# largest number of compared states: in a chunk of a run, in a run, in a run with callbacks called in Python
+N_NEARBY = 8  # number of random states near the start at which calls and traces are compared, besides the start
+TIMES = np.linspace(0.0, 1.0, N_NEARBY)  # times of the random states, from 0 (start of the run) to 1 (its end)
+# largest distance of the coordinates of a random state from the start, relative to the sizes of the coordinates
+DISTANCE = 0.3
+# approximate largest number of states at which calls and traces are compared. MAX_OF_CHUNK: in one chunk of a run.
+# MAX_STATES: in a run. MAX_IN_PYTHON: in a run whose callbacks are called in Python.
 MAX_OF_CHUNK, MAX_STATES, MAX_IN_PYTHON = 32, 64, 9
-MAX_ENTRIES = 20_000  # approximate limit of the compared entries in a run: large systems are compared at fewer states
-# largest difference of call and trace that is rounding, relative to the largest term of a kind
-LOST = 16.0 * np.finfo(float).eps
-CLEAR = 1e-6  # relative as LOST: smaller differences count only if they are the same at neighbouring states
-PERTURBATION, N_NEIGHBOURS = 1e-7, 12  # largest relative distance of neighbouring states, and their number
-MARGIN = 0.01  # margin of a CheckedRegion relative to its sides; small compared with the steps of a run
-MARGIN_AT_REST = 1e-9  # further margin relative to the longest side except time: coordinates at rest have no side
+# approximate largest number of entries compared in a run, counted at all states: large systems have fewer states
+MAX_ENTRIES = 20_000
+# difference between call and trace that counts as a rounding error, relative to the largest term of any entry that the
+# callback returns
+ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps
+# relative difference, as for ROUNDING_DIFFERENCE, above which a trace is wrong; a smaller one must be about the same at
+# neighbouring states
+CLEAR_DIFFERENCE = 1e-6
+PERTURBATION, N_NEIGHBOURS = 1e-7, 12  # relative distance of neighbouring states, at most, and their number
+MARGIN = 0.01  # margin of a CheckedRegion, relative to its sides: small compared with the steps of a run
+# additional margin, relative to the longest side except time, because coordinates at rest have a side of length 0
+MARGIN_AT_REST = 1e-9
 
 
 class Traced:
-    """Traced callbacks as an operation table, to be compared with calls of the callbacks.
+    """Traces of callbacks as an operation table, to be compared with calls of the callbacks.
 
     Parameters
     ----------
@@ -52,7 +59,12 @@ class Traced:
     graph : Graph
         The graph of the trace, whose first inputs are t, q and v.
     forms : mapping or None
-        Traced results by kind of callback. None: the traces in `graph` of the callbacks that the system has.
+        Arrays of expressions by kind of callback. None: `graph.traced`, for the callbacks that the system has.
+
+    Attributes
+    ----------
+    trusted : bool
+        Whether calls and traces agreed near a start, and callbacks are compiled, so that they cannot change.
     """
 
     def __init__(self, system: ConstrainedSystem, graph: Graph, forms: Mapping[str, Any] | None = None):
@@ -67,19 +79,19 @@ class Traced:
         self.kinds = frozenset(graph.traced)  # all kinds of callbacks that were traced, compared or not
         self.trusted = False
         entries = (forms[kind][place] for kind, place in self.places)
-        # entries that are always zero need no comparison
+        # the table computes no entries that are always zero
         results = {k: form for k, form in enumerate(entries) if form.terms or form.constant}
         self.nonzero_kinds = frozenset(self.places[k][0] for k in results)
         self.program = OperationTable.of(graph, 1 + 2 * system.n_q, results)
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Traced":
-        """Return the traces for another system of the same cache, with the coefficients of that system."""
+        """Return a copy with the coefficients of another system of the same trace cache."""
         traced = self.with_numbers(evaluate)
         traced.name = system.name
         return traced
 
     def with_numbers(self, numbers_for: Callable[[Any], Array]) -> "Traced":
-        """Return a copy, not trusted yet, whose operation table has other coefficients."""
+        """Return a copy, not trusted yet, with `numbers_for` applied to each array of coefficients in the table."""
         traced = copy.copy(self)
         traced.program = self.program.with_numbers(numbers_for)
         traced.trusted = False
@@ -90,9 +102,9 @@ class Traced:
         refuse_wrong([self], system, t0, t1, q, v)
 
     def check_near_start(self, system: ConstrainedSystem, nearby: Array) -> None:
-        """Compare calls and traces at states whose first row is the start; raise Untraceable if they differ."""
+        """Compare calls and traces at the states `nearby`; set `trusted`, or raise Untraceable if they differ."""
         difference = None
-        for states in (nearby, *nearby[:, None, :]):  # all at once; one by one if a call raises
+        for states in (nearby, *nearby[:, None, :]):  # all states at once; if a call raises, one state after another
             try:
                 difference = difference or self.difference(system, states, everywhere=False)
             except Exception:  # the state is outside the domain of the callbacks
@@ -104,10 +116,10 @@ class Traced:
         self.trusted = not system.called_in_python  # compiled callbacks never change
 
     def difference(self, system: ConstrainedSystem, states: Array, everywhere: bool = True) -> str | None:
-        """Describe the first difference between calls and traces at states [t, q, v]; None if there is none.
+        """Return a description of the first difference between calls and traces at states [t, q, v], or None.
 
-        `everywhere`: where a call returns a value that is not finite, the trace must not be finite either. Otherwise
-        such values are not compared.
+        `everywhere`: if a call returns a value that is not finite, the value of the trace must not be finite either.
+        Otherwise values that are not finite are not compared.
         """
         from twoloop.kernels.evaluation import checks as kernels
 
@@ -126,10 +138,12 @@ class Traced:
         else:
             agree |= ~finite
         largest = np.where(np.isfinite(bounds), bounds, 0.0).max(axis=0)
-        # the largest term of the kind of each entry
+        # for each entry, the largest term of all entries that the same callback returns
         size = np.repeat(np.maximum.reduceat(largest, np.cumsum(self.n_entries) - self.n_entries), self.n_entries)
-        for k, entry in np.argwhere(~agree & ~(differences <= LOST * size)):
-            if not differences[k, entry] <= CLEAR * size[entry] or self._is_systematic(system, states[k], int(entry)):
+        for k, entry in np.argwhere(~agree & ~(differences <= ROUNDING_DIFFERENCE * size)):
+            if not differences[k, entry] <= CLEAR_DIFFERENCE * size[entry] or self._is_systematic(
+                system, states[k], int(entry)
+            ):
                 return self._message(states[k], int(entry), called[k, entry], traced[k, entry])
         return None
 
@@ -151,7 +165,7 @@ class Traced:
         return n_different, called, traced, bounds
 
     def _is_systematic(self, system: ConstrainedSystem, state: Array, entry: int) -> bool:
-        """Return whether a difference is about the same at neighbouring states, as rounding errors would not be."""
+        """Return whether an entry differs by about the same amount at neighbouring states; rounding errors do not."""
         parts = np.random.default_rng(5).uniform(-1.0, 1.0, (N_NEIGHBOURS, len(state)))
         _, called, traced, _ = self._evaluate(system.kit, state * (1.0 + PERTURBATION * parts))
         gap = (called - traced)[:, entry]
@@ -169,14 +183,14 @@ class Traced:
 
 
 class Sample:
-    """Sample of the states [t, q, v] of a run, from its start to its present time."""
+    """Sample of the states [t, q, v] of a run up to now; in long runs chunks and states are left out evenly."""
 
     def __init__(self, t: float, state: Array, n: int) -> None:
         self._n, self._parts = n, list[Array]()
         self.add(state[:0], state[None, :][:0], t, state)
 
     def add(self, t: Array, rows: Array, end: float, state: Array) -> None:
-        """Add a selection of the states of a chunk (times `t`, rows that begin with [q, v]), and its last state."""
+        """Add some states of a chunk (times `t`, rows that begin with [q, v]), and its last state, `state` at `end`."""
         stride = 1 + len(t) // MAX_OF_CHUNK
         times = t[::stride]
         part = np.empty((len(times) + 1, 1 + self._n))
@@ -187,18 +201,18 @@ class Sample:
             self._parts = self._parts[::2]
 
     def end(self, t: float, state: Array) -> None:
-        """Drop the states after the time at which a run ended, and add the state at that time."""
+        """Remove the states after t, the time at which a run ended, and add the state at t."""
         states = self.states()
         self._parts = [states[states[:, 0] <= t]]
         self.add(states[:0, 0], states[:0], t, state)
 
     def states(self) -> Array:
-        """Return all states, the latest first."""
+        """Return the states as rows [t, q, v], the latest first."""
         return np.concatenate(self._parts)
 
 
 def refuse_wrong(traced: Sequence[Traced], system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:
-    """Compare traces that are not trusted yet with calls, at states near the start and at times spread over the run.
+    """Compare traces that are not trusted yet with calls at random states near the start; times are those of the run.
 
     Raises
     ------
@@ -215,15 +229,15 @@ def refuse_wrong(traced: Sequence[Traced], system: ConstrainedSystem, t0: float,
             each.check_near_start(system, nearby)
 
 
-Check = Callable[[Traced], None]
+Check = Callable[[Traced], None]  # raises Untraceable if traces are wrong
 
 
 def unchecked(traced: Traced) -> None:
-    """Accept traces without a comparison: for callers whose results enter no run."""
+    """Accept traces without a comparison: a `Check` for results that no run uses."""
 
 
 def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:
-    """Return the start [t, q, v], and random states near it at times spread over the run."""
+    """Return rows [t, q, v]: the start, and N_NEARBY random states near it, at times spread over the run."""
     size = sizes(q)
     speed = np.maximum(size, np.abs(v))
     n, parts = len(q), _random_parts(len(q))
@@ -237,12 +251,12 @@ def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:
 
 @cache
 def _random_parts(n_q: int) -> Array:
-    """Return fixed random numbers between -1 and 1, (2, N_NEARBY, n_q)."""
+    """Return an array (2, N_NEARBY, n_q) of random numbers between -1 and 1, the same in every call."""
     return np.random.default_rng(6).uniform(-1.0, 1.0, (2, N_NEARBY, n_q))
 
 
 def extreme_states(t: Array, rows: Array) -> Array:
-    """Return the states [t, q, v] of a run at which a component is smallest or largest; `rows` are [q, v]."""
+    """Return the states, as rows [t, q, v], at which t or an entry of `rows` [q, v] is smallest or largest."""
     states = np.column_stack([t, rows])
     return states[np.unique([states.argmin(axis=0), states.argmax(axis=0)])]
 
@@ -253,7 +267,7 @@ class CheckedRegion:
     Attributes
     ----------
     bounds : ndarray (2, 1 + 2 n_q) or (2, 0)
-        Smallest and largest components of the states that need no new comparison: the box of states and its margin.
+        Smallest and largest t, q and v of the box and its margin: no comparison is needed at states within them.
     """
 
     def __init__(self) -> None:
@@ -263,15 +277,15 @@ class CheckedRegion:
         self.bounds = self._box
 
     def is_comparison_due(self) -> bool:
-        """Return whether the next run must compare callbacks at all its states, as the runs 1, 2, 4, 8, ... do."""
+        """Return whether the next run has the number 1, 2, 4, 8, ...: it compares callbacks at all sampled states."""
         return (self._runs + 1) & self._runs == 0
 
     def count(self) -> None:
-        """Count one more run."""
+        """Increase the number of runs by one."""
         self._runs += 1
 
     def states_outside(self, states: Array) -> Array:
-        """Return the states outside the region and its margin."""
+        """Return those of the states (rows [t, q, v]) that are outside the box of states and its margin."""
         if not self._box.size:
             return states
         least, largest = self.bounds
@@ -279,7 +293,7 @@ class CheckedRegion:
         return states[outside.any(axis=1)] if outside.any() else states[:0]
 
     def contains_parameters(self, parameters: Array) -> bool:
-        """Return whether parameters lie in the region or its margin."""
+        """Return whether parameters are inside the box of parameters or its margin."""
         if self._parameters is None:
             return False
         least, largest = self._parameters
@@ -287,12 +301,12 @@ class CheckedRegion:
         return bool((least - margin <= parameters).all() and (parameters <= largest + margin).all())
 
     def add_parameters(self, parameters: Array) -> None:
-        """Extend the region by the parameters of a run in which calls and traces agreed."""
+        """Extend the box of parameters by those of a run in which calls and traces agreed."""
         least, largest = self._parameters or (parameters, parameters)
         self._parameters = np.minimum(least, parameters), np.maximum(largest, parameters)
 
     def add(self, states: Array) -> None:
-        """Extend the region by states at which calls and traces agreed."""
+        """Extend the box of states by states at which calls and traces agreed."""
         if len(states) == 0:
             return
         checked = np.concatenate([states, self._box]) if self._box.size else states

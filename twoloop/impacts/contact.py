@@ -11,7 +11,7 @@ from twoloop.checks.arguments import Array, shown
 from twoloop.generate.derived_callbacks import with_derived_callbacks
 from twoloop.generate.graph import Affine, Derivative, Graph, Untraceable, symbols
 from twoloop.generate.program import MAX_TRACE_DIFFERENCE, N_COMPARED, TIME_SPACING, OperationTable
-from twoloop.generate.trace import as_forms, trace
+from twoloop.generate.trace import convert_to_expressions, trace
 from twoloop.generate.traced_values import unchecked
 from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import indices
@@ -53,7 +53,7 @@ class Gaps:
         for stop in stops:
             try:
                 value = np.array(trace(getattr(stop, function), t, symbols(q)), dtype=object)
-                (gap,) = as_forms(graph, value.reshape(1))
+                (gap,) = convert_to_expressions(graph, value.reshape(1))
             except (Untraceable, ValueError) as error:
                 raise ValueError(
                     f"{function} of {stop.name!r} must be a number computed from t and q by numpy functions, without "

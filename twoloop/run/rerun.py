@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from twoloop.checks.derivatives import wrong_derivative
 from twoloop.checks.structure import run_inconsistency
 from twoloop.generate.derived_callbacks import exact_derivatives, generic_states
-from twoloop.generate.traced_values import CLEAR, MAX_IN_PYTHON, CheckedRegion, Sample
+from twoloop.generate.traced_values import CLEAR_DIFFERENCE, MAX_IN_PYTHON, CheckedRegion, Sample
 from twoloop.kernels.data import indices
 from twoloop.methods import dop853
 from twoloop.methods.dop853 import DOP853
@@ -128,7 +128,7 @@ def find_nondeterminism(system: ConstrainedSystem, states: Array) -> str | None:
     first_forces, second_forces = np.array(forces[: len(states)]), np.array(forces[len(states) :][::-1])
     comparable = np.isfinite(first_forces) & np.isfinite(second_forces)
     differences = np.abs(np.subtract(first_forces, second_forces, out=np.zeros_like(first_forces), where=comparable))
-    if not differences.max() > CLEAR * np.abs(first_forces[comparable]).max(initial=0.0):
+    if not differences.max() > CLEAR_DIFFERENCE * np.abs(first_forces[comparable]).max(initial=0.0):
         return None
     k, entry = np.unravel_index(differences.argmax(), differences.shape)
     return _changed_value(system.name, float(states[k, 0]), int(entry), first_forces[k, entry], second_forces[k, entry])
@@ -170,7 +170,7 @@ def describe_changed_force(run: Run) -> str | None:
                 continue
             comparable = np.isfinite(value) & np.isfinite(again)
             differences = np.abs(np.subtract(value, again, out=np.zeros(len(value)), where=comparable))
-            if differences.max(initial=0.0) > CLEAR * np.abs(value[comparable]).max(initial=0.0):
+            if differences.max(initial=0.0) > CLEAR_DIFFERENCE * np.abs(value[comparable]).max(initial=0.0):
                 entry = int(differences.argmax())
                 return (
                     f"In the run {_changed_value(system.name, float(arguments[0]), entry, value[entry], again[entry])}."
