@@ -12,8 +12,8 @@ ROWS_SEARCHED = 4
 # limits of a pivot block, in three tiers, which are tried in this order. MAX_SQUARES: sum of squares of the changes of
 # its coordinates, if each other coordinate moves by 1. MIN_SINE_SQUARES: squared sine of the angle between its columns,
 # or square of a single pivot over that of its column of G. With the first tier pivots stay large for most of a
-# turn (spatial four-bar: 98 % of the time, 34 % with the second tier); the last tier is far enough from LEAST of
-# generate/null_space.py
+# turn (spatial four-bar: 98 % of the time, 34 % with the second tier); the last tier is far enough from
+# MIN_PIVOT_SQUARE of generate/null_space.py
 MAX_SQUARES, MIN_SINE_SQUARES = (4.0, 20.0, 200.0), (0.2**2, 0.1**2, 0.04**2)
 SMALL = 1e-3  # smallest constant that may be a pivot, relative to the largest entry of its row
 CANCELLATION = 1e-12  # difference of constants that counts as zero, relative to the subtracted one
