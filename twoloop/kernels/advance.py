@@ -1,6 +1,6 @@
 """Advance by many steps with step-size control, until the last output time, a full buffer or a failure.
 
-`advance` is the same for all methods: `f` (a `Kit`) has the functions of the step, `options` and `memory` its data.
+`advance` is the same for all methods: their functions are in `f` (a `Kit`), their data in `options` and `memory`.
 """
 
 import numpy as np
@@ -63,16 +63,17 @@ from twoloop.kernels.evaluation.inner_loop import (
 from twoloop.kernels.evaluation.partition import CHANGED
 from twoloop.kernels.linalg.dense import copy
 
-# error of a rejected step, in tolerances: above this, a force is assumed to jump or bend within the step
+# error of a rejected step, in tolerances, above which a force is assumed to change suddenly within the step
 SUDDEN_ERROR = 10.0
-MAX_RATIO_AFTER_REJECTION = 0.95  # maximum ratio of the next step size to that of a rejected step
-# number of accepted steps from which on a short next step ends the trial of a method; the first step size is a guess
+MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to that of a rejected step
+# smallest number of accepted steps after which a short next step ends the trial of a method: one is too few, because
+# the first step size is a guess
 FIRST_JUDGED = 2
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR))
 def start(f, w, t, state):
-    """Factor the mass matrix, choose the partition, and compute a and lam of `state` from q and v; return a code."""
+    """Factor the mass matrix, choose the partition, and store a and lam in `state` [q, v, a, lam]; return a code."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     w.notes[KINK_BEFORE] = t  # C_t or b of a drive may be discontinuous at the start
@@ -83,14 +84,14 @@ def start(f, w, t, state):
         code = find_tangents(f, w, t, q)
     if code == DONE:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
-    if code == DONE and f.flags[GAMMA_GIVEN] == 0:  # repeat: the first evaluation has found the scale of Gamma's errors
+    if code == DONE and f.flags[GAMMA_GIVEN] == 0:  # repeat, now that the scale of Gamma's errors is known
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
     return code
 
 
 @merged
 def _locate_kink(f, w, t, size, tolerances, accepted, state, new_state):
-    """Return JUMP, RAMP or SMOOTH for C_t and b within a step, and beginning and end of the jump or ramp."""
+    """Return JUMP, RAMP or SMOOTH for C_t and b within a step, and the beginning and end (s) of a jump or ramp."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     if not accepted:
@@ -106,7 +107,7 @@ def _locate_kink(f, w, t, size, tolerances, accepted, state, new_state):
 def _attempt(f, w, options, memory, tolerances, control, clock, t, size, crosses_jump, state, new_state):
     """Attempt a step; return its code, its error in tolerances, and the ratio of the next step size to this one.
 
-    With `crosses_jump`, the step crosses a jump of C_t or b: the caller has already computed `new_state`.
+    `crosses_jump`: the step crosses a jump of C_t or b, and the caller has already computed `new_state`.
     """
     w.notes[ORIENTATION_NEW] = 0.0
     if clock[at.FAILURE_CODE] == DONE:
@@ -129,9 +130,9 @@ def _attempt(f, w, options, memory, tolerances, control, clock, t, size, crosses
 
 @merged
 def _ends_at_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
-    """Return whether a step is to be repeated, because C_t or b jumps or bends within it.
+    """Return whether a step must be repeated because C_t or b jumps, or has a ramp, within the step.
 
-    Stores the interval of the jump, where the repeated step ends, or the size of the repeated step.
+    Stores in `clock` the interval of a jump, so that the repeated step ends where it begins; for a ramp, the next size.
     """
     kind, low, high = _locate_kink(f, w, t, size, tolerances, accepted, state, new_state)
     if kind == JUMP:
@@ -147,10 +148,10 @@ def _ends_at_kink(f, w, tolerances, control, clock, t, size, accepted, state, ne
 
 @merged
 def _handle_failure(f, w, control, clock, t, size, code, t_repeated, state):
-    """Handle a step that failed: shorten it, renew the partition, or return the code that ends the loop.
+    """Prepare the repetition of a failed step and return CONTINUE, or return the code that ends the loop.
 
-    A step of fixed size cannot become shorter: only the partition is renewed. `t_repeated` is the time at which a step
-    of fixed size was last repeated.
+    The step is repeated with a smaller size, with a new partition, or with both. A step of fixed size is repeated once,
+    with a new partition; `t_repeated` is the time of the last such repetition.
     """
     n = w.Q.size
     needs_partition = code in (SINGULAR, INNER_DIVERGED)
@@ -179,7 +180,7 @@ def _handle_failure(f, w, control, clock, t, size, code, t_repeated, state):
 
 @merged
 def _handle_rejection(f, w, control, clock, t, size, proposal, state):
-    """Handle a step whose error is too large: shorten it, or return the end code of a singular position nearby."""
+    """Reduce the size of a step whose error is too large; return CONTINUE, or an end code near a singular position."""
     n = w.Q.size
     w.counters[N_REJECTED_ERROR] += 1
     clock[at.FAILURE_CODE] = DONE
@@ -195,7 +196,7 @@ def _handle_rejection(f, w, control, clock, t, size, proposal, state):
 
 @merged
 def _may_take_many(control, clock):
-    """Return whether the method may take many steps in a row, without a check before each one."""
+    """Return whether the method may take many steps in one call, without checks by the loop between them."""
     if control[at.MAKES_MANY] == 0.0 or control[at.FIXED_STEP] > 0.0 or clock[at.APPLIES_JUMP] == 1.0:
         return False
     if control[at.SPACING] > 0.0 or clock[at.T] == clock[at.JUMP_FROM]:
@@ -205,7 +206,7 @@ def _may_take_many(control, clock):
 
 @merged
 def _pass_output_time(f, w, clock, outputs, state):
-    """Advance to the next output time; return whether the one just reached was the last."""
+    """Record the pivot at an output time, and go on to the next output time; return whether this was the last one."""
     record_pivot_at_output(f, w, clock, state)
     clock[at.NEXT_OUTPUT] += 1.0
     return int(clock[at.NEXT_OUTPUT]) == outputs.size
@@ -220,10 +221,12 @@ def advance(
 ):
     """Integrate from (clock, state) until every time in `outputs` is reached; return an end code of loop_state.py.
 
-    Steps are shortened to end at output times. A step is the difference of two floating-point times, so that the steps
-    add up to the time exactly.
-    With STORE_ALL = 1 every accepted state is stored, otherwise the states at output times. `filled` becomes two
-    numbers of rows: those written to out_t and out_state, and those written to out_steps, one for each accepted step.
+    Steps are shortened to end at output times. A step size is the difference of two floating-point times, so that the
+    sum of the step sizes is exact. `clock` and `state` are updated in place; `new_state` is scratch, but contains the
+    state after a jump if the next step crosses one (APPLIES_JUMP).
+    With STORE_ALL = 1 every accepted state is stored in a row of out_t and out_state, otherwise the states at output
+    times only; out_steps gets one row for each accepted step. On return, filled[0] is the number of rows written to
+    out_t and out_state, and filled[1] the number of rows written to out_steps.
     """
     fixed_size = control[at.FIXED_STEP] > 0.0
     n = w.Q.size
@@ -289,10 +292,10 @@ def advance(
         )
         if code == NOT_LOADED:
             return at.NEEDS_COMPILATION
-        if w.notes[TIME_IS_UP] == 1.0:  # evaluations of this attempt may have ended early
+        if w.notes[TIME_IS_UP] == 1.0:  # this attempt may lack evaluations: discard it
             f.settle(f, w, options, memory, tolerances, False)
             return at.PAUSED
-        # where a force jumps, an estimated error may be small by chance: until ROUGH_TO it is multiplied by `strict`
+        # where a force jumps, an error estimate may be small by chance: it is multiplied by `strict` until ROUGH_TO
         strict = control[at.ROUGH] if t < clock[at.ROUGH_TO] else 1.0
         accepted = code == DONE and error * strict <= 1.0
         if accepted and not reaches_goal and ends_at_singular(f, w, control, clock):
@@ -330,7 +333,7 @@ def advance(
         error *= strict
         if factor == 0.0:
             factor = factor_of(control, clock, size, error)
-        elif strict > 1.0 and error > 0.0:  # the step computed `factor` without `strict`: `factor` may be too large
+        elif strict > 1.0 and error > 0.0:  # the method computed `factor` from the error without `strict`
             factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
         proposal = min(size * factor, clock[at.H_LIMIT])
         if not accepted and factor > 1.0:
@@ -359,7 +362,7 @@ def advance(
             out_t[filled[0]] = clock[at.T]
             copy(state, out_state[filled[0]])
             filled[0] += 1
-        # the size of a step shortened to end at an output time says little about the next step
+        # a step that was shortened to end at an output time must not limit the size of the next one
         clock[at.H_NEXT] = max(proposal, h) if shortened else proposal
         clock[at.LIMIT_AGE] += 1.0
         if clock[at.LIMIT_AGE] > control[at.LIMIT_MEMORY]:

@@ -1,12 +1,12 @@
-"""Start a run and take its first steps in one compiled call, and report on them in one array.
+"""Start a run and take its first steps in one compiled call, which stores all results in one array.
 
 `start_and_advance` checks the start, repeats the choices of the previous run (independent rows, dependent coordinates),
 takes steps, and fills one array:
 
     ... | report: N_REPORT numbers, counters | times | steps | states ...
                                                              ^ a fixed index
-`advance` writes states from the fixed index on. The report, whose length depends on the number of steps, is copied
-afterwards so that it ends where the states begin. A result is then contiguous: Python copies it as one slice, and
+`advance` writes states from the fixed index on. The length of the other parts depends on the number of steps: they are
+copied afterwards, and end where the states begin. A result is then contiguous: Python copies it as one slice, and
 splits the copy when a field of the result is used.
 """
 
@@ -35,15 +35,15 @@ from twoloop.kernels.data.common import (
 from twoloop.kernels.data.indices import FORM, GAP, LONGEST_UNSEEN, LOOK, N_ACCEPTED, N_COUNTERS
 from twoloop.kernels.evaluation.checks import CONSISTENT, DEFINITE, IN_ORDER, INDEFINITE
 
-ROUNDING = 1e-15  # relative to the largest coordinate: smaller corrections are rounding errors
+ROUNDING = 1e-15  # rounding error of positions, relative to the largest coordinate: smaller corrections are not needed
 
 
 @merged
 def prepare_work(w, numbers, integers, pattern, q, accuracy, reuse):
-    """Reset the workspace `w` before a run from q.
+    """Reset the workspace `w` in place before a run that starts at the position q.
 
-    `numbers` and `integers` are the arrays of `w` that keep data from step to step, `accuracy` is GAMMA_REQUIRED, and
-    `reuse` the least REUSE (see data/indices.py).
+    `numbers` and `integers` are the parts of `w` that keep data from step to step, `pattern` is stored in w.pattern,
+    `accuracy` is the value of GAMMA_REQUIRED, and `reuse` the smallest value of REUSE (see data/indices.py).
     """
     for k in range(numbers.size):
         numbers[k] = 0.0
@@ -59,7 +59,7 @@ def prepare_work(w, numbers, integers, pattern, q, accuracy, reuse):
     for j in range(q.size):
         rounded = max(rounded, ROUNDING * abs(q[j]))
     w.notes[indices.ROUNDED], w.notes[indices.REUSE] = rounded, max(reuse, rounded)
-    w.notes[indices.GAMMA_REQUIRED], w.notes[indices.GAMMA_SHARE] = accuracy, 1.0
+    w.notes[indices.GAMMA_REQUIRED], w.notes[indices.GAMMA_STEP_RATIO] = accuracy, 1.0
     w.notes[indices.KINK_BEFORE], w.notes[indices.KINK_AFTER] = -math.inf, math.inf
 
 
@@ -69,18 +69,18 @@ def prepare_workspace(w, numbers, integers, pattern, q, accuracy, reuse):
     prepare_work(w, numbers, integers, pattern, q, accuracy, reuse)
 
 
-FIRST_STEP = 0.01  # first step size, relative to the shortest time scale of the state
+FIRST_STEP = 0.01  # first step size, relative to the shortest time scale of the initial motion, see _first_step
 MIN_FIRST_STEP = 1e4  # smallest first step size, in spacings of floating-point numbers at the start time
-SHORTEST_STEP = 1e-16  # shortest step size, relative to the first one
-GAP_TO_LOOK = 10  # ratio of GAP to LOOK, if forces may change suddenly with position or velocity
+SHORTEST_STEP = 1e-16  # smallest allowed step size, relative to the first step size
+GAP_TO_LOOK = 10  # ratio of tolerances[GAP] to tolerances[LOOK] if forces may change suddenly with position or velocity
 
 
 @exact
 def _first_step(state, n, t, span, smallest):
-    """Return the first step size, s: a fraction of the time in which coordinates change by as much as their size.
+    """Return the first step size, s: FIRST_STEP times the time in which coordinates change by as much as their size.
 
-    That size is max|q|, or `smallest` if this is larger. The result is at most a fraction of `span`, and at least
-    MIN_FIRST_STEP spacings of floating-point numbers, however small the coordinates are.
+    The size of the coordinates is max|q|, or `smallest` if this is larger. The result is at most FIRST_STEP times the
+    duration `span` of the run, and at least MIN_FIRST_STEP spacings of floating-point numbers at t.
     """
     distance, speed, acceleration = smallest, 0.0, 0.0
     for j in range(n):
@@ -91,7 +91,7 @@ def _first_step(state, n, t, span, smallest):
         time_scale = min(time_scale, distance / speed)
     if acceleration > 0.0:
         time_scale = min(time_scale, math.sqrt(distance / acceleration))
-    # unless the motion is almost at rest
+    # the time in which velocities change by their size counts only if the motion is not almost at rest
     if speed > 0.0 and acceleration > 0.0 and speed / acceleration > FIRST_STEP * time_scale:
         time_scale = min(time_scale, speed / acceleration)
     return max(FIRST_STEP * time_scale, MIN_FIRST_STEP * np.spacing(abs(t)))
@@ -99,9 +99,10 @@ def _first_step(state, n, t, span, smallest):
 
 @exact
 def _limit_steps(control, tolerances, span, longest, within):
-    """Limit the time between two evaluations of the equations to a hundredth of the run's duration `span`.
+    """Store limits for the time between two evaluations of the equations: LONGEST_UNSEEN of the run's duration `span`.
 
-    `within`: steps evaluate the equations at interior points as well, so that only `longest` (s) limits the step size.
+    The limits are GAP and LOOK in `tolerances`, and MAX_STEP, APART and SPACING in `control`. `within`: steps evaluate
+    the equations at interior points, too, so that only `longest` (s) limits the step size.
     """
     gap = LONGEST_UNSEEN * span
     tolerances[GAP], tolerances[LOOK] = gap, gap / (GAP_TO_LOOK if control[at.BY_STATE] > 0.0 else 1.0)
@@ -111,8 +112,11 @@ def _limit_steps(control, tolerances, span, longest, within):
 
 
 @kernel(f8(VECTOR, VECTOR, VECTOR, i8, f8, f8, f8, f8, types.boolean))
-def set_sizes(control, tolerances, state, n, t, t1, smallest, longest, within):
-    """Return the first step size from a state, s; if `longest` > 0, also limit the time between two evaluations."""
+def first_step_and_limits(control, tolerances, state, n, t, t1, smallest, longest, within):
+    """Return the first step size (s) of a run from `state` at t to t1; if `longest` > 0, also store limits.
+
+    The limits are those of `_limit_steps`. `smallest` is an argument of `_first_step`.
+    """
     if longest > 0.0:
         _limit_steps(control, tolerances, t1 - t, longest, within)
     return _first_step(state, n, t, t1 - t, smallest)
@@ -120,7 +124,7 @@ def set_sizes(control, tolerances, state, n, t, t1, smallest, longest, within):
 
 @merged
 def _all_within(t, rows, bounds):
-    """Return whether all rows [t, q, v] are within `bounds`: lower and upper bounds of the first entries of a row."""
+    """Return whether times t and the first entries of each state in `rows` are between bounds[0] and bounds[1]."""
     for k in range(t.size):
         if not bounds[0, 0] <= t[k] <= bounds[1, 0]:
             return False
@@ -132,9 +136,9 @@ def _all_within(t, rows, bounds):
 
 @kernel(types.void(MATRIX, INTEGERS, VECTOR, types.int64[:, ::1], types.boolean[::1]))
 def split_steps(steps, counts, h, changes, used_newton):
-    """Split the rows of steps into step sizes `h`, `changes` of the counters, and whether Newton's method was used.
+    """Store step sizes in `h`, changes of the counters in `changes`, and whether Newton's method was used.
 
-    `counts` are the rejections and partitions before these steps on entry, and after these steps on return.
+    `counts` are the numbers of rejections and partitions: on entry before these steps, on return after them.
     """
     for k in range(h.size):
         h[k], used_newton[k] = steps[k, at.H], steps[k, at.JACOBIANS] > 0.0
@@ -144,15 +148,15 @@ def split_steps(steps, counts, h, changes, used_newton):
 
 
 # codes that `start_and_advance` returns instead of a number of steps. REFUSED: the choices of the previous run do not
-# suit this start. IN_DOUBT: the start may be inconsistent and needs a closer check. UNUSUAL: Python has to read the
-# report or to continue the run
+# suit this start. IN_DOUBT: the start may be inconsistent and needs a closer check. UNUSUAL: Python must read the
+# report, and may have to continue the run
 REFUSED, IN_DOUBT, UNUSUAL = -1, -2, -3
 
-# Arrays of runs that are repeated from different starts: for checking a start, for choosing rows, and for the run.
-# - `start_numbers`: clock, control and tolerances at a start, which are copied to `numbers`
-# - `start_memory`: initial values of the method's `memory` at the indices `memory_places`; the other values are zero
-# - `last_start`: the last start, see START; `saved`, `saved_integers`: the state of the whole run at that start, stored
-#   when the start is repeated; `start_rows`: the independent rows at that start
+# arrays of runs that are repeated from different starts: for checking a start, for choosing rows, and for the run.
+# - `numbers`: memory of clock, control and tolerances; `start_numbers`: initial values of `numbers`
+# - `start_memory`: initial values of the method's `memory` at the indices `memory_places`; other initial values are 0
+# - `last_start`: the last start, see START; `start_rows`: the independent rows at that start
+# - `saved`, `saved_integers`: all data of a run that has just started at `last_start`, saved when a start is repeated
 RUN_ARRAYS = Reference(
     "RunArrays",
     {
@@ -174,21 +178,23 @@ RUN_ARRAYS.add_function("choose", i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INT
 RUN_ARRAYS.add_function("dependents", i8(MATRIX, INTEGERS, INTEGERS, i8, VECTOR, INTEGERS, INTEGERS))
 RUN_ARRAYS.add_function("start", i8(KIT, WORK, f8, VECTOR))
 RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS))
-# indices in `constants`. For starts: values of w.notes; whether rows have entries wherever `kinds` says so; arguments
-# of `choose`; tolerance of redundant rows; flag of M (DEFINITE, INDEFINITE or 0); smallest pivot of an accepted start;
-# form of the equations. For steps: the user's first step size, or 0; arguments of set_sizes. For ends: the pivot below
-# which Python checks the run; the largest ratio of a change of velocities to that by accelerations; and the least time
-# between two sudden changes, in samples
+# indices in `constants`. ACCURACY, REUSE, NEARLY_SINGULAR: initial values in w.notes. HAS_ALL_ENTRIES: 1 if rows are
+# nonzero wherever `kinds` is not 0. RANK, WEAK: thresholds for `choose`. SCALE: factor of the rows added to M.
+# CONTRADICTS: tolerance of redundant rows. MASS_FLAG: flag of M (DEFINITE, INDEFINITE or 0). LEAST_PIVOT: smallest
+# pivot of an accepted start. EQUATION_FORM: value of FORM. FIRST: first step size that the user has chosen, s; 0: none.
+# LEAST: argument `smallest` of _first_step. LONGEST, EVALUATES_WITHIN: arguments of _limit_steps. NEAR: pivot below
+# which Python checks the run. MAX_CHANGE_RATIO: largest ratio of the change of velocities in the last step to that by
+# accelerations. MIN_SAMPLES: least time between two sudden changes, in spacings of samples
 ACCURACY, REUSE, NEARLY_SINGULAR, HAS_ALL_ENTRIES, RANK, WEAK, SCALE, CONTRADICTS, MASS_FLAG, LEAST_PIVOT = range(10)
 EQUATION_FORM, FIRST, LEAST, LONGEST, EVALUATES_WITHIN, NEAR, MAX_CHANGE_RATIO, MIN_SAMPLES = range(10, 18)
-# indices in `expected`, the choices of the generated code (empty without generated code): result of choose_rows,
-# numbers of kept rows and of rows added to M, then these rows
+# indices in `expected`, the choices for which code was generated (empty without generated code). PLACE: result of
+# choose_rows. N_KEPT, N_ADDED: numbers of independent rows and of rows added to M. KEPT: first index of these rows
 PLACE, N_KEPT, N_ADDED, KEPT = range(4)
 
 
 @merged
 def _has_same_choices(b):
-    """Return whether independent rows, rows added to M and dependent coordinates are those of the generated code."""
+    """Choose rows and dependent coordinates at the start; return whether the generated code is for the same choices."""
     b.scratch[0] = 0.0
     first_bound = b.choose(b.mass, b.rows, b.constants[RANK], b.constants[WEAK], b.bounds, b.scratch, b.chosen)
     n_kept, n_added = b.expected[N_KEPT], b.expected[N_ADDED]
@@ -219,7 +225,7 @@ def _copy(source, target):
 
 @merged
 def _redundant_rows_hold(w, b, n):
-    """Return whether the accelerations satisfy all rows, including redundant rows that were left out."""
+    """Return whether the accelerations in b.state satisfy all rows, including redundant rows, up to a tolerance."""
     if w.rows_v.size == len(b.rows):
         return True
     for i in range(len(b.rows)):
@@ -241,7 +247,7 @@ def _check_start(checked_kit, b, t, q, v, sizes, shifts):
 
 @merged
 def _has_all_entries(b):
-    """Return whether rows are nonzero wherever `kinds` says so: then entries are not sought at positions nearby."""
+    """Return whether b.rows is nonzero exactly where b.kinds is: then no entries are sought at positions nearby."""
     n, same = b.rows.shape[1], True
     for k in range(b.kinds.size):
         same = same and (b.kinds[k] != 0) == (b.rows[k // n, k % n] != 0.0)
@@ -250,10 +256,10 @@ def _has_all_entries(b):
 
 @merged
 def _start_run(f, checked_kit, w, b, t, t1, q, v, sizes, is_consistent):
-    """Start a run from t to t1 with the choices of the previous run; return 0, REFUSED or IN_DOUBT.
+    """Prepare a run from t to t1 with the choices of the previous run; return 0, REFUSED or IN_DOUBT.
 
-    `checked_kit`: kit of the system that is checked; `sizes`: see `evaluate_start`; `is_consistent`: the state is known
-    to be consistent.
+    `checked_kit` has the callbacks that are checked at the start; for `sizes` see `evaluate_start`. `is_consistent`:
+    the initial state is already known to satisfy the constraints.
     """
     n = q.size
     if not (finite_vector(q) and finite_vector(v)):
@@ -307,14 +313,14 @@ def _restore_start(b):
     _copy(b.saved_integers, b.lasting_integers)
 
 
-# indices in `last_start`: the number of successive runs from that start, at most IS_SAVED; from START on: t, t1, q, v
+# indices in `last_start`. N_EQUAL: number of successive runs from this start, at most IS_SAVED. START: [t, t1, q, v]
 N_EQUAL, START = 0, 1
 NEVER, IS_SAVED = 0.0, 2.0
 
 
 @exact
 def _is_last_start(last_start, t, t1, q, v):
-    """Return whether a start equals the one in `last_start` bit for bit; write it to `last_start`."""
+    """Return whether the start (t, t1, q, v) equals that in `last_start` bit for bit, and store it in `last_start`."""
     n, same = q.size, last_start[N_EQUAL] > NEVER
     for k in range(2 + 2 * n):
         x = t if k == 0 else t1 if k == 1 else q[k - 2] if k < 2 + n else v[k - 2 - n]
@@ -324,18 +330,19 @@ def _is_last_start(last_start, t, t1, q, v):
     return same
 
 
-# entries of the report: number of states (with the first) and of steps; then 1 or 0 for: NO_REMARK, nothing has to be
-# checked; JUMPED, velocities changed suddenly in the last step; IN_CHECKED_REGION, all states are in the region where
-# callbacks were compared with their traces; HAS_DEFECTS, every step evaluated its defect; then the largest defect, the
-# longest time between two evaluations, the code of `advance`, 1 if the start is new, and the counters
-N_STATES, N_STEPS, NO_REMARK, JUMPED, IN_CHECKED_REGION, HAS_DEFECTS = range(6)
+# indices in the report. N_STATES: number of states, including the first. NOTHING_TO_CHECK: 1 if nothing in the run
+# needs a check. JUMPED: 1 if velocities changed suddenly in the last step. IN_CHECKED_REGION: 1 if all states are in
+# the region in which callbacks were compared with their traces. DEFECT_KNOWN: 1 if the defect was evaluated in every
+# step. DEFECT: the largest defect. LONGEST_GAP: longest time between two evaluations, s. END_CODE: code that `advance`
+# returned. IS_NEW: 1 if the start differs from the previous one. From N_REPORT on: the counters
+N_STATES, N_STEPS, NOTHING_TO_CHECK, JUMPED, IN_CHECKED_REGION, DEFECT_KNOWN = range(6)
 DEFECT, LONGEST_GAP, END_CODE, IS_NEW, N_REPORT = range(6, 11)
 N_HEAD = N_REPORT + N_COUNTERS
 
 
 @merged
 def _velocities_jumped(b, k, n):
-    """Return whether velocities change in the last step by more than the accelerations at its ends explain."""
+    """Return whether velocities change from state k - 1 to k by more than the accelerations at both states explain."""
     change, first, last = 0.0, 0.0, 0.0
     for j in range(n):
         change = max(change, abs(b.states[k, n + j] - b.states[k - 1, n + j]))
@@ -345,39 +352,41 @@ def _velocities_jumped(b, k, n):
 
 @merged
 def _write_report(w, b, region, n_rows, n_steps, code, is_new):
-    """Write the report of a run with n_rows states after the first, and n_steps steps.
+    """Store the report, times and steps in b.report; return n_steps if nothing needs a check, else UNUSUAL.
 
-    Returns n_steps if nothing has to be checked, else UNUSUAL. `region`: bounds of [t, q, v], as in `_all_within`.
+    The run has n_rows states after the first, and n_steps steps. `region`: bounds of the states for IN_CHECKED_REGION,
+    see `_all_within`.
     """
     jumped = n_rows > 0 and _velocities_jumped(b, n_rows, w.Q.size)
     inside = region.shape[1] > 0 and _all_within(b.t[: 1 + n_rows], b.states, region)
     near_singular = b.clock[at.PIVOT_AT_OUTPUT] < b.constants[NEAR]
     undersampled = b.clock[at.SHORTEST_CHANGE] < b.constants[MIN_SAMPLES] * b.clock[at.WIDEST_SAMPLING]
-    no_remark, width = not (jumped or near_singular or undersampled), b.steps.shape[1]
+    nothing_to_check, width = not (jumped or near_singular or undersampled), b.steps.shape[1]
     begin = b.report.size - N_HEAD - 1 - n_rows - width * n_steps
     report = b.report[begin:]
-    report[N_STATES], report[N_STEPS], report[NO_REMARK] = 1 + n_rows, n_steps, no_remark
+    report[N_STATES], report[N_STEPS], report[NOTHING_TO_CHECK] = 1 + n_rows, n_steps, nothing_to_check
     report[JUMPED], report[IN_CHECKED_REGION], report[END_CODE], report[IS_NEW] = jumped, inside, code, is_new
-    report[HAS_DEFECTS] = w.counters[N_ACCEPTED] > 0 and w.notes[indices.UNCHECKED] == 0.0
+    report[DEFECT_KNOWN] = w.counters[N_ACCEPTED] > 0 and w.notes[indices.UNCHECKED] == 0.0
     report[DEFECT], report[LONGEST_GAP] = w.notes[indices.LARGEST_DEFECT], w.notes[indices.WIDEST_GAP]
     for k in range(N_COUNTERS):
         report[N_REPORT + k] = w.counters[k]
     _copy(b.t[: 1 + n_rows], report[N_HEAD : N_HEAD + 1 + n_rows])
     for k in range(n_steps):
         _copy(b.steps[k], report[N_HEAD + 1 + n_rows + k * width : N_HEAD + 1 + n_rows + (k + 1) * width])
-    as_usual = code == at.ALL_OUTPUT_DONE and no_remark and inside and n_rows == n_steps
+    as_usual = code == at.ALL_OUTPUT_DONE and nothing_to_check and inside and n_rows == n_steps
     b.filled[0], b.filled[1] = n_rows, n_steps
     return n_steps if as_usual else UNUSUAL
 
 
 @kernel(i8(KIT, KIT, WORK, RUN_ARRAYS, f8, f8, VECTOR, VECTOR, VECTOR, MATRIX, types.boolean), vectorized=True)
 def start_and_advance(f, checked_kit, w, b, t, t1, q, v, sizes, region, is_consistent):
-    """Start a run to t1 and take the first steps; return their number, or a code if Python has to check something.
+    """Start a run from t to t1, and take the first steps; return the number of steps, REFUSED, IN_DOUBT or UNUSUAL.
 
-    If a start is repeated bit for bit, the second run still checks it and saves the state of the started run; from the
-    third run on, that state is restored without a check.
+    If a start is repeated bit for bit, the second run still checks the start, and then saves the data of the started
+    run. From the third run on, these data are restored without a check. For other arguments see `_start_run` and
+    `_write_report`.
     """
-    f.flags[FORM] = int(b.constants[EQUATION_FORM])  # a run may have changed it
+    f.flags[FORM] = int(b.constants[EQUATION_FORM])  # the run before may have changed the form
     same, n_equal = _is_last_start(b.last_start, t, t1, q, v), b.last_start[N_EQUAL]
     if same and n_equal == IS_SAVED:
         _restore_start(b)

@@ -1,7 +1,7 @@
-"""Interpolate states within steps by polynomials through neighbouring states, projected onto the constraints.
+"""Interpolate states within steps by polynomials through neighbouring states, and project the results.
 
-States are rows [q, v, a] at the times `t`; interval i lies between rows i and i + 1. For methods that take
-long steps, `fill` computes interior states first, and a polynomial goes through the states of one interval.
+Row i of `states` is [q, v, a] at the time t[i]; interval i is between rows i and i + 1. For methods that take long
+steps, `fill` first computes states within an interval, which one polynomial interpolates.
 """
 
 import numpy as np
@@ -25,22 +25,26 @@ from twoloop.kernels.evaluation.partition import least_pivot, partition_is_poor
 from twoloop.kernels.linalg.dense import copy, largest_of
 
 TABLE = types.int64[:, ::1]
-CHECKED_AT = (0.3, 0.7)  # where polynomials are checked: time since the beginning of an interval, over its length
+CHECKED_AT = (0.3, 0.7)  # times at which polynomials are checked, as fractions of an interval
 N_CHECKED = len(CHECKED_AT)
 EPS = 2.0**-52
 MAX_GAP_RATIO = 8.0  # largest ratio of the longest to the shortest of neighbouring steps that count as equally long
-NOISY = 10.0  # rounding of q divided by the interval, in tolerances of v: above this, v gets a polynomial of its own
-# largest pivot of a singular position within an interval, relative to the larger of the pivots at the ends
-SINGULAR_SHARE = 0.01
-SINGULAR_PIVOT = 1e-5  # largest pivot of a singular position, see least_pivot in partition.py
-# a position is singular, too, if its pivot is below WEAK_PIVOT, and pivot times change of velocities by the projection,
-# which is about the violation of the rows, is below RESIDUAL tolerances
+NOISY = 10.0  # rounding of q over the size of the interval, in tolerances of v, above which v gets its own polynomial
+# largest pivot of a singular position within an interval, relative to the larger of the pivots at the interval's ends
+SINGULAR_RATIO = 0.01
+SINGULAR_PIVOT = 1e-5  # a position with a smaller pivot is singular; for the pivot see least_pivot in partition.py
+# a position with a pivot below WEAK_PIVOT is singular, too, if the polynomials' velocities nearly satisfy the rows:
+# if pivot times change of velocities by the projection, about the violation of the rows, is below RESIDUAL tolerances
 RESIDUAL, WEAK_PIVOT = 10.0, 0.05
 
 
 @merged
 def _window(low, high, i, last):
-    """Return the first and last state of the polynomial for the interval from state i: centred, except near an end."""
+    """Return the indices of the first and last state that the polynomial for the interval from state i interpolates.
+
+    The interval is in the middle of these states, except near the states `low` and `high`, which limit them. If `fill`
+    has computed states within the interval, the polynomial interpolates the states i to `last`.
+    """
     if last > i + 1:  # `fill` has computed interior states of the interval
         return i, last
     size = min(kinds.WINDOW, high - low + 1)
@@ -50,11 +54,11 @@ def _window(low, high, i, last):
 
 @compiled
 def _divided_differences(t, states, lo, hi, i, h, column, order, z, c):
-    """Compute the Hermite polynomial through rows lo to hi in Newton's form; return the number of coefficients.
+    """Compute the nodes `z` and coefficients `c` of the Hermite polynomial through rows lo to hi; return their number.
 
-    It interpolates n columns of `states` from `column` on, less the values in row i; its variable is (time - t[i]) / h.
-    The columns behind these are their derivatives: `order` values are used at each node. `z` becomes the nodes, `c` the
-    coefficients.
+    The polynomial, in Newton's form, interpolates n columns of `states`, from index `column` on, minus their values in
+    row i. Its variable is (time - t[i]) / h. The next n columns are first derivatives, and the n columns after them
+    second derivatives: at each node, `order` of these groups are interpolated.
     """
     n = c.shape[1]
     size = (hi - lo + 1) * order
@@ -78,7 +82,11 @@ def _divided_differences(t, states, lo, hi, i, h, column, order, z, c):
 
 @merged
 def _interpolate(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
-    """Evaluate the polynomials of an interval of length h at t[i] + s h into q and v, by Horner's scheme."""
+    """Store in q and v the values at t[i] + s h of the polynomials of an interval of duration h, by Horner's scheme.
+
+    (z, c, size) are nodes, coefficients and number of coefficients of the polynomial for q, (z_v, c_v, size_v) those of
+    the polynomial for v, which is used if `kind` is APART; otherwise v is the derivative of q.
+    """
     n = q.size
     for m in range(n):
         value, slope = c[size - 1, m], 0.0
@@ -96,7 +104,7 @@ def _interpolate(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
 
 @merged
 def _kind_by_length(kind, tolerances, h, states, i):
-    """Return `kind`, or APART for an interval so short that rounding of q would spoil the slope of its polynomial."""
+    """Return `kind`, or APART if the interval is so short that rounding of q would spoil velocities, see NOISY."""
     n = tolerances.size - ATOL
     for m in range(n):
         atol, rtol = tolerances[ATOL + m], tolerances[RTOL]
@@ -107,7 +115,7 @@ def _kind_by_length(kind, tolerances, h, states, i):
 
 @merged
 def _change(tolerances, v_before, v):
-    """Return the largest change of a velocity by the projection, from v_before to v, in tolerances."""
+    """Return the largest change of a velocity from v_before to v, relative to its tolerance."""
     speed, largest = largest_of(v_before), 0.0
     for m in range(v.size):
         change = abs(v[m] - v_before[m]) / (tolerances[ATOL + m] + tolerances[RTOL] * speed)
@@ -118,11 +126,11 @@ def _change(tolerances, v_before, v):
 
 @compiled
 def _is_singular(f, w, t, states, i, last, time, q, change):
-    """Return whether q, within an interval, is so near a singular position that rounding explains `change`.
+    """Return whether q at `time`, within an interval, is so near a singular position that rounding explains `change`.
 
-    `change` is the change of velocities by the projection, in tolerances. Its cause is rounding if the smallest pivot
-    at q is very small, or small relative to the pivots at the ends of the interval, or if the polynomials' velocities
-    nearly satisfy the constraints.
+    `change` is the change of velocities by the projection, in tolerances. Rounding causes this change if the smallest
+    pivot at q is very small, or small relative to the pivots at the ends of the interval, or if the polynomials'
+    velocities nearly satisfy the constraints.
     """
     n, largest = w.Q.size, 0.0
     for r in (i, last):
@@ -130,22 +138,23 @@ def _is_singular(f, w, t, states, i, last, time, q, change):
             largest = max(largest, least_pivot(f, w, t[r], states[r, :n]))
     code = renew_partition(f, w, time, q)
     pivot = least_pivot(f, w, time, q) if code == DONE else 0.0
-    return pivot < max(SINGULAR_SHARE * largest, SINGULAR_PIVOT, min(RESIDUAL / change, WEAK_PIVOT))
+    return pivot < max(SINGULAR_RATIO * largest, SINGULAR_PIVOT, min(RESIDUAL / change, WEAK_PIVOT))
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR, VECTOR, MATRIX, TABLE, VECTOR, VECTOR, MATRIX, MATRIX))
 def between(f, w, tolerance, tolerances, t, states, groups, times, z, room, out):
-    """Compute [q, v] at `times` into the rows of `out`; return the number of failed projections.
+    """Store [q, v] at times[p] in row p of `out`; return the number of failed projections.
 
-    A projection fails if no dependent coordinates are found, or if rounding determines the projected velocities near a
-    singular position: q and v are then those of the polynomials. `groups` is the table of intervals described in
-    data/indices.py; `z` and `room` are scratch, for the nodes and coefficients of two polynomials.
+    A projection fails if dependent coordinates cannot be determined, or if rounding determines the projected velocities
+    near a singular position: row p then has the values of the polynomials. `groups` is the table of intervals described
+    in data/indices.py; `z` and `room` are scratch, for the nodes and coefficients of two polynomials. `tolerance` is
+    that of the projection, `tolerances` are those of the run.
     """
     n = w.Q.size
     half = z.size // 2
     z_q, z_v, c_q, c_v = z[:half], z[half:], room[:half], room[half:]
     q_0, v_0 = room[2 * half - 2], room[2 * half - 1]  # the last two rows, which c_v does not use
-    reduced = f.flags[FORM] == NULL_SPACE  # this form computes w.D, which shows whether a partition is poor
+    reduced = f.flags[FORM] == NULL_SPACE  # only this form computes w.D, which shows whether a partition is poor
     failures = 0
     for g in range(groups.shape[0]):
         i, last, kind = groups[g, kinds.FIRST_OWN], groups[g, kinds.LAST_OWN], groups[g, kinds.KIND]
@@ -155,7 +164,7 @@ def between(f, w, tolerance, tolerances, t, states, groups, times, z, room, out)
         order = 3 if kind >= kinds.ACCELERATIONS else 2
         size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
         size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == kinds.APART else 0
-        # choose independent coordinates for each interval anew: results must not depend on other output times
+        # choose independent coordinates anew in each interval, so that results do not depend on other output times
         has_partition = False
         for p in range(groups[g, kinds.FIRST_TIME], groups[g, kinds.END_TIME]):
             q, v = out[p, :n], out[p, n : 2 * n]
@@ -193,7 +202,7 @@ def between(f, w, tolerance, tolerances, t, states, groups, times, z, room, out)
 
 @merged
 def _difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other):
-    """Return the largest of scale_q times a difference of q, and scale_v times one of v, in tolerances at state i."""
+    """Return the largest difference of (q, v) and (q_other, v_other), in tolerances, times scale_q or scale_v."""
     n = q.size
     rtol, largest = tolerances[RTOL], 0.0
     for m in range(n):
@@ -205,7 +214,7 @@ def _difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other)
 
 @merged
 def _accelerations_of_polynomials(kind, h, s, z, c, size, z_v, c_v, size_v, a):
-    """Evaluate the accelerations of the polynomials at t[i] + s h into `a`; for the arguments see `_interpolate`."""
+    """Store in `a` the accelerations of the polynomials at t[i] + s h; for the arguments see `_interpolate`."""
     for m in range(a.size):
         value, slope, bend = c[size - 1, m], 0.0, 0.0
         for r in range(size - 2, -1, -1):
@@ -224,7 +233,7 @@ def _accelerations_of_polynomials(kind, h, s, z, c, size, z_v, c_v, size_v, a):
 
 @merged
 def _has_similar_gaps(t, lo, hi):
-    """Return whether the gaps between the times lo to hi are of similar length."""
+    """Return whether the steps between the times t[lo] to t[hi] are about equally long, see MAX_GAP_RATIO."""
     shortest, longest = np.inf, 0.0
     for r in range(lo, hi):
         shortest, longest = min(shortest, t[r + 1] - t[r]), max(longest, t[r + 1] - t[r])
@@ -233,13 +242,14 @@ def _has_similar_gaps(t, lo, hi):
 
 @kernel(i8(KIT, WORK, f8, VECTOR, VECTOR, MATRIX, TABLE, VECTOR, MATRIX, MATRIX, VECTOR))
 def judge(f, w, tolerance, tolerances, t, states, groups, z, room, rows, out):
-    """Estimate the error of the polynomials in each of `groups`, in tolerances, into `out`.
+    """Store in out[g] the estimated error of the polynomials of interval g of `groups`, relative to the tolerances.
 
-    The error is 0 if the last node changes a polynomial by less than the tolerances. Otherwise the polynomial is
-    compared with the constraints and the equations of motion at CHECKED_AT: the error of its accelerations, times h
-    over the number of coefficients, is an error of velocity. If accelerations contain the noise of stiff modes, only
-    the change by the last node counts. Methods of low order take steps that are short for their polynomials, which are
-    therefore checked only between steps of unequal length. Intervals with interior states are always checked.
+    If there are more than two nodes, the difference that the last node makes is computed first. If it is at most 1, or
+    if accelerations contain the noise of stiff modes (VELOCITIES), it is the estimate. Otherwise positions, velocities
+    and accelerations at CHECKED_AT are compared with the constraints and the equations of motion: the error of
+    accelerations, times h over the number of coefficients, counts as an error of velocity.
+    Polynomials of methods of low order interpolate short steps, and are accurate if neighbouring steps are about
+    equally long: the estimate is then 0, unless the interval has interior states.
     """
     n = w.Q.size
     half = z.size // 2
@@ -295,7 +305,7 @@ def judge(f, w, tolerance, tolerances, t, states, groups, z, room, rows, out):
 
 @kernel(i8(KIT, WORK, VECTOR, MATRIX, MATRIX))
 def complete(f, w, times, states, out):
-    """Compute rows [a, lam] of `out` at consistent states [q, v]; return the number of failures (rows of NaN)."""
+    """Store [a, lam] at consistent states [q, v] in the rows of `out`; return the number of failures (rows of NaN)."""
     n = w.Q.size
     code = SINGULAR
     failures = 0
@@ -309,7 +319,7 @@ def complete(f, w, times, states, out):
                 code = find_tangents(f, w, times[p], q)
         if code == DONE:
             code = accelerations(f, w, times[p], q, v, out[p, :n], out[p, n:])
-        if code == GAMMA_INACCURATE:  # take the best available values: no step depends on them
+        if code == GAMMA_INACCURATE:  # use the best available Gamma, because no step depends on these accelerations
             required = w.notes[GAMMA_REQUIRED]
             w.notes[GAMMA_REQUIRED] = np.inf
             code = accelerations(f, w, times[p], q, v, out[p, :n], out[p, n:])
@@ -322,10 +332,11 @@ def complete(f, w, times, states, out):
 
 @kernel(i8(KIT, WORK, *(VECTOR,) * 7, MATRIX, INTEGERS, VECTOR, MATRIX))
 def fill(f, w, options, memory, initial_memory, tolerances, state, new_state, t, states, intervals, out_t, out):
-    """Compute states within intervals by equal steps of the method; return the number of intervals that failed.
+    """Store states within intervals, computed by equal steps of the method; return the number of intervals that failed.
 
-    `out_t` and `out` have the same number of rows for each interval: its first state, the interior states, and its last
-    state. After a failure the first time of the interval is NaN. `initial_memory` is the method's memory at a start.
+    `intervals` are the indices of the intervals. `out_t` and `out` have the same number of rows for each interval: the
+    first state, the interior states, and the last state. After a failure the first time of the interval becomes NaN.
+    `initial_memory` is the method's memory at a start.
     """
     n = w.Q.size
     rows = out_t.size // intervals.size

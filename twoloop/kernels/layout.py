@@ -1,4 +1,4 @@
-"""Allocate the workspace of a run once, and reuse it for later runs of the same sizes."""
+"""Allocate the workspace of a run, and keep unused workspaces for later runs of the same sizes."""
 
 import math
 from collections.abc import Mapping
@@ -14,33 +14,33 @@ from twoloop.kernels.data.indices import N_COUNTERS, N_NOTES
 from twoloop.kernels.linalg.band import N_ROUTINES
 from twoloop.kernels.linalg.markowitz_lu import MAX_ENTRIES_PER_LINE, N_COUNTS, N_LISTS, index_size, values_size
 
-# largest number of unused workspaces that are kept for later runs, and largest number of floats in one of them
+# largest number of unused workspaces that are kept for later runs, and largest number of floats in such a workspace
 MOST_FREE, LARGEST_FREE = 32, 100_000
-WORD, LINE = 8, 8  # bytes of a number; numbers in a cache line: each array begins at the start of one
+WORD, LINE = 8, 8  # bytes of a number; numbers in a cache line, at the start of which each array begins
 
 
 class Static(NamedTuple):
-    """Sizes that only the static form needs."""
+    """Sizes of arrays that only the static form uses."""
 
     n_factors: int
     n_mass_values: int
     n_jacobian_values: int
-    dense_mass: bool  # whether M varies and is given as a full matrix, from which its values are copied
-    dense_jacobian: bool  # whether C_q is given as a full matrix, from which its values are copied
+    dense_mass: bool  # whether a callback fills a full matrix with a varying M, from which the entries are copied
+    dense_jacobian: bool  # whether a callback fills a full matrix with C_q, from which the entries are copied
 
 
 # n_q, n_c, n_a, ranks of C_q and of all rows, whether T^T M T is used, whether the augmented matrix is used, number of
 # nodes of the traced programs, sizes of the static form (None: another form), length of the array `matrices`
 Sizes = tuple[int, int, int, int, int, bool, bool, int, Static | None, int]
-ArrayRanges = list[tuple[str, int, int, tuple[int, ...]]]  # arrays in one piece of memory: name, begin, end, shape
+ArrayRanges = list[tuple[str, int, int, tuple[int, ...]]]  # for each array: name, first offset, end, shape
 
 
 class Layout(NamedTuple):
-    """Offsets of the arrays of a workspace, in one piece of memory for numbers and one for integers.
+    """Offsets of the arrays of a workspace: one block of memory contains all numbers, another one all integers.
 
-    The table of addresses and shapes is `table`, plus `of_numbers` times the address of the numbers, plus `of_integers`
-    times the address of the integers. The first `n_lasting` numbers and `n_lasting_integers` integers keep data from
-    one step to the next; a step fills all others before it reads them.
+    A workspace's table of addresses and shapes is `table`, plus `of_numbers` times the address of the numbers, plus
+    `of_integers` times the address of the integers. The first `n_lasting` numbers and `n_lasting_integers` integers
+    keep data from one step to the next; a step fills all others before it reads them.
     """
 
     numbers: ArrayRanges
@@ -55,7 +55,7 @@ class Layout(NamedTuple):
 
 
 def empty(sizes: Sizes) -> Work:
-    """Return a workspace in its initial state: a cleared unused one of these sizes, or else a newly allocated one."""
+    """Return a workspace in its initial state: an unused one of these sizes, reset, or else a newly allocated one."""
     unused = _take_unused(sizes)
     return _allocate(sizes) if unused is None else cleared(unused)
 
@@ -71,7 +71,7 @@ def copy_of(work: Work) -> Work:
 
 
 def lasting(work: Work) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the numbers and integers of a workspace that keep data from one step to the next."""
+    """Return two views of a workspace: the numbers, and the integers, that keep data from one step to the next."""
     layout = _layout(*work.sizes)
     return work.notes.base[: layout.n_lasting], work.counters.base[: layout.n_lasting_integers]
 
@@ -95,22 +95,22 @@ def _allocate(sizes: Sizes) -> Work:
 
 
 def give_back(work: Work) -> None:
-    """Keep an unused workspace for a later run of the same sizes."""
+    """Store an unused workspace for a later run of the same sizes, unless it is large; drop the oldest if too many."""
     free = _free.pop(work.sizes, [])
     if work.notes.base.size <= LARGEST_FREE and len(free) < MOST_FREE:
         free.append(work)
-    _free[work.sizes] = free  # re-insert last: the dictionary is ordered by how long workspaces have waited
+    _free[work.sizes] = free  # re-insert last: the dictionary begins with the sizes that have not been used for longest
     for oldest in list(_free)[:-1]:
         if sum(map(len, list(_free.values()))) <= MOST_FREE:
             break
         _free.pop(oldest, None)
 
 
-_free: dict[Sizes, list[Work]] = {}  # unused workspaces, by sizes
+_free: dict[Sizes, list[Work]] = {}  # unused workspaces of each combination of sizes
 
 
 def cleared(work: Work) -> Work:
-    """Reset a workspace to its state after allocation."""
+    """Reset a workspace in place to its state after allocation, and return it."""
     for each in lasting(work):
         each[:] = 0
     work.G_of_S[:] = np.nan
@@ -119,16 +119,17 @@ def cleared(work: Work) -> Work:
 
 @cache
 def cached_run() -> Any:
-    """Return the module `cached_run`, compiled or read from the disk at the first call."""
+    """Import the module `cached_run` at the first call, which compiles it or reads it from the disk; return it."""
     from twoloop.kernels import cached_run
 
     return cached_run
 
 
 def _static_shapes(n_q: int, n_c: int, rank: int, static: Static) -> tuple[dict[str, tuple[int, ...]], ...]:
-    """Return the shapes of the arrays (numbers, integers) that differ in the static form, which has no partition.
+    """Return the shapes of the arrays of numbers, and of integers, that differ in the static form.
 
-    All coordinates count as dependent, because the predictions of all are compared, and also as independent.
+    The static form has no partition: all coordinates count as independent, and also as dependent, because all predicted
+    positions are compared with the positions on the constraints.
     """
     n, n_redundant = n_q + n_c, n_c - rank
     n_rows = n_c if static.dense_jacobian else 0
@@ -181,7 +182,7 @@ def _layout(
     size = n_q + r_v if augmented else 0
     n_entries = (n_rows + 1) * n_q
     numbers: dict[str, tuple[int, ...]] = {
-        "augmented": (n_entries + n_q * n_q,),  # the first array, whose parts are `entries`, `G` and `M`
+        "augmented": (n_entries + n_q * n_q,),  # must be the first array; `entries`, `G` and `M` are parts of it
         "L": (n_q, n_q),
         "S": (r_v, r_v),
         "W": (r_v, n_q),
@@ -209,7 +210,7 @@ def _layout(
         "nodes": (n_nodes,),
         **dict.fromkeys(("mass_values", "jacobian_values", "counts", "factors", "pivot_sizes"), (0,)),
         **dict.fromkeys(("unknowns", "solutions"), (0,)),
-        "matrices": (n_matrices,),  # must be the last array: a step fills it before it reads it
+        "matrices": (n_matrices,),  # must be the last array, as it keeps no data from one step to the next
     }
     integers: dict[str, tuple[int, ...]] = {
         "places": (n_rows + 1 + n_rows * n_q,),
@@ -220,7 +221,7 @@ def _layout(
         "row_order": (n_rows,),
         "counters": (N_COUNTERS,),
         "lapack": (N_ROUTINES,),
-        "index": (index_size(r),),  # must be the last array: a step fills its end before it reads it
+        "index": (index_size(r),),  # must be the last array, as its end keeps no data from one step to the next
     }
     rows_of_G, side = n_rows + 1, n_q
     if static is not None:
@@ -229,7 +230,7 @@ def _layout(
         integers |= static_shapes[1]
         rows_of_G, side = (n_rows + 1) * static.dense_jacobian, n_q * static.dense_mass
         n_entries = rows_of_G * n_q
-    # arrays of positions that velocities share if there are no rows of A
+    # names of the arrays of positions that also serve velocities, because there are no rows of A
     of_positions = {name for name in integers if n_a == 0 and f"{name}_v" in integers}
     for name in of_positions:
         del integers[f"{name}_v"]
@@ -259,7 +260,10 @@ def _layout(
 
 
 def _array_ranges(shapes: Mapping[str, tuple[int, ...]]) -> tuple[dict[str, tuple[int, int, tuple[int, ...]]], int]:
-    """Return (begin, end, shape) of each array, which begins at the start of a cache line, and the total length."""
+    """Return (first offset, end, shape) of each array, and the length of their memory, counted in numbers.
+
+    Each array begins at the start of a cache line.
+    """
     ranges, end = {}, 0
     for name, shape in shapes.items():
         size = math.prod(shape)

@@ -253,7 +253,7 @@ class CachedIntegrator:
             if not self._check_new_start(t1, q0, v0):
                 arrays.last_start[loops.N_EQUAL] = loops.NEVER
                 return None
-        if report[loops.END_CODE] != run.a.ALL_OUTPUT_DONE or not report[loops.NO_REMARK]:
+        if report[loops.END_CODE] != run.a.ALL_OUTPUT_DONE or not report[loops.NOTHING_TO_CHECK]:
             self.loop_used = True
             arguments = output.request(run), ignore_progress, output.time_limit, interrupts, False
             loop = IntegrationLoop(run, t1, *arguments, start=rows[0], system=system)
@@ -365,7 +365,7 @@ def _deferred_field(
         by_step = step_fields(data[begin:end].reshape(n_steps, N_STEP_COLUMNS), INITIAL_COUNTS.copy())
         return by_step | {"stats": statistics(counts, cpu_time)} | options.metadata
     rank, redundant, own = run_fields
-    defect = float(data[loops.DEFECT]) if data[loops.HAS_DEFECTS] else None
+    defect = float(data[loops.DEFECT]) if data[loops.DEFECT_KNOWN] else None
     fields = {"rank": rank, "redundant": redundant.copy(), "defect": defect, "compiled": own}
     fields |= {"widest_gap": float(data[loops.LONGEST_GAP]), "system": system, "atol": options.atol.copy(), "t_end": t1}
     t, rows = (data[loops.N_HEAD : begin], data[end:].reshape(n_states, -1)) if timed_states is None else timed_states

@@ -415,7 +415,7 @@ class Run:
     def first_step(self, t: float, t1: float, state: Array, longest: float = 0.0) -> float:
         """Return the first step from a state, s. If `longest` > 0, also limit the time between two evaluations."""
         numbers = self.system.n_q, t, t1, self.least_atol, longest, self.plan.looks_within
-        first: float = entry_point(cached_run().set_sizes)(self.control, self.tolerances, state, *numbers)
+        first: float = entry_point(cached_run().first_step_and_limits)(self.control, self.tolerances, state, *numbers)
         return first
 
     def defect(self) -> float | None:

@@ -1,24 +1,27 @@
-"""Detect sudden changes of forces, C_t and b ahead of a step: a gust, a blow, a switch, a magnet.
+"""Detect sudden changes of forces, C_t and b ahead of a step, such as gusts, blows and switches.
 
 A step evaluates the equations at its stages only, and may pass over a force that acts between two stages. So forces,
-C_t and b are sampled ahead: a sample calls single callbacks and costs less than an evaluation of the equations.
+C_t and b are sampled at times ahead of the step. A sample calls single callbacks, and costs less than an evaluation of
+the equations.
 
-- A value is smooth if the second differences of its samples are small relative to its range (after the straight line
-  from the first to the last sample is subtracted). A change within one or two samples makes these differences as large
-  as the range. The step then ends at the change. A step also ends where a value is not finite.
-- Where forces may change suddenly with position or velocity, and steps are longer than the spacing of samples, samples
-  follow the motion: the parabola of the present position, velocity and acceleration. One set of samples is for one long
-  step, or for all short steps that end within LEAST_DISTANCE spacings. Other samples are samples in time alone, at the
-  state at which the step begins.
-- Samples in time alone are no further apart than a fraction of the step, either.
-- Two times are recorded: the shortest between two changes, and the shortest for which a value differs from the values
-  before and after. If samples were further apart, other changes as short may have been missed: a message says so.
+- A force, C_t or b is smooth if the second differences of its samples are small relative to the range of the samples
+  (after the straight line from the first to the last sample is subtracted). A change within one or two samples makes
+  second differences as large as the range. The step then ends at the change, as it does where a value is not finite.
+- If forces may change suddenly with position or velocity, and steps are longer than the spacing of samples, samples
+  follow the motion: the parabola of the present position, velocity and acceleration. One set of samples is taken for
+  one long step, or for all short steps that end within LEAST_DISTANCE spacings.
+- All other samples are samples in time alone, at the state at which the step begins. Their spacing is also limited to a
+  fraction of the step size.
+- Two durations are recorded: the shortest time between two changes, and the shortest time during which a value differs
+  from the values before and after. If the spacing of samples exceeded this time, equally short changes may have been
+  missed, and a message says so.
 
 A jump of C_t or b, as at the end of a ramp in a drive, changes velocities as an impulse does. Methods that restore the
-dependent coordinates leave the independent ones unchanged, which violates the balance of momentum. So a step is checked
-if its velocities change by more than its accelerations explain: C_t and b are sampled at thirteen times within it. The
+dependent coordinates leave the independent ones unchanged, which violates the balance of momentum. So if velocities
+change in a step by more than accelerations explain, C_t and b are sampled at thirteen times within the step. The
 twelfth difference of these samples is almost zero if C_t and b are smooth on the scale of the step, and falls by 2^12
-when the interval is halved. If they jump, it stays as large as the jump in one of the halves, however short.
+when the interval is halved. If C_t or b jumps, the twelfth difference stays as large as the jump in one half of the
+interval, however short the interval is.
 """
 
 import numpy as np
@@ -33,18 +36,18 @@ from twoloop.kernels.linalg.symbolic_factorization import jacobian_of
 N_PARTS = 12  # number of parts of an interval, at whose ends C_t and b are sampled
 # coefficients of the twelfth difference
 BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.0, 66.0, -12.0, 1.0)
-RATE_HALVINGS = 60  # largest number of bisections that locate a jump or a ramp
-RATE_ROUNDING = 1e-11  # rounding errors of the twelfth difference, relative to C_t
-TIME_ROUNDING = 5e3  # rounding errors of the twelfth difference due to t, relative to slope times spacing of t
-STEEPNESS = 4.0  # slope of C_t or b relative to its mean over the step: a steeper part of the step is a ramp
-MAX_RAMP_SHARE = 0.125  # longest ramp that a step must not pass over, relative to the step
-MIN_SPACINGS = 8.0  # shortest interval that is halved, in spacings of floating-point numbers
+RATE_HALVINGS = 60  # largest number of bisections that locate a jump or a ramp of C_t or b
+RATE_ROUNDING = 1e-11  # rounding error of the twelfth difference, relative to the largest sample of C_t or b
+TIME_ROUNDING = 5e3  # rounding error of the twelfth difference by that of t, relative to slope times spacing of t
+STEEPNESS = 4.0  # slope of C_t or b, relative to its mean over the step, above which a part of the step is a ramp
+MAX_RAMP_SHARE = 0.125  # largest fraction of a step that counts as a ramp, at which the step has to end
+MIN_SPACINGS = 8.0  # size of the shortest interval that is halved, in spacings of floating-point numbers
 SMOOTH, RAMP, JUMP = range(3)
 
 
 @compiled
 def _sample_rates(f, w, t, q, velocity, begin, end):
-    """Evaluate C_t and b at thirteen times from begin to end into w.rates; positions are q + velocity (time - t)."""
+    """Store C_t and b at thirteen times from begin to end in w.rates, at the positions q + velocity (time - t)."""
     for k in range(N_PARTS + 1):
         time = end if k == N_PARTS else begin + (end - begin) * (k / N_PARTS)
         for m in range(q.size):
@@ -64,7 +67,7 @@ def _twelfth_difference(w, row):
 
 @compiled
 def _slope_and_size(w, row, length):
-    """Return the mean absolute slope of a row over the samples, and its largest absolute value."""
+    """Return the mean absolute slope, over `length` seconds, and the largest absolute value of the samples of a row."""
     change = 0.0
     largest = abs(w.rates[0, row])
     for k in range(N_PARTS):
@@ -75,7 +78,7 @@ def _slope_and_size(w, row, length):
 
 @compiled
 def _allowed_error(f, w, tolerances, x, row):
-    """Return the error in a row that the tolerances of x (coordinates or velocities) allow."""
+    """Return the error of row `row` of G x that the tolerances of x (coordinates or velocities) allow."""
     largest = 0.0
     if f.flags[FORM] == STATIC:
         rows, columns, _ = jacobian_of(f.static_program)
@@ -92,7 +95,7 @@ def _allowed_error(f, w, tolerances, x, row):
 
 @compiled
 def unexplained_velocity_change(tolerances, h, state, new_state, n):
-    """Return the largest change of a velocity that accelerations at both ends do not explain, over its tolerance."""
+    """Return the largest change of a velocity minus h times its mean acceleration, relative to the tolerance."""
     largest = 0.0
     for m in range(n):
         v, v1, a, a1 = state[n + m], new_state[n + m], state[2 * n + m], new_state[2 * n + m]
@@ -103,11 +106,11 @@ def unexplained_velocity_change(tolerances, h, state, new_state, n):
 
 @compiled
 def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
-    """Return SMOOTH, RAMP or JUMP for the row of C_t and b that is least smooth from t to `end`, and where it changes.
+    """Return SMOOTH, RAMP or JUMP for the least smooth row of C_t and b from t to `end`, and two times.
 
-    The second and third result are beginning and end of the jump or ramp, or t and `end` if the row is smooth. A ramp
-    that is as long as the step counts as one of half this length: accelerations may be zero at both of its ends, and a
-    method that evaluates only there would miss it. `velocity`: velocity along which positions are extrapolated.
+    The times are beginning and end of the jump or ramp, or t and `end` if the row is smooth. A ramp as long as the step
+    is returned as one half as long: accelerations may be zero at both ends of the ramp, and a method that evaluates
+    only there would miss the ramp. (q, v) is the state at t; positions are extrapolated along `velocity`.
     """
     begin = t
     h = end - t
@@ -155,35 +158,36 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
     return SMOOTH, t, t + h
 
 
-N_SAMPLES = 20  # number of sample times ahead that are compared
+N_SAMPLES = 20  # number of sampling intervals in one set of samples
 LEAST_DISTANCE = 12.0  # shortest time ahead over which the motion is sampled, in spacings of samples
-SUDDEN_SHARE = 0.1  # second difference of a sudden change over the range: at least that of a bell four spacings wide
+SUDDEN_SHARE = 0.1  # smallest second difference of a sudden change, relative to the range: a bell four spacings wide
 LEAST_RANGE = 0.1  # smallest range of samples that matters, relative to rtol times the largest value so far
-# absolute lower bound of that range, in any units: squares of smaller values underflow, and subnormal numbers are too
-# coarsely spaced to look smooth
+# absolute lower bound of the range of samples that matters, whatever the units: squares of smaller values underflow,
+# and subnormal numbers are too coarsely spaced to look smooth
 LEAST_VALUE = 1e-150
-N_IN_STEP = 8.0  # samples in a step: its stages are up to a quarter of it apart, and may all miss a shorter force
-RESAMPLE_BELOW = 0.25  # ratio of the required spacing to the last one: below this, samples ahead are taken again
+N_IN_STEP = 8.0  # number of samples in a step: a force shorter than a quarter of the step may act between two stages
+RESAMPLE_BELOW = 0.25  # ratio of the required spacing to the last one below which samples ahead are taken again
 LEAST_APART = 16.0  # smallest spacing of samples, in spacings of floating-point numbers
-HALVINGS = 20  # number of bisections that find when a value changes between two samples
-SAME_CHANGE = 1e-5  # relative to the widest spacing of samples: changes closer together than this count as one
-# time after the start, relative to GAP, before which no change is recorded: a force that begins at zero, such as
-# 1 - cos(t), changes there by rounding
+HALVINGS = 20  # number of bisections that locate the change of a value between two samples
+SAME_CHANGE = 1e-5  # largest distance of changes that count as one change, relative to the widest spacing of samples
+# time after the start, relative to GAP, before which changes are not recorded: a force that begins at zero, such as
+# 1 - cos(t), changes at the start by rounding
 SOONEST = 5e-5
-STEEPER = 2.0  # smallest ratio of a sudden change to the changes before and after; a smooth slope is below it
-SHORT_STEP = 0.5  # relative to the longest of the last steps: shorter steps suggest a discontinuity
+STEEPER = 2.0  # smallest ratio of a sudden change to the changes before and after; in a smooth slope it is smaller
+SHORT_STEP = 0.5  # step size, relative to the longest of the last steps, below which a discontinuity is suspected
 N_IN_SHORT = 4  # number of samples within a short step
-# relative to the largest acceleration: if it changes by more while a velocity changes by its tolerance, it decays
+# change of an acceleration while a velocity changes by its tolerance, relative to the largest acceleration, above which
+# accelerations count as decaying
 DECAYED = 0.5
-AT_CHANGE = 0.01  # relative to the spacing of samples: a step that begins this close to a change begins at the change
-LARGEST = N_SAMPLES + 1  # row of w.changes for the largest absolute values so far, after the rows of samples
-MIDDLE = N_SAMPLES + 2  # row of w.changes for values between two samples
+AT_CHANGE = 0.01  # largest distance of a step's beginning from a change at which it begins, in spacings of samples
+LARGEST = N_SAMPLES + 1  # index in w.changes of the largest absolute values so far; the rows before are samples
+MIDDLE = N_SAMPLES + 2  # index in w.changes of values between two samples
 N_CHANGES = N_SAMPLES + 3  # number of rows of w.changes
 
 
 @compiled
 def _sample(f, w, time, elapsed, q, v, a, values):
-    """Evaluate forces, C_t and b into `values` at `time` and the state `elapsed` s after (q, v), if a is constant."""
+    """Store forces, C_t and b at `time` in `values`, at the state `elapsed` s after (q, v) with constant a."""
     for m in range(q.size):
         w.x[m] = q[m] + elapsed * (v[m] + 0.5 * elapsed * a[m])
         w.y[m] = v[m] + elapsed * a[m]
@@ -194,7 +198,7 @@ def _sample(f, w, time, elapsed, q, v, a, values):
 
 @compiled
 def _largest(values):
-    """Return the largest of these values, or 0: the scale of all, as a coordinate without a force has no scale."""
+    """Return the largest of the values, at least 0: the scale of all components, as those that are zero have none."""
     largest = 0.0
     for x in values:
         largest = max(largest, x)
@@ -203,7 +207,7 @@ def _largest(values):
 
 @compiled
 def _is_smooth(values, k, n):
-    """Return whether second differences of n + 1 values at index k and next to it have one sign and similar sizes."""
+    """Return whether second differences of n + 1 values, at index k and beside it, have one sign and similar sizes."""
     second_value = k + 1 if k + 2 <= n else k - 1
     if second_value < 1:
         return False
@@ -216,8 +220,8 @@ def _is_smooth(values, k, n):
 def _find_bend(values, n, slope, least, within):
     """Return the first index at which n + 1 values bend suddenly (0: none), and the limit of second differences.
 
-    A line of this slope (per sample) is subtracted. Ranges up to `least` do not matter; with `within` smooth bends are
-    excluded.
+    The limit is SUDDEN_SHARE times the range of the values, after a line of slope `slope` (per sample) is subtracted.
+    No bend is found in a range up to `least`. With `within`, bends of a smooth curve are excluded, see `_is_smooth`.
     """
     low = high = 0.0
     for k in range(1, n + 1):
@@ -234,13 +238,13 @@ def _find_bend(values, n, slope, least, within):
 
 @compiled
 def _first_sudden_bend(values, n, along, least):
-    """Return the index of the first sudden bend of sampled values (0: there is none), and the limit that it exceeds.
+    """Return the index of the first sudden bend of n + 1 samples (0: none), and the limit of its second difference.
 
     With `along` = 1 the straight line from the first to the last value is subtracted first. The search is repeated
-    among the values before the bend, until there is no earlier bend.
+    among the values before the bend, until it finds no earlier bend. `least`: see `_find_bend`.
     """
     index, limit = _find_bend(values, n, along * (values[n] - values[0]) / max(n, 1), least, False)
-    while index > 1:  # few values of a smooth curve may bend as much: _find_bend excludes these with `within`
+    while index > 1:  # a few values of a smooth curve may bend as much: `within` excludes such bends
         earlier, earlier_limit = _find_bend(values, index, along * (values[index] - values[0]) / index, least, True)
         if earlier == 0:
             break
@@ -250,7 +254,7 @@ def _first_sudden_bend(values, n, along, least):
 
 @compiled
 def _is_sudden_change(previous, first_value, second_value, following, limit):
-    """Return whether values change suddenly between two of four samples, and much less before and after these two."""
+    """Return whether values change by more than `limit` between the second and third of four samples, and suddenly."""
     change = second_value - first_value
     sign = 1.0 if change > 0.0 else -1.0
     beside = max(sign * (first_value - previous), sign * (following - second_value))
@@ -259,7 +263,7 @@ def _is_sudden_change(previous, first_value, second_value, following, limit):
 
 @compiled
 def _locate_change(f, w, low, high, k, j, q, v, a):
-    """Return the time just after the change of value j between the times low and high (samples k and k + 1)."""
+    """Return the time just after component j changes between the times low and high, which are samples k and k + 1."""
     changes = w.changes
     before, after = changes[k, j], changes[k + 1, j]
     for _ in range(HALVINGS):
@@ -275,7 +279,10 @@ def _locate_change(f, w, low, high, k, j, q, v, a):
 
 @compiled
 def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column, limit, q, v, a):
-    """Record when values of a column change next to the bend at `index`, and how long after the last change."""
+    """Store in `clock` the time of a sudden change next to the bend at `index`, and the time since the last change.
+
+    Samples k = 0 to n are at begin + k spacing; `column` is the component that bends, `limit` the smallest change.
+    """
     values, margin = w.changes[:, column], max(AT_CHANGE * spacing, SAME_CHANGE * clock[at.WIDEST_SAMPLING])
     soonest = clock[at.T_START] + SOONEST * tolerances[GAP]
     for k in range(index - 1, index + 1):
@@ -294,10 +301,10 @@ def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column
 
 @compiled
 def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follows_motion, q, v, a):
-    """Return the time of the first sample at which a value changes suddenly, or infinity; and the end of the samples.
+    """Return the time of the first sample at which a component changes suddenly, or infinity; and the last sample time.
 
-    (q, v, a) is the state at t; samples begin at `begin` and end at `last` or earlier. With `follows_motion` = 1 they
-    follow the motion, with 0 they stay at the state.
+    (q, v, a) is the state at t. Samples begin at `begin`, and end at `last` or earlier. With `follows_motion` = 1 they
+    follow the motion, with 0 they stay at the state (q, v).
     """
     changes, n, t_first = w.changes, 0, np.inf
     for k in range(N_SAMPLES + 1):
@@ -331,7 +338,7 @@ def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follow
 
 @compiled
 def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, a):
-    """Record for how long a value within a short step differs from values around it: samples ahead have missed this."""
+    """Store in `clock` the duration of a change within a short step, which samples ahead of the step have missed."""
     changes, spacing, begin, end = w.changes, control[at.APART], clock[at.T_START], t + size
     clock[at.COMPARED] = t
     if end + spacing > last or (t - 2.0 * spacing < begin and end + 2.0 * spacing > last):
@@ -357,10 +364,10 @@ def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, 
 
 @compiled
 def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
-    """Return whether accelerations hardly change until they have changed a velocity by its tolerance.
+    """Return whether accelerations hardly change (see DECAYED) while a velocity changes by its tolerance.
 
-    They do change if stiff friction keeps a body at rest: its acceleration is then a rounding error of balanced forces,
-    and a parabola with this acceleration would lead far away from the state of rest. (Q, V, A) is scratch.
+    They change much if stiff friction keeps a body at rest: the acceleration of the body is then a rounding error of
+    balanced forces, and a parabola with this acceleration would lead far from the state of rest. (Q, V, A) is scratch.
     """
     n, time, largest, change = w.Q.size, duration, 0.0, 0.0
     for m in range(n):
@@ -380,7 +387,7 @@ def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
 
 @compiled
 def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a, Q, V, A):
-    """Sample along the motion of a step, and of later ones that end within LEAST_DISTANCE spacings; store results."""
+    """Sample along the motion of a step, and of LEAST_DISTANCE spacings at least; store the next change in `clock`."""
     if clock[at.MOTION_SAMPLED_TO] >= t + (1.0 - AT_CHANGE) * size:
         return
     duration = min(max(size, LEAST_DISTANCE * spacing), last - t)
@@ -394,7 +401,7 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
             f, w, tolerances, clock, t, t, duration / N_SAMPLES, last, 1.0, q, v, A
         )
     clock[at.SAMPLES_MOTION] = 0.0
-    # if the last samples in time found a change, the next samples in time begin there, with their own spacing
+    # if the last samples in time alone found a change, the next ones begin at this change, with their own spacing
     change_found = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t
     if not change_found and duration <= N_SAMPLES * min(control[at.APART], size / N_IN_STEP):
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], duration / N_SAMPLES)
@@ -407,15 +414,15 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
 
 @compiled
 def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, q, v, a):
-    """Return when a value next changes suddenly with time, or `next_change` (infinite: no time) if that is earlier."""
+    """Return the time of the next sudden change in samples in time alone, or `next_change` if that is earlier."""
     every = max(min(control[at.APART], size / N_IN_STEP), LEAST_APART * np.spacing(abs(t)))
-    # multistep methods (ROUGH = 1) do not need closer samples: no jump deceives them, and they restart only after a
-    # rejected step. Nor do steps that find jumps of C_t and b themselves, which they do unless they end next to one
+    # closer samples are not needed in multistep methods (ROUGH = 1), whose error estimates show a jump, and not if C_t
+    # or b may jump (DRIVEN = 1), because such steps are checked for jumps
     may_resample = control[at.ROUGH] > 1.0 and control[at.DRIVEN] == 0.0
     if may_resample and every < RESAMPLE_BELOW * clock[at.SAMPLED_EVERY]:
         clock[at.SAMPLED_TO] = t
     begin = max(t, clock[at.SAMPLED_TO])
-    at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # samples from here on have to find the change again
+    at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # the next samples must find the same change again
     while begin < min(t + size, last, next_change):
         present_spacing, at_change = min(every, clock[at.SAMPLED_EVERY]) if at_change else every, False
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], present_spacing)
@@ -427,7 +434,7 @@ def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, 
 
 @compiled
 def limit_to_discontinuity(f, w, tolerances, control, clock, t, size, last, state, new_state):
-    """Return the size of a step, reduced so that it ends at the next sudden change; `new_state` is scratch."""
+    """Return the size of a step, `size` or less, so that it ends at the next sudden change; new_state is scratch."""
     n, spacing = w.Q.size, control[at.SPACING]
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]

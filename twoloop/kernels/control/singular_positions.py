@@ -1,4 +1,4 @@
-"""Check the partition and the distance from a singular position between the steps of a run."""
+"""Check, between the steps of a run, the partition and the distance from a singular position."""
 
 from twoloop.kernels.control import loop_state as at
 from twoloop.kernels.data.common import compiled, merged
@@ -21,35 +21,35 @@ from twoloop.kernels.evaluation.inner_loop import find_tangents, renew_partition
 from twoloop.kernels.evaluation.partition import MAX_ROWS_ELIMINATED, least_pivot, partition_is_poor, smallest_pivot
 from twoloop.kernels.evaluation.sparse_inner_loop import PROJECT_STAGES
 
-SHORT_STEP = 0.5  # relative to the longest of the last steps: a shorter step may be near a singular position
-COLLAPSED = 0.2  # relative to the longest of the last steps: after a shorter one the pivots of C_q are computed again
-# smallest pivot of C_q relative to its largest value so far: a position with a smaller one is near a singular position
+SHORT_STEP = 0.5  # step size, relative to the longest of the last steps, below which a singular position is suspected
+COLLAPSED = 0.2  # step size, relative to the longest of the last steps, after which the pivots of C_q are renewed
+# smallest pivot of C_q, relative to its largest value so far, below which a singular position is near
 SINGULAR_PIVOT = 0.2
-STATIC_SINGULAR = 0.01  # SINGULAR_PIVOT of the static form, whose pivots are sines of angles between rows
-# smallest pivot relative to its largest value so far: near a smaller one, a rejected step of the static form is
-# repeated with projected stages
+STATIC_SINGULAR = 0.01  # replaces SINGULAR_PIVOT in the static form, whose pivots are sines of angles between rows
+# smallest pivot, relative to its largest value so far, below which a rejected step of the static form is repeated with
+# projected stages
 REPEAT_BELOW = 0.05
 SHRINKAGE = 0.8  # size of a step repeated with projected stages, relative to the rejected step
-GIVE_UP_BELOW = 0.001  # relative to the longest of the last steps: smallest size of a step near a singular position
-# pivot relative to its largest value so far: below this, rounding determines accelerations, and short steps must stop
+GIVE_UP_BELOW = 0.001  # smallest step size near a singular position, relative to the longest of the last steps
+# pivot, relative to its largest value so far, below which rounding determines accelerations: short steps must stop
 UNDETERMINED = 1e-6
 CHECK_INTERVAL = 16  # number of accepted steps between two checks of a partition that steps do not use
-# with k times this number of freedoms, a partition is checked every k + 1 steps, because T is a full matrix
+# a partition is checked every k + 1 steps if there are k times this number of freedoms, because T is a full matrix
 FREEDOMS_PER_CHECK = 32
-N_CHECKED = 8  # number of parts of an accepted step at whose ends the smallest pivot of C_q is computed
-CHECKED_BELOW = 0.5  # pivot over its largest value so far: steps that begin or end with a smaller one are checked
-# smallest pivot within a step, relative to its largest change between samples: a smaller one passes through zero
+N_CHECKED = 8  # number of equal parts of an accepted step, at whose ends the smallest pivot of C_q is computed
+CHECKED_BELOW = 0.5  # pivot at an end of a step, relative to its largest value so far, below which the step is checked
+# smallest pivot within a step, relative to its largest change between samples, below which it passes through zero
 PASSED_SHARE = 0.6
-# numbers in near_share: lower and upper bound of the result, rounding errors relative to tolerances, unit roundoff
+# numbers in near_share: its smallest and its largest result, allowed rounding errors in tolerances, unit roundoff
 NEAR_LEAST, NEAR_MOST, SHARE_OF_NOISE, EPS = 0.02, 0.1, 0.2, 2.0**-53
-END_SHARE = 0.25  # smallest sine at the end of a step, relative to that at its start: below this, the step is halved
+END_SHARE = 0.25  # sine at the end of a step, relative to that at its start, below which the step is halved
 
 
 @merged
 def near_singular(f, w, control, clock, t, q):
-    """Return whether C_q was close to losing rank when the partition was chosen, if BRIDGE requires a stop there.
+    """Return whether BRIDGE is 1 and a singular position was near when the partition was chosen.
 
-    If steps do not use partitions, the partition may be old: near a singular position it is renewed first.
+    If steps do not use the partition, it may be old, and is renewed once the run has come near a singular position.
     """
     if control[at.BRIDGE] != 1.0:
         return False
@@ -61,7 +61,7 @@ def near_singular(f, w, control, clock, t, q):
 
 @merged
 def ends_at_singular(f, w, control, clock):
-    """Return whether a step of the static form ends so near a singular position that the next one would begin there.
+    """Return whether a step of the static form ends too near a singular position to begin the next step there.
 
     A singular position well between the ends of a step does no harm.
     """
@@ -72,17 +72,17 @@ def ends_at_singular(f, w, control, clock):
 
 @merged
 def fails_at_singular(f, clock, size):
-    """Return whether a very short step of the static form fails near a singular position: dense forms take over."""
+    """Return whether a failed step of the static form is so short and near a singular position that it is given up."""
     near = clock[at.PIVOT_HERE] < STATIC_SINGULAR * clock[at.LARGEST_PIVOT]
     return f.flags[FORM] == STATIC and near and size < GIVE_UP_BELOW * clock[at.H_LONG]
 
 
 @merged
 def retry_projected(f, w, control, clock, size):
-    """Return whether a rejected step of the static form near a singular position is repeated with projected stages.
+    """Return whether a rejected step of the static form is repeated with projected stages; store its next size.
 
-    The errors of accelerations at stages off the constraints grow near such a position. A long step that ends well
-    beyond it may succeed where shorter ones fail: sizes are tried from the longest of the last steps downwards.
+    Near a singular position, accelerations of stages off the constraints have large errors. A long step that ends well
+    beyond the position may succeed where shorter steps fail: the first repetition has H_LONG, the next are shorter.
     """
     near = clock[at.PIVOT_HERE] < REPEAT_BELOW * clock[at.LARGEST_PIVOT]
     if f.flags[FORM] != STATIC or control[at.FIXED_STEP] > 0.0 or w.notes[NEARLY_SINGULAR] == 1.0 or not near:
@@ -97,7 +97,7 @@ def retry_projected(f, w, control, clock, size):
 
 @merged
 def near_share(tolerances):
-    """Return the pivot over the largest one below which rounding disturbs results by SHARE_OF_NOISE tolerances."""
+    """Return the pivot, relative to the largest one, below which rounding errors exceed SHARE_OF_NOISE tolerances."""
     return min(max(NEAR_LEAST, (EPS / (SHARE_OF_NOISE * tolerances[LEAST])) ** (1.0 / 3.0)), NEAR_MOST)
 
 
@@ -105,7 +105,7 @@ def near_share(tolerances):
 def _least_pivot_within(f, w, t, size, before, end, state, new_state):
     """Return the smallest pivot within a step, and the largest change of the pivot between neighbouring samples.
 
-    Positions are those of the cubic through the ends of the step, whose pivots are `before` and `end`.
+    The samples are on the cubic through the states at the ends of the step, which have the pivots `before` and `end`.
     """
     n, least, change = w.Q.size, min(before, end), 0.0
     for k in range(1, N_CHECKED):
@@ -122,9 +122,9 @@ def _least_pivot_within(f, w, t, size, before, end, state, new_state):
 
 @compiled
 def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_state):
-    """Return whether an accepted step comes so near a singular position that a crossing step has to replace it.
+    """Return whether an accepted step comes so near a singular position that a crossing step must replace it.
 
-    Rounding of its stages there may change the result by more than the tolerances; error estimates see only part of it.
+    Rounding errors of its stages may change the result by more than the tolerances, unseen by error estimates.
     """
     bridge = control[at.BRIDGE]
     if bridge == 0.0 or control[at.WATCHFUL] == 0.0 or w.notes[NEARLY_SINGULAR] != 1.0 or control[at.FIXED_STEP] > 0.0:
@@ -151,7 +151,7 @@ def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_st
 
 @merged
 def record_pivot_at_output(f, w, clock, state):
-    """Record the distance from a singular position at an output time, or at the end of a step of fixed size."""
+    """Update the smallest pivot at output times and ends of steps of fixed size, clock[PIVOT_AT_OUTPUT]."""
     pivot = least_pivot(f, w, clock[at.T], state[: w.Q.size])
     if f.flags[FORM] == STATIC and pivot > 0.0:
         # pivots of the static form are sines of angles, all of them small in large mechanisms: only the ratio to the
@@ -164,7 +164,8 @@ def record_pivot_at_output(f, w, clock, state):
 def check_partition(f, w, control, clock, size, lands, state):
     """Renew a poor partition, and check how near a singular position is; return CONTINUE or an end code.
 
-    The state is complete (q, v, a, lam): a new choice of independent coordinates needs no conversion.
+    `size` is the size of the last step, s; `lands` is true if this step ended at an output time. A new partition needs
+    no conversion of the state, which contains all coordinates.
     """
     short = size < SHORT_STEP * clock[at.H_LONG] and control[at.FIXED_STEP] == 0.0 and not lands
     if f.flags[FORM] == STATIC:
@@ -185,7 +186,7 @@ def check_partition(f, w, control, clock, size, lands, state):
         find_tangents(f, w, clock[at.T], state[:n])
     if looked and partition_is_poor(w) and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
-    # steps of generated code do not use the partition: only a new one shows whether the run leaves the position
+    # steps of generated code do not use the partition: only a new one shows whether a singular position is still near
     if f.flags[STRAIGHT] == 1 and w.notes[NEAR_NOW] == 2.0 and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
     clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.notes[PIVOT])
@@ -196,11 +197,11 @@ def check_partition(f, w, control, clock, size, lands, state):
         # the pivots of an old partition may not show that the motion approaches a singular position
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
-        w.notes[SENSITIVITY] = 1.0  # as for a partition chosen far from singular positions, so that it is renewed soon
+        w.notes[SENSITIVITY] = 1.0  # the value far from singular positions, so that the partition is renewed soon
         if w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
             w.notes[NEARLY_SINGULAR] = w.notes[NEAR_NOW] = 1.0
     if short and size < GIVE_UP_BELOW * clock[at.H_LONG] and w.notes[NEARLY_SINGULAR] == 1.0:
-        # the partition may have been chosen far away: an implicit method may still continue with one chosen here
+        # the partition may have been chosen far from here: with a new one an implicit method may still continue
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
         if control[at.BRIDGE] != 1.0 and w.notes[PIVOT] < UNDETERMINED * clock[at.LARGEST_PIVOT]:

@@ -1,19 +1,21 @@
 """Step-size control: the size of the next step, the times at which steps end, and additional error measures.
 
-The size follows from the error of the last step. With the trend (Gustafsson, ACM TOMS 20 (1994), 496) the factor also
-depends on how the error has changed since the last accepted step.
+The next step size follows from the error of the last step. In methods with a trend (Gustafsson, ACM TOMS 20 (1994),
+496) it also depends on how the error has changed since the last accepted step.
 
 Errors that the embedded formula does not show are measured in two ways:
 
-- `departure` compares the dependent positions that the formula predicts with those that satisfy the constraints. On the
-  same assembly of the mechanism the difference is of the order of the step's error. On another assembly it is larger,
-  however smooth the independent coordinates are. A mechanism without independent coordinates (each is prescribed) has
-  no other estimate. Where two assemblies come close to one another, a large step may end on the wrong one with a small
-  difference; det C_qd then changes sign, as it does along a motion only at a singular position. So after a change of
-  sign the prediction must be nearly exact, as it is in short steps through a singular position.
-- `defect_ratio` is the defect of a Taylor step: how far its accelerations are from those of the equations at the same
-  states. A series contains the forces at its beginning, to all orders, and no later change of them. So the equations
-  are evaluated where the step ends, and within it at most tolerances[LOOK] apart.
+- `departure` compares the dependent positions that the formula predicts with those that satisfy the constraints. If
+  both belong to the same assembly of the mechanism, their difference is of the order of the step's error. If the step
+  has ended in another assembly, the difference is larger, however smooth the independent coordinates are. For a
+  mechanism without independent coordinates (all are prescribed) this is the only error estimate. Where two assemblies
+  come close to one another, a large step may end in the wrong assembly with a small difference. Then det C_qd changes
+  sign, as along a motion only at a singular position. So if the sign changes in a step, the prediction must be nearly
+  exact, as in short steps through a singular position.
+- `defect_ratio` is the defect of a Taylor step: the difference between the accelerations of the series and those of the
+  equations at the same states. A series contains the forces at the beginning of the step, to all orders, but no later
+  sudden change of the forces. So the equations are evaluated at the end of the step, and within the step at times that
+  are at most tolerances[LOOK] apart.
 """
 
 import numpy as np
@@ -57,12 +59,13 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, restore
 from twoloop.kernels.evaluation.tasks import PROJECT
 from twoloop.kernels.linalg.markowitz_lu import sign_of
 
-KEEP_BELOW = 1.2  # with the trend, a factor between 1 and this becomes 1: a new step size needs a new factorization
+# in methods with a trend, a factor between 1 and this one becomes 1, because a new step size needs a new factorization
+KEEP_BELOW = 1.2
 
 
 @compiled
 def factor_of(rule, past, h, error):
-    """Return the ratio of the next step size to h, after a step of size h whose error, in tolerances, is `error`."""
+    """Return the ratio of the next step size to h by `rule` and history `past`, for a step with `error` tolerances."""
     if not error > 0.0:
         return rule[FACTOR_MAX]
     follows = error <= 1.0 and rule[LEAST_ERROR] > 0.0
@@ -76,14 +79,14 @@ def factor_of(rule, past, h, error):
 
 @merged
 def record_accepted(rule, past, h, error):
-    """Record size and error of an accepted step in the history `past`."""
+    """Store size and error of an accepted step in `past`, the history of step-size control."""
     past[H_BEFORE], past[ERROR_BEFORE] = h, max(error, rule[LEAST_ERROR])
 
 
 @compiled
 def evaluate_near(f, w, t, Q, V, A):
-    """Project a state (Q, V) near the constraints onto them, and evaluate its accelerations A; return the code."""
-    # generated code projects to the nearest state at less cost, and the static form projects only by this task
+    """Project (Q, V), near the constraints, onto them in place, store its accelerations in A, and return a code."""
+    # with generated code the task PROJECT costs least, and in the static form the task EVALUATE does not project
     if (f.flags[STRAIGHT] == 1 and w.Rate.size == w.C.size) or f.flags[FORM] == STATIC:
         return f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
     return evaluate(f, w, t, Q, V, INNER_TOL, A)
@@ -94,20 +97,20 @@ def commit_nothing(f, w, options, memory, tolerances, accepted):
     """Do nothing: the method of the step has no memory."""
 
 
-EQUAL_SPACINGS = 4.0  # times closer than this many spacings of floating-point numbers count as equal
+EQUAL_SPACINGS = 4.0  # largest difference of times that count as equal, in spacings of floating-point numbers
 
 
 @merged
 def on_grid(clock, t, h, target, goal):
-    """Return the size of a step of a fixed grid, how many grid steps it covers, and whether it reaches `goal`.
+    """Return three values for a step on a fixed grid: size, number of completed grid steps, whether it reaches `goal`.
 
-    Grid times are multiples of h, not sums; an output time within a millionth of h from a grid point counts as equal.
+    Grid times are T_START plus multiples of h. An output time within a millionth of h counts as equal to a grid point.
     """
     rounding = EQUAL_SPACINGS * np.spacing(max(abs(t), abs(target)))
     margin = max(1e-6 * h, rounding)
     n_grid_steps = 1.0
     if target <= clock[at.T_START] + clock[at.N_FIXED] * h + margin:
-        n_grid_steps = 0.0  # a second output time close to the grid point reached before
+        n_grid_steps = 0.0  # another output time follows close to the grid point at which the last step ended
     end = clock[at.T_START] + (clock[at.N_FIXED] + n_grid_steps) * h
     reaches_goal = goal <= end + margin
     size = h
@@ -120,23 +123,23 @@ def on_grid(clock, t, h, target, goal):
 
 @merged
 def off_grid(control, t, h, left, crosses_jump):
-    """Return the size of a step under step-size control, and whether it reaches the goal, `left` seconds ahead."""
+    """Return the size of a step of wanted size h, and whether it reaches the goal, which is `left` seconds ahead."""
     reaches_goal = crosses_jump or h >= left * (1.0 - 1e-10)
     size = h
     if h > 0.5 * left and not reaches_goal:
-        size = 0.5 * left  # two equal steps rather than a long and a tiny one
+        size = 0.5 * left  # two equal steps instead of a long step and a tiny one
     size = representable_step(t, size)
     if size > control[at.MAX_STEP]:
         size = representable_step(t, size - np.spacing(abs(t + size)))
     return size, reaches_goal
 
 
-FADING = 0.98  # factor on H_LONG, the longest recent step, at each accepted step
+FADING = 0.98  # factor on H_LONG, the longest of the last steps, after each accepted step
 
 
 @merged
 def count_step(w, tolerances, control, clock, size, out_step):
-    """Count an accepted step, and record its defect and the widest gap between evaluations."""
+    """Count an accepted step, update the largest defect and gap in w.notes, and fill the step's row of out_steps."""
     w.counters[N_ACCEPTED] += 1
     if w.notes[DEFECT] >= 0.0:
         w.notes[LARGEST_DEFECT] = max(w.notes[LARGEST_DEFECT], w.notes[DEFECT])
@@ -145,7 +148,7 @@ def count_step(w, tolerances, control, clock, size, out_step):
     gap = size
     if w.notes[DEFECT] >= 0.0:
         gap = min(size, tolerances[LOOK])
-    elif is_beyond_gap(tolerances, size):  # only steps with closely spaced stages may be longer than GAP
+    elif is_beyond_gap(tolerances, size):  # a step longer than GAP has closely spaced stages
         gap = control[at.MAX_EVALUATION_GAP] * size
     w.notes[WIDEST_GAP] = max(w.notes[WIDEST_GAP], gap)
     clock[at.H_LONG] = max(size, FADING * clock[at.H_LONG])
@@ -157,26 +160,27 @@ def count_step(w, tolerances, control, clock, size, out_step):
     out_step[at.JACOBIANS] = 0.0 if w.notes[EXPLICIT_STEP] == 1.0 else w.counters[N_JACOBIANS]
 
 
-# largest error of a prediction at any tolerance, relative to the largest motion of a coordinate in the step
+# largest allowed error of a predicted position, relative to the largest motion of a coordinate in the step
 SHARE_OF_MOTION = 0.1
 SHARE_THROUGH_ZERO = 1e-6  # replaces SHARE_OF_MOTION if the sign of det C_qd changes in the step
-LEAST = 1e-300  # lower bound of a scale, which avoids a division by zero
-FLOOR = 0.01  # in tolerances: distance that is added to the limit SHARE_OF_MOTION, for steps with hardly any motion
+LEAST = 1e-300  # lower bound of a divisor, which avoids a division by zero
+# allowed error of a predicted position, in tolerances, in addition to SHARE_OF_MOTION: for steps with hardly any motion
+FLOOR = 0.01
 
 
 @merged
 def store_prediction(w, q1):
-    """Store the dependent positions of q1 before the constraints change them."""
+    """Store the dependent positions of q1, the prediction by the formula, in w.predicted."""
     for k in range(w.dependent.size):
         w.predicted[k] = q1[w.dependent[k]]
 
 
 @merged
 def departure(w, tolerances, h, q, v, q1):
-    """Return the largest distance of the stored prediction from q1, over the allowed distance.
+    """Return the largest difference of a dependent position in w.predicted from q1, relative to the allowed difference.
 
-    Allowed are the tolerance, or a fraction of the motion in the step if this is smaller. Needs the factors of C_qd at
-    q1, which the inner loop stores in `w`. With fixed steps the result is 0.
+    The allowed difference is the tolerance, or a fraction of the motion in the step if this fraction is smaller. The
+    factors of C_qd in `w` must be those at q1. With steps of fixed size the result is 0.
     """
     if tolerances[ESTIMATE] == 0.0:
         return 0.0
@@ -197,21 +201,22 @@ def departure(w, tolerances, h, q, v, q1):
 
 @merged
 def project_prediction(f, w, tolerances, t, h, q, v, q1, v1, inner_tol):
-    """Project the prediction (q1, v1) of a step of h from (q, v) onto the constraints; return code and departure."""
+    """Project (q1, v1), predicted by a step of size h from (q, v), onto the constraints; return code and departure."""
     store_prediction(w, q1)
     code = restore(f, w, t, q1, v1, inner_tol)
     return code, departure(w, tolerances, h, q, v, q1) if code == DONE else 0.0
 
 
-ROUNDING = 1e-13  # relative to the largest acceleration: a smaller defect is a rounding error
+ROUNDING = 1e-13  # largest defect that counts as a rounding error, relative to the largest acceleration
 
 
 @compiled
 def defect_ratio(tolerances, h, order, predicted, a, q, v):
-    """Return the defect |predicted - a| at the end of a step h, over the largest that the tolerances of q and v allow.
+    """Return the defect |predicted - a| at the end of a step of size h, relative to the largest allowed defect.
 
-    The result is infinite if a defect is not finite. The defect of a series of this order grows as the highest power of
-    the time: its integral is h / order times its value at the end.
+    The tolerances of q and v determine the allowed defect. The result is infinite if a defect is not finite. The defect
+    of a series of order `order` grows as the highest power of the time: its integral over the step is h / order times
+    its value at the end.
     """
     rtol, share, largest, worst = tolerances[RTOL], h / order, 0.0, 0.0
     for j in range(a.size):

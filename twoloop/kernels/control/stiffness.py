@@ -1,23 +1,24 @@
-"""Combine two methods in one run: an explicit one, and an implicit one where stiffness would make its steps tiny.
+"""Combine two methods in one run: an explicit one, and an implicit one for stiff parts of the motion.
 
 The largest rate of the motion, rho, is the square root of the largest eigenvalue of dF/dq, or the largest eigenvalue of
-dF/dv, where F are the accelerations. From time to time a few power iterations, of one evaluation each, estimate it. If
-h rho is well below the limit of stability of the explicit method, the motion is not stiff. Near the limit, either
+dF/dv, where F are the accelerations. From time to time a few power iterations, of one evaluation each, estimate rho. If
+h rho is well below the stability limit of the explicit method, the motion is not stiff. Near the limit, either
 stiffness or accuracy may determine the step size h. Then the implicit method is tried for a window of steps, in which
-its errors count tenfold, and replaces the explicit one if it costs less per second of motion.
+errors count tenfold, and replaces the explicit method if it costs less per second of motion.
 
 A trial also begins at smaller h rho if
 
-- rho is far above the rates that the motion shows: a component that decays so fast may prevent longer steps through the
+- rho is far above the rates that the motion shows: a component that decays at the rate rho may limit steps through the
   error estimate;
-- all components that could move at the rate rho are about the tolerances: steps at the limit of stability excite them;
-- the run as a whole is expected to cost a thousand times as much as a trial.
+- all components that could vibrate at the rate rho have velocities of a few tolerances: steps at the stability limit
+  excite such components;
+- the whole run is expected to cost a thousand times as much as a trial.
 
 A trial that may be in vain waits until the run has cost a few times as much as a trial, or is expected to cost ten
 times as much. Costs are counted in evaluations of the explicit method; with generated code, an evaluation of the
-implicit method counts several times. In the same way the explicit method is tried again if h rho is well below the
-limit, or if a second of motion costs more than it did with the explicit method. A method that was tried in vain is
-tried again after twice as many estimates.
+implicit method counts several times. The explicit method is tried again if h rho is well below the limit, or if a
+second of motion costs more than before with the explicit method. A method that was tried in vain is tried again after
+twice as many estimates.
 
 Kernels call both methods by their addresses, so that each method is compiled in its own module.
 """
@@ -67,68 +68,69 @@ from twoloop.kernels.data.indices import (
 from twoloop.kernels.evaluation.inner_loop import renew_partition
 from twoloop.kernels.linalg.dense import copy
 
-# number of evaluations before the first estimate of the rate, and between two estimates, which take about eight each;
-# during the explicit method these numbers are multiplied by COST_RATIO
+# number of evaluations before the first estimate of rho, and between two estimates, which take about eight evaluations
+# each; these numbers are multiplied by COST_RATIO while the explicit method is used
 EARLY, INTERVAL = 100.0, 600.0
-ITERATIONS = 4  # iterations of the power method for dF/dq, and for dF/dv
-NEGLIGIBLE = 1e-3  # rate of decay times step size below which a second iteration is unnecessary
-SEED = 1e-3  # new value of a zero component of a direction, relative to its largest component
-STABILITY_LIMIT = 3.0  # h rho relative to LIMIT: above this, stability limits the step of the explicit method
-# cost of the run, in evaluations per independent coordinate, before a trial whose Jacobian needs finite differences,
-# about eight evaluations per coordinate
+ITERATIONS = 4  # largest number of power iterations for dF/dq in one estimate, and for dF/dv
+NEGLIGIBLE = 1e-3  # largest eigenvalue of dF/dv times step size below which no further iteration for dF/dv is needed
+SEED = 1e-3  # value that replaces a zero component of a direction, relative to the largest component
+STABILITY_LIMIT = 3.0  # ratio of h rho to LIMIT above which stability limits the step of the explicit method
+# least cost of the run so far, in evaluations per independent coordinate, at which a trial may begin if its Jacobian
+# needs finite differences, which take about eight evaluations per coordinate
 MIN_COST = 64.0
-TRIAL = 300.0  # approximate number of evaluations that a trial of the implicit method takes
-AFFORDED = 3.0  # cost of the run, in costs of a trial, before a trial that may be in vain
+TRIAL = 300.0  # approximate cost of a trial of the implicit method, in its evaluations
+AFFORDED = 3.0  # least cost of the run, relative to the cost of a trial, at which a trial that may be in vain can begin
 SHARE_OF_RUN = 0.3  # fraction of the expected cost of the whole run that counts as spent from the beginning
-# cost of the run, relative to AFFORDED trials, at which a trial begins whatever the rates are; it doubles after one
-# trial, triples after two, and so on
+# cost of the run, relative to AFFORDED trials, at which a trial begins whatever the rates are; this number doubles
+# after one trial, triples after two, and so on
 COST_OF_ANY_TRIAL = 100.0
-HIDDEN_RATIO = 30.0  # smallest ratio of a hidden rate to the rates that the motion shows
-# in tolerances of velocities: at its stability limit an explicit method leaves about this much oscillation of decaying
+HIDDEN_RATIO = 30.0  # ratio of rho to the rates that the motion shows above which rho is a hidden rate
+# size of an oscillation, in tolerances of velocities, that an explicit method at its stability limit leaves in decaying
 # components
 QUIET_FACTOR = 10.0
-HIDDEN_FROM = 0.05  # h rho relative to LIMIT: above this, damping a hidden rate may allow longer steps
-INSTANT = 1e-4  # relative to 1 / rate: time step of the difference that estimates the rate of the motion
-RETURN_BELOW = 0.4  # h rho relative to LIMIT: below this, the explicit method is tried again
-# factor on the error during a trial of the implicit method, whose order is lower than that of the explicit one
-STRICT = 10.0
-MEAN = 0.8  # weight of the previous mean step size in the new one
-SETTLED = 5.0  # number of accepted steps of a trial before its cost is measured: the first steps are untypical
+HIDDEN_FROM = 0.05  # ratio of h rho to LIMIT above which damping a hidden rate may allow longer steps
+INSTANT = 1e-4  # time step of the difference that estimates the rate of the motion, relative to 1 / rho
+RETURN_BELOW = 0.4  # ratio of h rho to LIMIT below which the explicit method is tried again
+# factor on the error during a trial of the implicit method, whose order is lower than that of the explicit method
+TRIAL_ERROR_FACTOR = 10.0
+MEAN_WEIGHT = 0.8  # weight of the previous mean step size in the new mean step size
+N_UNTYPICAL = 5.0  # number of accepted steps at the beginning of a trial whose cost is not measured
 WINDOW = 10.0  # number of accepted steps over which the cost of the method on trial is measured
-MIN_GAIN = 1.2  # ratio of costs above which the method on trial replaces the other
-PATIENCE = 4.0  # number of estimates from a successful trial to the next one
+MIN_GAIN = 1.2  # ratio of costs above which the method on trial replaces the method used before
+PATIENCE = 4.0  # number of estimates from a successful trial to the next trial
 
-# phases: explicit method, implicit method on trial, implicit method, explicit method on trial
+# values of PHASE: explicit method, implicit method on trial, implicit method, explicit method on trial
 EXPLICIT, ON_TRIAL, IMPLICIT, BACK_ON_TRIAL = range(4)
 
-# indices in `options`: first those of the pair, then for each method its step-size rule (see loop_state.py) and
-# REUSE_OF, its value of REUSE, then the options of each method. LIMIT: h rho above which the implicit method is tried,
-# if N_ESTIMATES successive estimates exceed it. MATRIX_COST: cost of a Jacobian in evaluations. COST_RATIO: cost of an
-# evaluation of the second method in evaluations of the first. SIZE_1: length of the options of the first method
+# indices in `options`. In this order, `options` contains: the N_PAIR options of the pair; for each method its step-size
+# rule (see loop_state.py) and, at REUSE_OF, its value of REUSE; the options of the first method; those of the second.
+# LIMIT: h rho above which the implicit method is tried, if N_ESTIMATES successive estimates exceed LIMIT. MATRIX_COST:
+# cost of a Jacobian in evaluations. COST_RATIO: cost of an evaluation of the second method in evaluations of the first.
+# SIZE_1: number of options of the first method
 LIMIT, N_ESTIMATES, MATRIX_COST, COST_RATIO, SIZE_1, N_PAIR = range(6)
 REUSE_OF, N_OF_EACH = N_RULE, N_RULE + 1
 N_OPTIONS = N_PAIR + 2 * N_OF_EACH
 
-# indices in `memory`: scalars, two directions (n_q), then the memories of the two methods
+# indices in `memory`, which contains scalars, two directions (n_q each), and the memories of the two methods
 (
-    PHASE,
+    PHASE,  # which method is used, see above
     STEPS,  # number of accepted steps in this phase
     MAY_ESTIMATE,  # 1: the last attempt was accepted, so that the rate may be estimated
     NEXT_ESTIMATE,  # number of evaluations at which the rate is estimated again
-    ESTIMATES_TO_WAIT,  # number of estimates that are left before the next trial
+    ESTIMATES_TO_WAIT,  # number of estimates before the next trial may begin
     WAIT,  # value of ESTIMATES_TO_WAIT after the last trial
-    T_BEGIN,  # time from which costs per second are measured, s
-    COST_BEGIN,  # cost of the run at that time
-    COST_PER_SECOND,  # cost of a second of motion by the method used before the trial
-    RATE,  # last estimate of the largest rate, 1 / s
-    FIRST_MEMORY,  # length of the memory of the first method
+    T_BEGIN,  # time from which the cost per second is measured, s
+    COST_BEGIN,  # cost of the run at the time T_BEGIN, in evaluations
+    COST_PER_SECOND,  # cost of a second of motion by the method used before the trial, in evaluations
+    RATE,  # last estimate of rho, 1/s
+    FIRST_MEMORY,  # number of entries of the memory of the first method
     H_MEAN,  # mean step size, s
-    HISTORY,  # history of the steps of this phase, see loop_state.py
-    _HISTORY_ERROR,
+    HISTORY,  # first index of the history of step-size control in this phase, see loop_state.py
+    _HISTORY_ERROR,  # last index of this history
     H_TRIED,  # size of the last attempted step, s
     ERROR_TRIED,  # error of the last attempted step, in tolerances
     N_TRIALS,  # number of trials so far
-    N_ABOVE_LIMIT,  # number of estimates in a row with h rho above LIMIT
+    N_ABOVE_LIMIT,  # number of successive estimates with h rho above LIMIT
     N_SCALARS,
 ) = range(19)
 
@@ -138,10 +140,10 @@ def switching_options(
 ) -> NDArray[np.float64]:
     """Return `options` of a pair of methods.
 
-    The first four arguments are the options from LIMIT on. `each` has the step-size rule and REUSE_OF of both methods,
-    `first` and `second` are the options of each method.
+    `limit` to `ratio` are LIMIT, N_ESTIMATES, MATRIX_COST and COST_RATIO. `each` has one row for each method, with its
+    step-size rule and REUSE_OF; `first` and `second` are the options of each method.
     """
-    first = np.asarray(first)  # array of numbers, or of expressions in the parameters
+    first = np.asarray(first)  # numbers, or expressions in the parameters
     scalars = [limit, float(estimates), matrix_cost, ratio, float(first.size)]
     return np.concatenate([scalars, np.asarray(each, dtype=np.float64).ravel(), first, np.asarray(second)])
 
@@ -173,10 +175,10 @@ def _memories(memory, n):
 
 @compiled
 def _power_iteration(f, w, t, state, direction, by_v, Q, V, A):
-    """Take one step of a power iteration: return the growth of `direction` under dF/dq (with `by_v` under dF/dv).
+    """Multiply `direction` by dF/dq (with `by_v`, by dF/dv), scale it, and return the factor by which it has grown.
 
-    `direction` becomes its image, scaled to a largest component of 1; its components are those of the independent
-    coordinates. (Q, V, A) is scratch. Returns 0 if the image cannot be evaluated.
+    `direction` is overwritten, with a largest component of 1; only components of independent coordinates are used.
+    (Q, V, A) is scratch. Returns 0, and keeps `direction`, if the product cannot be evaluated.
     """
     n = Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
@@ -205,7 +207,7 @@ def _power_iteration(f, w, t, state, direction, by_v, Q, V, A):
 
 @compiled
 def _largest_rate(f, w, memory, t, state, new_state):
-    """Return rho, the largest rate of the motion at a state, 1/s; `new_state` is scratch."""
+    """Return rho at `state`, 1/s, and improve the two directions in `memory`; `new_state` is scratch."""
     n = w.Q.size
     by_q, by_v = memory[N_SCALARS : N_SCALARS + n], memory[N_SCALARS + n : N_SCALARS + 2 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
@@ -220,7 +222,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
         damping = _power_iteration(f, w, t, state, by_v, True, Q, V, A)
         if damping * memory[H_MEAN] < NEGLIGIBLE:
             break
-    for m in range(n):  # components of coordinates that were dependent at all estimates so far are zero
+    for m in range(n):  # a component is zero if its coordinate was dependent in all estimates so far
         if by_q[m] == 0.0:
             by_q[m] = SEED
         if by_v[m] == 0.0:
@@ -230,7 +232,10 @@ def _largest_rate(f, w, memory, t, state, new_state):
 
 @compiled
 def _motion_rate(f, w, t, state, rate, Q, V, A):
-    """Return the largest relative rate of change of velocities or accelerations, 1/s; infinite if it is unknown."""
+    """Return the largest relative rate of change of velocities or accelerations, 1/s; infinity if it is unknown.
+
+    `rate` is rho, 1/s; (Q, V, A) is scratch.
+    """
     n = Q.size
     dt = INSTANT / rate
     fastest = largest = change = 0.0
@@ -250,7 +255,10 @@ def _motion_rate(f, w, t, state, rate, Q, V, A):
 
 @compiled
 def _is_quiet(w, tolerances, state, rate):
-    """Return whether a vibration at this rate with these accelerations has velocities of a few tolerances at most."""
+    """Return whether a vibration of angular frequency `rate` with the accelerations of `state` has small velocities.
+
+    Velocities are small up to QUIET_FACTOR tolerances.
+    """
     n = w.Q.size
     for i in w.independent_v:
         v = state[n + i]
@@ -274,13 +282,13 @@ def _cost_per_second(w, options, memory, t):
 
 @compiled
 def _evaluations_between_estimates(options, memory):
-    """Return the number of evaluations until the next estimate: INTERVAL, times COST_RATIO for the explicit method."""
+    """Return the number of evaluations between two estimates of rho by the method in use, see INTERVAL."""
     return INTERVAL * options[COST_RATIO] if _is_explicit(memory) else INTERVAL
 
 
 @compiled
 def _begin_phase(w, options, memory, phase, t):
-    """Begin another phase: its method starts without a history of step sizes and errors."""
+    """Store in `memory` that `phase` begins at t: with no history of errors, and with the cost measured from t on."""
     memory[PHASE] = phase
     memory[STEPS] = 0.0
     memory[HISTORY + ERROR_BEFORE] = 0.0
@@ -290,10 +298,10 @@ def _begin_phase(w, options, memory, phase, t):
 
 @compiled
 def _judge_trial(w, options, memory, t):
-    """Decide whether to keep the method on trial; return the phase to begin, or -1 while the trial continues."""
-    if memory[STEPS] == SETTLED:
+    """Return the phase that follows a trial (which of the two methods to use), or -1 while the trial continues."""
+    if memory[STEPS] == N_UNTYPICAL:
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
-    if memory[STEPS] < SETTLED + WINDOW:
+    if memory[STEPS] < N_UNTYPICAL + WINDOW:
         return -1
     cost_per_second = _cost_per_second(w, options, memory, t)
     is_kept = cost_per_second * MIN_GAIN <= memory[COST_PER_SECOND]
@@ -306,7 +314,7 @@ def _judge_trial(w, options, memory, t):
 
 @compiled
 def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
-    """Estimate the rate and decide whether to try the other method; return the phase to begin, or -1."""
+    """Estimate rho and decide whether to try the other method; return the phase of the trial, or -1 for no trial."""
     n = w.Q.size
     memory[RATE] = _largest_rate(f, w, memory, t, state, new_state)
     cost_per_second, cost = _cost_per_second(w, options, memory, t), _cost(w, options)
@@ -318,7 +326,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         memory[N_ABOVE_LIMIT] += 1.0
     if memory[ESTIMATES_TO_WAIT] > 0.0:
         return -1
-    # a trial that may be in vain, or that needs finite differences, has to cost little compared with the run so far
+    # a trial that may be in vain, or that needs finite differences, must cost little compared with the run so far
     counted_cost, least_cost = cost, AFFORDED * TRIAL * options[COST_RATIO]
     if np.isfinite(tolerances[GAP]):
         counted_cost = max(counted_cost, SHARE_OF_RUN * tolerances[GAP] / LONGEST_UNSEEN * cost_per_second)
@@ -331,8 +339,8 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         hidden = _is_quiet(w, tolerances, state, memory[RATE])
         if not hidden:
             hidden = memory[RATE] > HIDDEN_RATIO * _motion_rate(f, w, t, state, memory[RATE], Q, V, A)
-    # a run that has cost this much starts a trial whatever the rate is: where friction is about to reverse, few states
-    # show the largest rate, and the cost of a run is known only after the short steps of its start
+    # a run of high cost starts a trial whatever the rates are: few states show the largest rate if friction is about to
+    # reverse. The condition on `cost` excludes the short steps at the start, after which the expected cost is known
     costs_enough = (
         is_cheap and cost > least_cost and counted_cost > COST_OF_ANY_TRIAL * least_cost * (1.0 + memory[N_TRIALS])
     )
@@ -342,9 +350,9 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         or costs_enough
         or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and is_cheap)
     )
-    if is_cheap and h_rho <= 1.0:  # while a trial is too expensive, N_ABOVE_LIMIT is kept
+    if is_cheap and h_rho <= 1.0:  # N_ABOVE_LIMIT is not reset while a trial is too expensive
         memory[N_ABOVE_LIMIT] = 0.0
-    expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # compared with the explicit method before
+    expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # compared with the previous explicit phase
     if (memory[PHASE] == EXPLICIT and is_due) or (memory[PHASE] == IMPLICIT and (h_rho < RETURN_BELOW or expensive)):
         memory[COST_PER_SECOND] = cost_per_second
         memory[N_TRIALS] += 1.0
@@ -354,14 +362,14 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
 
 @compiled
 def _clear(memory):
-    """Clear a method's memory, as at the beginning of a run."""
+    """Set a method's memory to zeros, as at the beginning of a run."""
     for i in range(memory.size):
         memory[i] = 0.0
 
 
 @kernel(SETTLE)
 def settle_switching(f, w, options, memory, tolerances, accepted):
-    """Commit or discard the attempted step in the memory of its method, and count accepted steps."""
+    """Commit or discard the attempted step in the memory of the active method, and count it if it is accepted."""
     first, second = _memories(memory, w.Q.size)
     begin = N_OPTIONS + int(options[SIZE_1])
     memory[MAY_ESTIMATE] = 0.0
@@ -378,13 +386,13 @@ def settle_switching(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step by the active method, whose step-size control is the same as if it were used alone.
+    """Attempt a step by the active method, after choosing this method if an estimate or the end of a trial is due.
 
-    When the other method becomes active, its memory is cleared.
+    The memory of a method is cleared when this method becomes active. Step-size control is that of the active method.
     """
     n = w.Q.size
     first, second = _memories(memory, n)
-    if np.isnan(memory[T_BEGIN]):  # at the start of a run, and after a singular position
+    if np.isnan(memory[T_BEGIN]):  # this is the first step of a run, or the first after a singular position
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
         memory[NEXT_ESTIMATE] = w.counters[N_EVALUATIONS] + EARLY * options[COST_RATIO]
     if memory[MAY_ESTIMATE] == 1.0 and tolerances[ESTIMATE] == 1.0:
@@ -405,25 +413,25 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.notes[REUSE] = max(rule[REUSE_OF], w.notes[ROUNDED])
     if explicit:
         code, error, factor = f.attempt_first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
-        # a step of fixed size cannot become shorter
+        # a step of fixed size that does not converge cannot be shortened: try the implicit method
         if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.flags[FORM] != STATIC:
             _begin_phase(w, options, memory, IMPLICIT, t)
             _clear(second)
             w.notes[EXPLICIT_STEP] = 0.0
             code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     else:
-        # only the first method may take steps longer than GAP: it also evaluates the equations between their ends
+        # only the first method may take steps longer than GAP, because it evaluates the equations within a step, too
         ratio = gap_ratio(tolerances, h)
         if ratio > 0.0:
             return Attempt(DONE, ratio, 1.0 / ratio)
         code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     if code == NOT_LOADED:
         return Attempt(code, error, 0.0)
-    memory[H_MEAN] = MEAN * memory[H_MEAN] + (1.0 - MEAN) * h
+    memory[H_MEAN] = MEAN_WEIGHT * memory[H_MEAN] + (1.0 - MEAN_WEIGHT) * h
     if code != DONE or not np.isfinite(error):
         return Attempt(code, error, 0.0)
     if memory[PHASE] == ON_TRIAL:
-        error *= STRICT
+        error *= TRIAL_ERROR_FACTOR
     memory[H_TRIED], memory[ERROR_TRIED] = h, max(error, rule[LEAST_ERROR])
     if factor == 0.0:
         factor = factor_of(rule, _history(memory), h, error)

@@ -1,61 +1,61 @@
 """Layout of the memory of collocation steps, which generated code fills and steps/lobatto_step.py reads.
 
-Offsets are counted in numbers, from an aligned address on. "lanes" are groups of eight numbers: one number for each
-unknown node, or one for each of eight steps that are projected together.
+An offset is the index of a number in this memory, which begins at an aligned address. "Lanes" are groups of eight
+numbers: one number for each unknown node, or one for each of eight steps that are projected together.
 """
 
-LANES = 8
-ORDER = 12.0  # order of the estimated error
-NOISE = 1e-13  # relative to the values: smaller differences may be rounding errors
-# results of the iteration of the stages. REFUSED: the step is rejected. GUESSED: the step size was a guess, and another
-# one has to be tried. NOT_COMPUTED: the accelerations could not be computed
+LANES = 8  # numbers in a group of lanes
+ORDER = 12.0  # the error estimate is proportional to this power of the step size
+NOISE = 1e-13  # differences of at most this size, relative to the values, may be rounding errors
+# results of the iteration for the stages. REFUSED: the step is rejected. GUESSED: the step size was a guess, and must
+# be replaced by another one. NOT_COMPUTED: accelerations at the nodes could not be computed
 CONVERGED, REFUSED, GUESSED, NOT_COMPUTED = range(4)
 
 (
-    T,  # beginning of the step
-    H,
-    H_BEFORE,  # size of the step whose polynomial predicts this one
-    DEGREE,  # degree of the polynomial that predicts this step
-    PREDICTS,  # 1: there is a polynomial; 0: accelerations are predicted to be constant
-    WHICH,  # index of the polynomial of the last accepted step
-    TRIED,  # 1: the polynomial with the other index belongs to the step just attempted
-    NEXT_DEGREE,
-    KEPT_DEGREE,  # degree of the prediction before a rejected step; 0: none was rejected
-    MAY_GUESS,  # 1: the step size is a guess, and another is tried if the contraction is far from its target
-    CAREFUL,  # number of steps that still use the elimination that begins with M
+    T,  # time at the beginning of the step, s
+    H,  # step size, s
+    H_BEFORE,  # size of the step whose polynomial predicts the accelerations in this step, s
+    DEGREE,  # degree of the polynomial that predicts the accelerations in this step
+    PREDICTS,  # 1: accelerations are predicted by a polynomial; 0: they are predicted to be constant
+    WHICH,  # index (0 or 1) of the polynomial of the last accepted step
+    TRIED,  # 1: the other polynomial is that of the step just attempted
+    NEXT_DEGREE,  # degree of the polynomial that will predict the accelerations in the next step
+    KEPT_DEGREE,  # value of DEGREE before a step was rejected, to be restored; 0: no step was rejected
+    MAY_GUESS,  # 1: the step size is a guess: try another one if the contraction is far from its target
+    CAREFUL,  # number of further steps that use the elimination that begins with M
     STARTS,  # number of guesses of the first step size so far
-    N_STEPS,  # number of steps since the beginning of the run
-    LIMITED,  # number of steps that convergence limited, less those that accuracy limited
-    FAILURES,  # twice the number of steps that did not converge, less those accepted
-    DEFECT,  # largest defect between nodes over the allowed defect; -1: not evaluated
-    RHO,  # contraction by a sweep: ratio of successive changes
-    SWEEPS,  # number of sweeps of the step
-    TARGETED,  # target of the number of sweeps
-    CHANGE,  # change of velocities by the last sweep, over the tolerances
-    ERROR,  # error of the step, over the tolerances
-    CURVED,  # Legendre coefficients of degree 5 and 6 of the accelerations, over the tolerances
+    N_STEPS,  # number of accepted steps since the method began
+    LIMITED,  # number of steps whose size convergence limited, minus the number of other steps; at least 0
+    FAILURES,  # twice the number of steps that did not converge, minus the number of accepted steps; at least 0
+    DEFECT,  # largest defect between nodes, relative to the allowed defect; -1: not evaluated
+    RHO,  # contraction by a sweep: ratio of successive changes of the velocities
+    SWEEPS,  # number of sweeps in the step
+    TARGETED,  # target number of sweeps
+    CHANGE,  # change of velocities by the last sweep, relative to the tolerances
+    ERROR,  # error of the step, relative to the tolerances
+    CURVED,  # Legendre coefficients of degree 5 and 6 of the accelerations, relative to the tolerances
     FACTOR,  # ratio of the next step size to this one that convergence allows
     FACTOR_OF_ERROR,  # ratio of the next step size to this one that the error allows
     FACTOR_OF_DEFECT,  # ratio of the next step size to this one that the defect allows
-    ALLOWED_H,  # step size that the error would have allowed, s
-    SIZE,  # size of velocities and of their changes, over the tolerances
-    STRICTER,  # ratio by which the tolerances of other coordinates are stricter than those of the iterated ones
+    ALLOWED_H,  # step size that the error would have allowed in the last step, s
+    SIZE,  # size of velocities and of their changes, relative to the tolerances
+    STRICTER,  # ratio by which tolerances of the coordinates that are not iterated are stricter
 ) = range(28)
-# offsets of the arrays behind the scalars
-POWERS = 32  # lanes: powers 1 to 8 of the ratio of the step size to the previous step size
-SCALED = 40  # lanes: coefficients of a polynomial times these powers
-MOVED = 48  # lanes: largest change of a coordinate by the last projection
-FINE = 56  # lanes: 1 where the projection succeeded
-DEFECTS = 64  # lanes: defects of successive steps
-WEIGHTS = 72  # (n): reciprocals of the allowed errors of velocities
+# offsets of the arrays that follow the scalars
+POWERS = 32  # offset of eight numbers: powers 1 to 8 of H / H_BEFORE
+SCALED = 40  # offset of eight numbers: coefficients of a polynomial, multiplied by these powers
+MOVED = 48  # offset of eight numbers: largest change of a coordinate by the last projection, for each of eight steps
+FINE = 56  # offset of eight numbers: 1 for steps whose projection succeeded
+DEFECTS = 64  # offset of eight numbers: defects of successive steps
+WEIGHTS = 72  # offset of n_q numbers: reciprocals of the allowed errors of velocities
 
 
 def places(n, n_iterated, n_rows):
     """Return the offsets of the arrays whose sizes depend on the mechanism, and the length of the memory.
 
-    For the stages: accelerations (n lanes), positions, velocities and two polynomials (n_iterated lanes each), and the
-    Legendre coefficients of the accelerations (n lanes). For the projection: t, q and v (1 + 2 n lanes), a (n lanes)
-    and lam (n_rows lanes).
+    Arrays of the stages: accelerations (n lanes), positions, velocities and two polynomials (n_iterated lanes each),
+    and Legendre coefficients of the accelerations (n lanes). Arrays of the projection: t, q and v (1 + 2 n lanes), a (n
+    lanes) and lam (n_rows lanes).
     """
     a = WEIGHTS + LANES * (-(-n // LANES))
     q = a + LANES * n

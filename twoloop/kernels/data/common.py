@@ -1,4 +1,4 @@
-"""Shared definitions of kernels: types, compiling decorators, the workspace, the table of callbacks, tolerances.
+"""Define what all kernels share: types, compiling decorators, the workspace, the table of callbacks, tolerances.
 
 Each kind of callback has a fixed signature, and writes its results into an argument. So the integrator is compiled
 once, and receives the functions of any mechanism and any method as arguments.
@@ -26,10 +26,11 @@ from twoloop.kernels.data.indices import ATOL, ESTIMATE, FAULT_KIND, FAULT_TIME,
 
 i8 = types.int64
 INTEGERS = types.int64[::1]
-PLACES = types.int32[::1]  # type of long programs: 32-bit integers, so that they fit in the cache
+PLACES = types.int32[::1]  # type of long programs: 32-bit integers, so that a program fits in the processor's cache
 
-# programs that replace missing callbacks (evaluation/operations.py), and programs of the sparse elimination of large
-# systems and of their Newton matrices (linalg/symbolic_factorization.py); a missing program has size 0
+# names of the programs in `Functions`: programs that replace missing callbacks (evaluation/operations.py), and programs
+# for sparse factors of large systems and of their Newton matrices (linalg/symbolic_factorization.py, sparse_lu.py). A
+# program that a system does not need has size 0
 PROGRAMS = (
     "jacobian_program",
     "jacobian_numbers",
@@ -45,26 +46,26 @@ Functions: Any = namedtuple("Functions", [*KINDS, "p", "flags", *PROGRAMS])  # t
 class Work(NamedTuple):
     """Arrays that an evaluation writes; allocated once per run.
 
-    Sizes: n_q coordinates; n_c + n_a rows of C_q and A, of which r_v are independent, r of them in C_q; n_dof is
-    n_q - r_v. Fields that end in _v belong to velocities; without rows of A these are the arrays of positions.
+    Sizes: n_q coordinates; n_c rows of C_q and n_a rows of A; r independent rows in C_q, r_v in C_q and A together;
+    n_dof = n_q - r_v. Fields that end in _v belong to velocities; without rows of A they are the arrays of positions.
     """
 
     M: Any  # (n_q, n_q) mass matrix
     L: Any  # (n_q, n_q) inverse of a constant M, else the factors of M, dense (see ldl_factor) or banded
     G: Any  # (n_c + n_a + 1, n_q) C_q and A at the last position, and a row of zeros
     entries: Any  # view of `G` as a vector
-    augmented: Any  # the numbers of `G`, followed by those of `M`
+    augmented: Any  # view of the memory of `G`, followed by that of `M`
     S: Any  # (r_v, r_v) G M^-1 G^T of the independent rows, and its factors
     W: Any  # (r_v, n_q) rows G M^-1 of the independent rows
     A: Any  # (n_dof, n_dof) T^T M T and its factors; empty where S is used
     MT: Any  # (n_q, n_dof) M T
-    D: Any  # (n_dof + 1, r_v) rows of -(G_d^-1 G_i)^T, and the dependent velocities at v_i = 0; in elimination order
+    D: Any  # (n_dof + 1, r_v) -(G_d^-1 G_i)^T, then the dependent velocities if v_i = 0; columns in elimination order
     Gx: Any  # (n_c + n_a, n_q) C_q and A at a displaced position (for Gamma by differences); scratch for full pivoting
-    G_of_S: Any  # (n_c + n_a, n_q) the G from which S and W were computed, if M is constant and not diagonal; NaN: none
+    G_of_S: Any  # (n_c + n_a, n_q) value of G from which S and W were computed, for constant M; NaN: not computed yet
     pattern: Any  # (n_c + n_a, n_q) 1 where G has had a nonzero entry, else 0
     mass_pattern: Any  # (n_q, n_q) 1 where M has had a nonzero entry, else 0; empty without the augmented form
     places: Any  # index of the first entry of each row of G (n_c + n_a + 1), then the columns of the entries
-    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences: over twice the present length, and over the length before
+    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences with twice the present step, and with the step tried before
     rates: Any  # (13, n_c + n_a) C_t and b at times within a step, see discontinuities.py
     changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces, C_t and b ahead, see discontinuities.py
     Q: Any  # (n_q) force
@@ -78,18 +79,18 @@ class Work(NamedTuple):
     lam: Any  # (n_c + n_a) scratch for multipliers that the caller does not need
     minimum: Any  # scratch for the multipliers of least norm, see saddle_point.py
     rows: Any  # (r) indices of the independent rows of C_q
-    dependent: Any  # (r) columns of the coordinates that these rows determine
-    independent: Any  # (n_q - r) columns of the independent coordinates
-    index: Any  # program of the factors of C_qd, see markowitz_lu.py
+    dependent: Any  # (r) indices of the dependent coordinates
+    independent: Any  # (n_q - r) indices of the independent coordinates
+    index: Any  # program that factors C_qd, see markowitz_lu.py
     values: Any  # the factors of C_qd
     rows_v: Any  # (r_v) indices of the independent rows of G
-    dependent_v: Any  # (r_v) columns of the velocities that these rows determine
-    independent_v: Any  # (n_dof) columns of the independent velocities
-    index_v: Any  # program of the factors of G_d
+    dependent_v: Any  # (r_v) indices of the dependent velocities
+    independent_v: Any  # (n_dof) indices of the independent velocities
+    index_v: Any  # program that factors G_d
     values_v: Any  # the factors of G_d
-    index_a: Any  # program of the factors of the augmented matrix; its SIZE is 0 if there is none yet
-    values_a: Any  # the factors of the augmented matrix; empty without this form
-    right: Any  # (2 (n_q + r_v)) right-hand side of the augmented matrix, and scratch
+    index_a: Any  # program that factors the augmented matrix; its SIZE is 0 while the program is not written
+    values_a: Any  # the factors of the augmented matrix; empty in other forms
+    right: Any  # (2 (n_q + r_v)) right-hand side for the augmented matrix, and scratch
     order: Any  # (n_q) scratch: column order of the full pivoting
     row_order: Any  # (n_c + n_a) scratch: row order of the full pivoting
     counters: Any  # (N_COUNTERS) see indices.py
@@ -98,18 +99,18 @@ class Work(NamedTuple):
     notes: Any  # (N_NOTES) see indices.py
     nodes: Any  # results of the operations of a traced program
     matrices: Any  # matrices of Newton's method, see steps/stages.py and steps/newton_systems.py
-    # fields of the static form, empty in other forms, just as their fields are empty in this one; N is n_q + n_c
+    # the fields from here to `solutions` are those of the static form, and are empty in other forms; N is n_q + n_c
     mass_values: Any  # entries of M, see linalg/symbolic_factorization.py
     jacobian_values: Any  # entries of G
     counts: Any  # (n_c) 1 for independent rows, else 0
     factors: Any  # numbers of the factors, in the slots of the program
-    pivot_sizes: Any  # (N) squared lengths of the rows, to which pivots are compared, see linalg/sparse_ldl.py
-    unknowns: Any  # (N) right-hand side and solution
+    pivot_sizes: Any  # (N) squared norms of the rows, to which pivots are compared, see linalg/sparse_ldl.py
+    unknowns: Any  # (N) right-hand side on entry to a solver, solution on return
     solutions: Any  # (3 N) scratch, then (n_c) factors by which rows stiffen M, see linalg/sparse_ldl.py
 
-    sizes: Any = None  # the Sizes of layout.py for which the arrays are allocated
+    sizes: Any = None  # value of `Sizes` (layout.py) for which the arrays are allocated
     address: Any = 0  # address of `table`
-    table: Any = None  # addresses and shapes of these arrays, for kernels
+    table: Any = None  # addresses and shapes of the arrays above, for kernels
 
 
 _INTEGER_FIELDS = {
@@ -132,13 +133,14 @@ def _type_of_work(value: Any, context: Any) -> Any:
 
 
 class Attempt(NamedTuple):
-    """Result of an attempted step: its code, its error and the factor of the next step.
+    """Result of an attempted step: its code, its error and the factor for the next step size.
 
     code : DONE, or the reason why the step failed.
-    error : error in tolerances: the step is accepted up to 1. If a step is longer than the method allows, it is not
-        computed, and `error` is the ratio of its length to the allowed one.
-    factor : ratio of the next step size to this one; 0: the controller computes it from the error. If both factor and
-        error exceed 1, the step size was a guess: the step was not completed, and a longer one is to be tried.
+    error : error in tolerances: the step is accepted if this is at most 1. If a step is longer than the method allows,
+        the step is not computed, and `error` is the ratio of its size to the allowed size.
+    factor : ratio of the next step size to this one; 0: the controller computes the ratio from the error. If both
+        factor and error exceed 1, the step size was a guess: the step was not completed, and has to be repeated with a
+        larger size.
     """
 
     code: int
@@ -147,9 +149,9 @@ class Attempt(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Compiled functions of a step: `attempt` computes it, `settle` commits or discards it in the method's memory.
+    """Compiled functions of a method: `attempt` computes a step, `settle` commits or discards it in the memory.
 
-    `many` computes several steps in one call; None if the method cannot.
+    `many` computes several steps in one call, and is None if the method has no such function.
     """
 
     attempt: Any = None
@@ -183,18 +185,20 @@ for _name in ("settle", "settle_first", "settle_second"):
 MANY = i8(KIT, WORK, *[VECTOR] * 5, f8, *[VECTOR] * 3, MATRIX, MATRIX)
 KIT.add_function("attempt_many", MANY)
 
-# functions generated for a mechanism, see generate/elimination.py and collocation_code.py. A boolean result tells
-# whether the conditions of the generated code are satisfied; only then are the results written
+# functions generated for a mechanism, see generate/elimination.py and collocation_code.py. A boolean result is False if
+# the conditions of the generated code are not satisfied: results are then not written
 OWN_FUNCTIONS = {
-    # arguments (t, q, v, numbers), then arrays for the results: accelerations; corrected positions and the correction;
-    # corrected positions, velocities, accelerations and multipliers; accelerations that satisfy redundant rows, too
+    # functions of a state, with arguments (t, q, v, numbers) and then arrays for the results. own_accelerate: a.
+    # own_correct_positions: the correction, and corrected q. own_project: a, the correction of q, corrected q and v,
+    # and lam. own_redundant writes no results: its conditions are that the state satisfies the redundant rows
     "own_accelerate": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
     "own_correct_positions": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR),
     "own_project": types.boolean(f8, *[VECTOR] * 8),
     "own_redundant": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
     # functions of collocation; their first argument is the memory described in data/collocation.py. attempt_nodes
     # (memory, state, tolerances, numbers) returns how the iteration ended, audit_nodes (memory, state, numbers) the
-    # defect between nodes. The others have (memory, state), (memory, state, new_state), and twice (memory, numbers)
+    # defect between nodes. Other arguments: retry_nodes (memory, state), end_nodes (memory, state, new_state),
+    # correct_ends and project_ends (memory, numbers)
     "attempt_nodes": f8(*[VECTOR] * 4),
     "audit_nodes": f8(*[VECTOR] * 3),
     "retry_nodes": types.none(*[VECTOR] * 2),
@@ -219,7 +223,7 @@ def _text(module: str) -> str:
 
 
 def _imports(text: str) -> set[str]:
-    """Return the names of the kernels' modules that a source imports, such as "steps.stages"."""
+    """Return the names of those modules of the kernels that a source text imports, such as "steps.stages"."""
     names = set()
     for folder, several, single in re.findall(
         r"^from twoloop\.kernels([\w.]*) import (?:\(([^)]*)\)|(.+))$", text, re.MULTILINE
@@ -234,7 +238,7 @@ def _imports(text: str) -> set[str]:
 
 @cache
 def stamp(module: str) -> str:
-    """Return a digest of all sources and callback signatures on which a module, such as "steps.stages", depends."""
+    """Return a digest of the callback signatures and of all sources that a module, such as "steps.stages", needs."""
     known: set[str] = set()
     pending = {module}
     while pending:
@@ -247,7 +251,7 @@ def stamp(module: str) -> str:
 
 
 def _module(function: Callable[..., Any]) -> str:
-    """Return the name of the module of a kernel, such as "steps.stages"."""
+    """Return the name of the module that defines a kernel, such as "steps.stages"."""
     path = Path(inspect.getfile(function)).with_suffix("")
     return ".".join(path.relative_to(_FOLDER).parts) if path.is_relative_to(_FOLDER) else path.stem
 
@@ -256,7 +260,7 @@ _ANNOUNCEMENT = "twoloop: compiling the integrator, about a minute; later proces
 
 
 def kernel(signature: Any, vectorized: bool = False) -> Callable[[Callable[..., Any]], Dispatcher]:
-    """Return a decorator that compiles a kernel, or reads its machine code if no file that it needs has changed."""
+    """Return a decorator that compiles a kernel, or reads its saved machine code if its sources have not changed."""
 
     def compile_now(function: Callable[..., Any]) -> Dispatcher:
         return compile_cached(
@@ -271,9 +275,9 @@ def kernel(signature: Any, vectorized: bool = False) -> Callable[[Callable[..., 
     return compile_now
 
 
-# fastmath without "nnan" and "ninf", so that NaN and infinity are respected. `_nrt`: without numba's runtime, code that
-# allocates arrays does not compile, and there are no reference counts, which would take a third of the time of an
-# evaluation of the four-bar
+# options of numba for all kernels. "fastmath" lacks "nnan" and "ninf", so that NaN and infinity are respected.
+# `_nrt` = False excludes numba's runtime: code that allocates arrays does not compile, and arrays have no reference
+# counts, which would take a third of the time of an evaluation of the four-bar
 OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "fastmath": {"contract", "reassoc", "nsz", "arcp"},
@@ -289,25 +293,25 @@ def _helper(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
 
 
 # forceinline is always set explicitly, because a callee inherits the flags of its caller: all helpers that a merged
-# helper calls would be merged, too. `exact` keeps the order of floating-point operations
-exact = _helper(fastmath=False, forceinline=False)
-compiled = _helper(forceinline=False)  # compiled as one copy, unless LLVM finds it short enough to inline
-inlined = _helper(inline="always")  # inlined by numba; only such a helper can return views of arrays
-# typed once, inlined by LLVM: for short helpers and those of every evaluation; each call becomes a copy of the code
+# helper calls would be merged, too
+exact = _helper(fastmath=False, forceinline=False)  # keeps the order of floating-point operations as in the source
+compiled = _helper(forceinline=False)  # compiled as one function, which LLVM inlines only if it is short
+inlined = _helper(inline="always")  # inlined by numba; only a helper of this kind can return views of arrays
+# inlined by LLVM, so that each call becomes a copy of the code: for short helpers, and for those of every evaluation
 merged = _helper(forceinline=True)
 
 
-NONE = np.zeros(0)
+NONE = np.zeros(0)  # empty data of generated functions
 
 
 class Kit:
     """Functions and data of a system and a method, passed to kernels as one reference.
 
-    `functions` are the callbacks, `inner` is the inner loop, and `step` the step; None: never called. Kernels call the
-    inner loop and the step by their addresses, and do not compile them again. A step that switches between two steps
-    calls them as `first` and `second`. `own` are sets of functions generated for the mechanism: an inner loop that
-    calls them leaves other tasks to the inner loop `general`. `numbers` are the data of these functions, and
-    `own_numbers` those of the collocation functions.
+    `functions` are the callbacks, `inner` is the inner loop, and `step` has the functions of the method; None: never
+    called. Kernels call the inner loop and the step by their addresses, without compiling them again. A pair of methods
+    calls its two methods as `first` and `second`. `own` are sets of functions generated for the mechanism: an inner
+    loop that calls these functions leaves other tasks to the inner loop `general`. `numbers` are the data of the
+    generated functions, and `own_numbers` the data of the collocation functions.
     """
 
     def __init__(
@@ -344,7 +348,7 @@ def _type_of_kit(value: Any, context: Any) -> Any:
     return KIT
 
 
-# indices of callbacks in Functions, for FAULT_KIND
+# indices of callbacks in Functions, which are the values of FAULT_KIND in Work.notes
 MASS, FORCE, CONSTRAINT, JACOBIAN, RATE, GAMMA = (
     Functions._fields.index(kind) for kind in ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")
 )
@@ -373,7 +377,7 @@ def finite(A):
 
 @compiled
 def not_finite(notes, kind, t, q):
-    """Record for the message which callback returned a value that is not finite (-1 if q is not); return NOT_FINITE."""
+    """Store in `notes` that callback `kind` (-1 if q is not finite) returned a non-finite value; return NOT_FINITE."""
     notes[FAULT_KIND] = kind if finite_vector(q) else -1.0
     notes[FAULT_TIME] = t
     return NOT_FINITE
@@ -381,7 +385,7 @@ def not_finite(notes, kind, t, q):
 
 @compiled
 def faulty_callback(w):
-    """Return the index in Functions of the callback because of which an acceleration is not finite; -1: unknown."""
+    """Return the index in Functions of the callback that made an acceleration non-finite; -1: unknown."""
     n_c = w.C.size
     if not finite_vector(w.Rate[:n_c]):
         return RATE
@@ -396,24 +400,24 @@ def faulty_callback(w):
     return FORCE if not finite_vector(w.Q) else -1
 
 
-SLACK = 1e-9  # relative: a step may exceed GAP by this much because of rounding
+SLACK = 1e-9  # amount, relative to GAP, by which a step may be longer than GAP because of rounding
 
 
 @merged
 def allowed(tolerances, m, x, x1):
-    """Return the allowed error of coordinate m, or of its velocity, in a step from x to x1."""
+    """Return the allowed error of coordinate m, or of its velocity, in a step in which its value goes from x to x1."""
     return tolerances[ATOL + m] + tolerances[RTOL] * max(abs(x), abs(x1))
 
 
 @merged
 def is_beyond_gap(tolerances, h):
-    """Return whether a step is longer than GAP."""
+    """Return whether a step of size h is longer than tolerances[GAP]."""
     return h > tolerances[GAP] * (1.0 + SLACK)
 
 
 @merged
 def gap_ratio(tolerances, h):
-    """Return the ratio of a step size to GAP; 0 if the ratio is at most 1, or if the step size is fixed."""
+    """Return h / tolerances[GAP] for a step of size h; 0 if this ratio is at most 1, or if the step size is fixed."""
     if tolerances[ESTIMATE] == 1.0 and is_beyond_gap(tolerances, h):
         return h / tolerances[GAP]
     return 0.0

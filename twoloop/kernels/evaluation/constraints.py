@@ -1,9 +1,9 @@
-"""Rows of the constraints on velocities, their rates, and Gamma (right-hand side of accelerations) by differences.
+"""Evaluate the rows of the constraints on velocities, their rates, and their right-hand side Gamma by differences.
 
 The first rows are C_q of C(t, q) = 0, the others A of A(t, q) v + b(t, q) = 0.
 
-Gamma is computed by differences along the motion: two central differences, over times e and 2 e, give the derivative to
-order 4. Their disagreement estimates its error, by which the length e is chosen.
+Gamma, in G a = Gamma, is computed by differences along the motion: two central differences, with the steps e and 2 e
+(s), give the derivative to order 4. The disagreement of the two differences estimates the error, by which e is chosen.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ from twoloop.kernels.data.indices import (
     GAMMA_INACCURATE,
     GAMMA_REQUIRED,
     GAMMA_SCALE,
-    GAMMA_SHARE,
+    GAMMA_STEP_RATIO,
     KINK_AFTER,
     KINK_BEFORE,
     NONHOLONOMIC_RATE_GIVEN,
@@ -29,7 +29,7 @@ from twoloop.kernels.linalg.dense import copy, largest_of
 
 @merged
 def constraint_rows(f, w, t, q, G):
-    """Evaluate C_q and A at (t, q) into G, which is w.G or w.Gx, full of zeros."""
+    """Store C_q and A at (t, q) in G, which is w.G or w.Gx and contains zeros on entry."""
     n_c, n_rows = w.C.size, w.Rate.size
     if n_c > 0 and not jacobian_by_program(f, w, t, q, G):
         f.jacobian(t, q, f.p, G[:n_c])
@@ -38,7 +38,7 @@ def constraint_rows(f, w, t, q, G):
 
 
 @compiled
-def _clear_places(w):
+def _clear_recorded_entries(w):
     for i in range(w.Rate.size):
         for k in range(w.places[i], w.places[i + 1]):
             w.G[i, w.places[k]] = 0.0
@@ -46,19 +46,19 @@ def _clear_places(w):
 
 @merged
 def clear_rows(f, w):
-    """Set w.G to zero.
+    """Set w.G to zero; in the augmented form, only where its rows are known to have entries, see w.places.
 
-    In large matrices only recorded entries are cleared; the task VERIFY_PATTERN detects new entries after a step.
+    The task VERIFY_PATTERN detects new entries after a step.
     """
     if f.flags[FORM] == AUGMENTED:
-        _clear_places(w)
+        _clear_recorded_entries(w)
     else:
         w.entries[:] = 0.0
 
 
 @merged
 def row_residual(w, v, rows):
-    """Compute G v + (C_t, b) of the rows with indices `rows` into w.z."""
+    """Store G v + (C_t, b) of the rows with the indices `rows` in w.z, from w.G and w.Rate."""
     for k in range(rows.size):
         row = rows[k]
         total = w.Rate[row]
@@ -69,7 +69,7 @@ def row_residual(w, v, rows):
 
 @merged
 def constraint_rates(f, w, t, q, rate):
-    """Evaluate C_t and b at (t, q) into `rate`."""
+    """Store C_t and b at (t, q) in `rate`."""
     n_c, n_rows = w.C.size, w.Rate.size
     rate[:] = 0.0
     if f.flags[CONSTRAINT_RATE_GIVEN] == 1:
@@ -80,7 +80,7 @@ def constraint_rates(f, w, t, q, rate):
 
 @merged
 def kinematics(f, w, t, q, v):
-    """Evaluate C, C_q and A, C_t and b, and Gamma of the rows of C at (t, q, v), by the fused callback."""
+    """Store C, C_q and A, C_t and b, and Gamma of the rows of C, at (t, q, v), in `w`, by the fused callback."""
     n_c, n_rows = w.C.size, w.Rate.size
     clear_rows(f, w)
     w.C[:] = 0.0
@@ -95,7 +95,7 @@ def kinematics(f, w, t, q, v):
 
 @merged
 def gather_independent_columns(G, rate, rows, independent, D):
-    """Write right-hand sides into the rows of D: minus the independent columns of G, and minus `rate`."""
+    """Store right-hand sides in the rows of D: the negative independent columns of G, then the negative `rate`."""
     for j in range(independent.size):
         column = independent[j]
         for k in range(rows.size):
@@ -104,42 +104,44 @@ def gather_independent_columns(G, rate, rows, independent, D):
         D[independent.size, k] = -rate[rows[k]]
 
 
-# largest time of a difference, s, and largest relative change of q in it; smallest such time over the largest one
-MAX_DIFFERENCE, MIN_SHARE = 2e-4, 1e-4
-LEVELS = 12  # number of lengths that _choose_length tries, each a quarter of the length before
+# largest difference step, s, and largest change of q in such a step, relative to max|q|. MIN_STEP_RATIO: lower bound of
+# the result of largest_difference_step, relative to MAX_DIFFERENCE_STEP
+MAX_DIFFERENCE_STEP, MIN_STEP_RATIO = 2e-4, 1e-4
+N_DIFFERENCE_STEPS = 12  # number of steps that _choose_difference_step tries, each a quarter of the one before
 ROUNDING_DISAGREEMENT = 1e-9  # disagreement of both differences, relative to Gamma, that rounding alone may cause
-# disagreement, relative to Gamma, below which the length is doubled: this loses no accuracy and reduces rounding
-LENGTHENING_DISAGREEMENT = 1e-11
-# weights of values at 0, e, 2 e and 4 e: first derivatives of order 2, over e and over 2 e
+# disagreement, relative to Gamma, below which the difference step is doubled: accuracy suffices, and rounding decreases
+ENLARGE_BELOW = 1e-11
+# weights of the values at 0, e, 2 e and 4 e in first derivatives of order 2, with the step e, and with the step 2 e
 ONE_SIDED, ONE_SIDED_TWICE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
-# length of one-sided differences relative to two-sided ones: their order is lower, so that a shorter length is better
-ONE_SIDED_LENGTH = 1.0 / 16.0
-# rounding error of Gamma if the terms of G v cancel, relative to the largest term over longest_difference
+# step of one-sided differences, relative to that of central ones: it is smaller, because their order is lower
+ONE_SIDED_STEP_RATIO = 1.0 / 16.0
+# rounding error of Gamma if the terms of G v cancel, relative to the largest term over largest_difference_step
 ROUNDING_OF_TERMS = 1e-14
-CONVERGED_SHARE = 0.01  # relative to the required accuracy: a smaller change ends the search for a length
+# change of Gamma from one difference step to the next, relative to the required accuracy, that ends the search for e
+CONVERGED_CHANGE = 0.01
 
 
 @exact
 def representable_step(t, h):
-    """Return (t + h) - t, the step that floating-point times can make: near 1e9 s their spacing is 2e-7 s."""
+    """Return (t + h) - t, the step nearest to h that floating-point times allow: near 1e9 s, a multiple of 1.2e-7 s."""
     return (t + h) - t
 
 
 @merged
-def longest_difference(q, v):
-    """Return the largest time e of a difference, s: MAX_DIFFERENCE, or less if q moves fast.
+def largest_difference_step(q, v):
+    """Return the largest difference step e, s: MAX_DIFFERENCE_STEP, or less if the coordinates move fast.
 
-    In this time q moves by at most MAX_DIFFERENCE times max|q|; the time is at least MIN_SHARE times MAX_DIFFERENCE.
+    During e, coordinates move by at most MAX_DIFFERENCE_STEP times max|q|, unless MIN_STEP_RATIO limits e from below.
     """
     size, speed = largest_of(q), largest_of(v)
     if speed <= size:
-        return MAX_DIFFERENCE
-    return MAX_DIFFERENCE * max(size / speed, MIN_SHARE)  # MIN_SHARE matters where all coordinates pass through zero
+        return MAX_DIFFERENCE_STEP
+    return MAX_DIFFERENCE_STEP * max(size / speed, MIN_STEP_RATIO)  # the latter where all coordinates are near zero
 
 
 @merged
 def _one_sided_direction(notes, t, e):
-    """Return on which side of t (1 or -1) to take differences near a known jump of C_t or b; 0: on both sides."""
+    """Return the side of t for differences near a known jump of C_t or b: 1 after t, -1 before t, 0 both sides."""
     before, after = t - notes[KINK_BEFORE], notes[KINK_AFTER] - t
     if min(before, after) >= 2.0 * e:
         return 0.0
@@ -148,10 +150,14 @@ def _one_sided_direction(notes, t, e):
 
 @compiled
 def _differences(f, w, t, q, v, e, first, last):
-    """Compute Gamma by differences over e and 2 e; return its largest entry, disagreement, and term of G v."""
+    """Store Gamma[first:last], by differences with the steps e and 2 e, in w.Gamma; return three maxima.
+
+    They are the largest entry of Gamma, the largest disagreement of both differences, and the largest term of G v. The
+    first two are NaN if Gamma is not finite.
+    """
     Gamma_twice = w.Gamma_tried[0]
     side = _one_sided_direction(w.notes, t, e)
-    shorter = representable_step(t, ONE_SIDED_LENGTH * e)
+    shorter = representable_step(t, ONE_SIDED_STEP_RATIO * e)
     if side != 0.0 and shorter > 0.0:
         e = shorter
     terms = 0.0
@@ -189,20 +195,20 @@ def _differences(f, w, t, q, v, e, first, last):
 
 @merged
 def _max_disagreement(notes):
-    """Return the largest accepted disagreement of both differences: their combination is far more accurate."""
+    """Return the largest accepted disagreement of both differences; the error of their combination is much smaller."""
     return max(notes[GAMMA_REQUIRED], ROUNDING_DISAGREEMENT) * notes[GAMMA_SCALE]
 
 
 @compiled
-def _choose_length(f, w, t, q, v, longest, first, last):
-    """Compute Gamma over ever shorter lengths until it no longer changes, or use the length with the least change.
+def _choose_difference_step(f, w, t, q, v, largest_step, first, last):
+    """Store Gamma in w.Gamma by that of ever smaller difference steps at which Gamma changes least; return a code.
 
-    Stores the length as GAMMA_SHARE. Returns GAMMA_INACCURATE if the change exceeds the required accuracy, else DONE.
+    Stores the step as GAMMA_STEP_RATIO. The code is GAMMA_INACCURATE if this change is too large, else DONE.
     """
     least_change = np.inf
-    share = 1.0
-    for level in range(LEVELS):
-        e = representable_step(t, share * longest)
+    step_ratio = 1.0
+    for level in range(N_DIFFERENCE_STEPS):
+        e = representable_step(t, step_ratio * largest_step)
         if e <= 0.0:
             break
         copy(w.Gamma, w.Gamma_tried[1])
@@ -215,34 +221,34 @@ def _choose_length(f, w, t, q, v, longest, first, last):
             change = max(change, abs(w.Gamma[i] - w.Gamma_tried[1, i]))
         if level > 0 and change < least_change and disagreement <= _max_disagreement(w.notes):
             least_change = change
-            w.notes[GAMMA_SHARE] = share
-            if change <= CONVERGED_SHARE * w.notes[GAMMA_REQUIRED] * w.notes[GAMMA_SCALE]:
+            w.notes[GAMMA_STEP_RATIO] = step_ratio
+            if change <= CONVERGED_CHANGE * w.notes[GAMMA_REQUIRED] * w.notes[GAMMA_SCALE]:
                 break
-        share *= 0.25
+        step_ratio *= 0.25
     w.notes[GAMMA_ACCURACY] = least_change / w.notes[GAMMA_SCALE]
-    _differences(f, w, t, q, v, representable_step(t, w.notes[GAMMA_SHARE] * longest), first, last)
+    _differences(f, w, t, q, v, representable_step(t, w.notes[GAMMA_STEP_RATIO] * largest_step), first, last)
     return DONE if w.notes[GAMMA_ACCURACY] <= w.notes[GAMMA_REQUIRED] else GAMMA_INACCURATE
 
 
 @compiled
 def gamma_by_differences(f, w, t, q, v, first, last):
-    """Compute Gamma[first:last] by differences; return GAMMA_INACCURATE if no length is accurate enough, else DONE.
+    """Store Gamma[first:last] in w.Gamma, by differences; return GAMMA_INACCURATE if no step suffices, else DONE.
 
     Gamma = -d/de [G v + (C_t, b)](t + e, q + e v) at e = 0.
 
-    Errors are relative to the largest entry of Gamma so far in this run. The length is GAMMA_SHARE of
-    longest_difference; if the two differences disagree, it is chosen anew: a drive of kilohertz needs a short length.
+    Errors are relative to the largest entry of Gamma so far in this run. The difference step is GAMMA_STEP_RATIO times
+    largest_difference_step; it is chosen anew if the two differences disagree, as for drives of several kilohertz.
     """
-    longest = longest_difference(q, v)
-    e = representable_step(t, w.notes[GAMMA_SHARE] * longest)
+    largest_step = largest_difference_step(q, v)
+    e = representable_step(t, w.notes[GAMMA_STEP_RATIO] * largest_step)
     if e > 0.0:
         largest, disagreement, terms = _differences(f, w, t, q, v, e, first, last)
         if np.isnan(largest) or disagreement == 0.0 or w.notes[GAMMA_SCALE] == 0.0:
             return DONE  # the caller reports values that are not finite; without a scale, no error can be judged
-        rounding = ROUNDING_OF_TERMS * terms / longest
+        rounding = ROUNDING_OF_TERMS * terms / largest_step
         w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], largest, rounding / w.notes[GAMMA_REQUIRED])
-        if disagreement < LENGTHENING_DISAGREEMENT * w.notes[GAMMA_SCALE]:
-            w.notes[GAMMA_SHARE] = min(1.0, 2.0 * w.notes[GAMMA_SHARE])
+        if disagreement < ENLARGE_BELOW * w.notes[GAMMA_SCALE]:
+            w.notes[GAMMA_STEP_RATIO] = min(1.0, 2.0 * w.notes[GAMMA_STEP_RATIO])
         if disagreement <= _max_disagreement(w.notes):
             return DONE
-    return _choose_length(f, w, t, q, v, longest, first, last)
+    return _choose_difference_step(f, w, t, q, v, largest_step, first, last)

@@ -1,8 +1,8 @@
-"""Operations of traced programs: their kinds, the layout of their tables, and an interpreter in compiled code.
+"""Define the operations of traced programs and the layout of their tables, and run programs in compiled code.
 
-Programs compute C_q and Gamma if no callback computes them (generate/derived_callbacks.py), and forces, motions and
-rows that the user of a model gives as functions (bodies/program_results.py). An exact derivative may overflow where the
-function does not, for example that of tanh at large arguments.
+Programs compute C_q and Gamma if no callback computes them (generate/derived_callbacks.py), and forces, prescribed
+motions and constraint rows that the user of a model defines by functions (bodies/program_results.py). An exact
+derivative may overflow where the function does not, for example the derivative of tanh at large arguments.
 """
 
 import math
@@ -12,17 +12,17 @@ from twoloop.kernels.data.common import compiled, exact
 # kinds of operations. PENDING: product in a Taylor series whose second factor is known only after the linear equations
 # of the present order are solved. RESULT: output of a program
 PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGENT, PENDING, SUM, RESULT = range(11)
-# columns of a table, a row of which is an operation: kind; index of its result among the nodes (or among the results);
-# first term of its first argument, first term of its second argument, and end of the terms of the second
+# columns of a table, which has one row for each operation. KIND: kind of the operation. NODE: index of its result among
+# the nodes, or among the results for RESULT. FIRST to SECOND - 1 and SECOND to END - 1: terms of its two arguments
 KIND, NODE, FIRST, SECOND, END, N_COLUMNS = range(6)
-# a program is a vector of integers: the sizes N_NODES to N_RESULTS, the rows of the table, the node of each term, and
-# the index of each result in its array; the last nodes are the results
+# indices of the sizes with which a program, a vector of integers, begins. The rows of the table, the node of each term,
+# and the index of each result in its array follow. The last nodes are the results
 N_NODES, N_ROWS, N_TERMS, N_RESULTS, HEAD = range(5)
 
 
 @exact
 def operation(kind, x, y):
-    """Return the result of an operation; y is the second factor of a product."""
+    """Return the result of an operation of kind `kind` on x; y is the second factor of a product."""
     if kind == PRODUCT:
         z = x * y
     elif kind == RECIPROCAL:
@@ -46,7 +46,7 @@ def operation(kind, x, y):
 
 @exact
 def affine(nodes, table, columns, numbers, coefficients, constant, begin, end):
-    """Return numbers[constant] plus the sum of coefficient times node for the terms begin to end."""
+    """Return numbers[constant] plus the sum of coefficient times node of the terms begin to end - 1, see run_table."""
     total = numbers[constant]
     for k in range(begin, end):
         total = total + numbers[coefficients + k] * nodes[int(table[columns + k])]
@@ -55,10 +55,11 @@ def affine(nodes, table, columns, numbers, coefficients, constant, begin, end):
 
 @exact
 def run_table(table, rows, n_rows, columns, numbers, coefficients, constants, nodes, inputs, t, q, v):
-    """Compute all nodes of a table from its inputs t, q and v, which become the nodes from index `inputs` on.
+    """Compute all `nodes` from the inputs t, q and v, which are stored as the nodes from index `inputs` on.
 
-    The table contains integers, or whole floats if it is among the parameters of a model. `rows` and `columns` are
-    indices in the table, `coefficients` and `constants` indices in `numbers`.
+    The table contains integers, or whole floats if it is among the parameters of a model. `rows` and `columns` are the
+    first indices of the operations and of the terms' nodes in `table`; `coefficients` and `constants` are the first
+    indices of these numbers in `numbers`.
     """
     nodes[inputs] = t
     for j in range(q.size):
@@ -74,7 +75,7 @@ def run_table(table, rows, n_rows, columns, numbers, coefficients, constants, no
 
 @exact
 def _run_program(program, numbers, nodes, t, q, v):
-    """Compute all nodes of a system's program."""
+    """Compute all `nodes` of a program that replaces a callback of a system."""
     n_rows = program[N_ROWS]
     columns = HEAD + N_COLUMNS * n_rows
     run_table(program, HEAD, n_rows, columns, numbers, 2 * n_rows, 0, nodes, 0, t, q, v)
@@ -82,14 +83,14 @@ def _run_program(program, numbers, nodes, t, q, v):
 
 @exact
 def _results(program):
-    """Return the number of results, the first node that is a result, and where their indices begin in the program."""
+    """Return the number of results, the index of the first one in the nodes, and that of their indices in `program`."""
     n = program[N_RESULTS]
     return n, program[N_NODES] - n, HEAD + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
 
 
 @compiled
 def gamma_by_program(f, w, t, q, v):
-    """Compute the rows of Gamma that no callback computes; return whether there is a program and all are finite."""
+    """Store the rows of Gamma that no callback computes; return False if there is no program or a value not finite."""
     program = f.gamma_program
     if program.size == 0:
         return False
@@ -104,7 +105,7 @@ def gamma_by_program(f, w, t, q, v):
 
 @compiled
 def jacobian_by_program(f, w, t, q, G):
-    """Compute C_q into the first rows of G, full of zeros; return whether there is a program and all is finite."""
+    """Store C_q in rows of G that are zero on entry; return False if there is no program or a value is not finite."""
     program = f.jacobian_program
     if program.size == 0:
         return False

@@ -1,4 +1,4 @@
-"""Tasks of an inner loop: inner_loop.py has a function of the same name for each task, which explains it."""
+"""Number the tasks of an inner loop; inner_loop.py has a function for each task, whose docstring explains the task."""
 
 (
     EVALUATE,
