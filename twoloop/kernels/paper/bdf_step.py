@@ -20,19 +20,19 @@ from twoloop.kernels.steps.stages import options_array as gauss_options
 
 MAX_ORDER = 5
 N_DIFFERENCES = MAX_ORDER + 2  # differences of orders 0 to MAX_ORDER + 1
-STARTER_STAGES = 3  # number of stages of the Gauss steps that begin a run of fixed steps
+STARTER_STAGES = 3  # number of stages of the Gauss steps at the beginning of a run with fixed step size
 MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
-SAFETY = 0.9  # safety factor on the step size after a rejected step; smallest ratio of step sizes after an accepted one
-LEAST_FACTOR = 0.2  # smallest ratio of step sizes after a rejected step, or one far from its prediction
-STRICT = 10.0  # factor on the error estimate: errors of many short steps add up, and then come close to the tolerance
-BIAS = 6.0  # factor on the error estimate in the choice of the step size, as in VODE; a smaller one causes rejections
-OTHER_ORDER = 1.4  # factor on the error estimates of other orders, so that the order rarely changes back and forth
-KEEP_BELOW = 1.2  # ratio of step sizes from 1 to this at which the step size remains unchanged
+SAFETY = 0.9  # factor on the step size after a rejected step; smallest ratio of step sizes after an accepted step
+LEAST_FACTOR = 0.2  # smallest ratio of step sizes after a rejected step, or one whose end is far from its prediction
+ERROR_FACTOR = 10.0  # factor on the error estimate, because the errors of many short steps add up
+STEP_SIZE_FACTOR = 6.0  # further factor on it in the choice of the next step size, as in VODE, to avoid rejected steps
+ORDER_FACTOR = 1.4  # factor on the error estimates of other orders, so that the order rarely changes to and fro
+KEEP_BELOW = 1.2  # ratio of the next step size to this one below which the step size is not increased
 GROWTH = 2.0  # largest ratio of successive step sizes
 
-# indices of the scalars in `options`; then follow the options of the Gauss steps
+# indices of the scalars in `options`, which are followed by the options of the Gauss steps
 HIGHEST, INNER_TOL, OUTER_TOL, N_SCALARS = range(4)
-# indices of the scalars in `memory`; then follow rows of coefficients and vectors, see _coefficients and _blocks
+# indices of the scalars in `memory`, which are followed by the arrays of _coefficients and _blocks
 (
     HAS_TRIAL,  # 1: the last attempt has stored the differences at the end of its step
     ORDER,
@@ -42,8 +42,8 @@ HIGHEST, INNER_TOL, OUTER_TOL, N_SCALARS = range(4)
     NEXT_DEPTH,
     N_MEMORY_SCALARS,
 ) = range(7)
-# numbers of the rows of coefficients. SPANS, NEW_SPANS: times, s, since the points of the history, measured from its
-# last point and from the end of the step; ERROR_CONSTANTS: of the orders 0, 1, ...
+# indices of the rows of coefficients. SPANS: times, s, from earlier points of the history to its last point; NEW_SPANS:
+# times, s, from all points of the history to the end of the step; ERROR_CONSTANTS: those of the orders 0, 1, ...
 SPANS, NEW_SPANS, ERROR_CONSTANTS, N_ROWS = range(4)
 
 
@@ -60,16 +60,17 @@ def memory_size(n_q: int) -> int:
 
 @inlined
 def _coefficients(memory, row):
-    """Return a view (N_DIFFERENCES) of row number `row`, such as SPANS, of the coefficients."""
+    """Return a view (N_DIFFERENCES) of row `row`, such as SPANS, of the coefficients in `memory`."""
     start = N_MEMORY_SCALARS + row * N_DIFFERENCES
     return memory[start : start + N_DIFFERENCES]
 
 
 @inlined
 def _blocks(memory, n):
-    """Return views of `memory`: differences and trial differences (N_DIFFERENCES, 2 n each), and further vectors.
+    """Return views of five parts of `memory`.
 
-    These are the prediction of (q, v) and its derivative (2 n each), and scratch.
+    They are the differences and the trial differences (N_DIFFERENCES, 2 n each), the prediction of (q, v) and its
+    derivative (2 n each), and scratch.
     """
     o = N_MEMORY_SCALARS + N_ROWS * N_DIFFERENCES
     size = N_DIFFERENCES * 2 * n
@@ -81,7 +82,7 @@ def _blocks(memory, n):
 
 @kernel(SETTLE)
 def settle_bdf(f, w, options, memory, tolerances, accepted):
-    """After an accepted attempt, make the trial differences the history; after either, adopt the order chosen."""
+    """Set ORDER to the chosen order; after an accepted attempt, also replace the history by the trial differences."""
     differences, trial, _, _, _ = _blocks(memory, w.Q.size)
     has_trial = memory[HAS_TRIAL]
     memory[HAS_TRIAL] = 0.0
@@ -101,7 +102,7 @@ def settle_bdf(f, w, options, memory, tolerances, accepted):
 
 @compiled
 def _begin_history(memory, differences, state, h, order):
-    """Start the history from the state and, if `order` is 1, its derivative."""
+    """Start a history of the given order, 0 or 1, from `state` and its derivative, for steps of size h."""
     size = differences.shape[1]
     for m in range(size):
         differences[0, m] = state[m]
@@ -113,9 +114,10 @@ def _begin_history(memory, differences, state, h, order):
 
 @compiled
 def _predict(memory, differences, trial, h, prediction, rate):
-    """Scale the differences to a step of h into `trial`; compute the error constants, the prediction and its rate.
+    """Store the differences, scaled to a step of size h, in `trial`, and compute the prediction and its `rate`.
 
-    The prediction extrapolates the polynomial of degree ORDER to the end of the step; `rate` is its derivative there.
+    The prediction extrapolates the polynomial of degree ORDER to the end of the step, and `rate` is the derivative of
+    this polynomial there. Also stores NEW_SPANS and ERROR_CONSTANTS.
     """
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, new_spans = _coefficients(memory, SPANS), _coefficients(memory, NEW_SPANS)
@@ -129,17 +131,17 @@ def _predict(memory, differences, trial, h, prediction, rate):
     for m in range(rate.size):
         rate[m] = 0.0
     scale = 1.0
-    in_rate = 0.0
+    rate_factor = 0.0
     for j in range(1, depth + 1):
         scale *= new_spans[j - 1] / spans[j - 1]
-        in_rate += 1.0 / new_spans[j - 1]
+        rate_factor += 1.0 / new_spans[j - 1]
         constants[j] = constants[j - 1] * j * h / new_spans[j]
         for m in range(rate.size):
             trial[j, m] = scale * differences[j, m]
         if j <= k:
             for m in range(rate.size):
                 prediction[m] += trial[j, m]
-                rate[m] += in_rate * trial[j, m]
+                rate[m] += rate_factor * trial[j, m]
 
 
 @merged
@@ -155,7 +157,8 @@ def _corrector_coefficient(h, k):
 def _correct(f, w, options, t, c, prediction, rate, new_state, a_new):
     """Solve y = prediction + c (y' - rate) at time t for y = (q_i, v_i); return a code.
 
-    The fixed-point iteration is on the independent accelerations. `new_state` becomes consistent as a whole.
+    The fixed-point iteration is on the independent accelerations. On return, all of `new_state` satisfies the
+    equations. `a_new` is scratch.
     """
     n = w.Q.size
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
@@ -176,7 +179,7 @@ def _correct(f, w, options, t, c, prediction, rate, new_state, a_new):
             change = max(change, difference / max(abs(v1[m]), 1.0))
             change = max(change, c * difference / max(abs(q1[m]), 1.0))
         copy(a_new, a1)
-        # the first iteration evaluates the prediction, which is never the result: extrapolation alone is unstable
+        # the first iteration only evaluates the prediction, which is never accepted: extrapolation alone is unstable
         if iteration > 0 and (change <= options[OUTER_TOL] or (change >= before and change <= rounding_floor(q1))):
             for k in range(w.dependent.size):
                 m = w.dependent[k]
@@ -190,7 +193,7 @@ def _correct(f, w, options, t, c, prediction, rate, new_state, a_new):
 
 @compiled
 def _norm(tolerances, y, y1, d, sign, difference):
-    """Return the largest component of d + sign * difference over atol + rtol |y|."""
+    """Return the largest component of |d + sign * difference|, relative to atol + rtol max(|y|, |y1|)."""
     n_q = d.size // 2
     largest = 0.0
     for m in range(d.size):
@@ -201,10 +204,13 @@ def _norm(tolerances, y, y1, d, sign, difference):
 
 @compiled
 def _choose_order(options, memory, tolerances, trial, y, y1, d):
-    """Return the error, from d = y1 - prediction, and the ratio of the next step size to h; set NEXT_ORDER."""
+    """Store NEXT_ORDER; return the error of a step, and the ratio of the next step size to h.
+
+    The error, in units of the tolerances, is estimated from d = y1 - prediction.
+    """
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, constants = _coefficients(memory, NEW_SPANS), _coefficients(memory, ERROR_CONSTANTS)
-    norm = STRICT * _norm(tolerances, y, y1, d, 0.0, d)
+    norm = ERROR_FACTOR * _norm(tolerances, y, y1, d, 0.0, d)
     # at unequal steps the interpolation of the history has an error, too; as in DASSL, the larger error counts
     interpolation = spans[0] / spans[k]
     for j in range(k):
@@ -213,17 +219,17 @@ def _choose_order(options, memory, tolerances, trial, y, y1, d):
     here = norm * constants[k]
     below, above = np.inf, np.inf
     if k > 1:
-        below = STRICT * OTHER_ORDER * constants[k - 1] * _norm(tolerances, y, y1, d, 1.0, trial[k])
+        below = ERROR_FACTOR * ORDER_FACTOR * constants[k - 1] * _norm(tolerances, y, y1, d, 1.0, trial[k])
     if k < options[HIGHEST] and depth > k:
-        above = STRICT * OTHER_ORDER * constants[k + 1] * _norm(tolerances, y, y1, d, -1.0, trial[k + 1])
+        above = ERROR_FACTOR * ORDER_FACTOR * constants[k + 1] * _norm(tolerances, y, y1, d, -1.0, trial[k + 1])
     memory[NEXT_ORDER] = k
     if not error <= 1.0:
         if below < here:
             memory[NEXT_ORDER] = k - 1
         return error, max(SAFETY * error ** (-1.0 / (k + 1)), LEAST_FACTOR)
-    factor = (BIAS * here) ** (-1.0 / (k + 1))
+    factor = (STEP_SIZE_FACTOR * here) ** (-1.0 / (k + 1))
     if memory[AGE] >= k:  # estimates for other orders require k + 1 steps at this order
-        lower, higher = (BIAS * below) ** (-1.0 / k), (BIAS * above) ** (-1.0 / (k + 2))
+        lower, higher = (STEP_SIZE_FACTOR * below) ** (-1.0 / k), (STEP_SIZE_FACTOR * above) ** (-1.0 / (k + 2))
         if lower > max(factor, higher):
             memory[NEXT_ORDER] = k - 1
         elif higher > factor:
@@ -238,7 +244,7 @@ def _choose_order(options, memory, tolerances, trial, y, y1, d):
 
 @compiled
 def _update_differences(memory, trial, y1, d):
-    """Replace the scaled differences in `trial` by those at the end of the step, (t + h, y1)."""
+    """Replace the scaled differences in `trial` by the differences at the end of the step, where the state is y1."""
     k = int(memory[ORDER])
     memory[NEXT_DEPTH] = k + 1
     if memory[DEPTH] > k and k < MAX_ORDER:
@@ -287,7 +293,7 @@ def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
 def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt a step: predict from the history, correct, and choose the order and the size of the next step.
 
-    Fixed steps have the order HIGHEST. As many Gauss steps precede them, to start the history.
+    Steps of fixed size have the order HIGHEST; before them, HIGHEST Gauss steps fill the history.
     """
     n = w.Q.size
     differences, trial, prediction, rate, scratch = _blocks(memory, n)

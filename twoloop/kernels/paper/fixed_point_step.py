@@ -1,4 +1,4 @@
-"""Implicit Runge-Kutta steps with a fixed-point iteration as outer loop: that of twoloop, and that of the paper."""
+"""Implicit Runge-Kutta steps with a fixed-point iteration as outer loop: twoloop's iteration, or the paper's."""
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from twoloop.kernels.steps.stages import (
 
 @kernel(SETTLE)
 def settle_runge_kutta(f, w, options, memory, tolerances, accepted):
-    """Store the stages of an accepted step, which predict those of the next step, and its rounding errors."""
+    """Store the stage accelerations of an accepted step, which predict the next step, and its rounding errors."""
     s, n = int(options[STAGES]), w.Q.size
     if accepted and memory[at.HAS_TRIAL] == 1.0:
         previous, trial = block(memory, s, n, at.PREVIOUS), block(memory, s, n, at.TRIAL)
@@ -45,11 +45,12 @@ def settle_runge_kutta(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step by fixed-point iteration; for the error estimate, take a step of h and two of h/2.
+    """Attempt a step by fixed-point iteration; to estimate its error, take a step of h and two steps of h/2.
 
     The result is the end of the second half step. With EXTRAPOLATION = 1 / (2^order - 1), it is extrapolated by means
     of the whole step, and projected onto the constraints. The polynomial through the stage accelerations of the last
-    accepted step predicts the stages of the whole step. These predict the stages of the half steps.
+    accepted step predicts the stages of the whole step. The polynomial of the whole step predicts those of the half
+    steps. With fixed step size, the result is the end of the whole step.
     """
     s, _, _, _, _, c = tableau_of(options)
     n = w.Q.size
@@ -109,14 +110,12 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
 RUNGE_KUTTA = Step(runge_kutta_step, settle_runge_kutta)
 
 
-# value of `end_error` times END_ERROR_WEIGHT above which a step is rejected; this test is not part of the paper's
-# procedure
-SUDDEN_ERROR = 10.0
+SUDDEN_ERROR = 10.0  # END_ERROR_WEIGHT times `end_error` above which `paper_step` rejects a step; not part of the paper
 
 
 @kernel(ATTEMPT)
 def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step as in Sects. 3.1-3.3: the error is the difference between a step of h and two steps of h/2."""
+    """Attempt a step as in Sects. 3.1-3.3 of the paper, with the error estimated from a step of h and two of h/2."""
     s, _, _, _, _, _ = tableau_of(options)
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]

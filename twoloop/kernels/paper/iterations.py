@@ -4,7 +4,7 @@
 `iterate_first_order` is the loop of the paper on y_i = [v_i, q_i]. Both are compiled as parts of the steps in
 fixed_point_step.py. Equation numbers refer to the paper.
 
-Richardson's estimate of the error is the difference between a step and two half steps. It also serves to extrapolate.
+Richardson's error estimate is the difference between a step and two half steps, which also allows extrapolation.
 """
 
 import numpy as np
@@ -16,12 +16,12 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, restore, rounding_fl
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TEST, OUTER_TOL, tableau_of
 
-# number of rows of REST, the rounding errors in the compensated sums of fixed steps: of q and v at the last accepted
-# step, then of q and v in this attempt. Without compensation, the energy of a symmetric method drifts with the number
-# of steps
+# number of rows of REST, the rounding errors in the compensated sums of steps of fixed size: of q and v at the last
+# accepted step, then of q and v in this attempt. Without compensation, the energy of a symmetric method drifts with the
+# number of steps
 N_RESTS = 4
 
-# indices in `memory` of scalars, of the stage blocks (s, n_q) after them, and of the vectors (n_q) after these
+# indices of the scalars, of the stage blocks (s, n_q), and of the vectors (n_q) in `memory`, in this order
 HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(5)
 PREVIOUS, TRIAL, HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, REST, N_VECTORS = (*range(8), 7 + N_RESTS)
@@ -34,62 +34,62 @@ def memory_size(s: int, n_q: int) -> int:
 
 @inlined
 def block(memory, s, n, which):
-    """Return a view (s, n) of block number `which`, such as PREVIOUS, of `memory`."""
+    """Return a view (s, n) of block `which`, such as PREVIOUS, of `memory`."""
     start = N_MEMORY_SCALARS + which * s * n
     return memory[start : start + s * n].reshape((s, n))
 
 
 @inlined
 def vector(memory, s, n, which):
-    """Return a view (n) of vector number `which`, such as Q_FULL, of `memory`."""
+    """Return a view (n) of vector `which`, such as Q_FULL, of `memory`."""
     start = N_MEMORY_SCALARS + N_BLOCKS * s * n + which * n
     return memory[start : start + n]
 
 
 @inlined
 def rests_of(memory, s, n, tolerances):
-    """Return a view (N_RESTS, n) of REST, or (0, n) under step-size control, where rounding errors do not matter."""
+    """Return a view (N_RESTS, n) of REST; (0, n) under step-size control, with which rounding errors do not matter."""
     start, count = N_MEMORY_SCALARS + (N_BLOCKS * s + REST) * n, N_RESTS if tolerances[ESTIMATE] == 0.0 else 0
     return memory[start : start + count * n].reshape((count, n))
 
 
 @merged
 def store_rest(rest):
-    """Copy the rounding errors of an accepted attempt to the rows of the last accepted step."""
+    """Copy the rows of `rest` for this attempt, which was accepted, to the rows for the last accepted step."""
     for i in range(rest.shape[0] // 2):
         copy(rest[rest.shape[0] // 2 + i], rest[i])
 
 
 MAX_ITERATIONS = 60  # number of iterations after which `iterate_accelerations` has failed
-MAX_ITERATIONS_PAPER = 200  # limit in `iterate_first_order`; in the paper there is none, but (33) ends divergent loops
-# ratio of a change to the first one above which the iteration diverges; smaller growth is possible, because the matrix
-# of the iteration is not normal
-GROWTH = 1e3
-PATIENCE = 8  # number of iterations after which a change larger than the previous one means divergence
+MAX_ITERATIONS_PAPER = 200  # limit in `iterate_first_order`; the paper has no limit, and ends divergent loops by (33)
+# ratio of a change to the first change above which the iteration counts as divergent; a smaller growth is possible in a
+# convergent iteration, because its matrix is not normal
+MAX_GROWTH = 1e3
+MIN_ITERATIONS = 8  # number of iterations after which a change larger than the previous one means divergence
 UNDECIDED, CONVERGED, DIVERGED = range(3)
 
 
 @merged
-def _judge(change, before, first, iteration, tolerance, q):
-    """Return UNDECIDED, CONVERGED or DIVERGED, from the last, the previous and the first change in the iteration.
+def _test_convergence(change, before, first, iteration, tolerance, q):
+    """Return UNDECIDED, CONVERGED or DIVERGED, from the latest, the previous and the first change in an iteration.
 
-    A change that does not decrease, and is not larger than rounding errors of q, means convergence.
+    Changes that no longer decrease, and are not larger than rounding errors of q, mean convergence.
     """
     if change <= tolerance:
         return CONVERGED
-    if not change <= GROWTH * first:
+    if not change <= MAX_GROWTH * first:
         return DIVERGED
     if change >= before:
         if change <= rounding_floor(q):
             return CONVERGED
-        if iteration >= PATIENCE:
+        if iteration >= MIN_ITERATIONS:
             return DIVERGED
     return UNDECIDED
 
 
 @exact
-def _compensated(x, rest, increment):
-    """Return x + rest + increment, and the rounding error of this sum (W. Kahan, Commun. ACM 8 (1965), 40)."""
+def _compensated_sum(x, rest, increment):
+    """Return x + (rest + increment), and the rounding error of this sum (W. Kahan, Commun. ACM 8 (1965), 40)."""
     increment += rest
     total = x + increment
     return total, increment - (total - x)
@@ -97,7 +97,7 @@ def _compensated(x, rest, increment):
 
 @merged
 def _clear_rests(coordinates, rest):
-    """Set the rounding errors of this attempt to zero for the given coordinates, which the constraints determine."""
+    """Set the rounding errors of this attempt to zero for `coordinates`, which the constraints determine."""
     for i in range(N_RESTS // 2, rest.shape[0]):
         for m in coordinates:
             rest[i, m] = 0.0
@@ -105,12 +105,12 @@ def _clear_rests(coordinates, rest):
 
 @compiled
 def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1, rest):
-    """Take a step of size h from (q, v) by a fixed-point iteration on the stage accelerations; return code, departure.
+    """Take a step of size h from (q, v) by fixed-point iteration on the stage accelerations; return code, departure.
 
-    A_stage (s, n) is the prediction of the accelerations on entry, and the result on return; (q1, v1) becomes the end
-    of the step, on the constraints. The stages Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk
-    a_k then satisfy (17). For undamped systems the rate of convergence is the square of that of the first-order
-    iteration. Sums are compensated if `rest` has rows. `departure` is explained in step_size.py.
+    A_stage (s, n) contains predicted accelerations on entry, and the solution on return; (q1, v1) becomes the end of
+    the step, on the constraints. The stages Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k
+    then satisfy (17). For undamped systems, the contraction per iteration is the square of that of the first-order
+    iteration. Sums are compensated if `rest` has rows. For the departure, see `departure` in step_size.py.
     """
     s, A, A2, b, bA, c = tableau_of(options)
     n = q.size
@@ -123,19 +123,19 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
             Q_stage[j, m] = q[m] + c[j] * h * v[m] + h * h * total
     first = 0.0
     before = np.inf
-    verdict = UNDECIDED
+    result = UNDECIDED
     for iteration in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1
         # all stages are computed before any is evaluated: in Gauss-Seidel order, convergence requires a smaller h
         for j in range(s):
             for m in w.independent:
-                in_q = 0.0
-                in_v = 0.0
+                sum_q = 0.0
+                sum_v = 0.0
                 for k in range(s):
-                    in_q += A2[j, k] * A_stage[k, m]
-                    in_v += A[j, k] * A_stage[k, m]
-                Q_stage[j, m] = q[m] + c[j] * h * v[m] + h * h * in_q
-                V_stage[j, m] = v[m] + h * in_v
+                    sum_q += A2[j, k] * A_stage[k, m]
+                    sum_v += A[j, k] * A_stage[k, m]
+                Q_stage[j, m] = q[m] + c[j] * h * v[m] + h * h * sum_q
+                V_stage[j, m] = v[m] + h * sum_v
         change = 0.0
         for j in range(s):
             code = evaluate(f, w, t + c[j] * h, Q_stage[j], V_stage[j], tolerance, q1)
@@ -148,31 +148,31 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
             copy(q1, A_stage[j])
         if iteration == 0:
             first = change
-        verdict = _judge(change, before, first, iteration, options[OUTER_TOL], q)
-        if verdict != UNDECIDED:
+        result = _test_convergence(change, before, first, iteration, options[OUTER_TOL], q)
+        if result != UNDECIDED:
             break
         before = change
-    if verdict != CONVERGED:
+    if result != CONVERGED:
         return OUTER_DIVERGED, 0.0
     for m in range(n):
-        in_q = 0.0
-        in_v = 0.0
+        sum_q = 0.0
+        sum_v = 0.0
         for k in range(s):
-            in_q += bA[k] * A_stage[k, m]
-            in_v += b[k] * A_stage[k, m]
+            sum_q += bA[k] * A_stage[k, m]
+            sum_v += b[k] * A_stage[k, m]
         if rest.shape[0] == 0:
-            q1[m] = q[m] + h * v[m] + h * h * in_q
-            v1[m] = v[m] + h * in_v
+            q1[m] = q[m] + h * v[m] + h * h * sum_q
+            v1[m] = v[m] + h * sum_v
         else:
-            q1[m], rest[2, m] = _compensated(q[m], rest[0, m], h * v[m] + h * h * in_q)
-            v1[m], rest[3, m] = _compensated(v[m], rest[1, m], h * in_v)
+            q1[m], rest[2, m] = _compensated_sum(q[m], rest[0, m], h * v[m] + h * h * sum_q)
+            v1[m], rest[3, m] = _compensated_sum(v[m], rest[1, m], h * sum_v)
     _clear_rests(w.dependent, rest)
     return project_prediction(f, w, tolerances, t + h, h, q, v, q1, v1, tolerance)
 
 
 @merged
 def _largest_change(coordinates, q, v, q_old, v_old):
-    """Return the largest change of the coordinates and their velocities, relative to max(1, |value|)."""
+    """Return the largest change of `coordinates` and their velocities, relative to max(1, |value|)."""
     change = 0.0
     for m in coordinates:
         change = max(change, abs(q[m] - q_old[m]) / max(abs(q[m]), 1.0))
@@ -185,8 +185,8 @@ def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage,
     """Take a step of size h by the paper's outer loop on y_i = [v_i, q_i]; return a code.
 
     The loop starts from an Euler step, and ends by the tests (32) and (33). `a` are the accelerations at (t, q, v). Row
-    j of A_stage and of V_stage is K_j = [a_j; v_j]. An iteration updates one stage after another with the latest K
-    (Gauss-Seidel). (q1, v1) becomes the end of the step, on the constraints.
+    j of A_stage and row j of V_stage are a_j and v_j in K_j = [a_j; v_j]. An iteration updates one stage after another
+    with the latest K (Gauss-Seidel). (q1, v1) becomes the end of the step, on the constraints.
     """
     s, A, _, b, _, c = tableau_of(options)
     n = q.size
@@ -206,26 +206,26 @@ def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage,
         w.counters[N_OUTER] += 1
         for j in range(s):
             for m in w.independent:
-                in_q = 0.0
-                in_v = 0.0
+                sum_q = 0.0
+                sum_v = 0.0
                 for k in range(s):
-                    in_q += A[j, k] * V_stage[k, m]
-                    in_v += A[j, k] * A_stage[k, m]
-                Q_stage[j, m] = q[m] + h * in_q
-                V_stage[j, m] = v[m] + h * in_v
+                    sum_q += A[j, k] * V_stage[k, m]
+                    sum_v += A[j, k] * A_stage[k, m]
+                Q_stage[j, m] = q[m] + h * sum_q
+                V_stage[j, m] = v[m] + h * sum_v
             code = evaluate(f, w, t + c[j] * h, Q_stage[j], V_stage[j], tolerance, A_stage[j])
             if code != DONE:
                 return code
         copy(q1, q_old)
         copy(v1, v_old)
         for m in w.independent:
-            in_q = 0.0
-            in_v = 0.0
+            sum_q = 0.0
+            sum_v = 0.0
             for k in range(s):
-                in_q += b[k] * V_stage[k, m]
-                in_v += b[k] * A_stage[k, m]
-            q1[m] = q[m] + h * in_q
-            v1[m] = v[m] + h * in_v
+                sum_q += b[k] * V_stage[k, m]
+                sum_v += b[k] * A_stage[k, m]
+            q1[m] = q[m] + h * sum_q
+            v1[m] = v[m] + h * sum_v
         code = restore(f, w, t + h, q1, v1, tolerance)
         if code != DONE:
             return code
@@ -246,32 +246,33 @@ def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage,
 
 @compiled
 def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
-    """Return the difference between a step and two half steps over the tolerances (26), in positions and velocities.
+    """Return the difference between a step and two half steps, in units of the tolerances (26).
 
-    If `largest`, return its largest component, otherwise the root mean square (27).
+    The result is the largest component for positions and velocities if `largest`, otherwise the root mean square (27).
     """
     rtol = tolerances[RTOL]
     total = 0.0
-    top = 0.0
+    largest_component = 0.0
     for m in range(q.size):
         atol = tolerances[ATOL + m]
-        in_q = (q_full[m] - q1[m]) / (atol + rtol * max(abs(q[m]), abs(q_full[m])))
-        in_v = (v_full[m] - v1[m]) / (atol + rtol * max(abs(v[m]), abs(v_full[m])))
-        total += in_q * in_q + in_v * in_v
-        top = max(top, abs(in_q), abs(in_v))
-    return top if largest else np.sqrt(total / (2 * q.size))
+        sum_q = (q_full[m] - q1[m]) / (atol + rtol * max(abs(q[m]), abs(q_full[m])))
+        sum_v = (v_full[m] - v1[m]) / (atol + rtol * max(abs(v[m]), abs(v_full[m])))
+        total += sum_q * sum_q + sum_v * sum_v
+        largest_component = max(largest_component, abs(sum_q), abs(sum_v))
+    return largest_component if largest else np.sqrt(total / (2 * q.size))
 
 
 @compiled
-def estimate_and_extrapolate(f, w, share, inner_tol, t, tolerances, q, v, q_full, v_full, q1, v1):
-    """Return a code and the error; if `share` > 0, also extrapolate (q1, v1).
+def estimate_and_extrapolate(f, w, factor, inner_tol, t, tolerances, q, v, q_full, v_full, q1, v1):
+    """Return a code and the error of Richardson's estimate; if `factor` > 0, also extrapolate (q1, v1).
 
-    (q1, v1) is the end of two half steps, (q_full, v_full) that of a step; `share` is 1 / (2^order - 1).
+    (q1, v1) is the end of two half steps, (q_full, v_full) the end of a whole step. `factor` is 1 / (2^order - 1), or 0
+    for no extrapolation.
     """
-    error = _richardson_error(tolerances, share > 0.0, q, v, q_full, v_full, q1, v1)
-    if not (share > 0.0 and error <= 1.0):
+    error = _richardson_error(tolerances, factor > 0.0, q, v, q_full, v_full, q1, v1)
+    if not (factor > 0.0 and error <= 1.0):
         return DONE, error
     for m in range(q.size):
-        q1[m] += share * (q1[m] - q_full[m])
-        v1[m] += share * (v1[m] - v_full[m])
+        q1[m] += factor * (q1[m] - q_full[m])
+        v1[m] += factor * (v1[m] - v_full[m])
     return restore(f, w, t, q1, v1, inner_tol), error
