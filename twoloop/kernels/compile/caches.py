@@ -1,8 +1,8 @@
 """Cache machine code on disk: where it is stored, when it is out of date, and what happens if it cannot be stored.
 
-Numba's own cache has three shortcomings. It notices changes only of the file in which a function is defined, not of
-helpers in other files or of the values of globals, which numba freezes. It raises an error if no folder can be written
-or if a file is damaged. And it runs code that other users have put into its folder.
+Numba's own cache has three shortcomings. It notices changes of the file in which a function is defined, but not changes
+of helpers in other files or of the values of globals, which numba freezes. It raises an error if no folder can be
+written or if a file is damaged. And it runs code that other users have put into its folder.
 
 Here each function and key has its own file with a checksum. Code is loaded only from files and folders that belong to
 the user or root, and that no other user can write, as SSH requires of its keys: whoever can write or replace a file of
@@ -79,10 +79,10 @@ def make_trusted_folder(folder: Path) -> None:
 
 @cache
 def trusted_folder(folder: Path) -> Path:
-    """Return the folder if no other user can write it or the folders above it; otherwise, return a replacement.
+    """Return `folder` if no other user can write this folder or a folder above it; otherwise, return a replacement.
 
-    The replacement is in the user's cache folder. If others can write this folder, too, it is a temporary folder of
-    this process.
+    The replacement is in the user's cache folder. If other users can write the cache folder, too, the replacement is in
+    a temporary folder of this process.
     """
     reason = reason_to_distrust(folder)
     if not reason:
@@ -96,7 +96,7 @@ def trusted_folder(folder: Path) -> Path:
 
 
 def reason_to_distrust(folder: Path) -> str:
-    """Return why another user could have written a folder or a folder above it, or "" if nobody could."""
+    """Return why another user could have written to a folder or a folder above it, or "" if nobody could."""
     if os.name != "posix":  # on other systems, the mode does not contain the access rights
         return ""
     real = Path(os.path.realpath(folder))
@@ -129,13 +129,13 @@ def _reason_of_mode(status: os.stat_result) -> str:
 
 
 def _reason_of_owner(status: os.stat_result) -> str:
-    """Return that a file or folder belongs to another user, or "" if it belongs to the user or root."""
+    """Return the text that a file or folder belongs to another user, or "" if it belongs to the user or root."""
     return "" if status.st_uid in (0, os.geteuid()) else f"belongs to user {status.st_uid}"
 
 
 @cache
 def _is_private_group(gid: int) -> bool:
-    """Return whether only the user and root belong to a group: that of root, or the user's own one."""
+    """Return whether a group is root's or the user's own, and has no other members than root and the user."""
     import grp  # not available on Windows
     import pwd
 
@@ -161,7 +161,7 @@ _warnings: list[str] = []
 
 
 def _warn_first(text: str) -> None:
-    """Print a warning on stderr, unless this process has printed one before."""
+    """Print a warning on stderr if it is the first warning of this process about files of other users."""
     if not _warnings:
         _warnings.append(text)
         print(text, file=sys.stderr, flush=True)
@@ -172,10 +172,11 @@ CHECKSUM = hashlib.sha256().digest_size  # length of the checksum at the beginni
 
 
 class CodeFiles:
-    """Store the machine code of a function, in a file with a checksum for each key, which only the user can write.
+    """Store the machine code of a function on disk, in one file with a checksum for each key.
 
-    A file that is damaged or out of date counts as missing. Numba's own cache has an index, which may assign the
-    machine code of one function to another if two processes write at the same time; here there is none.
+    Only the user can write these files. A file that is damaged or out of date counts as missing. There is no index, as
+    in numba's own cache, which may assign the machine code of one function to another if two processes write at the
+    same time.
     """
 
     def __init__(self, folder: Path, name: str, stamp: Any, limited: bool = False):
@@ -183,7 +184,7 @@ class CodeFiles:
         self.made_of = numba.__version__, stamp
 
     def save(self, key: Any, data: Any) -> None:
-        """Write the data for a key, and replace the previous file."""
+        """Write the data for a key to its file, which replaces the previous file for this key."""
         content = pickle.dumps((repr((*self.made_of, key)), dumps(data)))
         path = self._path(key)
         unfinished = path.with_suffix(f".{uuid.uuid4().hex}")
@@ -239,7 +240,7 @@ UNWRITABLE = (
     "that only you can write"
 )
 MAX_IN_MEMORY = 50  # largest number of entries of a BoundedCache, in memory
-# the class has a private name in numba 0.61
+# numba's class that finds the cache folder in NUMBA_CACHE_DIR; it has a private name in numba 0.61
 _LOCATOR: Any = vars(caching).get("UserProvidedCacheLocator") or vars(caching)["_UserProvidedCacheLocator"]
 
 
@@ -260,9 +261,9 @@ def compile_cached(
     signature : numba signature
         Its only signature.
     watched : (str, str) or None
-        Digests of all on which the machine code depends, see `digests_of`. Machine code with another first digest is
-        out of date; the second digest is the key of a file, because functions with the same source may have other
-        closure variables. None: the machine code is not stored.
+        Digests of everything on which the machine code depends, see `digests_of`. A file with another first digest is
+        out of date. The second digest is part of the key of a file, because functions with the same source may have
+        different closure variables. None: the machine code is not stored.
     announcement : str
         Text printed on stderr before the first compilation of this process.
     **options
@@ -296,10 +297,10 @@ def garbage_collection_off() -> Iterator[None]:
 
 
 class BoundedCache(dict[Any, Any]):
-    """Cache the newest MAX_IN_MEMORY entries: each entry is for one mechanism, and a sweep adds one for each run."""
+    """Dictionary of at most MAX_IN_MEMORY entries, the newest: a parameter sweep adds an entry for each run."""
 
-    def __setitem__(self, key: Any, made: Any) -> None:
-        super().__setitem__(key, made)
+    def __setitem__(self, key: Any, value: Any) -> None:
+        super().__setitem__(key, value)
         for old in list(self)[:-MAX_IN_MEMORY]:
             self.pop(old, None)
 
@@ -329,9 +330,9 @@ def cache_folder(package: types.ModuleType) -> Path | None:
 def with_unique_name(function: Callable[..., Any], watched: tuple[str, str] | None) -> Callable[..., Any]:
     """Return a copy of a nested function or lambda with a unique name; return any other function unchanged.
 
-    Numba's symbols consist of the qualified name of a function and a number that counts within a process. If machine
-    code of two closures with the same name comes from different processes, they may have the same symbol: then both run
-    the code that was loaded first.
+    Numba's symbols consist of the qualified name of a function and the number of functions compiled so far in the
+    process. If two closures with the same name are compiled by different processes, their symbols may be equal: then
+    both run the code that is loaded first.
     """
     if watched is None or "<" not in function.__qualname__:
         return function
@@ -346,13 +347,13 @@ def with_unique_name(function: Callable[..., Any], watched: tuple[str, str] | No
 
 
 class _Cache(FunctionCache):
-    """Numba's cache of a function, with the digests and files of twoloop; an error costs time, but is never raised."""
+    """Numba's cache of a function, with the digests and files of twoloop; after an error, the function is compiled."""
 
     def __init__(self, function: Callable[..., Any], stamp: str, key: str, announcement: str):
-        chosen: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
-        if chosen:  # numba would create the folder with access rights that depend on the umask
+        cache_dir: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
+        if cache_dir:  # numba would create the folder with access rights that depend on the umask
             with suppress(OSError):
-                make_trusted_folder(Path(chosen, _LOCATOR.get_suitable_cache_subpath(inspect.getfile(function))))
+                make_trusted_folder(Path(cache_dir, _LOCATOR.get_suitable_cache_subpath(inspect.getfile(function))))
         super().__init__(function)
         source = self._cache_file._source_stamp
         folder = trusted_folder(Path(self._cache_path))
@@ -361,18 +362,18 @@ class _Cache(FunctionCache):
         self._key, self._announcement = key, announcement
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
-        """Return the key of a file: signature, processor and second digest."""
+        """Return the key of the file for a signature: the signature, the processor and the second digest."""
         return sig, codegen.magic_tuple(), self._key
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the machine code for a signature, or None if it has to be compiled."""
         try:
-            found = super().load_overload(sig, target_context)
-        except Exception:  # an incompatible file, of another installation: compile, and overwrite it
-            found = None
-        if found is None and self._announcement:
+            loaded = super().load_overload(sig, target_context)
+        except Exception:  # an incompatible file from another installation: it is overwritten after the compilation
+            loaded = None
+        if loaded is None and self._announcement:
             warn_once(self._announcement)
-        return found
+        return loaded
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Store machine code, or warn that this is impossible."""
@@ -385,10 +386,10 @@ class _Cache(FunctionCache):
 def sources_folder() -> Path:
     """Return the folder of generated code: in NUMBA_CACHE_DIR if this is set, otherwise in the user's cache folder.
 
-    If other users can write this folder, return its replacement, see `trusted_folder`.
+    If other users can write this folder, return a replacement, see `trusted_folder`.
     """
-    chosen: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
-    folder = chosen or AppDirs(appname="twoloop", appauthor=False).user_cache_dir
+    cache_dir: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
+    folder = cache_dir or AppDirs(appname="twoloop", appauthor=False).user_cache_dir
     return trusted_folder(Path(folder) / "equations")
 
 
@@ -405,7 +406,7 @@ def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispa
         watched = digests_of(function)
         dispatcher = njit(**options)(with_unique_name(function, watched))
         if watched is not None:
-            # so that a callback that uses this function as a closure variable does not compile it again
+            # a callback that uses this function as a closure variable must not compile it again
             _COMPILED_DIGESTS[dispatcher] = watched
             with suppress(RuntimeError):  # no folder can be written
                 dispatcher._cache = _Cache(dispatcher.py_func, *watched, "")
@@ -415,11 +416,12 @@ def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispa
 
 
 def digests_of(function: Callable[..., Any]) -> tuple[str, str] | None:
-    """Return two digests for the machine code of a function, the second of its closure variables.
+    """Return two digests of everything on which the machine code of a function depends; replace its helpers' caches.
 
-    The first digest is of its code, its defaults, and the globals and attributes of modules that it uses. For compiled
-    helpers among these values, their own values are hashed, too. Returns None if a value may change without a change of
-    the digest. The helpers get the cache of twoloop.
+    The first digest is that of its code, defaults, globals, and the attributes that it uses of modules. The second
+    digest is that of its closure variables. For a compiled helper among these values, the values that the helper uses
+    are hashed, too; numba's cache of the helper is replaced by that of twoloop. Returns None if a value may change
+    without a change of the digest.
     """
     watched, helpers = _digests_and_helpers(function)
     for each in helpers:
@@ -428,23 +430,23 @@ def digests_of(function: Callable[..., Any]) -> tuple[str, str] | None:
 
 
 def _digests_and_helpers(function: Callable[..., Any]) -> tuple[tuple[str, str] | None, list[Any]]:
-    """Return the digests of `digests_of`, and all compiled helpers, each after the helpers that it calls itself."""
-    code, enclosed = Digest(), Digest()
-    enclosed.names = reachable_names(function)  # names of the attributes that the function may use of modules
+    """Return the digests of `digests_of`, and the compiled helpers; each helper follows the helpers that it calls."""
+    code, closure = Digest(), Digest()
+    closure.names = reachable_names(function)  # names of the attributes that the function may use of modules
     try:
         code.add_function(function, enclosed=False)
-        enclosed.add(closure_values(function))
-        watched = code.hash.hexdigest(), enclosed.hash.hexdigest()
+        closure.add(closure_values(function))
+        watched = code.hash.hexdigest(), closure.hash.hexdigest()
     except NotDigestible:
         watched = None
-    return watched, [*code.helpers, *enclosed.helpers]
+    return watched, [*code.helpers, *closure.helpers]
 
 
 def helper(function: Callable[..., Any]) -> Any:
     """Decorate a function that compiled callbacks call, like numba's `njit` with the cache of twoloop.
 
-    The function must not allocate arrays. So it does not need numba's runtime, whose reference counts would take longer
-    than the computation of a row of C_q.
+    The function must not allocate arrays, so that it does not need numba's runtime, whose reference counts would take
+    longer than the computation of a row of C_q.
     """
     options: dict[str, Any] = {"_nrt": False, "error_model": "numpy"}
     dispatcher = njit(**options)(function)
@@ -461,14 +463,14 @@ def _use_twoloop_cache(helper: Any) -> None:
     """Replace numba's cache of a helper by that of twoloop, and recompile the helper if its digests have changed.
 
     Numba's cache does not notice changes of functions in other files that the helper calls. Functions compiled later
-    use the helper as numba first compiled or loaded it, which may have been before the first call of this function.
+    use the code of the helper that numba compiled or loaded first, perhaps before the first call of this function.
     """
-    watched, known = _digests_and_helpers(getattr(helper, "py_func", helper))[0], _COMPILED_DIGESTS.get(helper)
-    changed = known is not None and known != watched
+    watched, compiled = _digests_and_helpers(getattr(helper, "py_func", helper))[0], _COMPILED_DIGESTS.get(helper)
+    changed = compiled is not None and compiled != watched
     if watched is not None:
         _COMPILED_DIGESTS[helper] = watched
     if jitable_templates(helper):
-        if changed or known is None:
+        if changed or compiled is None:
             forget_compiled(helper)
         return
     if isinstance(helper._cache, FunctionCache) and (changed or not isinstance(helper._cache, _Cache)):
@@ -476,5 +478,5 @@ def _use_twoloop_cache(helper: Any) -> None:
             helper._cache = NullCache() if watched is None else _Cache(helper.py_func, *watched, "")
         except RuntimeError:
             helper._cache = NullCache()
-    if helper.overloads and (changed or (known is None and (helper._can_compile or helper.stats.cache_hits))):
+    if helper.overloads and (changed or (compiled is None and (helper._can_compile or helper.stats.cache_hits))):
         helper.recompile()

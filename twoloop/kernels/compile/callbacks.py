@@ -5,8 +5,8 @@ All kinds are defined in the table `KINDS`. Its entries determine the signature 
 functions.
 
 If a function computes indices, for example into a table, all its indices are checked in every call. Otherwise machine
-code might read memory beyond the end of an array, or crash the process. Functions with constant indices and loop
-counters only are not checked: their first call shows whether these indices are valid.
+code might read memory beyond the end of an array, or crash the process. A function whose indices are constants or loop
+counters is not checked: its first call shows whether the indices are valid.
 """
 
 import ast
@@ -34,30 +34,33 @@ from twoloop.kernels.compile.dependencies import (
 )
 from twoloop.kernels.compile.linking import add_signature, options_of
 
-BOUNDS_CHECK = {"boundscheck": True}  # option of numba
-# built-in functions whose result is a constant or loop counter if their arguments are
+BOUNDS_CHECK = {"boundscheck": True}  # numba's option to check all indices
+# built-in functions whose result counts as a constant or loop counter if all arguments are constants or loop counters
 SAFE_CALLS = ("len", "min", "max", "abs", "range", "enumerate", "zip", "reversed")
 
 
 def with_bounds_checks(function: Callable[..., Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
-    """Return a function, or its copy with bounds-checked helpers, and numba's options that check its own indices."""
+    """Return the function to compile instead of `function`, with the options of numba that check its indices.
+
+    It is `function` itself, or a copy that calls bounds-checked copies of its helpers if a helper computes indices.
+    """
     helpers = [helper for place in frozen_locations(function) if (helper := python_function(place.value)) is not None]
     if any(map(has_computed_indices, helpers)):
-        return FunctionCopier(_with_bounds_checks).copy_of(function), BOUNDS_CHECK
+        return FunctionCopier(_compile_with_bounds_checks).copy_of(function), BOUNDS_CHECK
     return function, BOUNDS_CHECK if has_computed_indices(function) else {}
 
 
-def _with_bounds_checks(copy: Any, original: Any) -> Any:
-    """Compile the copy of a helper with bounds checks; return other functions unchanged."""
+def _compile_with_bounds_checks(copy: Any, original: Any) -> Any:
+    """Compile `copy` with bounds checks if `original` is a compiled helper; otherwise, return `copy`."""
     helper = python_function(original)
     if helper is None:
         return copy
-    copy.__qualname__ = f"{helper.__qualname__}.watched"  # a different name in numba's symbols
+    copy.__qualname__ = f"{helper.__qualname__}.watched"  # so that numba's symbols differ from those of the helper
     return jit(**{**options_of(original), **BOUNDS_CHECK})(with_unique_name(copy, digests_of(helper)))
 
 
 def has_computed_indices(function: Callable[..., Any]) -> bool:
-    """Return whether an index in a function may be other than a constant or a loop counter; True without its source."""
+    """Return whether a function may have an index that is no constant or loop counter; True if it has no source."""
     if is_twoloop(function.__module__ or "") or is_library(function.__module__ or ""):
         return False
     try:
@@ -65,11 +68,11 @@ def has_computed_indices(function: Callable[..., Any]) -> bool:
     except (OSError, TypeError, SyntaxError):  # typed at a prompt, or only part of a statement
         return True
     computed = _computed_names(tree)
-    return any(not _is_safe(node.slice, computed) for node in ast.walk(tree) if isinstance(node, ast.Subscript))
+    return any(not _is_safe_index(node.slice, computed) for node in ast.walk(tree) if isinstance(node, ast.Subscript))
 
 
 def _computed_names(tree: ast.AST) -> set[str]:
-    """Return the names whose values may be other than constants and loop counters."""
+    """Return the names in a function whose values may be other than constants, loop counters and array sizes."""
     computed = {node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)}
     while True:
         before = len(computed)
@@ -82,39 +85,39 @@ def _computed_names(tree: ast.AST) -> set[str]:
                 targets, value = [node.target], None
             else:
                 continue
-            if value is None or not _is_safe(value, computed):
+            if value is None or not _is_safe_index(value, computed):
                 names = [node for target in targets for node in ast.walk(target) if isinstance(node, ast.Name)]
                 computed |= {name.id for name in names if isinstance(name.ctx, ast.Store)}
         if len(computed) == before:
             return computed
 
 
-def _is_safe(node: ast.AST | None, computed: set[str]) -> bool:
+def _is_safe_index(node: ast.AST | None, computed: set[str]) -> bool:
     """Return whether an expression contains only constants, loop counters and sizes of arrays."""
     if node is None or isinstance(node, ast.Constant):
         return True
     if isinstance(node, ast.Name):
         return node.id not in computed
     if isinstance(node, ast.Attribute):
-        return node.attr in ("size", "shape", "ndim") or _is_safe(node.value, computed)
+        return node.attr in ("size", "shape", "ndim") or _is_safe_index(node.value, computed)
     if isinstance(node, ast.Call):
-        named = isinstance(node.func, ast.Name) and node.func.id in SAFE_CALLS
-        sized = isinstance(node.func, ast.Name) and node.func.id == "len"
-        return named and (sized or all(_is_safe(each, computed) for each in node.args))
+        is_listed = isinstance(node.func, ast.Name) and node.func.id in SAFE_CALLS
+        is_len = isinstance(node.func, ast.Name) and node.func.id == "len"
+        return is_listed and (is_len or all(_is_safe_index(each, computed) for each in node.args))
     if isinstance(node, ast.Subscript):
-        return _is_safe(node.value, computed) and _is_safe(node.slice, computed)
+        return _is_safe_index(node.value, computed) and _is_safe_index(node.slice, computed)
     if isinstance(node, ast.BinOp | ast.UnaryOp | ast.Tuple | ast.List | ast.Slice):
-        kept = (ast.operator, ast.unaryop, ast.expr_context)
-        return all(_is_safe(each, computed) for each in ast.iter_child_nodes(node) if not isinstance(each, kept))
+        skip = (ast.operator, ast.unaryop, ast.expr_context)
+        return all(_is_safe_index(each, computed) for each in ast.iter_child_nodes(node) if not isinstance(each, skip))
     return False
 
 
 f8 = numba.types.float64
 VECTOR = numba.types.float64[::1]
-READ = numba.types.Array(f8, 1, "C", readonly=True)  # has the layout of VECTOR in memory
+READ = numba.types.Array(f8, 1, "C", readonly=True)  # type of a read-only vector, with the memory layout of VECTOR
 MATRIX = numba.types.float64[:, ::1]
 
-# sizes of the arguments of callbacks other than t and p; lam are the multipliers of C, without those of A
+# sizes of the vectors among the arguments of callbacks, other than p; lam are the multipliers of C, not those of A
 STATE = {"q": "n_q", "v": "n_q", "lam": "n_c"}
 
 
@@ -125,21 +128,21 @@ class Kind:
     Attributes
     ----------
     state : tuple of str
-        Arguments other than t and p, keys of `STATE`.
+        Arguments between t and p, keys of `STATE`.
     output : str
         Name of the array that the callback fills.
     shape : tuple of str
-        Sizes of that array: attributes of a system.
+        Sizes of this array, as names of attributes of a system, such as "n_q".
     meaning : str
         Meaning of the output in a few words, for messages.
     note : str
         Remarks for the documentation.
     absent : str
-        Replacement if the callback is not given. "": none, it must be given; "zeros": a callback that leaves zeros;
-        "differences": a callback that computes differences of C, see `jacobian.py`; "kernels": none, because the
-        kernels compute differences themselves.
+        Replacement if the callback is not given. "": no replacement, because the callback must be given; "zeros": a
+        callback that changes nothing; "differences": a callback that computes differences of C, see `jacobian.py`;
+        "kernels": no replacement, because the kernels compute differences themselves.
     needed_by : str
-        Size of the system, "n_c" or "n_a"; the callback must be given if this is above zero.
+        Name of a size of the system, "n_c" or "n_a"; the callback must be given if this size is above zero.
     more : tuple
         Names and shapes of further arrays that the callback fills. Such a callback must be compiled.
     """
@@ -178,10 +181,10 @@ class Kind:
         """Return the signature that numba compiles, in which all arrays except for the outputs are read-only."""
         return self._signature(READ)
 
-    def _signature(self, given: Any) -> Any:
-        """Return the signature in which all arrays except for the outputs have the type `given`."""
+    def _signature(self, input_type: Any) -> Any:
+        """Return the signature in which all arrays except for the outputs have the type `input_type`."""
         filled = [VECTOR if len(shape) == 1 else MATRIX for _, shape in self.outputs]
-        return numba.types.void(f8, *[given] * len(self.state), given, *filled)
+        return numba.types.void(f8, *[input_type] * len(self.state), input_type, *filled)
 
     @property
     def size(self) -> str:
@@ -382,8 +385,8 @@ def compile_callback(
 ) -> Dispatcher:
     """Compile a function that fills its arrays in place as a callback; raise TypeError if it cannot be compiled.
 
-    `watched`: see `compile_cached`; `named`: function to name in the message, by default `function`; `allocates`: see
-    `callback`.
+    `watched`: see `compile_cached`; `named`: function whose name is in the error message, by default `function`;
+    `allocates`: see `callback`.
     """
     compiled, more = with_bounds_checks(function)
     options = {**_OPTIONS, **more} if allocates else {**_OPTIONS, **more, "_nrt": False}
@@ -396,7 +399,7 @@ def compile_callback(
     else:
         add_signature(dispatcher, KINDS[kind].signature)
     if watched is not None:
-        # register the digest of this compilation, because values that the function uses may change later
+        # register the digest now, because values that the function uses may change after its compilation
         register_digest(dispatcher, f"{kind} {watched}")
     frozen_values(dispatcher, function)
     return dispatcher
@@ -410,12 +413,15 @@ def _compile_writable(
     error: Exception,
     options: dict[str, Any],
 ) -> Dispatcher:
-    """Compile a function whose helpers require writable arrays; raise TypeError if it writes to its own arguments."""
+    """Compile a function whose helpers require writable arrays; raise TypeError if it writes to its inputs.
+
+    `error` is the error of the compilation with read-only inputs.
+    """
     try:
         dispatcher = compile_cached(function, KINDS[kind].signature, watched, **options)
     except Exception as second_error:
         raise TypeError(_failure_message(kind, named, second_error)) from None
-    if _ONLY_A_HELPER.search(plain := _without_colours(error)) and "setitem" not in plain:
+    if _HELPER_REJECTS_READ_ONLY.search(plain := _without_colours(error)) and "setitem" not in plain:
         return dispatcher
     raise TypeError(
         f"{kind}: the function {_describe(named)} must not change the arrays that it is given "
@@ -424,29 +430,29 @@ def _compile_writable(
     ) from None
 
 
-# message of numba if a helper does not accept read-only arrays
-_ONLY_A_HELPER = re.compile(r"Invalid use of type\(CPUDispatcher\(")
+# part of numba's message if a helper does not accept read-only arrays
+_HELPER_REJECTS_READ_ONLY = re.compile(r"Invalid use of type\(CPUDispatcher\(")
 
 
 @cache
 def zero_callback(kind: str) -> Dispatcher:
-    """Compile the replacement of an optional callback that is missing: it leaves its outputs at zero."""
+    """Return a compiled callback that leaves its outputs at zero, the replacement of a missing optional callback."""
 
-    def leaves_zeros(t, q, p, out):
+    def leave_zeros(t, q, p, out):
         pass
 
-    def leaves_zeros_3(t, q, x, p, out):
+    def leave_zeros_3(t, q, x, p, out):
         pass
 
-    def leaves_zeros_4(t, q, v, p, C, Cq, Ct, Qd):
+    def leave_zeros_4(t, q, v, p, C, Cq, Ct, Qd):
         pass
 
-    function = leaves_zeros if len(KINDS[kind].state) == 1 else leaves_zeros_4 if KINDS[kind].more else leaves_zeros_3
+    function = leave_zeros if len(KINDS[kind].state) == 1 else leave_zeros_4 if KINDS[kind].more else leave_zeros_3
     return compile_callback(kind, function, ("leaves zeros", ""))
 
 
 def _failure_message(kind: str, function: Callable[..., Any], error: Exception) -> str:
-    """Return the message for a function that numba cannot compile, with a line of numba's message."""
+    """Return the error message for a function that numba cannot compile, with one line of numba's own message."""
     return (
         f"{kind}: numba cannot compile the function {_describe(function)}; it must use numbers, numpy arrays of one "
         f"type and of the shape that {kind} asks for, and functions that numba knows (helpers need numba.njit)\n"
@@ -460,7 +466,8 @@ def _describe(function: Callable[..., Any]) -> str:
     return f"{name!r} ({code.co_filename}, line {code.co_firstlineno})" if code else repr(name)
 
 
-_SOURCE = re.compile(r"^File \".*?^[ ]*\^$", re.MULTILINE | re.DOTALL)  # numba's excerpt of a file, down to a mark ^
+# numba's excerpt of a source file, down to a mark ^
+_EXCERPT = re.compile(r"^File \".*?^[ ]*\^$", re.MULTILINE | re.DOTALL)
 # beginnings of lines of numba's messages that only refer to other lines
 _UNINFORMATIVE = re.compile(
     r"Failed in |- Resolution failure|During: |File \"|>>> |There (is|are) \d+ candidate|- Of which|Overload (in|of) |"
@@ -476,7 +483,7 @@ def _without_colours(error: Exception) -> str:
 def _informative_line(error: Exception) -> str:
     """Return the type of an error, and the last line of numba's message that gives a reason."""
     plain = _without_colours(error)
-    plain = re.sub(r":\s*>>> ", ": ", _SOURCE.sub("", plain))  # >>> marks a signature without a match
+    plain = re.sub(r":\s*>>> ", ": ", _EXCERPT.sub("", plain))  # >>> marks a signature without a match
     lines = [line.strip() for line in plain.splitlines() if line and not line.startswith("    ")]
     informative = [line for line in lines if line and not _UNINFORMATIVE.match(line) and not line.startswith("def ")]
     return f"{type(error).__name__}: {informative[-1] if informative else plain.strip()[:200]}"

@@ -24,13 +24,13 @@ from numba.core.types import Type
 
 from twoloop.kernels.compile.linking import Dispatcher, jitable_templates, options_of
 
-# libraries whose functions are identified by their names; the versions of numba and numpy are compared, too
+# libraries whose functions are hashed by name only, because keys also contain the versions of numba and numpy
 LIBRARIES = {*sys.stdlib_module_names, "numpy", "numba", "scipy"}
 
-# number of code objects whose names are cached: each run creates new functions with the same code, and reading the
-# instructions of helpers each time would take most of the time of tracing
+# largest number of code objects for which `_loaded_names` caches its result: runs create new functions with the same
+# code, and reading their instructions again would take most of the time of tracing
 MAX_CODES = 2000
-FORM = 2  # version of the digests: increase it if machine code cached by earlier versions may be wrong
+DIGEST_VERSION = 2  # part of all digests: increase it if machine code cached by earlier versions may be wrong
 
 
 def digest_of(text: str, *sources: str | types.ModuleType) -> str:
@@ -41,7 +41,7 @@ def digest_of(text: str, *sources: str | types.ModuleType) -> str:
     return digest.hexdigest()
 
 
-_DIGEST_TEXTS: WeakKeyDictionary[Dispatcher, str] = WeakKeyDictionary()  # texts of `register_digest`
+_DIGEST_TEXTS: WeakKeyDictionary[Dispatcher, str] = WeakKeyDictionary()  # texts registered by `register_digest`
 
 
 def register_digest(callback: Dispatcher, text: str) -> None:
@@ -59,12 +59,12 @@ class NotDigestible(Exception):
 
 
 class Digest:
-    """Hash values of many types, and for functions, all values that they use."""
+    """Hash values of many types; for a function, hash all values that it uses."""
 
     def __init__(self) -> None:
-        self.hash = hashlib.sha256(f"{FORM} {np.__version__}".encode())
-        self.names: set[str] = set()  # names of attributes that the present function may use of a module
-        self.seen: dict[tuple[int, str], int] = {}  # numbers of the values added so far, by id and name
+        self.hash = hashlib.sha256(f"{DIGEST_VERSION} {np.__version__}".encode())
+        self.names: set[str] = set()  # names of attributes of modules that the function being added may use
+        self.seen: dict[tuple[int, str], int] = {}  # position of each value added so far, by its id and name
         self.helpers: list[Any] = []  # compiled helpers added so far, each after the helpers that it calls
 
     def add(self, value: Any) -> None:
@@ -116,7 +116,7 @@ class Digest:
                 self.helpers.append(helper)
 
     def _add_module(self, module: types.ModuleType) -> None:
-        """Add the name of a module, and unless it is a library, the attributes that the present function may use."""
+        """Add the name of a module; unless it is a library, also add its attributes that are listed in `names`."""
         self.hash.update(module.__name__.encode())
         if not is_library(module.__name__):
             for name in sorted(self.names & set(vars(module))):
@@ -136,7 +136,7 @@ class Digest:
         self.hash.update(f"{module}.{name}".encode())
 
     def _is_new(self, value: Any, name: str = "") -> bool:
-        """Return whether a value is new, and register it; if it is not, add its number to the hash."""
+        """Register a new value and return True; for a registered value, add its position to the hash, return False."""
         key = (id(value), name)
         if key in self.seen:
             self.hash.update(f"<again {self.seen[key]}>".encode())
@@ -146,19 +146,19 @@ class Digest:
 
 
 def names_of_code(code: types.CodeType) -> set[str]:
-    """Return the names of all globals and attributes in a code object, including functions within it."""
+    """Return the names of all globals and attributes that a code object and the functions within it use."""
     inner = [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
     return set(code.co_names).union(*map(names_of_code, inner))
 
 
 def globals_of(function: Any) -> dict[str, Any]:
-    """Return the globals that a function and functions within it load, by name; of `math.log` this is `math` only."""
+    """Return the globals that a function and functions within it load, by name; for `math.log`, this is `math`."""
     names = {each.name for each in _loaded_names(function.__code__) if not each.free} & set(function.__globals__)
     return {name: function.__globals__[name] for name in sorted(names)}
 
 
 def reachable_names(function: Any, seen: set[int] | None = None) -> set[str]:
-    """Return the names used in a function and in its compiled helpers, such as those of attributes of modules."""
+    """Return the names of all globals and attributes that a function and its compiled helpers use."""
     seen = set() if seen is None else seen
     seen.add(id(function))
     names = names_of_code(function.__code__)
@@ -176,7 +176,7 @@ def is_library(module: str) -> bool:
 
 
 def is_twoloop(module: str) -> bool:
-    """Return whether a module is part of twoloop or generated: names in it are constant, and indices are valid."""
+    """Return whether a module is part of twoloop or generated, so that its globals are constant and indices valid."""
     return f"{module}.".startswith(("twoloop.", "twoloop_equations_"))
 
 
@@ -184,7 +184,7 @@ def is_twoloop(module: str) -> bool:
 LOADS_GLOBAL = ("LOAD_GLOBAL", "LOAD_NAME")
 LOADS_ATTRIBUTE = ("LOAD_ATTR", "LOAD_METHOD")
 FROZEN_VALUES = "__as_compiled__"  # attribute of a compiled callback with the result of `frozen_values`
-NO_EFFECT = ("EXTENDED_ARG", "CACHE", "NOP", "PUSH_NULL")  # instructions that may follow a load without using its value
+NO_EFFECT = ("EXTENDED_ARG", "CACHE", "NOP", "PUSH_NULL")  # instructions that do not use the value loaded before them
 
 
 class FrozenValue(NamedTuple):
@@ -193,8 +193,8 @@ class FrozenValue(NamedTuple):
     Attributes
     ----------
     holder : cell, dict or None
-        Container in which the value may be replaced later. None: the value is a default or an item of a tuple, which
-        cannot be replaced.
+        Cell or dict that contains the value, which may be replaced later. None: the value is a default or an item of a
+        tuple, which cannot be replaced.
     key : str
         Key of the value if the holder is a dict.
     name : str
@@ -218,35 +218,35 @@ class _LoadedName(NamedTuple):
 
 
 def frozen_values(compiled: Any, function: Any = None) -> list[tuple[FrozenValue, bytes | None]]:
-    """Return the values that were frozen in a compiled function, with the bytes of those that are arrays.
+    """Return the values that are frozen in a compiled function, each with its bytes if it is an array, else None.
 
-    They are collected and stored at the first call, when the function is compiled. `function`: the original, if a copy
-    of it was compiled.
+    The first call, just after the compilation, stores this list in an attribute of `compiled`. `function`: the original
+    function, if a copy of it was compiled.
     """
-    found: list[tuple[FrozenValue, bytes | None]] | None = getattr(compiled, FROZEN_VALUES, None)
-    if found is None:
-        found = [(each, _array_bytes(each.value)) for each in frozen_locations(function or compiled.py_func)]
-        setattr(compiled, FROZEN_VALUES, found)
-    return found
+    values: list[tuple[FrozenValue, bytes | None]] | None = getattr(compiled, FROZEN_VALUES, None)
+    if values is None:
+        values = [(each, _array_bytes(each.value)) for each in frozen_locations(function or compiled.py_func)]
+        setattr(compiled, FROZEN_VALUES, values)
+    return values
 
 
 def _array_bytes(value: Any) -> bytes | None:
-    """Return the bytes of an array, None for other values."""
+    """Return the bytes of an array, or None for any other value."""
     return value.tobytes() if isinstance(value, (np.ndarray, np.void)) else None
 
 
 def frozen_locations(function: Any, seen: set[int] | None = None) -> Iterator[FrozenValue]:
     """Yield the values in a function and its helpers that numba freezes: numbers, arrays, text, functions, modules.
 
-    Values in modules of twoloop are constant, and not yielded; only their helpers are searched.
+    Values that functions of twoloop use are constant, and not yielded; only the helpers among them are searched.
     """
     seen = set() if seen is None else seen
     if id(function) in seen:
         return
     seen.add(id(function))
     is_ours = is_twoloop(function.__globals__.get("__name__", ""))
-    for found in _direct_locations(function):
-        for location in _value_and_items(found, seen):
+    for used in _direct_locations(function):
+        for location in _value_and_items(used, seen):
             if not is_ours and _is_frozen(location.value):
                 yield location
             helper = python_function(location.value)
@@ -277,7 +277,7 @@ def _is_frozen(value: Any) -> bool:
 
 
 def _value_and_items(location: FrozenValue, seen: set[int]) -> Iterator[FrozenValue]:
-    """Yield a value, and if it is a tuple, the items in it that can change."""
+    """Yield a frozen value; if it is a tuple, also yield its items that can change."""
     yield location
     if not isinstance(location.value, tuple) or id(location.value) in seen:
         return
@@ -309,8 +309,8 @@ def _direct_locations(function: FunctionType) -> Iterator[FrozenValue]:
 def _locations_in_module(location: FrozenValue, attributes: tuple[str, ...], names: set[str]) -> Iterator[FrozenValue]:
     """Yield the attributes that are used of a user's module, and of modules within it.
 
-    If no attribute of the module is loaded, the module itself is passed on, for example to a local variable or a
-    helper. Then all attributes are yielded that are listed in `names`.
+    `attributes` are the names loaded one after another, as in `module.inner.K`. If there are none, the module itself is
+    passed on, for example to a local variable or a helper, and all attributes listed in `names` are yielded.
     """
     if not isinstance(location.value, ModuleType) or is_library(location.value.__name__):
         return
@@ -325,27 +325,28 @@ def _locations_in_module(location: FrozenValue, attributes: tuple[str, ...], nam
 @lru_cache(MAX_CODES)
 def _loaded_names(code: CodeType) -> tuple[_LoadedName, ...]:
     """Return the globals and closure variables that a code object and the functions within it load."""
-    found: dict[_LoadedName, None] = {}
+    loaded_names: dict[_LoadedName, None] = {}
     loaded = None
     for each in dis.get_instructions(code):
         if loaded is not None and each.opname in LOADS_ATTRIBUTE:
             loaded = loaded._replace(attributes=(*loaded.attributes, each.argval))
         elif each.opname not in NO_EFFECT:
             if loaded is not None:
-                found[loaded] = None
+                loaded_names[loaded] = None
             free = each.opname == "LOAD_DEREF" and each.argval in code.co_freevars
             loaded = _LoadedName(free, each.argval, ()) if free or each.opname in LOADS_GLOBAL else None
     inner = [
         entry for constant in code.co_consts if isinstance(constant, CodeType) for entry in _loaded_names(constant)
     ]
-    found.update((entry, None) for entry in inner if not entry.free or entry.name in code.co_freevars)
-    return tuple(found)
+    loaded_names.update((entry, None) for entry in inner if not entry.free or entry.name in code.co_freevars)
+    return tuple(loaded_names)
 
 
 class FunctionCopier:
     """Copy functions, and replace the compiled helpers in their globals, defaults and closure variables.
 
-    `wrap(copy, original)` returns the replacement of a helper, from a copy that already contains replacements.
+    `wrap(copy, original)` returns the replacement of the helper `original`. `copy` is a copy of its Python function, in
+    which values are replaced only afterwards.
     """
 
     def __init__(self, wrap: Callable[[types.FunctionType, Any], Any]):
@@ -383,7 +384,7 @@ class FunctionCopier:
         return self.known[id(function)]
 
     def _add_copy(self, helper: Any) -> None:
-        """Add the replacement of a helper or function to `known`."""
+        """Add the replacement of a helper or function to `self.known`."""
         function = getattr(helper, "py_func", helper)
         own, names = names_of_code(function.__code__), frozenset(reachable_names(function))
         cells = tuple(types.CellType() for _ in function.__closure__ or ())

@@ -1,8 +1,8 @@
 """Compile LLVM functions generated for one mechanism, cache them on disk, and load them, without numba.
 
-Numba writes, parses and optimises some thousand lines of code around each function, and its front end takes ten
-milliseconds for each line of source. Generated code consists of arithmetic on numbers in memory, already in the right
-order, so that LLVM can emit machine code after few optimisations.
+For each function, numba writes, parses and optimises about a thousand additional lines of code, and its front end takes
+ten milliseconds for each line of source. Generated code consists of arithmetic on numbers in memory, already in the
+right order, so that LLVM can emit machine code after few optimisations.
 """
 
 from collections import defaultdict
@@ -20,7 +20,7 @@ SINGLE_PASSES = hasattr(binding.ModulePassManager, "add_reassociate_pass")
 
 
 class GeneratedFunctions:
-    """Load generated functions into memory for as long as this object lives.
+    """Machine code of generated functions in memory, which is freed together with this object.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class GeneratedFunctions:
 
 
 class DeferredFunctions:
-    """Generate functions only when their addresses are first used, because many runs do not need them."""
+    """Functions that are generated when their addresses are first used, because many runs do not need them."""
 
     def __init__(self, make: Callable[[], GeneratedFunctions]):
         self._make = make
@@ -60,7 +60,7 @@ class DeferredFunctions:
         return self.functions.addresses
 
 
-_IN_MEMORY: dict[str, BoundedCache] = defaultdict(BoundedCache)  # caches by kind
+_IN_MEMORY: dict[str, BoundedCache] = defaultdict(BoundedCache)  # functions by kind, then by key
 
 
 def generated_functions(
@@ -70,14 +70,14 @@ def generated_functions(
     write: Callable[[], tuple[list[str], str]],
     passes: bool = True,
 ) -> GeneratedFunctions:
-    """Return the functions of a module from memory or from the disk; if it is in neither, compile the text of `write`.
+    """Return the functions of a module from memory or from the disk, or compile the text that `write` returns.
 
     Parameters
     ----------
     kind : str
-        Name of the cache; on disk it contains the newest MAX_ON_DISK modules.
+        Name of the cache, which contains the newest MAX_ON_DISK modules on disk.
     stamp, key : str
-        Digests of the Python code that generates the functions, and of the expressions that they compute.
+        Digest of the Python code that generates the functions, and digest of the expressions that they compute.
     write : callable
         Returns the names of the functions and the text of the LLVM module.
     passes : bool
@@ -88,7 +88,7 @@ def generated_functions(
     files, disk_key = _code_files(kind, stamp), _disk_key(key)
     try:
         stored = files.load(disk_key)
-    except Exception:  # an incompatible file, of another installation: compile, and overwrite it
+    except Exception:  # an incompatible file from another installation: it is overwritten after the compilation
         stored = None
     if stored is None:
         names, text = write()
@@ -103,7 +103,7 @@ def generated_functions(
 
 
 def are_cached(kind: str, stamp: str, key: str) -> bool:
-    """Return whether the functions are in memory or on disk."""
+    """Return whether the functions that `generated_functions` would return are in memory or on disk."""
     return key in _IN_MEMORY[kind] or _code_files(kind, stamp).has(_disk_key(key))
 
 
@@ -136,10 +136,10 @@ def _compiler() -> Any:
 
 @cache
 def _two_passes() -> tuple[Any, Any]:
-    """Return a manager of the two passes that accelerate the code of small mechanisms by a tenth, and their builder.
+    """Return a manager of two passes, which make the code of small mechanisms a tenth faster, and their builder.
 
-    All other passes together gain nothing more. Passes are created once per process, because LLVM leaks about 300 kB
-    for each pass.
+    All other passes together gain no further speed. Passes are created once per process, because LLVM leaks about
+    300 kB for each pass.
     """
     passes = binding.create_new_module_pass_manager()
     passes.add_reassociate_pass()
@@ -148,7 +148,7 @@ def _two_passes() -> tuple[Any, Any]:
 
 
 def _all_passes() -> tuple[Any, Any]:
-    """Return a manager of all passes, for llvmlite 0.44, and their builder; they can be used for one module only."""
+    """Return a manager of all passes, and their builder, for a single module; only llvmlite 0.44 requires this."""
     builder = _pass_builder()
     return builder.getModulePassManager(), builder
 
@@ -163,7 +163,7 @@ def _triple() -> str:
 
 
 def _machine() -> Any:
-    """Create LLVM's description of the processor for which numba compiles; each engine needs a new one."""
+    """Return a new LLVM description of the processor for which numba compiles; each engine needs its own."""
     options: dict[str, Any] = {"opt": 1}  # level 2 takes a quarter longer and gains nothing in straight-line code
     cpu_target.target_context.codegen()._customize_tm_options(options)
     return binding.Target.from_triple(_triple()).create_target_machine(**options)

@@ -3,13 +3,13 @@
 By default, numba optimises each function together with all functions that it calls, and emits its machine code. So a
 helper at depth five is optimised six times, and the machine code emitted for the helper alone is never called. Here,
 helpers remain LLVM's intermediate code, and only the kernel that calls them is optimised. Passes of numba's front end
-that find nothing to do are skipped; they take half of its time. Loops are neither unrolled nor vectorised: in the
-kernels they are short, and the tests of their length would cost more than is gained.
+that find nothing to do are skipped; they take half of its time. Loops are neither unrolled nor vectorised, unless the
+kernel requests it: most loops in kernels are short, and tests of their length would cost more than is gained.
 
 While a kernel is compiled, `kernel_rules` replaces some of numba's functions; other functions compiled at that time are
-not affected. In kernels, negative indices do not count from the end of an array: kernels have none, and the code for
-this would hide from LLVM that elements are adjacent. The other replacements yield the same machine code in less time:
-half of a compilation is Python code, in which numba repeatedly computes the same results.
+not affected. In kernels, negative indices do not count from the end of an array: kernels have no such indices, and the
+code for them would hide from LLVM that elements are adjacent. The other replacements yield the same machine code in
+less time: half of the time of a compilation, numba's Python code computes the same results repeatedly.
 
 Modules that need private parts of numba to generate code import them from this one.
 """
@@ -61,7 +61,7 @@ def jitable_templates(function: Any) -> list[Any]:
 
 
 def add_signature(function: Dispatcher, signature: Any) -> None:
-    """Make a function, compiled for one signature, callable by a second one.
+    """Make a function that is compiled for one signature callable with arguments of a second signature.
 
     The arguments of both signatures must have the same layout in memory.
     """
@@ -89,7 +89,7 @@ _numba_fix_index = arrayobj.fix_integer_index
 
 
 def _resolve_index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
-    """Emit code for an index; in kernels and helpers, negative ones do not count from the end."""
+    """Emit code for an index of an array; in kernels and helpers, a negative index does not count from the end."""
     if kind.signed and isinstance(context.active_code_library, _HelperLibrary | _KernelLibrary):
         return context.cast(builder, index, kind, types.intp)
     return _numba_fix_index(context, builder, kind, index, size)
@@ -103,7 +103,7 @@ def _element_address(
 ) -> Any:
     """Emit code for the address of an element of a contiguous array, without the code that only slices need.
 
-    All other indexing is left to numba.
+    For slices and other arrays, numba's own function emits the code.
     """
     is_element = len(indices) == kind.ndim and all(isinstance(each, types.Integer) for each in index_types)
     if kind.layout != "C" or not is_element or options.get("boundscheck"):
@@ -116,7 +116,7 @@ def _element_address(
 
 _numba_call_type: Any = BaseFunction.get_call_type
 _call_types: dict[Any, tuple[Any, Any]] = {}
-# options and their texts by the id of the options, which are stored here so that no other object gets this id
+# options and their texts by the id of the options; the options are stored so that no other object gets their id
 _options: dict[int, tuple[Any, str]] = {}
 
 
@@ -128,10 +128,10 @@ def _options_text(options: Any) -> str:
 
 
 def _cached_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
-    """Return the signature of a call of a function that numba implements, cached by types and options.
+    """Return the signature of a call of a function that numba implements, cached by argument types and options.
 
-    Without this cache, numba tries all implementations of an operator at each call, which takes a tenth of a
-    compilation.
+    Without this cache, numba tries all implementations of an operator at each call, which takes a tenth of the time of
+    a compilation.
     """
     key = self, args, tuple(kws.items()), _options_text(ConfigStack.top_or_none())
     if key not in _call_types:
@@ -146,7 +146,7 @@ _sizes: dict[str, int] = {}
 
 
 def _cached_size(self: Any, kind: Any) -> Any:
-    """Return the size of a type, cached; numba would let LLVM parse a module for each variable."""
+    """Return the size of a type, bytes, cached; numba would make LLVM parse a module for each variable."""
     name = str(kind)
     if name not in _sizes:
         _sizes[name] = _numba_size(self, kind)
@@ -167,7 +167,7 @@ def _cached_inlined_code(self: Any, function: Any, enable_ssa: bool = False) -> 
     return code
 
 
-_LEAF_TYPES = {ir.Loc, str, int, bool, type(None)}  # types within a statement that contain no variables
+_LEAF_TYPES = {ir.Loc, str, int, bool, type(None)}  # types of parts of a statement that contain no variables
 
 
 def _variables(self: Any, part: Any) -> list[Any]:
@@ -190,7 +190,7 @@ _numba_load_registries: Any = CPUContext.load_additional_registries
 
 
 def _load_registries_once(self: Any) -> None:
-    """Install numba's implementations of Python's and NumPy's functions; numba would import them for each function.
+    """Install numba's implementations of Python and NumPy functions; numba would import them for each function.
 
     All copies of a context share the registries, to which numba adds new intrinsics.
     """
@@ -205,11 +205,11 @@ _LOCKS = ("numba:llvm_lock", "numba:compiler_lock")
 
 
 def _without_lock_events(report: Any) -> Any:
-    """Return a function that reports events, except for those of locks: there are thousands of them for each kernel."""
+    """Return a function that reports all events except those of locks, of which each kernel has thousands."""
     return lambda kind, *args, **named: None if kind in _LOCKS else report(kind, *args, **named)
 
 
-# numba's functions that are replaced: owner, name and replacement
+# functions of numba that are replaced, as attributes of their owner: owner, name and replacement
 _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
     (Function, "get_call_type", _cached_call_type),
     (arrayobj, "fix_integer_index", _resolve_index),
@@ -221,7 +221,7 @@ _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
     (event, "start_event", _without_lock_events(event.start_event)),
     (event, "end_event", _without_lock_events(event.end_event)),
 ]
-_NONE = object()  # stands for an attribute that an owner does not have
+_MISSING = object()  # stands for an attribute that an owner does not have
 _depth = [0]  # number of nested compilations of kernels
 
 
@@ -229,7 +229,7 @@ _depth = [0]  # number of nested compilations of kernels
 def kernel_rules() -> Iterator[None]:
     """Replace numba's functions by those of `_RULES` while a kernel is compiled."""
     if _depth[0] == 0:
-        before = [vars(owner).get(name, _NONE) for owner, name, _ in _RULES]
+        before = [vars(owner).get(name, _MISSING) for owner, name, _ in _RULES]
         for owner, name, rule in _RULES:
             setattr(owner, name, rule)
     _depth[0] += 1
@@ -239,14 +239,14 @@ def kernel_rules() -> Iterator[None]:
         _depth[0] -= 1
         if _depth[0] == 0:
             for (owner, name, _), original in zip(_RULES, before, strict=True):
-                if original is _NONE:
+                if original is _MISSING:
                     delattr(owner, name)
                 else:
                     setattr(owner, name, original)
 
 
 class _WithoutEnvironment:
-    """Numba's code generator for code that is never loaded: its environment has no address."""
+    """Wrapper of numba's code generator for code that is never loaded, whose environment needs no address."""
 
     def __init__(self, codegen: Any):
         self._codegen = codegen
@@ -272,7 +272,7 @@ class _HelperLibrary(CPUCodeLibrary):
         pass  # the code is optimised as part of the callers
 
     def _get_module_for_linking(self) -> Any:
-        """Return the module itself; a copy, as in numba, is not needed, because nothing else uses it."""
+        """Return the module itself; numba would return a copy, which is not needed, because nothing else uses it."""
         if self._shared_module is None:
             self._ensure_finalized()
             for function in self._final_module.functions:
@@ -303,7 +303,7 @@ class _VectorizedLibrary(_KernelLibrary):
     vectorized = True
 
 
-# passes that find nothing to do in kernels: they treat functions within functions, expressions of whole arrays,
+# passes of numba that find nothing to do in kernels: they are for nested functions, expressions of whole arrays,
 # overloads that replace calls before lowering, and code that is not allowed in compiled functions
 _SKIPPED_PASSES = {InlineClosureLikes, NopythonRewrites, InlineOverloads, IRLegalization}
 
@@ -312,7 +312,7 @@ class _Compiler(Compiler):
     """Numba's compiler without the passes that kernels do not need."""
 
     def define_pipelines(self) -> list[Any]:
-        """Return the passes, without _SKIPPED_PASSES."""
+        """Return numba's pipelines without _SKIPPED_PASSES."""
         pipelines: list[Any] = super().define_pipelines()
         for pipeline in pipelines:
             pipeline.passes = [each for each in pipeline.passes if each[0] not in _SKIPPED_PASSES]
@@ -350,20 +350,20 @@ class VectorizingCompiler(KernelCompiler):
 
 @cache
 def entry_point(function: Dispatcher) -> Any:
-    """Return a function that calls a compiled function without a check of the types of arguments.
+    """Return a callable for a compiled function that does not check the types of its arguments.
 
-    The check takes as long as two steps of a small mechanism. Wrong types crash the process.
+    The check would take as long as two steps of a small mechanism. Arguments of wrong types crash the process.
     """
     compiled: Any = next(iter(function.overloads.values()))
     return compiled.entry_point
 
 
-# addresses of compiled functions, each of which has one signature
+# addresses of the machine code of compiled functions, each of which has one signature
 _ADDRESSES: WeakKeyDictionary[Dispatcher, int] = WeakKeyDictionary()
 
 
 def machine_code(function: Dispatcher, signature: Any) -> int:
-    """Return the address of a compiled function, which has numba's calling convention for arguments and errors."""
+    """Return the address of the machine code of a compiled function, which uses numba's calling convention."""
     if function not in _ADDRESSES:
         compiled: Any = function.overloads.get(signature.args) or function.get_compile_result(signature)
         _ADDRESSES[function] = int(compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name))

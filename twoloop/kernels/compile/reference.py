@@ -1,8 +1,8 @@
-"""Types of structures that kernels get by reference: one pointer to a table of addresses and lengths.
+"""Types of structures that are passed to kernels by reference, as one pointer to a table of addresses and lengths.
 
-Numba passes a named tuple by value, member by member: a workspace of forty arrays becomes some three hundred arguments,
-which every call that LLVM does not inline writes to memory. A value of type `Reference` has the members as attributes,
-and is a single argument.
+Numba passes a named tuple by value, member by member: a workspace of forty arrays becomes about three hundred
+arguments, which every call that LLVM does not inline writes to memory. A value of type `Reference` has the members as
+attributes, and is a single argument.
 """
 
 import hashlib
@@ -22,11 +22,11 @@ from numba.np.numpy_support import as_dtype
 from twoloop.kernels.compile.caches import BoundedCache
 from twoloop.kernels.compile.linking import machine_code
 
-_REFERENCES: dict[str, Any] = {}  # all references by name
+_REFERENCES: dict[str, Any] = {}  # all types `Reference`, by name
 
 
 def _reference_named(name: str) -> Any:
-    """Return the only `Reference` of this name; pickle calls this function, so that it never creates a second one."""
+    """Return the `Reference` of this name; pickle calls this function, so that there is only one for each name."""
     return _REFERENCES[name]
 
 
@@ -34,8 +34,8 @@ class Reference(types.Type):
     """Type of a structure that is passed as a pointer to a table.
 
     The table contains the address and shape of each array, and the address of each function. Functions are compiled by
-    numba, or generated as LLVM code (see generated_functions.py). Generated functions get addresses of arrays, and
-    report no errors.
+    numba, or generated as LLVM code (see generated_functions.py). Arguments of generated functions that are arrays are
+    passed as addresses, and generated functions report no errors.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ class Reference(types.Type):
         return _reference_named, (self.name,)
 
     def __repr__(self) -> str:
-        """Return the name and a digest of the layout; the keys of machine code on disk contain this text."""
+        """Return the name and a digest of the layout, which are part of the keys of machine code on disk."""
         fields: list[Any] = [(field, str(kind)) for field, kind in self.arrays.items()]
         fields += [
             (field, str(self.functions[field])) if field in self.llvm_functions else field for field in self.functions
@@ -71,16 +71,16 @@ class Reference(types.Type):
         return f"{self.name}-{hashlib.sha256(repr(fields).encode()).hexdigest()[:16]}"
 
     def add_function(self, field: str, signature: Signature) -> None:
-        """Add a function compiled by numba; its signature may contain this type."""
+        """Add a field for a function compiled by numba, whose signature may contain this type."""
         self.functions[field] = signature
         self.offsets[field] = self.n_words
         self.n_words += 1
         _define_call(self, field, signature)
 
     def add_llvm_functions(self, signatures: Mapping[str, Signature]) -> None:
-        """Add generated functions, which get the addresses of arrays.
+        """Add fields for generated functions, whose signatures are given by name.
 
-        Callers have to check that such a function is present.
+        Before a call, the caller has to check that the function is not missing.
         """
         for field, signature in signatures.items():
             self.functions[field] = signature
@@ -90,15 +90,15 @@ class Reference(types.Type):
             _define_llvm_call(self, field, signature)
 
     def llvm_type(self, field: str) -> tuple[str, list[str]]:
-        """Return the types of the result and of the arguments of a generated function, in LLVM's notation."""
+        """Return the type of the result and the types of the arguments of a generated function, as LLVM's text."""
         signature = self.functions[field]
         return str(_llvm_type(signature.return_type)), [str(_llvm_type(kind)) for kind in signature.args]
 
     def table(self, values: Any) -> Any:
-        """Return the table (int64) for an object whose attributes are the arrays and functions of this type.
+        """Return the table (int64) for the object `values`, whose attributes are the arrays and functions of this type.
 
-        The object has to live as long as the table is used. Its attributes for generated functions are addresses, 0 if
-        a function is missing.
+        The object must exist as long as the table is used. Its attributes for generated functions are addresses; 0 if a
+        function is missing.
         """
         words: list[int] = []
         for field, kind in self.arrays.items():
@@ -115,7 +115,7 @@ class Reference(types.Type):
         return np.array(words, dtype=np.int64)
 
     def _address(self, field: str, function: Any) -> int:
-        """Return the address of a function, 0 if it is missing."""
+        """Return the address of the machine code of a function, or 0 if the function is missing."""
         if field in self.llvm_functions:
             return int(function)
         return 0 if function is None else machine_code(function, self.functions[field])
@@ -126,9 +126,9 @@ register_model(Reference)(models.OpaqueModel)
 
 @unbox(Reference)
 def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
-    """Convert an argument from Python: the pointer is its attribute `address`, or the argument itself if it is an int.
+    """Emit code that converts an argument from Python to a pointer: its attribute `address`, or itself if it is an int.
 
-    An int saves the lookup of the attribute, a tenth of a microsecond.
+    An int saves the lookup of the attribute, which takes a tenth of a microsecond.
     """
     kind = c.builder.load(
         c.builder.gep(c.builder.bitcast(obj, obj.type.as_pointer()), [ir.Constant(ir.IntType(32), 1)])
@@ -147,7 +147,7 @@ def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
 
 
 def _load_word(context: Any, builder: Any, pointer: Any, offset: int, kind: Any) -> Any:
-    """Emit code that loads the word at an offset of a table; mark it as constant, so that LLVM loads it only once."""
+    """Emit code that loads the word at an offset of a table, marked as constant so that LLVM loads it only once."""
     slot = builder.gep(builder.bitcast(pointer, ir.IntType(64).as_pointer()), [ir.Constant(ir.IntType(64), offset)])
     word = builder.load(builder.bitcast(slot, kind.as_pointer()))
     word.set_metadata("invariant.load", builder.module.add_metadata([]))
@@ -156,7 +156,7 @@ def _load_word(context: Any, builder: Any, pointer: Any, offset: int, kind: Any)
 
 @infer_getattr
 class _Fields(AttributeTemplate):
-    """Numba's typing of the attributes of a reference."""
+    """Types of the attributes of a `Reference`, for numba."""
 
     key = Reference
 
@@ -175,7 +175,7 @@ class _Fields(AttributeTemplate):
 
 @lower_getattr_generic(Reference)
 def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) -> Any:
-    """Emit code that loads a field: numba's structure of an array, or the table itself for a function."""
+    """Emit code that returns a field: numba's structure of an array, or for a function, the pointer to the table."""
     if field in typ.functions:  # `call` below loads the address of the function from the table
         return pointer
     kind, offset = typ.arrays[field], typ.offsets[field]
@@ -203,7 +203,7 @@ def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) 
 
 
 def _define_call(typ: Reference, field: str, signature: Signature) -> None:
-    """Define how numba calls a function of a reference that it has compiled."""
+    """Define how numba calls field `field` of a `Reference`, a function compiled by numba."""
     offset = typ.offsets[field]
 
     @lower_builtin((typ.name, field), typ, *signature.args)
@@ -226,12 +226,12 @@ _LLVM_TYPES = {
 
 
 def _llvm_type(kind: Any) -> Any:
-    """Return the LLVM type of an argument or result of a generated function; arrays are pointers."""
+    """Return the LLVM type of an argument or result of a generated function; an array is passed as a pointer."""
     return _LLVM_TYPES[kind.dtype].as_pointer() if isinstance(kind, types.Array) else _LLVM_TYPES[kind]
 
 
 def _define_llvm_call(typ: Reference, field: str, signature: Signature) -> None:
-    """Define how numba calls a generated function of a reference."""
+    """Define how numba calls field `field` of a `Reference`, a generated function."""
     offset = typ.offsets[field]
 
     @lower_builtin((typ.name, field), typ, *signature.args)
