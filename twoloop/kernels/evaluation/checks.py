@@ -1,11 +1,11 @@
 """Compiled parts of the checks of a start: evaluation of all callbacks, checks of the rows, and units of coordinates.
 
-If the evaluation finds nothing wrong, no other check needs to run. Units of rows and of coordinates are such that the
-entries of C_q have similar sizes in them. The linear range of a row is the distance over which coordinates can move
-before the row changes much (checks/scales.py).
+If the evaluation finds nothing wrong, no other check needs to run. Units of rows and of coordinates are chosen so that
+the entries of C_q in these units have similar sizes. The linear range of a row is the distance over which coordinates
+can move before the row changes much (checks/scales.py).
 
-Callbacks are also compared with their traces, see generate/traced_values.py. With each traced number a bound of its
-rounding error is computed, in units of EPS: at least the sum of the absolute values of its terms.
+Callbacks are also compared with their traces, see generate/traced_values.py. A bound of the rounding error is computed
+for each traced number, in units of EPS: at least the sum of the absolute values of its terms.
 """
 
 import math
@@ -26,9 +26,9 @@ from twoloop.kernels.evaluation import operations as op
 from twoloop.kernels.evaluation.operations import operation
 from twoloop.kernels.linalg.dense import largest_of, ldl_factor
 
-NO_ENTRY = 1e-12  # relative to the largest entry of a row: smaller entries are rounding errors
-MAX_SWEEPS = 20  # largest number of sweeps of the alternating least squares, in column_units
-NEGLIGIBLE = 1e-6  # relative to the largest coordinate: smaller coordinates count as zero, and are no measure of size
+NO_ENTRY = 1e-12  # largest entry of C_q that counts as a rounding error of zero, relative to the largest in its row
+MAX_SWEEPS = 20  # largest number of sweeps of the alternating least squares in column_units
+NEGLIGIBLE = 1e-6  # largest coordinate that counts as zero in linear_ranges, relative to the largest coordinate
 
 
 @exact
@@ -43,7 +43,7 @@ def _sort(values):
 
 @exact
 def _fit_columns(rows, columns, counts, logs):
-    """Compute the logarithms of the units of columns that best fit those of the rows; return whether none changed."""
+    """Store in `columns` the logarithms of units that best fit those in `rows`; return whether none has changed."""
     unchanged = True
     for j in range(columns.size):
         total, n = 0.0, 0
@@ -59,7 +59,7 @@ def _fit_columns(rows, columns, counts, logs):
 
 @exact
 def _fit_rows(columns, rows, counts, logs):
-    """Compute the logarithms of the units of rows that best fit those of the columns."""
+    """Store in `rows` the logarithms of units that best fit those in `columns`, see `_fit_columns`."""
     for i in range(rows.size):
         total, n = 0.0, 0
         for j in range(columns.size):
@@ -71,11 +71,11 @@ def _fit_rows(columns, rows, counts, logs):
 
 @kernel(types.void(MATRIX, VECTOR, VECTOR, MATRIX, MATRIX, VECTOR, VECTOR))
 def column_units(matrix, typical, columns, counts, logs, rows, scratch):
-    """Estimate the units of the coordinates from a constraint Jacobian, so that lengths and angles can be compared.
+    """Store in `columns` units of the coordinates, estimated from a constraint Jacobian, to compare angles and lengths.
 
     |entry (i, j)| is about unit of row i / unit of coordinate j: the sum of squares of log|entry| + log(unit of j) -
-    log(unit of i) is least. The free common factor follows from the units `typical`: the median ratio to them is 1.
-    Coordinates without entries get their typical units. `columns` becomes the result; the last four arrays are scratch.
+    log(unit of i) is minimal. A common factor is free, and is such that the median ratio of the units to `typical` is
+    1. Coordinates without entries get their typical units. The last four arrays are scratch.
     """
     n_used, log_factor = 0, 0.0
     for i in range(rows.size):
@@ -107,11 +107,11 @@ def column_units(matrix, typical, columns, counts, logs, rows, scratch):
 
 @kernel(types.void(MATRIX, VECTOR, f8, VECTOR, VECTOR))
 def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
-    """Compute the linear range of each row: the radius if this is at most 1, or at most the largest coordinate.
+    """Store in `ranges` the linear range of each row: its radius, if at most 1 or at most its largest coordinate.
 
-    Otherwise it is the lower median of the coordinates that are not negligible, which an offset does not affect; or 1
-    if all are negligible. `coordinates_in_units`: coordinates of each row, 0 where the row is 0; `radius`: length of
-    each row over its change when a coordinate moves by a unit.
+    Otherwise the linear range is the lower median of the row's coordinates that are not NEGLIGIBLE, which an offset
+    does not affect; or 1 if all are at most `negligible`. `coordinates_in_units`: coordinates of each row, 0 where the
+    row is 0; `radius`: norm of each row over its change when a coordinate moves by a unit.
     """
     for i in range(ranges.size):
         largest, n = 0.0, 0
@@ -133,13 +133,13 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
 # state satisfies the constraints up to rounding. DEFINITE, INDEFINITE: M varies, and is positive definite, or not
 # positive definite, by a margin
 IN_ORDER, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
-NEAR_SHARE = 0.5  # largest distance from a position at which the stored sizes apply, relative to these sizes
-ROUNDING_OF_ZERO = 2.0**-52  # relative to the largest coordinate: a smaller coordinate may be a rounding error of zero
-EIGENVALUE_MARGIN = 2.0  # factor on the limit below which an eigenvalue counts as zero: rounding changes it by less
+NEAR_SHARE = 0.5  # largest distance from a stored position at which its sizes of coordinates apply, relative to them
+ROUNDING_OF_ZERO = 2.0**-52  # largest coordinate that may be a rounding error of zero, relative to the largest one
+EIGENVALUE_MARGIN = 2.0  # factor on the limit of zero eigenvalues, larger than that by which rounding changes them
 
 
 def room_size(n: int, n_c: int, n_a: int) -> int:
-    """Return the length of `room` in evaluate_start: results of callbacks except M and rows, and scratch."""
+    """Return the length of the argument `room` of evaluate_start."""
     return n + 2 * (n_c + n_a) + n_c * (n + 4) + n * max(n, n_c + n_a + 1)
 
 
@@ -152,7 +152,7 @@ def _clear(A):
 
 @exact
 def _has_empty_row(rows):
-    """Return whether any of the rows contains only zeros."""
+    """Return whether one of the rows contains only zeros."""
     empty = False
     for i in range(len(rows)):
         empty = empty or largest_of(rows[i]) == 0.0
@@ -161,7 +161,7 @@ def _has_empty_row(rows):
 
 @exact
 def _is_symmetric(mass, allowed):
-    """Return whether no entry differs from its transposed entry by more than `allowed` times the largest entry."""
+    """Return whether M is symmetric, up to differences of `allowed` times its largest entry."""
     largest, asymmetry, same = 0.0, 0.0, True
     for i in range(len(mass)):
         for j in range(i):
@@ -178,7 +178,7 @@ def _is_symmetric(mass, allowed):
 def _is_rounding(value, row, state, sizes, least, rate, allowed):
     """Return whether the sum `value` is a rounding error: at most `allowed` times the sum of the sizes of its terms.
 
-    The terms are `rate`, and entries of `row` times values of `state`, which count as at least `sizes` and `least`.
+    The terms are `rate` and the products of row[j] and state[j]; |state[j]| counts as at least sizes[j] and `least`.
     """
     size = abs(rate)
     for j in range(state.size):
@@ -188,7 +188,7 @@ def _is_rounding(value, row, state, sizes, least, rate, allowed):
 
 @exact
 def _is_near(q, sizes, stored_q):
-    """Return whether q is so near `stored_q` that the sizes of the coordinates at that position apply to q, too."""
+    """Return whether q is so near `stored_q` that the `sizes` of the coordinates at stored_q apply to q, too."""
     near = True
     for j in range(q.size):
         near = near and abs(q[j] - stored_q[j]) <= NEAR_SHARE * sizes[j]
@@ -197,7 +197,7 @@ def _is_near(q, sizes, stored_q):
 
 @exact
 def _has_entries(rows, entries):
-    """Return whether `rows` is nonzero exactly where `entries` is: otherwise stored sizes do not apply."""
+    """Return whether `rows` is nonzero exactly where `entries` (row by row) is; otherwise stored sizes do not apply."""
     same, n = True, rows.shape[1]
     for i in range(entries.size // n):
         largest = largest_of(rows[i])
@@ -208,7 +208,7 @@ def _has_entries(rows, entries):
 
 @exact
 def _find_known_sizes(q, rows, n_c, sizes):
-    """Return the index in `sizes` of the sizes stored for a position near q; -1: there are none."""
+    """Return the first index in `sizes` of the data of a stored position near q (its sizes come first); -1: none."""
     n = q.size
     n_numbers = 2 * n + n_c * n
     for k in range(0, sizes.size, n_numbers):
@@ -221,7 +221,7 @@ def _find_known_sizes(q, rows, n_c, sizes):
 
 @exact
 def _is_consistent(C, rate, rows, q, v, sizes, allowed):
-    """Return whether positions and velocities satisfy the rows up to rounding.
+    """Return whether (q, v) satisfies the constraints, with values C, `rows` and `rate`, up to rounding.
 
     The size of a coordinate counts as at least its stored size, and at least the rounding error of the largest
     coordinate: if the coordinates of a constraint are zero but for rounding, as out of the plane of a motion, the value
@@ -251,7 +251,10 @@ def _record_entries(rows, pattern):
 
 @exact
 def _record_entries_near(f, t, q, shifts, position, rows, n_c, pattern):
-    """Add to `pattern` where rows are nonzero at positions that differ from q by `shifts` times the size of q."""
+    """Set `pattern` to 1 also where rows are nonzero at q plus the size of q times a row of `shifts`.
+
+    `position` and `rows` are scratch.
+    """
     largest = largest_of(q)
     for k in range(len(shifts)):
         for j in range(q.size):
@@ -264,7 +267,7 @@ def _record_entries_near(f, t, q, shifts, position, rows, n_c, pattern):
 
 @exact
 def _is_definite(mass, min_eigenvalue, factors):
-    """Return whether all eigenvalues of a symmetric matrix are at least `min_eigenvalue` times its largest entry."""
+    """Return whether all eigenvalues of M exceed `min_eigenvalue` times its largest entry; `factors` is scratch."""
     n, largest = len(mass), 0.0
     for i in range(n):
         for j in range(n):
@@ -277,16 +280,16 @@ def _is_definite(mass, min_eigenvalue, factors):
 
 @kernel(i8(KIT, f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR), vectorized=True)
 def evaluate_start(f, t, q, v, sizes, lam, room, mass, rows, shifts, pattern, roundings):
-    """Evaluate all callbacks at (t, q, v); return flags of the results.
+    """Evaluate all callbacks at (t, q, v), and store their results; return the flags IN_ORDER to INDEFINITE.
 
     Arguments:
 
-    - roundings: relative rounding errors that are allowed in constraints, in the symmetry of M, and in its eigenvalues
-    - sizes: stored positions and the sizes of their coordinates (`keep` of checks/scales.py), which are the smallest
-      sizes near these positions
-    - shifts: displacements of q, over its size, at which nonzero entries of rows are also recorded
-    - mass, rows, pattern: zeros on entry, become M, C_q with A, and 1 where rows are nonzero
-    - room: `room_size` zeros on entry, becomes the force, C, C_t with b, and other values and scratch
+    - roundings: allowed relative rounding errors of constraints, of the symmetry of M, and of its eigenvalues
+    - sizes: stored positions and the sizes of their coordinates (`keep` of checks/scales.py), which are lower bounds of
+      the sizes near these positions
+    - shifts: displacements of q, relative to its size, at which nonzero entries of rows are also recorded
+    - mass, rows, pattern: zeros on entry; on return M, C_q with A, and 1 where rows are nonzero
+    - room: `room_size` zeros on entry; on return the force, C, C_t with b, other results of callbacks, and scratch
     """
     n, n_c, n_rows, flags = q.size, lam.size, rows.shape[0], f.flags
     force, C, rate, gamma = n, n + n_c, n + n_c + n_rows, n + n_c + 2 * n_rows  # ends of the parts of `room`
@@ -330,7 +333,7 @@ def evaluate_start(f, t, q, v, sizes, lam, room, mass, rows, shifts, pattern, ro
         result_flags = IN_ORDER
         if _is_consistent(room[force:C], room[C:rate], rows, q, v, sizes, roundings[0]):
             result_flags |= CONSISTENT
-    if flags[CONSTANT_MASS] == 0:  # neither flag is set if the smallest eigenvalue is between the two margins
+    if flags[CONSTANT_MASS] == 0:  # neither DEFINITE nor INDEFINITE if the smallest eigenvalue is within the margin
         if _is_definite(mass, EIGENVALUE_MARGIN * roundings[2], scratch):
             result_flags |= DEFINITE
         elif not _is_definite(mass, roundings[2] / EIGENVALUE_MARGIN, scratch):
@@ -343,7 +346,7 @@ def evaluate_start(f, t, q, v, sizes, lam, room, mass, rows, shifts, pattern, ro
 
 @kernel(types.void(KIT, f8, MATRIX, i8, MATRIX))
 def rows_at(f, t, positions, n_c, rows):
-    """Evaluate C_q (n_c rows) and A at the positions `positions` into `rows`, full of zeros, one below the other."""
+    """Store C_q (n_c rows) and A at one position after the other in `rows`, which contains zeros on entry."""
     n_rows = len(rows) // len(positions)
     for k in range(len(positions)):
         begin = k * n_rows
@@ -353,7 +356,7 @@ def rows_at(f, t, positions, n_c, rows):
 
 @exact
 def _agrees(fused, separate, allowed, rounding_errors):
-    """Return whether numbers of row i differ by at most more[i], plus `allowed` times the largest number of all."""
+    """Return whether entries in row i of both matrices differ by at most rounding_errors[i] + allowed max|separate|."""
     largest = 0.0
     for i in range(separate.shape[0]):
         for j in range(separate.shape[1]):
@@ -367,10 +370,10 @@ def _agrees(fused, separate, allowed, rounding_errors):
 
 @kernel(types.boolean(KIT, f8, VECTOR, VECTOR, MATRIX, MATRIX, VECTOR, f8, f8))
 def kinematics_agree(f, t, q, v, fused, separate, rounding_errors, allowed, rounding):
-    """Return whether the fused callback agrees with the separate ones, up to `allowed` times the largest number.
+    """Return whether results of the fused and the separate callbacks differ by at most `allowed` times the largest.
 
     Constraints may also differ by `rounding` times the sizes of their terms. `fused` and `separate`, (3 + n_q, n_c),
-    become C, C_t, gamma and the numbers of C_q; `rounding_errors`, (n_c), is scratch. All three are zero on entry.
+    are zero on entry, and C, C_t, gamma and C_q on return; `rounding_errors` (n_c), zero on entry, is scratch.
     """
     n, n_c = q.size, rounding_errors.size
     fused_rows, separate_rows = fused[3:].reshape((n_c, n)), separate[3:].reshape((n_c, n))
@@ -394,12 +397,12 @@ VALUE, BOUND = range(2)  # rows of `nodes`: values of the nodes of a program, an
 
 EPS = 2.0**-52
 SAME = 1e-9  # largest difference of a callback and its trace, relative to the largest number, apart from rounding
-ROUNDED = 200.0 * EPS  # largest rounding error of a traced number, over its bound
+ROUNDED = 200.0 * EPS  # largest rounding error of a traced number, relative to its bound in `bounds`
 
 
 @exact
 def _sum(columns, coefficients, constant, nodes, begin, end):
-    """Return an affine expression of nodes, and a bound of its rounding error."""
+    """Return `constant` plus the sum of coefficient times node over the terms begin to end - 1, and its error bound."""
     total, bound = constant, abs(constant)
     for k in range(begin, end):
         term = coefficients[k] * nodes[VALUE, columns[k]]
@@ -410,7 +413,7 @@ def _sum(columns, coefficients, constant, nodes, begin, end):
 
 @exact
 def _operation(kind, x, dx, y, dy):
-    """Return the result of an operation on x and y, whose bounds are dx and dy, and a bound of its rounding error."""
+    """Return the result of an operation on x and y, and its error bound; dx and dy are the bounds of x and y."""
     z = operation(kind, x, y)
     if kind == op.PRODUCT:
         dz = abs(x) * dy + abs(y) * dx
@@ -432,7 +435,7 @@ def _operation(kind, x, dx, y, dy):
 
 @exact
 def _run_trace(program, columns, coefficients, constants, nodes, values, bounds):
-    """Compute the results of a traced program, and their bounds, from its inputs, which are the first nodes."""
+    """Store results of a traced program in `values`, their error bounds in `bounds`; `nodes` begins with the inputs."""
     for i in range(len(program)):
         first, second, end = program[i, op.FIRST], program[i, op.SECOND], program[i, op.END]
         x, dx = _sum(columns, coefficients, constants[i, 0], nodes, first, second)
@@ -446,7 +449,7 @@ def _run_trace(program, columns, coefficients, constants, nodes, values, bounds)
 
 @exact
 def _count_differences(called, traced, bounds):
-    """Count the numbers that differ by more than SAME and ROUNDED allow, or are not finite."""
+    """Return the number of entries that differ by more than SAME and ROUNDED allow, or are not finite."""
     count = 0
     for i in range(called.shape[1]):
         largest = 0.0
@@ -465,11 +468,11 @@ def _count_differences(called, traced, bounds):
 def compare_traces(
     f, sizes, is_compared, states, program, columns, coefficients, constants, nodes, called, traced, bounds
 ):
-    """Compare callbacks at states [t, q, v], one a row, with their traces; return how many numbers differ.
+    """Compare callbacks with their traces at `states`, which has rows [t, q, v]; return how many numbers differ.
 
     Two numbers differ if their difference exceeds SAME times the largest value at these states, plus ROUNDED times the
-    bound. `sizes`: n_q, n_c and n_a; `is_compared`: 1 for each of KINDS in traced_values.py that is to be compared;
-    `called`: zeros.
+    bound. `sizes`: n_q, n_c and n_a; `is_compared`: 1 for each of KINDS in traced_values.py that has to be compared.
+    `called`, zero on entry, `traced` and `bounds` become the results, `nodes` is scratch.
     """
     n, n_c, n_a = sizes[0], sizes[1], sizes[2]
     for k in range(len(states)):

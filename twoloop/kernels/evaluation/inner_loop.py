@@ -1,12 +1,12 @@
-"""Compile the inner loop once, as one function that all steps call, so that no step compiles it again.
+"""Inner loop: evaluate accelerations, and move states onto the constraints, for all steps.
 
-A step gets a `Kit`, which has the callbacks and this function; helpers in this file call it, one helper for each task.
-Accelerations and multipliers are those of eqs. (6)-(8) of the paper.
+The inner loop is compiled once, as one function, and passed to steps in a `Kit`; steps call it by the helpers in this
+file, one for each task. Accelerations and multipliers are those of eqs. (6)-(8) of the paper.
 
-If a step integrates all coordinates, its states are off the constraints by the error of the formula. One pass computes
-the accelerations there and moves positions and velocities to the nearest state on the constraints, in the metric of M,
-which does not depend on the partition. Positions are then accurate to the square of their correction, velocities and
-accelerations to the correction itself: a correction that is not near rounding is followed by another pass.
+If a step integrates all coordinates, its states are off the constraints by the error of the formula. One pass of a
+projection moves positions and velocities to the nearest state on the constraints, in the metric of M, which does not
+depend on the partition. The error of positions is then the square of their correction, but that of velocities and
+accelerations is of the size of this correction: if it is not near rounding, another pass follows.
 """
 
 import numpy as np
@@ -75,7 +75,7 @@ from twoloop.kernels.linalg.saddle_point import factor, factor_mass, least_norm,
 
 @merged
 def acceleration_constraint(f, w, t, q, v):
-    """Compute the right-hand side Gamma of G a = Gamma into w.Gamma; return DONE, or why that failed."""
+    """Store Gamma, the right-hand side of G a = Gamma, in w.Gamma; return DONE, or the reason of a failure."""
     n_c, n_rows = w.C.size, w.Rate.size
     if w.notes[KNOWN] == 1.0 and n_rows == n_c:
         return DONE
@@ -98,14 +98,14 @@ def acceleration_constraint(f, w, t, q, v):
 
 @merged
 def mass_matrix(f, w, t, q):
-    """Evaluate M(t, q) into w.M."""
+    """Store M(t, q) in w.M."""
     w.M[:, :] = 0.0
     f.mass(t, q, f.p, w.M)
 
 
 @merged
 def factor_mass_at(f, w, t, q):
-    """Evaluate M(t, q), and factor M if the form of the equations needs the factors; return a code."""
+    """Store M(t, q) in w.M, and its factors if the form of the equations needs them; return a code."""
     w.notes[FACTORED] = 0.0
     mass_matrix(f, w, t, q)
     code = factor_mass(f, w) if f.flags[FORM] == MULTIPLIERS or banded_mass(f) else DONE
@@ -114,7 +114,7 @@ def factor_mass_at(f, w, t, q):
 
 @merged
 def factor_at(f, w, t, q):
-    """Factor the linear problem at a state whose rows, factors and null space are in w; return a code."""
+    """Factor the equations of accelerations at a state whose rows, their factors and w.D are in w; return a code."""
     if f.flags[CONSTANT_MASS] == 0:
         w.notes[FACTORED] = 0.0
         mass_matrix(f, w, t, q)
@@ -126,7 +126,7 @@ def factor_at(f, w, t, q):
 
 @merged
 def accelerate(f, w, t, q, v, a):
-    """Compute the accelerations at a state whose rows, factors and null space are in w; return a code."""
+    """Store in `a` the accelerations at (q, v), whose rows, their factors and w.D are in w; return a code."""
     w.counters[N_EVALUATIONS] += 1
     code = factor_at(f, w, t, q)
     if code == DONE:
@@ -147,7 +147,7 @@ def accelerate(f, w, t, q, v, a):
 
 @compiled
 def _record_gamma_scale(w, a):
-    """Record the largest sum of |terms| in G a, the scale of the errors of Gamma by differences."""
+    """Update GAMMA_SCALE, the scale of errors of Gamma, by the largest sum of |terms| in a row of G a."""
     for i in range(w.Rate.size):
         total = 0.0
         for p in range(w.places[i], w.places[i + 1]):
@@ -157,7 +157,7 @@ def _record_gamma_scale(w, a):
 
 @merged
 def equilibrate(f, w, a, lam):
-    """Compute the multipliers of all rows, G^T lam = Q - M a, of least norm if rows are redundant."""
+    """Store in lam the multipliers of all rows, G^T lam = Q - M a, of least norm if rows are redundant."""
     lam[:] = 0.0
     saddle_point.multipliers(f, w, w.Q, a, lam)
     if w.rows_v.size < lam.size:
@@ -166,7 +166,7 @@ def equilibrate(f, w, a, lam):
 
 @merged
 def _factor_rows_at(f, w, t, q, v):
-    """Evaluate and factor the rows, and find the null space, at (q, v), which need not be on the constraints."""
+    """Store rows and factors, with NULL_SPACE also w.D, at (q, v), which may be off the constraints; return a code."""
     if f.flags[KINEMATICS_GIVEN] == 1:
         kinematics(f, w, t, q, v)
         w.notes[KNOWN] = 1.0
@@ -180,7 +180,7 @@ def _factor_rows_at(f, w, t, q, v):
 
 @merged
 def accelerate_at(f, w, t, q, v, a):
-    """Compute the accelerations at (q, v), which need not be on the constraints."""
+    """Store in `a` the accelerations at (q, v), which may be off the constraints; return a code."""
     code = _factor_rows_at(f, w, t, q, v)
     return accelerate(f, w, t, q, v, a) if code == DONE else code
 
@@ -201,7 +201,7 @@ def _correct(f, w, x):
 
 @merged
 def _correct_both(f, w, q, v):
-    """Correct q and v by the factors at q; return the largest correction of a position, and of a velocity."""
+    """Correct q and v in place by the factors at q; return the largest correction of a position and of a velocity."""
     rows, n_c = w.rows_v, w.C.size
     for i in range(rows.size):
         w.g[rows[i]] = -w.C[rows[i]] if rows[i] < n_c else 0.0
@@ -214,13 +214,13 @@ def _correct_both(f, w, q, v):
 
 @merged
 def project_state(f, w, t, q, v, theta, a, lam):
-    """Project (q, v) onto the constraints, then compute accelerations and multipliers there.
+    """Project (q, v) onto the constraints in place, then store accelerations in `a` and multipliers in lam.
 
-    Rows of A constrain velocities only; positions move in directions that these rows allow.
+    Rows of A constrain velocities only; positions are corrected in directions that these rows allow.
 
-    Positions are corrected until a correction is at most theta, and velocities until it is at most theta times the
-    largest velocity. If the correction of positions is at most theta times the smallest pivot, whose inverse bounds how
-    tangents turn, velocities are accurate after the same pass.
+    Passes end when a correction of positions is at most theta, and that of velocities at most theta times the largest
+    velocity. They also end when a correction of positions is at most theta times the smallest pivot: the inverse of
+    this pivot bounds how fast tangents turn, so that velocities are accurate after the same pass.
     """
     before = np.inf
     theta = max(theta, MIN_CORRECTION * w.notes[ROUNDED])
@@ -257,12 +257,12 @@ def project_state(f, w, t, q, v, theta, a, lam):
     return code
 
 
-ROUNDING_OF_Q = 2e-14  # about a hundred times the rounding of q, see rounding_floor
+ROUNDING_OF_Q = 2e-14  # about a hundred times the rounding error of q, relative to max|q|, see rounding_floor
 
 
 @merged
 def _verify_pattern(w):
-    """Write new programs, and return a failure, if the Jacobian has a new entry, which results do not include yet."""
+    """Return DONE if the Jacobian has no new entry; else write new programs and return a failure: results lack it."""
     if not record_entries(w):
         return DONE
     return INNER_DIVERGED if write_programs(w) else SINGULAR
@@ -288,7 +288,7 @@ def _other_task(f, w, task, t, q, v):
 
 @kernel(INNER)
 def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
-    """Do a task of tasks.py at (t, q, v): the functions below are named like the tasks and explain them."""
+    """Do `task`, one of tasks.py, at (t, q, v); return a code. The functions below explain the tasks."""
     if task >= tasks.FIND_NULL_SPACE:
         return _other_task(f, w, task, t, q, v)
     if task in (tasks.EVALUATE, tasks.EVALUATE_AS_GIVEN) and w.notes[TIME_IS_UP] == 1.0:
@@ -317,29 +317,29 @@ def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
 
 @merged
 def evaluate(f, w, t, q, v, tolerance, a):
-    """Evaluate the right-hand side: dependent q and v from the independent ones, then a.
+    """Store in q and v dependent coordinates that fit the independent ones, and in `a` accelerations; return a code.
 
-    Velocities and accelerations use the Jacobian of the last Newton iterate that was factored; its position differs
-    from the final one by at most w.notes[REUSE].
+    Velocities and accelerations are computed with the last Jacobian that was factored; its position differs from the
+    final one by at most w.notes[REUSE].
     """
     return f.inner(f, w, tasks.EVALUATE, t, q, v, tolerance, a, w.lam)
 
 
 @merged
 def evaluate_state(f, w, t, q, v, tolerance, a, lam):
-    """Evaluate a state that may be accepted: exact to rounding, with multipliers."""
+    """Do the task of `evaluate` for a state that may be accepted: up to rounding, with multipliers in lam."""
     return f.inner(f, w, tasks.EVALUATE_STATE, t, q, v, tolerance, a, lam)
 
 
 @merged
 def evaluate_as_given(f, w, t, q, v, a):
-    """Evaluate accelerations at (q, v) without a projection; the state need not be on the constraints."""
+    """Store in `a` the accelerations at (q, v), which may be off the constraints, and return a code."""
     return f.inner(f, w, tasks.EVALUATE_AS_GIVEN, t, q, v, 0.0, a, w.lam)
 
 
 @merged
 def project(f, w, t, q, v, theta, a, lam):
-    """Project (q, v) onto the constraints, with a and lam; the last correction of a position is at most theta."""
+    """Project (q, v) onto the constraints in place, and store a and lam; see `project_state`."""
     code = f.inner(f, w, tasks.PROJECT, t, q, v, theta, a, lam)
     if code == DONE and has_new_entries(w.G, w.pattern):
         code = f.inner(f, w, tasks.VERIFY_PATTERN, t, q, v, theta, a, lam)
@@ -348,43 +348,43 @@ def project(f, w, t, q, v, theta, a, lam):
 
 @merged
 def restore(f, w, t, q, v, tolerance):
-    """Restore dependent q and v from the independent ones; leaves w ready for `accelerations` at this state."""
+    """Store in q and v dependent coordinates that fit the independent ones, up to rounding; return a code."""
     return f.inner(f, w, tasks.RESTORE, t, q, v, tolerance, w.x, w.lam)
 
 
 @merged
 def accelerations(f, w, t, q, v, a, lam):
-    """Solve eqs. (6)-(8) at a state that was restored just before: accelerations and multipliers."""
+    """Store in `a` and lam the solution of eqs. (6)-(8) at (q, v), right after `restore`; return a code."""
     return f.inner(f, w, tasks.ACCELERATIONS, t, q, v, 0.0, a, lam)
 
 
 @merged
 def multipliers(f, w, t, q, v, a, lam):
-    """Compute the multipliers of the accelerations that were computed just before."""
+    """Store in lam the multipliers for `a`, right after the evaluation of `a`; return a code."""
     return f.inner(f, w, tasks.MULTIPLIERS, t, q, v, 0.0, a, lam)
 
 
 @merged
 def find_tangents(f, w, t, q):
-    """Factor the rows at a position on the constraints, and find the velocities that they allow, in w.D."""
+    """Factor the rows at a position q on the constraints, and store the velocities they allow in w.D; return a code."""
     return f.inner(f, w, tasks.FIND_NULL_SPACE, t, q, q, 0.0, w.x, w.lam)
 
 
 @merged
 def prepare_mass(f, w, t, q):
-    """Evaluate M(t, q), and its factors if they are needed."""
+    """Store M(t, q), and its factors if the form of the equations needs them, in w; return a code."""
     return f.inner(f, w, tasks.PREPARE_MASS, t, q, q, 0.0, w.x, w.lam)
 
 
 @merged
 def renew_partition(f, w, t, q):
-    """Choose a partition at an accepted state, and record the sign of det C_qd, which later states must have, too."""
+    """Choose a new partition at the position q of an accepted state, and store the sign of det C_qd; return a code."""
     return f.inner(f, w, tasks.RENEW_PARTITION, t, q, q, 0.0, w.x, w.lam)
 
 
 @merged
 def adopt_midpoint_partition(f, w, t_mid, state, new_state):
-    """Adopt the partition of the middle of a step, see `partition_of_midpoint`."""
+    """Adopt the partition that suits the middle of a step; return a code, see `partition_of_midpoint`."""
     return f.inner(f, w, tasks.ADOPT_MIDPOINT, t_mid, state, new_state, 0.0, w.x, w.lam)
 
 
@@ -396,13 +396,13 @@ def check_redundant(f, w, t, q, v):
 
 @merged
 def rounding_floor(q):
-    """Return the relative change, the rounding of q, at which a stagnant fixed-point iteration counts as converged."""
+    """Return the change, due to rounding of q, at which a stagnant fixed-point iteration counts as converged."""
     return max(ROUNDING_OF_CORRECTIONS, ROUNDING_OF_Q * largest_of(q))
 
 
 @kernel(INNER)
 def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
-    """Do a task by the mechanism's generated code; leave other tasks, and failures, to the general loop."""
+    """Do a task by the mechanism's generated code, or else by the general inner loop; return a code."""
     if task == tasks.EVALUATE_AS_GIVEN:
         w.counters[N_EVALUATIONS] += 1
         w.counters[N_FACTORIZATIONS] += 1

@@ -1,7 +1,7 @@
-"""Partition coordinates by LU: choose independent coordinates and rows, and restore the dependent coordinates.
+"""Partition coordinates by LU: choose independent coordinates and rows, and compute the dependent coordinates.
 
-Dependent positions follow from Newton's method, the inner loop of the paper, dependent velocities from a linear solve.
-Equation numbers are those of Zhang & Zhang (2016), doi 10.1007/s11071-016-2682-8.
+Dependent positions follow from Newton's method, the inner loop of the paper, dependent velocities from linear
+equations. Equation numbers are those of Zhang & Zhang (2016), doi 10.1007/s11071-016-2682-8.
 """
 
 import numpy as np
@@ -54,14 +54,14 @@ from twoloop.kernels.linalg.markowitz_lu import (
 )
 
 RANK_TOLERANCE = 1e-11  # largest pivot that counts as zero, for rows scaled to 1
-CHANGED = -1  # code, in place of DONE: a new partition has been adopted
+CHANGED = -1  # code returned instead of DONE if a new partition has been adopted
 MAX_ROWS_ELIMINATED = 200  # largest number of rows that are eliminated only to measure how near a singular position is
-SENSITIVITY_GROWTH = 3.0  # a partition is renewed if max|C_qd^-1 C_qi| has grown by more since the partition was chosen
+SENSITIVITY_GROWTH = 3.0  # ratio of max|C_qd^-1 C_qi| to its value for a new partition above which a partition is poor
 
 
 @compiled
 def scale_rows(A):
-    """Divide each row by a power of two, so that its largest entry is about 1."""
+    """Divide each row of A in place by a power of two, so that the largest entry of the row is about 1."""
     for i in range(A.shape[0]):
         top = largest_of(A[i])
         if top > 0.0 and top < np.inf:
@@ -81,10 +81,10 @@ def _largest_from(row, first):
 
 @compiled
 def full_pivoting(A, order, row_order, largest, first, last, max_rank):
-    """Eliminate A in place by Gauss with full pivoting, from pivot `first` on; return the numerical rank.
+    """Eliminate A in place by Gauss with full pivoting, from pivot number `first` on; return the numerical rank.
 
-    Pivots are chosen among the rows before `last`, and there are at most `max_rank`, including those before `first`.
-    `order` and `row_order` become the order of columns and rows. `largest` is scratch: the largest |entry| of each row.
+    Pivots are chosen among the rows before `last`; there are at most `max_rank`, including those before `first`.
+    `order` and `row_order` are permuted as the columns and rows of A; `largest` is scratch, with one number per row.
     """
     n_q = A.shape[1]
     k = first
@@ -122,10 +122,10 @@ def full_pivoting(A, order, row_order, largest, first, last, max_rank):
 
 @compiled
 def least_pivot(f, w, t, q):
-    """Return the ratio of the smallest to the largest pivot at (t, q), without scaling; keep the partition.
+    """Return the ratio of the smallest to the largest pivot of C_q and A at (t, q), without a new partition.
 
-    Scaling would hide that a row or a column is short at a singular position. With sparse factors or too many rows the
-    result is the smallest pivot of the last partition.
+    Rows are not scaled, because this would hide that a row is short at a singular position. In the static form, or with
+    more than MAX_ROWS_ELIMINATED rows, the result is w.notes[PIVOT], of the last partition.
     """
     if f.flags[FORM] == STATIC or w.rows_v.size > MAX_ROWS_ELIMINATED:
         return w.notes[PIVOT]
@@ -149,7 +149,7 @@ def least_pivot(f, w, t, q):
 
 @compiled
 def _eliminate(w, max_rank, max_rank_v):
-    """Order rows and columns of w.Gx: first the independent ones of C_q, then those that A adds.
+    """Store in w.row_order and w.order the order of pivots of w.Gx, first those of C_q, then those that A adds.
 
     Returns the rank of C_q and that of C_q and A together, counted up to `max_rank` and `max_rank_v`.
     """
@@ -164,7 +164,7 @@ def _eliminate(w, max_rank, max_rank_v):
     w.notes[PIVOT] = abs(G[rank - 1, rank - 1]) if rank > 0 else 1.0
     if n_rows == n_c:
         return rank, rank
-    last = rank  # end of the rows to be eliminated: rows of A replace the redundant rows of C
+    last = rank  # end of the rows to be eliminated, after rows of A have replaced redundant rows of C_q
     for i in range(n_c, n_rows):
         row_order[last], row_order[i] = row_order[i], row_order[last]
         for j in range(G.shape[1]):
@@ -175,7 +175,7 @@ def _eliminate(w, max_rank, max_rank_v):
 
 @compiled
 def smallest_pivot(f, w, t, q):
-    """Return the smallest pivot at (t, q), scaled as in w.notes[PIVOT]; keep the partition."""
+    """Return the smallest pivot of C_q at (t, q), with rows scaled as for w.notes[PIVOT], without a new partition."""
     rank = w.rows.size
     if rank == 0:
         return 1.0
@@ -204,7 +204,7 @@ def _insert_sorted(source, target):
 
 @compiled
 def _adopt_order(w):
-    """Adopt the order found by `_eliminate` as the partition; return False if C_qd is singular."""
+    """Store the partition by the order of `_eliminate`, and its programs; return False if C_qd is singular."""
     rank, rank_v = w.rows.size, w.rows_v.size
     # in ascending order, so that equal sets of coordinates are equal partitions
     _insert_sorted(w.row_order[:rank], w.rows)
@@ -227,7 +227,7 @@ def _adopt_order(w):
 
 @compiled
 def write_programs(w):
-    """Write the programs that factor the dependent columns of w.G; return False if these are singular."""
+    """Write the programs that factor the dependent columns of w.G; return False if these columns are singular."""
     _record_columns(w)
     w.notes[FACTORED] = 0.0
     is_regular = make_program(w.G, w.pattern, w.rows, w.dependent, w.index, w.values)
@@ -238,7 +238,7 @@ def write_programs(w):
 
 @compiled
 def _record_columns(w):
-    """Record in w.places (see Work) in which columns each row has entries."""
+    """Store in w.places (see Work) the columns in which each row of w.G has entries, from w.pattern."""
     n_rows = w.Rate.size
     index = n_rows + 1
     for i in range(n_rows):
@@ -252,7 +252,7 @@ def _record_columns(w):
 
 @compiled
 def record_entries(w):
-    """Record where w.G has entries; return whether any entry is new, so that programs must be written again."""
+    """Set w.pattern to 1 where w.G has entries; return whether an entry is new, so that programs must be rewritten."""
     if not note_pattern(w.G, w.pattern):
         return False
     w.index_a[SIZE] = 0
@@ -261,9 +261,9 @@ def record_entries(w):
 
 @compiled
 def choose_partition(f, w, t, q):
-    """Choose dependent and independent coordinates at (t, q), and the independent rows.
+    """Choose dependent and independent coordinates at (t, q), and the independent rows, and store them; return a code.
 
-    Returns SINGULAR if the rank is less than that of the previous partition. Returns RANK_DIFFERS, with the ranks in
+    The code is SINGULAR if the rank is less than that of the previous partition, and RANK_DIFFERS, with the ranks in
     w.notes, if this is the first partition and the workspace is allocated for other ranks.
     """
     w.entries[:] = 0.0
@@ -285,13 +285,13 @@ def choose_partition(f, w, t, q):
 
 @compiled
 def partition_of_midpoint(f, w, t_mid, state, new_state):
-    """Adopt the partition that full pivoting finds in the middle of a step; return CHANGED, or DONE without a change.
+    """Adopt the partition that full pivoting chooses in the middle of a step; return CHANGED, or DONE if unchanged.
 
-    The reversed step has the same middle, so that the choice, and with it the map of a symmetric tableau, is symmetric
-    in time. A partition that is kept until it is poor would depend on the direction of time.
+    The reversed step has the same middle, so that the partition, and with it the step by a symmetric tableau, is
+    symmetric in time. A partition that is used until it is poor would depend on the direction of time.
 
-    The middle is computed from the attempt under the current partition, and is not checked again after the step is
-    repeated under the new one. If two choices are equally good within the difference of the two attempts, O(h^(p+1)),
+    The middle is computed from the attempt with the current partition, and is not checked again after the step is
+    repeated with the new one. If two partitions are equally good within the difference of the two attempts, O(h^(p+1)),
     the reversed step may choose the other one.
     """
     n = w.Q.size
@@ -323,7 +323,7 @@ def _same_set(a, b):
 
 @compiled
 def choose_oriented_partition(f, w, t, q):
-    """Choose a partition at an accepted state, and record the sign of det C_qd, which later states must have, too."""
+    """Choose a partition at an accepted state, and store the sign of det C_qd as ORIENTATION; return a code."""
     code = choose_partition(f, w, t, q)
     w.notes[ORIENTATION] = 0.0
     if code != DONE:
@@ -337,7 +337,7 @@ def choose_oriented_partition(f, w, t, q):
 
 @compiled
 def _largest_coefficient(w):
-    """Return the largest coefficient, from w.minimum, of an independent row in a redundant one (rows scaled to 1)."""
+    """Return the largest coefficient, in w.minimum, of an independent row in a redundant one, for rows scaled to 1."""
     rows = rows_of(w.index_v)
     largest = 0.0
     begin = 0
@@ -355,11 +355,11 @@ def _largest_coefficient(w):
 
 @compiled
 def partition_is_poor(w):
-    """Return whether dependent coordinates move much faster, per independent one, than when the partition was chosen.
+    """Return whether dependent coordinates move much faster, relative to independent ones, than with a new partition.
 
     The measure is max|C_qd^-1 C_qi|, from w.D. It is near 1 after full pivoting, and grows without bound where the
-    independent coordinates stop being valid. The coefficients of independent rows in a redundant row grow in the same
-    way where the independent rows become dependent: there C_qd is singular, but not C_q.
+    independent coordinates stop being valid. Coefficients of independent rows in redundant rows are compared in the
+    same way: they grow where the independent rows become dependent, so that C_qd is singular, but not C_q.
     """
     largest = 0.0
     for j in range(w.independent_v.size):
@@ -377,20 +377,20 @@ def partition_is_poor(w):
     return not coefficient <= SENSITIVITY_GROWTH * w.notes[LEANING]
 
 
-MAX_ITERATIONS = 25  # Newton iterations; quadratic convergence needs 2 to 5
-CONTRACTION = 0.5  # largest ratio of a correction to the correction before
-ROUNDING_OF_CORRECTIONS = 1e-12  # relative to the largest coordinate: corrections of this size no longer shrink
+MAX_ITERATIONS = 25  # largest number of Newton iterations; quadratic convergence needs 2 to 5
+CONTRACTION = 0.5  # largest ratio of a correction to the one before in a converging iteration
+ROUNDING_OF_CORRECTIONS = 1e-12  # correction, relative to the largest coordinate, that may not decrease, by rounding
 # factor on ROUNDING_OF_CORRECTIONS if all rows are satisfied up to rounding: the rounding of a position of 1 m turns a
 # rod of 1 mm by 1e-13, and a chain of 1,000 such rods by more
 AMPLIFIED = 1e3
-CLOSED = 2e-15  # violation of a row that is a rounding error, relative to the largest term of the row
-MIN_CORRECTION = 10.0  # smallest tolerance of corrections, relative to ROUNDED, the rounding of positions
+CLOSED = 2e-15  # largest violation of a row that counts as a rounding error, relative to the largest term of the row
+MIN_CORRECTION = 10.0  # smallest tolerance of corrections, relative to w.notes[ROUNDED], the rounding of positions
 MAX_VIOLATION = 1e-7  # largest violation of a redundant row, relative to the size of the mechanism
 
 
 @compiled
 def _factor_in_new_order(w, t, q):
-    """Factor the dependent columns in a new order of elimination; return DONE, SINGULAR or NOT_FINITE."""
+    """Factor the dependent columns of w.G in a new order of elimination; return DONE, SINGULAR or NOT_FINITE."""
     record_entries(w)
     if not finite(w.G):
         return not_finite(w.notes, JACOBIAN, t, q)
@@ -409,13 +409,13 @@ def factor_rows(w, t, q):
     if w.Rate.size > w.C.size:
         ratio = min(ratio, factor(w.entries, w.index_v, w.values_v))
         w.counters[N_FACTORIZATIONS] += 1
-    # after a small pivot, the order of elimination no longer suits the numbers; after NaN, they are not finite
+    # a small ratio may be due to an order of elimination that does not suit the numbers, or to NaN
     return DONE if ratio > RANK_TOLERANCE else _factor_in_new_order(w, t, q)
 
 
 @merged
 def factor_dependent(f, w, t, q):
-    """Evaluate C_q and A at (t, q), and factor the dependent columns; return DONE, SINGULAR or NOT_FINITE."""
+    """Store C_q and A at (t, q) in w.G, and factor the dependent columns; return DONE, SINGULAR or NOT_FINITE."""
     w.notes[KNOWN] = 0.0
     clear_rows(f, w)
     constraint_rows(f, w, t, q, w.G)
@@ -424,7 +424,7 @@ def factor_dependent(f, w, t, q):
 
 @compiled
 def rows_hold(w, q):
-    """Return whether w.C are rounding errors: |C_i| at most CLOSED times the largest |G_ij q_j|."""
+    """Return whether all C_i in w.C are rounding errors, that is, at most CLOSED times the largest |G_ij q_j|."""
     for i in range(w.C.size):
         size = 0.0
         for p in range(w.places[i], w.places[i + 1]):
@@ -436,10 +436,10 @@ def rows_hold(w, q):
 
 @merged
 def restore_positions(f, w, t, q, v, tolerance, reuse):
-    """Solve eq. (15) by Newton's method for the dependent positions, up to corrections of `tolerance`; return a code.
+    """Solve eq. (15) by Newton's method for the dependent positions in q; return a code.
 
-    Rows and factors remain in w: those at q, or those before a last correction of at most `reuse`. With the fused
-    callback w.Rate and w.Gamma remain, too, for the velocities v before these are restored.
+    The iteration ends after a correction of at most `tolerance`. On return, rows and factors in w are those at q, or
+    those before a last correction of at most `reuse`; the fused callback also stores w.Rate and w.Gamma, for v.
     """
     last_correction = np.inf
     converged = w.C.size == 0
@@ -470,8 +470,8 @@ def restore_positions(f, w, t, q, v, tolerance, reuse):
             return DONE
         converged = correction <= tolerance
         if not converged and correction > CONTRACTION * last_correction:
-            # accept if rounding of large coordinates exceeds the tolerance; otherwise Newton's method has left its
-            # region of convergence, and could converge to another assembly of the mechanism
+            # accept a correction that is due to rounding; otherwise Newton's method has left its region of convergence,
+            # and could converge to another assembly of the mechanism
             limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
             converged = correction <= limit or (correction <= AMPLIFIED * limit and rows_hold(w, q))
             if not converged:
@@ -482,7 +482,7 @@ def restore_positions(f, w, t, q, v, tolerance, reuse):
 
 @merged
 def find_null_space(f, w, t, q):
-    """Compute w.D, the velocities that the constraints allow, from the rows and factors in w."""
+    """Store in w.D the velocities that the constraints allow (see Work), from the rows and factors in w."""
     if f.flags[KINEMATICS_GIVEN] == 0 or w.notes[KNOWN] == 0.0:
         constraint_rates(f, w, t, q, w.Rate)
     gather_independent_columns(w.G, w.Rate, rows_of(w.index_v), w.independent_v, w.D)
@@ -492,9 +492,9 @@ def find_null_space(f, w, t, q):
 
 @merged
 def restore_velocities(f, w, t, q, v, reuse):
-    """Solve eq. (14) for the dependent velocities, G_d v_d = -(C_t, b) - G_i v_i, with the rows and factors in w.
+    """Solve eq. (14), G_d v_d = -(C_t, b) - G_i v_i, for the dependent velocities in v, with rows and factors in w.
 
-    If the fused callback has computed w.Gamma, w.Gamma is used further if velocities change by at most `reuse`.
+    A w.Gamma that the fused callback has computed stays valid (KNOWN) if velocities change by at most `reuse`.
     """
     rows, columns = rows_of(w.index_v), columns_of(w.index_v)
     n_dof = w.independent_v.size

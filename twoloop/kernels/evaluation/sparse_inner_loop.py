@@ -1,10 +1,10 @@
 """Inner loop of large systems, by sparse factors whose order of elimination is chosen once.
 
-There is no partition: all coordinates are integrated, and evaluated without a projection. Tasks for which other forms
-restore dependent coordinates move all coordinates to the nearest state on the constraints, in the metric of M. If
-sparse factors do not show which rows are independent, a task returns NEEDS_DENSE: the run then continues with the forms
-of saddle_point.py, which methods with a partition always use. If callbacks return values of entries, no array has n_c
-times n_q numbers. Dense callbacks fill dense arrays, from which the entries are copied.
+There is no partition: all coordinates are integrated, and evaluated without a projection. Tasks that compute dependent
+coordinates in other forms move all coordinates to the nearest state on the constraints, in the metric of M. If sparse
+factors do not show which rows are independent, a task returns NEEDS_DENSE: the run then continues with the forms of
+saddle_point.py, which methods with a partition always use. If callbacks return values of entries, no array has n_c
+times n_q numbers. Callbacks that fill dense matrices are also allowed: the entries are copied from these.
 
 If rows are redundant, multipliers have the least norm. Of all lam with G^T lam = b, that of least norm is G x for some
 x, and both solve
@@ -12,9 +12,9 @@ x, and both solve
     [0  G^T] [ x ]   [b]
     [G  -1 ] [lam] = [0]
 
-This matrix is singular, because the constraints leave some motion free. With a small positive diagonal matrix W in
-place of 0 it is quasi-definite, and can be factored in any order (Vanderbei 1995, doi 10.1137/0805005), so also by the
-program for M and G. Refined solutions converge to the same lam, because b is a combination of rows of G: along a
+This matrix is singular, because the constraints leave some motion free. If a small positive diagonal matrix W replaces
+0, the matrix is quasi-definite, and can be factored in any order (Vanderbei 1995, doi 10.1137/0805005), so also by the
+program for M and G. Refined solutions converge to lam of least norm, because b is a combination of rows of G: along a
 direction in which G x is s, relative to the sizes of its columns, each refinement divides the error by
 1 + s^2 / REGULARIZATION.
 """
@@ -76,17 +76,18 @@ from twoloop.kernels.linalg.dense import copy, has_new_entries, largest_of
 from twoloop.kernels.linalg.sparse_ldl import factor, load, solve, solve_refined
 from twoloop.kernels.linalg.symbolic_factorization import N_OFF, N_PIVOTS, jacobian_of, mass_of, order_of
 
-SUSPECT_PIVOT = 1e-6  # pivot over the size of its row: a smaller one is checked, because it may be a rounding error
-MIN_PIVOT = 1e-10  # pivot over the size of its row: below this the factorization fails, as pivots are single rows
-DEPENDENT = 1e-11  # sine of the angle to the other rows, computed without cancellation, up to which a row is redundant
-PROJECT_STAGES = 2.0  # value of NEARLY_SINGULAR: stages have to be projected, because their errors matter there
-# smallest pivot over the size of its row: below these limits solutions are refined once, or twice
+# pivot, relative to the size of its row, below which a row is checked, because the pivot may be a rounding error
+SUSPECT_PIVOT = 1e-6
+MIN_PIVOT = 1e-10  # smallest pivot, relative to the size of its row, with which factors by 1-by-1 pivots are accurate
+MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the other rows, see _sine, is at most this
+PROJECT_STAGES = 2.0  # value of NEARLY_SINGULAR near a singular position, where stages must be projected
+# smallest pivot, relative to the size of its row, below which solutions are refined once, and twice
 REFINED_ONCE, REFINED_TWICE = 1e-3, 1e-7
 
 
 @compiled
 def fill_mass_values(f, w, t, q):
-    """Evaluate the entries of M into w.mass_values, which already has those of a constant dense M."""
+    """Store the entries of M(t, q) in w.mass_values, unless M is constant and dense: then they are already stored."""
     if f.flags[MASS_VALUES_GIVEN] == 1:
         w.mass_values[:] = 0.0
         f.mass_values(t, q, f.p, w.mass_values)
@@ -101,7 +102,7 @@ def fill_mass_values(f, w, t, q):
 
 @compiled
 def fill_jacobian_values(f, w, t, q):
-    """Evaluate the entries of C_q into w.jacobian_values."""
+    """Store the entries of C_q(t, q) in w.jacobian_values."""
     if f.flags[JACOBIAN_VALUES_GIVEN] == 1:
         w.jacobian_values[:] = 0.0
         f.jacobian_values(t, q, f.p, w.jacobian_values)
@@ -117,7 +118,7 @@ def fill_jacobian_values(f, w, t, q):
 
 @compiled
 def _factor(f, w, least):
-    """Factor the current values; return the smallest ratio of a pivot to its row, see sparse_ldl.py."""
+    """Factor the entries of M and G in w by `factor` of sparse_ldl.py, with `least`; return its result."""
     w.counters[N_FACTORIZATIONS] += 1
     stiffness = w.solutions[3 * f.static_program[N_PIVOTS] :]
     load(f.static_program, w.mass_values, w.jacobian_values, w.factors, stiffness, w.pivot_sizes)
@@ -129,7 +130,7 @@ def _factor(f, w, least):
 
 @compiled
 def _factor_fault(w, t, q):
-    """Return why factors failed: values that are not finite, a singular M (for dense forms), or dependent rows."""
+    """Return why a factorization failed: NOT_FINITE, NEEDS_DENSE if M is singular, SINGULAR if rows are dependent."""
     if not finite_vector(w.mass_values):
         return not_finite(w.notes, MASS, t, q)
     if not finite_vector(w.jacobian_values):
@@ -139,7 +140,7 @@ def _factor_fault(w, t, q):
 
 @compiled
 def factor_at(f, w, t, q):
-    """Evaluate the entries at (t, q), and factor with the independent rows."""
+    """Store the entries of M and G at (t, q), and factor them with the independent rows; return a code."""
     if f.flags[CONSTANT_MASS] == 0:
         fill_mass_values(f, w, t, q)
     fill_jacobian_values(f, w, t, q)
@@ -155,7 +156,7 @@ def factor_at(f, w, t, q):
 
 @compiled
 def solve_values(f, w, times):
-    """Solve in place for the right-hand side in w.unknowns, refined `times` times."""
+    """Replace the right-hand side in w.unknowns by the solution, refined `times` times; see `solve_refined`."""
     n = f.static_program[N_PIVOTS]
     scratch = w.solutions
     return solve_refined(
@@ -175,14 +176,14 @@ def solve_values(f, w, times):
 
 @compiled
 def n_refinements(w):
-    """Return the number of refinements that solutions with these factors need."""
+    """Return the number of refinements that solutions with the factors in w need."""
     smallest = w.notes[SMALLEST]
     return 0 if smallest > REFINED_ONCE else 1 if smallest > REFINED_TWICE else 2
 
 
 @compiled
 def _sine(f, w, row, size):
-    """Return the sine of the angle of a redundant row to the independent ones; `size` is g M^-1 g^T."""
+    """Return the sine of the angle between the row g, number `row`, and the independent rows; `size` is g M^-1 g^T."""
     x, part = w.unknowns, 0.0
     x[:] = 0.0
     rows, columns, _ = jacobian_of(f.static_program)
@@ -206,22 +207,21 @@ def _count(counts):
 
 @compiled
 def _choose_rows(f, w, t, q):
-    """Choose the independent rows, into w.counts, and factor with them; return DONE, or why that failed.
+    """Store the choice of independent rows in w.counts, and factor with these rows; return a code.
 
-    Rows with small pivots are left out at first, and added one after another if they are independent of the rows chosen
-    so far.
+    Rows with small pivots are left out at first, then added one by one if independent of the rows chosen so far.
     """
     w.counts[:] = 1.0
     if not _factor(f, w, SUSPECT_PIVOT) > 0.0:
         return _factor_fault(w, t, q)
     order, n_q = order_of(f.static_program), w.Q.size
-    copy(w.counts, w.z)  # 0 for rows to be checked
+    copy(w.counts, w.z)  # 0 for rows that must be checked
     for k in range(order.size):
         row = order[k] - n_q
         if row < 0 or w.z[row] != 0.0:
             continue
         sine = _sine(f, w, row, w.pivot_sizes[k])
-        if sine <= DEPENDENT:
+        if sine <= MAX_DEPENDENT_SINE:
             continue
         number = _count(w.counts)
         w.counts[row] = 1.0
@@ -233,7 +233,7 @@ def _choose_rows(f, w, t, q):
 
 @compiled
 def _adopt_rows(w):
-    """Adopt the chosen rows as those of the workspace; return SINGULAR if their number differs."""
+    """Store the indices of the rows with w.counts = 1 in w.rows_v; return SINGULAR if their number differs, or DONE."""
     if _count(w.counts) != w.rows_v.size:
         return SINGULAR
     place = 0
@@ -246,7 +246,7 @@ def _adopt_rows(w):
 
 @compiled
 def choose_rows(f, w, t, q):
-    """Choose the independent rows at (t, q); return RANK_DIFFERS if the workspace has another number of them."""
+    """Choose and store the independent rows at (t, q); return RANK_DIFFERS if w is allocated for another number."""
     w.counters[N_PARTITIONS] += 1
     fill_mass_values(f, w, t, q)
     fill_jacobian_values(f, w, t, q)
@@ -261,15 +261,15 @@ def choose_rows(f, w, t, q):
     return _adopt_rows(w)
 
 
-REGULARIZATION = 1e-11  # diagonal entries of W, relative to the sum of squares of a column of G
+REGULARIZATION = 1e-11  # diagonal entry of W, relative to the sum of squares of the column of G
 CONVERGED_RESIDUAL = 1e-14  # residual at which the refinement ends, relative to the largest force
 MAX_RESIDUAL = 1e-9  # largest residual, relative to the largest force, that is accepted if it no longer decreases
-MAX_SOLUTIONS = 30  # largest number of solutions, i.e. refinements
+MAX_SOLUTIONS = 30  # largest number of solutions in the refinement of multipliers of least norm
 
 
 @compiled
 def _load(program, jacobian, n_q, weights, values):
-    """Copy the numbers of the matrix for least norm to their slots; `weights` is scratch for n_q numbers."""
+    """Store the numbers of the matrix [W G^T; G -1] in their slots in `values`; `weights` (n_q) is scratch."""
     rows, columns, slots = jacobian_of(program)
     for j in range(n_q):
         weights[j] = 0.0
@@ -290,7 +290,7 @@ def _load(program, jacobian, n_q, weights, values):
 
 @compiled
 def _residual(program, jacobian, force, x, r):
-    """Compute r = [b - G^T lam, lam - G x] for x = [x, lam] and the force b; return its largest force over b's."""
+    """Store r = [b - G^T lam, lam - G x] for the force b and unknowns [x, lam]; return max|b - G^T lam| / max|b|."""
     n_q, largest, left = force.size, 0.0, 0.0
     copy(force, r[:n_q])
     for i in range(n_q, x.size):
@@ -307,7 +307,7 @@ def _residual(program, jacobian, force, x, r):
 
 @compiled
 def least_norm(f, w, lam):
-    """Replace lam by the multipliers of least norm with the same G^T lam; return NEEDS_DENSE if that fails."""
+    """Replace lam by the multipliers of least norm with the same G^T lam; return DONE, or NEEDS_DENSE if this fails."""
     program, n_q = f.static_program, w.Q.size
     n = program[N_PIVOTS]
     n_factors = n + program[N_OFF] + 1
@@ -346,7 +346,7 @@ def least_norm(f, w, lam):
 
 @compiled
 def _add_jacobian_times(f, w, x, out):
-    """Add G x to out."""
+    """Add G x to `out` in place."""
     rows, columns, _ = jacobian_of(f.static_program)
     for k in range(rows.size):
         out[rows[k]] += w.jacobian_values[k] * x[columns[k]]
@@ -354,7 +354,7 @@ def _add_jacobian_times(f, w, x, out):
 
 @compiled
 def _gamma(f, w, t, q, v):
-    """Compute the right-hand side of the acceleration constraints into w.Gamma."""
+    """Store the right-hand side of G a = Gamma in w.Gamma; return NEEDS_DENSE if this needs differences, else DONE."""
     w.Gamma[:] = 0.0
     if f.flags[GAMMA_GIVEN] == 1:
         f.gamma(t, q, v, f.p, w.Gamma)
@@ -364,7 +364,7 @@ def _gamma(f, w, t, q, v):
 
 @compiled
 def _acceleration_fault(w, t, q):
-    """Record which callback gave an acceleration that is not finite; return NOT_FINITE."""
+    """Store which callback made an acceleration non-finite; return NOT_FINITE."""
     if not finite_vector(w.Gamma):
         return not_finite(w.notes, GAMMA, t, q)
     if not finite_vector(w.Q):
@@ -374,7 +374,7 @@ def _acceleration_fault(w, t, q):
 
 @compiled
 def _accelerate(f, w, t, q, v, a):
-    """Compute the accelerations by the current factors; multipliers go into w.z."""
+    """Store accelerations at (q, v) in `a`, and multipliers in w.z, by the factors in w; return a code."""
     w.counters[N_EVALUATIONS] += 1
     code = _gamma(f, w, t, q, v)
     if code != DONE:
@@ -392,7 +392,7 @@ def _accelerate(f, w, t, q, v, a):
 
 @compiled
 def _equilibrate(f, w, lam):
-    """Compute the multipliers of all rows, of least norm if rows are redundant."""
+    """Store the multipliers of all rows in lam, from w.z, of least norm if rows are redundant; return a code."""
     copy(w.z, lam)
     return least_norm(f, w, lam) if w.rows_v.size < lam.size else DONE
 
@@ -415,7 +415,7 @@ def _move(f, w, x):
 
 @compiled
 def _rows_hold(f, w, q):
-    """Return whether w.C are rounding errors: |C_i| at most CLOSED times the largest |G_ij q_j|."""
+    """Return whether all C_i in w.C are rounding errors, that is, at most CLOSED times the largest |G_ij q_j|."""
     rows, columns, _ = jacobian_of(f.static_program)
     size = w.solutions[: w.g.size]
     size[:] = 0.0
@@ -429,7 +429,7 @@ def _rows_hold(f, w, q):
 
 @compiled
 def _to_constraints(f, w, t, q, v, theta):
-    """Project (q, v) onto the constraints as inner_loop.py does, but keep the factors before the last correction."""
+    """Project (q, v) onto the constraints in place, with factors before the last correction in w; return a code."""
     before = np.inf
     theta = max(theta, MIN_CORRECTION * w.notes[ROUNDED])
     for _ in range(MAX_ITERATIONS):
@@ -465,7 +465,7 @@ def _to_constraints(f, w, t, q, v, theta):
 
 @compiled
 def _mass_pattern_holds(w):
-    """Return whether a dense mass matrix has entries only where the program expects them."""
+    """Return whether w.M, if a callback fills this dense matrix, has entries only where the program expects them."""
     return w.M.size == 0 or not has_new_entries(w.M, w.mass_pattern)
 
 
@@ -491,7 +491,7 @@ def _redundant_rows_hold(f, w, t, q, v):
 
 @compiled
 def _solve(f, w, r, c, a, lam):
-    """Solve for `a` and lam with any right-hand side (r, c), by the current factors."""
+    """Store in `a` and lam the solution for the right-hand side (r, c), by the factors in w; return DONE."""
     n = r.size
     copy(r, w.unknowns[:n])
     copy(c, w.unknowns[n:])
@@ -519,7 +519,7 @@ def _other_task(f, w, task, t, q, v, a, lam):
 
 @kernel(INNER)
 def sparse_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
-    """Do a task at (t, q, v), see inner_loop.py; for SOLVE, q and v are the right-hand side."""
+    """Do `task` at (t, q, v), see inner_loop.py; return a code. For SOLVE, q and v are the right-hand side."""
     if task in (tasks.EVALUATE, tasks.EVALUATE_AS_GIVEN):
         code = STOPPED if w.notes[TIME_IS_UP] == 1.0 else DONE
         if code == DONE and task == tasks.EVALUATE and w.notes[NEARLY_SINGULAR] == PROJECT_STAGES:
