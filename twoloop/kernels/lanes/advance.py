@@ -1,4 +1,4 @@
-"""Integration loop of runs in lanes: each lane has its own step size, and gets a new run when its run has ended.
+"""Integration loop of runs in lanes: each lane has its own step size, and starts a new run when its run has ended.
 
 A run is removed from its lane, to be repeated alone, if a condition of the generated code does not hold, or if many
 successive steps are rejected. The function `step` of `CODE` takes the steps.
@@ -53,7 +53,7 @@ def _refill(code, order, control, work, n, n_rows, numbers, q0, v0, next_run, st
     n_fresh, n_running = 0, 0
     for k in range(LANES):
         last = int(work[RUN * LANES + k])
-        # the generated code of a series ends a run without a reason
+        # the generated code of a series ends a run without storing a reason
         if work[RUNNING * LANES + k] == 0.0 and last >= 0 and status[last] == UNDECIDED:
             status[last] = OFTEN_REFUSED if work[REFUSED * LANES + k] < np.inf else NO_VALUES
         work[FINE * LANES + k] = work[FRESH * LANES + k] = 0.0
@@ -85,7 +85,7 @@ def _refill(code, order, control, work, n, n_rows, numbers, q0, v0, next_run, st
 
 @compiled
 def _write_within_steps(code, settings, control, options, work, n, new, times, out_q, out_v, status, n_steps):
-    """Compute the states at output times within the accepted steps, into out_q and out_v; NaN where this fails."""
+    """Store the states at output times within the accepted steps in out_q and out_v, or NaN if that fails."""
     while True:
         n_requested = 0
         for k in range(LANES):
@@ -114,7 +114,10 @@ def _write_within_steps(code, settings, control, options, work, n, new, times, o
 
 @compiled
 def _write_ends(work, control, n, n_rows, new, a, last, out_q, out_v, out_a, status):
-    """Copy the final states of runs that have reached t1 to out_q, out_v and out_a, and end these runs."""
+    """End the runs whose accepted step ends at t1, and copy their final states to out_q, out_v and out_a.
+
+    `last` is the index of t1 among the output times.
+    """
     for k in range(LANES):
         if work[ACCEPTED * LANES + k] == 0.0 or work[H * LANES + k] != control[T1] - work[T * LANES + k]:
             continue
@@ -128,7 +131,7 @@ def _write_ends(work, control, n, n_rows, new, a, last, out_q, out_v, out_a, sta
 
 @compiled
 def _count(settings, work, n_evaluations):
-    """Count the evaluations of a step in lanes with a run: those within the step, and one at its end."""
+    """Add the evaluations within a step, and the one at its end, to `n_evaluations` in lanes with a run."""
     for k in range(LANES):
         if work[RUNNING * LANES + k] == 1.0:
             n_before = settings[N_EVALUATIONS] + int(work[EVALUATED * LANES + k])
@@ -137,7 +140,7 @@ def _count(settings, work, n_evaluations):
 
 @compiled
 def _advance_time(work, control, n_steps):
-    """Advance the time in lanes whose step was accepted, and count this step."""
+    """Advance T and `n_steps` in lanes whose step was accepted."""
     for k in range(LANES):
         if work[ACCEPTED * LANES + k] == 1.0:
             h, t = work[H * LANES + k], work[T * LANES + k]
@@ -157,10 +160,10 @@ def advance_lanes(
 ):
     """Integrate runs, one for each row of `numbers`, from t0 to t1.
 
-    times : (n_t,) output times, the last of which is t1; numbers : data of the generated code; q0, v0 : (n_runs, n)
-    initial states; out_q, out_v : (n_runs, n, n_t) results; out_a : (n_runs, n + n_rows) accelerations and multipliers
-    at t1; status, n_steps : (n_runs,) results; n_evaluations : (n_runs,) increased by the number of evaluations;
-    options : those of the method.
+    options : those of the method, see control.py; times : (n_t,) output times, the last of which is t1; numbers :
+    (n_runs, n_numbers) data of the generated code; q0, v0 : (n_runs, n) initial states. Results are stored in out_q and
+    out_v : (n_runs, n, n_t); out_a : (n_runs, n + n_rows) accelerations and multipliers at t1; status and n_steps :
+    (n_runs,); n_evaluations : (n_runs,) increased by the number of evaluations.
     """
     n, n_rows, order = settings[N], settings[N_ROWS], settings[ORDER]
     _, new, _, _, a, _, _, _ = places_of(n, n_rows, numbers.shape[1])

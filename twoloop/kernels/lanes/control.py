@@ -59,16 +59,18 @@ from twoloop.kernels.lanes.layout import (
 
 # indices in `options`, after the rule of step-size control. ROUGH: factor by which errors may exceed their estimates if
 # a force jumps; FIRST: first step, relative to the shortest time scale at the start; LEAST: the smallest tolerance.
-# Then follow the options of the method for runs outside the lanes
+# From N_HEAD on, `options` are those of the method outside the lanes
 ROUGH, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
 
-# the values of SUDDEN_ERROR and REFUSED in kernels/advance.py, and of the relative rounding error of a time in
-# `off_grid`
+# SUDDEN_ERROR: error, in tolerances, above which a force may have jumped. AFTER_REJECTION: largest ratio of the next
+# step size to the size of a rejected step. Both are as in kernels/advance.py. ROUNDING_OF_END: a step that is shorter
+# than the time to t1 by at most this fraction ends at t1, as in `off_grid`
 SUDDEN_ERROR, AFTER_REJECTION, ROUNDING_OF_END = 10.0, 0.95, 1e-10
-LIMIT_FACTOR, LIMIT_MEMORY = 0.7, 10.0  # the values in methods/plan.py
-RESOLVED = 20.0 * SHORTEST  # lower bound of the first step, relative to t0
-MOST_REFUSED = 30  # largest number of successive rejected steps: in stiff motion, these steps may remain far too long
-MOST_STEPS = 100_000  # largest number of steps of a run in lanes, because the user cannot interrupt it
+# ratio of H_LIMIT to the size of a step that failed, and number of accepted steps for which it applies, as in `Plan`
+LIMIT_FACTOR, LIMIT_MEMORY = 0.7, 10.0
+LEAST_FIRST_STEP = 20.0 * SHORTEST  # smallest size of the first step, relative to |t0|
+MAX_REJECTED = 30  # largest number of successive rejected steps: in stiff motion, steps may remain far too long
+MOST_STEPS = 100_000  # largest number of steps of a run in lanes, because the user cannot interrupt a run there
 
 
 @inlined
@@ -79,7 +81,7 @@ def _history(work, k):
 
 @compiled
 def _first_step(options, control, work, n, state, a, k):
-    """Return the first step, s: options[FIRST] times the shortest time scale of the motion of lane k at t0."""
+    """Return the size, s, of the first step in lane k: options[FIRST] times the shortest time scale of the motion."""
     largest_q, largest_v, largest_a, least = 0.0, 0.0, 0.0, np.inf
     for j in range(n):
         largest_q = max(largest_q, abs(work[(state + j) * LANES + k]))
@@ -93,12 +95,12 @@ def _first_step(options, control, work, n, state, a, k):
         scale = min(scale, np.sqrt(largest_q / largest_a))
     if largest_v > 0.0 and largest_a > 0.0 and largest_v / largest_a > options[FIRST] * scale:
         scale = min(scale, largest_v / largest_a)
-    return max(options[FIRST] * scale, RESOLVED * abs(control[T0]))
+    return max(options[FIRST] * scale, LEAST_FIRST_STEP * abs(control[T0]))
 
 
 @compiled
 def begin_control(options, control, work, n, state, a, start):
-    """Choose the first steps of new runs, and copy their accelerations A to `start`."""
+    """Initialize step-size control in lanes with FRESH = 1, and copy the accelerations `a` to `start` there."""
     for k in range(LANES):
         if work[FRESH * LANES + k] == 1.0:
             for j in range(n):
@@ -112,7 +114,11 @@ def begin_control(options, control, work, n, state, a, start):
 
 @compiled
 def choose_steps(work, control, status, n_steps):
-    """Choose the step size H = X of each lane, at most GAP; 0 in lanes without a run. Set FINE to RUNNING."""
+    """Store the size of the next step of each lane, at most GAP, in H and X; copy RUNNING to FINE.
+
+    The size is 0 in lanes without a run. A run is removed from its lane if its step would be too short, or if it has
+    taken too many steps.
+    """
     t1 = control[T1]
     for k in range(LANES):
         work[H * LANES + k], t = 0.0, work[T * LANES + k]
@@ -136,7 +142,7 @@ def choose_steps(work, control, status, n_steps):
 
 @compiled
 def set_end(work, control):
-    """Set AHEAD to the time X after the beginning of the step."""
+    """Set AHEAD to T + X, or exactly to t1 if this is the end of the run."""
     for k in range(LANES):
         t, x = work[T * LANES + k], work[X * LANES + k]
         work[AHEAD * LANES + k] = control[T1] if x == control[T1] - t else t + x
@@ -144,10 +150,10 @@ def set_end(work, control):
 
 @compiled
 def end_steps(code, settings, control, work, predicted_v):
-    """Project NEW; set ERROR to the change by the projection over the tolerances, if this is larger.
+    """Project NEW onto the constraints; increase ERROR to the change by the projection, if this is larger.
 
-    If velocities change by more than the tolerances, a drive has a jump or kink between the stages. `predicted_v` (n)
-    is scratch.
+    The change is in units of the tolerances. A change of velocities above 1 shows that a drive has a jump or kink
+    between the stages. `predicted_v` (n) is scratch.
     """
     n, order = settings[N], settings[ORDER]
     state, new, predicted, _, _, _, _, _ = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
@@ -169,18 +175,18 @@ def end_steps(code, settings, control, work, predicted_v):
 
 @merged
 def _accept_or_shorten(options, work, k):
-    """Return whether the step of lane k is accepted, and choose the size of the next step."""
+    """Store the size of the next step of lane k, H_NEXT; return whether its last step is accepted."""
     h, t, error = work[H * LANES + k], work[T * LANES + k], work[ERROR * LANES + k]
     if work[FINE * LANES + k] == 0.0 or not np.isfinite(error):
         work[H_NEXT * LANES + k], work[H_LIMIT * LANES + k] = 0.5 * h, LIMIT_FACTOR * h
         work[LIMIT_AGE * LANES + k] = 0.0
         return False
-    # at a jump of the force, an estimate may be small by chance: up to ROUGH_TO, the estimate is multiplied by ROUGH
-    strict = options[ROUGH] if t < work[ROUGH_TO * LANES + k] else 1.0
-    accepted = error * strict <= 1.0
+    # at a jump of a force, the error estimate may be small by chance: before ROUGH_TO, it is multiplied by ROUGH
+    factor = options[ROUGH] if t < work[ROUGH_TO * LANES + k] else 1.0
+    accepted = error * factor <= 1.0
     if error > SUDDEN_ERROR and not accepted:
         work[ROUGH_TO * LANES + k] = t + h
-    error *= strict
+    error *= factor
     past = _history(work, k)
     proposal = min(h * factor_of(options, past, h, error), work[H_LIMIT * LANES + k])
     if not accepted:
@@ -196,7 +202,7 @@ def _accept_or_shorten(options, work, k):
 
 @compiled
 def judge_steps(options, work, n, a, start, status):
-    """Set ACCEPTED according to ERROR and FINE; copy the accelerations A at the end of accepted steps to `start`."""
+    """Set ACCEPTED according to ERROR and FINE; copy the accelerations `a` at the end of accepted steps to `start`."""
     for k in range(LANES):
         work[ACCEPTED * LANES + k] = 0.0
         if work[RUNNING * LANES + k] == 0.0:
@@ -207,12 +213,12 @@ def judge_steps(options, work, n, a, start, status):
                 work[(start + j) * LANES + k] = work[(a + j) * LANES + k]
         else:
             work[REFUSED * LANES + k] += 1.0
-            if work[REFUSED * LANES + k] > MOST_REFUSED:
+            if work[REFUSED * LANES + k] > MAX_REJECTED:
                 leave_run(work, status, k, OFTEN_REFUSED if work[FINE * LANES + k] == 1.0 else NO_VALUES)
 
 
 def memory_size(s: int, n: int) -> int:
-    """Return the length of the method's memory, in vectors, for s stages."""
+    """Return the length of the method's memory, in vectors, for s stages and n coordinates."""
     return (SLOPES + s) * n
 
 
@@ -249,7 +255,7 @@ def step_by_series(code, settings, control, options, work, status, n_steps, with
             work[X * LANES + k] = work[X * LANES + k] / work[UNIT * LANES + k]
         code.evaluate(order, control, work)
         return
-    for k in range(LANES):  # in stiff motion, no tolerance limits the number of steps
+    for k in range(LANES):  # in stiff motion, the number of steps may be large with any tolerance
         if work[RUNNING * LANES + k] == 1.0 and n_steps[int(work[RUN * LANES + k])] >= MOST_STEPS:
             leave_run(work, status, k, MANY_STEPS)
     code.series(order, control, work)

@@ -1,8 +1,9 @@
-"""Layout of the memory `work` of runs in lanes, operations on it, generated functions, and codes for the end of a run.
+"""Layout of the memory `work` of runs in lanes, operations on `work`, generated functions, and codes of ended runs.
 
-`work` consists of vectors with one number for each lane. Offsets of vectors, and distances between them, are counted in
-vectors. The operations treat all lanes at once, for example the LU factorization of one matrix in each lane. The
-imaginary part of a complex number is `imaginary` vectors after the real part; if `imaginary` is 0, the number is real.
+`work` consists of vectors with one number for each lane. Offsets in `work`, and distances between vectors, are counted
+in vectors; arguments such as `target` or `x` are offsets. The operations treat all lanes at once, for example the LU
+factorization of one matrix in each lane. The imaginary part of a complex number is `imaginary` vectors after the real
+part; if `imaginary` is 0, the number is real.
 """
 
 from typing import Any
@@ -15,68 +16,66 @@ from twoloop.kernels.compile.generated_functions import GeneratedFunctions, has_
 from twoloop.kernels.compile.reference import Reference
 from twoloop.kernels.data.common import INTEGERS, compiled, inlined, merged
 
-# status of a run: not ended, ended at t1, or (below 0) the reason why it has to be repeated alone, outside the lanes
+# status of a run: not ended, ended at t1, or (negative) the reason why the run has to be repeated outside the lanes
 UNDECIDED, ENDED = 0, 1
 NO_START, NO_STATE, NO_VALUES, OFTEN_REFUSED, MANY_STEPS, UNLIKE = range(-6, 0)
 
+LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of doubles in a SIMD register
 
-LANES = 8 if has_wide_vectors() else 4  # number of runs at once: that of doubles in a SIMD register
-
-# offsets in `work` of vectors with one number for each lane; STATE, NEW, PREDICTED, ... follow, see `places`
+# offsets in `work` of the fields, each a vector; the fields are followed by STATE, NEW, PREDICTED, ..., see `places`
 (
     T,  # time of STATE, s
     AHEAD,  # time of NEW, s
     UNIT,  # unit of time of a series, s
     H,  # size of the step, s
     X,  # time of a state to compute, after the beginning of the step, s
-    FINE,  # 1 in lanes for which a task is to run; it remains 1 if the task succeeds
-    DEFECT,  # defect at the end of the step, over its allowed size
+    FINE,  # 1 in lanes in which a task has to run; it remains 1 if the task succeeds
+    DEFECT,  # defect at the end of the step, relative to the allowed defect
     OFF,  # departure of the step, see control/step_size.py
-    LENGTH,  # size of the step that a series allows, in units
-    LONGEST,  # longest step allowed, s
+    LENGTH,  # step size that a series allows, in units of UNIT
+    LONGEST,  # largest allowed step size, s
     REQUESTED,  # 1 in lanes that begin a run, or for which a state within a step is requested
-    WORST,  # largest defect within the step
+    WORST,  # largest defect within the step, relative to the allowed defect
     REFUSED,  # number of successive rejected steps
     RUNNING,  # 1 in lanes with a run
     RUN,  # index of the run in this lane
-    REACHED,  # number of output times reached
+    REACHED,  # number of output times that the run has reached
     LEFT_TO_MOVE,  # 1 in lanes whose projection has not converged yet
-    MOVED_BEFORE,  # largest change of positions by the previous pass of a projection
+    MOVED_BEFORE,  # largest change of a position by the previous pass of a projection
     ACCEPTED,  # 1 in lanes whose step was accepted
     FRESH,  # 1 in lanes whose run has not taken a step yet
-    ERROR,  # error of a step, over the tolerances
+    ERROR,  # error of a step, in units of the tolerances
     H_FREE,  # size of the step before it was shortened to reach the end of the run, s
     H_NEXT,  # size of the next step, s
-    H_LIMIT,  # upper limit of the step size after a step that failed, s; infinite: none
+    H_LIMIT,  # upper limit of the step size after a step that failed, s; infinite if there is no limit
     LIMIT_AGE,  # number of accepted steps since H_LIMIT was set
     ROUGH_TO,  # end of the last step that was rejected because of a suddenly large error, s
-    SHIFT,  # shift of the times within a step at which the defect is evaluated
+    SHIFT,  # number from 0 to 1 that shifts the times within a step at which the defect is evaluated
     EVALUATED,  # number of evaluations within the step, in addition to N_EVALUATIONS in `settings`
     PAST,  # history of step-size control, stored lane by lane, see control/step_size.py
     _MORE_PAST,
     N_FIELDS,
 ) = range(31)
-# names of functions generated for a mechanism; their arguments are (order, control, work), and they change `work`
+# names of tasks: functions (order, control, work) generated for a mechanism, which change `work`
 TASKS = (
     "approach",  # move the positions of NEW, at the time AHEAD, towards the constraints, in lanes with FINE = 1
-    "refine",  # project NEW in lanes with LEFT_TO_MOVE = 1; compute A and LAM; FINE: the projection converges
+    "refine",  # correct NEW once in lanes with LEFT_TO_MOVE = 1; compute A and LAM; FINE is 1 if NEW has converged
     "redundant",  # clear FINE in lanes in which redundant constraints do not hold at NEW
     "departure",  # compute OFF, the departure of NEW from PREDICTED, in a step H from STATE
     "commit",  # copy NEW to STATE in lanes with ACCEPTED = 1
 )
-# "rows": compute C, C_t and the entries of C_q at NEW and AHEAD into the method's memory; FINE: all of them are finite
+# "rows": store C, C_t and the entries of C_q at NEW and AHEAD in the method's memory; it succeeds if all are finite
 TASKS_OF_STARTS = ("rows",)
 TASKS_OF_STAGES = ("accelerate",)  # compute the accelerations A at the state NEW, without a projection
-# "stages": compute the state NEW at the time X after the beginning of the step, and ERROR if X is the whole step; FINE
-# remains 1 in lanes where that succeeded
+# "stages": compute the state NEW at the time X after the beginning of the step, and ERROR if X is the whole step
 TASKS_OF_EXPLICIT = ("stages",)
 TASKS_OF_SERIES = (
     "series",  # compute the coefficients of the series about STATE at T, in units of time UNIT
-    "lengths",  # compute LENGTH, H and X of the step; FINE: the run can continue
+    "lengths",  # compute LENGTH, H and X of the step; it succeeds if the run can continue
     "check_within",  # compute WORST, the largest defect within a step H, and AHEAD, the time of its end
     "evaluate",  # compute NEW, PREDICTED and FOUND, the accelerations, by the series after X units of time
     "defect",  # compute DEFECT, the defect of A at NEW, the end of a step H
-    "judge",  # compute ACCEPTED, and choose the size of the next step
+    "judge",  # set ACCEPTED, and choose the size of the next step
 )
 CODE = Reference("LaneKit", {})
 ALL_TASKS = (*TASKS, *TASKS_OF_STARTS, *TASKS_OF_STAGES, *TASKS_OF_EXPLICIT, *TASKS_OF_SERIES)
@@ -87,18 +86,18 @@ CODE.add_llvm_functions(dict.fromkeys(ALL_TASKS, types.none(types.int64, VECTOR,
 STEP = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[INTEGERS] * 2, types.boolean)
 CODE.add_function("step", STEP)
 
-# offsets in the memory of an explicit method, in n vectors: accelerations at STATE, the state at the beginning of the
-# step (twice n), velocities before the projection, and accelerations of the stages
+# offsets in the memory of an explicit method, in units of n vectors: accelerations at STATE, the state at the beginning
+# of the step (2 n vectors), velocities before the projection, and accelerations of the stages
 START, BEGIN, _BEGIN_V, PREDICTED_V, SLOPES = range(5)
 
 N, N_ROWS, ORDER, CHECKS_REDUNDANT, N_NUMBERS, N_EVALUATIONS = range(6)  # indices in `settings`
 T0, T1, GAP, RTOL, ATOL = range(5)  # indices in `control`; from ATOL on, one absolute tolerance for each coordinate
 
-SHORTEST = 1e-13  # shortest step, relative to the time of its beginning or to t1
+SHORTEST = 1e-13  # smallest step size, relative to the larger of |t| at its beginning and |t1|
 
 
 class LaneKit:
-    """Functions generated for a mechanism, and the step of a method, passed to kernels as a reference (`CODE`)."""
+    """Functions generated for a mechanism and the step of a method, which kernels get as a reference (`CODE`)."""
 
     def __init__(self, own: GeneratedFunctions, step: Any = None):
         self.__dict__.update(dict.fromkeys(ALL_TASKS, 0))
@@ -134,27 +133,27 @@ places_of = merged(places)
 
 @merged
 def fill_field(work, field, value):
-    """Set a vector to `value` in all lanes."""
+    """Set the vector with offset `field` to `value` in all lanes."""
     for k in range(LANES):
         work[field * LANES + k] = value
 
 
 @merged
 def leave_run(work, status, k, reason):
-    """Remove the run of lane k, and store the reason, such as NO_VALUES, why it has to be repeated alone."""
+    """Remove the run of lane k; store in `status` the reason, such as NO_VALUES, why it has to be repeated alone."""
     work[RUNNING * LANES + k] = 0.0
     status[int(work[RUN * LANES + k])] = reason
 
 
 @inlined
 def vectors(work, begin, count):
-    """Return a flat view of `count` adjacent vectors of `work`, from vector number `begin` on."""
+    """Return a flat view of `count` adjacent vectors of `work`, which begin at offset `begin`."""
     return work[begin * LANES : (begin + count) * LANES]
 
 
 @inlined
 def table(work, begin, rows, count):
-    """Return a view (rows, count * LANES) of adjacent vectors of `work`, from vector number `begin` on."""
+    """Return a view (rows, count * LANES) of adjacent vectors of `work`, which begin at offset `begin`."""
     return work[begin * LANES : (begin + rows * count) * LANES].reshape((rows, count * LANES))
 
 
@@ -167,7 +166,7 @@ def copy_vectors(work, source, target, count):
 
 @compiled
 def sum_rows(weights, rows, total):
-    """Compute the sum of weights[k] rows[k] over k into `total`, four rows at once, which LLVM can vectorise."""
+    """Store the sum of weights[k] rows[k] over k in `total`, computed for four rows at once, which LLVM vectorises."""
     first = weights.size % 4
     for m in range(total.size):
         total[m] = 0.0
@@ -183,7 +182,7 @@ def sum_rows(weights, rows, total):
 
 @merged
 def _add_four(work, t, p, q, sign):
-    """Add sign x y to the target in four adjacent lanes; t, p and q are indices of target, x and y in `work`."""
+    """Add sign x y to a vector in four adjacent lanes; t, p and q are indices in `work` of the vector, x and y."""
     t0, t1 = work[t] + sign * work[p] * work[q], work[t + 1] + sign * work[p + 1] * work[q + 1]
     t2, t3 = work[t + 2] + sign * work[p + 2] * work[q + 2], work[t + 3] + sign * work[p + 3] * work[q + 3]
     work[t], work[t + 1], work[t + 2], work[t + 3] = t0, t1, t2, t3
@@ -198,14 +197,14 @@ def add_product(work, target, x, y, sign):
 
 @merged
 def _larger(work, most, error, factor, one, other, atol, rtol):
-    """Return the new value of `most` in one lane, see `enlarge`."""
+    """Return the new value of `most` in one lane, see `enlarge`; vectors are given by indices in `work`."""
     scale = atol + rtol * max(abs(work[one]), abs(work[other]))
     return max(work[most], abs(work[error]) * work[factor] / scale)
 
 
 @compiled
 def enlarge(work, most, error, factor, one, other, atol, rtol):
-    """Set the vector `most` to |error| factor / (atol + rtol max(|one|, |other|)) in lanes in which this is larger."""
+    """Set the vector `most` to |error| factor / (atol + rtol max(|one|, |other|)) in lanes in which that is larger."""
     for k in range(0, LANES, 4):
         m, e, f, x, y = most * LANES + k, error * LANES + k, factor * LANES + k, one * LANES + k, other * LANES + k
         m0 = _larger(work, m, e, f, x, y, atol, rtol)
@@ -217,9 +216,9 @@ def enlarge(work, most, error, factor, one, other, atol, rtol):
 
 @merged
 def _scale(work, target, apart, x, imaginary):
-    """Multiply the number `target` by x; if `imaginary` > 0, both are complex.
+    """Multiply the number `target` by x in each lane; if `imaginary` > 0, both numbers are complex.
 
-    Imaginary parts are `apart` vectors after the real part of `target`, and `imaginary` vectors after that of x.
+    Their imaginary parts are `apart` vectors after the real part of `target`, and `imaginary` vectors after that of x.
     """
     for k in range(LANES):
         t, p = target * LANES + k, x * LANES + k
@@ -233,9 +232,10 @@ def _scale(work, target, apart, x, imaginary):
 
 @merged
 def _subtract(work, target, x, y, imaginary, imaginary_y):
-    """Subtract x y from the number `target`; if `imaginary` > 0, all are complex.
+    """Subtract x y from the number `target` in each lane; if `imaginary` > 0, all three numbers are complex.
 
-    Imaginary parts are `imaginary` vectors after the real part of x, and `imaginary_y` after those of y and `target`.
+    Their imaginary parts are `imaginary` vectors after the real part of x, and `imaginary_y` vectors after the real
+    parts of y and `target`.
     """
     add_product(work, target, x, y, -1.0)
     if imaginary > 0:
@@ -252,22 +252,22 @@ def _exchange(work, one, other, k):
 
 
 @merged
-def _size(work, entry, imaginary, k):
-    """Return the absolute value of a real number in lane k; of a complex one, the sum for its two parts."""
+def _absolute_value(work, entry, imaginary, k):
+    """Return the absolute value of a real number in lane k, or the sum of those of both parts of a complex number."""
     size = abs(work[entry * LANES + k])
     return size if imaginary == 0 else size + abs(work[(entry + imaginary) * LANES + k])
 
 
 @compiled
-def _pivot(work, matrix, pivots, n, imaginary, c):
-    """Make the largest entry of column c, from row c on, the pivot, by an exchange of rows, and invert it.
+def _choose_pivot(work, matrix, pivots, n, imaginary, c):
+    """Exchange rows so that the pivot (c, c) is the largest entry of column c from row c on; replace it by its inverse.
 
     Clear FINE in lanes in which the pivot is zero.
     """
     for k in range(LANES):
-        best, top = c, _size(work, matrix + c * n + c, imaginary, k)
+        best, top = c, _absolute_value(work, matrix + c * n + c, imaginary, k)
         for i in range(c + 1, n):
-            size = _size(work, matrix + i * n + c, imaginary, k)
+            size = _absolute_value(work, matrix + i * n + c, imaginary, k)
             if size > top:
                 best, top = i, size
         work[(pivots + c) * LANES + k] = best
@@ -291,7 +291,7 @@ def _pivot(work, matrix, pivots, n, imaginary, c):
 def factor_lanes(work, matrix, pivots, n, imaginary):
     """Replace a matrix (n, n) in each lane by its LU factors, with inverted pivots; store row exchanges in `pivots`."""
     for c in range(n):
-        _pivot(work, matrix, pivots, n, imaginary, c)
+        _choose_pivot(work, matrix, pivots, n, imaginary, c)
         for i in range(c + 1, n):
             _scale(work, matrix + i * n + c, imaginary, matrix + c * n + c, imaginary)
             for j in range(c + 1, n):
@@ -322,14 +322,14 @@ def solve_lanes(work, matrix, pivots, n, imaginary, x):
         _scale(work, x + i, apart, matrix + i * n + i, imaginary)
 
 
-MOST_PASSES = 10  # largest number of passes of a projection
+MAX_PASSES = 10  # largest number of passes of a projection, each with the task "refine"
 
 
 @compiled
 def project_lanes(code, order, control, work):
     """Project NEW onto the constraints in lanes with FINE = 1; clear FINE where the projection does not converge."""
     code.approach(order, control, work)
-    for _ in range(MOST_PASSES):
+    for _ in range(MAX_PASSES):
         code.refine(order, control, work)
         left = 0.0
         for k in range(LANES):

@@ -6,7 +6,7 @@ The unknowns are the accelerations a_j of all coordinates at the stages,
 
 where F are the accelerations at a state that is not projected: stages violate the constraints by the error of the
 formula, and only the end of the step is projected. In each step, the derivatives of F are computed anew, by
-differences, for all lanes at once.
+differences, for all lanes at once. Offsets are those in `work`, see layout.py.
 """
 
 import numpy as np
@@ -59,23 +59,23 @@ from twoloop.kernels.steps.stages import (
 )
 from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STEPS_TO_DECAY
 
-# offsets of single vectors in the method's memory; blocks of vectors follow
+# offsets of single vectors in the method's memory, before the blocks of vectors
 (
     ITERATING,  # 1 in lanes whose iteration has not ended
     DONE,  # 1 in lanes whose iteration has converged
-    CHANGE_BEFORE,  # size of the previous correction
-    SCALE_Q,  # largest position of the stages, at least 1
-    SCALE_V,  # largest velocity of the stages, at least 1
-    LARGEST_Q,  # largest correction of positions, for a step of 1
-    LARGEST_V,  # largest correction of velocities, for a step of 1
-    H_PREVIOUS,  # size of the step whose accelerations are PREVIOUS, s; 0: none
+    CHANGE_BEFORE,  # previous correction, relative to the scales, see _end_iteration
+    SCALE_Q,  # largest absolute position at the stages, at least 1
+    SCALE_V,  # largest absolute velocity at the stages, at least 1
+    LARGEST_Q,  # largest correction of positions, over the square of the step size
+    LARGEST_V,  # largest correction of velocities, over the step size
+    H_PREVIOUS,  # size of the step with the accelerations PREVIOUS, s; 0 if there is no such step
     CONSTANT,  # 1: the stages are predicted to have the accelerations at the beginning of the step
     DURATION,  # s, duration of an error of the velocities, see velocity_errors.py; 0: not known
     N_OF_LANES,
 ) = range(11)
-# numbers of the blocks of n vectors: accelerations at STATE; q, v and a at the beginning of the step; sums; a state in
-# the middle of the step, and its accelerations; the estimated error of q and v; that of v unfiltered, and filtered
-# once; and a complex vector, real part first
+# indices of the blocks of n vectors: accelerations at STATE; q, v and a at the beginning of the step; sums; q, v and a
+# in the middle of the step; the estimated errors of q and v; the error of v unfiltered, and filtered once; a complex
+# vector, real part first
 (
     START,
     BEGIN_Q,
@@ -93,38 +93,38 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     _IMAGINARY,
     N_VECTORS,
 ) = range(15)
-STAGES, PREVIOUS, RESIDUAL, CHANGES, N_BLOCKS = range(5)  # numbers of the blocks (s, n); then follow weights (s, s)
-# numbers of the matrices (n, n): from SYSTEMS on, a real and an imaginary part for each system; then follow the pivots
+STAGES, PREVIOUS, RESIDUAL, CHANGES, N_BLOCKS = range(5)  # indices of the blocks (s, n), before the weights (s, s)
+# indices of the matrices (n, n), before the pivots; from SYSTEMS on, a real and an imaginary part for each system
 BY_Q, BY_V, SYSTEMS = range(3)
 
 
 def memory_size(s: int, n: int) -> int:
-    """Return the length of the method's memory, in vectors, for s stages; each eigenvalue or pair has a system."""
+    """Return the length of the method's memory, in vectors; each real eigenvalue or complex pair of A has a system."""
     n_systems = (s + 1) // 2
     return N_OF_LANES + (N_VECTORS + N_BLOCKS * s + n_systems) * n + s * s + (SYSTEMS + 2 * n_systems) * n * n
 
 
 @merged
 def vector_at(memory, n, which):
-    """Return the offset of block number `which` (n), such as START."""
+    """Return the offset of block `which` (n vectors), such as START; `memory`: offset of the method's memory."""
     return memory + N_OF_LANES + which * n
 
 
 @merged
 def block_at(memory, n, s, which):
-    """Return the offset of block number `which` (s, n), such as STAGES."""
+    """Return the offset of block `which` ((s, n) vectors), such as STAGES."""
     return memory + N_OF_LANES + (N_VECTORS + which * s) * n
 
 
 @merged
 def _weights_at(memory, n, s):
-    """Return the offset of the weights (s, s)."""
+    """Return the offset of the weights (s, s) with which `predict_stages` multiplies PREVIOUS."""
     return memory + N_OF_LANES + (N_VECTORS + N_BLOCKS * s) * n
 
 
 @merged
 def matrix_at(memory, n, s, which):
-    """Return the offset of matrix number `which` (n, n); system k has the numbers SYSTEMS + 2 k and the next one."""
+    """Return the offset of matrix `which` (n, n), such as BY_Q; the parts of system k begin at SYSTEMS + 2 k."""
     return _weights_at(memory, n, s) + s * s + which * n * n
 
 
@@ -136,14 +136,14 @@ def pivots_at(memory, n, s, n_systems, k):
 
 @compiled
 def _evaluate_middle(code, settings, control, c, work, new, a, memory):
-    """Compute the state in the middle of the step and its accelerations, into MIDDLE_Q, MIDDLE_V and MIDDLE_A.
+    """Store a state in the middle of the step, and its accelerations, in MIDDLE_Q, MIDDLE_V and MIDDLE_A.
 
-    It is extrapolated from the beginning of the step, and its positions are moved towards the constraints.
+    The state is extrapolated from the beginning of the step, and its positions are moved towards the constraints.
     """
     n, order = settings[N], settings[ORDER]
-    share, begin = middle_node(c), vector_at(memory, n, BEGIN_Q)
+    node, begin = middle_node(c), vector_at(memory, n, BEGIN_Q)
     for k in range(LANES):
-        x = share * work[X * LANES + k]
+        x = node * work[X * LANES + k]
         work[AHEAD * LANES + k] = work[T * LANES + k] + x
         for j in range(n):
             at = (begin + j) * LANES + k
@@ -158,9 +158,9 @@ def _evaluate_middle(code, settings, control, c, work, new, a, memory):
 
 @compiled
 def find_derivatives(code, settings, control, c, work):
-    """Compute the derivatives of the accelerations by q and v in the middle of the step, in lanes with FINE = 1.
+    """Store the derivatives BY_Q and BY_V of the accelerations in the middle of the step, in lanes with FINE = 1.
 
-    The time is that of a stage, so that the derivatives contain no force that no stage has.
+    They are computed at the time of a stage, because a force might act between two stages that acts at no stage.
     """
     n, order = settings[N], settings[ORDER]
     _, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
@@ -183,7 +183,7 @@ def find_derivatives(code, settings, control, c, work):
 
 @compiled
 def factor_systems_of_lanes(settings, method_options, s, work):
-    """Factor I - (X l)^2 J_q - X l J_v for each eigenvalue l of A, or pair of eigenvalues."""
+    """Factor I - (X l)^2 J_q - X l J_v for each real eigenvalue l of A, and for one eigenvalue l of each pair."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     n_systems, offset = count_eigenvalues(method_options, s), eigen_offset(s)
@@ -207,10 +207,10 @@ def factor_systems_of_lanes(settings, method_options, s, work):
 
 @compiled
 def predict_stages(settings, c, work, begins):
-    """Predict the stage accelerations by the polynomial PREVIOUS, or as constant if there is none.
+    """Predict STAGES, the stage accelerations, by the polynomial through PREVIOUS if the step is not too long for it.
 
-    `begins`: time at which the step begins, relative to the step of PREVIOUS: 1 if that is the last step, 0 if it is
-    this step, within which a state is computed.
+    Otherwise, they are predicted to be constant. `begins`: beginning of the step, relative to the step of PREVIOUS: 1
+    if PREVIOUS is of the last step, 0 if PREVIOUS is of this step, within which a state is computed.
     """
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
@@ -242,7 +242,7 @@ def predict_stages(settings, c, work, begins):
 
 @compiled
 def _compute_residuals(code, settings, control, A, A2, c, work):
-    """Compute RESIDUAL, SCALE_Q and SCALE_V for the present stages; clear FINE in lanes with invalid values."""
+    """Store RESIDUAL, SCALE_Q and SCALE_V for the accelerations STAGES; clear FINE in lanes with invalid values."""
     n, order = settings[N], settings[ORDER]
     _, new, _, _, a, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     s = c.size
@@ -275,13 +275,13 @@ def _compute_residuals(code, settings, control, A, A2, c, work):
 
 @compiled
 def _correct(settings, method_options, s, work):
-    """Compute the corrections of the stages into CHANGES; add them to STAGES in lanes with ITERATING = 1."""
+    """Store the corrections of the stage accelerations in CHANGES; add them to STAGES in lanes with ITERATING = 1."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     n_systems, offset = count_eigenvalues(method_options, s), eigen_offset(s)
     n_real = int(method_options[offset + N_REAL])
     offset += N_EIGEN_SCALARS + s
-    one, changes = vector_at(memory, n, COMPLEX), block_at(memory, n, s, CHANGES)
+    scratch, changes = vector_at(memory, n, COMPLEX), block_at(memory, n, s, CHANGES)
     residual, stages = block_at(memory, n, s, RESIDUAL), block_at(memory, n, s, STAGES)
     residual_rows, width = table(work, residual, s, n), n * LANES
     for i in range(s * width):
@@ -289,16 +289,16 @@ def _correct(settings, method_options, s, work):
     for system in range(n_systems):
         row, column = offset + 2, offset + 2 + 2 * s
         offset += 2 + 4 * s
-        sum_rows(method_options[row : row + s], residual_rows, vectors(work, one, n))
-        sum_rows(method_options[row + s : row + 2 * s], residual_rows, vectors(work, one + n, n))
+        sum_rows(method_options[row : row + s], residual_rows, vectors(work, scratch, n))
+        sum_rows(method_options[row + s : row + 2 * s], residual_rows, vectors(work, scratch + n, n))
         matrix, pivots = matrix_at(memory, n, s, SYSTEMS + 2 * system), pivots_at(memory, n, s, n_systems, system)
         imaginary = 0 if system < n_real else n * n
-        solve_lanes(work, matrix, pivots, n, imaginary, one)
-        twice = 1.0 if system < n_real else 2.0
+        solve_lanes(work, matrix, pivots, n, imaginary, scratch)
+        multiplicity = 1.0 if system < n_real else 2.0
         for j in range(s):
-            re, im = twice * method_options[column + j], twice * method_options[column + s + j]
+            re, im = multiplicity * method_options[column + j], multiplicity * method_options[column + s + j]
             for i in range(width):
-                change = re * work[one * LANES + i] - im * work[one * LANES + width + i]
+                change = re * work[scratch * LANES + i] - im * work[scratch * LANES + width + i]
                 work[(changes + j * n) * LANES + i] += change
     for i in range(s * width):
         if work[(memory + ITERATING) * LANES + i % LANES] == 1.0:
@@ -306,8 +306,8 @@ def _correct(settings, method_options, s, work):
 
 
 @merged
-def _enlarge(work, most, sums, n):
-    """Set `most` to the largest absolute value of n vectors in lanes in which this is larger, or NaN."""
+def _store_largest(work, most, sums, n):
+    """Set the vector `most` to the largest absolute value of n vectors in lanes in which that is larger, or NaN."""
     for i in range(n * LANES):
         size, at = abs(work[sums * LANES + i]), most * LANES + i % LANES
         if size > work[at] or size != size:
@@ -316,7 +316,7 @@ def _enlarge(work, most, sums, n):
 
 @compiled
 def _largest_corrections(settings, A, A2, work):
-    """Compute LARGEST_Q and LARGEST_V, the largest corrections of the stages by CHANGES, for a step of size 1."""
+    """Store LARGEST_Q and LARGEST_V, the largest corrections of the stages by CHANGES for a step of size 1."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     s = A.shape[0]
@@ -325,14 +325,14 @@ def _largest_corrections(settings, A, A2, work):
     fill_field(work, memory + LARGEST_V, 0.0)
     for j in range(s):
         sum_rows(A2[j], stage_rows, vectors(work, sums, n))
-        _enlarge(work, memory + LARGEST_Q, sums, n)
+        _store_largest(work, memory + LARGEST_Q, sums, n)
         sum_rows(A[j], stage_rows, vectors(work, sums, n))
-        _enlarge(work, memory + LARGEST_V, sums, n)
+        _store_largest(work, memory + LARGEST_V, sums, n)
 
 
 @merged
 def _end_iteration(options, work, memory, iteration, k):
-    """Return whether the iteration of lane k ends; set DONE to 1 if it has converged, otherwise to 0."""
+    """Set DONE to 1 if the iteration of lane k has converged, otherwise to 0; return whether the iteration ends."""
     x, tolerance = work[X * LANES + k], options[N_HEAD + OUTER_TOL]
     floor = STAGNATION * options[LEAST]
     fast = x * work[(memory + LARGEST_V) * LANES + k] / work[(memory + SCALE_V) * LANES + k]
@@ -359,7 +359,7 @@ def _end_iteration(options, work, memory, iteration, k):
 
 @compiled
 def solve_stages(code, settings, control, options, method_options, A, A2, c, work):
-    """Solve for the stages of a step X from their prediction, in lanes with FINE = 1; clear FINE on divergence."""
+    """Solve for STAGES of a step X from their predictions in lanes with FINE = 1; clear FINE on divergence."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
     iterating, done = memory + ITERATING, memory + DONE
@@ -386,7 +386,7 @@ def solve_stages(code, settings, control, options, method_options, A, A2, c, wor
 
 @compiled
 def end_of_stages(settings, b, bA, work):
-    """Compute NEW, the state at the time X after the beginning of the step, from the stages."""
+    """Store the state at the time X after the beginning of the step in NEW, computed from STAGES."""
     n = settings[N]
     _, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     s = b.size
@@ -404,14 +404,14 @@ def end_of_stages(settings, b, bA, work):
 
 @merged
 def _allowed(control, work, state, new, j, entry, k):
-    """Return the allowed error of entry `entry` of a state [q, v], which belongs to coordinate j."""
+    """Return the allowed error, in lane k, of entry `entry` of a state [q, v], which belongs to coordinate j."""
     size = max(abs(work[(state + entry) * LANES + k]), abs(work[(new + entry) * LANES + k]))
     return control[ATOL + j] + control[RTOL] * size
 
 
 @compiled
 def _embedded_estimate(settings, method_options, A, work, memory):
-    """Compute the embedded error estimate, unfiltered, into E_Q and E_V."""
+    """Store the unfiltered error estimate of the embedded formula in E_Q and E_V."""
     n, s = settings[N], A.shape[0]
     offset = eigen_offset(s)
     gamma0, e = method_options[offset + GAMMA0], method_options[offset + N_EIGEN_SCALARS : offset + N_EIGEN_SCALARS + s]
@@ -438,30 +438,30 @@ def _filter(settings, method_options, s, work, memory):
     """Replace (E_Q, E_V) by (I - z J)^-1 (E_Q, E_V), z = gamma0 H, where J is the Jacobian of (v, F)."""
     n = settings[N]
     gamma0 = method_options[eigen_offset(s) + GAMMA0]
-    e_q, e_v, one = vector_at(memory, n, E_Q), vector_at(memory, n, E_V), vector_at(memory, n, COMPLEX)
+    e_q, e_v, scratch = vector_at(memory, n, E_Q), vector_at(memory, n, E_V), vector_at(memory, n, COMPLEX)
     by_q = matrix_at(memory, n, s, BY_Q)
     for i in range(n):
         for k in range(LANES):
             total = 0.0
             for j in range(n):
                 total += work[(by_q + i * n + j) * LANES + k] * work[(e_q + j) * LANES + k]
-            work[(one + i) * LANES + k] = work[(e_v + i) * LANES + k] + gamma0 * work[H * LANES + k] * total
+            work[(scratch + i) * LANES + k] = work[(e_v + i) * LANES + k] + gamma0 * work[H * LANES + k] * total
     pivots = pivots_at(memory, n, s, count_eigenvalues(method_options, s), 0)
-    solve_lanes(work, matrix_at(memory, n, s, SYSTEMS), pivots, n, 0, one)
-    copy_vectors(work, one, e_v, n)
+    solve_lanes(work, matrix_at(memory, n, s, SYSTEMS), pivots, n, 0, scratch)
+    copy_vectors(work, scratch, e_v, n)
     for i in range(n * LANES):
         work[e_q * LANES + i] += gamma0 * work[H * LANES + i % LANES] * work[e_v * LANES + i]
 
 
 @compiled
 def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
-    """Return the error over the tolerances that a velocity error causes in lane k, see velocity_errors.py."""
+    """Return the error, in units of the tolerances, that a velocity error causes in lane k, see velocity_errors.py."""
     raw, once, twice = vector_at(memory, n, UNFILTERED), vector_at(memory, n, FILTERED_ONCE), vector_at(memory, n, E_V)
     begin = vector_at(memory, n, BEGIN_V)
-    largest = curvature = fastest = change = 0.0
+    largest = curvature = largest_v = largest_a = 0.0
     for j in range(n):
-        fastest = max(fastest, abs(work[(begin + j) * LANES + k]))
-        change = max(change, abs(work[(begin + n + j) * LANES + k]))
+        largest_v = max(largest_v, abs(work[(begin + j) * LANES + k]))
+        largest_a = max(largest_a, abs(work[(begin + n + j) * LANES + k]))
         largest = max(largest, abs(work[(twice + j) * LANES + k]))
         second_difference = (
             work[(twice + j) * LANES + k] - 2.0 * work[(once + j) * LANES + k] + work[(raw + j) * LANES + k]
@@ -470,37 +470,37 @@ def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
     if largest > 0.0:
         work[(memory + DURATION) * LANES + k] = z * np.sqrt(largest / curvature)
     duration = work[(memory + DURATION) * LANES + k]
-    if duration * change * SLOW_FACTOR > fastest:
-        duration *= min(SLOW_FACTOR, duration * change * SLOW_FACTOR / fastest) if fastest > 0.0 else SLOW_FACTOR
+    if duration * largest_a * SLOW_FACTOR > largest_v:
+        duration *= min(SLOW_FACTOR, duration * largest_a * SLOW_FACTOR / largest_v) if largest_v > 0.0 else SLOW_FACTOR
     return _velocity_error(control, work, n, twice, duration, state, new, k)
 
 
 @compiled
 def _velocity_error(control, work, n, error_v, duration, state, new, k):
-    """Return the largest component of a velocity error that lasts for `duration`, s, over the tolerances, in lane k."""
+    """Return the largest effect, in lane k and in tolerances, of a velocity error that lasts for `duration`, s."""
     error = 0.0
     for j in range(n):
-        share_q = duration / _allowed(control, work, state, new, j, j, k)
-        share_v = 1.0 / _allowed(control, work, state, new, j, n + j, k)
-        error = max(error, abs(work[(error_v + j) * LANES + k]) * min(share_q, share_v))
+        weight_q = duration / _allowed(control, work, state, new, j, j, k)
+        weight_v = 1.0 / _allowed(control, work, state, new, j, n + j, k)
+        error = max(error, abs(work[(error_v + j) * LANES + k]) * min(weight_q, weight_v))
     return error
 
 
 @merged
 def _motion_time(control, work, n, memory, k):
-    """Return the time, s, in which accelerations change velocities by their size, see velocity_errors.py."""
+    """Return the largest velocity over the largest acceleration in lane k, s, as `motion_time` does."""
     begin = vector_at(memory, n, BEGIN_V)
-    fastest = change = 0.0
+    largest_v = largest_a = 0.0
     for j in range(n):
-        fastest = max(fastest, abs(work[(begin + j) * LANES + k]))
-        change = max(change, abs(work[(begin + n + j) * LANES + k]))
+        largest_v = max(largest_v, abs(work[(begin + j) * LANES + k]))
+        largest_a = max(largest_a, abs(work[(begin + n + j) * LANES + k]))
     longest = LONGEST_GAPS * control[GAP]
-    return fastest / change if fastest < longest * change else longest
+    return largest_v / largest_a if largest_v < longest * largest_a else longest
 
 
 @compiled
 def _error_in_slow_directions(settings, control, method_options, s, work):
-    """Set ERROR to the error that E_V causes in slow directions, if this is larger, see newton_step.py."""
+    """Increase ERROR to the error that E_V causes in slow directions, if this is larger, see newton_step.py."""
     n = settings[N]
     state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     e_v, most, fine = vector_at(memory, n, E_V), memory + LARGEST_V, memory + ITERATING
@@ -536,7 +536,7 @@ def _error_in_slow_directions(settings, control, method_options, s, work):
 
 @compiled
 def _estimate(settings, control, method_options, A, work):
-    """Compute ERROR, the embedded error estimate over the tolerances, filtered to suppress stiff components."""
+    """Store the error estimate, filtered to suppress stiff components and in units of the tolerances, in ERROR."""
     n, s = settings[N], A.shape[0]
     state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
     offset = eigen_offset(s)
@@ -564,7 +564,7 @@ def _estimate(settings, control, method_options, A, work):
 
 @compiled
 def _store_stages(work, memory, n, s):
-    """Store the stages of accepted steps, which predict those of the next step, and states within this step."""
+    """Copy STAGES of accepted steps to PREVIOUS, which predicts STAGES of the next step, and of parts of this step."""
     stages, previous = block_at(memory, n, s, STAGES), block_at(memory, n, s, PREVIOUS)
     for k in range(LANES):
         if work[ACCEPTED * LANES + k] == 1.0:
