@@ -114,11 +114,7 @@ def begin_control(options, control, work, n, state, a, start):
 
 @compiled
 def choose_steps(work, control, status, n_steps):
-    """Store the size of the next step of each lane, at most GAP, in H and X; copy RUNNING to FINE.
-
-    The size is 0 in lanes without a run. A run is removed from its lane if its step would be too short, or if it has
-    taken too many steps.
-    """
+    """Store the size of the next step, at most GAP, in H and X, 0 in lanes without a run; copy RUNNING to FINE."""
     t1 = control[T1]
     for k in range(LANES):
         work[H * LANES + k], t = 0.0, work[T * LANES + k]

@@ -1,14 +1,14 @@
 """Project initial states onto the constraints by the least change, in lanes; check whether another assembly is as near.
 
-The least change follows from the Cholesky factors of G G^T, with the rows of G scaled to length 1. Redundant rows are
+The least change follows from the Cholesky factor of G G^T, with the rows of G scaled to norm 1. Redundant rows are
 linearly dependent at positions that satisfy the constraints, and nearly so at others. The rows of Z are eigenvectors of
-G G^T: combinations of rows that vanish on the constraints. They are removed from right-hand sides, and Z^T Z is added
-to G G^T, so that it is not singular. Lanes are independent of one another.
+G G^T: combinations of rows of G that vanish if the constraints hold. Components of right-hand sides along the rows of Z
+are removed, and Z^T Z is added to G G^T, so that the sum is not singular. Lanes are independent of one another.
 
-`pattern` is the sparsity pattern of G. It begins with n_rows + 1 indices in `pattern`, at which the columns of each row
-begin and the last ones end; then follow the columns. Matrices and vectors in `work` are given by offsets, in vectors.
+`pattern` is the sparsity pattern of G. Its first n_rows + 1 entries are indices in `pattern`: the columns of row i are
+the entries from pattern[i] to pattern[i + 1] - 1. Matrices and vectors in `work` are given by offsets, in vectors.
 
-Two further kernels check the results of runs in lanes: they evaluate the callbacks, and return residuals.
+Two further kernels check the results of runs in lanes: they evaluate the callbacks, and store residuals.
 """
 
 import numpy as np
@@ -33,18 +33,18 @@ from twoloop.kernels.lanes.layout import (
     places_of,
 )
 
-LEAST = 1e-15  # added to the diagonal of G G^T, so that it is not singular
-ITERATION_SHIFT = 1e-8  # added instead of LEAST for the inverse iteration, where some eigenvalues are zero
-WEAK = 1e-4  # eigenvalue of G G^T below which a combination of rows is redundant
-# number of inverse iterations for eigenvectors of redundant rows; few, as their eigenvalues are much smaller than
-# others
+LEAST = 1e-15  # added to the diagonal of G G^T, so that the matrix is not singular
+ITERATION_SHIFT = 1e-8  # replaces LEAST in inverse iterations, for which some eigenvalues of G G^T are zero
+MAX_REDUNDANT = 1e-4  # eigenvalue of G G^T below which a combination of rows counts as redundant
+# number of inverse iterations for each row of Z; few are enough, because the eigenvalues of redundant combinations of
+# rows are much smaller than the others
 REDUNDANT_ITERATIONS = 5
 GOLDEN = 0.6180339887498949  # fractional parts of its multiples are irregular start values of inverse iterations
 
 
 @merged
 def _subtract_four(work, target, x, dx, y, dy, count):
-    """Subtract products in four adjacent lanes, see `subtract_products`; all arguments are indices in `work`."""
+    """Do the same as `subtract_products` in four adjacent lanes; `target`, x, y, dx, dy are indices in `work`."""
     t0, t1, t2, t3 = work[target], work[target + 1], work[target + 2], work[target + 3]
     for _ in range(count):
         t0 -= work[x] * work[y]
@@ -58,14 +58,14 @@ def _subtract_four(work, target, x, dx, y, dy, count):
 
 @compiled
 def subtract_products(work, target, x, dx, y, dy, count):
-    """Subtract the scalar product of two lists of `count` vectors from `target`; vectors are dx and dy apart."""
+    """Subtract the sum of x_i y_i over `count` vectors from the vector `target`, at offsets x + i dx and y + i dy."""
     for k in range(0, LANES, 4):
         _subtract_four(work, target * LANES + k, x * LANES + k, dx * LANES, y * LANES + k, dy * LANES, count)
 
 
 @merged
 def subtract_row(work, target, entries, pattern, i, y):
-    """Subtract the product of row i of G and y from `target`; `entries` are those of all rows of G, row by row."""
+    """Subtract the product of row i of G and y from `target`; `entries`: offset of the entries of G, row by row."""
     for e in range(pattern[i], pattern[i + 1]):
         subtract_products(work, target, entries + e - pattern[0], 1, y + pattern[e], 1, 1)
 
@@ -79,9 +79,9 @@ def _scale(work, target, factor):
 
 @compiled
 def _cholesky(work, pattern, n_rows, n_redundant, row, factors, shift):
-    """Compute the Cholesky factor of G G^T + shift I + Z^T Z in each lane, with the inverse of its diagonal.
+    """Store the Cholesky factor of G G^T + shift I + Z^T Z in each lane, with the inverse of its diagonal entries.
 
-    `factors` begins with the scaled entries of G; the factor is stored after them. `row` (n) is scratch full of zeros.
+    The factor is stored in `factors`, see `factor_gram`. `row` (n) is scratch, with zeros on entry and on return.
     """
     n_entries = pattern[n_rows] - pattern[0]
     gram = factors + n_entries + n_rows
@@ -108,9 +108,9 @@ def _cholesky(work, pattern, n_rows, n_redundant, row, factors, shift):
 
 @compiled
 def factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors):
-    """Compute the parts of `factors`: scaled entries of G, 1 / lengths of its rows, Cholesky factor of G G^T, and Z.
+    """Store in `factors` the scaled entries of G, 1 / norms of its rows, the Cholesky factor of G G^T, and Z.
 
-    Columns of fixed coordinates (`moves` = 0) are set to zero; then the rows are scaled to length 1.
+    Columns of fixed coordinates (`moves` = 0) are set to zero; then the rows are scaled to norm 1.
     """
     n_entries = pattern[n_rows] - pattern[0]
     for i in range(n_rows):
@@ -135,52 +135,52 @@ def factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors):
 
 @compiled
 def _find_redundant(work, pattern, n_rows, n_redundant, row, factors):
-    """Compute Z, the eigenvectors of the n_redundant smallest eigenvalues of G G^T; NaN if these are not below WEAK."""
+    """Store Z, eigenvectors of the n_redundant smallest eigenvalues of G G^T; NaN if one is not below MAX_REDUNDANT."""
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
     Z = gram + n_rows * n_rows
-    spare = Z + n_redundant * n_rows
+    scratch = Z + n_redundant * n_rows
     _cholesky(work, pattern, n_rows, 0, row, factors, ITERATION_SHIFT)
     for w in range(n_redundant):
         z = Z + w * n_rows
         for i in range(n_rows):
             fill_field(work, z + i, 0.5 + (GOLDEN * (i + 1) * (w + 1)) % 1.0)
         for _ in range(REDUNDANT_ITERATIONS):
-            normalise(work, z, n_rows, spare)
+            normalise(work, z, n_rows, scratch)
             _solve(work, n_rows, gram, z)
-            _remove_redundant(work, n_rows, w, Z, z, spare)
-        normalise(work, z, n_rows, spare)
+            _remove_redundant(work, n_rows, w, Z, z, scratch)
+        normalise(work, z, n_rows, scratch)
         for k in range(LANES):
-            if not work[spare * LANES + k] < WEAK:  # now `spare` is the eigenvalue plus ITERATION_SHIFT
+            if not work[scratch * LANES + k] < MAX_REDUNDANT:  # `scratch` is now the eigenvalue plus ITERATION_SHIFT
                 work[z * LANES + k] = np.nan
 
 
 @compiled
-def normalise(work, x, n_rows, spare):
-    """Scale x (n_rows) to length 1; `spare` becomes the reciprocal of its previous length."""
-    fill_field(work, spare, 0.0)
-    subtract_products(work, spare, x, 1, x, 1, n_rows)
+def normalise(work, x, n_rows, scratch):
+    """Scale x (n_rows) to norm 1; set `scratch` to the reciprocal of its previous norm."""
+    fill_field(work, scratch, 0.0)
+    subtract_products(work, scratch, x, 1, x, 1, n_rows)
     for k in range(LANES):
-        work[spare * LANES + k] = 1.0 / np.sqrt(abs(work[spare * LANES + k]))
+        work[scratch * LANES + k] = 1.0 / np.sqrt(abs(work[scratch * LANES + k]))
     for i in range(n_rows):
-        _scale(work, x + i, spare)
+        _scale(work, x + i, scratch)
 
 
 @compiled
-def _remove_redundant(work, n_rows, n_redundant, Z, x, spare):
-    """Remove the components of x (n_rows) along the rows of Z; `spare` is scratch."""
+def _remove_redundant(work, n_rows, n_redundant, Z, x, scratch):
+    """Subtract from x (n_rows) its components along the rows of Z; overwrite the vector `scratch`."""
     for w in range(n_redundant):
         z = Z + w * n_rows
-        fill_field(work, spare, 0.0)
-        subtract_products(work, spare, z, 1, x, 1, n_rows)
+        fill_field(work, scratch, 0.0)
+        subtract_products(work, scratch, z, 1, x, 1, n_rows)
         for k in range(LANES):
-            work[spare * LANES + k] *= -1.0
+            work[scratch * LANES + k] *= -1.0
         for i in range(n_rows):
-            subtract_products(work, x + i, z + i, 1, spare, 1, 1)
+            subtract_products(work, x + i, z + i, 1, scratch, 1, 1)
 
 
 @compiled
 def _solve(work, n_rows, gram, x):
-    """Replace x by the solution y of G G^T y = x, with the Cholesky factor `gram`."""
+    """Replace x (n_rows) by the solution y of G G^T y = x, with the Cholesky factor at the offset `gram`."""
     for i in range(n_rows):
         subtract_products(work, x + i, gram + i * n_rows, 1, x, 1, i)
         _scale(work, x + i, gram + i * n_rows + i)
@@ -191,9 +191,9 @@ def _solve(work, n_rows, gram, x):
 
 @compiled
 def along_rows(work, pattern, n, n_rows, n_redundant, factors, x, out):
-    """Replace x (n_rows) by y with G G^T y = x, and compute out (n) = -G^T y.
+    """Replace x (n_rows) by the solution y of G G^T y = x, and store -G^T y in `out` (n).
 
-    Rows of G have length 1; redundant components of x are removed first.
+    The rows of G are scaled to norm 1. First, the components of x along the rows of Z are removed.
     """
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
     Z = gram + n_rows * n_rows
@@ -208,32 +208,32 @@ def along_rows(work, pattern, n, n_rows, n_redundant, factors, x, out):
 
 @compiled
 def least_change(work, pattern, n, n_rows, n_redundant, factors, x, change):
-    """Compute the smallest change (n) with G change = -x, not finite in lanes with dependent rows; overwrites x."""
+    """Store the smallest d with G d = -x in `change` (n), not finite in lanes with dependent rows; overwrite x."""
     for i in range(n_rows):
         _scale(work, x + i, factors + pattern[n_rows] - pattern[0] + i)
     along_rows(work, pattern, n, n_rows, n_redundant, factors, x, change)
 
 
-MOST_ITERATIONS = 12  # largest number of steps of the Gauss-Newton iteration
-AT_ROUNDING = 64.0  # residual of a constraint that counts as a rounding error, in rounding errors of its terms
-# largest difference of the projection of a displaced state and its prediction by C_q, relative to the displacement
+MAX_ITERATIONS = 12  # largest number of steps of the Gauss-Newton iteration
+ROUNDING_FACTOR = 64.0  # largest residual of a constraint that holds, in rounding errors of its terms
+# largest difference between the projection of a displaced state and its prediction by C_q, relative to the displacement
 MAX_CURVATURE = 0.25
-SINGULAR = 1e-12  # smallest eigenvalue of G G^T at which rows of length 1 count as independent
-# number of inverse iterations for the eigenvector of the smallest eigenvalue, if all rows are independent
-WEAKEST_ITERATIONS = 10
-N_REDUNDANT = 5  # index in `settings` of the number of redundant rows; runs have N_EVALUATIONS there
-# other guesses for the comparison: their displacements from the state found are these multiples of the change that the
-# projection has made, and of the weakest direction
+SINGULAR = 1e-12  # smallest eigenvalue of G G^T at which rows of norm 1 count as independent
+WEAKEST_ITERATIONS = 10  # number of inverse iterations for the weakest direction, see `places_of_starts`
+N_REDUNDANT = 5  # index in `settings` of the number of redundant rows; for runs, N_EVALUATIONS has this index
+# displacements, from the projected positions, of the guesses with which these are compared: multiples of the change
+# from the guess to the projected positions, and of the weakest direction
 OTHER_GUESSES = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
 
 def places_of_starts(n, n_rows, n_entries, n_redundant):
-    """Return the offsets of the parts of `work`, in vectors after the beginning of the method's memory, and its length.
+    """Return the offsets, in vectors, of the parts of the method's memory, and its length.
 
-    The generated code writes C, C_t (n_rows each) and the entries of G. Then follow a vector of the rows (n_rows);
-    changes of positions or velocities, the positions found, the change from the guess to them, the weakest direction,
-    the displacement of another guess, and a row of G (n each); and the results of `factor_gram` at the positions found,
-    and at NEW. The weakest direction is that which the rows determine least.
+    The memory begins with C and C_t (n_rows each), and the entries of G; the generated code writes these parts. The
+    other parts are a right-hand side x (n_rows); a change of positions or velocities, the projected positions, the
+    change from the guess to these, the weakest direction, the displacement of another guess, and a row of G (n each);
+    and the results of `factor_gram` at the projected positions, and at NEW. The weakest direction is the direction that
+    the rows of G determine least.
     """
     G = 2 * n_rows
     x = G + n_entries
@@ -253,7 +253,7 @@ _places = merged(places_of_starts)
 
 @merged
 def _largest(work, offset, count, k):
-    """Return the largest absolute value of `count` numbers in lane k; NaN if one of them is NaN."""
+    """Return the largest absolute value of `count` numbers in lane k, or NaN if one of the numbers is NaN."""
     largest = 0.0
     for j in range(count):
         size = abs(work[(offset + j) * LANES + k])
@@ -264,7 +264,7 @@ def _largest(work, offset, count, k):
 @merged
 def _constraints_hold(work, pattern, n, n_rows, C, G, new, k):
     """Return whether every constraint holds in lane k, up to rounding errors of its terms."""
-    allowed = AT_ROUNDING * np.finfo(np.float64).eps * _largest(work, new, n, k)
+    allowed = ROUNDING_FACTOR * np.finfo(np.float64).eps * _largest(work, new, n, k)
     for i in range(n_rows):
         off, terms = abs(work[(C + i) * LANES + k]), 0.0
         for e in range(pattern[i], pattern[i + 1]):
@@ -276,20 +276,20 @@ def _constraints_hold(work, pattern, n, n_rows, C, G, new, k):
 
 @compiled
 def _gauss_newton(code, settings, control, pattern, moves, work):
-    """Project the positions of NEW onto the constraints by steps of least change; clear RUNNING on divergence."""
+    """Project the positions of NEW onto the constraints by steps of least change; clear RUNNING in lanes that fail."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = places_of(n, n_rows, settings[N_NUMBERS])
     G, x, change, _, _, _, _, row, _, at_new, _ = _places(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
     G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + at_new
     for k in range(LANES):
         work[LEFT_TO_MOVE * LANES + k] = work[RUNNING * LANES + k]
-    for _ in range(MOST_ITERATIONS):
+    for _ in range(MAX_ITERATIONS):
         fill_field(work, FINE, 1.0)
         code.rows(0, control, work)
         factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors)
         copy_vectors(work, memory, x, n_rows)
         least_change(work, pattern, n, n_rows, n_redundant, factors, x, change)
-        left = 0.0
+        n_left = 0.0
         for k in range(LANES):
             if work[LEFT_TO_MOVE * LANES + k] == 0.0:
                 continue
@@ -302,8 +302,8 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
             if _constraints_hold(work, pattern, n, n_rows, memory, G, new, k):
                 work[LEFT_TO_MOVE * LANES + k] = 0.0
             else:
-                left += 1.0
-        if left == 0.0:
+                n_left += 1.0
+        if n_left == 0.0:
             return
     for k in range(LANES):
         if work[LEFT_TO_MOVE * LANES + k] == 1.0:
@@ -312,7 +312,7 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
 
 @compiled
 def _change_velocities(code, settings, control, pattern, moves, work):
-    """Project the velocities of NEW, so that C_q v + C_t = 0; store the factors for its positions."""
+    """Project the velocities of NEW so that C_q v + C_t = 0; store the results of `factor_gram` at its positions."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = places_of(n, n_rows, settings[N_NUMBERS])
     G, x, change, _, _, _, _, row, at_found, _, _ = _places(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
@@ -336,29 +336,29 @@ def _change_velocities(code, settings, control, pattern, moves, work):
 
 @compiled
 def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, correction, weakest):
-    """Compute the direction that the rows determine least, as long as the change that the projection has made.
+    """Store the weakest direction in `weakest` (n), scaled so that its largest entry is as large as in `correction`.
 
     Clear RUNNING in lanes with dependent rows.
     """
-    spare = factors + pattern[n_rows] - pattern[0] + n_rows * (1 + n_rows + n_redundant)
+    scratch = factors + pattern[n_rows] - pattern[0] + n_rows * (1 + n_rows + n_redundant)
     for i in range(n_rows):
         fill_field(work, x + i, 0.5 + (GOLDEN * (i + 1)) % 1.0)
     for _ in range(WEAKEST_ITERATIONS):
-        normalise(work, x, n_rows, spare)
+        normalise(work, x, n_rows, scratch)
         along_rows(work, pattern, n, n_rows, n_redundant, factors, x, weakest)
-    normalise(work, x, n_rows, spare)
-    least = SINGULAR if n_redundant == 0 else WEAK * n_rows
+    normalise(work, x, n_rows, scratch)
+    least = SINGULAR if n_redundant == 0 else MAX_REDUNDANT * n_rows
     for k in range(LANES):
-        if not work[spare * LANES + k] > least:  # now `spare` is the smallest eigenvalue
+        if not work[scratch * LANES + k] > least:  # `scratch` is now the smallest eigenvalue
             work[RUNNING * LANES + k] = 0.0
-        share = _largest(work, correction, n, k) / max(_largest(work, weakest, n, k), LEAST)
+        factor = _largest(work, correction, n, k) / max(_largest(work, weakest, n, k), LEAST)
         for j in range(n):
-            work[(weakest + j) * LANES + k] *= share
+            work[(weakest + j) * LANES + k] *= factor
 
 
 @compiled
 def _compare_with_other_starts(code, settings, control, pattern, moves, work):
-    """Clear RUNNING in lanes in which the projections of other, similarly distant guesses are not as C_q predicts."""
+    """Clear RUNNING in lanes in which the projection of another guess differs much from its prediction by C_q."""
     n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = places_of(n, n_rows, settings[N_NUMBERS])
     _, x, change, found, correction, weakest, displacement, _, at_found, _, _ = _places(
@@ -378,7 +378,7 @@ def _compare_with_other_starts(code, settings, control, pattern, moves, work):
         # the component of the displacement that is normal to the constraints
         along_rows(work, pattern, n, n_rows, n_redundant, factors, x, change)
         for k in range(LANES):
-            apart, rounding = 0.0, AT_ROUNDING * np.finfo(np.float64).eps * _largest(work, found, n, k)
+            apart, rounding = 0.0, ROUNDING_FACTOR * np.finfo(np.float64).eps * _largest(work, found, n, k)
             for j in range(n):
                 m = j * LANES + k
                 expected = work[found * LANES + m] + work[displacement * LANES + m] - work[change * LANES + m]
@@ -392,10 +392,10 @@ _START_SIGNATURE = types.void(CODE, INTEGERS, VECTOR, *[INTEGERS] * 2, *[types.f
 
 @kernel(_START_SIGNATURE, vectorized=True)
 def start_lanes(code, settings, control, pattern, moves, numbers, q, v, fine, work):
-    """Project states (q, v), one for each row of `numbers`, onto the constraints at t0.
+    """Replace the states q and v (n_runs, n) by their projections onto the constraints at t0.
 
-    Overwrites q and v (n_runs, n); `fine` (n_runs,) becomes 1 where this succeeds, otherwise 0. pattern : see above;
-    moves : (n,) 1 for coordinates that may change; numbers : data of the generated code.
+    `fine` (n_runs,) becomes 1 for runs whose projection succeeds, otherwise 0. pattern : sparsity pattern of G, see
+    above; moves : (n,) 1 for coordinates that may change; numbers : (n_runs, n_numbers) data of the generated code.
     """
     n, n_rows, n_redundant, n_runs = settings[N], settings[N_ROWS], settings[N_REDUNDANT], numbers.shape[0]
     _, new, _, _, _, _, own, memory = places_of(n, n_rows, numbers.shape[1])
@@ -431,7 +431,7 @@ TABLE, STATES = types.float64[:, ::1], types.float64[:, :, ::1]
 
 @compiled
 def _relative_residual(value, allowed):
-    """Return |value| / allowed; 0 if the value is zero, infinity if it is not finite or nothing is allowed."""
+    """Return |value| / allowed; 0 if `value` is zero, otherwise infinity if it is not finite or `allowed` is zero."""
     if not np.isfinite(value):
         return np.inf
     if value == 0.0:
@@ -441,14 +441,13 @@ def _relative_residual(value, allowed):
 
 @kernel(types.void(KIT, INTEGERS, f8, f8, f8, INTEGERS, TABLE, STATES, STATES, TABLE, VECTOR, VECTOR))
 def motion_residuals(f, sizes, t, share, atol, runs, parameters, states_q, states_v, ends, scratch, worst):
-    """Compute the largest residual of the equations at the end of each run, relative to the allowed residual.
+    """Store in `worst` (n_rows,) the largest residual of the equations at the end of each run, over the allowed one.
 
     The equations are C = 0, C_q v + C_t = 0, C_q a = gamma and M a + C_q^T lam = Q. The allowed residual is `share`
-    times the terms of the equation, and for the constraints also the effect of errors `atol` of coordinates and
-    velocities. runs : (n_rows,) index of the run of each row, or -1 to omit the row; parameters : (n_runs, n_p) those
-    of all runs, which are stored in p from index sizes[2] on; states_q, states_v : (n_rows, n, n_t), of which the last
-    time is used; ends : (n_rows, n + n_c) a and lam; scratch : (n (n + 3) + n_c (n + 3),) overwritten; worst :
-    (n_rows,) results.
+    times the terms of the equation, and for constraints also the effect of errors `atol` of coordinates and velocities.
+    sizes : n, n_c and the first index in p of the parameters; runs : (n_rows,) index of the run of each row, or -1 to
+    omit the row; parameters : (n_runs, n_p); states_q, states_v : (n_rows, n, n_t), where the last time is the end;
+    ends : (n_rows, n + n_c) a and lam at the end; scratch : (n (n + 3) + n_c (n + 3),) overwritten.
     """
     n, n_c, first = sizes[0], sizes[1], sizes[2]
     M, Q = scratch[: n * n].reshape((n, n)), scratch[n * n : n * n + n]
@@ -482,14 +481,14 @@ def motion_residuals(f, sizes, t, share, atol, runs, parameters, states_q, state
         if gamma_given:
             f.gamma(t, q, v, f.p, gamma)
         for i in range(n_c):
-            row, faster, off, terms = 0.0, rate[i], -gamma[i], abs(gamma[i])
+            row, sum_v, off, terms = 0.0, rate[i], -gamma[i], abs(gamma[i])
             for j in range(n):
                 row += abs(G[i, j])
-                faster += G[i, j] * v[j]
+                sum_v += G[i, j] * v[j]
                 off += G[i, j] * a[j]
                 terms += abs(G[i, j] * a[j])
             largest = max(largest, _relative_residual(C[i], row * (share * largest_q + atol)))
-            largest = max(largest, _relative_residual(faster, row * (share * largest_v + atol) + share * abs(rate[i])))
+            largest = max(largest, _relative_residual(sum_v, row * (share * largest_v + atol) + share * abs(rate[i])))
             if gamma_given:
                 largest = max(largest, _relative_residual(off, share * terms + row * atol))
         size, apart = 0.0, 0.0
@@ -509,10 +508,10 @@ def motion_residuals(f, sizes, t, share, atol, runs, parameters, states_q, state
 
 @kernel(types.void(KIT, INTEGERS, f8, f8, TABLE, TABLE, TABLE, VECTOR, VECTOR))
 def constraint_residuals(f, sizes, t, slow, parameters, q, v, scratch, worst):
-    """Compute the largest relative residual of C = 0 and C_q v + C_t = 0 for each state (row of q and v), into `worst`.
+    """Store in `worst` the largest relative residual of C = 0 and C_q v + C_t = 0 for each state, a row of q and v.
 
     Residuals are relative to the sum of a row of |C_q| times the largest entry of q or v. slow : lower bound of the
-    largest velocity in this scale, for states at rest; scratch : (n_c (n + 2),) overwritten.
+    largest velocity in this product, for states at rest; scratch : (n_c (n + 2),) overwritten.
     """
     n, n_c, first = sizes[0], sizes[1], sizes[2]
     C, rate, G = scratch[:n_c], scratch[n_c : 2 * n_c], scratch[2 * n_c :].reshape((n_c, n))
@@ -527,12 +526,12 @@ def constraint_residuals(f, sizes, t, slow, parameters, q, v, scratch, worst):
         for j in range(n):
             largest_q, largest_v = max(largest_q, abs(q[k, j])), max(largest_v, abs(v[k, j]))
         for i in range(n_c):
-            row, faster = 0.0, rate[i]
+            row, sum_v = 0.0, rate[i]
             for j in range(n):
                 row += abs(G[i, j])
-                faster += G[i, j] * v[k, j]
+                sum_v += G[i, j] * v[k, j]
             worst[k] = max(
                 worst[k],
                 _relative_residual(C[i], row * largest_q),
-                _relative_residual(faster, row * largest_v + abs(rate[i])),
+                _relative_residual(sum_v, row * largest_v + abs(rate[i])),
             )

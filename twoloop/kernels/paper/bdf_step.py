@@ -204,10 +204,7 @@ def _norm(tolerances, y, y1, d, sign, difference):
 
 @compiled
 def _choose_order(options, memory, tolerances, trial, y, y1, d):
-    """Store NEXT_ORDER; return the error of a step, and the ratio of the next step size to h.
-
-    The error, in units of the tolerances, is estimated from d = y1 - prediction.
-    """
+    """Store NEXT_ORDER; return the error in tolerances and the ratio of the next step size to h; d: y1 - prediction."""
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, constants = _coefficients(memory, NEW_SPANS), _coefficients(memory, ERROR_CONSTANTS)
     norm = ERROR_FACTOR * _norm(tolerances, y, y1, d, 0.0, d)

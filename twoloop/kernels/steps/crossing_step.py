@@ -222,10 +222,7 @@ def _choose_partition_at_end(f, w, t, q, pivot, near):
 
 @compiled
 def _weights_to_start(b, c, c0, weights_v, weights_q):
-    """Store the weights (S) of the accelerations in their integral from 0 to c0, and in their double integral.
-
-    The weights are stored in weights_v and weights_q.
-    """
+    """Store the weights (S) of accelerations in their integral, weights_v, and double integral, weights_q, to c0."""
     weights_v[:] = 0.0
     weights_q[:] = 0.0
     for i in range(S):

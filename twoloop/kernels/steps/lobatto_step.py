@@ -111,8 +111,7 @@ def _predict_from_rejected(f, data, state):
 def _collocate(f, w, options, data, tolerances, t, h, state):
     """Solve for the stages of a step of size h; return a result, the error, and the ratio of the next step size to h.
 
-    The result is CONVERGED, REFUSED, GUESSED or NOT_COMPUTED, see data/collocation.py. The error is in units of the
-    tolerances.
+    The result is CONVERGED, REFUSED, GUESSED or NOT_COMPUTED, see data/collocation.py. The error is in tolerances.
     """
     first, estimated = data[field.PREDICTS] == 0.0, tolerances[ESTIMATE] == 1.0
     h_max = tolerances[LOOK] / CHECKED_GAP
@@ -318,10 +317,7 @@ def _may_continue(w, data, tolerances, control, clock, h):
 
 @merged
 def _take_steps(f, w, options, data, tolerances, control, clock, goal, state, n_most, out_t, out_state, out_steps):
-    """Take at most n_most steps in a row without projecting their ends; return the number of steps.
-
-    Stores the ends in out_t and out_state, the step sizes in out_steps, and the last end in `state`.
-    """
+    """Take at most n_most steps, and store their unprojected ends in out_t and out_state; return their number."""
     n, t, n_ends = w.Q.size, clock[at.T], 0
     while n_ends < n_most and t < goal:
         h_wanted = min(clock[at.H_NEXT], control[at.MAX_STEP])
