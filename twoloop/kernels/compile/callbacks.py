@@ -40,7 +40,7 @@ SAFE_CALLS = ("len", "min", "max", "abs", "range", "enumerate", "zip", "reversed
 
 
 def with_bounds_checks(function: Callable[..., Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
-    """Return a function, or a copy that calls bounds-checked copies of its helpers, and numba's options to compile it."""
+    """Return a function, or its copy that calls bounds-checked copies of helpers, and numba's options to compile it."""
     helpers = [helper for place in frozen_locations(function) if (helper := python_function(place.value)) is not None]
     if any(map(has_computed_indices, helpers)):
         return FunctionCopier(_compile_with_bounds_checks).copy_of(function), BOUNDS_CHECK

@@ -319,7 +319,7 @@ def end_series(w, order, series):
 
 @compiled
 def expand(f, w, options, memory, t, state, unit):
-    """Store series TARGET, about `state` at t, in units of `unit`, s; return a code. w has the factors at this state."""
+    """Store series TARGET about `state` at t, in units of `unit`, s; return a code. w has the factors at this state."""
     n, n_rows, order = w.Q.size, w.Rate.size, int(options[ORDER])
     N, X1, Y1, X2, Y2, total1, total2, r, c = arrays_of(options, memory, n, n_rows)
     series = series_of(memory, order, n, memory[TARGET])
