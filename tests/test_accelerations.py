@@ -22,7 +22,7 @@ from twoloop.generate.null_space import LEAST
 from twoloop.generate.program import Coefficients
 from twoloop.kernels.compile.generated_functions import GeneratedFunctions, object_code
 from twoloop.kernels.lanes.layout import LANES
-from twoloop.kernels.linalg.dependent_columns import NONE, NUMBER, VARIES, choose_dependent_columns, room_size
+from twoloop.kernels.linalg.dependent_columns import NONE, NUMBER, VARIES, choose_dependent_columns, scratch_sizes
 
 pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 
@@ -185,7 +185,7 @@ def test_pivots_are_one_for_each_row_and_not_small(m, freedom, seed):
     rng, n = np.random.default_rng(seed), m + freedom
     G = rng.standard_normal((m, n)) * (rng.random((m, n)) < 0.4)
     kinds = np.where(G == 0.0, NONE, np.where(rng.random((m, n)) < 0.5, NUMBER, VARIES))
-    numbers, integers = room_size(m, n)
+    numbers, integers = scratch_sizes(m, n)
     out, work = np.zeros(4 * m, np.int64), np.zeros(integers, np.int64)
     count = choose_dependent_columns(G, kinds.ravel(), np.arange(m), m, np.zeros(numbers), work, out)
     if count == 0:

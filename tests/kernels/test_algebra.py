@@ -13,7 +13,7 @@ from twoloop.kernels.lanes.layout import FINE, LANES, N_FIELDS
 from twoloop.kernels.linalg import dense as linalg
 from twoloop.kernels.linalg import markowitz_lu as elimination
 from twoloop.kernels.linalg import markowitz_lu as factors
-from twoloop.kernels.linalg.rank import STAYS_SINGULAR, choose_rows, room_size
+from twoloop.kernels.linalg.rank import STAYS_SINGULAR, choose_rows, workspace_size
 
 # not positive definite, and singular or not finite
 UNFIT = [[[1.0, 2.0], [2.0, 4.0]], [[0.0, 0.0], [0.0, 1.0]], [[np.nan, 1.0], [1.0, 1.0]]]
@@ -133,7 +133,7 @@ def test_the_least_solution_is_that_of_the_pseudo_inverse(rows):
 
 def chosen(mass, G):
     """What the kernel says of M and G: the bound that pivots keep, rows that count and that help, and the factor."""
-    room, found = np.full(room_size(*G.shape), np.nan), np.zeros(2 + 3 * len(G), dtype=np.int64)
+    room, found = np.full(workspace_size(*G.shape), np.nan), np.zeros(2 + 3 * len(G), dtype=np.int64)
     place = choose_rows(np.ascontiguousarray(mass), np.ascontiguousarray(G), RANK, SINGULAR_MASS, BOUNDS, room, found)
     n_kept, n_added, *places = found.tolist()
     return place, places[:n_kept], places[len(G) : len(G) + n_added], room[0]

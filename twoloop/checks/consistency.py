@@ -309,10 +309,10 @@ class StartEvaluation:
 
     def __init__(self, system: ConstrainedSystem):
         from twoloop.kernels.evaluation import checks as start_checks
-        from twoloop.kernels.evaluation.checks import evaluate_start, room_size
+        from twoloop.kernels.evaluation.checks import evaluate_start, results_size
 
         self.flags, self._evaluate = start_checks, entry_point(evaluate_start)
-        n, n_rows, size = system.n_q, system.n_c + system.n_a, room_size(system.n_q, system.n_c, system.n_a)
+        n, n_rows, size = system.n_q, system.n_c + system.n_a, results_size(system.n_q, system.n_c, system.n_a)
         self.system, values = system, np.zeros(size + n * n + 2 * n_rows * n)
         self._room, mass, rows, pattern = np.split(values, np.cumsum([size, n * n, n_rows * n]))
         self.mass, self.rows, self.pattern = mass.reshape(n, n), rows.reshape(n_rows, n), pattern.reshape(n_rows, n)

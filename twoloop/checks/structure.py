@@ -70,13 +70,13 @@ def least_solution(rows: Array, values: Array) -> tuple[Array, Array] | None:
     gram, parts = np.zeros((n_rows, n_rows)), np.zeros((2, n_rows))
     room = basis, factors, kept, shares, gram, parts
     n = entry_point(independent.least_solution)(np.ascontiguousarray(rows), left, NO_DIRECTION, *room, x)
-    inverse = entry_point(independent.size_of_inverse)(factors, n, parts[0])
+    inverse = entry_point(independent.norm_of_inverse)(factors, n, parts[0])
     return (x, left) if WEAK * math.sqrt(n_rows) * inverse < 1.0 else None
 
 
 def surely_above(ratio: float, rows: Array, rank: int) -> bool:
     """Return whether `rank` singular values certainly exceed `ratio` times the largest, by bounds, without an SVD."""
-    from twoloop.kernels.linalg.rank import singular_values_exceed, size_of_inverse
+    from twoloop.kernels.linalg.rank import singular_values_exceed, norm_of_inverse
 
     if rank == len(rows) > 0 and entry_point(singular_values_exceed)(
         np.ascontiguousarray(rows), ratio, np.empty((rank, rank))
@@ -85,7 +85,7 @@ def surely_above(ratio: float, rows: Array, rank: int) -> bool:
     _, factors, kept = orthogonalised(rows, NO_DIRECTION)
     if len(kept) != rank or rank == 0:
         return False
-    inverse = entry_point(size_of_inverse)(np.ascontiguousarray(factors), rank, np.zeros(rank))
+    inverse = entry_point(norm_of_inverse)(np.ascontiguousarray(factors), rank, np.zeros(rank))
     return bool(ratio * float(np.linalg.norm(rows)) * inverse < 1.0)
 
 
@@ -101,7 +101,7 @@ def redundant_rows(scaled: Array) -> list[int]:
 
 def in_words(jacobian: Array, redundant: list[int]) -> str:
     """Describe which rows depend on which others, with coefficients only if they are few: many vary between starts."""
-    from twoloop.kernels.linalg.rank import shares_of_others
+    from twoloop.kernels.linalg.rank import express_other_rows
 
     (n_rows, n_q), shown = jacobian.shape, redundant[:SHOWN]
     others = [i for i in range(n_rows) if i not in redundant]
@@ -109,7 +109,7 @@ def in_words(jacobian: Array, redundant: list[int]) -> str:
     lengths, shares = np.zeros(n_rows), np.zeros((len(shown), len(others)))
     order, kept = np.array([*others, *shown]), np.zeros(n_rows, dtype=np.int64)
     room = np.zeros((max_rank, n_q)), np.zeros((max_rank, max_rank)), kept
-    if not entry_point(shares_of_others)(
+    if not entry_point(express_other_rows)(
         np.ascontiguousarray(jacobian), order, RANK_TOLERANCE, rest, *room, shares, lengths
     ):
         shares[:] = np.linalg.lstsq(rest.T, jacobian[shown].T, rcond=None)[0].T

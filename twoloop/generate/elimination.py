@@ -118,9 +118,9 @@ class DependentColumns:
     def __init__(self, system: ConstrainedSystem, rows: tuple[int, ...]):
         kinds = _kinds_of_entries(system) if len(rows) >= MIN_ROW_RATIO * system.n_q > 0 else None
         if kinds is not None:
-            from twoloop.kernels.linalg.dependent_columns import choose_dependent_columns, room_size
+            from twoloop.kernels.linalg.dependent_columns import choose_dependent_columns, scratch_sizes
 
-            numbers, integers = room_size(len(rows), system.n_q)
+            numbers, integers = scratch_sizes(len(rows), system.n_q)
             blocks, scratch, work = np.zeros(4 * len(rows), np.int64), np.zeros(numbers), np.zeros(integers, np.int64)
             self.find, self._blocks = entry_point(choose_dependent_columns), blocks
             self.arguments = kinds, np.array(rows, np.int64), len(rows), scratch, work, blocks
@@ -157,11 +157,14 @@ class PivotChooser:
     """Function object that returns the choice for values of M and G, at any number of positions of a system."""
 
     def __init__(self, system: ConstrainedSystem):
-        from twoloop.kernels.linalg.rank import choose_rows, room_size
+        from twoloop.kernels.linalg.rank import choose_rows, workspace_size
 
         n_rows = system.n_c + system.n_a
         self.system, self._choose = system, entry_point(choose_rows)
-        self._room, self._chosen = np.zeros(room_size(n_rows, system.n_q)), np.zeros(2 + 3 * n_rows, dtype=np.int64)
+        self._room, self._chosen = (
+            np.zeros(workspace_size(n_rows, system.n_q)),
+            np.zeros(2 + 3 * n_rows, dtype=np.int64),
+        )
         self._key, self._last = (0, b"", 0.0), PivotChoice((), (), 1.0, 0.0)
 
     def choice(self, mass: Array, G: Array) -> PivotChoice:

@@ -142,18 +142,18 @@ def _is_singular(f, w, t, states, i, last, time, q, change):
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR, VECTOR, MATRIX, TABLE, VECTOR, VECTOR, MATRIX, MATRIX))
-def between(f, w, tolerance, tolerances, t, states, groups, times, z, room, out):
+def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z, coefficients, out):
     """Store [q, v] at times[p] in row p of `out`; return the number of failed projections.
 
     A projection fails if dependent coordinates cannot be determined, or if rounding determines the projected velocities
     near a singular position: row p then has the values of the polynomials. `groups` is the table of intervals described
-    in data/indices.py; `z` and `room` are scratch, for the nodes and coefficients of two polynomials. `tolerance` is
-    that of the projection, `tolerances` are those of the run.
+    in data/indices.py; `z` (nodes) and `coefficients` of two polynomials are scratch. `tolerance` is that of the
+    projection, `tolerances` are those of the run.
     """
     n = w.Q.size
     half = z.size // 2
-    z_q, z_v, c_q, c_v = z[:half], z[half:], room[:half], room[half:]
-    q_0, v_0 = room[2 * half - 2], room[2 * half - 1]  # the last two rows, which c_v does not use
+    z_q, z_v, c_q, c_v = z[:half], z[half:], coefficients[:half], coefficients[half:]
+    q_0, v_0 = coefficients[2 * half - 2], coefficients[2 * half - 1]  # the last two rows, which c_v does not use
     reduced = f.flags[FORM] == NULL_SPACE  # only this form computes w.D, which shows whether a partition is poor
     failures = 0
     for g in range(groups.shape[0]):
@@ -241,7 +241,7 @@ def _has_similar_gaps(t, lo, hi):
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR, VECTOR, MATRIX, TABLE, VECTOR, MATRIX, MATRIX, VECTOR))
-def judge(f, w, tolerance, tolerances, t, states, groups, z, room, rows, out):
+def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficients, rows, out):
     """Store in out[g] the estimated error of the polynomials of interval g of `groups`, relative to the tolerances.
 
     If there are more than two nodes, the difference that the last node makes is computed first. If it is at most 1, or
@@ -253,7 +253,7 @@ def judge(f, w, tolerance, tolerances, t, states, groups, z, room, rows, out):
     """
     n = w.Q.size
     half = z.size // 2
-    z_q, z_v, c_q, c_v = z[:half], z[half:], room[:half], room[half:]
+    z_q, z_v, c_q, c_v = z[:half], z[half:], coefficients[:half], coefficients[half:]
     q, v, q_1, v_1 = rows[0, :n], rows[0, n:], rows[1, :n], rows[1, n:]
     for g in range(groups.shape[0]):
         i, last, kind = groups[g, kinds.FIRST_OWN], groups[g, kinds.LAST_OWN], groups[g, kinds.KIND]

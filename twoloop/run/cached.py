@@ -423,7 +423,7 @@ def arrays_of(
         **{"saved": np.empty(numbers.size + lasting_floats.size + run.state.size), "saved_integers": integers.copy()},
         **{"constants": np.array([*start_constants, *step_fields, run.near, TURNED, REPEAT_BELOW])},
         lapack=np.array(lapack_addresses() if run.kit.flags[BANDWIDTH] >= 0 else [], dtype=np.int64),
-        **{"bounds": BOUNDS, "scratch": np.zeros(pivots.room_size(n_rows, system.n_q)), "expected": expected},
+        **{"bounds": BOUNDS, "scratch": np.zeros(pivots.workspace_size(n_rows, system.n_q)), "expected": expected},
         **{"chosen": np.zeros(2 + 3 * n_rows, dtype=np.int64), "blocks": np.array(blocks, dtype=np.int64).ravel()},
         **dict(zip(("kinds", "counted", "_", "search", "search_places", "found"), search, strict=True)),
         **{"last_start": np.zeros(loops.START + 2 + 2 * system.n_q), "start_rows": run.work.rows_v.copy()},

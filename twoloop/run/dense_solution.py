@@ -206,10 +206,10 @@ class Interpolator:
         """Write rows [q, v] at the times of the groups to `out`; return the number of failures."""
         states = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups))
         rest = (times, self.nodes, self.scratch, out)
-        failures = int(entry_point(self.kernels.between)(self.kit, self.work, INNER_TOL, *states, *rest))
+        failures = int(entry_point(self.kernels.interpolate_states)(self.kit, self.work, INNER_TOL, *states, *rest))
         if failures > 0 and self.static is not None:
             self._become_dense()
-            failures = int(entry_point(self.kernels.between)(self.kit, self.work, INNER_TOL, *states, *rest))
+            failures = int(entry_point(self.kernels.interpolate_states)(self.kit, self.work, INNER_TOL, *states, *rest))
         return failures
 
     def _divide_where_needed(self, table: Table, groups: Groups) -> None:
@@ -245,7 +245,7 @@ class Interpolator:
         """Estimate the residuals of the polynomials of intervals, relative to the tolerances."""
         out, groups = np.zeros(len(groups)), np.ascontiguousarray(groups)
         arrays = self.tolerances, table.t, table.states, groups, self.nodes, self.scratch, self.rows, out
-        entry_point(self.kernels.judge)(self.kit, self.work, INNER_TOL, *arrays)
+        entry_point(self.kernels.estimate_errors)(self.kit, self.work, INNER_TOL, *arrays)
         return out
 
     def _repair(self, table: Table, group: Groups, smallest: float) -> None:

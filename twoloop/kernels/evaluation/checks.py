@@ -138,8 +138,8 @@ ROUNDING_OF_ZERO = 2.0**-52  # largest coordinate that may be a rounding error o
 EIGENVALUE_MARGIN = 2.0  # factor on the limit of zero eigenvalues, larger than that by which rounding changes them
 
 
-def room_size(n: int, n_c: int, n_a: int) -> int:
-    """Return the length of the argument `room` of evaluate_start."""
+def results_size(n: int, n_c: int, n_a: int) -> int:
+    """Return the length of the argument `results` of evaluate_start."""
     return n + 2 * (n_c + n_a) + n_c * (n + 4) + n * max(n, n_c + n_a + 1)
 
 
@@ -279,7 +279,7 @@ def _is_definite(mass, min_eigenvalue, factors):
 
 
 @kernel(i8(KIT, f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR), vectorized=True)
-def evaluate_start(f, t, q, v, sizes, lam, room, mass, rows, shifts, pattern, roundings):
+def evaluate_start(f, t, q, v, sizes, lam, results, mass, rows, shifts, pattern, roundings):
     """Evaluate all callbacks at (t, q, v), and store their results; return the flags IN_ORDER to INDEFINITE.
 
     Arguments:
@@ -289,31 +289,31 @@ def evaluate_start(f, t, q, v, sizes, lam, room, mass, rows, shifts, pattern, ro
       the sizes near these positions
     - shifts: displacements of q, relative to its size, at which nonzero entries of rows are also recorded
     - mass, rows, pattern: zeros on entry; on return M, C_q with A, and 1 where rows are nonzero
-    - room: `room_size` zeros on entry; on return the force, C, C_t with b, other results of callbacks, and scratch
+    - results: `results_size` zeros on entry; on return the force, C, C_t with b, other results of callbacks, and scratch
     """
     n, n_c, n_rows, flags = q.size, lam.size, rows.shape[0], f.flags
-    force, C, rate, gamma = n, n + n_c, n + n_c + n_rows, n + n_c + 2 * n_rows  # ends of the parts of `room`
+    force, C, rate, gamma = n, n + n_c, n + n_c + n_rows, n + n_c + 2 * n_rows  # ends of the parts of `results`
     f.mass(t, q, f.p, mass)
-    f.force(t, q, v, f.p, room[:force])
-    f.constraint(t, q, f.p, room[force:C])
+    f.force(t, q, v, f.p, results[:force])
+    f.constraint(t, q, f.p, results[force:C])
     f.jacobian(t, q, f.p, rows[:n_c])
     f.nonholonomic(t, q, f.p, rows[n_c:])
-    f.constraint_rate(t, q, f.p, room[C : C + n_c])
-    f.nonholonomic_rate(t, q, f.p, room[C + n_c : rate])
+    f.constraint_rate(t, q, f.p, results[C : C + n_c])
+    f.nonholonomic_rate(t, q, f.p, results[C + n_c : rate])
     if flags[GAMMA_GIVEN] == 1:
-        f.gamma(t, q, v, f.p, room[rate : rate + n_c])
+        f.gamma(t, q, v, f.p, results[rate : rate + n_c])
     if flags[NONHOLONOMIC_GAMMA_GIVEN] == 1:
-        f.nonholonomic_gamma(t, q, v, f.p, room[rate + n_c : gamma])
+        f.nonholonomic_gamma(t, q, v, f.p, results[rate + n_c : gamma])
     if flags[KINEMATICS_GIVEN] == 1:
-        fused_results = room[gamma : gamma + n_c * (n + 3)]
+        fused_results = results[gamma : gamma + n_c * (n + 3)]
         matrix = fused_results[3 * n_c :].reshape((n_c, n))
         f.kinematics(
             t, q, v, f.p, fused_results[:n_c], matrix, fused_results[n_c : 2 * n_c], fused_results[2 * n_c : 3 * n_c]
         )
     end = gamma + n_c * (n + 3)
-    if not (finite(mass) and finite(rows) and finite_vector(room[:end])):
+    if not (finite(mass) and finite(rows) and finite_vector(results[:end])):
         return 0
-    scratch = room[end : end + n * n].reshape((n, n))
+    scratch = results[end : end + n * n].reshape((n, n))
     if flags[FORCE_BY_Q_GIVEN] == 1:
         f.force_by_q(t, q, v, f.p, scratch)
         if not finite(scratch):
@@ -331,7 +331,7 @@ def evaluate_start(f, t, q, v, sizes, lam, room, mass, rows, shifts, pattern, ro
     result_flags = 0
     if _is_symmetric(mass, roundings[1]) and not _has_empty_row(rows):
         result_flags = IN_ORDER
-        if _is_consistent(room[force:C], room[C:rate], rows, q, v, sizes, roundings[0]):
+        if _is_consistent(results[force:C], results[C:rate], rows, q, v, sizes, roundings[0]):
             result_flags |= CONSISTENT
     if flags[CONSTANT_MASS] == 0:  # neither DEFINITE nor INDEFINITE if the smallest eigenvalue is within the margin
         if _is_definite(mass, EIGENVALUE_MARGIN * roundings[2], scratch):
@@ -339,8 +339,8 @@ def evaluate_start(f, t, q, v, sizes, lam, room, mass, rows, shifts, pattern, ro
         elif not _is_definite(mass, roundings[2] / EIGENVALUE_MARGIN, scratch):
             result_flags |= INDEFINITE
     _record_entries(rows, pattern)
-    rows_nearby = room[end : end + n_rows * n].reshape((n_rows, n))
-    _record_entries_near(f, t, q, shifts, room[end + n_rows * n : end + n_rows * n + n], rows_nearby, n_c, pattern)
+    rows_nearby = results[end : end + n_rows * n].reshape((n_rows, n))
+    _record_entries_near(f, t, q, shifts, results[end + n_rows * n : end + n_rows * n + n], rows_nearby, n_c, pattern)
     return result_flags
 
 

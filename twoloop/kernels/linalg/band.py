@@ -1,11 +1,12 @@
-"""Factor and solve banded matrices by LAPACK: the mass matrix, and systems with a border of constraints.
+"""Factor and solve banded matrices by LAPACK: the mass matrix, and Newton matrices with a border of constraints.
 
-LAPACK's band storage has entry (i, j) at [j, top + i - j] of a C-ordered array, with top = b for the upper triangle of
-M, and top = 2 b for an LU, whose row exchanges fill another b diagonals. b is the bandwidth that the system declares.
+In LAPACK's band storage, entry (i, j) of a matrix is entry [j, top + i - j] of a C-ordered array, with top = b for the
+upper triangle of M, and top = 2 b for an LU, whose row exchanges fill another b diagonals. b is the bandwidth that the
+system declares.
 
-The routines are those of the library that SciPy uses. Their addresses differ from process to process, and kernels are
-stored on disk, so no address is compiled in: a run stores `lapack_addresses` in its workspace, and `call_lapack` gets
-one of these addresses. (Numba calls LAPACK only for dense matrices, and allocates memory.)
+The LAPACK library is that of SciPy. The addresses of its routines differ from process to process, and kernels are
+stored on disk, so that addresses cannot be compiled in: a run stores `lapack_addresses` in its workspace, and
+`call_lapack` gets one of these addresses. (Numba calls LAPACK only for dense matrices, and allocates memory.)
 """
 
 import numpy as np
@@ -19,8 +20,8 @@ from twoloop.kernels.data.common import compiled, inlined, merged
 from twoloop.kernels.data.indices import BANDWIDTH, DIAGONAL_MASS, DONE, MASS_NOT_DEFINITE, SINGULAR
 from twoloop.kernels.linalg.dense import lu_factor, lu_solve
 
-# routines, in the order of `lapack_addresses`: Cholesky factorization of a banded matrix, and solution with its factor;
-# LU factorization with row exchanges, and solution, of real matrices, then of complex ones
+# names of LAPACK routines, and their indices in `lapack_addresses`: Cholesky factorization of a banded matrix (dpbtrf),
+# solution with this factor (dpbtrs); LU factorization and solution of real matrices (dgb), and of complex ones (zgb)
 ROUTINES = ("dpbtrf", "dpbtrs", "dgbtrf", "dgbtrs", "zgbtrf", "zgbtrs")
 DPBTRF, DPBTRS, DGBTRF, DGBTRS, ZGBTRF, ZGBTRS, N_ROUTINES = range(7)
 
@@ -44,10 +45,10 @@ def lapack_addresses() -> list[int]:
 
 @intrinsic
 def call_lapack(typing_context, address, arguments):
-    """Call the LAPACK routine at `address` with Fortran's conventions and the added argument `info`; return its value.
+    """Call the LAPACK routine at `address` with `arguments` and Fortran's last argument `info`; return `info`.
 
-    `arguments` is a tuple of arrays, passed by the address of their first element, and of integers, passed by that of
-    a 32-bit copy. Integers also serve as characters: the machines that numba supports have the low byte first.
+    `arguments` is a tuple of arrays and integers. An array is passed as the address of its first element, an integer as
+    the address of a 32-bit copy, which also serves as a character, because numba's machines have the low byte first.
     """
 
     def generate(context, builder, signature, values):
@@ -69,20 +70,20 @@ def call_lapack(typing_context, address, arguments):
     return types.int64(address, arguments), generate
 
 
-# number of coordinates from which on a Newton step by banded algebra is faster: measured 36 to 75, on chains of
-# bandwidth 1 to 11 and on beams. Single evaluations, as in a fixed-point iteration, are faster only above about 150
-# coordinates; at 56 they take a third longer
+# smallest number of coordinates for which Newton steps by banded algebra count as faster: the measured limit is 36 to
+# 75, on chains of bandwidth 1 to 11 and on beams. Single evaluations, as in a fixed-point iteration, are faster only
+# above about 150 coordinates; with 56 coordinates they take a third longer
 BANDED_FROM = 56
 
 
 def banded_pays(n_q: int, n_c: int, bandwidth: int) -> bool:
-    """Return whether banded linear algebra is faster than dense, and its matrices fit into memory of the dense ones."""
+    """Return whether banded linear algebra is faster than dense, and its arrays fit in the memory of the dense ones."""
     return n_q >= max(BANDED_FROM, 3 * bandwidth + 2 + 2 * n_c)
 
 
 @merged
 def banded_mass(f):
-    """Return whether M is factored as a band; False if M is diagonal, because dividing is faster."""
+    """Return whether M is factored as a banded matrix; False if M is diagonal, because divisions are faster."""
     return f.flags[BANDWIDTH] >= 0 and f.flags[DIAGONAL_MASS] == 0
 
 
@@ -94,14 +95,14 @@ def _mass_band(w, b):
 
 @inlined
 def _mass_diagonals(w, b):
-    """Return the part of w.L after the factor, with entry (i, i + k) of M at [k, i]."""
+    """Return a view of w.L behind the Cholesky factor, for the diagonals of M: entry (i, i + k) of M is at [k, i]."""
     n = w.Q.size
     return w.L.reshape(n * n)[n * (b + 1) : 2 * n * (b + 1)].reshape((b + 1, n))
 
 
 @compiled
 def factor_banded_mass(f, w):
-    """Factor w.M by Cholesky; store the factor, and the diagonals of w.M, in w.L; return DONE or MASS_NOT_DEFINITE."""
+    """Store the Cholesky factor and the diagonals of w.M in w.L; return DONE or MASS_NOT_DEFINITE."""
     n = w.Q.size
     b = f.flags[BANDWIDTH]
     band = _mass_band(w, b)
@@ -117,7 +118,7 @@ def factor_banded_mass(f, w):
 
 @merged
 def solve_banded_mass(f, w, x):
-    """Replace x by M^-1 x."""
+    """Replace x by M^-1 x, with the factor of `factor_banded_mass`."""
     n = w.Q.size
     b = f.flags[BANDWIDTH]
     call_lapack(w.lapack[DPBTRS], (UPPER, n, b, 1, _mass_band(w, b), b + 1, x, n))
@@ -125,7 +126,7 @@ def solve_banded_mass(f, w, x):
 
 @compiled
 def add_banded_mass_times(f, w, x, y):
-    """Add M x to y, diagonal by diagonal, because rows of a band are too short for fast loops."""
+    """Add M x to y in place, diagonal by diagonal, because rows within the band are too short for fast loops."""
     n = w.Q.size
     for i in range(n):
         y[i] += w.M[i, i] * x[i]
@@ -140,14 +141,14 @@ def add_banded_mass_times(f, w, x, y):
             y[i + k] += diagonals[k, i] * x[i]
 
 
-# The system [[B, Cq^T], [Cq, 0]] [x; mu] = [r; 0], where b is the bandwidth of B, has the solution
-# mu = (Cq B^-1 Cq^T)^-1 Cq B^-1 r. The array `numbers`, real or complex, contains the LU of B, the transpose of
-# B^-1 Cq^T, Cq B^-1 Cq^T, and scratch (n_c).
+# The bordered system [[B, Cq^T], [Cq, 0]] [x; mu] = [r; 0], where b is the bandwidth of B, has the solution
+# mu = (Cq B^-1 Cq^T)^-1 Cq B^-1 r, x = B^-1 (r - Cq^T mu). The array `numbers`, real or complex, contains the LU of B,
+# the transpose of B^-1 Cq^T, the matrix Cq B^-1 Cq^T, and scratch (n_c).
 
 
 @inlined
 def lu_band(numbers, n, b):
-    """Return the part of `numbers` for B, which its LU overwrites: entry (i, j) is at [j, 2 b + i - j]."""
+    """Return the view of `numbers` that contains B, then its LU: entry (i, j) of B is at [j, 2 b + i - j]."""
     return numbers[: n * (3 * b + 1)].reshape((n, 3 * b + 1))
 
 
@@ -171,7 +172,7 @@ def _scratch(numbers, n, n_c, b):
 
 @compiled
 def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
-    """Factor the system whose B is in lu_band(numbers); `factorize`, `substitute`: indices of xGBTRF and xGBTRS."""
+    """Factor the bordered system in `numbers` by the routines `factorize` and `substitute` (xGBTRF, xGBTRS)."""
     n_c, n = Cq.shape
     band = lu_band(numbers, n, b)
     rows = pivots[: n - n_c].view(np.int32)
@@ -193,7 +194,7 @@ def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
 
 @compiled
 def solve_bordered(w, b, Cq, numbers, pivots, substitute, x):
-    """Solve with the factors of `factor_bordered`; x (n_q), r on entry, becomes the solution."""
+    """Replace x (n_q), the right-hand side r, by the solution of the bordered system factored by `factor_bordered`."""
     n_c, n = Cq.shape
     band, rows = lu_band(numbers, n, b), pivots[: n - n_c].view(np.int32)
     call_lapack(w.lapack[substitute], (NO_TRANSPOSE, n, b, b, 1, band, 3 * b + 1, rows, x, n))

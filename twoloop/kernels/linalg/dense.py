@@ -1,6 +1,6 @@
 """Factor small dense matrices in place, without allocation, and record where matrices have entries.
 
-All loops run along rows and skip zero factors: constraint Jacobians are sparse even where they are small.
+Inner loops run along rows, and are skipped if their factor is zero: even small constraint Jacobians are sparse.
 """
 
 from twoloop.kernels.data.common import compiled, merged
@@ -15,7 +15,7 @@ def copy(source, target):
 
 @merged
 def copy_matrix(source, target):
-    """Copy the rows of `source` to those of `target`, as many as both have."""
+    """Copy rows of `source` to `target`, as many as both matrices have."""
     for i in range(min(source.shape[0], target.shape[0])):
         for j in range(source.shape[1]):
             target[i, j] = source[i, j]
@@ -23,7 +23,7 @@ def copy_matrix(source, target):
 
 @merged
 def largest_of(x):
-    """Return max|x_i| of a vector; 0 of an empty one."""
+    """Return max|x_i| of a vector; 0 for an empty vector."""
     largest = 0.0
     for j in range(x.size):
         largest = max(largest, abs(x[j]))
@@ -47,9 +47,9 @@ def _magnitude(x):
 
 @merged
 def lu_factor(A, pivots):
-    """Factor A, real or complex, into L U with row exchanges, in place, with 1/u_kk on the diagonal.
+    """Replace A, real or complex, by its factors L U with row exchanges `pivots`, with 1/u_kk on the diagonal.
 
-    Returns min|u_kk| / max|u_kk|; 0 for a singular matrix or one with values that are not finite.
+    Returns min|u_kk| / max|u_kk|, or 0 if A is singular or a pivot is not finite.
     """
     n = A.shape[0]
     smallest = 1e300
@@ -83,7 +83,7 @@ def lu_factor(A, pivots):
 
 @merged
 def lu_sign(A, pivots):
-    """Return the sign of the determinant of a real matrix from the factors of `lu_factor`."""
+    """Return the sign of the determinant of a real matrix, whose factors by `lu_factor` are A and `pivots`."""
     sign = 1.0
     for k in range(A.shape[0]):
         if (A[k, k] < 0.0) != (pivots[k] != k):
@@ -93,7 +93,7 @@ def lu_sign(A, pivots):
 
 @merged
 def lu_solve(A, pivots, x):
-    """Solve with the factors of `lu_factor`; x, the right-hand side, becomes the solution."""
+    """Replace x, the right-hand side, by the solution, with the factors A and `pivots` of `lu_factor`."""
     n = A.shape[0]
     for k in range(n):
         p = pivots[k]
@@ -113,9 +113,9 @@ def lu_solve(A, pivots, x):
 
 @merged
 def ldl_factor(A):
-    """Factor a symmetric A into U^T D^-1 U from its upper triangle, in place: 1/d_k on the diagonal, U above it.
+    """Replace the upper triangle of a symmetric A by its factors U^T D^-1 U: 1/d_k on the diagonal, U above it.
 
-    Returns False if A is not positive definite or has values that are not finite.
+    Returns False if A is not positive definite, or has values that are not finite.
     """
     n = A.shape[0]
     for k in range(n):
@@ -156,7 +156,7 @@ def invert_definite(A):
 
 @merged
 def ldl_solve(A, x):
-    """Solve with the factors of `ldl_factor`; x, the right-hand side, becomes the solution."""
+    """Replace x, the right-hand side, by the solution, with the factors A of `ldl_factor`."""
     n = A.shape[0]
     for k in range(n):
         if x[k] != 0.0:
@@ -172,7 +172,7 @@ def ldl_solve(A, x):
 
 @merged
 def ldl_solve_rows(A, B):
-    """Solve with the factors of `ldl_factor` for all columns of B at once; they become the solutions."""
+    """Replace the columns of B, right-hand sides, by the solutions, with the factors A of `ldl_factor`."""
     n, m = B.shape
     for k in range(n):
         for i in range(k + 1, n):
@@ -201,7 +201,7 @@ def has_new_entries(G, pattern):
 
 @compiled
 def note_pattern(G, pattern):
-    """Set `pattern` to 1 where G is not zero; return whether this changes it."""
+    """Set `pattern` to 1 where G is not zero; return whether this changes `pattern`."""
     if not has_new_entries(G, pattern):
         return False
     new = False

@@ -1,32 +1,31 @@
-"""Choose dependent coordinates for generated code, as pivots of rows of G, in blocks of one or two.
+"""Choose dependent coordinates for generated code, as pivots in rows of G, in blocks of one or two rows.
 
-Constant entries are chosen first: they need no division and do not change. Among other entries that are large enough,
-those with the least fill are chosen, not the largest, so that neighbouring positions mostly have the same pivots.
+Constant entries are chosen first: they need no division and do not change. Among varying entries that are large enough,
+those with the least fill are chosen, not the largest ones, so that nearby positions mostly have the same pivots.
 """
 
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, i8, kernel
 
-NONE, NUMBER, VARIES = 0, 1, 2  # kinds of entries: always zero, constant, varying
-# number of rows, those with the fewest entries, among which pairs are sought: among all 60 rows this takes milliseconds
-ROWS_SEARCHED = 4
+NONE, NUMBER, VARIES = 0, 1, 2  # kinds of entries of G: always zero, constant, varying
+ROWS_SEARCHED = 4  # number of rows, those with the fewest entries, among which pivot blocks are sought: to save time
 # limits of a pivot block, in three tiers, which are tried in this order. MAX_SQUARES: sum of squares of the changes of
-# its coordinates, if each other coordinate moves by 1. MIN_SINE_SQUARES: squared sine of the angle between its columns,
-# or square of a single pivot over that of its column of G. With the first tier pivots stay large for most of a
-# turn (spatial four-bar: 98 % of the time, 34 % with the second tier); the last tier is far enough from
-# MIN_PIVOT_SQUARE of generate/null_space.py
+# the block's coordinates if each other coordinate moves by 1. MIN_SINE_SQUARES: squared sine of the angle between the
+# block's two columns, or, for a single pivot, its square over the squared norm of its column of G. Pivots chosen by the
+# first tier stay large for 98 % of a turn of a spatial four-bar, pivots chosen by the second tier for 34 %. The last
+# tier is well above MIN_PIVOT_SQUARE of generate/null_space.py, so that a choice stays valid for some motion
 MAX_SQUARES, MIN_SINE_SQUARES = (4.0, 20.0, 200.0), (0.2**2, 0.1**2, 0.04**2)
 SMALL = 1e-3  # smallest constant that may be a pivot, relative to the largest entry of its row
-CANCELLATION = 1e-12  # difference of constants that counts as zero, relative to the subtracted one
+CANCELLATION = 1e-12  # largest difference of two constants that counts as zero, relative to the subtracted constant
 
 
-def room_size(n_rows: int, n: int) -> tuple[int, int]:
-    """Return how many real numbers and how many integers `choose_dependent_columns` needs as scratch."""
+def scratch_sizes(n_rows: int, n: int) -> tuple[int, int]:
+    """Return the lengths of the arguments `numbers` and `integers` of `choose_dependent_columns`, which are scratch."""
     return n_rows * n + n, n_rows * n + 3 * n_rows + 2 * n
 
 
 @compiled
 def _find_constant_pivot(R, K, row_left, row_sizes, column_sizes):
-    """Return n * row + column of the constant entry with the least fill; -1 if there is none."""
+    """Return n * row + column of the constant entry that causes the least fill as a pivot; -1 if there is none."""
     best, best_fill, best_size, (m, n) = -1, 0, 0, R.shape
     for i in range(m):
         if not row_left[i]:
@@ -47,7 +46,7 @@ def _find_constant_pivot(R, K, row_left, row_sizes, column_sizes):
 
 @compiled
 def _is_pivot_block(R, column_left, squares, i, k, j, l, max_squares, min_sine_square):
-    """Return whether the entries of rows i and k, or of row i alone, in columns j and l, may be pivots."""
+    """Return whether rows i and k and columns j and l may be a pivot block: one row and column if i == k and j == l."""
     n, total = R.shape[1], 0.0
     if i == k:
         square = R[i, j] * R[i, j]
@@ -69,10 +68,10 @@ def _is_pivot_block(R, column_left, squares, i, k, j, l, max_squares, min_sine_s
 
 @compiled
 def _find_varying_pivots(R, K, row_left, column_left, squares, rows, column_sizes, block):
-    """Find a pivot block among entries that vary, and return whether there is one.
+    """Store a pivot block of varying entries in `block`; return False if there is none.
 
-    `block` becomes its two rows and two columns, or one row and one column, each twice. `rows` and `column_sizes` are
-    scratch.
+    `block` becomes two rows and two columns; a block of one row has its row and its column twice. `rows` and
+    `column_sizes` are scratch.
     """
     m, n = R.shape
     n_rows = 0
@@ -125,7 +124,7 @@ def _find_varying_pivots(R, K, row_left, column_left, squares, rows, column_size
 
 @compiled
 def _subtract(R, K, column_left, row_sizes, column_sizes, r, j, i):
-    """Subtract a multiple of row i, solved for column j, from row r, so that row r has no entry in column j."""
+    """Subtract from row r the multiple of row i that removes the entry in column j; row i is solved for column j."""
     factor, kind = R[r, j], K[r, j]
     R[r, j], K[r, j] = 0.0, NONE
     if kind == NONE:
@@ -145,9 +144,10 @@ def _subtract(R, K, column_left, row_sizes, column_sizes, r, j, i):
 
 @compiled
 def _eliminate(R, K, row_left, column_left, row_sizes, column_sizes, i, k, j, l):
-    """Solve rows i and k for columns j and l, or row i for column j, and eliminate these columns from the other rows.
+    """Solve row i for column j if i == k, else rows i and k for columns j and l; then eliminate these columns.
 
-    `row_sizes` and `column_sizes` are the numbers of entries; they are updated for single rows only.
+    `row_sizes` and `column_sizes` are the numbers of entries left in each row and column. They stay correct only while
+    single rows are eliminated (i == k), not after a block of two rows.
     """
     m, n = R.shape
     row_left[i] = row_left[k] = column_left[j] = column_left[l] = 0
@@ -180,8 +180,8 @@ def _eliminate(R, K, row_left, column_left, row_sizes, column_sizes, i, k, j, l)
 def choose_dependent_columns(G, kinds, rows, n_kept, numbers, integers, out):
     """Choose dependent columns for the first `n_kept` of the rows `rows` of G; return the number of blocks (0: failed).
 
-    kinds : kind of each entry of G, row by row. out : becomes, for each block, its two rows, as indices in `rows`, and
-    its two columns, or one row and one column, each twice. numbers, integers : scratch, see `room_size`.
+    kinds : kind of each entry of G, row by row. out : becomes two rows (as indices in `rows`) and two columns of each
+    block; a block of one row has its row and its column twice. numbers, integers : scratch, see `scratch_sizes`.
     """
     n = G.shape[1]
     if n_kept > n:

@@ -1,14 +1,14 @@
-"""Factor the dependent columns of the constraint Jacobian by LU, with a program for their pattern.
+"""Factor the dependent columns of the constraint Jacobian by LU, with a program for their pattern of entries.
 
 A mechanism's Jacobian has few nonzero entries, and their pattern does not change. So the order of elimination is chosen
-once for each partition (Markowitz's rule with a threshold), and with it the program, a list of operations: later
-factorizations follow this list, without a search for pivots and without tests for zeros. If multipliers become large,
-another order is chosen. If the list is nearly as long as that of a full matrix, the factors are dense, with row
-exchanges.
+once for each partition (Markowitz's rule with a threshold), and written as a program, a list of operations. Later
+factorizations follow this program, without a search for pivots and without tests for zeros. If multipliers become
+large, another order is chosen. If the program is nearly as long as that of a full matrix, the factors are dense, with
+row exchanges.
 
 To choose an order, entries are stored in lists by row and by column, and each step of the elimination uses only the
-lists that it changes: the work is proportional to size times entries, whereas full matrices would take the third power
-of the size.
+lists that it changes. So the work is proportional to the number of rows times the number of entries, instead of to the
+third power of the number of rows.
 
 The factors of a matrix are two arrays: `index`, the program, and `values`. Right-hand sides and solutions are in the
 order of elimination: entry k of a right-hand side belongs to row rows_of(index)[k] of the Jacobian, and entry k of a
@@ -19,7 +19,7 @@ from twoloop.kernels.data.common import compiled, inlined, merged
 from twoloop.kernels.linalg.dense import copy, lu_factor, lu_sign, lu_solve
 
 THRESHOLD = 0.1  # smallest pivot, relative to the largest entry in its column
-DENSE_SHARE = 0.5  # number of operations, relative to a dense factorization, above which the factors are dense
+DENSE_SHARE = 0.5  # number of subtractions, relative to a dense factorization, above which the factors are dense
 SMALL_SIZE = 3  # largest number of rows for which factors are never dense
 ZERO_PIVOT = 1e-11  # largest pivot that counts as zero, relative to the largest pivot so far
 # largest number of subtractions in a program, for which memory is allocated: MIN_SUBTRACTIONS + PER_ROW r
@@ -28,18 +28,19 @@ MAX_ENTRIES_PER_LINE = 64  # largest number of entries in a row or a column of t
 
 ORDERED, SINGULAR_MATRIX, TOO_MANY = range(3)  # results of `order`; TOO_MANY: too many entries for sparse factors
 
-# indices in `index`: the size r, 1 if the factors are dense, the sign of the permutations, the number of entries of the
-# factors, the first entry of L, and the number of columns of the Jacobian. Arrays follow: rows (r), columns (r), row
-# exchanges of dense factors (r), where rows of U begin (r) and end (r), where rows of L begin (r + 1); row, column and
-# source of each entry, where the source is the index of a number in the matrix; the targets of the subtractions; and
-# the lists for choosing an order. Entries are in this order: the diagonal, U from its last row up, L from its first
-# row down
+# indices in `index`. SIZE: number of rows r. DENSE: 1 if the factors are dense. SIGN: sign of the permutations.
+# N_SLOTS: number of entries of the factors. FIRST_LOWER: first entry of L. WIDTH: number of columns of the Jacobian.
+# Arrays follow: rows (r), columns (r), row exchanges of dense factors (r), first entries (r) and ends (r) of the rows
+# of U, first entries of the rows of L (r + 1); row, column and source of each entry, where the source is the index of a
+# number in the matrix; the targets of the subtractions; and the lists for choosing an order. The entries are sorted:
+# first the diagonal, then U from its last row up, then L from its first row down
 SIZE, DENSE, SIGN, N_SLOTS, FIRST_LOWER, WIDTH, N_HEAD = range(7)
-# numbers for each row and column of the matrix: entries in the list of a row, and of a column, less eliminated rows;
-# entries of a row in columns that are not eliminated; positions of a row and of a column in the order so far; scratch:
-# 1 + index of a row in the list of a column, or slot of the entry in a column
+# indices of arrays with one number per row or column. ROW_SIZE: entries in the list of a row. COLUMN_SIZE: entries in
+# the list of a column, without eliminated rows. ROW_LEFT: entries of a row in columns that are not eliminated.
+# ROW_POSITION, COLUMN_POSITION: positions in the order so far. WHERE: scratch, for 1 + the index of a row in the list
+# of a column, or for the slot of the entry in a column
 ROW_SIZE, COLUMN_SIZE, ROW_LEFT, ROW_POSITION, COLUMN_POSITION, WHERE, N_COUNTS = range(7)
-# lists of a row: columns and sources of its entries; list of a column: rows of its entries
+# indices of lists. COLUMNS, SOURCES: of the entries of each row. ROWS: of the entries of each column
 COLUMNS, SOURCES, ROWS, N_LISTS = range(4)
 
 
@@ -60,13 +61,13 @@ def max_subtractions(r: int) -> int:
 
 @inlined
 def rows_of(index):
-    """Return the rows of the matrix in the order of elimination."""
+    """Return the indices of the rows in the order of elimination."""
     return index[N_HEAD : N_HEAD + index[SIZE]]
 
 
 @inlined
 def columns_of(index):
-    """Return the columns of the matrix in the order of elimination."""
+    """Return the indices of the columns in the order of elimination."""
     return index[N_HEAD + index[SIZE] : N_HEAD + 2 * index[SIZE]]
 
 
@@ -90,7 +91,7 @@ def end_upper(r):
 
 @merged
 def begin_lower(r):
-    """Return the position in `index` of the list of the first entries of the rows of L, and the end of the last row."""
+    """Return the position in `index` of the list of the first entries of the rows of L, and of the end of the last."""
     return N_HEAD + 5 * r
 
 
@@ -102,7 +103,7 @@ def begin_entries(r):
 
 @inlined
 def lists_of(index, values):
-    """Return the lists of a matrix to be ordered: (N_COUNTS, r), (N_LISTS, r, entries), and the numbers by column."""
+    """Return views for the elimination in `order`: counts (N_COUNTS, r), lists (N_LISTS, r, width), numbers."""
     r = index[SIZE]
     width = min(r, MAX_ENTRIES_PER_LINE)
     counts = index[index.size - N_COUNTS * r :].reshape((N_COUNTS, r))
@@ -112,7 +113,7 @@ def lists_of(index, values):
 
 @compiled
 def clear_lists(index, r):
-    """Set r as the number of rows, and empty the lists of the matrix."""
+    """Store r as the number of rows in `index`, and make the lists of the matrix empty."""
     index[SIZE] = r
     index[DENSE] = 0
     for k in range(index.size - N_COUNTS * r, index.size):
@@ -121,7 +122,7 @@ def clear_lists(index, r):
 
 @compiled
 def put_entry(matrix, i, j, number, source):
-    """Add entry (i, j), which is not in the lists yet; return False if a list is full."""
+    """Add entry (i, j), a number with a source, to the lists of `matrix`; return False if a list is full."""
     counts, lists, numbers = matrix
     n, m = counts[ROW_SIZE, i], counts[COLUMN_SIZE, j]
     if n == numbers.shape[1] or m == numbers.shape[1]:
@@ -136,9 +137,9 @@ def put_entry(matrix, i, j, number, source):
 
 @compiled
 def _choose_pivot(matrix, rows, columns, k):
-    """Return row and column of pivot k, which has the least fill of those large enough; (-1, -1) if there is none.
+    """Return row and column of pivot k, the entry with the least fill of those large enough; (-1, -1): there is none.
 
-    Of pivots with equal fill the largest is chosen, and of equally large ones the first in the order so far.
+    Among entries with equal fill the largest is chosen, and among equally large ones the first in the order so far.
     """
     counts, lists, numbers = matrix
     r = rows.size
@@ -167,7 +168,7 @@ def _choose_pivot(matrix, rows, columns, k):
 
 @merged
 def _exchange(order, position, k, chosen):
-    """Move `chosen` to position k; return the sign of the permutation: -1, or 1 if `chosen` is already there."""
+    """Move `chosen` to position k of `order`; return the sign of the permutation: -1, or 1 if it is already there."""
     previous, exchanged = position[chosen], order[k]
     order[k], order[previous] = chosen, exchanged
     position[chosen], position[exchanged] = k, previous
@@ -176,7 +177,7 @@ def _exchange(order, position, k, chosen):
 
 @compiled
 def _subtract(matrix, row, column, pivot, j, zero_source):
-    """In column j, subtract multiples of the pivot's row from others, and remove it; return False if a list is full."""
+    """Eliminate `row` from column j, with the pivot at (row, column); return False if a list of entries is full."""
     counts, lists, numbers = matrix
     for m in range(counts[COLUMN_SIZE, j]):
         counts[WHERE, lists[ROWS, j, m]] = m + 1
@@ -202,10 +203,10 @@ def _subtract(matrix, row, column, pivot, j, zero_source):
 
 @compiled
 def order(index, matrix, zero_source, zero_share):
-    """Choose the pivots by eliminating `matrix` step by step, and write order and operations to `index`.
+    """Choose the pivots by eliminating `matrix` step by step, and store the program in `index`; return a result.
 
     Fill-in entries get the source `zero_source`, the index of a zero. A pivot of at most `zero_share` times the largest
-    one so far counts as zero. Returns ORDERED, SINGULAR_MATRIX or TOO_MANY; `index` is complete only if ORDERED.
+    one so far counts as zero. The result is ORDERED, SINGULAR_MATRIX or TOO_MANY; `index` is complete only if ORDERED.
     """
     counts, lists, numbers = matrix
     r = index[SIZE]
@@ -247,9 +248,9 @@ def _sort(columns, sources, size, position):
 
 @compiled
 def _size_of_program(rows, counts, lists):
-    """Count the entries of the factors and the subtractions that compute them; sort the lists of the rows.
+    """Sort the lists of the rows by the order of elimination; return the numbers of entries and subtractions.
 
-    Leaves the number of entries of each row of U, in elimination order, in counts[ROW_LEFT].
+    The number of entries of each row of U, in the order of elimination, becomes counts[ROW_LEFT].
     """
     position = counts[COLUMN_POSITION]
     entries, subtractions = 0, 0
@@ -267,7 +268,7 @@ def _size_of_program(rows, counts, lists):
 
 @compiled
 def _store_program(index, counts, lists):
-    """Write the program to `index`; return False, without writing, if dense factors would be faster."""
+    """Store the program in `index`; return False, without storing it, if dense factors would be faster."""
     r = index[SIZE]
     rows = rows_of(index)
     n_slots, subtractions = _size_of_program(rows, counts, lists)
@@ -306,14 +307,14 @@ def _store_program(index, counts, lists):
     return True
 
 
-GROWTH = 1e3  # largest multiplier: after a larger one, the order of elimination is chosen again
+GROWTH = 1e3  # multiplier above which the order of elimination is chosen again
 
 
 @compiled
 def make_program(G, pattern, rows, columns, index, values):
-    """Choose the order of elimination of G[rows][:, columns], whose entries are where `pattern` is not zero.
+    """Store in `index` the program that factors G[rows][:, columns]; return False if this matrix is singular.
 
-    Returns False for a singular matrix.
+    The matrix may have entries only where `pattern` is not zero; `values` is scratch.
     """
     r, width = rows.size, G.shape[1]
     clear_lists(index, r)
@@ -341,10 +342,11 @@ def make_program(G, pattern, rows, columns, index, values):
 
 @merged
 def factor(entries, index, values):
-    """Factor G[rows][:, columns], with 1/pivot on the diagonal; `entries` are G as a vector, whose last row is zero.
+    """Store in `values` the factors of G[rows][:, columns], with 1/pivot on the diagonal.
 
-    Returns the ratio of the smallest to the largest pivot. If a pivot is zero or not finite, or a multiplier exceeds
-    GROWTH, a negative number (0 from dense factors) shows that the order must be chosen again.
+    `entries` is G as a vector, whose last row is zero. Returns the ratio of the smallest to the largest pivot. The
+    result is negative (0 from dense factors) if a pivot is zero or not finite, or a multiplier exceeds GROWTH: the
+    order must then be chosen again.
     """
     r = index[SIZE]
     if index[DENSE] == 1:
@@ -362,7 +364,7 @@ def factor(entries, index, values):
 
 @merged
 def run_program(index, values):
-    """Factor the entries in `values` by the program; return the same ratio as `factor`."""
+    """Replace the entries in `values` by their factors, by the program; return the result of `factor`."""
     r, n_slots = index[SIZE], index[N_SLOTS]
     in_column = begin_entries(r) + n_slots
     target = in_column + 2 * n_slots
@@ -393,7 +395,7 @@ def run_program(index, values):
 
 @merged
 def sign_of(index, values):
-    """Return the sign of the determinant, for rows and columns in ascending order, from the factors."""
+    """Return the sign of the determinant of the factored matrix, with rows and columns in ascending order."""
     r = index[SIZE]
     if index[DENSE] == 1:
         return lu_sign(values[: r * r].reshape((r, r)), pivots_of(index))
@@ -406,7 +408,7 @@ def sign_of(index, values):
 
 @merged
 def solve(index, values, x):
-    """Solve for one right-hand side x, which becomes the solution."""
+    """Replace x, the right-hand side in the order of rows, by the solution, in the order of columns."""
     r, n_slots, first_lower = index[SIZE], index[N_SLOTS], index[FIRST_LOWER]
     if index[DENSE] == 1:
         lu_solve(values[: r * r].reshape((r, r)), pivots_of(index), x)
@@ -422,14 +424,14 @@ def solve(index, values, x):
 
 @merged
 def solve_rows(index, values, X, n):
-    """Solve for each of the first n rows of X, which become the solutions."""
+    """Replace each of the first n rows of X, right-hand sides, by its solution, see `solve`."""
     for j in range(n):
         solve(index, values, X[j])
 
 
 @merged
 def solve_transposed(index, values, x):
-    """Solve with the transposed matrix: x, in the order of columns, becomes the solution, in the order of rows."""
+    """Replace x, in the order of columns, by the solution with the transposed matrix, in the order of rows."""
     r = index[SIZE]
     if index[DENSE] == 1:
         A, pivots = values[: r * r].reshape((r, r)), pivots_of(index)

@@ -1,4 +1,4 @@
-"""Choose independent rows of G, and rows to add to M so that it is invertible; bound the pivots and the solutions."""
+"""Choose independent rows of G, and rows that make M invertible if added to M; bound the pivots and the solutions."""
 
 import math
 
@@ -7,9 +7,9 @@ from numba import types
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, f8, i8, kernel, merged
 from twoloop.kernels.linalg.dense import copy_matrix, ldl_factor, ldl_solve, ldl_solve_rows
 
-# rounding errors of a product of two rows, relative to the sum of squares of all entries, times the number of rows
+# rounding error of a product of two rows, relative to the sum of squares of all entries times the number of rows
 ROUNDING_OF_SQUARES = 4.0 * 2.0**-52
-# squared length of the rest of a row over that of the row: a longer rest is orthogonal up to rounding
+# squared norm of the orthogonal part of a row, relative to that of the row, below which orthogonalisation is repeated
 MOST_OF_SQUARE = 0.5
 
 
@@ -23,7 +23,7 @@ def _dot(x, y):
 
 @compiled
 def _orthogonalise(basis, n, rest, parts):
-    """Subtract from `rest` its components along n orthonormal rows, add these to `parts`; return its squared length."""
+    """Subtract from `rest` its components along n orthonormal rows, add them to `parts`; return |rest|^2."""
     for i in range(n):
         part = _dot(basis[i], rest)
         if part != 0.0:
@@ -35,12 +35,12 @@ def _orthogonalise(basis, n, rest, parts):
 
 @merged
 def select_rows(G, min_share, basis, factors, kept):
-    """Select each row that is independent of those selected before; write indices to `kept`; return their number.
+    """Store in `kept` the indices of rows of G, each independent of those selected before; return their number.
 
-    A row is independent if the part of it that is orthogonal to the selected rows exceeds `min_share` of its length.
-    The part is computed by Gram-Schmidt orthogonalisation, repeated if most of the row is lost. `basis` becomes
-    orthonormal rows, and `factors` the lower triangle whose product with `basis` is the selected rows. Both have as
-    many rows as can be independent, and one more for scratch.
+    A row is independent if its part that is orthogonal to the selected rows has a norm above `min_share` times that of
+    the row. The part is computed by Gram-Schmidt orthogonalisation, which is repeated if most of the row is lost. On
+    return, the rows of `basis` are orthonormal, and the lower triangle `factors` times `basis` is the selected rows.
+    Both arrays have as many rows as can be independent, and one more for scratch.
     """
     n_kept = 0
     for k in range(len(G)):
@@ -72,7 +72,7 @@ def independent_rows(G, min_share, basis, factors, kept):
 
 @merged
 def _find_coefficients(n, basis, factors, row, coefficients):
-    """Compute the `coefficients` of `row` as a combination of the n selected rows, by least squares."""
+    """Store the `coefficients` with which `row` is a combination of the n selected rows, by least squares."""
     for k in range(n):
         coefficients[k] = _dot(basis[k], row)
     for k in range(n - 1, -1, -1):
@@ -82,10 +82,10 @@ def _find_coefficients(n, basis, factors, row, coefficients):
 
 
 @kernel(types.float64(MATRIX, i8, VECTOR))
-def size_of_inverse(factors, n, column):
-    """Return the Frobenius norm of the inverse of a lower triangle of n rows; `column` is scratch.
+def norm_of_inverse(factors, n, column):
+    """Return the Frobenius norm of the inverse of the lower triangle `factors`, of n rows; `column` is scratch.
 
-    If `factors` are those of the independent rows of G, this result times the norm of b bounds the solution of least
+    If `factors` are those of the independent rows of G, the result times the norm of b bounds the solution of least
     norm of G x = b.
     """
     total = 0.0
@@ -100,11 +100,11 @@ def size_of_inverse(factors, n, column):
 
 
 @kernel(types.boolean(MATRIX, INTEGERS, f8, MATRIX, MATRIX, MATRIX, INTEGERS, MATRIX, VECTOR), vectorized=True)
-def shares_of_others(rows, order, min_share, chosen_rows, basis, factors, kept, coefficients, lengths):
-    """Return whether the first n of `rows` in `order` are independent; then express the following rows by these.
+def express_other_rows(rows, order, min_share, chosen_rows, basis, factors, kept, coefficients, lengths):
+    """Return whether the first n of `rows` in `order` are independent, and if so, express all others by these rows.
 
-    `chosen_rows`, (n, n_q), becomes the first n rows in `order`, and `coefficients` those of the following rows in
-    these, by least squares; `lengths` become the lengths of all `rows`. For other arguments see `select_rows`.
+    `chosen_rows`, (n, n_q), becomes the first n rows in `order`, coefficients[i] those of these rows in row n + i of
+    `order`, by least squares; `lengths` become the norms of all `rows`. For other arguments see `select_rows`.
     """
     n = len(chosen_rows)
     for i in range(len(rows)):
@@ -121,11 +121,11 @@ def shares_of_others(rows, order, min_share, chosen_rows, basis, factors, kept, 
 
 @kernel(i8(MATRIX, VECTOR, f8, MATRIX, MATRIX, INTEGERS, MATRIX, MATRIX, MATRIX, VECTOR), vectorized=True)
 def least_solution(rows, values, min_share, basis, factors, kept, coefficients, gram, parts, x):
-    """Compute the x of least norm for which rows @ x is nearest to `values`; return the number of independent rows.
+    """Store in `x` the vector of least norm for which rows @ x is nearest to `values`; return the rank of `rows`.
 
-    `x` is zero on entry, `values` become the residuals. Let y be the values of the independent rows, b those of the
-    other rows, and S the coefficients of the independent rows in the other ones. Then x gives the independent rows the
-    values y + S^T z, with (1 + S S^T) z = b - S y. `parts` is scratch for y and z.
+    `x` is zero on entry; `values` become the residuals. If y are the values of the independent rows, b the values of
+    the other rows, and S the coefficients of independent rows in the other ones, then the independent rows times x are
+    y + S^T z, with (1 + S S^T) z = b - S y. Other arguments are scratch (`parts` for y and z), see `select_rows`.
     """
     n, n_others = select_rows(rows, min_share, basis, factors, kept), 0
     y, z = parts[0], parts[1]
@@ -158,10 +158,10 @@ def least_solution(rows, values, min_share, basis, factors, kept, coefficients, 
 
 @kernel(types.boolean(MATRIX, f8, MATRIX), vectorized=True)
 def singular_values_exceed(rows, ratio, gram):
-    """Return whether all singular values of the rows exceed `ratio` times the largest one.
+    """Return whether all singular values of the matrix `rows` exceed `ratio` times the largest one.
 
-    So it is if G G^T minus (ratio times the largest one)^2 is definite. The Frobenius norm of the rows replaces the
-    largest singular value; `gram` is scratch.
+    They do if rows rows^T - (ratio s)^2 I is definite, where s, the largest one, is replaced by its upper bound, the
+    Frobenius norm. `gram` is scratch.
     """
     n, total = len(rows), 0.0
     for i in range(n):
@@ -173,12 +173,12 @@ def singular_values_exceed(rows, ratio, gram):
     return math.isfinite(total) and ldl_factor(gram)
 
 
-BOUND_ROUNDING = 1e-12  # relative amount by which pivots may be below a bound, because of rounding
+BOUND_ROUNDING = 1e-12  # amount, relative to a bound, by which pivots may be smaller because of rounding
 NOT_DEFINITE, STAYS_SINGULAR = -1, -2  # codes: M is not positive definite; no rows make M invertible
-TINY = 1e-300  # replaces zero as a divisor
-# smallest over largest eigenvalue of M. Above this, pivots larger than one of the bounds, which are at least 1e-5, show
-# that all rows are independent, and that no row needs to be added to M: the part of a row that is orthogonal to the
-# others is then at least 1e-6 of the row, whereas 1e-9 suffices
+TINY = 1e-300  # divisor that replaces zero
+# ratio of the smallest to the largest eigenvalue of M above which pivots show that all rows are independent, and that
+# no row must be added to M: if pivots exceed one of the bounds, which are at least 1e-5, the part of a row that is
+# orthogonal to other rows is at least 1e-6 of the row, whereas 1e-9 suffices
 SIMILAR_EIGENVALUES = 1e-7
 # largest coefficient of an independent row in a redundant one, both scaled to length 1: above it the two rows are
 # exchanged. If the coefficient passes through zero during the motion, the independent rows become dependent, as at each
@@ -187,15 +187,15 @@ SIMILAR_EIGENVALUES = 1e-7
 MAX_COEFFICIENT = 1.5
 
 
-def room_size(n_rows: int, n: int) -> int:
-    """Return the length of the scratch `room` of `choose_rows`."""
+def workspace_size(n_rows: int, n: int) -> int:
+    """Return the length of the scratch `workspace` of `choose_rows`."""
     n_max = min(n_rows, n) + 1
     return n_max * (n + n_max) + 2 * n * n + n_rows * (2 * n + 2 * n_rows + 1) + n
 
 
 @merged
 def _factor_and_count_negative(A):
-    """Factor a symmetric A, definite or not, as `ldl_factor` does; return the number of negative eigenvalues."""
+    """Replace a symmetric A by factors as `ldl_factor`, even if not definite; return the number of eigenvalues < 0."""
     n, count = len(A), 0
     for k in range(n):
         if not A[k, k] > 0.0:
@@ -213,7 +213,7 @@ def _factor_and_count_negative(A):
 
 @compiled
 def _count_weak_eigenvalues(mass, weak, A):
-    """Count the eigenvalues of M below b, `weak` times a bound of the largest; A becomes the factors of M - b I."""
+    """Return the number of eigenvalues of M below b = `weak` times their bound; A becomes the factors of M - b I."""
     largest = 0.0
     for i in range(len(mass)):
         total = 0.0
@@ -240,7 +240,7 @@ def _has_similar_eigenvalues(mass):
 
 @merged
 def _scale_of_added_rows(mass, G):
-    """Return the power of two that scales G^T G to the size of M."""
+    """Return the power of two by which G^T G must be multiplied to have about the size of M."""
     largest, longest = 0.0, 0.0
     for i in range(len(mass)):
         for j in range(len(mass)):
@@ -253,7 +253,7 @@ def _scale_of_added_rows(mass, G):
 
 @merged
 def _sort_by_entries(G, order, counts):
-    """Write the indices of the rows to `order`, sorted by their numbers of entries; `counts` become these."""
+    """Store in `order` the indices of the rows of G sorted by number of entries, and in `counts` these numbers."""
     for k in range(len(G)):
         count, i = 0.0, k
         for j in range(G.shape[1]):
@@ -266,9 +266,9 @@ def _sort_by_entries(G, order, counts):
 
 @merged
 def _removes_weak_eigenvalue(A, g, scale, x):
-    """Return whether adding scale g g^T to the matrix with factors A changes the sign of its determinant.
+    """Return whether adding scale g g^T to a matrix, whose factors are A, changes the sign of its determinant.
 
-    Then a negative eigenvalue becomes positive. `x` is scratch.
+    If so, a negative eigenvalue becomes positive. `x` is scratch.
     """
     for j in range(x.size):
         x[j] = g[j]
@@ -281,9 +281,9 @@ def _removes_weak_eigenvalue(A, g, scale, x):
 
 @merged
 def _stiffen_mass(mass, G, weak, scale, A, x, order, added):
-    """Add scale g g^T to M for rows g of G until no eigenvalue of M is below `weak` times the largest.
+    """Add scale g g^T to M in place, for rows g of G, until no eigenvalue of M is below `weak` times the largest.
 
-    `added` becomes the indices of these rows. Returns their number, or STAYS_SINGULAR.
+    Rows are tried in the sequence `order`; `added` become their indices. Returns their number, or STAYS_SINGULAR.
     """
     n_added = 0
     while _count_weak_eigenvalues(mass, weak, A) > 0:
@@ -306,10 +306,10 @@ def _stiffen_mass(mass, G, weak, scale, A, x, order, added):
 
 @compiled
 def _exchange_rows(G, n_kept, basis, factors, kept, order, coefficients, rows_kept):
-    """Exchange independent rows for redundant rows in which they have coefficients above MAX_COEFFICIENT.
+    """Replace independent rows by redundant rows in which their coefficients exceed MAX_COEFFICIENT.
 
-    An exchange multiplies the volume that the independent rows span by the coefficient. `basis`, `factors` and `kept`
-    are results of `select_rows`, and are updated; `order`, `coefficients` (n_rows) and `rows_kept` (n, n) are scratch.
+    Each exchange multiplies the volume spanned by the independent rows by the coefficient. `basis`, `factors` and
+    `kept`, results of `select_rows`, are updated; `order`, `coefficients` (n_rows) and `rows_kept` (n, n) are scratch.
     """
     for _ in range(2 * (len(G) - n_kept)):
         largest, leaving, entering, position = MAX_COEFFICIENT, -1, -1, 0
@@ -326,7 +326,7 @@ def _exchange_rows(G, n_kept, basis, factors, kept, order, coefficients, rows_ke
                     largest, leaving, entering = coefficient, k, i
         if leaving < 0:
             return
-        k = leaving  # move the rows between both, so that `kept` stays sorted
+        k = leaving  # move the indices between those of both rows, so that `kept` stays sorted
         while k + 1 < n_kept and kept[k + 1] < entering:
             kept[k] = kept[k + 1]
             k += 1
@@ -342,10 +342,10 @@ def _exchange_rows(G, n_kept, basis, factors, kept, order, coefficients, rows_ke
 
 @merged
 def _first_bound_below_pivots(mass, G, kept, n_rows, bounds, factors, solved_scratch, S_scratch, sizes):
-    """Return the index of the first of `bounds` that is below all pivots, which are relative to their rows alone.
+    """Return the index of the first of `bounds` that is below all pivots of the rows `kept`; bounds.size if none is.
 
-    No pivot is below the least eigenvalue of S = G M^-1 G^T, scaled to a diagonal of 1. This eigenvalue exceeds a bound
-    b if S - b I is definite. Returns bounds.size if no bound is below all pivots, and NOT_DEFINITE if M is not.
+    A pivot is relative to its diagonal entry of S = G M^-1 G^T. No pivot is below the least eigenvalue of S, scaled to
+    a diagonal of 1, which exceeds a bound b if S - b I is definite. Returns NOT_DEFINITE if M is not positive definite.
     """
     copy_matrix(mass, factors)
     if not ldl_factor(factors):
@@ -379,31 +379,31 @@ def _first_bound_below_pivots(mass, G, kept, n_rows, bounds, factors, solved_scr
 
 
 @kernel(i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS), vectorized=True)
-def choose_rows(original_mass, G, min_share, weak_share, bounds, room, chosen):
+def choose_rows(original_mass, G, min_share, weak_share, bounds, workspace, chosen):
     """Choose the independent rows of G, and rows that make M (`original_mass`) invertible; return an index or a code.
 
-    Rows of G are independent as in `select_rows` for `min_share`, except for exchanges. Rows are added to M if it has
-    eigenvalues below `weak_share` times the largest; 0: no rows. `chosen`, of 2 + 3 n_rows numbers, becomes the number
-    of independent rows, that of added rows, and a list of each, of length n_rows. `room` is scratch, of `room_size`
-    numbers; room[0] becomes the factor of the added rows. Returns the result of `_first_bound_below_pivots`, or
-    STAYS_SINGULAR. See generate/elimination.py.
+    Rows of G are selected as in `select_rows` with `min_share`, then exchanged as in `_exchange_rows`. Rows are added
+    to M if it has eigenvalues below `weak_share` times the largest; weak_share = 0: no rows are added. `chosen`, of
+    2 + 3 n_rows numbers, becomes the number of independent rows, the number of added rows, and the lists of both, of
+    length n_rows each. `workspace` is scratch, but workspace[0] becomes the factor of the added rows. Returns the
+    result of `_first_bound_below_pivots`, or STAYS_SINGULAR. See generate/elimination.py.
     """
     n_rows, n = G.shape
     n_max = min(n_rows, n) + 1
     kept, added, order = chosen[2 : 2 + n_rows], chosen[2 + n_rows : 2 + 2 * n_rows], chosen[2 + 2 * n_rows :]
     end = n_max * n
-    basis, factors = room[:end].reshape((n_max, n)), room[end : end + n_max * n_max].reshape((n_max, n_max))
-    mass, end = room[end : end + n * n].reshape((n, n)), end + n * n
-    A, end = room[end : end + n * n].reshape((n, n)), end + n * n
-    x, end = room[end : end + n], end + n
-    sizes, end = room[end : end + n_rows], end + n_rows
-    solved, S = room[end : end + n * n_rows], room[end + n * n_rows :]
+    basis, factors = workspace[:end].reshape((n_max, n)), workspace[end : end + n_max * n_max].reshape((n_max, n_max))
+    mass, end = workspace[end : end + n * n].reshape((n, n)), end + n * n
+    A, end = workspace[end : end + n * n].reshape((n, n)), end + n * n
+    x, end = workspace[end : end + n], end + n
+    sizes, end = workspace[end : end + n_rows], end + n_rows
+    solved, S = workspace[end : end + n * n_rows], workspace[end + n * n_rows :]
     if n_rows <= n and _has_similar_eigenvalues(original_mass):
         for k in range(n_rows):
             kept[k] = k
         first_bound = _first_bound_below_pivots(original_mass, G, kept, n_rows, bounds, A, solved, S, sizes)
         if 0 <= first_bound < bounds.size:  # all rows are independent, and M is invertible
-            chosen[0], chosen[1], room[0] = n_rows, 0, 1.0
+            chosen[0], chosen[1], workspace[0] = n_rows, 0, 1.0
             return first_bound
     n_kept = select_rows(G, min_share, basis, factors, kept)
     if n_kept < n_rows:
@@ -417,5 +417,5 @@ def choose_rows(original_mass, G, min_share, weak_share, bounds, room, chosen):
     chosen[0], chosen[1], first_bound = n_kept, max(n_added, 0), n_added
     if n_added >= 0:
         first_bound = _first_bound_below_pivots(mass, G, kept, n_kept, bounds, A, solved, S, sizes)
-    room[0] = scale
+    workspace[0] = scale
     return first_bound

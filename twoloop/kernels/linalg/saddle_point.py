@@ -1,10 +1,10 @@
-"""Solve the linear problem of accelerations, M a + G^T lam = r and G a = c, in one of three forms.
+"""Solve the linear equations of accelerations, M a + G^T lam = r and G a = c, in one of three forms.
 
-- NULL_SPACE, for few degrees of freedom: a = g + T x, where g satisfies G g = c with zero independent entries, and the
-  columns of T = [I; D^T], D^T = -G_d^-1 G_i, are the velocities that the constraints allow. x follows from
+- NULL_SPACE, for few degrees of freedom: a = g + T x, where G g = c, the independent entries of g are 0, and the
+  columns of T = [I; D^T], D^T = -G_d^-1 G_i, are the velocities that the constraints allow. x is the solution of
   (T^T M T) x = T^T (r - M g): M need only be positive definite on these velocities.
 - MULTIPLIERS: by the Schur complement G M^-1 G^T.
-- AUGMENTED: by sparse factors of the whole matrix, in which M is multiplied by w.notes[MASS_SCALE].
+- AUGMENTED: by sparse factors of the augmented matrix [M G^T; G 0], in which M is multiplied by w.notes[MASS_SCALE].
 """
 
 import numpy as np
@@ -55,7 +55,7 @@ from twoloop.kernels.linalg.markowitz_lu import solve as solve_dependent
 
 @compiled
 def find_null_space(w):
-    """Compute w.D, the velocities that the constraints allow, from the rows and factors in w."""
+    """Store in w.D (but for its last row) the velocities that the constraints allow, from the rows and factors in w."""
     rows, independent = rows_of(w.index_v), w.independent_v
     for j in range(independent.size):
         for k in range(rows.size):
@@ -65,7 +65,7 @@ def find_null_space(w):
 
 @merged
 def _reduce_diagonal(columns, independent, M, D, A, m):
-    """Compute the upper triangle of T^T M T into A, for a diagonal M; m is scratch."""
+    """Store the upper triangle of T^T M T in A, for a diagonal M; m is scratch."""
     for k in range(columns.size):
         m[k] = M[columns[k], columns[k]]
     for i in range(independent.size):
@@ -79,7 +79,7 @@ def _reduce_diagonal(columns, independent, M, D, A, m):
 
 @merged
 def _reduce_dense(columns, independent, M, D, A, MT):
-    """Compute the upper triangle of T^T M T into A, for any M; MT is scratch."""
+    """Store the upper triangle of T^T M T in A, for any M; MT is scratch."""
     n, n_dof = M.shape[0], independent.size
     for i in range(n):
         for j in range(n_dof):
@@ -101,7 +101,7 @@ def _reduce_dense(columns, independent, M, D, A, MT):
 
 @merged
 def factor_reduced(f, w):
-    """Factor T^T M T into w.A, from w.M and w.D; return DONE, MASS_NOT_DEFINITE or NOT_FINITE."""
+    """Store the factors of T^T M T in w.A, from w.M and w.D; return DONE, MASS_NOT_DEFINITE or NOT_FINITE."""
     columns = columns_of(w.index_v)
     if f.flags[DIAGONAL_MASS] == 1:
         _reduce_diagonal(columns, w.independent_v, w.M, w.D, w.A, w.x)
@@ -115,14 +115,14 @@ def factor_reduced(f, w):
 
 @merged
 def solve_reduced(f, w, r, c, a):
-    """Solve M a + G^T lam = r and G a = c for a."""
+    """Store in `a` the accelerations with M a + G^T lam = r and G a = c, by the factors of T^T M T."""
     rows, columns, independent = rows_of(w.index_v), columns_of(w.index_v), w.independent_v
     n_dof, z, x, D, M = independent.size, w.z, w.x, w.D, w.M
     for k in range(rows.size):
         z[k] = c[rows[k]]
     solve_dependent(w.index_v, w.values_v, z)
     copy(r, a)
-    # a = r - M g for now: g are the accelerations if the independent ones are zero, with z as dependent entries
+    # `a` becomes r - M g, where g has the dependent entries z, and zero independent entries
     for k in range(columns.size):
         m = columns[k]
         if f.flags[DIAGONAL_MASS] == 1:
@@ -147,7 +147,7 @@ def solve_reduced(f, w, r, c, a):
 
 @merged
 def reduced_multipliers(f, w, r, a, lam):
-    """Compute the multipliers of the independent rows into lam, from G^T lam = r - M a in the dependent columns."""
+    """Store the multipliers of the independent rows in lam, from G^T lam = r - M a in the dependent columns."""
     rows, columns, z = rows_of(w.index_v), columns_of(w.index_v), w.z
     for k in range(columns.size):
         m = columns[k]
@@ -165,7 +165,7 @@ def reduced_multipliers(f, w, r, a, lam):
 
 @merged
 def factor_mass(f, w):
-    """Invert w.M if it is constant and dense, because the inverse is faster to apply, or factor it; return a code."""
+    """Store in w.L factors of w.M, or the inverse, faster to apply, if M is constant and dense; return a code."""
     if banded_mass(f):
         definite = factor_banded_mass(f, w) == DONE
     else:
@@ -178,7 +178,7 @@ def factor_mass(f, w):
 
 @merged
 def _times_inverse_mass(f, w, x, y):
-    """Compute y = M^-1 x; x and y may be one array unless M is constant, dense and not diagonal."""
+    """Store M^-1 x in y; x and y may be the same array unless M is constant, dense and not diagonal."""
     n = x.size
     if f.flags[DIAGONAL_MASS] == 1:
         for i in range(n):
@@ -208,7 +208,7 @@ def _equal(A, B):
 
 @merged
 def factor_schur(f, w):
-    """Compute and factor S = G M^-1 G^T of the independent rows; with a constant M only if G has changed."""
+    """Store the factors of S = G M^-1 G^T of the independent rows in w.S, if G or M has changed; return a code."""
     is_constant = f.flags[CONSTANT_MASS] == 1
     if is_constant and _equal(w.G, w.G_of_S):
         return DONE
@@ -234,7 +234,7 @@ def factor_schur(f, w):
 
 @merged
 def solve_schur(f, w, r, c, a):
-    """Solve M a + G^T lam = r and G a = c for a; the multipliers of the independent rows go into w.z."""
+    """Store in `a` and w.z the accelerations and the multipliers of the independent rows, by the factors of S."""
     rows, solved = w.rows_v, w.W
     _times_inverse_mass(f, w, r, a)
     for i in range(rows.size):
@@ -249,13 +249,13 @@ def solve_schur(f, w, r, c, a):
 
 
 MIN_ROWS = 8  # smallest number of rows, and of freedoms, for which the augmented form is the fastest (on chains: 7)
-# smallest number of coordinates for which the augmented form is the fastest even with few freedoms (measured: about
-# 30); not if M is diagonal
+# smallest number of coordinates for which the augmented form is the fastest even with few freedoms, unless M is
+# diagonal (measured: about 30)
 MIN_COORDINATES = 32
 
 
 def sparse_pays(n_q: int, n_rows: int, diagonal: bool) -> bool:
-    """Return whether the augmented form is faster than dense ones for a sparse pattern; `diagonal`: M is diagonal."""
+    """Return whether the augmented form is faster than dense forms for sparse matrices; `diagonal`: M is diagonal."""
     return n_rows >= MIN_ROWS and (n_q - n_rows >= MIN_ROWS or (n_q >= MIN_COORDINATES and not diagonal))
 
 
@@ -270,7 +270,7 @@ def _largest(A):
 
 @compiled
 def _make_program(w):
-    """Choose the order of elimination of the augmented matrix for w.M and w.G; return the code of `order`."""
+    """Store in w.index_a the program that factors the augmented matrix of w.M and w.G; return the result of `order`."""
     n, rows, index, values = w.Q.size, w.rows_v, w.index_a, w.values_a
     note_pattern(w.M, w.mass_pattern)
     clear_lists(index, n + rows.size)
@@ -293,7 +293,7 @@ def _make_program(w):
 
 @compiled
 def _factor(w):
-    """Factor the augmented matrix by its program; return False if the program does not suit the numbers."""
+    """Store the factors of the augmented matrix in w.values_a, by its program; return False if it needs another one."""
     index, values, scale, first_of_mass = w.index_a, w.values_a, w.notes[MASS_SCALE], w.entries.size
     source = begin_entries(index[at.SIZE]) + 2 * index[at.N_SLOTS]
     for s in range(index[at.N_SLOTS]):
@@ -304,7 +304,7 @@ def _factor(w):
 
 @compiled
 def factor_sparse(f, w):
-    """Factor the augmented matrix, or choose a dense form in f.flags if the factors are not sparse; return a code."""
+    """Factor the augmented matrix, or store a dense form in f.flags if the factors are not sparse; return a code."""
     w.counters[N_FACTORIZATIONS] += 1
     new = f.flags[CONSTANT_MASS] == 0 and note_pattern(w.M, w.mass_pattern)
     if w.index_a[at.SIZE] == 0 or new or not _factor(w):
@@ -324,7 +324,7 @@ def factor_sparse(f, w):
 
 @compiled
 def solve_sparse(w, r, c, a):
-    """Solve M a + G^T lam = r and G a = c for a; the multipliers of the independent rows go into w.z."""
+    """Store in `a` and w.z the accelerations and the multipliers of the independent rows, by the sparse factors."""
     n, size, scale = r.size, w.index_a[at.SIZE], w.notes[MASS_SCALE]
     x, y = w.right[:size], w.right[size:]
     for j in range(n):
@@ -345,7 +345,7 @@ def solve_sparse(w, r, c, a):
 
 @compiled
 def _factor_sparse(f, w):
-    """Factor the augmented matrix; if dense forms take over, compute w.D or the factors of M; return a code."""
+    """Factor the augmented matrix; if a dense form replaces it, compute w.D or factors of M instead; return a code."""
     code = factor_sparse(f, w)
     if code == DONE and f.flags[FORM] == NULL_SPACE:
         find_null_space(w)
@@ -356,7 +356,7 @@ def _factor_sparse(f, w):
 
 @merged
 def factor(f, w):
-    """Factor the linear problem for w.M, and rows, factors and null space in w; return DONE, or why this failed."""
+    """Factor the equations of accelerations with w.M, the rows, their factors and w.D in w; return a code."""
     if w.notes[FACTORED] == 1.0:
         return DONE
     code = _factor_sparse(f, w) if f.flags[FORM] == AUGMENTED else DONE
@@ -375,7 +375,7 @@ def factor(f, w):
 
 @merged
 def solve(f, w, r, c, a):
-    """Solve for `a` with any right-hand side (r, c); r, c and `a` are different arrays."""
+    """Store in `a` the accelerations for the right-hand side (r, c); r, c and `a` must be different arrays."""
     if f.flags[FORM] == NULL_SPACE:
         solve_reduced(f, w, r, c, a)
     elif f.flags[FORM] == MULTIPLIERS:
@@ -386,7 +386,7 @@ def solve(f, w, r, c, a):
 
 @merged
 def multipliers(f, w, r, a, lam):
-    """Compute the multipliers of the last solution `a` into lam; those of redundant rows stay unchanged."""
+    """Store the multipliers of the last solution `a` in lam; those of redundant rows are not changed."""
     if f.flags[FORM] == NULL_SPACE:
         reduced_multipliers(f, w, r, a, lam)
     else:
@@ -396,7 +396,7 @@ def multipliers(f, w, r, a, lam):
 
 @merged
 def solve_both(f, w, r, c, a, lam):
-    """Solve for `a` and the multipliers lam with any right-hand side (r, c)."""
+    """Store in `a` and lam the accelerations and multipliers for the right-hand side (r, c)."""
     solve(f, w, r, c, a)
     multipliers(f, w, r, a, lam)
 

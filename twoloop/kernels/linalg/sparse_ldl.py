@@ -1,15 +1,15 @@
 """Factor and solve the matrix of a large system by its program, see symbolic_factorization.py.
 
-An independent row of G has a negative pivot: minus the squared length of the part of the row that previous rows do not
-span. Divided by the squared length of the row, which is the sum of the bodies' contributions, it is the squared sine of
-the angle between the row and the previous rows, in the metric of M^-1; `smallest` is the least of these. For a
-redundant row, 0 replaces 1 / pivot, which removes the row from the solution without another program. If the smallest
-squared sine is 10^-k, solutions lose k digits, which refinement against M and G recovers.
+An independent row of G has a negative pivot: minus the squared norm of the part of the row that is orthogonal to
+previous rows, in the metric of M^-1. The squared norm of the row is the sum of the contributions of the bodies. The
+ratio of both is the squared sine of the angle between the row and the previous rows; `smallest` is the smallest of
+these squared sines. For a redundant row, 0 replaces 1 / pivot, which removes the row from the solution without another
+program. If the smallest squared sine is 10^-k, solutions lose k digits, which refinement with M and G recovers.
 
 If a body's M is singular, as with four Euler parameters, rows g that involve this body alone stiffen it: M + s g g^T
-replaces M. Accelerations are the same, because g a is prescribed, and the multiplier of g is less by s g a. So M need
-only be positive definite on the velocities that these rows allow. A row stiffens M even if it is redundant, as rows of
-loops through a hub may be; then s g^T (g a) is added to the right-hand side.
+replaces M. Accelerations do not change, because g a is prescribed, and the multiplier of g decreases by s g a. So M
+need only be positive definite on the velocities that these rows allow. A row stiffens M even if it is redundant, as
+rows of loops through a hub may be; then s g^T (g a) is added to the right-hand side.
 """
 
 from twoloop.kernels.data.common import compiled, merged
@@ -29,7 +29,7 @@ NOT_DEFINITE = -1.0  # returned instead of the smallest pivot if a pivot of M is
 
 @compiled
 def _find_stiffness(program, mass, jacobian, stiffness, scratch):
-    """Compute s for each row that stiffens M: largest diagonal entry of M in its columns, over its squared length."""
+    """Store in `stiffness`, for each row g that stiffens M, s = largest diagonal entry of M in its columns / |g|^2."""
     n_q = program[N_COORDINATES]
     for k in range(program[N_PIVOTS]):
         scratch[k] = 0.0
@@ -55,7 +55,7 @@ def _find_stiffness(program, mass, jacobian, stiffness, scratch):
 
 @merged
 def load(program, mass, jacobian, values, stiffness, scratch):
-    """Copy the numbers of M and G to their slots in `values`, and stiffen M."""
+    """Store the entries of G and the stiffened M in their slots in `values`; `scratch` has one number per pivot."""
     for s in range(values.size):
         values[s] = 0.0
     _, _, slots = mass_of(program)
@@ -73,11 +73,11 @@ def load(program, mass, jacobian, values, stiffness, scratch):
 
 @compiled
 def factor(program, counts, values, sizes, least):
-    """Factor the numbers in place, with 1/pivot on the diagonal; return the smallest ratio of a pivot to its row.
+    """Replace `values` by the factors, with 1/pivot on the diagonal; return the smallest squared sine of a row.
 
-    The ratio is that to the squared length of the row. Returns NOT_DEFINITE if M is not positive definite on the
-    velocities that the rows allow. `counts` is 0 for redundant rows, and becomes 0 for rows with a ratio up to `least`,
-    which the result excludes. `sizes` becomes the squared lengths.
+    The squared sine is minus the pivot over the squared norm of the row, which is stored in `sizes`. `counts` is 0 for
+    redundant rows, and becomes 0 for rows with a squared sine up to `least`; these rows do not affect the result.
+    Returns NOT_DEFINITE if M is not positive definite on the velocities that the rows allow.
     """
     (n_q, n) = program[N_COORDINATES], program[N_PIVOTS]
     order, runs = order_of(program), runs_of(program)
@@ -126,7 +126,7 @@ def factor(program, counts, values, sizes, least):
 
 @compiled
 def solve(program, values, stiffness, x, y):
-    """Solve by the factors: x, the right-hand side [r, c], becomes the solution [a, lam]; y is scratch."""
+    """Replace x, the right-hand side [r, c], by the solution [a, lam], by the factors `values`; y is scratch."""
     n, order, n_q = program[N_PIVOTS], order_of(program), program[N_COORDINATES]
     # M + s g g^T replaces M, with r + s g c on the right. As g a = c, r alone gives the same accelerations, and a
     # multiplier that is less by s c, which is added at the end
@@ -149,7 +149,7 @@ def solve(program, values, stiffness, x, y):
 
 @compiled
 def add_redundant_stiffness(program, jacobian, counts, stiffness, c, right):
-    """Add s g^T c to `right` for the redundant rows g that stiffen M."""
+    """Add s g^T c_g to `right` in place, for each redundant row g that stiffens M; c_g is its entry in c = [r, c]."""
     n_q = program[N_COORDINATES]
     _, columns, _ = jacobian_of(program)
     which, first, second, _ = stiffened_of(program)
@@ -178,9 +178,10 @@ def subtract_product(program, mass, jacobian, counts, x, b):
 
 @compiled
 def solve_refined(program, mass, jacobian, counts, values, stiffness, x, times, right, residual, y):
-    """Solve for x, [r, c] on entry, and refine the solution `times` times; `right`, `residual` and `y` are scratch.
+    """Replace x, the right-hand side [r, c], by the solution [a, lam], refined `times` times.
 
-    Returns the largest acceleration in the last correction over the largest in the solution; 0 without refinement.
+    Returns the largest acceleration in the last correction, relative to the largest one in the solution; 0 without a
+    refinement. `right`, `residual` and `y` are scratch.
     """
     n_q, change = program[N_COORDINATES], 0.0
     for k in range(x.size):

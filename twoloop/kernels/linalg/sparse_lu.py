@@ -3,10 +3,10 @@
     [M - z^2 K - z D  G^T]
     [G                 0 ]  = L U
 
-The order of elimination is that of symbolic_factorization.py with couplings; pivots are single rows, chosen without
-regard to the numbers. The program lists the entries of M first, then those of K and D. Groups of columns of K and D
-follow the program: no two columns of a group have an entry in the same row, so that one displacement gives all columns
-of the group by differences (Curtis, Powell & Reid 1974, doi 10.1093/imamat/13.1.117).
+The order of elimination is that of symbolic_factorization.py with couplings; pivots are single entries, chosen by the
+pattern alone. The program lists the entries of M first, then those of K and D. It ends with groups of columns of K and
+D: no two columns of a group have an entry in the same row, so that one displacement gives all columns of the group by
+differences (Curtis, Powell & Reid 1974, doi 10.1093/imamat/13.1.117).
 """
 
 from collections.abc import Iterable, Sequence
@@ -32,7 +32,7 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     stiffened_of,
 )
 
-MIN_PIVOT = 1e-11  # smallest pivot relative to the terms whose difference it is: a smaller one is a rounding error
+MIN_PIVOT = 1e-11  # smallest pivot, relative to the sum of its terms, below which the pivot may be a rounding error
 
 
 def newton_program(
@@ -44,9 +44,10 @@ def newton_program(
     together: Iterable[Sequence[int]],
     stiff_rows: Sequence[int],
 ) -> NDArray[np.int32] | None:
-    """Return the program for Newton's matrix; None if there would be too many updates.
+    """Return the program that factors Newton's matrix; None if it would have too many updates.
 
-    `tangents` are the entries of K and D, both triangles, in the order of `grouped_entries`.
+    `tangents` are the entries of K and D, both triangles, in the order of `grouped_entries`. For other arguments see
+    `factorization_program`.
     """
     groups = column_groups(tangents, n_q)[tangents[1]]
     begins = np.searchsorted(groups, np.arange(groups.max(initial=-1) + 2))
@@ -57,13 +58,13 @@ def newton_program(
 
 
 def grouped_entries(tangents: Entries, n_q: int) -> Entries:
-    """Return the entries, sorted by the groups of their columns."""
+    """Return the entries of K and D, sorted by the groups of their columns."""
     sequence = np.argsort(column_groups(tangents, n_q)[tangents[1]], kind="stable")
     return tangents[0][sequence], tangents[1][sequence]
 
 
 def column_groups(entries: Entries, n_q: int) -> Integers:
-    """Return the group of each column; the columns of a group have no entry in the same row."""
+    """Return the index of the group of each column (n_q); the columns of a group have no entry in the same row."""
     rows_of: list[list[int]] = [[] for _ in range(n_q)]
     for i, j in zip(*(each.tolist() for each in entries), strict=True):
         rows_of[j].append(i)
@@ -79,7 +80,7 @@ def column_groups(entries: Entries, n_q: int) -> Integers:
 
 @inlined
 def tangents_of(program):
-    """Return rows and columns of the entries of K and D; and among these, where groups begin and the last one ends."""
+    """Return rows and columns of the entries of K and D, and the indices at which groups of entries begin and end."""
     begins = program[end_of_sections(program) :]
     rows, columns, _ = mass_of(program)
     n_mass = rows.size - begins[begins.size - 1]
@@ -88,7 +89,7 @@ def tangents_of(program):
 
 @compiled
 def load(program, mass, jacobian, K, D, z, stiffness, values):
-    """Copy the numbers of Newton's matrix, for the number z (real or complex), to their slots in `values`."""
+    """Store the entries of Newton's matrix, for z (real or complex), in their slots in `values`."""
     for s in range(values.size):
         values[s] = 0.0
     off = program[N_OFF]
@@ -111,9 +112,10 @@ def load(program, mass, jacobian, K, D, z, stiffness, values):
 
 @compiled
 def factor(program, counts, values, sizes):
-    """Factor the numbers in place, with 1/pivot on the diagonal; return whether all pivots are large enough.
+    """Replace `values` by the factors, with 1/pivot on the diagonal; return whether all pivots are large enough.
 
-    Redundant rows, 0 in `counts`, get zeros, which remove them from solutions. `sizes` is scratch of real numbers.
+    Factors of redundant rows, for which `counts` is 0, become zeros, which removes these rows from solutions. `sizes`
+    is scratch: the sum of |terms| of each pivot.
     """
     n_q, n, off = program[N_COORDINATES], program[N_PIVOTS], program[N_OFF]
     order, runs = order_of(program), runs_of(program)
@@ -162,7 +164,7 @@ def factor(program, counts, values, sizes):
 
 @compiled
 def solve(program, values, x, y):
-    """Solve by the factors: x, the right-hand side [r, c], becomes the solution; y is scratch."""
+    """Replace x, the right-hand side [r, c], by the solution, by the factors `values`; y is scratch."""
     n, off, order = program[N_PIVOTS], program[N_OFF], order_of(program)
     begin, row_of = columns_of(program)
     for k in range(n):

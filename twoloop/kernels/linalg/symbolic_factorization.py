@@ -1,18 +1,18 @@
-"""Symbolic factorization of large systems: the order of elimination, and the program of the factors.
+"""Symbolic factorization of large systems: choose the order of elimination, and write the program for the factors.
 
     [M  G^T]
     [G   0 ]  = L D L^T
 
-is factored in an order of elimination that is chosen once, from the pattern of entries. Pivots are single rows, chosen
-without regard to the numbers: see sparse_ldl.py and sparse_lu.py. A slot is the index of a number of the factors: the
-pivots come first, in their order, then the columns of L, each downwards.
+is factored in an order of elimination that is chosen once, by the pattern of entries alone. Pivots are single entries:
+see sparse_ldl.py and sparse_lu.py. A slot is the index of a number of the factors: the pivots come first, in their
+order, then the columns of L, each downwards.
 
-Coordinates that M couples, or that a joint has in one group, form a body; the rows that involve the same bodies form a
-joint. Bodies with few joints are eliminated first. Then G M^-1 G^T remains, which is positive definite, so that any
-order of its joints is stable. A body with more joints, a hub, would couple all of them, and is ordered among the
-joints: with hubs the order is that of constrained minimum degree. A joint may precede a hub that it involves, or that
-joints before it involve, only if its rows are independent even without the motion of the hub: one of its bodies must
-have no support yet. A support is the ground or a hub, to which eliminated joints connect the body.
+Coordinates that M couples, or that the system declares as a group, form a body; the rows that involve the same bodies
+form a joint. Bodies with few joints are eliminated first. G M^-1 G^T remains, which is positive definite, so that any
+order of its joints is stable. A body with more joints, a hub, would couple all these joints, and is ordered among the
+joints, by constrained minimum degree. A joint that involves a hub, or that follows joints which involve a hub, may be
+eliminated before this hub only if its rows are independent even without the motion of the hub: one of its bodies must
+have no support yet. A support of a body is the ground or a hub to which eliminated joints connect the body.
 """
 
 import heapq
@@ -24,13 +24,13 @@ from numpy.typing import NDArray
 
 from twoloop.kernels.data.common import inlined
 
-MAX_JOINTS = 4  # largest number of joints of a body that is eliminated before its joints; others are hubs
+MAX_JOINTS = 4  # largest number of joints of a body that is eliminated before its joints; bodies with more are hubs
 
 Integers = NDArray[np.int64]
 
 
 class _DisjointSets:
-    """Disjoint sets of the integers below n (union-find), each named by its smallest member."""
+    """Disjoint sets of the integers below n (union-find), each represented by its smallest member."""
 
     def __init__(self, n: int):
         self.parent = list(range(n))
@@ -48,19 +48,19 @@ class _DisjointSets:
 
 
 class _Supports:
-    """Supports of the parts, which are bodies connected by eliminated joints: the ground, and remaining hubs."""
+    """The ground and the remaining hubs as supports of parts; a part is a set of bodies joined by eliminated joints."""
 
     def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int], lone: AbstractSet[int]):
         self.joints, self.hubs = joints, set(hubs)  # bodies of each joint; hubs that are not eliminated yet
-        self.lone = lone  # bodies with a single known coordinate: parts that contain one may be fixed
+        self.lone = lone  # bodies with a single coordinate: a joint with one of these may fix a part to the ground
         self.parts = _DisjointSets(n_bodies)
         self.grounded = [False] * n_bodies
         self.hubs_of: list[set[int]] = [set() for _ in range(n_bodies)]  # hubs that support each part
-        # for each hub: bodies whose parts are, or were, supported by the hub
+        # for each hub: one body of each part that the hub supports or has supported
         self.supported: dict[int, list[int]] = {hub: [] for hub in hubs}
 
     def may_eliminate(self, joint: int) -> bool:
-        """Return whether a joint may be eliminated now."""
+        """Return whether a joint may be eliminated next, see the docstring of this module."""
         bodies = self.joints[joint]
         parts = {self.parts.find(body) for body in bodies if body not in self.hubs}
         if not bodies & self.lone and any(not self.grounded[part] and not self.hubs_of[part] for part in parts):
@@ -68,13 +68,13 @@ class _Supports:
         return not bodies & self.hubs and not any(self.hubs_of[part] for part in parts)
 
     def eliminate(self, joint: int) -> None:
-        """Join the parts that a joint connects."""
+        """Merge the parts that an eliminated joint connects, and update their supports."""
         bodies = self.joints[joint]
         grounded = len(bodies) == 1 or bool(bodies & self.lone)
         self._join((body for body in bodies if body not in self.hubs), grounded, bodies & self.hubs)
 
     def eliminate_hub(self, hub: int) -> None:
-        """Join a hub and the parts that it supports."""
+        """Merge an eliminated hub and the parts that it supports, and update their supports."""
         self.hubs.discard(hub)
         supported = self.supported.pop(hub)
         for body in supported:
@@ -105,7 +105,7 @@ def elimination_order(
     first: Sequence[int] = (),
     couplings: tuple[Integers, Integers] | None = None,
 ) -> Integers:
-    """Return the order of elimination: coordinate j as j, and row i of G as n_q + i.
+    """Return the order of elimination as indices: j for coordinate j, and n_q + i for row i of G.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def elimination_order(
 
 
 def bodies_of(n_q: int, mass_entries: tuple[Integers, Integers], together: Iterable[Sequence[int]]) -> list[int]:
-    """Return, for each coordinate, the first coordinate of its body."""
+    """Return, for each coordinate, the index of the first coordinate of its body."""
     pairs = np.array([(first, other) for first, *others in together for other in others], dtype=np.int64).reshape(-1, 2)
     ones, others = (np.concatenate([entries, column]) for entries, column in zip(mass_entries, pairs.T, strict=True))
     first_of, before = np.arange(n_q), np.full(n_q, -1)
@@ -183,10 +183,10 @@ def _minimum_degree(
     pairs: Iterable[tuple[int, int]],
     lone: AbstractSet[int],
 ) -> list[int]:
-    """Return the order of joints, and of hubs as len(joints) + their index.
+    """Return the order of elimination of joints and hubs as indices: k for joint k, len(joints) + k for hub k.
 
-    The next one is always the allowed one with the fewest neighbours (as rows or coordinates). `pairs`: hubs that are
-    coupled other than by joints. `lone`: see `_Supports`.
+    The next joint or hub is the allowed one whose neighbours have the fewest rows and coordinates. `pairs`: pairs of
+    hubs that are coupled other than by joints. `lone`: see `_Supports`.
     """
     n_joints = len(joints)
     node_of = {hub: n_joints + k for k, hub in enumerate(hubs)}
@@ -215,7 +215,7 @@ def _minimum_degree(
     while heap:
         degree_on_heap, node = heapq.heappop(heap)
         if done[node] or degree_on_heap != degree(node):
-            continue  # the heap has a newer entry
+            continue  # a newer entry of the heap replaces this one
         if node < n_joints and not supports.may_eliminate(node):
             continue  # the hub that supports its parts is a neighbour: its elimination puts the joint on the heap again
         done[node] = True
@@ -235,11 +235,11 @@ def _minimum_degree(
 
 Entries = tuple[Integers, Integers]  # rows and columns
 
-# indices in the program; the sections that the functions below return follow
+# indices of the sizes with which a program begins; the functions below return the sections that follow
 N_COORDINATES, N_PIVOTS, N_OFF, N_UPDATES, N_RUNS, N_OF_MASS, N_OF_JACOBIAN, N_STIFFENED, N_HEAD = range(9)
-ALWAYS_ALLOWED_UPDATES = 3_000_000  # number of updates (multiplications) up to which a program is always faster
-MAX_UPDATE_SHARE = 1e-3  # number of updates over n^3 up to which a program is faster, for n pivots
-MAX_UPDATES = 30_000_000  # number of updates up to which the memory needed for making the program is acceptable
+ALWAYS_ALLOWED_UPDATES = 3_000_000  # number of updates (multiplications) up to which a program is always written
+MAX_UPDATE_SHARE = 1e-3  # number of updates, relative to n^3 for n pivots, up to which a program is faster
+MAX_UPDATES = 30_000_000  # number of updates up to which writing a program does not need too much memory
 
 
 def factorization_program(
@@ -250,7 +250,7 @@ def factorization_program(
     together: Iterable[Sequence[int]] = (),
     stiff_rows: Sequence[int] = (),
 ) -> NDArray[np.int32] | None:
-    """Return the program for M and G with these entries; None if it would have too many updates.
+    """Return the program that factors M and G; None if it would have too many updates.
 
     Parameters
     ----------
@@ -269,7 +269,10 @@ def factorization_program(
 def program_in_order(
     order: Integers, n_q: int, mass: Entries, jacobian: Entries, stiff_rows: Sequence[int], both: bool = False
 ) -> NDArray[np.int32] | None:
-    """Return the program for an order; with `both` for unsymmetric factors: slots of U are those of L plus N_OFF."""
+    """Return the program for an order of elimination; None if it would have too many updates.
+
+    With `both` it is for unsymmetric factors: the slot of an entry of U is that of the entry of L plus N_OFF.
+    """
     n = len(order)
     position = np.empty(n, dtype=np.int64)
     position[order] = np.arange(n)
@@ -298,7 +301,7 @@ def program_in_order(
     runs = _runs(slots(first_of, second_of), first_of == second_of)
     source = slots(low, high)
     n_mass = len(mass[0])
-    # entries of the other triangle: without U, they get a slot that is never read
+    # entries of M above the diagonal: in symmetric factors they get a slot that is never read
     above = rows[:n_mass] < columns[:n_mass]
     source[:n_mass][above] = source[:n_mass][above] + len(keys) if both else n + len(keys)
     which, first, second = _products_of_entries(jacobian[0], stiff_rows)
@@ -310,10 +313,10 @@ def program_in_order(
 
 
 def _runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
-    """Return length and first target of each run, a sequence of off-diagonal updates with consecutive targets.
+    """Return [length, first target] of each run, a sequence of off-diagonal updates with consecutive targets.
 
-    The rows of a joint are neighbours in all columns, so that runs are long: the numbers of a run are read and written
-    as vectors, and the program is a tenth as long as a list of all targets.
+    The rows of a joint are adjacent in all columns, so that runs are long: the numbers of a run are read and written as
+    vectors, and the program is a tenth as long as a list of all targets.
     """
     off = np.flatnonzero(~diagonal)
     begins = np.flatnonzero(diagonal[off - 1] | (targets[off] != targets[off - 1] + 1))
@@ -322,7 +325,7 @@ def _runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
 
 
 def _products_of_entries(rows: Integers, chosen: Sequence[int]) -> tuple[Integers, Integers, Integers]:
-    """Return all products of two entries in one of the rows `chosen`: the row, and the indices of both entries."""
+    """Return the row, and the indices of both entries, of each product of two entries in one of the rows `chosen`."""
     parts: list[tuple[Integers, Integers, Integers]] = [(rows[:0], rows[:0], rows[:0])]
     sequence = np.argsort(rows, kind="stable")
     ordered = rows[sequence]
@@ -345,9 +348,9 @@ def _index_pairs(m: int) -> Entries:
 
 
 def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]:
-    """Return the row indices of each column of L below the diagonal.
+    """Return, for each column of L, the indices of the rows below the diagonal that have an entry in it.
 
-    If i is the first row of a column, elimination adds all rows of the column to column i.
+    If i is the first row of a column, elimination adds all rows of this column to column i.
     """
     rows_below: list[set[int]] = [set() for _ in range(n)]
     for column, row in zip(low.tolist(), high.tolist(), strict=True):
@@ -365,20 +368,20 @@ def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]
 
 @inlined
 def end_of_sections(program):
-    """Return the end of the sections of a program."""
+    """Return the index at which the sections of a program end."""
     first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_RUNS]
     return first + 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN]) + 4 * program[N_STIFFENED]
 
 
 @inlined
 def order_of(program):
-    """Return the coordinate, or n_q + the row, of each pivot."""
+    """Return the index of each pivot: j for coordinate j, n_q + i for row i of G."""
     return program[N_HEAD : N_HEAD + program[N_PIVOTS]]
 
 
 @inlined
 def columns_of(program):
-    """Return where each column of L begins and the last one ends; and the row of each entry, in the order of pivots."""
+    """Return the first entry of each column of L, with the end of the last, and the row of each entry, as its pivot."""
     first = N_HEAD + program[N_PIVOTS]
     middle = first + program[N_PIVOTS] + 1
     return program[first:middle], program[middle : middle + program[N_OFF]]
@@ -386,7 +389,7 @@ def columns_of(program):
 
 @inlined
 def runs_of(program):
-    """Return length and first slot of the runs of off-diagonal updates, pivot by pivot and entry by entry."""
+    """Return [length, first slot] of the runs of off-diagonal updates, in the order in which `factor` uses them."""
     first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF]
     return program[first : first + program[N_RUNS]]
 
